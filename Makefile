@@ -1,0 +1,47 @@
+# Verbs: install, demo, check, format, test, test-all, schemas, clean. All work from a fresh clone.
+PYTHON ?= python3
+BIN := .venv/bin
+INSTALLED := .venv/installed
+
+.PHONY: install demo check format test test-all schemas benchmarks clean
+
+install: $(INSTALLED)
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "Python 3.11 or later is needed; name one with: make PYTHON=python3.12"; exit 2; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $(INSTALLED)
+
+demo: install
+	@rm -rf demo
+	@echo "1/4  a synthetic match with known truth"
+	@$(BIN)/worldpose simulate --scenario tiny --seed 1 --out demo/tiny
+	@echo "2/4  the factory: Prefect flow, Dask tasks, Zarr store"
+	@$(BIN)/worldpose run demo/tiny --project demo/project
+	@echo "3/4  figures against truth"
+	@$(BIN)/worldpose evaluate --prediction demo/tiny --reference demo/tiny/reference --project demo/project
+	@echo "4/4  the report"
+	@$(BIN)/worldpose report demo/tiny --project demo/project --out demo/report.html
+
+check: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: install
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+test: install check
+	$(BIN)/pytest -m "not slow"
+
+test-all: install check
+	$(BIN)/pytest
+
+schemas: install
+	$(BIN)/python -m data_contracts.schemas docs/schemas
+
+clean:
+	rm -rf .venv demo build dist *.egg-info

@@ -1,0 +1,76 @@
+"""Layouts of stored arrays: dimensions, dtype, unit, chunk and missing value.
+
+A layout is checked when a result is written and travels with the array as attributes, so that a
+reader needs no other source to know what the numbers are.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+
+from data_contracts.records import CONTRACT_VERSION, Name, Record
+
+Missing = Literal["nan", "-1", "0", "none"]
+
+CHUNK_BYTES = 1 << 20
+"""Least size of a full chunk before compression: smaller ones halve the throughput."""
+
+
+class ArrayLayout(Record):
+    """One array of a result."""
+
+    name: Name
+    dims: tuple[str, ...]
+    """Dimension names in storage order; a dimension that names a coordinate is labelled by it."""
+    dtype: Literal["float64", "float32", "int64", "int32", "int16", "uint8", "bool"]
+    unit: str
+    """m, px, rad, s, m^2, frame, or 1 for a pure number."""
+    missing: Missing
+    about: str
+    """What the numbers are, with their frame of reference."""
+    chunk_dim: str | None = None
+    """The dimension that is cut into chunks of at least `CHUNK_BYTES`; None = one chunk."""
+
+    def chunks(self, shape: tuple[int, ...]) -> tuple[int, ...]:
+        """Chunk shape for an array of `shape`, whole except along `chunk_dim`."""
+        whole = tuple(max(1, n) for n in shape)
+        if self.chunk_dim is None:
+            return whole
+        axis = self.dims.index(self.chunk_dim)
+        row_bytes = np.dtype(self.dtype).itemsize * int(np.prod(whole)) // whole[axis]
+        rows = -(-CHUNK_BYTES // max(1, row_bytes))
+        return (*whole[:axis], min(whole[axis], rows), *whole[axis + 1 :])
+
+    def attributes(self) -> dict[str, Any]:
+        """Attributes stored beside the array."""
+        return {"unit": self.unit, "missing": self.missing, "about": self.about}
+
+
+class GroupLayout(Record):
+    """All arrays of one stage's result, and the labels of its dimensions."""
+
+    contract: int = CONTRACT_VERSION
+    stage: Name
+    about: str
+    arrays: tuple[ArrayLayout, ...]
+    coordinates: tuple[ArrayLayout, ...] = ()
+    """One-dimensional arrays named as their dimension: frame numbers, person ids."""
+    labels: dict[str, tuple[str, ...]] = {}
+    """Dimensions with fixed names, such as joint = COCO-17."""
+    attributes: dict[str, str] = {}
+    """Group attributes that a writer must give, and what each says."""
+    optional: tuple[str, ...] = ()
+    """Names of arrays that may be absent."""
+
+    def layout(self, name: str) -> ArrayLayout:
+        """The layout of the array or coordinate `name`.
+
+        Raises:
+            KeyError: the group has no such array.
+        """
+        for array in (*self.coordinates, *self.arrays):
+            if array.name == name:
+                return array
+        raise KeyError(f"{self.stage} has no array {name!r}")

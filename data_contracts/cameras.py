@@ -1,0 +1,87 @@
+"""Calibrated cameras as records and as stored arrays."""
+
+from __future__ import annotations
+
+from data_contracts.arrays import ArrayLayout
+from data_contracts.conventions import DISTORTION
+from data_contracts.records import Name, Record
+
+Vector3 = tuple[float, float, float]
+
+
+class CameraCalibration(Record):
+    """One calibrated static camera."""
+
+    id: Name
+    image_size: tuple[int, int]
+    """Width and height [px]."""
+    focal_px: tuple[float, float]
+    """fx, fy [px]."""
+    principal_point_px: tuple[float, float]
+    """cx, cy [px]; (0, 0) is the centre of the top-left pixel."""
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2, k3: OpenCV's order [1]."""
+    rotation: tuple[Vector3, Vector3, Vector3]
+    """Rows of R in x_cam = R x_world + t."""
+    translation: Vector3
+    """t in x_cam = R x_world + t [m]."""
+
+
+CAMERA_LABELS: dict[str, tuple[str, ...]] = {
+    "axis": ("x", "y"),
+    "coefficient": DISTORTION,
+    "coordinate": ("x", "y", "z"),
+    "cam_coordinate": ("x_cam", "y_cam", "z_cam"),
+}
+
+CAMERA_ARRAYS = (
+    ArrayLayout(
+        name="focal",
+        dims=("axis",),
+        dtype="float64",
+        unit="px",
+        missing="none",
+        about="focal lengths fx, fy",
+    ),
+    ArrayLayout(
+        name="principal_point",
+        dims=("axis",),
+        dtype="float64",
+        unit="px",
+        missing="none",
+        about="principal point cx, cy; (0, 0) is the centre of the top-left pixel",
+    ),
+    ArrayLayout(
+        name="distortion",
+        dims=("coefficient",),
+        dtype="float64",
+        unit="1",
+        missing="none",
+        about="k1, k2, p1, p2, k3 in OpenCV's order",
+    ),
+    ArrayLayout(
+        name="rotation",
+        dims=("cam_coordinate", "coordinate"),
+        dtype="float64",
+        unit="1",
+        missing="none",
+        about="R in x_cam = R x_world + t",
+    ),
+    ArrayLayout(
+        name="translation",
+        dims=("cam_coordinate",),
+        dtype="float64",
+        unit="m",
+        missing="none",
+        about="t in x_cam = R x_world + t",
+    ),
+    ArrayLayout(
+        name="image_size",
+        dims=("axis",),
+        dtype="int64",
+        unit="px",
+        missing="none",
+        about="width, height",
+    ),
+)
+"""Arrays of one static camera."""

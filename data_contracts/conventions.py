@@ -1,0 +1,98 @@
+"""Frames, axes, units and joint names: the one record that ships with every result.
+
+tests/unit/cameras proves the image half of it against OpenCV.
+"""
+
+from __future__ import annotations
+
+from data_contracts.records import CONTRACT_VERSION, Record
+
+COCO17 = (
+    "nose",
+    "left_eye",
+    "right_eye",
+    "left_ear",
+    "right_ear",
+    "left_shoulder",
+    "right_shoulder",
+    "left_elbow",
+    "right_elbow",
+    "left_wrist",
+    "right_wrist",
+    "left_hip",
+    "right_hip",
+    "left_knee",
+    "right_knee",
+    "left_ankle",
+    "right_ankle",
+)
+"""Joint order of every `keypoints` and `joints` array."""
+
+COCO17_BONES = (
+    (5, 7),
+    (7, 9),
+    (6, 8),
+    (8, 10),
+    (5, 6),
+    (11, 12),
+    (5, 11),
+    (6, 12),
+    (11, 13),
+    (13, 15),
+    (12, 14),
+    (14, 16),
+    (0, 1),
+    (0, 2),
+    (1, 3),
+    (2, 4),
+    (0, 5),
+    (0, 6),
+)
+"""Pairs of indices into `COCO17` that are drawn as bones."""
+
+COCO17_SIGMAS = (
+    0.026,
+    0.025,
+    0.025,
+    0.035,
+    0.035,
+    0.079,
+    0.079,
+    0.072,
+    0.072,
+    0.062,
+    0.062,
+    0.107,
+    0.107,
+    0.087,
+    0.087,
+    0.089,
+    0.089,
+)
+"""COCO's per-joint spread of human labels, as a fraction of person size."""
+
+DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+"""Order of distortion coefficients, OpenCV's."""
+
+
+class Conventions(Record):
+    """What every number in a result means."""
+
+    contract: int = CONTRACT_VERSION
+    world: str = (
+        "metres; origin at the centre spot on the ground; x along the touch line, y across, z up; "
+        "right-handed; the main camera stands at negative y. A match without a pitch keeps the "
+        "world frame of its calibration."
+    )
+    camera: str = "x right, y down, z forward; x_cam = R x_world + t (cam_from_world)"
+    pixel_origin: str = "(0, 0) is the centre of the top-left pixel; u right, v down"
+    distortion: tuple[str, ...] = DISTORTION
+    rotations: str = "3x3 matrices or axis-angle vectors in radians"
+    frames: str = "0-based match frames; camera frame = match frame + offset_frames"
+    dimensions: str = "frame, camera, person, joint, coordinate"
+    missing: str = "NaN in floats, -1 in indices, 0 in counts; never a zero coordinate"
+    joints: tuple[str, ...] = COCO17
+    smpl_pivot: str = "global_orient rotates about the pelvis joint; transl is added after it"
+
+
+CONVENTIONS = Conventions()

@@ -1,0 +1,142 @@
+"""match.yaml and the registration of a match folder."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from data_contracts.records import CONTRACT_VERSION, Digest, Name, Record
+
+
+class CameraSpec(Record):
+    """One camera of the match folder."""
+
+    id: Name
+    kind: Literal["static", "broadcast"] = "static"
+    width: int = Field(gt=0)
+    """[px]"""
+    height: int = Field(gt=0)
+    """[px]"""
+    fps: float | None = Field(default=None, gt=0)
+    """[1/s]; absent = the match's."""
+    offset_frames: float = 0.0
+    """This camera's own frame number at match frame 0: camera frame = match frame + offset."""
+    video: str | None = None
+    """Video file or folder of images, relative to the match folder."""
+    still: str | None = None
+    """One picture of a static camera where there is no video, relative to the match folder."""
+
+
+class ClipSpec(Record):
+    """A stretch of the match that is reconstructed as one piece."""
+
+    id: Name
+    first_frame: int = 0
+    """First match frame."""
+    frame_count: int = Field(gt=0)
+    broadcast: Name | None = None
+    """The broadcast camera that filmed this clip, if any."""
+    broadcast_offset_frames: float = 0.0
+    """Frame of the broadcast clip's own video at the clip's first frame."""
+
+
+class PlayerSpec(Record):
+    """A person of the roster."""
+
+    id: Name
+    name: str = ""
+    team: str = ""
+    role: Literal["player", "goalkeeper", "official"] = "player"
+
+
+class MatchSpec(Record):
+    """match.yaml."""
+
+    contract: Literal[1] = CONTRACT_VERSION
+    match_id: Name
+    fps: float = Field(gt=0)
+    """[1/s] of match time."""
+    cameras: tuple[CameraSpec, ...] = Field(min_length=1)
+    clips: tuple[ClipSpec, ...] = Field(min_length=1)
+    pitch: str | None = None
+    """`none` for footage without a pitch, a file name, or absent for the standard pitch."""
+    roster: tuple[PlayerSpec, ...] = ()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        ids = [camera.id for camera in self.cameras] + [clip.id for clip in self.clips]
+        twice = sorted({name for name in ids if ids.count(name) > 1})
+        if twice:
+            raise ValueError(f"ids of cameras and clips must differ; used twice: {twice}")
+        broadcast = {camera.id for camera in self.cameras if camera.kind == "broadcast"}
+        for clip in self.clips:
+            if clip.broadcast is not None and clip.broadcast not in broadcast:
+                raise ValueError(
+                    f"clip {clip.id} names broadcast camera {clip.broadcast!r}; "
+                    f"broadcast cameras here: {sorted(broadcast)}"
+                )
+        for camera in self.cameras:
+            if camera.fps is not None and camera.fps != self.fps:
+                raise ValueError(
+                    f"camera {camera.id} has fps {camera.fps:g}, the match {self.fps:g}; "
+                    "resample it first"
+                )
+            if camera.kind == "static" and camera.offset_frames != int(camera.offset_frames):
+                raise ValueError(
+                    f"camera {camera.id} has offset_frames {camera.offset_frames:g}; "
+                    "a static camera's offset must be whole"
+                )
+        return self
+
+    @property
+    def static_cameras(self) -> tuple[CameraSpec, ...]:
+        """The static cameras in file order, which is the order of every camera dimension."""
+        return tuple(camera for camera in self.cameras if camera.kind == "static")
+
+    def camera(self, camera_id: str) -> CameraSpec:
+        """The camera with this id.
+
+        Raises:
+            KeyError: no such camera.
+        """
+        return {camera.id: camera for camera in self.cameras}[camera_id]
+
+    def clip(self, clip_id: str) -> ClipSpec:
+        """The clip with this id.
+
+        Raises:
+            KeyError: no such clip.
+        """
+        return {clip.id: clip for clip in self.clips}[clip_id]
+
+
+class SourceFile(Record):
+    """One file of a match folder as it was when the match was registered."""
+
+    path: str
+    """Relative to the match folder, with forward slashes."""
+    size: int
+    """[byte]"""
+    modified_ns: int
+    """Only a hint that lets an unchanged file's digest be kept; never part of a key."""
+    sha256: Digest
+
+
+class Registration(Record):
+    """A match known to a project: what it is and where its folder lies."""
+
+    contract: Literal[1] = CONTRACT_VERSION
+    spec: MatchSpec
+    folder: str
+    """Absolute path of the match folder."""
+    identity: Digest
+    """Digest of videos, detections and pitch: the same content is the same match."""
+    files: tuple[SourceFile, ...]
+
+    def digest_of(self, path: str) -> str | None:
+        """SHA-256 of a registered file, None when the folder has no such file."""
+        for source in self.files:
+            if source.path == path:
+                return source.sha256
+        return None

@@ -1,0 +1,130 @@
+"""Lineage: recipes, results and runs."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Literal
+
+from pydantic import JsonValue
+
+from data_contracts.records import CONTRACT_VERSION, Digest, Key, Name, Record
+
+
+class Project(Record):
+    """project.json: what makes a folder or a bucket's prefix a project."""
+
+    contract: Literal[1] = CONTRACT_VERSION
+    store_format: str
+    """Version of the way arrays are written as bytes."""
+
+
+class Recipe(Record):
+    """Everything that decides a result; its digest is the result's key."""
+
+    contract: Literal[1] = CONTRACT_VERSION
+    match_id: Name
+    stage: Name
+    unit: Name
+    sources: dict[str, JsonValue]
+    """What the match folder gives: digests of files, and values such as the frame rate."""
+    inputs: dict[str, Key]
+    """Results it is made from: `stage/unit` to key."""
+    settings: dict[str, JsonValue]
+    code: dict[str, str]
+    """Source modules that compute it: module name to digest."""
+    libraries: dict[str, str]
+    """Numeric libraries that compute it: name to version."""
+
+    @property
+    def name(self) -> str:
+        """Stage and unit: `tracking/clip`."""
+        return f"{self.stage}/{self.unit}"
+
+
+class Work(Record):
+    """One unit of one stage, ready to be computed by a task."""
+
+    project: str
+    """Folder or URL of the store."""
+    folder: str
+    """The match folder; read by `ingest` alone."""
+    recipe: Recipe
+    key: Key
+    run_id: Name
+
+
+class StoredFile(Record):
+    """One file of a published result."""
+
+    path: str
+    """Relative to the result's group."""
+    size: int
+    """[byte]"""
+    sha256: Digest
+
+
+class ResultManifest(Record):
+    """Written last: a result exists when this file names every other with its checksum."""
+
+    contract: Literal[1] = CONTRACT_VERSION
+    key: Key
+    recipe: Recipe
+    files: tuple[StoredFile, ...]
+    content: Digest
+    """Digest of `files`: two honest computations of one key agree in it."""
+    figures: dict[str, float]
+    """Quality figures, with the unit in the name."""
+    created_at: datetime
+    seconds: float
+    run_id: Name
+    checksum: Digest
+    """Digest of this record without `checksum`."""
+
+
+class UnitFailure(Record):
+    """Why a unit of a run has no result."""
+
+    unit: str
+    """Stage and unit: `tracking/clip`."""
+    error: str
+    message: str
+
+
+class Reservation(Record):
+    """<run>.open.json: a run's number is taken; alone, the run has not finished."""
+
+    contract: Literal[1] = CONTRACT_VERSION
+    run_id: Name
+    match_id: Name
+    started_at: datetime
+    host: str
+    pid: int
+
+
+RunState = Literal["complete", "partial", "failed"]
+
+
+class RunRecord(Record):
+    """One run of a match: which result stands for which unit."""
+
+    contract: Literal[1] = CONTRACT_VERSION
+    run_id: Name
+    match_id: Name
+    parent: Name | None
+    """The run before this one."""
+    state: RunState
+    results: dict[str, Key]
+    """Unit, as `stage/unit`, to key."""
+    settings: dict[str, dict[str, JsonValue]]
+    """Stage to all its settings."""
+    overrides: dict[str, dict[str, JsonValue]]
+    """Stage to the settings that were asked for; the others are defaults."""
+    executed: tuple[str, ...]
+    reused: tuple[str, ...]
+    failed: tuple[UnitFailure, ...]
+    figures: dict[str, dict[str, float]]
+    """Unit, as `stage/unit`, to quality figures."""
+    versions: dict[str, str]
+    started_at: datetime
+    finished_at: datetime
+    seconds: float

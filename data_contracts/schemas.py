@@ -1,0 +1,65 @@
+"""JSON Schemas of all contracts: `python -m data_contracts.schemas docs/schemas` writes them."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from data_contracts.arrays import GroupLayout
+from data_contracts.body_fitting import BODY_FITTING
+from data_contracts.cameras import CameraCalibration
+from data_contracts.conventions import CONVENTIONS, Conventions
+from data_contracts.evaluation import Evaluation
+from data_contracts.ingest import INGEST
+from data_contracts.match import MatchSpec, Registration
+from data_contracts.pitch import PitchSpec
+from data_contracts.records import Record
+from data_contracts.review import Correction, ReviewDecision, ReviewRequest
+from data_contracts.run import Project, Reservation, ResultManifest, RunRecord
+from data_contracts.tracking import TRACKING, Track
+from data_contracts.triangulation import TRIANGULATION
+
+RECORDS: dict[str, type[Record]] = {
+    "match": MatchSpec,
+    "registration": Registration,
+    "camera": CameraCalibration,
+    "pitch": PitchSpec,
+    "track": Track,
+    "review_request": ReviewRequest,
+    "review_decision": ReviewDecision,
+    "correction": Correction,
+    "project": Project,
+    "reservation": Reservation,
+    "result_manifest": ResultManifest,
+    "run": RunRecord,
+    "evaluation": Evaluation,
+    "conventions": Conventions,
+    "layout": GroupLayout,
+}
+
+LAYOUTS: tuple[GroupLayout, ...] = (INGEST, TRACKING, TRIANGULATION, BODY_FITTING)
+
+
+def documents() -> dict[str, Any]:
+    """Every generated document by file name: schemas, array layouts, conventions."""
+    schemas = {
+        f"{name}.schema.json": record.model_json_schema() for name, record in RECORDS.items()
+    }
+    return schemas | {
+        "arrays.json": [layout.model_dump(mode="json") for layout in LAYOUTS],
+        "conventions.json": CONVENTIONS.model_dump(mode="json"),
+    }
+
+
+def write(folder: Path) -> None:
+    """Write all documents into `folder`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, document in documents().items():
+        text = json.dumps(document, indent=2, ensure_ascii=False)
+        (folder / name).write_text(text + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    write(Path(sys.argv[1]))

@@ -1,0 +1,68 @@
+"""Result of stage `tracking`: who is who, in every camera and over time (T1, T2)."""
+
+from __future__ import annotations
+
+from data_contracts.arrays import ArrayLayout, GroupLayout
+from data_contracts.conventions import COCO17
+from data_contracts.observations import FRAME
+from data_contracts.records import Name, Record
+
+PERSON = ArrayLayout(
+    name="person",
+    dims=("person",),
+    dtype="int32",
+    unit="1",
+    missing="none",
+    about="person id, stable within the clip, from 0",
+)
+
+TRACKING = GroupLayout(
+    stage="tracking",
+    about="Which detection of every camera is which person.",
+    coordinates=(FRAME, PERSON),
+    arrays=(
+        ArrayLayout(
+            name="detection_index",
+            dims=("frame", "camera", "person"),
+            dtype="int16",
+            unit="1",
+            missing="-1",
+            about="place in `ingest` detections of this camera and frame",
+            chunk_dim="frame",
+        ),
+        ArrayLayout(
+            name="ray_distance",
+            dims=("frame", "camera", "person"),
+            dtype="float32",
+            unit="m",
+            missing="nan",
+            about="mean distance of the detection's rays to the person's joints when matched",
+            chunk_dim="frame",
+        ),
+        ArrayLayout(
+            name="joints",
+            dims=("frame", "person", "joint", "coordinate"),
+            dtype="float32",
+            unit="m",
+            missing="nan",
+            about="the tracker's own quick 3D joints, world; `triangulation` has the good ones",
+            chunk_dim="frame",
+        ),
+    ),
+    labels={"joint": COCO17, "coordinate": ("x", "y", "z")},
+    attributes={"camera": "camera ids in the order of the camera dimension"},
+)
+
+
+class Track(Record):
+    """One person's presence in a clip."""
+
+    person: int
+    first_frame: int
+    last_frame: int
+    frames_seen: int
+    """Frames with at least one matched detection."""
+    views: float
+    """Mean number of cameras in those frames."""
+    name: Name | None = None
+    """Roster id, where known."""

@@ -1,0 +1,67 @@
+"""Result of stage `triangulation`: where every joint is, and how sure that is (T3)."""
+
+from __future__ import annotations
+
+from data_contracts.arrays import ArrayLayout, GroupLayout
+from data_contracts.conventions import COCO17
+from data_contracts.observations import FRAME
+from data_contracts.tracking import PERSON
+
+TRIANGULATION = GroupLayout(
+    stage="triangulation",
+    about="3D joints of every person with covariance and the views that carry them.",
+    coordinates=(FRAME, PERSON),
+    arrays=(
+        ArrayLayout(
+            name="joints",
+            dims=("frame", "person", "joint", "coordinate"),
+            dtype="float64",
+            unit="m",
+            missing="nan",
+            about="joints, world",
+            chunk_dim="frame",
+        ),
+        ArrayLayout(
+            name="covariance",
+            dims=("frame", "person", "joint", "coordinate", "coordinate_"),
+            dtype="float64",
+            unit="m^2",
+            missing="nan",
+            about="covariance of `joints` from the image noise that the settings state",
+            chunk_dim="frame",
+        ),
+        ArrayLayout(
+            name="views",
+            dims=("frame", "person", "joint"),
+            dtype="uint8",
+            unit="1",
+            missing="0",
+            about="cameras whose observation agrees with the joint",
+            chunk_dim="frame",
+        ),
+        ArrayLayout(
+            name="reprojection_error",
+            dims=("frame", "person", "joint"),
+            dtype="float32",
+            unit="px",
+            missing="nan",
+            about="root mean square over the agreeing cameras",
+            chunk_dim="frame",
+        ),
+        ArrayLayout(
+            name="inliers",
+            dims=("frame", "camera", "person", "joint"),
+            dtype="bool",
+            unit="1",
+            missing="none",
+            about="does this camera's observation agree with the joint",
+            chunk_dim="frame",
+        ),
+    ),
+    labels={
+        "joint": COCO17,
+        "coordinate": ("x", "y", "z"),
+        "coordinate_": ("x", "y", "z"),
+    },
+    attributes={"camera": "camera ids in the order of the camera dimension"},
+)

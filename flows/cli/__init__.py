@@ -1,0 +1,40 @@
+"""The `worldpose` command.
+
+Exit codes: 0 done, 1 failed, 2 usage, 3 waits for review, 4 partial.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import typer
+
+from flows.cli import lineage, matches, project, results, run
+from flows.cli.console import errors
+from worldpose.errors import UsageError, WorldposeError
+
+app = typer.Typer(
+    name="worldpose",
+    help="Metric 3D poses of every player from many cameras: a data factory.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+for module in (project, matches, run, lineage, results):
+    module.add_to(app)
+
+
+def main() -> None:
+    """Run the command line; user errors become one message and an exit code."""
+    try:
+        app()
+    except WorldposeError as error:
+        if "--json" in sys.argv:
+            print(json.dumps({"error": type(error).__name__, "message": str(error)}))  # noqa: T201
+        errors.print(f"[bold red]error:[/] {_escaped(str(error))}", highlight=False)
+        sys.exit(2 if isinstance(error, UsageError) else 1)
+
+
+def _escaped(text: str) -> str:
+    return text.replace("[", r"\[")

@@ -1,0 +1,111 @@
+"""What all commands share: the project and JSON options, output, progress."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from flows.progress import Reporter, in_short, reporting_to
+from worldpose.store import Store
+
+output = Console(soft_wrap=True)
+errors = Console(stderr=True, soft_wrap=True)
+
+ProjectOption = Annotated[
+    str,
+    typer.Option(
+        "--project",
+        envvar="WORLDPOSE_PROJECT",
+        help="Folder or s3:// URL that holds all results.",
+    ),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]
+MatchArgument = Annotated[
+    str, typer.Argument(metavar="MATCH", help="A match folder, or the id of a registered match.")
+]
+RunOption = Annotated[str, typer.Option("--run", help="A run's number; latest by default.")]
+
+DEFAULT_PROJECT = "worldpose-data"
+
+
+def open_or_create(project: str) -> Store:
+    """The project's store; one that does not exist yet is made."""
+    return Store.create(project)
+
+
+def print_json(value: Mapping[str, Any]) -> None:
+    """One JSON object on standard output."""
+    print(json.dumps(value, indent=2, default=str))  # noqa: T201
+
+
+def table(title: str, *columns: str) -> Table:
+    """A plain table; columns that start with ">" are right-aligned."""
+    made = Table(title=title, title_justify="left", box=None, pad_edge=False, title_style="bold")
+    for column in columns:
+        made.add_column(column.lstrip(">"), justify="right" if column.startswith(">") else "left")
+    return made
+
+
+class ConsoleReporter(Reporter):
+    """Progress as lines on standard error, with a spinner while a terminal watches."""
+
+    def __init__(self) -> None:
+        self._started = time.monotonic()
+        self._left = 0
+        self._tenths = 0
+
+    def say(self, text: str) -> None:
+        """One line, stamped with the seconds since the start."""
+        seconds = time.monotonic() - self._started
+        errors.print(f"[dim]{seconds:7.1f} s[/]  {text}", highlight=False)
+
+    def bytes_read(self, done: int, total: int) -> None:
+        """Tells of every tenth of a long reading."""
+        tenth = 10 * done // max(total, 1)
+        if tenth > self._tenths:
+            self._tenths = tenth
+            self.say(f"{done / 1e6:.1f} of {total / 1e6:.1f} MB checked")
+
+    def stage_started(self, stage: str, about: str, *, units: int, missing: int) -> None:
+        """Names the stage and how much of it is already there."""
+        super().stage_started(stage, about, units=units, missing=missing)
+        reused = f", {units - missing} already there" if missing < units else ""
+        self._left = missing
+        self.say(f"[bold]{stage}[/]: {about} ({missing} of {units} to compute{reused})")
+
+    def unit_done(self, unit: str, seconds: float, figures: Mapping[str, float]) -> None:
+        """Names the unit, its time and its figures."""
+        super().unit_done(unit, seconds, figures)
+        self._left -= 1
+        self.say(f"  {unit}  {seconds:.2f} s  [dim]{in_short(figures)}[/]  ({self._left} left)")
+
+    def unit_failed(self, unit: str, message: str) -> None:
+        """Names the unit and why it failed."""
+        super().unit_failed(unit, message)
+        self._left -= 1
+        self.say(f"  [bold red]{unit} failed[/]  ({self._left} left)")
+
+
+@contextmanager
+def progress() -> Iterator[ConsoleReporter]:
+    """Progress of whatever runs inside, as lines on standard error."""
+    reporter = ConsoleReporter()
+    with reporting_to(reporter):
+        if errors.is_terminal:
+            with errors.status("working"):
+                yield reporter
+        else:
+            yield reporter
+
+
+def match_path(folder: str) -> Path:
+    """A folder given on the command line."""
+    return Path(folder).expanduser()

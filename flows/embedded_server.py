@@ -1,0 +1,29 @@
+"""Prefect's API for one run: `python -m flows.embedded_server PORT`, ends with its standard input.
+
+Prefect's own temporary server outlives a parent that is killed; this one does not.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+
+import uvicorn
+from prefect.server.api.server import create_app
+
+
+def main() -> None:
+    """Serve on loopback until standard input is closed."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    app = create_app(ephemeral=True, final=True)
+    uvicorn.run(app, host="127.0.0.1", port=int(sys.argv[1]), log_level="error", lifespan="on")
+
+
+def _end_with_parent() -> None:
+    sys.stdin.buffer.read()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,56 @@
+"""Progress of a run, told to whoever started it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+logger = logging.getLogger("worldpose.run")
+
+
+class Reporter:
+    """Tells progress as log lines, which a Prefect server shows with the run.
+
+    The command line puts a livelier one in its place, which tells this one too.
+    """
+
+    def say(self, text: str) -> None:
+        """Anything else that takes a while."""
+        logger.info(text)
+
+    def stage_started(self, stage: str, about: str, *, units: int, missing: int) -> None:
+        """A stage begins: how many units it has and how many must be computed."""
+        logger.info("%s: %s (%d units, %d to compute)", stage, about, units, missing)
+
+    def unit_done(self, unit: str, seconds: float, figures: Mapping[str, float]) -> None:
+        """A unit has been computed and published."""
+        logger.info("%s: done in %.2f s (%s)", unit, seconds, in_short(figures))
+
+    def unit_failed(self, unit: str, message: str) -> None:
+        """A unit has no result."""
+        logger.error("%s: failed: %s", unit, message)
+
+
+def in_short(figures: Mapping[str, float]) -> str:
+    """A unit's figures on one line, without those of single cameras."""
+    return ", ".join(f"{name} {value:.4g}" for name, value in figures.items() if "." not in name)
+
+
+_reporter: ContextVar[Reporter | None] = ContextVar("reporter", default=None)
+
+
+def reporter() -> Reporter:
+    """The reporter of the run under way."""
+    return _reporter.get() or Reporter()
+
+
+@contextmanager
+def reporting_to(target: Reporter) -> Iterator[None]:
+    """Let runs started in this context tell `target` of their progress."""
+    token = _reporter.set(target)
+    try:
+        yield
+    finally:
+        _reporter.reset(token)

@@ -1,0 +1,119 @@
+"""Matches known to a project: registering folders, opening what is registered."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from data_contracts.match import Registration, SourceFile
+from flows.stage import Match
+from worldpose.errors import InputError, UsageError
+from worldpose.ingest import (
+    MatchFolder,
+    read_match,
+    read_unit,
+    register_match,
+    require_calibrated,
+)
+from worldpose.store import Store
+
+
+def register(store: Store, folder: Path) -> tuple[Match, bool]:
+    """Validate a match folder and make it known; tells whether it was new or changed.
+
+    The same content under another name is the same match. A known match whose videos, detections
+    or pitch changed is another match and needs another id.
+
+    Raises:
+        InputError: the folder is not a valid match, or its id or content is taken.
+    """
+    match_folder = read_match(folder)
+    _require_inputs(match_folder)
+    match_id = match_folder.spec.match_id
+    previous = store.registration(match_id)
+    registration = register_match(match_folder, previous)
+    match = Match(match_folder, registration)
+    if previous is not None:
+        if previous.identity != registration.identity:
+            raise InputError(
+                f"{folder}: match.yaml: match_id",
+                expected=f"the videos, detections and pitch that {match_id} was registered with",
+                found=_changes(previous.files, registration.files),
+                todo="Restore the files, or give the changed match an id of its own.",
+            )
+        if previous == registration:
+            return match, False
+    _refuse_duplicate(store, registration)
+    _read_new_detections(match_folder, registration, previous)
+    store.register(registration)
+    return match, True
+
+
+def open_match(store: Store, match_id: str) -> Match:
+    """A registered match, with its folder read anew: annotations may have changed since.
+
+    Raises:
+        UsageError: no such match.
+    """
+    registration = store.registration(match_id) if match_id in store.matches() else None
+    if registration is None:
+        known = ", ".join(store.matches()) or "(none registered)"
+        raise UsageError(
+            f"match {match_id}",
+            expected=f"a match folder or one of {known}",
+            found=repr(match_id),
+            todo="Register it: worldpose ingest FOLDER.",
+        )
+    return register(store, Path(registration.folder))[0]
+
+
+def find_match(store: Store, name: str) -> Match:
+    """The match that a person means by a folder or an id; a folder is registered first."""
+    folder = Path(name)
+    if (folder / "match.yaml").is_file() or (folder.is_dir() and name not in store.matches()):
+        return register(store, folder)[0]
+    return open_match(store, name)
+
+
+def _require_inputs(match: MatchFolder) -> None:
+    """Refuse a match whose static cameras are not all calibrated and observed."""
+    require_calibrated(match)
+    for camera in match.spec.static_cameras:
+        if camera.id not in match.detections:
+            raise InputError(
+                f"{match.folder}: camera {camera.id}",
+                expected="2D poses in detections/",
+                found="none",
+                todo=f"Add detections/{camera.id}.json or .npz, or remove the camera.",
+            )
+
+
+def _refuse_duplicate(store: Store, registration: Registration) -> None:
+    """Refuse a second folder of known content; a folder that moved is no second one."""
+    for known in filter(None, map(store.registration, store.matches())):
+        same_content = known.identity == registration.identity
+        renamed = known.spec.match_id != registration.spec.match_id
+        copied = known.folder != registration.folder and Path(known.folder).exists()
+        if same_content and (renamed or copied):
+            raise InputError(
+                f"{registration.folder}: match.yaml: match_id",
+                expected="a match that is not registered yet",
+                found=f"the content of {known.spec.match_id}, registered from {known.folder}",
+                todo=f"The same content is one match: use {known.spec.match_id}.",
+            )
+
+
+def _read_new_detections(
+    match: MatchFolder, registration: Registration, previous: Registration | None
+) -> None:
+    """Refuse broken 2D poses now, by file and place, rather than in the middle of a run."""
+    known = {source.sha256 for source in previous.files} if previous is not None else set()
+    for unit, path in match.detections.items():
+        if registration.digest_of(path.relative_to(match.folder).as_posix()) not in known:
+            read_unit(match, unit)
+
+
+def _changes(before: tuple[SourceFile, ...], after: tuple[SourceFile, ...]) -> str:
+    old = {source.path: source.sha256 for source in before}
+    new = {source.path: source.sha256 for source in after}
+    changed = sorted(path for path in old | new if old.get(path) != new.get(path))
+    return f"changes in {', '.join(changed[:3])}" + (" and more" if len(changed) > 3 else "")

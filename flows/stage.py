@@ -1,0 +1,46 @@
+"""What a stage is to the factory: its units, what each is made from, its settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pydantic import JsonValue
+
+from data_contracts.match import Registration
+from data_contracts.records import Record
+from worldpose.ingest import MatchFolder
+
+
+@dataclass(frozen=True)
+class Match:
+    """A registered match: its folder as validated, and the digests of its files."""
+
+    folder: MatchFolder
+    registration: Registration
+
+    @property
+    def match_id(self) -> str:
+        """The match's id."""
+        return self.registration.spec.match_id
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of the method; its task is the function of the same name in `tasks`.
+
+    Attributes:
+        name: the one word for this stage in flows/, tasks/, worldpose/ and data_contracts/.
+        about: what a person reads in progress lines.
+        settings: the record of its settings.
+        units: names of the pieces that are computed, retried and stored on their own.
+        inputs: for a unit, the `stage/unit` names of the results it is made from.
+        sources: for a unit, everything the match folder contributes to its result.
+    """
+
+    name: str
+    about: str
+    settings: type[Record]
+    units: Callable[[Match], tuple[str, ...]]
+    inputs: Callable[[Match, str], tuple[str, ...]]
+    sources: Callable[[Match, str], dict[str, JsonValue]]

@@ -1,0 +1,22 @@
+"""Stage `triangulation`: one unit a clip, from its tracks and all static cameras (T3)."""
+
+from __future__ import annotations
+
+from flows import tracking
+from flows.stage import Match, Stage
+from worldpose.triangulation import TriangulationSettings
+
+
+def inputs(match: Match, unit: str) -> tuple[str, ...]:
+    """What every static camera brought in, and who is who."""
+    return (*tracking.inputs(match, unit), f"tracking/{unit}")
+
+
+STAGE = Stage(
+    name="triangulation",
+    about="place every joint from the cameras that agree",
+    settings=TriangulationSettings,
+    units=tracking.units,
+    inputs=inputs,
+    sources=tracking.sources,
+)

@@ -1,0 +1,1 @@
+"""One retriable unit of work each: open the inputs, call worldpose, publish the result."""

@@ -1,0 +1,61 @@
+"""A clip as tracking and triangulation see it: all static cameras, one clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.run import Work
+from tasks.unit import open_input
+from worldpose.cameras import Camera
+from worldpose.cameras.stored import camera_from_arrays
+from worldpose.store import Store
+
+
+@dataclass(frozen=True)
+class ClipInputs:
+    """Observations of one clip.
+
+    Attributes:
+        camera_ids: in the order of every camera dimension.
+        cameras: (cameras,) batch.
+        frame: (frames,) match frames.
+        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
+        confidence: (frames, cameras, detections, 17); NaN where not found.
+        fps: frames a second of match time.
+    """
+
+    camera_ids: tuple[str, ...]
+    cameras: Camera
+    frame: NDArray[np.int64]
+    keypoints: NDArray[np.float64]
+    confidence: NDArray[np.float64]
+    fps: float
+
+
+def open_clip(store: Store, work: Work) -> ClipInputs:
+    """The clip of `work`, with every camera's detections padded to the same number."""
+    sources = work.recipe.sources
+    camera_ids = tuple(sources["cameras"])
+    first, count = sources["first_frame"], sources["frame_count"]
+    frame = np.arange(first, first + count)
+    ingested = [open_input(store, work, f"ingest/{camera}") for camera in camera_ids]
+    clips = [camera.sel(frame=frame) for camera in ingested]
+    detections = max(1, *(clip.sizes["detection"] for clip in clips))
+    shape = (count, len(camera_ids), detections, clips[0].sizes["joint"])
+    keypoints = np.full((*shape, 2), np.nan)
+    confidence = np.full(shape, np.nan)
+    for index, clip in enumerate(clips):
+        present = clip.sizes["detection"]
+        keypoints[:, index, :present] = clip["keypoints"].values
+        confidence[:, index, :present] = clip["confidence"].values
+    return ClipInputs(
+        camera_ids=camera_ids,
+        cameras=Camera.stack([camera_from_arrays(camera) for camera in ingested]),
+        frame=frame,
+        keypoints=keypoints,
+        confidence=confidence,
+        fps=float(sources["fps"]),
+    )

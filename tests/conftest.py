@@ -1,0 +1,65 @@
+"""What tests of the whole machine share: a match, a project, one Prefect server."""
+
+import os
+import shutil
+import urllib.request
+from pathlib import Path
+
+import pytest
+from command_line import succeed
+from moto.server import ThreadedMotoServer
+from werkzeug.serving import WSGIRequestHandler
+
+from flows.prefect_environment import prefect_server
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory):
+    """The address of one Prefect API for all tests that do not test starting one."""
+    before = dict(os.environ)
+    with prefect_server(str(tmp_path_factory.mktemp("prefect"))) as wait_until_ready:
+        wait_until_ready()
+        yield os.environ["PREFECT_API_URL"]
+    os.environ.clear()
+    os.environ.update(before)
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory):
+    """A small synthetic match folder with truth; read only."""
+    folder = tmp_path_factory.mktemp("matches") / "tiny"
+    succeed("simulate", "--scenario", "tiny", "--seed", 3, "--duration", 1.2, "--out", folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def tiny_run(server, tiny, tmp_path_factory):
+    """A project in which `tiny` has been run once; read only."""
+    project = tmp_path_factory.mktemp("project") / "worldpose-data"
+    succeed("run", tiny, "--project", project)
+    return project
+
+
+@pytest.fixture
+def project_copy(tiny_run, tmp_path):
+    """A copy of that project, to be changed."""
+    return Path(shutil.copytree(tiny_run, tmp_path / "worldpose-data"))
+
+
+@pytest.fixture(scope="session")
+def bucket():
+    """The URL of a bucket in an S3 server on loopback."""
+    # Connections that stay open halve the time of a request.
+    WSGIRequestHandler.protocol_version = "HTTP/1.1"
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    endpoint = f"http://{host}:{port}"
+    make = urllib.request.Request(f"{endpoint}/projects", method="PUT")
+    with urllib.request.urlopen(make), pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AWS_ENDPOINT_URL", endpoint)
+        patch.setenv("AWS_ACCESS_KEY_ID", "test")
+        patch.setenv("AWS_SECRET_ACCESS_KEY", "test")
+        patch.setenv("AWS_REGION", "us-east-1")
+        yield "s3://projects"
+    server.stop()

@@ -1,0 +1,124 @@
+"""Killed anywhere, run again: the store is that of an undisturbed run, byte for byte."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from command_line import WORLDPOSE, succeed
+
+from worldpose.store import Store, compare_stores, verify
+from worldpose.store.commit_points import COMMIT_POINTS
+
+pytestmark = [pytest.mark.usefixtures("server"), pytest.mark.faults]
+
+FAULT = Path(__file__).with_name("fault.py")
+IN_WORKER = [point for point in COMMIT_POINTS if "run_record" not in point]
+IN_MAIN = [point for point in COMMIT_POINTS if "run_record" in point]
+
+
+def fault_environment(tmp_path, point, skip=0):
+    struck = tmp_path / "struck"
+    plan = json.dumps({"point": point, "struck": str(struck), "skip": skip})
+    return {"WORLDPOSE_TEST_FAULT": plan}, struck
+
+
+def assert_same_store(project, undisturbed):
+    assert compare_stores(Store.open(str(project)), Store.open(str(undisturbed))) == []
+    assert verify(Store.open(str(project))) == ()
+
+
+def quick(points, kept):
+    """All points, but only some of them in the quick tier."""
+    return [
+        point if point in kept else pytest.param(point, marks=pytest.mark.slow) for point in points
+    ]
+
+
+@pytest.mark.parametrize("point", quick(IN_WORKER, {"during_publish", "before_commit"}))
+def test_a_worker_killed_at_a_commit_point_is_replaced(point, tiny, tiny_run, tmp_path):
+    environment, struck = fault_environment(tmp_path, point, skip=2)
+    environment["DASK_DISTRIBUTED__WORKER__PRELOAD"] = str(FAULT)
+    project = tmp_path / "worldpose-data"
+    succeed("run", tiny, "--project", project, environment=environment)
+    assert struck.exists(), "the fault did not strike"
+    assert_same_store(project, tiny_run)
+
+
+@pytest.mark.parametrize("point", IN_MAIN)
+def test_the_whole_process_killed_around_the_run_record(point, tiny, tiny_run, tmp_path):
+    environment, struck = fault_environment(tmp_path, point)
+    project = tmp_path / "worldpose-data"
+    killed = subprocess.run(
+        [sys.executable, FAULT, "run", tiny, "--project", project],
+        env={**os.environ, **environment},
+        capture_output=True,
+    )
+    assert killed.returncode == -signal.SIGKILL
+    assert struck.exists()
+    succeed("run", tiny, "--project", project)
+    assert_same_store(project, tiny_run)
+
+
+@pytest.mark.parametrize("seed", quick(range(20), {0, 1}))
+def test_the_whole_process_group_killed_at_a_random_time(seed, tiny, tiny_run, tmp_path):
+    project = tmp_path / "worldpose-data"
+    # From importing to the last stage: a run of this match takes about 9 s on two busy cores.
+    delay = random.Random(seed).uniform(1.0, 9.0)
+    process = subprocess.Popen(
+        [*WORLDPOSE, "run", str(tiny), "--project", str(project)],
+        start_new_session=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    time.sleep(delay)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    if Store.exists(str(project)):
+        store = Store.open(str(project))
+        for match in store.matches():
+            for run in store.runs(match):
+                assert store.run(match, run).state == "complete"
+        assert verify(store) == (), "something half-written can be read"
+    succeed("run", tiny, "--project", project)
+    assert_same_store(project, tiny_run)
+
+
+def test_workers_and_server_end_with_a_killed_run(tiny, tmp_path):
+    marker = f"WORLDPOSE_TEST_MARK={tmp_path.name}"
+    environment = {**os.environ, "WORLDPOSE_TEST_MARK": tmp_path.name}
+    environment.pop("PREFECT_API_URL")  # so that it brings a server of its own
+    process = subprocess.Popen(
+        [*WORLDPOSE, "run", str(tiny), "--project", str(tmp_path / "worldpose-data")],
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
+    for line in process.stderr:
+        if b"tracking" in line:  # server and workers are up
+            break
+    assert len(processes_with(marker)) > 2
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + 20
+    while processes_with(marker) and time.monotonic() < deadline:
+        time.sleep(0.2)
+    assert processes_with(marker) == []
+
+
+def processes_with(marker):
+    """Ids of live processes that have this in their environment."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            running = "\nState:\tZ" not in (folder / "status").read_text()
+            if running and marker.encode() in (folder / "environ").read_bytes():
+                found.append(int(folder.name))
+        except OSError:
+            continue
+    return [pid for pid in found if pid != os.getpid()]

@@ -1,0 +1,175 @@
+"""Bad input: one clear message with file, key, expected, found and what to do; nothing changed."""
+
+import shutil
+
+import numpy as np
+import pytest
+import yaml
+from command_line import TINY, worldpose
+
+pytestmark = pytest.mark.usefixtures("server")
+
+
+def contents(folder):
+    return {
+        path.relative_to(folder): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and "prefect" not in path.relative_to(folder).parts
+    }
+
+
+@pytest.fixture
+def match(tiny, tmp_path):
+    return shutil.copytree(tiny, tmp_path / "other")
+
+
+def rewrite(path, **changes):
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    for name, change in changes.items():
+        change(arrays[name])
+    np.savez(path, **arrays)
+
+
+def a_detection_file(match):
+    return sorted((match / "detections").glob("*.npz"))[1]
+
+
+def rename_match(match):
+    spec = yaml.safe_load((match / "match.yaml").read_text())
+    spec["match_id"] = "other"
+    (match / "match.yaml").write_text(yaml.safe_dump(spec))
+    return spec
+
+
+def truncate(match):
+    path = a_detection_file(match)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    return [path.name, "expected", "Write or export it again"]
+
+
+def nan_keypoint(match):
+    def spoil(keypoints):
+        place = tuple(np.argwhere(np.isfinite(keypoints[..., 0]))[0])
+        keypoints[(*place, 0)] = np.nan
+
+    path = a_detection_file(match)
+    rewrite(path, keypoints=spoil)
+    return [path.name, "keypoints"]
+
+
+def missing_camera(match):
+    path = a_detection_file(match)
+    path.unlink()
+    return [f"missing camera {path.stem}", f"detections/{path.stem}.json"]
+
+
+def missing_calibration(match):
+    import tomllib
+
+    path = match / "calibration.toml"
+    cameras = tomllib.loads(path.read_text())
+    first = next(iter(cameras))
+    text = path.read_text()
+    start = text.index(f"[{first}]")
+    end = text.index("\n[", start + 1)
+    path.write_text(text[:start] + text[end + 1 :])
+    return ["calibration.toml", "missing camera"]
+
+
+def unknown_key(match):
+    path = match / "match.yaml"
+    path.write_text(path.read_text() + "framerate: 25\n")
+    return ["match.yaml", "framerate"]
+
+
+@pytest.mark.parametrize(
+    "spoil", [truncate, nan_keypoint, missing_camera, missing_calibration, unknown_key]
+)
+def test_a_spoilt_match_is_refused(spoil, match, project_copy):
+    rename_match(match)
+    told = spoil(match)
+    before = contents(project_copy), contents(match)
+    answer = worldpose("run", match, "--project", project_copy)
+    assert answer.code in (1, 2)
+    assert "Traceback" not in answer.err
+    messages = [line for line in answer.err.splitlines() if "error:" in line or "Error:" in line]
+    assert len(messages) == 1, answer.err
+    for words in told:
+        assert words in messages[0]
+    assert "expected" in messages[0] and "found" in messages[0]
+    after = contents(project_copy), contents(match)
+    assert after[1] == before[1]
+    assert changed_results(before[0], after[0]) == set()
+
+
+def changed_results(before, after):
+    return {path for path in before | after if before.get(path) != after.get(path)}
+
+
+def test_a_duplicate_under_another_id_is_refused(match, project_copy):
+    rename_match(match)
+    before = contents(project_copy)
+    answer = worldpose("ingest", match, "--project", project_copy)
+    assert answer.code == 1
+    assert f"the content of {TINY}" in answer.err
+    assert f"use {TINY}" in answer.err
+    assert contents(project_copy) == before
+
+
+def test_a_copied_folder_is_refused_while_the_first_is_there(match, project_copy):
+    before = contents(project_copy)
+    answer = worldpose("ingest", match, "--project", project_copy)
+    assert answer.code == 1
+    assert "registered from" in answer.err
+    assert contents(project_copy) == before
+
+
+def test_ingesting_twice_says_so_and_changes_nothing(tiny, project_copy):
+    before = contents(project_copy)
+    answer = worldpose("ingest", tiny, "--project", project_copy)
+    assert answer.code == 0
+    assert "already registered" in answer.out
+    assert contents(project_copy) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--set", "triangulation.min_view=3"], "Did you mean 'min_views'"),
+        (["--set", "triangulaton.min_views=3"], "Did you mean 'triangulation'"),
+        (["--set", "triangulation.min_views=many"], "integer"),
+        (["--set", "min_views"], "stage.name=value"),
+        (["--from", "triangulation", "--until", "tracking"], "Swap them"),
+        (["--until", "body"], "one of ingest, tracking, triangulation"),
+    ],
+)
+def test_a_setting_or_stage_that_does_not_exist_is_a_usage_error(
+    arguments, told, tiny, project_copy
+):
+    before = contents(project_copy)
+    answer = worldpose("run", tiny, "--project", project_copy, *arguments)
+    assert answer.code == 2
+    assert told in answer.err
+    assert contents(project_copy) == before
+
+
+def test_reading_commands_do_not_make_a_project(tmp_path):
+    for command in (["status"], ["verify"], ["gc"], ["diff", "a/1", "a/2"]):
+        answer = worldpose(*command, "--project", tmp_path / "nowhere")
+        assert answer.code in (1, 2)
+        assert "worldpose init" in answer.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_flipped_byte_is_named(project_copy):
+    chunk = max(
+        (project_copy / "results" / TINY / "triangulation").rglob("c/*"),
+        key=lambda path: path.stat().st_size if path.is_file() else 0,
+    )
+    spoilt = bytearray(chunk.read_bytes())
+    spoilt[len(spoilt) // 2] ^= 1
+    chunk.write_bytes(spoilt)
+    answer = worldpose("verify", "--project", project_copy)
+    assert answer.code == 1
+    assert chunk.relative_to(project_copy).as_posix() in answer.err

@@ -1,0 +1,19 @@
+"""A project in object storage: the same commands, the same bytes."""
+
+import uuid
+
+from command_line import TINY, succeed
+
+from worldpose import open_run
+from worldpose.store import Store, compare_stores, verify
+
+
+def test_a_match_run_on_object_storage_equals_one_on_disk(server, bucket, tiny, tiny_run):
+    project = f"{bucket}/{uuid.uuid4().hex}"
+    succeed("run", tiny, "--project", project)
+    assert compare_stores(Store.open(project), Store.open(str(tiny_run))) == []
+    assert verify(Store.open(project)) == ()
+    joints = open_run(project, TINY)["triangulation/clip"].joints
+    assert joints.attrs["units"] == "m"
+    again = succeed("run", tiny, "--project", project, "--json").json
+    assert (again["run"], again["executed"]) == ("0001", 0)

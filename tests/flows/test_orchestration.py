@@ -1,0 +1,119 @@
+"""The real machinery: embedded, with a Prefect server, with a Dask cluster of its own processes."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import pytest
+from command_line import TINY, succeed, worldpose
+
+from worldpose.store import Store, compare_stores
+
+LOOPBACK_ONLY = str(Path(__file__).with_name("loopback_only"))
+
+
+@pytest.fixture
+def no_server(monkeypatch):
+    monkeypatch.delenv("PREFECT_API_URL", raising=False)
+
+
+def test_an_embedded_run_reaches_nothing_but_this_machine(no_server, tiny, tmp_path):
+    notes = tmp_path / "notes"
+    environment = {"PYTHONPATH": LOOPBACK_ONLY, "WORLDPOSE_TEST_NOTES": str(notes)}
+    probe = [sys.executable, "-c", "import socket; socket.create_connection(('192.0.2.1', 80), 1)"]
+    assert subprocess.run(probe, env={**os.environ, **environment}, capture_output=True).returncode
+    assert "192.0.2.1" in notes.read_text(), "the guard does not work"
+    notes.unlink()
+    project = tmp_path / "worldpose-data"
+    succeed("run", tiny, "--project", project, environment=environment)
+    assert not notes.exists(), notes.read_text()
+
+
+def test_a_run_is_visible_at_the_server_by_name(server, tiny, tmp_path):
+    succeed("run", tiny, "--project", tmp_path / "worldpose-data")
+
+    def ask(kind):
+        request = urllib.request.Request(
+            f"{server}/{kind}/filter",
+            data=b'{"sort": "EXPECTED_START_TIME_DESC", "limit": 50}',
+            headers={"content-type": "application/json"},
+        )
+        with urllib.request.urlopen(request) as answer:
+            return json.load(answer)
+
+    run = ask("flow_runs")[0]
+    assert (run["name"], run["state_name"]) == (TINY, "Completed")
+    assert run["parameters"]["match_id"] == TINY
+    tasks = {task["name"] for task in ask("task_runs") if task["flow_run_id"] == run["id"]}
+    assert {"tracking clip", "triangulation clip"} <= tasks
+
+
+def test_dask_workers_of_their_own_give_the_same_bytes(server, tiny, tiny_run, tmp_path):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    address = f"tcp://127.0.0.1:{port}"
+    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker"]
+    processes = [
+        subprocess.Popen(
+            [*dask, "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        ),
+        *(
+            subprocess.Popen(
+                [*worker, address, "--nthreads", "1", "--no-dashboard"],
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                cwd=tmp_path,
+            )
+            for _ in range(2)
+        ),
+    ]
+    try:
+        wait_for_port(port)
+        project = tmp_path / "worldpose-data"
+        succeed("run", tiny, "--project", project, "--dask", address)
+        assert compare_stores(Store.open(str(project)), Store.open(str(tiny_run))) == []
+    finally:
+        for process in processes:
+            process.terminate()
+        for process in processes:
+            process.wait()
+
+
+def wait_for_port(port):
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        time.sleep(0.1)
+    raise TimeoutError(port)
+
+
+def test_a_damaged_input_fails_its_unit_and_repair_mends_it(server, tiny, tmp_path):
+    project = tmp_path / "worldpose-data"
+    succeed("run", tiny, "--project", project, "--until", "tracking")
+    chunks = (project / "results" / TINY / "tracking").rglob("detection_index/c/*/*/*")
+    chunk = next(path for path in chunks if path.is_file())
+    spoilt = bytearray(chunk.read_bytes())
+    spoilt[-1] ^= 1
+    chunk.write_bytes(spoilt)
+    answer = worldpose("run", tiny, "--project", project)
+    assert answer.code == 1
+    assert "triangulation/clip" in answer.err
+    assert "detection_index" in answer.err
+    record = Store.open(str(project)).run(TINY)
+    assert record.state == "failed"
+    assert [failure.unit for failure in record.failed] == ["triangulation/clip"]
+    # Mending it: the damaged result is withdrawn and computed again.
+    assert worldpose("verify", "--repair", "--project", project).code == 1
+    again = succeed("run", tiny, "--project", project, "--json").json
+    assert (again["executed"], again["failed"]) == (2, 0)

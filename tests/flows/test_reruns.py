@@ -1,0 +1,103 @@
+"""A second run does nothing; a changed setting recomputes what depends on it and nothing else."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import TINY, succeed, worldpose
+
+from worldpose import open_run
+from worldpose.store import Store
+
+pytestmark = pytest.mark.usefixtures("server")
+
+NO_ORCHESTRATOR = {"PYTHONPATH": str(Path(__file__).with_name("without_orchestrators"))}
+
+
+def run_json(*arguments, **keywords):
+    return succeed("run", *arguments, "--json", **keywords).json
+
+
+def test_a_finished_match_has_nothing_to_do_and_starts_nothing(tiny, project_copy):
+    # Any import of Prefect or Dask ends this process at once.
+    answer = run_json(tiny, "--project", project_copy, environment=NO_ORCHESTRATOR)
+    assert answer["executed"] == 0
+    assert answer["failed"] == 0
+    assert answer["run"] == "0001"
+    assert Store.open(str(project_copy)).runs(TINY) == ("0001",)
+
+
+def test_the_guard_against_orchestrators_bites(tiny, tmp_path):
+    answer = worldpose("run", tiny, "--project", tmp_path / "new", environment=NO_ORCHESTRATOR)
+    assert answer.code != 0
+    assert "orchestrator imported" in answer.err
+
+
+def test_a_triangulation_setting_leaves_tracking_alone(tiny, project_copy):
+    answer = run_json(tiny, "--project", project_copy, "--set", "triangulation.min_views=3")
+    assert answer["run"] == "0002"
+    assert answer["executed"] == 1
+    units = {
+        unit["unit"]: unit
+        for unit in succeed(
+            "diff", f"{TINY}/0001", f"{TINY}/0002", "--project", project_copy, "--json"
+        ).json["units"]
+    }
+    changed = {name for name, unit in units.items() if unit["state"] != "same"}
+    assert changed == {"triangulation/clip"}
+    (reason,) = units["triangulation/clip"]["reasons"]
+    assert "min_views" in reason
+    assert "2" in reason and "3" in reason
+
+    why = succeed("why", f"{TINY}/tracking/clip", "--project", project_copy, "--json").json
+    assert why["state"].startswith("current")
+    asked = ("why", f"{TINY}/triangulation/clip", "--set", "triangulation.min_views=2")
+    why = succeed(*asked, "--project", project_copy, "--json").json
+    assert why["state"] == "stale since run 0002"
+    assert any("min_views" in reason for reason in why["reasons"])
+
+    # Back to the defaults: all results are there, so a new run is recorded without any task.
+    back = run_json(tiny, "--project", project_copy, environment=NO_ORCHESTRATOR)
+    assert (back["run"], back["executed"]) == ("0003", 0)
+    store = Store.open(str(project_copy))
+    assert store.run(TINY, "0003").results == store.run(TINY, "0001").results
+
+
+def test_more_views_leave_fewer_joints(tiny, project_copy):
+    run_json(tiny, "--project", project_copy, "--set", "triangulation.min_views=3")
+    loose = open_run(str(project_copy), TINY, "0001")["triangulation/clip"]
+    strict = open_run(str(project_copy), TINY, "0002")["triangulation/clip"]
+    assert int((strict.views > 0).sum()) <= int((loose.views > 0).sum())
+    assert int(strict.views.where(strict.views > 0).min()) >= 3
+
+
+def test_an_edited_detection_file_is_another_match(tiny, project_copy, tmp_path):
+    edited = shutil.copytree(tiny, tmp_path / "tiny")
+    path = next((edited / "detections").glob("*.npz"))
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    arrays["keypoints"] = arrays["keypoints"] + np.float32(1)
+    np.savez(path, **arrays)
+    answer = worldpose("run", edited, "--project", project_copy)
+    assert answer.code == 1
+    assert f"detections/{path.name}" in answer.err
+    assert "id of its own" in answer.err
+
+
+def test_a_moved_camera_recomputes_all_that_sees_through_it(tiny, tmp_path, server):
+    moved = shutil.copytree(tiny, tmp_path / "tiny")
+    project = tmp_path / "worldpose-data"
+    run_json(moved, "--project", project)
+    calibration = moved / "calibration.toml"
+    lines = calibration.read_text().splitlines()
+    row = next(number for number, line in enumerate(lines) if line.startswith("translation"))
+    numbers = json.loads(lines[row].partition("=")[2])
+    numbers[0] += 0.01
+    lines[row] = f"translation = {json.dumps(numbers)}"
+    calibration.write_text("\n".join(lines) + "\n")
+    answer = run_json(moved, "--project", project)
+    # One camera is taken in again; tracking and triangulation of the clip depend on it.
+    assert answer["executed"] == 3
+    assert answer["reused"] == len(Store.open(str(project)).run(TINY, "0001").results) - 3

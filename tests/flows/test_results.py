@@ -1,0 +1,121 @@
+"""What comes out of a run: figures against truth, files for others, a page, labelled arrays."""
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import TINY, succeed, worldpose
+
+from worldpose import open_run
+from worldpose.release import read_joints
+
+pytestmark = pytest.mark.usefixtures("server")
+
+
+def test_figures_against_truth(tiny, tiny_run):
+    figures = succeed(
+        *("evaluate", "--prediction", tiny, "--reference", tiny / "reference"),
+        *("--project", tiny_run, "--json"),
+    ).json
+    # Noise of a few pixels at 115 px a person, averaged over six views: seen 29 mm.
+    assert 5 < figures["mpjpe_mm"] < 60
+    assert figures["pcp3d"] > 97
+    assert figures["coverage"] == 1
+    assert figures["persons"] == 5
+
+
+def test_truth_scored_against_itself_is_perfect_and_a_shift_is_its_length(tiny, tmp_path):
+    truth = tiny / "reference" / "joints.npz"
+    figures = succeed("evaluate", "--prediction", truth, "--reference", truth, "--json").json
+    assert (figures["mpjpe_mm"], figures["pcp3d"], figures["coverage"]) == (0, 100, 1)
+    with np.load(truth) as stored:
+        arrays = dict(stored)
+    arrays["joints"] = arrays["joints"] + np.array([0.03, 0, 0.04])
+    np.savez(tmp_path / "shifted.npz", **arrays)
+    figures = succeed(
+        *("evaluate", "--prediction", tmp_path / "shifted.npz", "--reference", truth, "--json")
+    ).json
+    assert figures["mpjpe_mm"] == pytest.approx(50)
+
+
+def test_exported_joints_are_the_run_s_own(tiny_run, tmp_path):
+    succeed(*("export", TINY, "--format", "joints", "--out", tmp_path, "--project", tiny_run))
+    tracks = read_joints(tmp_path / "joints.npz")
+    result = open_run(tiny_run, TINY)["triangulation/clip"]
+    np.testing.assert_array_equal(tracks.joints, result.joints.values)
+    np.testing.assert_array_equal(tracks.frames, np.arange(30))
+    assert tracks.covariance.shape == (30, len(tracks.person_ids), 17, 3, 3)
+
+
+def test_exported_coco_lies_on_the_detections(tiny, tiny_run, tmp_path):
+    succeed(*("export", TINY, "--format", "coco", "--out", tmp_path, "--project", tiny_run))
+    cameras = sorted(path.stem for path in (tiny / "detections").iterdir())
+    assert sorted(path.stem for path in tmp_path.glob("*.json")) == cameras
+    dataset = json.loads((tmp_path / f"{cameras[0]}.json").read_text())
+    assert len(dataset["images"]) == 30
+    with np.load(tiny / "detections" / f"{cameras[0]}.npz") as detections:
+        keypoints = detections["keypoints"]
+    distances = []
+    for annotation in dataset["annotations"]:
+        points = np.array(annotation["keypoints"]).reshape(17, 3)
+        seen = points[:, 2] == 2
+        offsets = keypoints[annotation["image_id"]][:, seen] - points[seen, :2]
+        distances.append(np.nanmin(np.nanmean(np.linalg.norm(offsets, axis=-1), axis=-1)))
+    # Joints that this camera agreed with are a few pixels from what it detected.
+    assert np.median(distances) < 5
+
+
+def test_readme_example_gives_labelled_joints_with_units(tiny_run, tmp_path, capsys):
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
+    (example,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    assert len([line for line in example.splitlines() if line.strip()]) <= 5
+    exec(example.replace("worldpose-data", str(tiny_run)).replace('"lab"', f'"{TINY}"'), {})
+    assert capsys.readouterr().out == "('frame', 'joint', 'coordinate') m\n"
+
+
+class Outside(HTMLParser):
+    """Collects what a page would ask others for."""
+
+    def __init__(self):
+        super().__init__()
+        self.asked = []
+
+    def handle_starttag(self, tag, attributes):
+        self.asked += [
+            value
+            for name, value in attributes
+            if name in ("src", "href") and not value.startswith(("data:", "#"))
+        ]
+
+
+def test_report_is_one_page_that_asks_for_nothing(tiny, tiny_run, tmp_path):
+    out = tmp_path / "report.html"
+    succeed("report", tiny, "--out", out, "--project", tiny_run)
+    page = out.read_text()
+    outside = Outside()
+    outside.feed(page)
+    assert outside.asked == []
+    assert page.count("data:image/png;base64,") == 2
+    assert "Mean joint error" in page
+    assert "triangulation/clip" in page
+
+
+def test_a_run_without_joints_cannot_be_exported(server, tiny, tmp_path):
+    project = tmp_path / "worldpose-data"
+    succeed("run", tiny, "--project", project, "--until", "ingest")
+    answer = worldpose(
+        *("export", TINY, "--format", "joints", "--out", tmp_path / "out", "--project", project)
+    )
+    assert answer.code == 1
+    assert "Run the match to the end" in answer.err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", ["status", "verify", "gc", "ingest", "run", "why", "diff"])
+def test_every_command_explains_itself_with_an_example(command):
+    answer = succeed(command, "--help")
+    assert "Example: worldpose" in answer.out
+    assert "--json" in answer.out

@@ -1,0 +1,203 @@
+"""The cases of docs/metrics.md, under the same letters, and what must hold for any input."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from worldpose.evaluation import EvaluationSettings, evaluate_joints
+from worldpose.release import JointTracks
+
+# Sums of a few hundred rounded distances of some metres: 1e-9 mm is a thousand times their error.
+MM = 1e-9
+
+SIDES = {1: 0.03, 3: 0.07, 5: 0.20, 7: 0.20, 9: 0.20, 11: 0.11, 13: 0.11, 15: 0.11}
+HEIGHTS = (1.70, 1.72, 1.70, 1.45, 1.15, 0.89, 0.90, 0.50, 0.10)
+
+
+def person(x=0.0, y=0.0):
+    """A standing person: lower arms 0.26 m, lower legs 0.4 m, head 0.25 m."""
+    joints = np.zeros((17, 3))
+    joints[0] = (0.0, 0.0, HEIGHTS[0])
+    for (left, side), height in zip(SIDES.items(), HEIGHTS[1:], strict=True):
+        joints[left] = (0.0, side, height)
+        joints[left + 1] = (0.0, -side, height)
+    return joints + np.array([x, y, 0.0])
+
+
+def tracks(frames_of_people, views=None, first_frame=0):
+    joints = np.array(frames_of_people, dtype=np.float64)
+    return JointTracks(
+        np.arange(first_frame, first_frame + joints.shape[0]),
+        np.arange(joints.shape[1]),
+        joints,
+        views=views,
+    )
+
+
+def score(predicted, true, **settings):
+    return evaluate_joints(predicted, true, EvaluationSettings(**settings))[0]
+
+
+def crowd(frames=4, persons=3, seed=0):
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(-20.0, 20.0, (frames, persons, 1, 3)) * [1.0, 1.0, 0.0]
+    return tracks(person() + places)
+
+
+def test_truth_itself_scores_perfectly():
+    truth = crowd()
+    assert score(truth, truth).model_dump() == {
+        "mpjpe_mm": 0.0,
+        "pcp3d": 100.0,
+        "coverage": 1.0,
+        "joint_coverage": 1.0,
+        "false_persons_per_frame": 0.0,
+        "persons": 3,
+        "frames": 4,
+    }
+
+
+def test_a_shift_of_a_tenth_of_a_metre_is_100_mm():
+    truth = crowd()
+    shifted = replace(truth, joints=truth.joints + np.array([0.1, 0.0, 0.0]))
+    scores, people = evaluate_joints(shifted, truth)
+    assert scores.mpjpe_mm == pytest.approx(100.0, abs=MM)
+    assert [each.mpjpe_mm for each in people] == pytest.approx([100.0] * 3, abs=MM)
+
+
+def test_case_a_matching_takes_the_least_sum_not_the_nearest_pair_first():
+    truth = tracks([[person(0.0), person(0.5)]])
+    predicted = tracks([[person(0.9), person(0.3)]])
+    assert score(predicted, truth).mpjpe_mm == pytest.approx(350.0, abs=MM)
+
+
+def test_case_b_a_prediction_beyond_the_gate_is_missed_and_false():
+    scores = score(tracks([[person(1.2)]]), tracks([[person(0.0)]]))
+    assert scores.model_dump(exclude_none=True) == {
+        "pcp3d": 0.0,
+        "coverage": 0.0,
+        "joint_coverage": 0.0,
+        "false_persons_per_frame": 1.0,
+        "persons": 1,
+        "frames": 1,
+    }
+    assert score(tracks([[person(1.2)]]), tracks([[person(0.0)]]), match_gate=1.3).coverage == 1.0
+
+
+def test_case_c_a_missing_joint_lowers_joint_coverage_not_the_error():
+    predicted = person(0.03, 0.04)
+    predicted[9] = np.nan
+    scores = score(tracks([[predicted]]), tracks([[person()]]))
+    assert scores.mpjpe_mm == pytest.approx(50.0, abs=MM)
+    assert scores.joint_coverage == pytest.approx(16 / 17, abs=1e-15)
+    assert scores.coverage == 1.0
+    assert scores.pcp3d == 90.0
+
+
+def test_case_d_left_and_right_exchanged():
+    mirrored = person() * [1.0, -1.0, 1.0]
+    scores = score(tracks([[mirrored]]), tracks([[person()]]))
+    assert scores.mpjpe_mm == pytest.approx(1000 * 4 * (0.03 + 0.07 + 0.60 + 0.33) / 17, abs=MM)
+    assert scores.pcp3d == 20.0
+
+
+def test_case_e_a_dropped_person_lowers_coverage():
+    truth = tracks([[person(0.0), person(5.0)]] * 10)
+    joints = truth.joints.copy()
+    joints[3:7, 1] = np.nan
+    scores, people = evaluate_joints(replace(truth, joints=joints), truth)
+    assert (scores.coverage, scores.joint_coverage, scores.pcp3d) == (0.8, 0.8, 80.0)
+    assert [each.coverage for each in people] == [1.0, 0.6]
+    assert [each.frames for each in people] == [10, 10]
+    assert scores.mpjpe_mm == 0.0
+
+
+def test_case_f_people_whom_one_camera_saw_neither_count_nor_are_false():
+    views = np.full((1, 2, 17), 3)
+    views[0, 1] = 1
+    truth = tracks([[person(0.0), person(5.0)]], views=views)
+    scores, people = evaluate_joints(tracks(truth.joints), truth)
+    assert (scores.persons, scores.coverage, scores.false_persons_per_frame) == (1, 1.0, 0.0)
+    assert people[1].frames == 0
+    assert people[1].coverage is None
+    nobody = tracks(np.full((1, 1, 17, 3), np.nan))
+    assert score(nobody, truth).coverage == 0.0
+
+
+def test_case_g_a_limb_is_right_within_half_its_length():
+    for shift, expected in ((0.24, 100.0), (0.28, 90.0)):
+        predicted = person()
+        predicted[9, 0] += shift
+        assert score(tracks([[predicted]]), tracks([[person()]])).pcp3d == expected
+
+
+def test_joints_that_one_camera_saw_are_not_scored():
+    views = np.full((1, 1, 17), 2)
+    views[0, 0, 9] = 1
+    predicted = person()
+    predicted[9] += 0.5
+    scores = score(tracks([[predicted]]), tracks([[person()]], views=views))
+    assert (scores.mpjpe_mm, scores.joint_coverage, scores.pcp3d) == (0.0, 1.0, 100.0)
+
+
+def test_half_of_the_joints_make_a_person_count():
+    views = np.zeros((1, 1, 17), dtype=np.int64)
+    for seen, persons in ((8, 0), (9, 1)):
+        views[0, 0, :seen] = 2
+        assert score(crowd(1, 1), replace(crowd(1, 1), views=views)).persons == persons
+
+
+def test_frames_are_paired_by_number():
+    truth = tracks([[person(float(i))] for i in range(10)], first_frame=100)
+    later = JointTracks(truth.frames[6:], truth.person_ids, truth.joints[6:])
+    scores = score(later, truth)
+    assert (scores.frames, scores.coverage, scores.mpjpe_mm) == (10, 0.4, 0.0)
+    beyond = score(truth, later)
+    assert (beyond.frames, beyond.coverage, beyond.false_persons_per_frame) == (4, 1.0, 0.0)
+
+
+def test_a_false_person_is_counted_in_every_frame_it_shows_up():
+    truth = tracks([[person(0.0)]] * 4)
+    joints = np.concatenate([truth.joints, truth.joints + np.array([9.0, 0.0, 0.0])], axis=1)
+    joints[0, 1] = np.nan
+    scores = score(tracks(joints), truth)
+    assert (scores.false_persons_per_frame, scores.coverage) == (0.75, 1.0)
+
+
+def test_two_predictions_of_one_person_are_one_match_and_one_false_person():
+    scores = score(tracks([[person(0.1), person(0.2)]]), tracks([[person()]]))
+    assert scores.mpjpe_mm == pytest.approx(100.0, abs=MM)
+    assert scores.false_persons_per_frame == 1.0
+
+
+def test_an_empty_prediction_and_an_empty_truth_have_no_error():
+    truth = crowd()
+    nobody = JointTracks(truth.frames, np.arange(0), np.empty((4, 0, 17, 3)))
+    assert score(nobody, truth).mpjpe_mm is None
+    assert score(nobody, truth).coverage == 0.0
+    assert score(truth, nobody).coverage is None
+    assert score(truth, nobody).false_persons_per_frame == 3.0
+    no_frames = JointTracks(np.arange(0), np.arange(0), np.empty((0, 0, 17, 3)))
+    assert score(truth, no_frames).model_dump(exclude_none=True) == {"persons": 0, "frames": 0}
+
+
+@given(order=st.permutations(range(3)), seed=st.integers(0, 99))
+def test_neither_order_nor_ids_of_people_change_a_score(order, seed):
+    truth = crowd(seed=seed)
+    noisy = truth.joints + np.random.default_rng(seed).normal(0.0, 0.05, truth.joints.shape)
+    plain = score(replace(truth, joints=noisy), truth)
+    shuffled = JointTracks(truth.frames, np.array([7, 3, 9]), noisy[:, list(order)])
+    assert score(shuffled, truth) == plain
+
+
+@given(noise=st.floats(0.001, 0.1), seed=st.integers(0, 99))
+def test_mpjpe_is_the_mean_error_when_nobody_is_confused(noise, seed):
+    truth = tracks([[person(0.0), person(8.0)]])
+    error = np.random.default_rng(seed).normal(0.0, noise, truth.joints.shape)
+    expected = 1000.0 * np.linalg.norm(error, axis=-1).mean()
+    assert score(replace(truth, joints=truth.joints + error), truth).mpjpe_mm == pytest.approx(
+        expected, abs=MM
+    )

@@ -1,0 +1,322 @@
+import tomllib
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from data_contracts.cameras import CameraCalibration
+from worldpose.errors import InputError
+from worldpose.ingest.calibration_files import read_calibration, write_calibration_toml
+
+ANIPOSE = """
+[cam_0]
+name = "left"
+size = [1032, 776]
+matrix = [[1063.5, 0.0, 511.7], [0.0, 1071.8, 350.1], [0.0, 0.0, 1.0]]
+distortions = [-0.1, 0.02, 0.001, -0.002, 0.003]
+rotation = [1.5, -0.6, 0.7]
+translation = [-0.5, 0.9, 2.6]
+
+[metadata]
+adjusted = false
+error = 0.0
+"""
+
+POSE2SIM = """
+[cam_01]
+name = "cam_01"
+size = [ 1088.0, 1920.0]
+matrix = [ [ 1681.2, 0.0, 532.9], [ 0.0, 1681.0, 948.1], [ 0.0, 0.0, 1.0]]
+distortions = [ -0.1, 0.02, 9.5e-06, 1.1e-05]
+rotation = [ 1.6, 1.0, -0.4]
+translation = [ 0.3, 0.9, 2.8]
+fisheye = false
+"""
+
+CALISCOPE = """
+[cameras.3]
+cam_id = 3
+size = [1280, 720]
+rotation_count = 0
+error = 0.3
+matrix = [[900.0, 0.0, 640.0], [0.0, 901.0, 360.0], [0.0, 0.0, 1.0]]
+distortions = [[-0.1, 0.02, 0.0, 0.0, 0.0]]
+translation = [[0.1], [0.2], [3.0]]
+rotation = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
+grid_count = 20
+fisheye = false
+"""
+
+# Stands 10 m up at (1, 2), looks straight down; its picture's right is world x, its up is world y.
+QUALISYS = """<?xml version='1.0' encoding='UTF-8'?>
+<calibration created="2024-01-01 10:00:00" type="regular"><!-- wand <!> -->
+<cameras>
+<camera active="1" serial="26580" model="Miqus Video" viewrotation="0">
+<fov_video left="0" top="0" right="1919" bottom="1079"/>
+<transform x="1000" y="2000" z="10000" r11="1" r12="0" r13="0" r21="0" r22="1" r23="0"
+ r31="0" r32="0" r33="1"/>
+<intrinsic focallength="9.2" sensorMinU="0" sensorMaxU="122879" sensorMinV="0" sensorMaxV="69119"
+ focalLengthU="64000" focalLengthV="70400" centerPointU="61440" centerPointV="34560" skew="0.000"
+ radialDistortion1="-0.05" radialDistortion2="0.14" radialDistortion3="0.01"
+ tangentalDistortion1="0.0006" tangentalDistortion2="-0.0004"/>
+</camera>
+<camera active="0" serial="1"/>
+</cameras></calibration>
+"""
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read_text(text, name="calibration.toml"):
+        path = tmp_path / name
+        path.write_text(text)
+        return read_calibration(path)
+
+    return read_text
+
+
+@pytest.fixture
+def refusal(read):
+    def caught(text, name="calibration.toml"):
+        with pytest.raises(InputError) as error:
+            read(text, name)
+        return error.value
+
+    return caught
+
+
+def test_anipose_camera_is_called_by_its_name(read):
+    cameras = read(ANIPOSE)
+    assert list(cameras) == ["left"]
+    camera = cameras["left"]
+    assert camera.image_size == (1032, 776)
+    assert camera.focal_px == (1063.5, 1071.8)
+    assert camera.principal_point_px == (511.7, 350.1)
+    assert camera.distortion == (-0.1, 0.02, 0.001, -0.002, 0.003)
+    assert camera.translation == (-0.5, 0.9, 2.6)
+
+
+def test_rotation_vector_is_opencvs(read):
+    expected, _ = cv2.Rodrigues(np.array([1.5, -0.6, 0.7]))
+    # Two ways to the same matrix of entries up to 1, in float64.
+    np.testing.assert_allclose(read(ANIPOSE)["left"].rotation, expected, rtol=0, atol=1e-15)
+
+
+def test_pose2sim_has_four_coefficients_and_sizes_with_a_point(read):
+    camera = read(POSE2SIM)["cam_01"]
+    assert camera.image_size == (1088, 1920)
+    assert camera.distortion == (-0.1, 0.02, 9.5e-06, 1.1e-05, 0.0)
+
+
+def test_caliscope_camera_is_called_by_its_number_and_may_give_a_matrix(read):
+    cameras = read(CALISCOPE)
+    assert list(cameras) == ["cam_3"]
+    camera = cameras["cam_3"]
+    assert camera.rotation == ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
+    assert camera.distortion == (-0.1, 0.02, 0.0, 0.0, 0.0)
+    assert camera.translation == (0.1, 0.2, 3.0)
+
+
+def test_further_coefficients_may_be_there_when_they_are_zero(read):
+    text = ANIPOSE.replace("0.003]", "0.003, 0.0, 0, 0.0]")
+    assert read(text)["left"].distortion[4] == 0.003
+
+
+def test_a_rotation_that_was_rounded_becomes_a_rotation(read):
+    rounded = np.round(Rotation.from_rotvec([1.5, -0.6, 0.7]).as_matrix(), 5)
+    camera = read(ANIPOSE.replace("[1.5, -0.6, 0.7]", str(rounded.tolist())))["left"]
+    rotation = np.array(camera.rotation)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(rotation, rounded, rtol=0, atol=2e-5)  # five decimals were kept
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "place", "words"),
+    [
+        ("[-0.5, 0.9, 2.6]", "[-0.5, nan, 2.6]", "cam_0.translation", "finite"),
+        ("[-0.5, 0.9, 2.6]", "[-0.5, inf, 2.6]", "cam_0.translation", "finite"),
+        ("[-0.5, 0.9, 2.6]", "[-0.5, 1e300, 2.6]", "cam_0.translation", "finite"),
+        ("[-0.5, 0.9, 2.6]", "[0.9, 2.6]", "cam_0.translation", "shape (3,)"),
+        ("[-0.5, 0.9, 2.6]", '["a", 0.9, 2.6]', "cam_0.translation", "numbers"),
+        ("[-0.5, 0.9, 2.6]", "[true, 0.9, 2.6]", "cam_0.translation", "numbers"),
+        ("[-0.5, 0.9, 2.6]", "[[1], 0.9, 2.6]", "cam_0.translation", "numbers"),
+        ("translation = [-0.5, 0.9, 2.6]", "", "cam_0.translation", "a value"),
+        ("[1.5, -0.6, 0.7]", "[1.5, -0.6]", "cam_0.rotation", "Rodrigues"),
+        ("[1.5, -0.6, 0.7]", "[[1,0,0],[0,1,0],[0,0,1.1]]", "cam_0: rotation", "orthonormal"),
+        ("[1.5, -0.6, 0.7]", "[[1,0,0],[0,1,0],[0,0,-1]]", "cam_0: rotation", "mirror"),
+        ("1063.5", "-1063.5", "cam_0: focal length", "positive"),
+        ("1063.5, 0.0", "1063.5, 2.0", "cam_0.matrix", "[fx, 0, cx]"),
+        ("[0.0, 0.0, 1.0]]", "[0.0, 0.0, 2.0]]", "cam_0.matrix", "[fx, 0, cx]"),
+        (", [0.0, 0.0, 1.0]]", "]", "cam_0.matrix", "shape (3, 3)"),
+        ("[1032, 776]", "[1032, 0]", "cam_0: size", "whole pixels"),
+        ("[1032, 776]", "[1032, 776.5]", "cam_0: size", "whole pixels"),
+        ("[1032, 776]", "[1032, 776, 3]", "cam_0.size", "shape (2,)"),
+        ("0.003]", "0.003, 0.1, 0.0, 0.0]", "cam_0.distortions", "zero beyond the fifth"),
+        ("[-0.1, 0.02, 0.001, -0.002, 0.003]", "[0.1, 0.2]", "cam_0.distortions", "4 or 5"),
+        ('"left"', '"../left"', "cam_0: name", "letters"),
+        ("[metadata]", "fisheye = true\n[metadata]", "cam_0.fisheye", "standard model"),
+        ("[cam_0]", "title = 1\n[cam_0]", "title", "a table for each camera"),
+    ],
+)
+def test_wrong_entry_is_refused_with_its_key(refusal, old, new, place, words):
+    assert old in ANIPOSE
+    error = refusal(ANIPOSE.replace(old, new, 1))
+    assert error.where.endswith(f"calibration.toml: {place}")
+    assert words in str(error)
+
+
+def test_a_file_without_cameras_and_two_of_one_name_are_refused(refusal):
+    assert refusal("[metadata]\nerror = 0.0\n").expected == "at least one camera"
+    twice = ANIPOSE + ANIPOSE.replace("[cam_0]", "[cam_1]").split("[metadata]")[0]
+    assert "'left' a second time" in refusal(twice).found
+
+
+def test_another_kind_of_file_is_refused(refusal):
+    assert "'.yaml'" in refusal("", "calibration.yaml").found
+
+
+def test_written_cameras_come_back(tmp_path, make_camera):
+    cameras = {f"cam{i}": make_camera(f"cam{i}", angle=0.7 * i) for i in range(5)}
+    write_calibration_toml(tmp_path / "c.toml", cameras)
+    back = read_calibration(tmp_path / "c.toml")
+    assert list(back) == list(cameras)
+    for name, camera in cameras.items():
+        exact = back[name].model_copy(update={"rotation": camera.rotation})
+        assert exact == camera
+        # The rotation went through a Rodrigues vector: a few roundings of numbers up to pi.
+        np.testing.assert_allclose(back[name].rotation, camera.rotation, rtol=0, atol=2e-15)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, np.pi - 1e-9, np.pi])
+def test_rotations_at_zero_and_half_a_turn_come_back(tmp_path, make_camera, angle):
+    camera = make_camera("cam1", angle=angle)
+    write_calibration_toml(tmp_path / "c.toml", {"cam1": camera})
+    back = read_calibration(tmp_path / "c.toml")["cam1"]
+    np.testing.assert_allclose(back.rotation, camera.rotation, rtol=0, atol=2e-15)
+
+
+def test_written_file_has_the_keys_that_anipose_and_pose2sim_read(tmp_path, make_camera):
+    write_calibration_toml(tmp_path / "c.toml", {"left": make_camera("left")})
+    tables = tomllib.loads((tmp_path / "c.toml").read_text())
+    assert list(tables) == ["cam_0", "metadata"]
+    camera = tables["cam_0"]
+    assert camera["name"] == "left"
+    assert camera["fisheye"] is False
+    assert np.shape(camera["matrix"]) == (3, 3)
+    assert len(camera["rotation"]) == len(camera["translation"]) == 3
+    assert len(camera["distortions"]) == 5
+
+
+def test_qualisys_camera_projects_as_it_stands(read):
+    camera = read(QUALISYS, "rig.qca.txt")["26580"]
+    assert camera.image_size == (1920, 1080)
+    assert camera.focal_px == (1000.0, 1100.0)  # 64000 / 64, 70400 / 64
+    assert camera.principal_point_px == (960.0, 540.0)
+    rotation, t = np.array(camera.rotation), np.array(camera.translation)
+    np.testing.assert_array_equal(-rotation.T @ t, [1.0, 2.0, 10.0])  # whole numbers throughout
+
+    def pixel(point):
+        return cv2.projectPoints(
+            np.array([point]), cv2.Rodrigues(rotation)[0], t, _matrix(camera), None
+        )[0].ravel()
+
+    # 1 m at 10 m distance is a tenth of the focal length; world y is up in the picture.
+    np.testing.assert_allclose(pixel([1.0, 2.0, 0.0]), [960, 540], atol=1e-9)
+    np.testing.assert_allclose(pixel([2.0, 2.0, 0.0]), [1060, 540], atol=1e-9)
+    np.testing.assert_allclose(pixel([1.0, 3.0, 0.0]), [960, 430], atol=1e-9)
+
+
+def _matrix(camera: CameraCalibration):
+    (fx, fy), (cx, cy) = camera.focal_px, camera.principal_point_px
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def test_qualisys_distortion_has_no_unit(read):
+    camera = read(QUALISYS, "rig.qca.txt")["26580"]
+    assert camera.distortion == (-0.05, 0.14, 0.0006, -0.0004, 0.01)
+
+
+def test_qualisys_video_that_shows_a_part_of_the_sensor_moves_the_centre(read):
+    part = QUALISYS.replace('left="0" top="0"', 'left="320" top="40"')
+    camera = read(part, "rig.qca.txt")["26580"]
+    assert camera.image_size == (1600, 1040)
+    assert camera.principal_point_px == (640.0, 500.0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "place"),
+    [
+        ('x="1000"', 'x="nan"', "camera[0].transform.x"),
+        ('x="1000"', 'x="inf"', "camera[0].transform.x"),
+        ('x="1000"', 'x="east"', "camera[0].transform.x"),
+        ('x="1000" ', "", "camera[0].transform.x"),
+        ('r33="1"', 'r33="-1"', "camera[0]: rotation"),
+        ('focalLengthU="64000"', 'focalLengthU="-1"', "camera[0]: focal length"),
+        ('skew="0.000"', 'skew="1.5"', "camera[0].intrinsic.skew"),
+        ('serial="26580"', 'serial=""', "camera[0]: name"),
+        ('<fov_video left="0" top="0" right="1919" bottom="1079"/>', "", "camera[0]"),
+        ('<camera active="1"', '<camera active="0"', "rig.qca.txt"),
+        ("</calibration>", "", "rig.qca.txt"),
+        ("<calibration", "<!DOCTYPE a [<!ENTITY b 'c'>]><calibration", "rig.qca.txt"),
+    ],
+)
+def test_wrong_qualisys_entry_is_refused_with_its_place(refusal, old, new, place):
+    assert old in QUALISYS
+    assert refusal(QUALISYS.replace(old, new, 1), "rig.qca.txt").where.endswith(place)
+
+
+def test_entities_are_refused_in_any_encoding(tmp_path):
+    path = tmp_path / "rig.xml"
+    text = "<?xml version='1.0' encoding='UTF-16'?><!DOCTYPE a [<!ENTITY b 'c'>]><a>&b;</a>"
+    path.write_bytes(text.encode("utf-16"))
+    with pytest.raises(InputError, match="a DOCTYPE"):
+        read_calibration(path)
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=4),
+    lambda inner: st.lists(inner, max_size=4),
+    max_leaves=12,
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.sampled_from(
+        ["size", "matrix", "distortions", "rotation", "translation", "name", "fisheye"]
+    ),
+    VALUES,
+)
+def test_any_value_in_any_entry_is_read_or_refused(tmp_path_factory, key, value):
+    path = tmp_path_factory.getbasetemp() / "fuzzed.toml"
+    lines = [line for line in ANIPOSE.splitlines() if not line.startswith(key)]
+    lines.insert(2, f"{key} = {_toml(value)}")
+    path.write_text("\n".join(lines))
+    try:
+        (camera,) = read_calibration(path).values()
+        assert np.all(np.isfinite(camera.rotation))
+    except InputError as error:
+        assert str(path) in error.where
+
+
+def _toml(value):
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value) if isinstance(value, int | float) else f"'{str(value).encode().hex()}'"
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(0, len(QUALISYS) - 1), st.integers(0, 40), st.text(max_size=6))
+def test_a_spoilt_qualisys_file_is_read_or_refused(tmp_path_factory, start, length, insert):
+    path = tmp_path_factory.getbasetemp() / "fuzzed.qca.txt"
+    spoilt = QUALISYS[:start] + insert + QUALISYS[start + length :]
+    path.write_bytes(spoilt.encode("utf-8", "replace"))
+    try:
+        assert read_calibration(path)
+    except InputError as error:
+        assert str(path) in error.where

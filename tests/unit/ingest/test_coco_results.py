@@ -1,0 +1,201 @@
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldpose.errors import InputError
+from worldpose.ingest.coco_results import read_coco_results
+
+
+def person(frame=0, **changes):
+    triples = [value for joint in range(17) for value in (100.0 + joint, 200.0 + 2 * joint, 0.5)]
+    return {"image_id": frame, "category_id": 1, "keypoints": triples, **changes}
+
+
+def with_joint(joint, *triple, **changes):
+    result = person(**changes)
+    result["keypoints"][3 * joint : 3 * joint + 3] = triple
+    return result
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read_content(content):
+        path = tmp_path / "cam1.json"
+        path.write_text(content if isinstance(content, str) else json.dumps(content))
+        return read_coco_results(path)
+
+    return read_content
+
+
+@pytest.fixture
+def refusal(read):
+    def caught(content):
+        with pytest.raises(InputError) as error:
+            read(content)
+        return error.value
+
+    return caught
+
+
+def test_people_come_by_frame_in_the_order_of_the_file(read):
+    results = [person(7, score=0.1), person(3, score=0.2), person(7, score=0.3)]
+    people = read(results)
+    np.testing.assert_array_equal(people.frame, [3, 7])
+    np.testing.assert_array_equal(
+        people.score, np.array([[0.2, np.nan], [0.1, 0.3]], dtype=np.float32)
+    )
+    assert np.all(np.isnan(people.keypoints[0, 1]))
+    np.testing.assert_array_equal(people.keypoints[1, 1, 2], [102, 204])
+
+
+def test_order_holds_in_a_crowd(read):
+    # Enough people, frames mixed, for an unstable sort to show.
+    people = read([person(i % 3, score=i / 300) for i in range(300)])
+    np.testing.assert_array_equal(np.argsort(people.score, axis=1), [np.arange(100)] * 3)
+
+
+def test_arrays_have_the_stored_types(read):
+    people = read([person()])
+    assert people.frame.dtype == np.int64
+    assert {array.dtype for array in people.arrays().values()} == {np.dtype(np.float32)}
+
+
+def test_an_empty_list_is_a_camera_that_saw_nobody(read):
+    people = read([])
+    assert people.frame.shape == (0,)
+    assert people.keypoints.shape == (0, 0, 17, 2)
+
+
+def test_joint_without_confidence_is_missing(read):
+    people = read([with_joint(4, 0, 0, 0)])
+    assert np.all(np.isnan(people.keypoints[0, 0, 4]))
+    assert np.isnan(people.confidence[0, 0, 4])
+    assert np.isfinite(people.keypoints).sum() == 2 * 16
+
+
+def test_confidence_too_small_for_storage_is_missing(read):
+    people = read([with_joint(4, 1.0, 2.0, 1e-60)])
+    assert np.isnan(people.confidence[0, 0, 4])
+    assert np.all(np.isnan(people.keypoints[0, 0, 4]))
+
+
+def test_given_box_becomes_its_corners(read):
+    people = read([person(bbox=[10.0, 20.0, 30.0, 40.0])])
+    np.testing.assert_array_equal(people.boxes[0, 0], [10, 20, 40, 60])
+
+
+def test_box_and_score_of_found_joints_stand_in(read):
+    # Joint 0, the lowest corner, is missing, so the box starts at joint 1.
+    people = read([with_joint(0, 0, 0, 0, bbox=None), person(bbox=[0, 0, 1, 1], score=0.25)])
+    np.testing.assert_array_equal(people.boxes[0, 0], [101, 202, 116, 232])
+    np.testing.assert_array_equal(people.boxes[0, 1], [0, 0, 1, 1])
+    np.testing.assert_array_equal(people.score[0], [0.5, 0.25])
+
+
+def test_person_without_joints_keeps_their_place_and_box(read):
+    nobody = person(keypoints=[0] * 51, bbox=[1, 2, 3, 4], score=0.9)
+    people = read([person(keypoints=[0] * 51), nobody, person()])
+    assert people.keypoints.shape[1] == 3
+    assert np.isnan(people.score[0, 0])
+    assert np.all(np.isnan(people.boxes[0, 0]))
+    np.testing.assert_array_equal(people.boxes[0, 1], [1, 2, 4, 6])
+    np.testing.assert_array_equal(people.score[0, 1:], np.array([0.9, 0.5], dtype=np.float32))
+
+
+def test_peak_a_little_above_one_is_certain(read):
+    assert read([with_joint(4, 1.0, 2.0, 1.008)]).confidence[0, 0, 4] == 1
+
+
+def test_data_set_annotations_may_carry_visibility(read):
+    hidden = with_joint(4, 50, 60, 1)
+    hidden["keypoints"][2::3] = [2] * 17
+    hidden["keypoints"][3 * 4 + 2] = 1
+    hidden["keypoints"][3 * 5 + 2] = 0
+    people = read({"images": [], "annotations": [hidden]})
+    assert people.confidence[0, 0, 4] == 1
+    assert people.confidence[0, 0, 6] == 1
+    assert np.isnan(people.confidence[0, 0, 5])
+
+
+def test_data_set_annotations_may_carry_confidence(read):
+    assert read({"annotations": [person()]}).confidence[0, 0, 0] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("content", "place", "words"),
+    [
+        (
+            [person(), with_joint(9, math.nan, 1, 0.5)],
+            "result 1, keypoints joint 9 (left_wrist)",
+            "nan",
+        ),
+        ([with_joint(16, 1, math.inf, 0.5)], "result 0, keypoints joint 16 (right_ankle)", "inf"),
+        ([with_joint(0, 1, 1, math.nan)], "result 0, keypoints joint 0 (nose)", "finite"),
+        ([with_joint(0, 1, 1e300, 0.5)], "result 0, keypoints joint 0 (nose)", "pixels up to"),
+        ([with_joint(0, 1, 1, -0.1)], "result 0, keypoints joint 0 (nose)", "Scale"),
+        ([with_joint(0, 1, 1, 8.5)], "result 0, keypoints joint 0 (nose)", "1 is certain"),
+        ([with_joint(2, 1, "x", 1)], "result 0, keypoints[7]", "a number"),
+        ([with_joint(2, 1, True, 1)], "result 0, keypoints[7]", "True"),
+        ([with_joint(2, 1, 10**400, 1)], "result 0, keypoints[7]", "a number"),
+        ([person(keypoints=[1.0] * 50)], "result 0, keypoints", "51 numbers"),
+        ([person(), person(keypoints=[1.0] * 75)], "result 1, keypoints", "found 75"),
+        ([person(keypoints=None)], "result 0, keypoints", "found nothing"),
+        ([person(keypoints={})], "result 0, keypoints", "a mapping"),
+        ([person("3.jpg")], "result 0, image_id", "'3.jpg'"),
+        ([person(True)], "result 0, image_id", "True"),
+        ([person(-1)], "result 0, image_id", "from 0"),
+        ([person(2**40)], "result 0, image_id", "1099511627776"),
+        ([person(), 3], "result 1", "a mapping"),
+        ([person(bbox=[1, 2, 3])], "result 0, bbox", "4 numbers"),
+        ([person(), person(bbox=[1, 2, -3, 4])], "result 1, bbox", "width"),
+        ([person(bbox=[1, 2, math.nan, 4])], "result 0, bbox", "nan"),
+        ([person(), person(score="high")], "result 1, score[0]", "'high'"),
+        ([person(score=math.inf)], "result 0, score", "finite"),
+        ([person(score=-1)], "result 0, score", "from 0"),
+        ({"images": []}, "cam1.json", "annotations"),
+        (3, "cam1.json", "annotations"),
+        ("[{]", "cam1.json", "expected JSON"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_its_place(refusal, content, place, words):
+    error = refusal(content)
+    assert error.where.endswith(place)
+    assert words in str(error)
+
+
+def test_crowd_that_would_fill_the_memory_is_refused(read, refusal, monkeypatch):
+    # One frame with many people pads every other frame: 4000 frames x 200 people.
+    results = [person(frame) for frame in range(4000)] + [person(0)] * 199
+    assert read(results[:10]).keypoints.shape == (10, 1, 17, 2)
+    monkeypatch.setattr("worldpose.ingest.coco_results.ARRAY_BYTES", 100 << 20)
+    assert "200 people in frame 0" in refusal(results).found
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=4),
+    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=3), inner),
+    max_leaves=10,
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from(["image_id", "keypoints", "bbox", "score", "annotations", "[5]"]), JSON)
+def test_any_value_anywhere_is_read_or_refused(tmp_path_factory, key, value):
+    path = tmp_path_factory.getbasetemp() / "fuzzed.json"
+    content = [person(), person(1)]
+    if key == "annotations":
+        content = {"annotations": value}
+    elif key == "[5]":
+        content[1]["keypoints"][5] = value
+    else:
+        content[1][key] = value
+    path.write_text(json.dumps(content))
+    try:
+        people = read_coco_results(path)
+        assert np.all(np.diff(people.frame) > 0)
+    except InputError as error:
+        assert str(path) in error.where

@@ -1,0 +1,236 @@
+import io
+import struct
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldpose.errors import InputError
+from worldpose.ingest import keypoint_arrays
+from worldpose.ingest.keypoint_arrays import read_keypoint_arrays, write_keypoint_arrays
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "cam1.npz"
+
+
+@pytest.fixture
+def refusal(path):
+    def caught():
+        with pytest.raises(InputError) as error:
+            read_keypoint_arrays(path)
+        assert error.value.where.startswith(str(path))
+        return error.value
+
+    return caught
+
+
+def members(people):
+    return {"frame": people.frame, **people.arrays()}
+
+
+def assert_same(a, b):
+    for name, array in members(a).items():
+        np.testing.assert_array_equal(array, members(b)[name])
+        assert array.dtype == members(b)[name].dtype
+
+
+def test_written_people_come_back(path, make_people):
+    people = make_people(5, 4, 3)
+    write_keypoint_arrays(path, people)
+    assert_same(read_keypoint_arrays(path), people)
+
+
+@pytest.mark.parametrize(("frames", "detections"), [(0, 0), (4, 0), (0, 3)])
+def test_nobody_comes_back(path, make_people, frames, detections):
+    people = make_people(0, frames, detections)
+    write_keypoint_arrays(path, people)
+    assert_same(read_keypoint_arrays(path), people)
+
+
+def test_the_same_arrays_are_the_same_bytes(tmp_path, make_people, monkeypatch):
+    write_keypoint_arrays(tmp_path / "a.npz", make_people())
+    monkeypatch.setattr("time.time", lambda: 2e9)  # another day
+    write_keypoint_arrays(tmp_path / "b.npz", make_people())
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_numpys_own_files_are_read_and_ours_by_numpy(path, make_people, save):
+    people = make_people()
+    save(path, **members(people))
+    assert_same(read_keypoint_arrays(path), people)
+    write_keypoint_arrays(path, people)
+    with np.load(path, allow_pickle=False) as file:
+        np.testing.assert_array_equal(file["keypoints"], people.keypoints)
+
+
+def test_column_major_arrays_are_read(path, make_people):
+    people = make_people()
+    arrays = {name: np.asfortranarray(array) for name, array in members(people).items()}
+    np.savez(path, **arrays)
+    assert_same(read_keypoint_arrays(path), people)
+
+
+def test_gaps_between_frames_are_read(path, make_people):
+    people = replace(make_people(), frame=np.array([3, 7, 8]))
+    write_keypoint_arrays(path, people)
+    np.testing.assert_array_equal(read_keypoint_arrays(path).frame, [3, 7, 8])
+
+
+@pytest.mark.parametrize("kept", [0, 1, 10, 0.3, 0.6, 0.99])
+def test_truncated_file_is_refused(path, make_people, refusal, kept):
+    write_keypoint_arrays(path, make_people())
+    content = path.read_bytes()
+    path.write_bytes(content[: kept if isinstance(kept, int) else int(kept * len(content))])
+    assert "an npz file" in refusal().expected
+
+
+def test_truncated_member_is_named(path, make_people, refusal):
+    with zipfile.ZipFile(path, "w") as file:
+        for name, array in members(make_people()).items():
+            data = io.BytesIO()
+            np.save(data, array)
+            file.writestr(f"{name}.npy", data.getvalue()[: -4 if name == "boxes" else None])
+    assert refusal().where == f"{path}: boxes.npy"
+
+
+def test_flipped_bit_is_noticed(path, make_people, refusal):
+    people = make_people()
+    write_keypoint_arrays(path, people)
+    content = bytearray(path.read_bytes())
+    content[content.find(people.boxes.tobytes())] ^= 1
+    path.write_bytes(bytes(content))
+    assert "CRC" in refusal().found
+    assert refusal().where == f"{path}: boxes.npy"
+
+
+def test_wrong_checksum_of_a_packed_array_is_noticed(path, make_people, refusal):
+    np.savez_compressed(path, **members(make_people()))
+    with zipfile.ZipFile(path) as file:
+        crc = struct.pack("<I", file.getinfo("boxes.npy").CRC)
+    path.write_bytes(path.read_bytes().replace(crc, b"\0\0\0\0"))
+    assert "CRC" in refusal().found
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("frame", lambda a: a.astype(np.int32), "<i8"),
+        ("frame", lambda a: a.astype(np.float64), "<i8"),
+        ("frame", lambda a: a[:-1], "shape"),
+        ("frame", lambda a: a[::-1], "rise"),
+        ("frame", lambda a: a * 0, "rise"),
+        ("frame", lambda a: a + 2**40, "up to"),
+        ("keypoints", lambda a: a.astype(np.float64), "<f4"),
+        ("keypoints", lambda a: a.astype(">f4"), "little-endian"),
+        ("keypoints", lambda a: a.astype(object), "keypoints.npy"),
+        ("keypoints", lambda a: a[:, :, :16], "17, 2)"),
+        ("keypoints", lambda a: a[..., 0], "17, 2)"),
+        ("boxes", lambda a: a[:, :1], "(3, 2, 4)"),
+        ("boxes", lambda a: a[..., [2, 3, 0, 1]], "x0 y0 x1 y1"),
+        ("boxes", lambda a: a * np.float32(np.nan), "a box for every person"),
+        ("score", lambda a: a[..., None], "(3, 2)"),
+        ("score", lambda a: a * np.float32(np.nan), "a score for every person"),
+        ("score", lambda a: a + np.float32(np.inf), "finite"),
+        ("score", lambda a: a - 2, "from 0"),
+        ("confidence", lambda a: a + 1, "(0, 1]"),
+        ("confidence", lambda a: a * 0, "(0, 1]"),
+        ("confidence", lambda a: a * np.float32(np.nan), "finite exactly where"),
+        ("keypoints", lambda a: a * np.float32(np.nan), "finite exactly where"),
+        ("keypoints", lambda a: a + np.float32(np.inf), "pixels"),
+        ("keypoints", lambda a: a * np.float32(1e5), "pixels"),
+    ],
+)
+def test_wrong_array_is_refused_by_name(path, make_people, refusal, name, change, words):
+    arrays = members(make_people(5))
+    np.savez(path, **{**arrays, name: change(arrays[name])})
+    error = refusal()
+    # A confidence without keypoint, or the reverse, is found at the keypoint.
+    assert any(f"{path}: {part}" in error.where for part in (name, "keypoints"))
+    assert words in str(error)
+
+
+def test_wrong_value_is_named_with_its_frame(path, make_people, refusal, monkeypatch):
+    monkeypatch.setattr(keypoint_arrays, "_BLOCK", 2)
+    people = make_people(100, 5)
+    people.keypoints[3, 1, 9, 0] = np.nan
+    write_keypoint_arrays(path, people)
+    assert refusal().where == f"{path}: keypoints[3, 1, 9] (frame 103)"
+
+
+def test_missing_and_further_members_are_refused(path, make_people, refusal):
+    arrays = members(make_people())
+    np.savez(path, **arrays, extra=np.zeros(3))
+    assert "extra.npy" in refusal().found
+    del arrays["score"]
+    np.savez(path, **arrays)
+    assert "score.npy" in refusal().expected
+
+
+def test_a_repeated_member_is_refused(path, make_people, refusal):
+    write_keypoint_arrays(path, make_people())
+    with zipfile.ZipFile(path, "a") as file, pytest.warns(UserWarning, match="Duplicate"):
+        file.writestr("frame.npy", b"")
+    assert "the members" in refusal().expected
+
+
+def test_declared_bomb_is_refused_before_it_is_unpacked(path, refusal):
+    # 6 TB of keypoints by their header, which a zip entry of a few bytes claims to hold.
+    shapes = {
+        "frame": (10**8,),
+        "keypoints": (10**8, 500, 17, 2),
+        "confidence": (10**8, 500, 17),
+        "boxes": (10**8, 500, 4),
+        "score": (10**8, 500),
+    }
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, shape in shapes.items():
+            header = io.BytesIO()
+            kind = "<i8" if name == "frame" else "<f4"
+            np.lib.format.write_array_header_1_0(
+                header, {"descr": kind, "fortran_order": False, "shape": shape}
+            )
+            file.writestr(f"{name}.npy", header.getvalue())
+    assert "bytes for its shape" in refusal().expected
+
+
+def test_arrays_beyond_the_limit_are_refused(path, make_people, refusal, monkeypatch):
+    write_keypoint_arrays(path, make_people())
+    monkeypatch.setattr(keypoint_arrays, "ARRAY_BYTES", 1000)
+    assert refusal().expected == "at most 1000 bytes of arrays"
+
+
+def test_a_header_of_gigabytes_is_refused_unread(path, make_people, refusal):
+    with zipfile.ZipFile(path, "w") as file:
+        for name in members(make_people()):
+            file.writestr(f"{name}.npy", b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**32 - 1))
+    assert "npy 1.0" in refusal().found
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 10**6), st.integers(0, 30), st.binary(max_size=12))
+def test_a_spoilt_file_is_read_or_refused(tmp_path_factory, start, length, insert):
+    base = tmp_path_factory.getbasetemp()
+    good, spoilt = base / "good.npz", base / "spoilt.npz"
+    if not good.exists():
+        zeros = np.full((1, 1, 17), 0.5, np.float32)
+        np.savez(
+            good,
+            frame=np.zeros(1, np.int64),
+            keypoints=np.zeros((1, 1, 17, 2), np.float32),
+            confidence=zeros,
+            boxes=np.zeros((1, 1, 4), np.float32),
+            score=np.zeros((1, 1), np.float32),
+        )
+    content = good.read_bytes()
+    start %= len(content)
+    spoilt.write_bytes(content[:start] + insert + content[start + length :])
+    try:
+        assert len(read_keypoint_arrays(spoilt).frame) == 1
+    except InputError as error:
+        assert str(spoilt) in error.where

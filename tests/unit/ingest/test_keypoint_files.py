@@ -1,0 +1,101 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from worldpose.errors import InputError
+from worldpose.ingest.keypoint_arrays import write_keypoint_arrays
+from worldpose.ingest.keypoint_files import on_frames, read_observations, seen_frames
+
+
+@pytest.fixture
+def npz(tmp_path, make_people):
+    """Frames 10, 11 and 14 with two people each."""
+    path = tmp_path / "cam1.npz"
+    people = replace(make_people(), frame=np.array([10, 11, 14]))
+    write_keypoint_arrays(path, people)
+    return path, people
+
+
+def test_without_a_range_the_file_is_dense_from_its_first_to_its_last_frame(npz):
+    path, people = npz
+    read = read_observations(path)
+    np.testing.assert_array_equal(read.frame, [10, 11, 12, 13, 14])
+    np.testing.assert_array_equal(read.keypoints[[0, 1, 4]], people.keypoints)
+    assert np.all(np.isnan(read.keypoints[2:4]))
+    assert np.all(np.isnan(read.score[2:4]))
+
+
+def test_a_range_leaves_out_and_pads(npz):
+    path, people = npz
+    read = read_observations(path, 11, 6)
+    np.testing.assert_array_equal(read.frame, np.arange(11, 17))
+    np.testing.assert_array_equal(read.boxes[[0, 3]], people.boxes[1:])
+    assert np.all(np.isnan(read.boxes[[1, 2, 4, 5]]))
+
+
+def test_a_range_may_begin_before_frame_zero(npz):
+    read = read_observations(npz[0], -2, 14)
+    assert (read.frame[0], read.frame[-1]) == (-2, 11)
+    assert np.isfinite(read.score).sum() == 4
+
+
+def test_both_forms_of_the_same_people_read_alike(tmp_path, npz):
+    path, people = npz
+    results = [
+        {
+            "image_id": int(frame),
+            "keypoints": np.nan_to_num(
+                np.concatenate([people.keypoints[f, d], people.confidence[f, d, :, None]], axis=-1)
+            )
+            .astype(float)
+            .ravel()
+            .tolist(),
+            "score": float(people.score[f, d]),
+        }
+        for f, frame in enumerate(people.frame)
+        for d in range(2)
+    ]
+    (tmp_path / "cam2.json").write_text(json.dumps(results))
+    a, b = read_observations(path), read_observations(tmp_path / "cam2.json")
+    np.testing.assert_array_equal(a.frame, b.frame)
+    for name in a.arrays():
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+@pytest.mark.parametrize("first_frame", [0, 15, 2**40, -(10**30)])
+def test_people_outside_the_wanted_frames_are_refused(npz, first_frame):
+    with pytest.raises(InputError, match="found frames 10 to 14") as caught:
+        read_observations(npz[0], first_frame, 5)
+    assert "offset_frames" in caught.value.todo
+
+
+@pytest.mark.parametrize(("first", "count"), [(0, 10**12), (10**30, 3)])
+def test_frames_beyond_belief_are_refused(tmp_path, first, count):
+    (tmp_path / "empty.json").write_text("[]")
+    with pytest.raises(InputError, match="frame numbers up to"):
+        read_observations(tmp_path / "empty.json", first, count)
+
+
+def test_two_people_a_year_apart_do_not_fill_the_memory(tmp_path):
+    result = {"keypoints": [1.0, 1.0, 0.5] * 17}
+    content = [{"image_id": 0, **result}, {"image_id": 2**31 - 1, **result}]
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="2147483648 frames"):
+        read_observations(tmp_path / "a.json")
+
+
+def test_seen_frames_are_those_with_a_joint(make_people):
+    people = make_people(10, 5)
+    people.confidence[[0, 1, 4]] = np.nan
+    assert seen_frames(people) == (12, 13)
+    people.confidence[:] = np.nan
+    assert seen_frames(people) is None
+    assert seen_frames(make_people(0, 0, 0)) is None
+
+
+def test_nobody_is_nobody_on_any_frames(tmp_path, make_people):
+    read = on_frames(tmp_path, make_people(0, 0, 0), 5, 3)
+    np.testing.assert_array_equal(read.frame, [5, 6, 7])
+    assert read.keypoints.shape == (3, 0, 17, 2)

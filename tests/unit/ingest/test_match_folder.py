@@ -1,0 +1,255 @@
+import json
+import os
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from data_contracts.pitch import PitchSpec
+from worldpose.errors import InputError
+from worldpose.ingest.match_folder import read_match, require_calibrated
+
+
+@pytest.fixture
+def edit(match_folder):
+    """Change match.yaml: `edit(lambda content: ...)`."""
+
+    def change(function):
+        path = match_folder / "match.yaml"
+        content = yaml.safe_load(path.read_text())
+        function(content)
+        path.write_text(yaml.safe_dump(content))
+
+    return change
+
+
+def refusal(folder):
+    with pytest.raises(InputError) as caught:
+        read_match(folder)
+    return caught.value
+
+
+def test_a_complete_folder_is_read(match_folder, spec, make_camera):
+    match = read_match(match_folder)
+    assert match.spec == spec
+    assert match.folder == match_folder
+    assert list(match.calibrations) == ["cam1", "cam2"]
+    assert match.calibrations["cam1"].image_size == (1920, 1080)
+    assert {name: path.name for name, path in match.detections.items()} == {
+        "cam1": "cam1.npz",
+        "cam2": "cam2.npz",
+        "goal": "goal.npz",
+    }
+    assert match.videos == {}
+
+
+def test_a_folder_without_match_yaml_is_refused(tmp_path):
+    assert refusal(tmp_path).where == str(tmp_path / "match.yaml")
+    assert refusal(tmp_path / "absent").where == str(tmp_path / "absent" / "match.yaml")
+
+
+def test_wrong_key_is_named_with_its_file(match_folder, edit):
+    edit(lambda content: content["cameras"][2].update(kind="moving"))
+    assert refusal(match_folder).where == f"{match_folder / 'match.yaml'}: cameras[2].kind"
+
+
+def test_pitch_absent_is_the_standard_one(match_folder):
+    assert read_match(match_folder).pitch == PitchSpec()
+
+
+def test_pitch_none_is_no_pitch_even_beside_a_pitch_file(match_folder, edit):
+    (match_folder / "pitch.json").write_text("{}")
+    edit(lambda content: content.update(pitch="none"))
+    assert read_match(match_folder).pitch is None
+
+
+def test_pitch_json_is_read_without_being_named(match_folder):
+    (match_folder / "pitch.json").write_text(json.dumps({"length": 101.5}))
+    assert read_match(match_folder).pitch == PitchSpec(length=101.5)
+
+
+def test_named_pitch_file_is_read_and_must_be_there(match_folder, edit):
+    edit(lambda content: content.update(pitch="survey.json"))
+    assert refusal(match_folder).where.endswith("match.yaml: pitch")
+    (match_folder / "survey.json").write_text(json.dumps({"width": 64.0}))
+    assert read_match(match_folder).pitch == PitchSpec(width=64.0)
+
+
+@pytest.mark.parametrize(
+    ("content", "place"),
+    [
+        ('{"length": -1}', "pitch.json: length"),
+        ('{"crwon": 0}', "pitch.json: crwon"),
+        ("{", "json"),
+    ],
+)
+def test_wrong_pitch_is_refused(match_folder, content, place):
+    (match_folder / "pitch.json").write_text(content)
+    assert refusal(match_folder).where.endswith(place)
+
+
+def test_static_camera_without_footage_is_missing(match_folder):
+    (match_folder / "detections" / "cam2.npz").unlink()
+    error = refusal(match_folder)
+    assert "missing camera cam2; there: cam1" in error.found
+    assert "videos/cam2.mp4" in error.todo
+
+
+def test_a_video_in_its_usual_place_is_footage(match_folder):
+    (match_folder / "detections" / "cam2.npz").unlink()
+    (match_folder / "videos").mkdir()
+    (match_folder / "videos" / "cam2.mp4").write_bytes(b"video")
+    assert read_match(match_folder).videos == {"cam2": match_folder / "videos" / "cam2.mp4"}
+
+
+def test_a_folder_of_images_is_footage_unless_empty(match_folder, edit):
+    (match_folder / "detections" / "cam2.npz").unlink()
+    (match_folder / "images").mkdir()
+    edit(lambda content: content["cameras"][1].update(video="images"))
+    assert refusal(match_folder).where.endswith("cameras[1].video")
+    (match_folder / "images" / "000.png").write_bytes(b"png")
+    assert read_match(match_folder).videos == {"cam2": match_folder / "images"}
+
+
+def test_a_broadcast_clip_needs_footage(match_folder):
+    (match_folder / "detections" / "goal.npz").unlink()
+    assert "broadcast camera main for clip goal" in refusal(match_folder).expected
+    (match_folder / "broadcast").mkdir()
+    (match_folder / "broadcast" / "goal.mp4").write_bytes(b"video")
+    assert read_match(match_folder).videos["goal"].name == "goal.mp4"
+
+
+def test_a_match_without_static_cameras_is_refused(match_folder, edit):
+    edit(lambda content: content.update(cameras=content["cameras"][2:]))
+    assert refusal(match_folder).where.endswith("match.yaml: cameras")
+
+
+@pytest.mark.parametrize("name", ["cam9.npz", "main.json", "corner.json"])
+def test_detections_of_nobody_are_refused(match_folder, name):
+    # main is a broadcast camera, seen clip by clip; corner is a clip without one.
+    (match_folder / "detections" / name).write_bytes(b"x")
+    error = refusal(match_folder)
+    assert error.where.endswith(name)
+    assert "cam1, cam2, goal" in error.expected
+
+
+def test_two_forms_of_one_cameras_detections_are_refused(match_folder):
+    (match_folder / "detections" / "cam1.json").write_text("[]")
+    assert refusal(match_folder).found == "cam1.json and cam1.npz"
+
+
+def test_other_files_beside_detections_are_left_alone(match_folder):
+    (match_folder / "detections" / "README.txt").write_text("x")
+    (match_folder / "detections" / "._cam1.json").write_text("x")
+    assert list(read_match(match_folder).detections) == ["cam1", "cam2", "goal"]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../out.mp4", "/etc/hostname", "detections/../real.mp4", "C:\\out.mp4", "C:out.mp4", "", "."],
+)
+@pytest.mark.parametrize("key", ["video", "still"])
+def test_a_name_that_is_not_plainly_inside_the_folder_is_refused(match_folder, edit, name, key):
+    (match_folder.parent / "out.mp4").write_bytes(b"video")
+    (match_folder / "real.mp4").write_bytes(b"video")
+    edit(lambda content: content["cameras"][0].update({key: name}))
+    error = refusal(match_folder)
+    assert error.where.endswith(f"cameras[0].{key}")
+    assert error.expected == "a path inside the match folder, without .."
+
+
+@pytest.mark.parametrize("name", ["absent.mp4", "detections/cam1.npz/x", "a" * 5000, "\x00"])
+def test_a_name_of_nothing_is_refused(match_folder, edit, name):
+    edit(lambda content: content["cameras"][0].update(video=name))
+    assert refusal(match_folder).found == f"no {name!r}"
+
+
+def test_a_pitch_outside_the_folder_is_refused(match_folder, edit):
+    (match_folder.parent / "pitch.json").write_text("{}")
+    edit(lambda content: content.update(pitch="../pitch.json"))
+    assert "inside the match folder" in refusal(match_folder).expected
+
+
+def test_a_link_that_leads_out_of_the_folder_is_refused(match_folder, edit):
+    (match_folder.parent / "secret.mp4").write_bytes(b"video")
+    (match_folder / "link.mp4").symlink_to(match_folder.parent / "secret.mp4")
+    edit(lambda content: content["cameras"][0].update(video="link.mp4"))
+    assert "a link that leads out" in refusal(match_folder).found
+
+
+def test_a_link_within_the_folder_is_followed(match_folder, edit):
+    (match_folder / "real.mp4").write_bytes(b"video")
+    (match_folder / "link.mp4").symlink_to("real.mp4")
+    edit(lambda content: content["cameras"][0].update(video="link.mp4"))
+    assert read_match(match_folder).videos["cam1"] == match_folder / "link.mp4"
+
+
+def test_a_loop_of_links_and_a_pipe_are_not_files(match_folder, edit):
+    (match_folder / "loop").symlink_to("loop")
+    os.mkfifo(match_folder / "pipe")
+    for name in ("loop", "pipe"):
+        edit(lambda content, name=name: content["cameras"][0].update(video=name))
+        assert refusal(match_folder).found == f"no '{name}'"
+
+
+def test_a_calibration_of_an_unknown_camera_is_refused(match_folder, edit):
+    edit(lambda content: content["cameras"][1].update(id="cam3"))
+    (match_folder / "detections" / "cam2.npz").rename(match_folder / "detections" / "cam3.npz")
+    error = refusal(match_folder)
+    assert error.where == str(match_folder / "calibration.toml")
+    assert (error.expected, error.found) == (
+        "static cameras of match.yaml: cam1, cam3",
+        "also cam2",
+    )
+
+
+def test_a_calibration_at_another_size_is_refused(match_folder, edit):
+    edit(lambda content: content["cameras"][0].update(width=1280))
+    error = refusal(match_folder)
+    assert error.where.endswith("calibration.toml: cam1.size")
+    assert "[1280, 1080]" in error.expected
+    assert error.found == "[1920, 1080]"
+
+
+def test_missing_calibrations_are_named_when_they_are_required(match_folder):
+    require_calibrated(read_match(match_folder))
+    path = match_folder / "calibration.toml"
+    path.write_text(path.read_text().replace("[cam_0]", "[metadata]").split("[metadata]\nadj")[0])
+    match = read_match(match_folder)
+    with pytest.raises(InputError, match="missing camera cam1; there: cam2"):
+        require_calibrated(match)
+    path.unlink()
+    with pytest.raises(InputError, match="missing camera cam1, cam2; there: none"):
+        require_calibrated(read_match(match_folder))
+
+
+MATCH_YAML = """contract: 1
+match_id: final
+fps: 25
+cameras:
+- {id: cam1, width: 1920, height: 1080, video: v.mp4, still: s.png}
+- {id: main, kind: broadcast, width: 1920, height: 1080}
+clips:
+- {id: clip, first_frame: 0, frame_count: 3}
+pitch: none
+"""
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.integers(0, len(MATCH_YAML) - 1),
+    st.integers(0, 12),
+    st.text(st.sampled_from("{}[]:,-&*!|'\"% \n#01.~/"), max_size=6) | st.text(max_size=3),
+)
+def test_a_spoilt_match_yaml_is_read_or_refused(tmp_path_factory, start, length, insert):
+    folder = tmp_path_factory.getbasetemp() / "spoilt"
+    folder.mkdir(exist_ok=True)
+    for name in ("v.mp4", "s.png"):
+        (folder / name).write_bytes(b"x")
+    spoilt = MATCH_YAML[:start] + insert + MATCH_YAML[start + length :]
+    (folder / "match.yaml").write_bytes(spoilt.encode("utf-8", "surrogatepass"))
+    try:
+        assert read_match(folder).spec.static_cameras
+    except InputError as error:
+        assert str(folder) in error.where

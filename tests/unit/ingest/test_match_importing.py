@@ -1,0 +1,132 @@
+import json
+
+import numpy as np
+import pytest
+
+from data_contracts.pitch import PitchSpec
+from worldpose.errors import InputError
+from worldpose.ingest.calibration_files import write_calibration_toml
+from worldpose.ingest.importing import import_match
+from worldpose.ingest.keypoint_arrays import write_keypoint_arrays
+from worldpose.ingest.match_folder import read_match, require_calibrated
+from worldpose.ingest.units import read_unit
+
+
+def results(*frames):
+    return [{"image_id": frame, "keypoints": [float(frame), 2.0, 0.5] * 17} for frame in frames]
+
+
+@pytest.fixture
+def source(tmp_path, make_camera):
+    """Two cameras' calibration and poses: frames 300 to 302 in one, 301 to 304 in the other."""
+    folder = tmp_path / "source"
+    (folder / "detections").mkdir(parents=True)
+    write_calibration_toml(
+        folder / "calibration.toml",
+        {name: make_camera(name, angle) for name, angle in (("right", 0.1), ("left", 0.2))},
+    )
+    (folder / "detections" / "right.json").write_text(json.dumps(results(300, 302)))
+    (folder / "detections" / "left.json").write_text(json.dumps(results(304, 301)))
+    return folder
+
+
+def run(source, out, **options):
+    return import_match(source / "calibration.toml", source / "detections", 25.0, out, **options)
+
+
+def test_other_tools_files_become_a_match(tmp_path, source):
+    out = tmp_path / "my match"
+    spec = run(source, out)
+    match = read_match(out)
+    require_calibrated(match)
+    assert match.spec == spec
+    assert (spec.match_id, spec.fps, match.pitch) == ("my-match", 25.0, None)
+    assert [camera.id for camera in spec.cameras] == ["right", "left"]
+    assert [(camera.width, camera.height) for camera in spec.cameras] == [(1920, 1080)] * 2
+
+
+def test_frames_keep_their_numbers_in_one_clip_over_all_cameras(tmp_path, source):
+    spec = run(source, tmp_path / "m")
+    (clip,) = spec.clips
+    assert (clip.id, clip.first_frame, clip.frame_count) == ("clip", 300, 5)
+    for name, seen in (("right", [300, 302]), ("left", [301, 304])):
+        people, _ = read_unit(read_match(tmp_path / "m"), name)
+        np.testing.assert_array_equal(people.frame, np.arange(300, 305))
+        found = np.isfinite(people.score[:, 0])
+        np.testing.assert_array_equal(people.frame[found], seen)
+        np.testing.assert_array_equal(people.keypoints[found, 0, 0, 0], seen)
+
+
+def test_arrays_are_imported_too(tmp_path, source, make_people):
+    (source / "detections" / "left.json").unlink()
+    write_keypoint_arrays(source / "detections" / "left.npz", make_people(299, 2))
+    assert run(source, tmp_path / "m").clips[0].first_frame == 299
+
+
+def test_a_camera_that_saw_nobody_is_kept(tmp_path, source):
+    (source / "detections" / "left.json").write_text("[]")
+    spec = run(source, tmp_path / "m")
+    assert (spec.clips[0].first_frame, spec.clips[0].frame_count) == (300, 3)
+    people, _ = read_unit(read_match(tmp_path / "m"), "left")
+    assert people.keypoints.shape == (3, 0, 17, 2)
+
+
+def test_id_and_pitch_can_be_given(tmp_path, source):
+    spec = run(source, tmp_path / "m", match_id="final", pitch=None)
+    assert spec.match_id == "final"
+    assert read_match(tmp_path / "m").pitch == PitchSpec()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda folder: (folder / "left.json").unlink(),
+        lambda folder: (folder / "left.json").rename(folder / "middle.json"),
+        lambda folder: (folder / "further.json").write_text("[]"),
+        lambda folder: (folder / "left.npz").write_bytes(b""),
+    ],
+)
+def test_files_that_are_not_one_a_camera_are_listed_beside_the_cameras(tmp_path, source, change):
+    change(source / "detections")
+    with pytest.raises(InputError) as caught:
+        run(source, tmp_path / "m")
+    assert caught.value.expected.endswith("calibration.toml: right, left")
+    names = sorted(path.name for path in (source / "detections").iterdir())
+    assert caught.value.found == ", ".join(names)
+    assert not (tmp_path / "m").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "where"),
+    [
+        (lambda s: (s / "detections" / "left.json").write_text("[{}]"), "result 0, image_id"),
+        (lambda s: (s / "calibration.toml").write_text(""), "calibration.toml"),
+        (lambda s: [f.write_text("[]") for f in (s / "detections").iterdir()], "detections"),
+        (lambda s: [f.unlink() for f in (s / "detections").iterdir()], "detections"),
+    ],
+)
+def test_a_broken_source_leaves_nothing(tmp_path, source, change, where):
+    change(source)
+    with pytest.raises(InputError) as caught:
+        run(source, tmp_path / "m")
+    assert caught.value.where.endswith(where)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["source"]
+
+
+@pytest.mark.parametrize("fps", [0.0, -25.0, float("nan"), float("inf")])
+def test_a_frame_rate_must_be_one(tmp_path, source, fps):
+    with pytest.raises(InputError, match=r"match\.yaml: fps"):
+        import_match(source / "calibration.toml", source / "detections", fps, tmp_path / "m")
+
+
+def test_an_unfit_id_is_refused(tmp_path, source):
+    with pytest.raises(InputError, match="match_id"):
+        run(source, tmp_path / "m", match_id="a/b")
+
+
+def test_an_existing_match_is_left_as_it_was(tmp_path, source):
+    run(source, tmp_path / "m")
+    (source / "detections" / "left.json").write_text(json.dumps(results(1)))
+    with pytest.raises(InputError, match="left as it was"):
+        run(source, tmp_path / "m")
+    assert read_match(tmp_path / "m").spec.clips[0].first_frame == 300

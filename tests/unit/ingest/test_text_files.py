@@ -1,0 +1,115 @@
+import json
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldpose.errors import InputError
+from worldpose.ingest import text_files
+from worldpose.ingest.text_files import read_json, read_toml, read_yaml
+
+
+@pytest.fixture
+def refused(tmp_path):
+    def check(read, content, words):
+        path = tmp_path / "file"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        with pytest.raises(InputError) as caught:
+            read(path)
+        assert words in str(caught.value)
+        assert str(path) in caught.value.where
+
+    return check
+
+
+def test_plain_yaml_is_read(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text("a: [1, 2.5, x]\nb: {c: true}\n")
+    assert read_yaml(path) == {"a": [1, 2.5, "x"], "b": {"c": True}}
+
+
+def test_a_date_stays_text(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text("match_id: 2024-05-01\n")
+    assert read_yaml(path) == {"match_id": "2024-05-01"}
+
+
+def test_a_byte_order_mark_is_no_content(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_bytes(b"\xef\xbb\xbfa: 1\n")
+    assert read_yaml(path) == {"a": 1}
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("a: &x [1, 2]\nb: *x\n", "alias"),
+        ("a: &a [*a]\n", "alias"),
+        ("fps: 25\nfps: 30\n", "'fps' is given twice"),
+        ("a: {b: 1, b: 1}\n", "'b' is given twice"),
+        ("1: a\n'1': b\n", "'1' is given twice"),
+        ("a: " + "[" * 100, "more than 32 levels"),
+        ("? [a]\n: 1\n", "unhashable"),
+        ("a: 1\n--- \nb: 2\n", "but found another document"),
+        ("!!python/object/apply:os.system [x]", "python/object"),
+        ("a: b: c\n", "line 1, column 5"),
+        ("a: " + "9" * 5000, "digits"),
+        (b"a: \xff\n", "UTF-8"),
+        (b"a: \x00\n", "YAML"),
+    ],
+)
+def test_hostile_or_broken_yaml_is_refused(refused, content, words):
+    refused(read_yaml, content, words)
+
+
+def test_a_flood_of_entries_is_refused_before_it_is_built(refused, monkeypatch):
+    monkeypatch.setattr(text_files, "EVENTS", 1000)
+    refused(read_yaml, "- a\n" * 1001, "more than 1000 entries")
+
+
+@pytest.mark.parametrize("read", [read_yaml, read_json, read_toml])
+def test_a_file_beyond_the_limit_is_refused_unread(refused, read):
+    refused(read, b"#" * (text_files.SETTINGS_BYTES + 1), "1048577 bytes")
+
+
+@pytest.mark.parametrize("read", [read_yaml, read_json, read_toml])
+def test_a_missing_file_and_a_folder_are_refused(tmp_path, read):
+    with pytest.raises(InputError, match="found nothing"):
+        read(tmp_path / "absent")
+    with pytest.raises(InputError, match="found something else"):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, '{"a": ', "", "[" + "9" * 5000 + "]"])
+def test_broken_json_is_refused(refused, content):
+    refused(read_json, content, "expected JSON")
+
+
+def test_a_key_that_would_take_hours_is_refused(refused):
+    refused(read_toml, "a" + ".a" * 300_000 + " = 1", "lines of at most 4096")
+
+
+def test_json_numbers_that_json_does_not_have_are_let_through_to_the_contract(tmp_path):
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps([float("inf")]))
+    assert read_json(path) == [float("inf")]
+
+
+@pytest.mark.parametrize("content", ["a = ", "a = 1\na = 2", "a = " + "[" * 4000, "x = 2024-99-99"])
+def test_broken_toml_is_refused(refused, content):
+    refused(read_toml, content, "expected TOML")
+
+
+YAML_SIGNS = st.text(alphabet="{}[]:,-?&*!|>'\"% \n#ab1.~<=", max_size=40)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.one_of(st.binary(max_size=60), YAML_SIGNS))
+def test_any_content_is_read_or_refused_with_an_input_error(tmp_path_factory, content):
+    path = tmp_path_factory.getbasetemp() / "fuzzed"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    for read in (read_yaml, read_json, read_toml):
+        try:
+            read(path)
+        except InputError as error:
+            assert str(path) in error.where

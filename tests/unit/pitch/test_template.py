@@ -1,0 +1,275 @@
+import math
+import pickle
+
+import numpy as np
+import pytest
+
+from data_contracts.pitch import ArcSpec, LineSpec, PitchSpec
+from worldpose.errors import InputError
+from worldpose.pitch import PitchTemplate
+
+# Coordinates up to 53 m round at 1e-14.
+ROUNDING = 1e-13
+
+
+@pytest.fixture(scope="module")
+def flat() -> PitchTemplate:
+    return PitchTemplate.from_spec(PitchSpec(crown=0.0))
+
+
+@pytest.fixture(scope="module")
+def standard() -> PitchTemplate:
+    return PitchTemplate.standard()
+
+
+def marking(template: PitchTemplate, name: str, spacing: float = 0.5) -> np.ndarray:
+    samples = template.sample_lines(spacing)
+    return samples.points_world[samples.marking == samples.names.index(name)]
+
+
+def extent(points: np.ndarray) -> float:
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+@pytest.mark.parametrize(
+    ("name", "place"),
+    [
+        ("center_mark", (0.0, 0.0, 0.0)),
+        ("corner_left_near", (-52.5, -34.0, 0.0)),
+        ("corner_right_far", (52.5, 34.0, 0.0)),
+        ("halfway_near", (0.0, -34.0, 0.0)),
+        ("halfway_far", (0.0, 34.0, 0.0)),
+        ("center_circle_near", (0.0, -9.15, 0.0)),
+        ("penalty_mark_left", (-41.5, 0.0, 0.0)),
+        ("penalty_mark_right", (41.5, 0.0, 0.0)),
+        ("penalty_area_left_near_back", (-52.5, -20.16, 0.0)),
+        ("penalty_area_right_far_front", (36.0, 20.16, 0.0)),
+        ("goal_area_left_far_back", (-52.5, 9.16, 0.0)),
+        ("goal_area_right_near_front", (47.0, -9.16, 0.0)),
+        ("goal_post_left_near_bottom", (-52.5, -3.66, 0.0)),
+        ("goal_post_right_far_top", (52.5, 3.66, 2.44)),
+        # 9.15^2 - 5.5^2 = 53.4725 = 7.31249^2
+        ("penalty_arc_left_far", (-36.0, math.sqrt(53.4725), 0.0)),
+        ("penalty_arc_right_near", (36.0, -math.sqrt(53.4725), 0.0)),
+    ],
+)
+def test_points_are_where_law_1_puts_them(flat, name, place):
+    np.testing.assert_allclose(flat.points[name], place, atol=ROUNDING)
+
+
+def test_all_points_of_law_1_are_there(flat):
+    # Centre 1, halfway 2, circle 2; on each side: mark 1, corners 2, arc ends 2, areas 4 + 4,
+    # posts 4.
+    assert len(flat.points) == 5 + 2 * 17
+
+
+def test_template_is_symmetric_about_both_axes(standard):
+    mirrored = {"left": "right", "near": "far"}
+    for name, place in standard.points.items():
+        for axis, (one, other) in enumerate(mirrored.items()):
+            words = [
+                other if word == one else one if word == other else word for word in name.split("_")
+            ]
+            twin = standard.points["_".join(words)]
+            np.testing.assert_allclose(twin, place * np.where(np.arange(3) == axis, -1.0, 1.0))
+
+
+def test_crown_falls_from_the_long_axis_to_the_touch_lines_and_beyond(standard):
+    # A parabola: 0 on the axis, a quarter of 0.2 m at half the way, four times as much at twice.
+    height = standard.height([0.0, 40.0, 10.0, -60.0], [0.0, 17.0, -34.0, 68.0])
+    np.testing.assert_allclose(height, [0.0, -0.05, -0.2, -0.8], atol=ROUNDING)
+    assert standard.height(0.0, [[1.0], [2.0]]).shape == (2, 1)
+    assert np.isnan(standard.height([np.nan, 0.0], [0.0, np.nan])).all()
+
+
+def test_points_on_the_ground_lie_on_the_crown(standard):
+    for name, (x, y, z) in standard.points.items():
+        above = 2.44 if name.endswith("_top") else 0.0
+        np.testing.assert_allclose(z, standard.height(x, y) + above, atol=ROUNDING)
+    assert standard.points["corner_left_far"][2] == pytest.approx(-0.2)
+    assert standard.points["center_mark"].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_pitch_without_crown_is_flat(flat):
+    assert np.all(flat.sample_lines(1.0).points_world[:, 2] == 0.0)
+    assert np.all(flat.height([1.0, 2.0], [3.0, 40.0]) == 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "length"),
+    [
+        ("touch_line_near", 105.0),
+        ("goal_line_right", 68.0),
+        ("halfway_line", 68.0),
+        ("penalty_area_left_front", 40.32),
+        ("penalty_area_right_far", 16.5),
+        ("goal_area_right_front", 18.32),
+        ("goal_area_left_near", 5.5),
+    ],
+)
+def test_straight_markings_have_the_lengths_of_law_1(flat, name, length):
+    assert extent(marking(flat, name)) == pytest.approx(length, abs=1e-12)
+
+
+def test_all_markings_together_have_the_length_of_law_1(flat):
+    samples = flat.sample_lines(0.005)
+    lengths = [
+        extent(samples.points_world[samples.marking == i]) for i in range(len(samples.names))
+    ]
+    straight = 2 * 105 + 3 * 68 + 2 * (40.32 + 2 * 16.5) + 2 * (18.32 + 2 * 5.5)
+    opening = 2 * math.acos(5.5 / 9.15)
+    curved = 2 * math.pi * 9.15 + 2 * opening * 9.15 + 4 * 0.5 * math.pi * 1.0
+    # The circle's last step, at most 5 mm, is left out; chords are shorter by 1e-8 of an arc.
+    assert sum(lengths) == pytest.approx(straight + curved, abs=0.0055)
+    # Outer lines 4, halfway 1, areas 4 of 3; circle 1, penalty arcs 2, corner arcs 4.
+    assert len(samples.names) == 4 + 1 + 12 + 1 + 2 + 4
+
+
+def test_penalty_arcs_begin_and_end_on_the_line_of_the_area(standard):
+    for side, inward in (("left", 1.0), ("right", -1.0)):
+        arc = marking(standard, f"penalty_arc_{side}")
+        ends = standard.positions([f"penalty_arc_{side}_near", f"penalty_arc_{side}_far"])
+        order = slice(None) if side == "left" else slice(None, None, -1)
+        np.testing.assert_allclose(arc[[0, -1]][order], ends, atol=ROUNDING)
+        # Outside the area, 9.15 m from the mark; the middle is 20.15 m from the goal line.
+        assert np.all(inward * arc[1:-1, 0] > -36.0)
+        radius = np.linalg.norm(arc[:, :2] - standard.points[f"penalty_mark_{side}"][:2], axis=1)
+        np.testing.assert_allclose(radius, 9.15, atol=ROUNDING)
+        assert np.abs(arc[:, 0]).min() == pytest.approx(52.5 - 20.15, abs=0.01)
+
+
+def test_corner_arcs_lie_inside_the_pitch(flat):
+    for side in ("left", "right"):
+        for end in ("near", "far"):
+            arc = marking(flat, f"corner_arc_{side}_{end}", 0.1)
+            corner = flat.points[f"corner_{side}_{end}"]
+            assert np.all(np.abs(arc[:, 0]) <= 52.5 + ROUNDING)
+            assert np.all(np.abs(arc[:, 1]) <= 34.0 + ROUNDING)
+            np.testing.assert_allclose(np.linalg.norm(arc - corner, axis=1), 1.0, atol=ROUNDING)
+            # One end on the touch line, one on the goal line.
+            assert np.abs(np.abs(arc[[0, -1], :2]) - [52.5, 34.0]).min(axis=0).max() < ROUNDING
+
+
+def test_centre_circle_is_sampled_once_around(flat):
+    circle = marking(flat, "center_circle", 1.0)
+    # 2 pi 9.15 = 57.49 m: 58 steps, and the end is the start.
+    assert len(circle) == 58
+    steps = np.linalg.norm(np.diff(circle, axis=0, append=circle[:1]), axis=1)
+    np.testing.assert_allclose(steps, 2.0 * 9.15 * np.sin(np.pi / 58), atol=ROUNDING)
+
+
+def test_samples_follow_the_crown_at_the_spacing(standard):
+    samples = standard.sample_lines(0.25)
+    points = samples.points_world
+    np.testing.assert_allclose(
+        points[:, 2], standard.height(points[:, 0], points[:, 1]), atol=1e-13
+    )
+    assert np.all(np.diff(samples.marking) >= 0)
+    assert set(samples.marking) == set(range(len(samples.names)))
+    gaps = np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1)[np.diff(samples.marking) == 0]
+    assert gaps.max() <= 0.25 + ROUNDING
+    # 105 m in steps of 0.25 m and 68 m likewise, whole numbers both.
+    assert len(marking(standard, "touch_line_far", 0.25)) == 421
+    assert len(marking(standard, "halfway_line", 0.25)) == 273
+
+
+def test_surveyed_points_replace_nominal_ones_and_carry_their_markings():
+    spec = PitchSpec(
+        points={"corner_left_near": (-52.4, -33.9, -0.15), "penalty_mark_left": (-41.4, 0.1, 0.02)}
+    )
+    template = PitchTemplate.from_spec(spec)
+    assert template.points["corner_left_near"].tolist() == [-52.4, -33.9, -0.15]
+    line = marking(template, "touch_line_near")
+    np.testing.assert_allclose(line[0], [-52.4, -33.9, -0.15], atol=ROUNDING)
+    np.testing.assert_allclose(line[-1], [52.5, -34.0, -0.2], atol=ROUNDING)
+    # Halfway the line has half of the corner's offset from the crown.
+    offset = -0.15 - float(template.height(-52.4, -33.9))
+    middle = line[len(line) // 2]
+    share = (middle[0] - 52.5) / (-52.4 - 52.5)
+    assert middle[2] == pytest.approx(
+        float(template.height(middle[0], middle[1])) + share * offset, abs=1e-12
+    )
+    arc = marking(template, "penalty_arc_left")
+    np.testing.assert_allclose(np.linalg.norm(arc[:, :2] - [-41.4, 0.1], axis=1), 9.15, atol=1e-12)
+    # The mark lies 0.02 m above the axis, and so does the whole arc above the crown.
+    above = arc[:, 2] - template.height(arc[:, 0], arc[:, 1])
+    np.testing.assert_allclose(above, 0.02 + 0.2 * (0.1 / 34.0) ** 2, atol=1e-12)
+
+
+def test_further_markings_join_the_standard_ones():
+    spec = PitchSpec(
+        points={"hash_left": (-20.0, 5.0, 0.0), "hash_right": (20.0, 5.0, 0.0)},
+        lines={"hash": LineSpec(start="hash_left", end="hash_right")},
+        arcs={"center_circle": ArcSpec(center="center_mark", radius=3.0, start_angle=0.0,
+                                       end_angle=math.pi)},
+    )  # fmt: skip
+    template = PitchTemplate.from_spec(spec)
+    assert extent(marking(template, "hash")[:, :2]) == pytest.approx(40.0)
+    half_circle = marking(template, "center_circle")
+    np.testing.assert_allclose(half_circle[[0, -1], :2], [[3.0, 0.0], [-3.0, 0.0]], atol=ROUNDING)
+    assert "touch_line_far" in template.lines
+
+
+def test_other_pitch_sizes_move_the_goals_and_keep_the_areas():
+    template = PitchTemplate.from_spec(PitchSpec(length=100.0, width=64.0, crown=0.1))
+    np.testing.assert_allclose(
+        template.positions(["corner_right_far", "penalty_mark_right", "goal_post_right_far_top"]),
+        [[50.0, 32.0, -0.1], [39.0, 0.0, 0.0], [50.0, 3.66, 2.44 - 0.1 * (3.66 / 32.0) ** 2]],
+        atol=ROUNDING,
+    )
+
+
+def test_positions_of_no_names_are_no_points(standard):
+    assert standard.positions([]).shape == (0, 3)
+
+
+def test_points_cannot_be_changed_in_place(standard):
+    with pytest.raises(ValueError, match="read-only"):
+        standard.points["center_mark"][0] = 1.0
+
+
+def test_template_travels_to_a_worker(standard):
+    again = pickle.loads(pickle.dumps(standard))
+    np.testing.assert_array_equal(
+        again.sample_lines(1.0).points_world, standard.sample_lines(1.0).points_world
+    )
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        (PitchSpec(length=105.0, width=40.0), r"room for the markings, found 105 x 40"),
+        (PitchSpec(length=58.0), r"more than 58\.6 x 40\.32 m"),
+        (
+            PitchSpec(lines={"x": LineSpec(start="nowhere", end="center_mark")}),
+            r"lines\.x: expected the name of a point, found 'nowhere'",
+        ),
+        (
+            PitchSpec(arcs={"x": ArcSpec(center="away", radius=1, start_angle=0, end_angle=1)}),
+            r"arcs\.x: expected the name of a point, found 'away'",
+        ),
+        (
+            PitchSpec(
+                arcs={"x": ArcSpec(center="center_mark", radius=1, start_angle=1, end_angle=0)}
+            ),
+            r"end_angle above start_angle by at most 2 pi, found 1 to 0 rad",
+        ),
+        (
+            PitchSpec(
+                arcs={"x": ArcSpec(center="center_mark", radius=1, start_angle=0, end_angle=7)}
+            ),
+            r"found 0 to 7 rad",
+        ),
+    ],
+)
+def test_impossible_pitches_are_refused(spec, message):
+    with pytest.raises(InputError, match=message):
+        PitchTemplate.from_spec(spec)
+
+
+def test_unknown_names_and_spacings_are_refused(standard):
+    with pytest.raises(InputError, match="expected the name of a point, found 'corner'"):
+        standard.positions(["corner"])
+    for spacing in (0.0, -1.0, math.nan):
+        with pytest.raises(InputError, match="positive distance"):
+            standard.sample_lines(spacing)

@@ -1,0 +1,40 @@
+from __future__ import annotations
+
+import tempfile
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from store_samples import SMALL_CHUNK
+
+import data_contracts.arrays
+from worldpose.store import Store
+from worldpose.store.commit_points import install_fault_hook
+
+
+@pytest.fixture(params=["folder", "s3"])
+def url(request: pytest.FixtureRequest) -> str:
+    """Where a project can be made: every test that takes it runs on disk and on S3."""
+    if request.param == "s3":
+        return f"{request.getfixturevalue('bucket')}/{uuid.uuid4().hex}"
+    return str(request.getfixturevalue("tmp_path") / "project")
+
+
+@pytest.fixture
+def store(url: str) -> Store:
+    return Store.create(url)
+
+
+@pytest.fixture
+def folder_store(tmp_path: Path) -> Store:
+    """For what does not depend on the medium: S3 tests cost ten times as much."""
+    return Store.create(tmp_path / "project")
+
+
+@pytest.fixture(autouse=True)
+def _small_chunks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    monkeypatch.setattr(data_contracts.arrays, "CHUNK_BYTES", SMALL_CHUNK)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    yield
+    install_fault_hook(None)

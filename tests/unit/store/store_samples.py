@@ -1,0 +1,232 @@
+"""A small stage for the store's tests, and the processes that are killed while writing it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import tempfile
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+import data_contracts.arrays
+from data_contracts.arrays import ArrayLayout, GroupLayout
+from data_contracts.match import CameraSpec, ClipSpec, MatchSpec, Registration, SourceFile
+from data_contracts.run import Recipe, RunRecord, Work
+from worldpose.store import ResultWriter, Store, key_of
+from worldpose.store.commit_points import install_fault_hook
+
+FRAMES, PERSONS = 40, 3
+SMALL_CHUNK = 1024
+"""[byte] Cuts the sample's joints into several chunks; real chunks are 1 MiB and more."""
+
+LAYOUT = GroupLayout(
+    stage="tracking",
+    about="Sample.",
+    coordinates=(
+        ArrayLayout(
+            name="frame", dims=("frame",), dtype="int64", unit="frame", missing="none", about="f"
+        ),
+    ),
+    arrays=(
+        ArrayLayout(
+            name="joints",
+            dims=("frame", "person", "coordinate"),
+            dtype="float64",
+            unit="m",
+            missing="nan",
+            about="joints, world",
+            chunk_dim="frame",
+        ),
+        ArrayLayout(
+            name="detection_index",
+            dims=("frame", "camera"),
+            dtype="int16",
+            unit="1",
+            missing="-1",
+            about="which detection",
+            chunk_dim="frame",
+        ),
+        ArrayLayout(
+            name="views",
+            dims=("frame",),
+            dtype="uint8",
+            unit="1",
+            missing="0",
+            about="how many cameras",
+        ),
+        ArrayLayout(
+            name="inliers",
+            dims=("frame", "person"),
+            dtype="bool",
+            unit="1",
+            missing="none",
+            about="is it good",
+        ),
+        ArrayLayout(
+            name="height", dims=(), dtype="float32", unit="m", missing="none", about="one number"
+        ),
+        ArrayLayout(
+            name="nothing",
+            dims=("detection",),
+            dtype="float32",
+            unit="px",
+            missing="nan",
+            about="no detections at all",
+        ),
+        ArrayLayout(
+            name="extra", dims=("frame",), dtype="int32", unit="1", missing="none", about="rare"
+        ),
+    ),
+    labels={"coordinate": ("x", "y", "z")},
+    attributes={"camera": "camera ids", "detector": "who detected"},
+    optional=("extra", "inliers", "height", "nothing"),
+)
+
+ATTRIBUTES: dict[str, Any] = {"detector": "none", "camera": ["left", "right"]}
+
+
+def sample_arrays(seed: int = 0) -> dict[str, Any]:
+    """The arrays that cannot be left out: few files, as S3 tests pay by the file."""
+    rng = np.random.default_rng(seed)
+    joints = rng.normal(size=(FRAMES, PERSONS, 3))
+    joints[3, 1] = np.nan
+    return {
+        "joints": joints,
+        "detection_index": rng.integers(-1, 5, size=(FRAMES, 2), dtype=np.int16),
+        "views": np.zeros(FRAMES, dtype=np.uint8),
+    }
+
+
+def all_sample_arrays() -> dict[str, Any]:
+    """An array of every kind."""
+    return {
+        **sample_arrays(),
+        "inliers": np.arange(FRAMES * PERSONS).reshape(FRAMES, PERSONS) % 2 == 0,
+        "height": np.array(1.8, dtype=np.float32),
+        "nothing": np.zeros(0, dtype=np.float32),
+    }
+
+
+def sample_coordinates() -> dict[str, Any]:
+    return {"frame": np.arange(100, 100 + FRAMES)}
+
+
+def sample_recipe(unit: str = "clip", **changes: Any) -> Recipe:
+    fields: dict[str, Any] = {
+        "match_id": "final",
+        "stage": "tracking",
+        "unit": unit,
+        "sources": {"pitch": "a" * 64},
+        "inputs": {},
+        "settings": {"gate": {"max_distance": 0.5}},
+        "code": {"worldpose.tracking": "b" * 64},
+        "libraries": {"numpy": "2.4.0"},
+    }
+    return Recipe(**(fields | changes))
+
+
+def sample_work(store: Store, recipe: Recipe | None = None, run_id: str = "0001") -> Work:
+    recipe = recipe or sample_recipe()
+    return Work(
+        project=store.url, folder="/match", recipe=recipe, key=key_of(recipe), run_id=run_id
+    )
+
+
+def publish(
+    store: Store, recipe: Recipe | None = None, seed: int = 0, run_id: str = "0001"
+) -> ResultWriter:
+    with store.publishing(sample_work(store, recipe, run_id)) as writer:
+        writer.write(LAYOUT, sample_arrays(seed), sample_coordinates(), ATTRIBUTES)
+        writer.figures["mean_views"] = 2.5
+    return writer
+
+
+def place(recipe: Recipe | None = None) -> tuple[str, str, str, str]:
+    recipe = recipe or sample_recipe()
+    return recipe.match_id, recipe.stage, recipe.unit, key_of(recipe)
+
+
+def sample_record(run_id: str, *recipes: Recipe, **changes: Any) -> RunRecord:
+    now = datetime.now(UTC)
+    fields: dict[str, Any] = {
+        "run_id": run_id,
+        "match_id": "final",
+        "parent": None,
+        "state": "complete",
+        "results": {recipe.name: key_of(recipe) for recipe in recipes},
+        "settings": {},
+        "overrides": {},
+        "executed": tuple(recipe.name for recipe in recipes),
+        "reused": (),
+        "failed": (),
+        "figures": {},
+        "versions": {"worldpose": "0.1.0"},
+        "started_at": now,
+        "finished_at": now,
+        "seconds": 1.0,
+    }
+    return RunRecord(**(fields | changes))
+
+
+def run_once(store: Store, *recipes: Recipe) -> str:
+    """A whole run: what exists is reused, the rest computed, the record written."""
+    recipes = recipes or (sample_recipe(),)
+    run_id = store.reserve_run("final")
+    for recipe in recipes:
+        if not store.has(*place(recipe)):
+            publish(store, recipe, run_id=run_id)
+    store.finish_run(sample_record(run_id, *recipes))
+    return run_id
+
+
+def sample_registration(match_id: str = "final", folder: str = "/match") -> Registration:
+    spec = MatchSpec(
+        match_id=match_id,
+        fps=50,
+        cameras=(CameraSpec(id="left", width=1920, height=1080),),
+        clips=(ClipSpec(id="clip", frame_count=FRAMES),),
+    )
+    source = SourceFile(path="match.yaml", size=3, modified_ns=1, sha256="c" * 64)
+    return Registration(spec=spec, folder=folder, identity="d" * 64, files=(source,))
+
+
+PROCESSES = multiprocessing.get_context("forkserver")
+PROCESSES.set_forkserver_preload(["pytest", "worldpose.store", "worldpose.store.groups", "obstore"])
+
+
+def run_process(
+    target: Callable[..., None], *arguments: Any
+) -> multiprocessing.context.ForkServerProcess:
+    """A started process that sees this one's object storage."""
+    process = PROCESSES.Process(
+        target=_with_environment,
+        args=(
+            {name: value for name, value in os.environ.items() if name.startswith("AWS_")},
+            tempfile.gettempdir(),
+            target,
+            *arguments,
+        ),
+        daemon=True,
+    )
+    process.start()
+    return process
+
+
+def _with_environment(
+    environment: Mapping[str, str], temporary: str, target: Callable[..., None], *arguments: Any
+) -> None:
+    os.environ.update(environment)
+    tempfile.tempdir = temporary
+    data_contracts.arrays.CHUNK_BYTES = SMALL_CHUNK
+    target(*arguments)
+
+
+def run_and_die(url: str, point: str, sabotage: Callable[[], None] | None = None) -> None:
+    """Runs the sample and dies, as from kill -9, the first time it is at `point`."""
+    if sabotage:
+        sabotage()
+    install_fault_hook(lambda name: os._exit(9) if name == point else None)
+    run_once(Store.open(url))

@@ -1,0 +1,215 @@
+"""Never half, and the same answer after any crash (F1, F2, F12); each with a sabotage twin."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+from store_samples import (
+    FRAMES,
+    place,
+    publish,
+    run_and_die,
+    run_once,
+    run_process,
+    sample_arrays,
+)
+
+from worldpose.store import ResultId, Store, collect, compare_stores, plan_gc, verify
+from worldpose.store.commit_points import COMMIT_POINTS, install_fault_hook, reached
+from worldpose.store.folder import LocalBlobs
+from worldpose.store.objects import ObjectBlobs
+from worldpose.store.runs import may_be_at_work
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
+    """The project that an undisturbed run leaves."""
+    with pytest.MonkeyPatch.context() as patch:
+        # A module's fixture is made before a test's: the chunks must be the same small ones.
+        patch.setattr("data_contracts.arrays.CHUNK_BYTES", 1024)
+        store = Store.create(tmp_path_factory.mktemp("undisturbed"))
+        run_once(store)
+        yield store
+
+
+def check_never_half(store: Store) -> None:
+    """What a reader can see is whole and right."""
+    assert verify(store) == ()
+    for result in store.results():
+        data = store.open_result(result.match_id, result.stage, result.unit, result.key)
+        assert data.sizes["frame"] == FRAMES
+        for name, values in sample_arrays().items():
+            np.testing.assert_array_equal(data[name], values)
+    for run_id in store.runs("final"):
+        for name, key in store.run("final", run_id).results.items():
+            assert store.has("final", *name.split("/"), key)
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("point", COMMIT_POINTS)
+def test_killed_run_leaves_nothing_half_and_the_next_gives_the_same_answer(
+    store: Store, undisturbed: Store, point: str
+) -> None:
+    process = run_process(run_and_die, store.url, point)
+    process.join(60)
+    assert process.exitcode == 9
+
+    check_never_half(store)
+    index = COMMIT_POINTS.index(point)
+    assert store.has(*place()) == (index >= COMMIT_POINTS.index("after_commit"))
+    assert bool(store.runs("final")) == (point == "after_run_record")
+    unfinished = store.unfinished_runs("final")
+    assert [run.run_id for run in unfinished if not may_be_at_work(run)] == (
+        [] if point == "after_run_record" else ["0001"]
+    )
+
+    assert run_once(store) == "0002"
+    check_never_half(store)
+    assert compare_stores(store, undisturbed) == []
+    assert store.manifest(*place()).run_id == (
+        "0001" if index >= COMMIT_POINTS.index("after_commit") else "0002"
+    )
+
+    collect(store, plan_gc(store, older_than=timedelta(0)))
+    assert store.blobs.staged() == []
+    assert store.unfinished_runs("final") == ()
+    assert compare_stores(store, undisturbed) == []
+
+
+def test_every_commit_point_is_reached_once_or_more_and_in_order(store: Store) -> None:
+    seen: list[str] = []
+    install_fault_hook(seen.append)
+    run_once(store)
+    assert list(dict.fromkeys(seen)) == list(COMMIT_POINTS)
+
+
+def test_every_file_and_folder_is_on_disk_before_the_rename(
+    folder_store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: set[int] = set()
+    synced_at_rename: set[int] = set()
+    fsync, rename = os.fsync, Path.rename
+
+    def record_fsync(descriptor: int) -> None:
+        fsync(descriptor)
+        synced.add(os.fstat(descriptor).st_ino)
+
+    def record_rename(self: Path, target: Path) -> Path:
+        synced_at_rename.update(synced)
+        return rename(self, target)
+
+    monkeypatch.setattr(os, "fsync", record_fsync)
+    monkeypatch.setattr(Path, "rename", record_rename)
+    publish(folder_store)
+    top = Path(folder_store.url, ResultId(*place()).path)
+    written = {path.stat().st_ino for path in (top, *top.rglob("*"))}
+    assert len(written) > 10
+    assert written <= synced_at_rename
+    above = {path.stat().st_ino for path in list(top.parents)[:5]}
+    assert above <= synced, "the names of the result and of the folders above it are on disk too"
+
+
+def publish_manifest_first() -> None:
+    """The order that the store must never have."""
+
+    def in_folder(
+        self: LocalBlobs, folder: Path, prefix: str, manifest_name: str, manifest: bytes
+    ) -> bool:
+        target = self.root / prefix
+        target.mkdir(parents=True)
+        (target / manifest_name).write_bytes(manifest)
+        reached("during_publish")
+        for path in folder.iterdir():
+            path.rename(target / path.name)
+        return True
+
+    def in_objects(
+        self: ObjectBlobs, folder: Path, prefix: str, manifest_name: str, manifest: bytes
+    ) -> bool:
+        self.put_new(f"{prefix}/{manifest_name}", manifest)
+        reached("during_publish")
+        for path in folder.rglob("*"):
+            if path.is_file():
+                self.put_new(f"{prefix}/{path.relative_to(folder)}", path.read_bytes())
+        return True
+
+    LocalBlobs.publish_tree = in_folder  # type: ignore[method-assign]
+    ObjectBlobs.publish_tree = in_objects  # type: ignore[method-assign]
+
+
+def record_before_results() -> None:
+    """A run that is recorded before its results are published."""
+    from store_samples import sample_recipe, sample_record
+
+    from worldpose.store.runs import write_record
+
+    real = Store.publishing
+
+    def publishing(self: Store, work: object) -> object:
+        write_record(self.blobs, sample_record("0001", sample_recipe()))
+        return real(self, work)  # type: ignore[arg-type]
+
+    Store.publishing = publishing  # type: ignore[method-assign,assignment]
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("sabotage", [publish_manifest_first, record_before_results])
+def test_wrong_order_is_caught_by_the_check(store: Store, sabotage: object) -> None:
+    process = run_process(run_and_die, store.url, "during_publish", sabotage)
+    process.join(60)
+    assert process.exitcode == 9
+    with pytest.raises(AssertionError):
+        check_never_half(store)
+
+
+def publish_slowly(url: str, ready: str) -> None:
+    def wait(point: str) -> None:
+        if point == "before_commit":
+            Path(ready).touch()
+            time.sleep(60)
+
+    install_fault_hook(wait)
+    publish(Store.open(url))
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_signal_before_the_commit_abandons_the_result(
+    store: Store, tmp_path: Path, number: signal.Signals
+) -> None:
+    ready = tmp_path / "ready"
+    process = run_process(publish_slowly, store.url, str(ready))
+    deadline = time.monotonic() + 60
+    while not ready.exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert process.pid is not None
+    os.kill(process.pid, number)
+    process.join(30)
+    assert process.exitcode == -number
+    check_never_half(store)
+    assert not store.has(*place())
+    publish(store)
+    check_never_half(store)
+    assert store.has(*place())
+
+
+@pytest.mark.parametrize("point", ["after_write", "during_publish", "before_commit"])
+def test_interruption_by_hand_leaves_no_staging(store: Store, tmp_path: Path, point: str) -> None:
+    def interrupt(name: str) -> None:
+        if name == point:
+            raise KeyboardInterrupt
+
+    install_fault_hook(interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run_once(store)
+    install_fault_hook(None)
+    check_never_half(store)
+    assert store.blobs.staged() == []
+    assert [path for path in tmp_path.iterdir() if path.name.startswith("worldpose-")] == []

@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+import os
+from datetime import timedelta
+
+import pytest
+from store_samples import (
+    place,
+    publish,
+    run_once,
+    run_process,
+    sample_recipe,
+    sample_record,
+)
+
+from worldpose.errors import CorruptionError, InputError, StoreError
+from worldpose.store import ResultId, Store, collect, key_of, plan_gc, verify
+
+NOW = timedelta(0)
+
+
+def reserve_and_die(url: str) -> None:
+    Store.open(url).reserve_run("final")
+    os._exit(9)
+
+
+def die(store: Store) -> None:
+    """A run begins and is killed."""
+    process = run_process(reserve_and_die, store.url)
+    process.join(60)
+    assert process.exitcode == 9
+
+
+def test_what_a_run_names_is_never_garbage(store: Store) -> None:
+    run_once(store, sample_recipe())
+    run_once(store, sample_recipe("late"))
+    plan = plan_gc(store, older_than=NOW)
+    assert plan.garbage == ()
+    assert collect(store, plan) == 0
+
+
+def test_what_no_run_reaches_is_listed_first_and_removed_second(store: Store) -> None:
+    run_once(store)
+    publish(store, sample_recipe("unused"))
+    leftover = ResultId(*place(sample_recipe("dead"))).path
+    store.blobs.put(f"{leftover}/joints/c/0", b"half")
+    plan = plan_gc(store, older_than=NOW)
+    assert {item.path: item.reason for item in plan.garbage} == {
+        ResultId(*place(sample_recipe("unused"))).path: "no kept run reaches it",
+        leftover: "never published",
+    }
+    assert store.has(*place(sample_recipe("unused"))), "planning removes nothing"
+    assert collect(store, plan) == plan.size > 4
+    assert store.results() == (ResultId(*place()),)
+    assert store.blobs.entries(leftover) == []
+    assert verify(store) == ()
+
+
+def test_what_a_named_result_was_made_from_is_kept(folder_store: Store) -> None:
+    first = sample_recipe("first")
+    second = sample_recipe("second", inputs={first.name: key_of(first)})
+    publish(folder_store, first)
+    publish(folder_store, second)
+    folder_store.finish_run(sample_record(folder_store.reserve_run("final"), second))
+    assert plan_gc(folder_store, older_than=NOW).garbage == ()
+
+
+def test_young_results_and_leftovers_are_spared(store: Store) -> None:
+    publish(store)
+    store.blobs.staging()
+    assert plan_gc(store, older_than=timedelta(hours=1)).garbage == ()
+
+
+def test_orphan_staging_is_removed(tmp_path: object) -> None:
+    store = Store.create(f"{tmp_path}/project")
+    folder = store.blobs.staging()
+    (folder / "chunk").write_bytes(b"12345")
+    store.blobs.staging()
+    plan = plan_gc(store, older_than=NOW)
+    assert sorted(item.size for item in plan.garbage) == [0, 5]
+    collect(store, plan)
+    assert store.blobs.staged() == []
+
+
+def test_match_with_a_run_at_work_is_left_alone(store: Store) -> None:
+    publish(store)
+    other = sample_recipe(match_id="semi")
+    publish(store, other)
+    run_id = store.reserve_run("final")
+    plan = plan_gc(store, older_than=NOW)
+    assert [item.path for item in plan.garbage] == [ResultId(*place(other)).path]
+    assert f"forget final/{run_id}" in plan.held[0]
+    plan = plan_gc(store, older_than=NOW, forget=[f"final/{run_id}"])
+    assert plan.held == ()
+    assert len(plan.garbage) == 3
+    collect(store, plan)
+    assert store.results() == ()
+    assert store.unfinished_runs("final") == ()
+
+
+def test_run_that_begins_after_planning_stops_the_collection(folder_store: Store) -> None:
+    publish(folder_store)
+    plan = plan_gc(folder_store, older_than=NOW)
+    folder_store.reserve_run("final")
+    with pytest.raises(StoreError, match="plan again"):
+        collect(folder_store, plan)
+    assert folder_store.has(*place())
+
+
+def test_dead_run_keeps_its_number_until_a_later_one_is_there(folder_store: Store) -> None:
+    run_once(folder_store)
+    die(folder_store)
+    assert plan_gc(folder_store, older_than=NOW).garbage == ()
+    assert run_once(folder_store) == "0003"
+    plan = plan_gc(folder_store, older_than=NOW)
+    assert [item.path for item in plan.garbage] == ["runs/final/0002.open.json"]
+    collect(folder_store, plan)
+    assert folder_store.unfinished_runs("final") == ()
+    assert run_once(folder_store) == "0004"
+
+
+def test_dead_run_does_not_hold_its_match(folder_store: Store) -> None:
+    publish(folder_store)
+    die(folder_store)
+    plan = plan_gc(folder_store, older_than=NOW)
+    assert [item.path for item in plan.garbage] == [ResultId(*place()).path]
+    assert plan.held == ()
+
+
+def test_forgotten_runs_go_with_what_only_they_reach(folder_store: Store) -> None:
+    for unit in ("one", "two", "three"):
+        run_once(folder_store, sample_recipe("shared"), sample_recipe(unit))
+    plan = plan_gc(folder_store, older_than=NOW, forget=["final/0001"])
+    assert [item.path for item in plan.garbage] == [
+        "runs/final/0001.json",
+        ResultId(*place(sample_recipe("one"))).path,
+    ]
+    collect(folder_store, plan_gc(folder_store, older_than=NOW, keep_last=1))
+    assert folder_store.runs("final") == ("0003",)
+    assert {result.unit for result in folder_store.results()} == {"shared", "three"}
+    assert verify(folder_store) == ()
+
+
+def test_damaged_run_record_stops_planning(folder_store: Store) -> None:
+    run_once(folder_store)
+    folder_store.blobs.put("runs/final/0001.json", b"damaged")
+    with pytest.raises(CorruptionError, match="0001"):
+        plan_gc(folder_store, older_than=NOW)
+
+
+def test_absent_runs_and_empty_keeps_are_refused(folder_store: Store) -> None:
+    run_once(folder_store)
+    with pytest.raises(InputError, match="no such run"):
+        plan_gc(folder_store, forget=["final/0009"])
+    with pytest.raises(InputError, match="1 or more"):
+        plan_gc(folder_store, keep_last=0)
+
+
+def test_interrupted_collection_is_finished_by_the_next(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_once(store, sample_recipe("one"), sample_recipe("two"))
+    run_once(store, sample_recipe("three"))
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(store.blobs), "delete_tree", stop)
+        with pytest.raises(KeyboardInterrupt):
+            collect(store, plan_gc(store, older_than=NOW, keep_last=1))
+    assert verify(store) == ()
+    assert store.runs("final") == ("0002",)
+    collect(store, plan_gc(store, older_than=NOW))
+    assert {result.unit for result in store.results()} == {"three"}

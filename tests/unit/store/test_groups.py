@@ -1,0 +1,166 @@
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from store_samples import ATTRIBUTES, LAYOUT, all_sample_arrays, sample_coordinates
+
+from data_contracts.arrays import ArrayLayout, GroupLayout
+from worldpose.errors import InputError
+from worldpose.store.groups import write_group
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def write(folder: Path, **changes: Any) -> dict[str, bytes]:
+    arrays = {**all_sample_arrays(), **changes}
+    write_group(folder, LAYOUT, arrays, sample_coordinates(), ATTRIBUTES)
+    return contents(folder)
+
+
+def test_equal_arrays_give_equal_files(tmp_path: Path) -> None:
+    one = write(tmp_path / "one")
+    arrays = dict(reversed(all_sample_arrays().items()))
+    # Another memory order, other sequence types and orders of names: the same content.
+    arrays["joints"] = np.asfortranarray(arrays["joints"])
+    attributes = dict(reversed(ATTRIBUTES.items()))
+    attributes["camera"] = tuple(attributes["camera"])
+    write_group(tmp_path / "two", LAYOUT, arrays, sample_coordinates(), attributes)
+    assert contents(tmp_path / "two") == one
+
+
+def test_threads_do_not_change_the_files(tmp_path: Path) -> None:
+    one = write(tmp_path / "one")
+    with zarr.config.set({"async.concurrency": 1, "threading.max_workers": 1}):
+        assert write(tmp_path / "two") == one
+
+
+def test_writers_in_many_threads_give_the_same_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Chunks of a real size, which Blosc cuts into blocks: its own threads would shuffle those.
+    monkeypatch.setattr("data_contracts.arrays.CHUNK_BYTES", 1 << 20)
+    values = np.cumsum(np.random.default_rng(0).normal(size=(2000, 200)), axis=0)
+    array = ArrayLayout(
+        name="x", dims=("a", "b"), dtype="float64", unit="1", missing="nan", about="x"
+    )
+    layout = GroupLayout(stage="any", about="any", arrays=(array,))
+
+    def write_one(name: str) -> dict[str, bytes]:
+        write_group(tmp_path / name, layout, {"x": values}, {}, {})
+        return contents(tmp_path / name)
+
+    alone = write_one("alone")
+    with ThreadPoolExecutor(4) as pool:
+        assert all(each == alone for each in pool.map(write_one, "abcd"))
+
+
+def test_sign_and_payload_of_nan_do_not_change_the_files(tmp_path: Path) -> None:
+    joints = all_sample_arrays()["joints"]
+    joints[np.isnan(joints)] = np.uint64(0xFFF8000000000123).view(np.float64)
+    assert write(tmp_path / "two", joints=joints) == write(tmp_path / "one")
+    assert np.signbit(joints[3, 1, 0]), "the caller's array stays as it was"
+
+
+def test_array_says_what_it_is_without_the_library(tmp_path: Path) -> None:
+    write(tmp_path)
+    group = zarr.open_group(tmp_path, mode="r")
+    joints = group["joints"]
+    assert isinstance(joints, zarr.Array)
+    assert dict(joints.attrs) == {"unit": "m", "missing": "nan", "about": "joints, world"}
+    assert joints.metadata.dimension_names == ("frame", "person", "coordinate")  # type: ignore[union-attr]
+    assert np.isnan(joints.fill_value)
+    assert group["detection_index"].fill_value == -1  # type: ignore[union-attr]
+    assert group.attrs["labels"] == {"coordinate": ["x", "y", "z"]}
+    codecs = [codec["name"] for codec in joints.metadata.to_dict()["codecs"]]  # type: ignore[index,union-attr,call-overload]
+    assert codecs == ["bytes", "blosc", "crc32c"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"joints": np.zeros((40, 3, 3), np.float32)}, "expected dtype float64, found dtype fl"),
+        ({"joints": np.zeros((40, 3, 3), ">f8")}, "found dtype >f8"),
+        ({"joints": np.zeros((40, 3, 3), object)}, "found dtype object"),
+        ({"joints": np.zeros((40, 3))}, r"expected dimensions \(frame, person, coordinate\)"),
+        ({"joints": np.zeros((39, 3, 3))}, "dimension frame: expected size 40, as in array frame"),
+        ({"joints": np.zeros((40, 3, 2))}, "size 3, as in the layout's labels"),
+        ({"inliers": np.zeros((40, 4), bool)}, "dimension person: expected size 3"),
+        ({"joints": np.full((40, 3, 3), np.inf)}, r"joints\[0, 0, 0\]: expected finite numbers or"),
+        ({"height": np.array(np.nan, np.float32)}, r"height\[\]: expected finite numbers only"),
+        (
+            {"detection_index": np.full((40, 2), -2, np.int16)},
+            "or -1 for missing, found -2, and 80",
+        ),
+        ({"surprise": np.zeros(3)}, "unknown: surprise"),
+        ({"extra": np.zeros(41, np.int32)}, "dimension frame"),
+    ],
+)
+def test_array_that_breaks_the_layout_is_refused(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        write(tmp_path, **changes)
+    assert list(tmp_path.iterdir()) == [], "checked before anything is written"
+
+
+def test_absent_array_is_refused_unless_optional(tmp_path: Path) -> None:
+    arrays = all_sample_arrays()
+    del arrays["views"]
+    with pytest.raises(InputError, match="absent: views"):
+        write_group(tmp_path, LAYOUT, arrays, sample_coordinates(), ATTRIBUTES)
+    with pytest.raises(InputError, match=r"coordinates.*absent: frame"):
+        write_group(tmp_path, LAYOUT, all_sample_arrays(), {}, ATTRIBUTES)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "message"),
+    [
+        ({"camera": ["left", "right"]}, "absent: detector"),
+        ({**ATTRIBUTES, "more": 1}, "unknown: more"),
+        ({**ATTRIBUTES, "camera": ["left"]}, "expected a list of 2 labels.*found 1 of them"),
+        ({**ATTRIBUTES, "camera": "left"}, "found 'left'"),
+        ({**ATTRIBUTES, "detector": float("nan")}, "plain JSON"),
+    ],
+)
+def test_attribute_that_breaks_the_layout_is_refused(
+    tmp_path: Path, attributes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        write_group(tmp_path, LAYOUT, all_sample_arrays(), sample_coordinates(), attributes)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    st.sampled_from(["float64", "float32", "int64", "int32", "int16", "uint8", "bool"]),
+    st.data(),
+)
+def test_any_array_of_any_shape_comes_back(dtype: Any, data: st.DataObject) -> None:
+    import tempfile
+
+    shape = data.draw(hnp.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=40))
+    finite = {"allow_infinity": False, "allow_nan": True} if dtype.startswith("f") else {}
+    values = data.draw(hnp.arrays(dtype, shape, elements=finite, fill=None))
+    dims = ("frame", "a", "b")[: len(shape)]
+    missing = "nan" if dtype.startswith("f") else "none"
+    array = ArrayLayout(
+        name="x", dims=dims, dtype=dtype, unit="1", missing=missing, about="x", chunk_dim="frame"
+    )
+    layout = GroupLayout(stage="any", about="any", arrays=(array,))
+    with tempfile.TemporaryDirectory() as folder:
+        write_group(Path(folder), layout, {"x": values}, {}, {})
+        stored = zarr.open_group(folder, mode="r")["x"]
+        np.testing.assert_array_equal(stored[...], values)  # type: ignore[index]

@@ -1,0 +1,137 @@
+"""Every damage is found and named (F15)."""
+
+from __future__ import annotations
+
+import pytest
+from store_samples import (
+    place,
+    publish,
+    run_once,
+    sample_recipe,
+    sample_record,
+    sample_registration,
+)
+
+from worldpose.store import ResultId, Store, repair, verify
+from worldpose.store.documents import seal
+
+
+@pytest.fixture
+def full(store: Store) -> Store:
+    """A project with every kind of file in it."""
+    store.register(sample_registration())
+    run_once(store, sample_recipe(), sample_recipe("late"))
+    store.reserve_run("final")
+    return store
+
+
+def all_paths(store: Store) -> list[str]:
+    tops = ("results", "runs", "matches")
+    return ["project.json", *(entry.path for top in tops for entry in store.blobs.entries(top))]
+
+
+def test_whole_project_has_no_findings(full: Store) -> None:
+    steps: list[tuple[int, int]] = []
+    assert verify(full, progress=lambda done, total: steps.append((done, total))) == ()
+    assert steps == sorted(steps)
+    assert steps[-1][0] == steps[-1][1]
+    assert verify(full, "final") == ()
+
+
+def flip(store: Store, path: str, number: int) -> bytes:
+    """Flips one bit of a file and returns what it was."""
+    data = store.blobs.read(path)
+    assert data is not None
+    flipped = bytearray(data)
+    flipped[(number * 37) % len(data)] ^= 1 << (number % 8)
+    store.blobs.put(path, bytes(flipped))
+    return data
+
+
+def is_document(path: str) -> bool:
+    return not path.startswith("results/") or path.endswith("/manifest.json")
+
+
+def test_flipped_bits_in_all_data_are_found_in_one_go(full: Store) -> None:
+    damaged = [path for path in all_paths(full) if not is_document(path)]
+    assert len(damaged) > 20
+    for number, path in enumerate(damaged):
+        flip(full, path, number)
+    found = verify(full)
+    assert [finding.path for finding in found] == sorted(damaged)
+    assert all(finding.path in finding.problem for finding in found)
+
+
+def test_flipped_bit_in_any_record_or_manifest_is_found_there(full: Store) -> None:
+    damaged = [path for path in all_paths(full) if is_document(path)]
+    # The project, two manifests, a run, a reservation and a registration.
+    assert len(damaged) == 6
+    for number, path in enumerate(damaged):
+        data = flip(full, path, number)
+        assert [finding.path for finding in verify(full)] == [path]
+        full.blobs.put(path, data)
+    assert verify(full) == ()
+
+
+def test_lost_files_are_found_in_one_go(full: Store) -> None:
+    lost = ["project.json", *(path for path in all_paths(full) if not is_document(path))]
+    for path in lost:
+        full.blobs.delete(path)
+    found = verify(full)
+    assert [finding.path for finding in found] == sorted(lost)
+    assert all("is missing" in finding.problem for finding in found)
+
+
+def test_result_that_lost_its_manifest_is_missed_by_its_run(full: Store) -> None:
+    full.blobs.delete(ResultId(*place()).manifest_path)
+    (finding,) = verify(full)
+    assert finding.path == "runs/final/0001.json"
+    assert ResultId(*place()).path in finding.problem
+    assert finding.result is None
+
+
+def test_foreign_file_is_found(full: Store) -> None:
+    foreign = [
+        f"{ResultId(*place()).path}/joints/c/9/0/0",
+        "results/final/tracking/stray",
+        "runs/final/notes.txt",
+        "matches/.hidden.json",
+    ]
+    for path in foreign:
+        full.blobs.put(path, b"foreign")
+    assert [finding.path for finding in verify(full)] == sorted(foreign)
+
+
+def test_whole_file_in_a_wrong_place_is_found(folder_store: Store) -> None:
+    full = folder_store
+    full.blobs.put("runs/final/0007.json", seal(sample_record("0008")))
+    full.blobs.put("matches/semi.json", seal(sample_registration("final")))
+    assert [finding.path for finding in verify(full)] == [
+        "matches/semi.json",
+        "runs/final/0007.json",
+    ]
+
+
+def test_manifest_whose_content_digest_is_not_its_files_is_found(folder_store: Store) -> None:
+    publish(folder_store)
+    manifest = folder_store.manifest(*place()).model_copy(update={"content": "0" * 64})
+    path = ResultId(*place()).manifest_path
+    folder_store.blobs.put(path, seal(manifest))
+    (finding,) = verify(folder_store)
+    assert finding.path == path
+    assert "content digest" in finding.problem
+
+
+def test_unpublished_leftovers_are_no_damage(full: Store) -> None:
+    full.blobs.put(f"{ResultId(*place(sample_recipe('dead'))).path}/zarr.json", b"half")
+    assert verify(full) == ()
+
+
+def test_repair_withdraws_what_is_damaged_and_nothing_else(full: Store) -> None:
+    path = f"{ResultId(*place()).path}/joints/c/0/0/0"
+    full.blobs.put(path, b"changed")
+    assert repair(full, verify(full)) == (ResultId(*place()),)
+    assert not full.has(*place())
+    assert full.has(*place(sample_recipe("late")))
+    publish(full)
+    assert verify(full) == ()

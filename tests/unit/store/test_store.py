@@ -1,0 +1,381 @@
+from __future__ import annotations
+
+import errno
+import os
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from store_samples import (
+    ATTRIBUTES,
+    LAYOUT,
+    PROCESSES,
+    all_sample_arrays,
+    place,
+    publish,
+    run_process,
+    sample_arrays,
+    sample_coordinates,
+    sample_recipe,
+    sample_record,
+    sample_registration,
+    sample_work,
+)
+
+from worldpose.errors import CorruptionError, InputError, NondeterminismError, StoreError
+from worldpose.store import ResultId, Store, verify
+from worldpose.store.canonical import canonical_json, digest
+from worldpose.store.paths import MANIFEST, PROJECT
+
+
+def test_result_comes_back_with_labels_units_and_conventions(store: Store) -> None:
+    with store.publishing(sample_work(store)) as writer:
+        writer.write(LAYOUT, all_sample_arrays(), sample_coordinates(), ATTRIBUTES)
+        writer.figures["mean_views"] = 2.5
+    manifest = writer.manifest
+    data = store.open_result(*place(), verify=True)
+    for name, values in all_sample_arrays().items():
+        np.testing.assert_array_equal(data[name].values, values)
+        assert data[name].dtype == values.dtype
+    assert data.joints.dims == ("frame", "person", "coordinate")
+    assert list(data.coordinate.values) == ["x", "y", "z"]
+    assert list(data.camera.values) == ["left", "right"]
+    assert data.frame.values[0] == 100
+    assert data.joints.sel(frame=103, person=1, coordinate="x").isnull()
+    assert data.joints.attrs["units"] == "m"
+    assert data.joints.attrs["missing"] == "nan"
+    assert "centre spot" in data.attrs["conventions"]["world"]
+    assert data.attrs["detector"] == "none"
+    assert (data.attrs["match"], data.attrs["stage"], data.attrs["unit"]) == place()[:3]
+    assert manifest is not None
+    assert manifest.figures == {"mean_views": 2.5}
+    assert manifest == store.manifest(*place())
+
+
+def test_result_is_cut_into_chunks_that_are_all_there(store: Store) -> None:
+    manifest = publish(store).manifest
+    assert manifest is not None
+    chunks = [file.path for file in manifest.files if file.path.startswith("joints/c/")]
+    # 40 frames of 72 bytes in chunks of at least 1024 bytes: 15 frames each.
+    assert chunks == ["joints/c/0/0/0", "joints/c/1/0/0", "joints/c/2/0/0"]
+    # All zero, and written nevertheless.
+    assert "views/c/0" in {file.path for file in manifest.files}
+
+
+def test_same_arrays_give_same_bytes(store: Store, tmp_path: Path) -> None:
+    twin = Store.create(tmp_path / "twin")
+    first, second = publish(store).manifest, publish(twin).manifest
+    assert first is not None
+    assert second is not None
+    assert first.content == second.content
+    for file in first.files:
+        path = f"{ResultId(*place()).path}/{file.path}"
+        assert store.blobs.read(path) == twin.blobs.read(path)
+
+
+def test_unknown_result_is_a_store_error_that_says_what_to_run(store: Store) -> None:
+    assert not store.has(*place())
+    with pytest.raises(StoreError, match="worldpose run final"):
+        store.open_result(*place())
+
+
+def test_error_while_computing_leaves_nothing(store: Store) -> None:
+    with pytest.raises(ZeroDivisionError), store.publishing(sample_work(store)) as writer:
+        writer.write(LAYOUT, sample_arrays(), sample_coordinates(), ATTRIBUTES)
+        raise ZeroDivisionError
+    assert not store.has(*place())
+    assert store.results() == ()
+    assert store.blobs.staged() == []
+    assert [entry.path for entry in store.blobs.entries("results")] == []
+
+
+def test_result_without_arrays_is_not_published(folder_store: Store) -> None:
+    with (
+        pytest.raises(StoreError, match="nothing was written"),
+        folder_store.publishing(sample_work(folder_store)),
+    ):
+        pass
+    assert folder_store.results() == ()
+
+
+def test_result_is_written_once(folder_store: Store) -> None:
+    with (
+        pytest.raises(StoreError, match="written once"),
+        folder_store.publishing(sample_work(folder_store)) as writer,
+    ):
+        for _ in range(2):
+            writer.write(LAYOUT, sample_arrays(), sample_coordinates(), ATTRIBUTES)
+    assert folder_store.results() == ()
+
+
+def test_work_with_a_foreign_key_is_refused(folder_store: Store) -> None:
+    work = sample_work(folder_store).model_copy(update={"key": "0" * 32})
+    with pytest.raises(InputError, match="its recipe's"), folder_store.publishing(work):
+        pass
+
+
+def test_layout_of_another_stage_is_refused(folder_store: Store) -> None:
+    work = sample_work(folder_store, sample_recipe(stage="triangulation"))
+    with (
+        pytest.raises(InputError, match="layout of stage"),
+        folder_store.publishing(work) as writer,
+    ):
+        writer.write(LAYOUT, sample_arrays(), sample_coordinates(), ATTRIBUTES)
+
+
+def test_figure_that_is_not_finite_is_refused(folder_store: Store) -> None:
+    with (
+        pytest.raises(InputError, match="figure error_px"),
+        folder_store.publishing(sample_work(folder_store)) as writer,
+    ):
+        writer.write(LAYOUT, sample_arrays(), sample_coordinates(), ATTRIBUTES)
+        writer.figures["error_px"] = float("nan")
+    assert folder_store.results() == ()
+
+
+def test_second_computation_of_a_key_changes_nothing(store: Store) -> None:
+    first = publish(store, run_id="0001").manifest
+    second = publish(store, run_id="0002").manifest
+    assert second == first
+    assert verify(store) == ()
+
+
+def test_nondeterminism_is_an_error_and_the_first_result_stays(store: Store) -> None:
+    first = publish(store, seed=0).manifest
+    with pytest.raises(NondeterminismError, match="detection_index/c/0/0"):
+        publish(store, seed=1)
+    assert store.manifest(*place()) == first
+    assert verify(store) == ()
+    np.testing.assert_array_equal(store.open_result(*place()).joints, sample_arrays(0)["joints"])
+
+
+def publish_together(url: str, barrier: object, outcome: object) -> None:
+    store = Store.open(url)
+    barrier.wait(30)  # type: ignore[attr-defined]
+    writer = publish(store, run_id=f"{os.getpid()}")
+    outcome.put(writer.manifest.content)  # type: ignore[attr-defined,union-attr]
+
+
+def test_many_writers_of_one_key_make_one_result(store: Store) -> None:
+    barrier, outcome = PROCESSES.Barrier(4), PROCESSES.Queue()
+    writers = [run_process(publish_together, store.url, barrier, outcome) for _ in range(4)]
+    contents = {outcome.get(timeout=60) for _ in writers}
+    for writer in writers:
+        writer.join(60)
+        assert writer.exitcode == 0
+    assert contents == {store.manifest(*place()).content}
+    assert verify(store) == ()
+    assert store.blobs.staged() == []
+
+
+def test_lost_chunk_is_corruption_and_never_a_fill_value(store: Store) -> None:
+    publish(store)
+    data = store.open_result(*place())
+    store.blobs.delete(f"{ResultId(*place()).path}/joints/c/1/0/0")
+    np.testing.assert_array_equal(data.joints[:10], sample_arrays()["joints"][:10])
+    with pytest.raises(CorruptionError, match="joints/c/1/0/0 is not as published: it is missing"):
+        data.joints[15:20].load()
+    with pytest.raises(CorruptionError, match="joints/c/1/0/0"):
+        store.open_result(*place(), verify=True)
+
+
+def test_flipped_bit_is_named_when_it_is_read(store: Store) -> None:
+    manifest = publish(store).manifest
+    assert manifest is not None
+    for file in manifest.files:
+        path = f"{ResultId(*place()).path}/{file.path}"
+        data = store.blobs.read(path)
+        assert data is not None
+        store.blobs.put(path, data[:-1] + bytes([data[-1] ^ 1]))
+        with pytest.raises(CorruptionError, match=f"{path} is not as published"):
+            store.open_result(*place()).load()
+        store.blobs.put(path, data)
+    store.open_result(*place()).load()
+
+
+def test_any_zarr_reader_refuses_a_flipped_chunk(tmp_path: Path) -> None:
+    import zarr
+
+    store = Store.create(tmp_path / "project")
+    publish(store)
+    group = tmp_path / "project" / ResultId(*place()).path
+    chunk = group / "joints/c/0/0/0"
+    data = bytearray(chunk.read_bytes())
+    data[len(data) // 2] ^= 1
+    chunk.write_bytes(data)
+    with pytest.raises(ValueError, match="checksum"):
+        zarr.open_group(group, mode="r")["joints"][:]
+
+
+def test_flipped_manifest_is_corruption(folder_store: Store) -> None:
+    publish(folder_store)
+    path = ResultId(*place()).manifest_path
+    data = folder_store.blobs.read(path)
+    assert data is not None
+    # Every hundredth byte, and both ends.
+    for index in (*range(0, len(data), 100), len(data) - 1):
+        folder_store.blobs.put(path, data[:index] + bytes([data[index] ^ 1]) + data[index + 1 :])
+        with pytest.raises(CorruptionError, match=MANIFEST):
+            folder_store.manifest(*place())
+
+
+def test_manifest_of_another_result_is_corruption(folder_store: Store) -> None:
+    publish(folder_store)
+    other = sample_recipe("other")
+    data = folder_store.blobs.read(ResultId(*place()).manifest_path)
+    assert data is not None
+    folder_store.blobs.put(ResultId(*place(other)).manifest_path, data)
+    with pytest.raises(CorruptionError, match="of another result"):
+        folder_store.manifest(*place(other))
+
+
+def test_result_without_manifest_does_not_exist_but_is_not_overwritten(tmp_path: Path) -> None:
+    store = Store.create(tmp_path / "project")
+    publish(store)
+    store.blobs.delete(ResultId(*place()).manifest_path)
+    assert not store.has(*place())
+    with pytest.raises(StoreError, match="worldpose gc"):
+        publish(store)
+
+
+def test_leftovers_with_other_bytes_are_nondeterminism(bucket: str, tmp_path: Path) -> None:
+    store = Store.create(f"{bucket}/leftovers")
+    store.blobs.put(f"{ResultId(*place()).path}/joints/c/0/0/0", b"another computation")
+    with pytest.raises(NondeterminismError, match=r"joints/c/0/0/0.*worldpose gc"):
+        publish(store)
+    assert not store.has(*place())
+
+
+def test_opening_no_project_says_how_to_make_one(url: str) -> None:
+    with pytest.raises(InputError, match=r"no worldpose project at .*worldpose init"):
+        Store.open(url)
+
+
+def test_project_of_another_contract_is_refused(store: Store) -> None:
+    fields = {"contract": 2, "store": "1"}
+    sealed = {**fields, "checksum": digest(canonical_json(fields))}
+    store.blobs.put(PROJECT, canonical_json(sealed) + b"\n")
+    with pytest.raises(InputError, match="expected contract 1, found contract 2"):
+        Store.open(store.url)
+    with pytest.raises(InputError, match="contract 2"):
+        Store.create(store.url)
+
+
+def test_making_a_project_twice_keeps_it(store: Store) -> None:
+    publish(store)
+    assert Store.create(store.url).has(*place())
+
+
+def test_store_travels_to_another_process(store: Store) -> None:
+    publish(store)
+    assert pickle.loads(pickle.dumps(store)).has(*place())
+
+
+def test_registered_matches_are_listed_and_replaced(store: Store) -> None:
+    assert store.matches() == ()
+    assert store.registration("final") is None
+    store.register(sample_registration())
+    store.register(sample_registration("semi"))
+    store.register(sample_registration(folder="/moved"))
+    assert store.matches() == ("final", "semi")
+    assert store.registration("final") == sample_registration(folder="/moved")
+
+
+def test_results_are_listed_by_match(store: Store) -> None:
+    publish(store)
+    publish(store, sample_recipe("late"))
+    publish(store, sample_recipe(match_id="semi"))
+    assert [result.unit for result in store.results("final")] == ["clip", "late"]
+    assert len(store.results()) == 3
+
+
+@pytest.mark.parametrize("name", ["..", "a/b", "", "/etc", "a\0b", "a\n", "x" * 65, "é"])
+def test_name_that_could_leave_the_project_is_refused(tmp_path: Path, name: str) -> None:
+    store = Store.create(tmp_path / "project")
+    with pytest.raises(InputError):
+        store.has("final", "tracking", name, "0" * 32)
+    with pytest.raises(InputError):
+        store.registration(name)
+    with pytest.raises(InputError):
+        store.runs(name)
+    with pytest.raises(InputError):
+        store.run("final", name)
+
+
+def test_run_that_names_an_absent_result_is_not_finished(folder_store: Store) -> None:
+    run_id = folder_store.reserve_run("final")
+    with pytest.raises(StoreError, match="not in"):
+        folder_store.finish_run(sample_record(run_id, sample_recipe()))
+    assert folder_store.runs("final") == ()
+
+
+@pytest.mark.parametrize(
+    ("failing", "code"),
+    [
+        ("os.fsync", errno.ENOSPC),
+        ("pathlib.Path.rename", errno.EACCES),
+        ("pathlib.Path.mkdir", errno.EROFS),
+        ("pathlib.Path.read_bytes", errno.EIO),
+        ("pathlib.Path.open", errno.ENOSPC),
+    ],
+)
+def test_failing_disk_is_a_store_error_and_a_retry_succeeds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str, code: int
+) -> None:
+    store = Store.create(tmp_path / "project")
+    publish(store, sample_recipe("earlier"))
+
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(failing, fail)
+        with pytest.raises(StoreError, match=os.strerror(code)) as caught:
+            publish(store)
+    assert str(tmp_path / "project") in str(caught.value)
+    assert "published results are untouched" in str(caught.value)
+    assert not store.has(*place())
+    assert verify(store) == ()
+    assert store.blobs.staged() == []
+    publish(store)
+    assert verify(store) == ()
+
+
+def publish_with_little_room(url: str, outcome: object) -> None:
+    import resource
+
+    store = Store.open(url)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (600, 600))
+    try:
+        publish(store)
+    except StoreError as error:
+        outcome.put(str(error))  # type: ignore[attr-defined]
+
+
+def test_chunk_that_finds_no_room_is_a_store_error(store: Store) -> None:
+    outcome = PROCESSES.Queue()
+    process = run_process(publish_with_little_room, store.url, outcome)
+    message = outcome.get(timeout=60)
+    process.join(60)
+    assert "File too large" in message
+    assert "run again" in message
+    assert not store.has(*place())
+    assert store.blobs.staged() == []
+    publish(store)
+    assert verify(store) == ()
+
+
+def test_project_folder_below_a_file_is_a_store_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("here")
+    with pytest.raises(StoreError, match=r"File exists \(.*file\)"):
+        Store.create(tmp_path / "file" / "project")
+
+
+def test_absent_bucket_is_a_store_error_that_names_it(bucket: str) -> None:
+    with pytest.raises(StoreError, match=r"s3://nowhere/project\.json.*AWS_ENDPOINT_URL"):
+        Store.create("s3://nowhere")
+    with pytest.raises(InputError, match="no bucket"):
+        Store.create("s3://")
+    with pytest.raises(InputError, match="scheme 'gs'"):
+        Store.open("gs://elsewhere/project")

@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from store_samples import place
+
+from worldpose.errors import InputError
+from worldpose.store import ResultId, Store
+from worldpose.store.paths import checked_path
+
+BAD = ["", "/", "/etc/passwd", "..", "a/../b", "a/..", "./a", "a//b", "a/", "a\0b", "a\nb", "a\\b"]
+
+
+def test_path_that_could_leave_the_project_is_refused_by_every_method(
+    store: Store, tmp_path: Path
+) -> None:
+    before = sorted(tmp_path.rglob("*"))
+    blobs = store.blobs
+    for path in BAD:
+        for call in (
+            lambda path=path: blobs.read(path),
+            lambda path=path: blobs.exists(path),
+            lambda path=path: blobs.put(path, b"x"),
+            lambda path=path: blobs.put_new(path, b"x"),
+            lambda path=path: blobs.delete(path),
+            lambda path=path: blobs.delete_tree(path, "manifest.json"),
+            lambda path=path: blobs.entries(path),
+        ):
+            with pytest.raises(InputError, match="path inside a project"):
+                call()
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@given(st.text())
+def test_accepted_path_stays_inside(path: str) -> None:
+    try:
+        checked_path(path)
+    except InputError:
+        return
+    root = Path("/root/project")
+    joined = root / path
+    assert ".." not in joined.parts
+    assert joined.is_relative_to(root)
+    assert joined != root
+
+
+def test_result_is_known_from_its_files() -> None:
+    result = ResultId(*place())
+    assert ResultId.at(result.manifest_path) == result
+    assert ResultId.at(f"{result.path}/joints/c/0") == result
+    assert ResultId.at(result.path) is None
+    assert ResultId.at(f"runs/{result.manifest_path}") is None
+    assert ResultId.named("final", result.name, result.key) == result
+
+
+@pytest.mark.parametrize("key", ["", "0" * 31, "0" * 33, "G" * 32, "A" * 32, "../" + "0" * 29])
+def test_key_that_is_no_key_is_refused(key: str) -> None:
+    with pytest.raises(InputError, match="32 lower-case"):
+        ResultId("final", "tracking", "clip", key)

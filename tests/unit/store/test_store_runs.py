@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from store_samples import (
+    PROCESSES,
+    publish,
+    run_once,
+    run_process,
+    sample_recipe,
+    sample_record,
+)
+
+from worldpose.errors import CorruptionError, InputError, StoreError
+from worldpose.store import Store
+from worldpose.store.runs import may_be_at_work
+
+
+def test_runs_are_numbered_from_one(store: Store) -> None:
+    assert [run_once(store) for _ in range(3)] == ["0001", "0002", "0003"]
+    assert store.runs("final") == ("0001", "0002", "0003")
+    assert store.run("final").run_id == "0003"
+    assert store.run("final", "0001").run_id == "0001"
+    assert store.unfinished_runs("final") == ()
+
+
+def test_latest_is_the_highest_number_and_not_the_last_text(folder_store: Store) -> None:
+    for run_id in ("0009", "9999", "10000"):
+        folder_store.finish_run(sample_record(run_id))
+    assert folder_store.run("final").run_id == "10000"
+    assert folder_store.reserve_run("final") == "10001"
+
+
+def test_unfinished_run_is_seen_and_is_not_the_latest(store: Store) -> None:
+    run_once(store)
+    assert store.reserve_run("final") == "0002"
+    assert store.run("final").run_id == "0001"
+    (unfinished,) = store.unfinished_runs("final")
+    assert (unfinished.run_id, unfinished.pid) == ("0002", os.getpid())
+    assert may_be_at_work(unfinished)
+    with pytest.raises(InputError, match="an unfinished run"):
+        store.run("final", "0002")
+
+
+def test_match_without_runs_says_what_to_run(folder_store: Store) -> None:
+    with pytest.raises(InputError, match="worldpose run final"):
+        folder_store.run("final")
+
+
+def test_record_is_written_once(store: Store) -> None:
+    record = sample_record(store.reserve_run("final"))
+    store.finish_run(record)
+    store.finish_run(record)
+    with pytest.raises(StoreError, match="was finished before"):
+        store.finish_run(record.model_copy(update={"state": "failed"}))
+    assert store.run("final") == record
+
+
+def test_damaged_record_is_corruption(folder_store: Store) -> None:
+    run_once(folder_store)
+    folder_store.blobs.put("runs/final/0001.json", b"{}")
+    with pytest.raises(CorruptionError, match=r"runs/final/0001\.json"):
+        folder_store.run("final")
+
+
+def test_number_that_another_run_took_and_finished_is_not_given_again(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = type(store.blobs).put_new
+    is_first = True
+
+    def put_new(self: object, path: str, data: bytes) -> bool:
+        nonlocal is_first
+        if is_first and path.endswith(".open.json"):
+            # Between our look at the runs and our reservation, another process does a whole run.
+            is_first = False
+            run_once(store, sample_recipe())
+        return real(self, path, data)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(type(store.blobs), "put_new", put_new)
+    assert store.reserve_run("final") == "0002"
+    assert store.runs("final") == ("0001",)
+    assert [run.run_id for run in store.unfinished_runs("final")] == ["0002"]
+
+
+def test_threads_get_different_numbers(store: Store) -> None:
+    with ThreadPoolExecutor(4) as pool:
+        numbers = list(pool.map(lambda _: store.reserve_run("final"), range(12)))
+    assert sorted(numbers) == [f"{number:04d}" for number in range(1, 13)]
+
+
+def reserve_some(url: str, outcome: object) -> None:
+    store = Store.open(url)
+    outcome.put([store.reserve_run("final") for _ in range(4)])  # type: ignore[attr-defined]
+
+
+def test_processes_get_different_numbers(store: Store) -> None:
+    outcome = PROCESSES.Queue()
+    processes = [run_process(reserve_some, store.url, outcome) for _ in range(3)]
+    numbers = [number for _ in processes for number in outcome.get(timeout=60)]
+    for process in processes:
+        process.join(60)
+    assert sorted(numbers) == [f"{number:04d}" for number in range(1, 13)]
+    assert len(store.unfinished_runs("final")) == 12
+
+
+def test_run_of_a_dead_process_is_known_to_be_dead(store: Store) -> None:
+    outcome = PROCESSES.Queue()
+    process = run_process(reserve_some, store.url, outcome)
+    outcome.get(timeout=60)
+    process.join(60)
+    assert not any(may_be_at_work(run) for run in store.unfinished_runs("final"))
+
+
+def test_run_on_another_machine_may_be_alive(folder_store: Store) -> None:
+    folder_store.reserve_run("final")
+    (run,) = folder_store.unfinished_runs("final")
+    assert may_be_at_work(run.model_copy(update={"host": "elsewhere", "pid": 2**22 + 1}))
+
+
+def test_results_can_be_reused_by_a_later_run(folder_store: Store) -> None:
+    publish(folder_store)
+    run_once(folder_store)
+    run_once(folder_store)
+    assert folder_store.run("final", "0001").results == folder_store.run("final", "0002").results

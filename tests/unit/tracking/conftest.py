@@ -1,0 +1,83 @@
+"""Cameras on a ring round the origin, standing people, and what the cameras see of them."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from worldpose.cameras import Camera, Rigid
+
+SKELETON = np.array(
+    [
+        [0.10, 0.00, 1.65],
+        [0.08, 0.03, 1.69],
+        [0.08, -0.03, 1.69],
+        [0.02, 0.07, 1.67],
+        [0.02, -0.07, 1.67],
+        [0.00, 0.18, 1.45],
+        [0.00, -0.18, 1.45],
+        [0.02, 0.25, 1.17],
+        [0.02, -0.25, 1.17],
+        [0.10, 0.27, 0.93],
+        [0.10, -0.27, 0.93],
+        [0.00, 0.13, 0.95],
+        [0.00, -0.13, 0.95],
+        [0.05, 0.13, 0.52],
+        [0.05, -0.13, 0.52],
+        [0.00, 0.13, 0.09],
+        [0.00, -0.13, 0.09],
+    ]
+)
+
+
+@pytest.fixture
+def ring() -> Callable[[int], Camera]:
+    """Cameras 30 m from the origin, 6 to 9 m up, looking at it with 1500 px focal length."""
+
+    def build(count: int) -> Camera:
+        cameras = []
+        for n in range(count):
+            angle = 2 * np.pi * (n + 0.3) / count
+            center = np.array([30 * np.cos(angle), 30 * np.sin(angle), 6.0 + n % 4])
+            forward = -center / np.linalg.norm(center)
+            right = np.cross(forward, [0.0, 0.0, 1.0])
+            right /= np.linalg.norm(right)
+            rotation = np.stack([right, np.cross(forward, right), forward])
+            cameras.append(
+                Camera(
+                    focal=np.array([1500.0, 1500.0]),
+                    principal_point=np.array([960.0, 540.0]),
+                    distortion=np.array([-0.1, 0.02, 0.0, 0.0, 0.0]),
+                    cam_from_world=Rigid(rotation, -rotation @ center),
+                    image_size=np.array([1920, 1080]),
+                )
+            )
+        return Camera.stack(cameras)
+
+    return build
+
+
+@pytest.fixture
+def people() -> Callable[[np.ndarray], np.ndarray]:
+    """Joints (..., 17, 3) of people who stand upright at ground places (..., 2)."""
+
+    def build(places: np.ndarray) -> np.ndarray:
+        places = np.asarray(places, dtype=float)
+        ground = np.concatenate([places, np.zeros((*places.shape[:-1], 1))], axis=-1)
+        return SKELETON + ground[..., None, :]
+
+    return build
+
+
+@pytest.fixture
+def seen() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+    """Keypoints and confidence of people (frames, persons, 17, 3): detection n is person n."""
+
+    def build(camera: Camera, joints: np.ndarray, noise: float = 1.0, seed: int = 0):
+        frames, persons = joints.shape[:2]
+        image = camera.project(joints.reshape(frames, 1, persons * 17, 3))
+        keypoints = image.reshape(frames, -1, persons, 17, 2)
+        keypoints += np.random.default_rng(seed).normal(0, noise, keypoints.shape)
+        return keypoints, np.full(keypoints.shape[:-1], 0.9)
+
+    return build

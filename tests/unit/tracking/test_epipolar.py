@@ -1,0 +1,119 @@
+import numpy as np
+import pytest
+
+from worldpose.tracking import TrackingSettings
+from worldpose.tracking.epipolar import associate, pair_distances, plausible
+
+SETTINGS = TrackingSettings()
+TWO = np.array([0, 1])
+
+
+def rays_of(camera, joints, noise=0.0):
+    """Directions and weights (cameras, persons, 17) of people (persons, 17, 3)."""
+    offsets = joints[None] - camera.center[:, None, None]
+    directions = offsets / np.linalg.norm(offsets, axis=-1, keepdims=True)
+    directions += np.random.default_rng(3).normal(0, noise, directions.shape)
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    return directions, np.ones(directions.shape[:-1])
+
+
+def test_crossing_rays_are_as_far_apart_as_their_common_perpendicular():
+    # Along x at height 0 and along y at height 2.
+    centers = np.array([[-5.0, 0.0, 0.0], [0.0, -5.0, 2.0]])
+    directions = np.array([[[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]])
+    distances = pair_distances(centers, directions, TWO, 1, 0.1)
+    np.testing.assert_allclose(distances, [[np.inf, 2.0], [np.inf, np.inf]], rtol=1e-15)
+
+
+def test_mean_runs_over_joints_seen_by_both():
+    centers = np.array([[-5.0, 0.0, 0.0], [0.0, -5.0, 2.0]])
+    directions = np.array([[[1.0, 0.0, 0.0]] * 2, [[0.0, 1.0, 0.0], [np.nan] * 3]])
+    assert pair_distances(centers, directions, TWO, 1, 0.1)[0, 1] == pytest.approx(2.0)
+    assert pair_distances(centers, directions, TWO, 2, 0.1)[0, 1] == np.inf
+
+
+def test_parallel_rays_start_nothing():
+    centers = np.array([[0.0, 0.0, 0.0], [0.0, 0.1, 0.0]])
+    directions = np.array([[[1.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]]])
+    assert np.isinf(pair_distances(centers, directions, TWO, 1, 0.1)).all()
+
+
+def test_detections_of_one_camera_are_not_a_pair():
+    centers = np.array([[-5.0, 0.0, 0.0], [-5.0, 0.0, 0.0]])
+    directions = np.array([[[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]])
+    assert np.isinf(pair_distances(centers, directions, np.array([0, 0]), 1, 0.1)).all()
+
+
+def test_people_are_found_with_all_their_detections(ring, people):
+    camera = ring(6)
+    joints = people([[0.0, 0.0], [0.8, 0.3], [-3.0, 2.0], [5.0, -4.0]])
+    # 1 mrad is 1.5 px.
+    groups = associate(camera.center, *rays_of(camera, joints, 1e-3), SETTINGS)
+    assert sorted(tuple(group.index) for group in groups) == [(n,) * 6 for n in range(4)]
+    for group in groups:
+        truth = joints[group.index[0]]
+        # 1 mrad at 30 m is 3 cm a view; six views, the worst of 204 coordinates.
+        np.testing.assert_allclose(group.joints, truth, atol=0.06)
+        assert group.ray_distance.max() < 0.06
+
+
+def test_no_detection_gives_nobody(ring):
+    camera = ring(3)
+    assert associate(camera.center, np.empty((3, 0, 17, 3)), np.empty((3, 0, 17)), SETTINGS) == []
+    blank = np.full((3, 2, 17, 3), np.nan)
+    assert associate(camera.center, blank, np.zeros((3, 2, 17)), SETTINGS) == []
+
+
+def test_two_views_are_not_enough_for_a_birth_among_more_cameras(ring, people):
+    camera = ring(5)
+    directions, weights = rays_of(camera, people([[0.0, 0.0]]))
+    directions[2:] = np.nan
+    weights[2:] = 0.0
+    assert associate(camera.center, directions, weights, SETTINGS) == []
+    two = SETTINGS.model_copy(update={"birth_views": 2})
+    assert len(associate(camera.center, directions, weights, two)) == 1
+
+
+def test_two_cameras_keep_two_people_apart_from_their_two_ghosts(ring, people):
+    # The rays of two views of two people meet at four places.
+    camera = ring(5)[TWO]
+    joints = people([[-1.5, 0.5], [1.5, 1.0]])
+    groups = associate(camera.center, *rays_of(camera, joints, 5e-4), SETTINGS)
+    assert sorted(tuple(group.index) for group in groups) == [(0, 0), (1, 1)]
+
+
+def test_third_camera_leaves_no_ghost_when_detections_are_missing(ring, people):
+    # Each camera misses one of three people: each person still has two views, and any ghost
+    # two as well. Nobody is born from two views.
+    camera = ring(3)
+    directions, weights = rays_of(camera, people([[-1.5, 0.5], [1.5, 1.0], [0.0, -2.0]]))
+    for n in range(3):
+        directions[n, n] = np.nan
+        weights[n, n] = 0.0
+    assert associate(camera.center, directions, weights, SETTINGS) == []
+
+
+def test_second_detection_of_a_person_stays_out_of_the_group(ring, people):
+    camera = ring(4)
+    directions, weights = rays_of(camera, people([[0.0, 0.0], [0.0, 0.0]]), 1e-3)
+    directions[1:, 1] = np.nan
+    weights[1:, 1] = 0.0
+    groups = associate(camera.center, directions, weights, SETTINGS)
+    assert len(groups) == 1
+    assert groups[0].index[1:].tolist() == [0, 0, 0]
+    assert groups[0].index[0] in (0, 1)
+
+
+@pytest.mark.parametrize(("size", "expected"), [(1.0, True), (0.5, False), (1.6, False)])
+def test_only_the_size_of_a_person_is_plausible(people, size, expected):
+    assert plausible(size * people([0.0, 0.0]), SETTINGS) is expected
+
+
+def test_pose_without_limbs_is_not_plausible():
+    assert not plausible(np.full((17, 3), np.nan), SETTINGS)
+
+
+def test_giant_is_nobody(ring, people):
+    camera = ring(4)
+    giant = 2.0 * people([[0.0, 0.0]])
+    assert associate(camera.center, *rays_of(camera, giant), SETTINGS) == []

@@ -1,0 +1,81 @@
+import numpy as np
+import pytest
+
+from worldpose.tracking import TrackingSettings
+from worldpose.tracking.person import Person, Sighting, separations
+
+SETTINGS = TrackingSettings()
+FPS = 50.0
+
+
+def sighting(joints, *index):
+    places = np.array(index or (0, 0))
+    return Sighting(places, np.where(places >= 0, 0.1, np.nan), joints)
+
+
+def test_separation_is_the_mean_distance_of_joints_known_in_both(people):
+    here = people([[0.0, 0.0]])
+    there = people([[3.0, 4.0], [0.0, 1.0]])
+    there[0, :10] = np.nan
+    np.testing.assert_allclose(separations(here, there), [[5.0, 1.0]], rtol=1e-14)
+
+
+def test_poses_without_a_common_joint_are_infinitely_apart(people):
+    here, there = people([[0.0, 0.0]]), people([[0.0, 0.0]])
+    here[0, :9] = np.nan
+    there[0, 9:] = np.nan
+    assert separations(here, there).item() == np.inf
+
+
+def test_velocity_is_learned_and_predicts_the_next_frame(people):
+    person = Person(0, people([0.0, 0.0]), 0)
+    for frame in range(1, 51):
+        person.advance(frame, FPS, SETTINGS)
+        person.see(frame, sighting(people([0.16 * frame, 0.0])), FPS, SETTINGS)
+    # 8 m/s; after 1 s = ten averaging times the start is forgotten to exp(-10).
+    np.testing.assert_allclose(person.velocity, [8.0, 0.0, 0.0], atol=1e-3)
+    person.advance(51, FPS, SETTINGS)
+    np.testing.assert_allclose(person.pose, people([0.16 * 51, 0.0]), atol=1e-4)
+
+
+def test_without_prediction_the_pose_stays_where_it_was_seen(people):
+    person = Person(0, people([0.0, 0.0]), 0, velocity=np.array([8.0, 0.0, 0.0]))
+    person.advance(1, FPS, SETTINGS.model_copy(update={"predict_motion": False}))
+    np.testing.assert_array_equal(person.pose, people([0.0, 0.0]))
+
+
+def test_velocity_of_an_unseen_person_fades(people):
+    person = Person(0, people([0.0, 0.0]), 0, velocity=np.array([8.0, 0.0, 0.0]))
+    for frame in range(1, 102):
+        person.advance(frame, FPS, SETTINGS)
+    # The first frame is still the one after a sighting; then 2 s = four fading times.
+    assert person.velocity[0] == pytest.approx(8.0 * np.exp(-100 / FPS / 0.5))
+    # Stays within its first velocity times the fading time, and half a frame's rounding up.
+    assert 0.0 < person.pose[0, 0] < 8.0 * 0.5 + 2 * 8.0 / FPS
+
+
+def test_joint_not_seen_follows_the_body(people):
+    person = Person(0, people([0.0, 0.0]), 0)
+    moved = people([0.3, 0.0])
+    moved[9] = np.nan
+    person.see(1, sighting(moved), FPS, SETTINGS)
+    np.testing.assert_allclose(person.pose, people([0.3, 0.0]), atol=1e-15)
+
+
+def test_sighting_that_fixes_nothing_changes_no_pose(people):
+    person = Person(0, people([0.0, 0.0]), 0)
+    person.see(1, sighting(np.full((17, 3), np.nan), 0, -1), FPS, SETTINGS)
+    assert (person.last_fixed, person.fixed) == (0, 0)
+    assert 1 in person.sightings
+
+
+def test_absorbed_sightings_fill_the_empty_cameras(people):
+    kept, other = Person(0, people([0.0, 0.0]), 0), Person(1, people([0.0, 0.0]), 0)
+    for frame in range(4):
+        kept.see(frame, sighting(people([0.0, 0.0]), 3, -1), FPS, SETTINGS)
+        other.see(frame, sighting(people([0.1, 0.0]), 5, 7), FPS, SETTINGS)
+    kept.absorb(other, 2)
+    assert kept.sightings[1].index.tolist() == [3, -1]
+    assert kept.sightings[2].index.tolist() == [3, 7]
+    assert sorted(other.sightings) == [0, 1]
+    assert other.fixed == 2

@@ -1,0 +1,276 @@
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from worldpose.cameras import Camera
+from worldpose.errors import InputError
+from worldpose.triangulation import TriangulationSettings, triangulate_joints
+
+SETTINGS = TriangulationSettings()
+# White pixel noise only: the noise that the Monte Carlo tests put in.
+WHITE = TriangulationSettings(pixel_noise=1.0, joint_noise=0.0)
+
+
+def some_joints(persons=2, count=17, frames=1):
+    rng = np.random.default_rng(7)
+    return rng.uniform([-4, -4, 0], [4, 4, 2], (frames, persons, count, 3))
+
+
+def test_no_frames_gives_empty_arrays(ring, seen):
+    none = [array[:0] for array in seen(ring(3), some_joints())]
+    result = triangulate_joints(ring(3), *none, SETTINGS)
+    assert result.joints.shape == (0, 2, 17, 3)
+    assert result.report.joints == 0
+    assert result.report.reprojection_error_px is None
+
+
+def test_no_detection_and_no_person_give_empty_arrays(ring):
+    index = np.empty((2, 3, 0), np.int16)
+    keypoints = np.empty((2, 3, 0, 17, 2))
+    result = triangulate_joints(ring(3), keypoints, keypoints[..., 0], index, SETTINGS)
+    assert result.inliers.shape == (2, 3, 0, 17)
+
+
+def test_one_view_determines_nothing(ring, seen):
+    keypoints, confidence, index = seen(ring(3), some_joints())
+    index[:, 1:] = -1
+    result = triangulate_joints(ring(3), keypoints, confidence, index, SETTINGS)
+    assert np.isnan(result.joints).all()
+    assert np.isnan(result.covariance).all()
+    assert np.isnan(result.reprojection_error).all()
+    assert not result.views.any()
+    assert not result.inliers.any()
+    assert result.report.undetermined == 34
+
+
+def test_two_nearly_parallel_rays_determine_nothing(ring, seen):
+    # Two cameras 0.06 rad apart on the ring, less than the 0.1 rad asked for.
+    narrow = ring(2, arc=0.12)
+    result = triangulate_joints(narrow, *seen(narrow, some_joints()), SETTINGS)
+    assert np.isnan(result.joints).all()
+    wide = SETTINGS.model_copy(update={"min_angle": 0.03})
+    assert np.isfinite(triangulate_joints(narrow, *seen(narrow, some_joints()), wide).joints).all()
+
+
+def test_two_cameras_that_face_each_other_determine_nothing_between_them(ring, seen):
+    opposite = ring(2)
+    middle = np.linspace(opposite.center[0], opposite.center[1], 7)[1:-1].reshape(1, 1, 5, 3)
+    result = triangulate_joints(opposite, *seen(opposite, middle), SETTINGS)
+    assert np.isnan(result.joints).all()
+
+
+def test_point_between_two_views_that_disagree_is_missing(ring, seen):
+    cameras = ring(4)[np.array([0, 1])]
+    keypoints, confidence, index = seen(cameras, some_joints(1, 1))
+    keypoints[0, 1, 0, 0, 1] += 100.0
+    result = triangulate_joints(cameras, keypoints, confidence, index, SETTINGS)
+    assert np.isnan(result.joints).all()
+    assert result.views.item() == 0
+
+
+def test_nan_keypoint_and_zero_confidence_are_left_out(ring, seen):
+    keypoints, confidence, index = seen(ring(5), some_joints())
+    keypoints[:, 0] = np.nan
+    keypoints[:, 1] += 50.0
+    confidence[:, 1] = 0.0
+    confidence[:, 2] = np.nan
+    result = triangulate_joints(ring(5), keypoints, confidence, index, SETTINGS)
+    np.testing.assert_array_equal(result.views, 2)
+    np.testing.assert_array_equal(result.inliers.any(axis=(0, 2, 3)), [0, 0, 0, 1, 1])
+    np.testing.assert_allclose(result.joints, some_joints(), atol=1e-8)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 8, 16])
+def test_noise_free_views_give_the_joint(ring, seen, count):
+    # Two cameras of four, so that they do not face each other.
+    cameras = ring(4)[np.array([0, 1])] if count == 2 else ring(count)
+    joints = some_joints(frames=3)
+    result = triangulate_joints(cameras, *seen(cameras, joints), SETTINGS)
+    # Undistortion is exact to 1e-13 of the focal length; seen 2e-13 m.
+    np.testing.assert_allclose(result.joints, joints, atol=1e-10)
+    np.testing.assert_array_equal(result.views, count)
+    assert result.inliers.all()
+    assert result.reprojection_error.max() < 1e-8
+    assert result.joints.dtype == np.float64
+    assert result.views.dtype == np.uint8
+    assert result.reprojection_error.dtype == np.float32
+    assert result.report.rejected_share == (0.0,) * count
+
+
+@pytest.mark.parametrize("count", [3, 4, 5, 8])
+@pytest.mark.parametrize("offset", [20.0, 60.0, 500.0])
+def test_outlier_view_is_rejected_and_named(ring, seen, count, offset):
+    keypoints, confidence, index = seen(ring(count), some_joints())
+    keypoints[:, 1] += offset / np.sqrt(2)
+    result = triangulate_joints(ring(count), keypoints, confidence, index, SETTINGS)
+    expected = np.arange(count) != 1
+    np.testing.assert_array_equal(
+        result.inliers, np.broadcast_to(expected[:, None, None], result.inliers.shape)
+    )
+    # The outlier is cut, not down-weighted: as exact as without it.
+    np.testing.assert_allclose(result.joints, some_joints(), atol=1e-8)
+    assert result.report.rejected_share[1] == 1.0
+
+
+def test_three_outliers_of_eight_are_rejected(ring, seen):
+    keypoints, confidence, index = seen(ring(8), some_joints())
+    rng = np.random.default_rng(1)
+    keypoints[:, :3] += rng.choice([-1, 1], (1, 3, 2, 17, 2)) * rng.uniform(
+        30, 200, (1, 3, 2, 17, 2)
+    )
+    result = triangulate_joints(ring(8), keypoints, confidence, index, SETTINGS)
+    np.testing.assert_allclose(result.joints, some_joints(), atol=1e-8)
+    np.testing.assert_array_equal(result.views, 5)
+
+
+def test_two_agreeing_views_of_four_win_over_two_that_do_not(ring, seen):
+    cameras = ring(5)[np.arange(4)]
+    keypoints, confidence, index = seen(cameras, some_joints())
+    rng = np.random.default_rng(2)
+    keypoints[:, 2:] += (
+        rng.uniform(80, 200, (1, 2, 2, 17, 2)) * np.array([1, -1])[:, None, None, None]
+    )
+    result = triangulate_joints(cameras, keypoints, confidence, index, SETTINGS)
+    good = np.linalg.norm(result.joints - some_joints(), axis=-1) < 1e-6
+    # An outlier may meet another ray by chance: within the gate of 7 px on a line of some
+    # 1000 px, a few of 34 joints; seen 0.
+    assert good.mean() > 0.9
+
+
+def test_reprojection_error_is_the_root_mean_square_length_in_pixels(ring, seen):
+    keypoints, confidence, index = seen(ring(6), some_joints(1, 17))
+    keypoints += np.random.default_rng(3).normal(0, 1.0, keypoints.shape)
+    result = triangulate_joints(ring(6), keypoints, confidence, index, SETTINGS)
+    image = ring(6).project(result.joints[0, 0])
+    lengths = np.linalg.norm(image - keypoints[0, :, 0], axis=-1)
+    inliers = result.inliers[0, :, 0]
+    expected = np.sqrt((lengths**2 * inliers).sum(0) / inliers.sum(0))
+    # The lens is linearised at the observation: 1 px bends by 1 / 1500 of itself at most.
+    np.testing.assert_allclose(result.reprojection_error[0, 0], expected, rtol=1e-3)
+
+
+def test_result_is_the_least_squares_point_of_the_weighted_pixels(ring, seen):
+    keypoints, confidence, index = seen(ring(4), some_joints(1, 3))
+    rng = np.random.default_rng(4)
+    keypoints += rng.normal(0, 1.0, keypoints.shape)
+    confidence[...] = rng.uniform(0.3, 1.0, confidence.shape)
+    result = triangulate_joints(ring(4), keypoints, confidence, index, WHITE)
+    assert result.inliers.all()
+
+    def cost(points):
+        errors = ring(4).project(points) - keypoints[0, :, 0]
+        return (confidence[0, :, 0] * (errors**2).sum(-1)).sum(0)
+
+    best = cost(result.joints[0, 0])
+    for axis in range(3):
+        for step in (-1e-3, 1e-3):
+            moved = result.joints[0, 0] + step * np.eye(3)[axis]
+            # One millimetre costs (0.05 px)^2 per view; the linearised lens shifts the
+            # optimum by under a hundredth of that.
+            assert (cost(moved) > best).all()
+
+
+def monte_carlo(cameras: Camera, seen, scale):
+    """Errors and covariances of one joint under white noise of `scale` [px], 4000 times."""
+    joint = np.array([1.0, -2.0, 1.2])
+    keypoints, confidence, index = seen(cameras, np.broadcast_to(joint, (4000, 1, 1, 3)))
+    rng = np.random.default_rng(5)
+    confidence[...] = np.linspace(0.4, 1.0, keypoints.shape[1])[:, None, None]
+    keypoints = (
+        keypoints + scale * rng.normal(size=keypoints.shape) / np.sqrt(confidence)[..., None]
+    )
+    loose = WHITE.model_copy(update={"pixel_noise": scale, "max_deviation": 6.0})
+    result = triangulate_joints(cameras, keypoints, confidence, index, loose)
+    return result.joints[:, 0, 0] - joint, result.covariance[:, 0, 0]
+
+
+def test_covariance_is_the_spread_of_a_monte_carlo(ring, seen):
+    errors, covariance = monte_carlo(ring(8, arc=2.0), seen, 1.0)
+    stated = covariance.mean(axis=0)
+    sampled = errors.T @ errors / len(errors)
+    # In coordinates where the stated covariance is the identity, the sampled one has entries
+    # with standard deviation sqrt(2 / 4000) = 0.022; four of these.
+    whiten = np.linalg.inv(np.linalg.cholesky(stated))
+    np.testing.assert_allclose(whiten @ sampled @ whiten.T, np.eye(3), atol=0.09)
+    # Bias of second order only, below its own sampling error: 4 / sqrt(4000) deviations.
+    assert np.abs(whiten @ errors.mean(axis=0)).max() < 4 / np.sqrt(4000)
+
+
+def test_twice_the_pixel_noise_is_four_times_the_covariance(ring, seen):
+    joints = some_joints()
+    views = seen(ring(5), joints)
+    once = triangulate_joints(ring(5), *views, WHITE)
+    twice = triangulate_joints(ring(5), *views, WHITE.model_copy(update={"pixel_noise": 2.0}))
+    np.testing.assert_allclose(twice.covariance, 4 * once.covariance, rtol=1e-9)
+
+
+def test_joint_noise_is_in_metres(ring, seen):
+    # Noise that grows with the picture of a person has the same effect near and far: two
+    # crossing rays with 5 cm across each give 5 cm in the plane of both.
+    cameras = ring(4)[np.array([0, 1])]
+    joint = np.array([0.0, 0.0, 8.0]).reshape(1, 1, 1, 3)
+    metric = TriangulationSettings(pixel_noise=1e-6, joint_noise=0.05)
+    result = triangulate_joints(cameras, *seen(cameras, joint), metric)
+    # x and y by one ray each, z by both. The point is 13 degrees off axis, where the picture is
+    # stretched along the radius by 1 / cos: 2.7 %, in variance 5.4 %.
+    np.testing.assert_allclose(
+        result.covariance[0, 0, 0], np.diag([0.05**2, 0.05**2, 0.05**2 / 2]), rtol=0.06, atol=4e-6
+    )
+
+
+def test_confidence_weighs_like_variance(ring, seen):
+    keypoints, confidence, index = seen(ring(5), some_joints())
+    full = triangulate_joints(ring(5), keypoints, confidence, index, WHITE)
+    quarter = triangulate_joints(ring(5), keypoints, confidence / 4, index, WHITE)
+    np.testing.assert_allclose(quarter.covariance, 4 * full.covariance, rtol=1e-9)
+
+
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(seed=st.integers(0, 10_000))
+def test_camera_order_does_not_matter(ring, seen, seed):
+    rng = np.random.default_rng(seed)
+    keypoints, confidence, index = seen(ring(6), some_joints())
+    keypoints = keypoints + rng.normal(0, 1.5, keypoints.shape)
+    keypoints[:, 0] += rng.uniform(-200, 200, 2)
+    order = rng.permutation(6)
+    straight = triangulate_joints(ring(6), keypoints, confidence, index, SETTINGS)
+    shuffled = triangulate_joints(
+        ring(6)[order], keypoints[:, order], confidence[:, order], index[:, order], SETTINGS
+    )
+    np.testing.assert_array_equal(straight.inliers[:, order], shuffled.inliers)
+    # Sums in another order, and steps that end below 1e-9 m.
+    np.testing.assert_allclose(straight.joints, shuffled.joints, atol=1e-8)
+
+
+def test_same_input_gives_the_same_bytes(ring, seen):
+    keypoints, confidence, index = seen(ring(6), some_joints(frames=3))
+    keypoints += np.random.default_rng(6).normal(0, 3.0, keypoints.shape)
+    runs = [triangulate_joints(ring(6), keypoints, confidence, index, SETTINGS) for _ in range(2)]
+    for name in ("joints", "covariance", "views", "reprojection_error", "inliers"):
+        assert getattr(runs[0], name).tobytes() == getattr(runs[1], name).tobytes()
+
+
+def test_frames_do_not_depend_on_their_block(ring, seen):
+    joints = some_joints(1, 2, frames=300)
+    keypoints, confidence, index = seen(ring(4), joints)
+    whole = triangulate_joints(ring(4), keypoints, confidence, index, SETTINGS)
+    tail = triangulate_joints(ring(4), keypoints[250:], confidence[250:], index[250:], SETTINGS)
+    np.testing.assert_array_equal(whole.joints[250:], tail.joints)
+
+
+def test_arrays_of_different_clips_are_refused(ring, seen):
+    keypoints, confidence, index = seen(ring(4), some_joints())
+    with pytest.raises(InputError, match="expected keypoints"):
+        triangulate_joints(ring(3), keypoints, confidence, index, SETTINGS)
+    with pytest.raises(InputError, match="same clip"):
+        triangulate_joints(ring(4), keypoints, confidence, index[:0], SETTINGS)
+
+
+def test_index_of_a_detection_that_does_not_exist_is_refused(ring, seen):
+    keypoints, confidence, index = seen(ring(4), some_joints())
+    index[0, 2, 1] = 2
+    with pytest.raises(InputError, match="one of 2 detections"):
+        triangulate_joints(ring(4), keypoints, confidence, index, SETTINGS)

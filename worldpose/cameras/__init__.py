@@ -1,0 +1,28 @@
+"""Cameras: where a world point appears, and which ray a pixel sees.
+
+Inputs: calibrations, world points [m] or pixels. Outputs: pixels with Jacobians, rays, distances.
+"""
+
+from worldpose.cameras.distortion import fold_radius
+from worldpose.cameras.pinhole import Camera, Projection
+from worldpose.cameras.rays import (
+    Rays,
+    RayStatus,
+    distance_to_rays,
+    intersect_rays,
+    ray_to_ray_distance,
+)
+from worldpose.cameras.rigid import Rigid, nearest_rotation
+
+__all__ = [
+    "Camera",
+    "Projection",
+    "RayStatus",
+    "Rays",
+    "Rigid",
+    "distance_to_rays",
+    "fold_radius",
+    "intersect_rays",
+    "nearest_rotation",
+    "ray_to_ray_distance",
+]

@@ -1,0 +1,228 @@
+"""Rigid transforms between two frames, single or in batches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import EllipsisType
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldpose.errors import InputError
+
+Index: TypeAlias = (
+    int
+    | slice
+    | EllipsisType
+    | NDArray[np.integer]
+    | NDArray[np.bool_]
+    | tuple[int | slice | EllipsisType | NDArray[np.integer] | NDArray[np.bool_] | None, ...]
+)
+"""What numpy accepts between brackets; it always addresses the batch dimensions only."""
+
+# Six decimals, cut off rather than rounded, put at most 2 sqrt(3) 1e-6 into rotation^T rotation.
+_ORTHONORMAL = 4e-6
+# Rotations written with all digits of float64 come back within this and are taken as they are.
+_EXACT = 1e-14
+
+
+@dataclass(frozen=True, eq=False)
+class Rigid:
+    """The transform `x_b = rotation x_a + translation`, named `b_from_a`.
+
+    Transforms compose as algebra: `c_from_b @ b_from_a` is `c_from_a`. Batch dimensions broadcast
+    against each other, in the constructor and in every operation.
+
+    Raises:
+        InputError: an array has the wrong trailing shape or the batches do not broadcast.
+    """
+
+    rotation: NDArray[np.float64]
+    """(..., 3, 3), orthonormal with determinant 1."""
+    translation: NDArray[np.float64]
+    """(..., 3) [m]."""
+
+    def __post_init__(self) -> None:
+        rotation = checked("Rigid.rotation", self.rotation, (3, 3))
+        translation = checked("Rigid.translation", self.translation, (3,))
+        batch = common_batch("Rigid", rotation.shape[:-2], translation.shape[:-1])
+        object.__setattr__(self, "rotation", np.broadcast_to(rotation, (*batch, 3, 3)))
+        object.__setattr__(self, "translation", np.broadcast_to(translation, (*batch, 3)))
+
+    @classmethod
+    def identity(cls) -> Rigid:
+        """Return the transform that moves nothing."""
+        return cls(np.eye(3), np.zeros(3))
+
+    @classmethod
+    def from_rotvec(cls, rotvec: ArrayLike, translation: ArrayLike) -> Rigid:
+        """Return the transform with an axis-angle rotation (Rodrigues' formula).
+
+        Args:
+            rotvec: (..., 3) [rad], the axis times the angle.
+            translation: (..., 3) [m].
+        """
+        vector = checked("Rigid.from_rotvec: rotvec", rotvec, (3,))
+        angle = np.linalg.norm(vector, axis=-1)[..., None, None]
+        # np.sinc keeps sin(a) / a and (1 - cos(a)) / a^2 exact at and near zero.
+        rotation = (
+            np.cos(angle) * np.eye(3)
+            + np.sinc(angle / np.pi) * _cross_matrix(vector)
+            + 0.5
+            * np.sinc(angle / (2.0 * np.pi)) ** 2
+            * vector[..., :, None]
+            * vector[..., None, :]
+        )
+        return cls(rotation, np.asarray(translation, dtype=np.float64))
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Shape of the batch; () for a single transform."""
+        return self.translation.shape[:-1]
+
+    @property
+    def rotvec(self) -> NDArray[np.float64]:
+        """The rotation as axis-angle vectors (..., 3) [rad] with angles in [0, pi]."""
+        r = self.rotation
+        diagonal = np.diagonal(r, axis1=-2, axis2=-1)
+        trace = diagonal.sum(-1)
+        # Four times the outer product of the unit quaternion (w, x, y, z) with itself. Its row
+        # with the largest diagonal entry is the quaternion up to a scale that is never small.
+        outer = np.empty((*self.batch_shape, 4, 4))
+        outer[..., 0, 0] = 1.0 + trace
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            outer[..., i + 1, i + 1] = 1.0 + 2.0 * diagonal[..., i] - trace
+            outer[..., 0, i + 1] = outer[..., i + 1, 0] = r[..., k, j] - r[..., j, k]
+            outer[..., j + 1, k + 1] = outer[..., k + 1, j + 1] = r[..., k, j] + r[..., j, k]
+        largest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+        quaternion = np.take_along_axis(outer, largest[..., None, None], axis=-2)[..., 0, :]
+        quaternion = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+        quaternion = np.where(quaternion[..., :1] < 0.0, -quaternion, quaternion)
+        sine = np.linalg.norm(quaternion[..., 1:], axis=-1, keepdims=True)
+        with np.errstate(invalid="ignore"):
+            factor = np.where(sine == 0.0, 2.0, 2.0 * np.arctan2(sine, quaternion[..., :1]) / sine)
+        scaled: NDArray[np.float64] = factor * quaternion[..., 1:]
+        return scaled
+
+    def inverse(self) -> Rigid:
+        """Return `a_from_b`."""
+        transposed = np.swapaxes(self.rotation, -1, -2)
+        return Rigid(transposed, -np.einsum("...ij,...j->...i", transposed, self.translation))
+
+    def __matmul__(self, other: Rigid) -> Rigid:
+        return Rigid(
+            self.rotation @ other.rotation,
+            np.einsum("...ij,...j->...i", self.rotation, other.translation) + self.translation,
+        )
+
+    def apply(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Return points in frame b.
+
+        Args:
+            points: (..., n, 3) [m] in frame a; the batch of the transform broadcasts against the
+                dimensions before n.
+
+        Raises:
+            InputError: the last dimension is not 3 or there is no n.
+        """
+        points_a = checked("Rigid.apply: points", points, (-1, 3))
+        moved: NDArray[np.float64] = (
+            points_a @ np.swapaxes(self.rotation, -1, -2) + self.translation[..., None, :]
+        )
+        return moved
+
+    def updated(self, delta: ArrayLike) -> Rigid:
+        """Return the transform after a small motion in frame b, the tangent update of solvers.
+
+        The motion acts from the left, rotation first: `x_b' = exp(delta[:3]) x_b + delta[3:]`,
+        so the derivative of x_b' at delta = 0 is `[-cross(x_b), identity]`.
+
+        Args:
+            delta: (..., 6): rotation vector [rad], then translation [m], both in frame b.
+
+        Raises:
+            InputError: the last dimension is not 6.
+        """
+        motion = checked("Rigid.updated: delta", delta, (6,))
+        return Rigid.from_rotvec(motion[..., :3], motion[..., 3:]) @ self
+
+    def __getitem__(self, index: Index) -> Rigid:
+        return Rigid(self.rotation[leading(index, 2)], self.translation[leading(index, 1)])
+
+
+def nearest_rotation(where: str, matrix: ArrayLike) -> NDArray[np.float64]:
+    """Return the rotation that a matrix written with at least six decimals stands for.
+
+    Args:
+        where: file and place of the matrix, for the message.
+        matrix: (3, 3), R of x_b = R x_a + t.
+
+    Raises:
+        InputError: the matrix is not orthonormal with determinant 1 within six decimals.
+    """
+    rotation = checked(where, matrix, (3, 3))
+    excess = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    determinant = float(np.dot(rotation[0], np.cross(rotation[1], rotation[2])))
+    if not excess <= _ORTHONORMAL or determinant < 0.0:
+        raise InputError(
+            where,
+            expected="an orthonormal matrix with determinant 1",
+            found=f"determinant {determinant:.6g}, largest entry {excess:.3g} of R^T R - identity",
+            todo="Give R of x_b = R x_a + t with at least six decimals, without mirrored axes.",
+        )
+    if excess <= _EXACT:
+        return rotation
+    u, _, v = np.linalg.svd(rotation)
+    nearest: NDArray[np.float64] = u @ v
+    return nearest
+
+
+def leading(index: Index, trailing: int) -> tuple[Any, ...]:
+    """Return `index` extended so that it cannot reach the last `trailing` dimensions."""
+    return (*(index if isinstance(index, tuple) else (index,)), *(slice(None),) * trailing)
+
+
+def checked(where: str, array: ArrayLike, trailing: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return `array` as float64 after a check of its last dimensions; -1 stands for any length.
+
+    Raises:
+        InputError: the last dimensions differ from `trailing`.
+    """
+    values = np.asarray(array, dtype=np.float64)
+    last = values.shape[values.ndim - len(trailing) :] if values.ndim >= len(trailing) else None
+    if last is None or any(want not in (-1, got) for want, got in zip(trailing, last, strict=True)):
+        wanted = ", ".join("n" if want == -1 else str(want) for want in trailing)
+        raise InputError(
+            where,
+            expected=f"shape (..., {wanted})",
+            found=f"shape {values.shape}",
+            todo="Check the order of the dimensions.",
+        )
+    return values
+
+
+def common_batch(where: str, *batches: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the shape that all batch shapes broadcast to.
+
+    Raises:
+        InputError: they do not broadcast.
+    """
+    try:
+        return np.broadcast_shapes(*batches)
+    except ValueError:
+        raise InputError(
+            where,
+            expected="batch shapes that broadcast",
+            found=" and ".join(str(batch) for batch in batches),
+            todo="Give every part the same batch dimensions, or none.",
+        ) from None
+
+
+def _cross_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (..., 3, 3) matrices M with M x = vector cross x."""
+    matrix = np.zeros((*vector.shape, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        matrix[..., k, j] = vector[..., i]
+        matrix[..., j, k] = -vector[..., i]
+    return matrix

@@ -1,0 +1,52 @@
+"""The error tree. A message says where, what was expected, what came, and what to do."""
+
+from __future__ import annotations
+
+
+class WorldposeError(Exception):
+    """Base of every error that a user can cause or mend."""
+
+
+class InputError(WorldposeError):
+    """Something given to worldpose is not what it must be.
+
+    Args:
+        where: file, and key or place in it: `match.yaml: cameras[2].kind`.
+        expected: what is needed there.
+        found: what is there instead.
+        todo: what the user can do about it.
+    """
+
+    def __init__(self, where: str, *, expected: str, found: str, todo: str) -> None:
+        self.where, self.expected, self.found, self.todo = where, expected, found, todo
+        super().__init__(f"{where}: expected {expected}, found {found}. {todo}")
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # Keyword-only arguments: without this the error cannot travel back from a worker.
+        return _input_error, (type(self), self.where, self.expected, self.found, self.todo)
+
+
+def _input_error(
+    kind: type[InputError], where: str, expected: str, found: str, todo: str
+) -> InputError:
+    return kind(where, expected=expected, found=found, todo=todo)
+
+
+class UsageError(InputError):
+    """A command or setting that does not exist or does not fit."""
+
+
+class DegenerateError(WorldposeError):
+    """The geometry does not determine the answer."""
+
+
+class StoreError(WorldposeError):
+    """The store cannot give or take a result."""
+
+
+class CorruptionError(StoreError):
+    """Stored bytes are not the bytes that were published."""
+
+
+class NondeterminismError(StoreError):
+    """One key was computed twice with different bytes."""

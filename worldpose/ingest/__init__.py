@@ -1,0 +1,30 @@
+"""Ingest: a match folder on disk becomes checked records and dense arrays.
+
+Inputs: match.yaml, calibration.toml, detections/, pitch.json, videos; or other tools' files.
+Outputs: `MatchFolder`, `Registration`, `Observations` on match frames.
+"""
+
+from worldpose.ingest.calibration_files import read_calibration, write_calibration_toml
+from worldpose.ingest.importing import import_match
+from worldpose.ingest.keypoint_files import read_observations
+from worldpose.ingest.match_folder import MatchFolder, read_match, require_calibrated
+from worldpose.ingest.observations import Observations
+from worldpose.ingest.registration import register_match
+from worldpose.ingest.units import UnitFrames, read_unit, unit_frames
+from worldpose.ingest.writing import write_match
+
+__all__ = [
+    "MatchFolder",
+    "Observations",
+    "UnitFrames",
+    "import_match",
+    "read_calibration",
+    "read_match",
+    "read_observations",
+    "read_unit",
+    "register_match",
+    "require_calibrated",
+    "unit_frames",
+    "write_calibration_toml",
+    "write_match",
+]

@@ -1,0 +1,113 @@
+"""Cameras that another tool calibrated, checked before they become records."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from data_contracts.cameras import CameraCalibration
+from worldpose.errors import InputError
+
+SIZE_LIMIT: Final = 1 << 16
+"""Widest or highest picture that is believed [px]; OpenCV's own limit for most operations."""
+
+NUMBER_LIMIT: Final = 1e9
+"""Largest number that is believed in any entry, whatever its unit."""
+
+ROTATION_TOLERANCE: Final = 1e-4
+"""Largest error of R R^T = I [1] that is taken for rounding; four decimals give less."""
+
+
+def given_camera(
+    where: str,
+    name: str,
+    *,
+    size: NDArray[np.float64],
+    focal: NDArray[np.float64],
+    principal_point: NDArray[np.float64],
+    distortion: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+    translation: NDArray[np.float64],
+) -> CameraCalibration:
+    """The camera record; a rotation that was rounded in its file becomes the nearest rotation.
+
+    Args:
+        where: file and camera, for messages.
+        name: id of the camera.
+        size: width and height [px].
+        focal: fx, fy [px].
+        principal_point: cx, cy [px].
+        distortion: k1, k2, p1, p2, k3 [1].
+        rotation: (3, 3), R in x_cam = R x_world + t.
+        translation: t [m].
+
+    Raises:
+        InputError: the size is not whole, a focal length not positive, the rotation none, or the
+            name unfit for a file.
+    """
+    if np.any(size < 1) or np.any(size > SIZE_LIMIT) or np.any(size != np.round(size)):
+        raise calibration_error(
+            f"{where}: size", f"whole pixels from 1 to {SIZE_LIMIT}", str(size.tolist())
+        )
+    if np.any(focal <= 0):
+        raise calibration_error(f"{where}: focal length", "positive [px]", str(focal.tolist()))
+    error = float(np.max(np.abs(rotation @ rotation.T - np.eye(3))))
+    if error > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        kind = "a mirror image" if error <= ROTATION_TOLERANCE else f"R R^T off by {error:.2g}"
+        raise calibration_error(
+            f"{where}: rotation", "a rotation: orthonormal, determinant 1", kind
+        )
+    if error > 1e-12:  # rounded in the file: take the nearest rotation
+        u, _, vt = np.linalg.svd(rotation)
+        rotation = u @ vt
+    try:
+        return CameraCalibration(
+            id=name,
+            image_size=(int(size[0]), int(size[1])),
+            focal_px=tuple(focal.tolist()),
+            principal_point_px=tuple(principal_point.tolist()),
+            distortion=tuple(distortion.tolist()),
+            rotation=tuple(tuple(row) for row in rotation.tolist()),
+            translation=tuple(translation.tolist()),
+        )
+    except ValidationError as invalid:
+        raise calibration_error(
+            f"{where}: name", "up to 64 letters, digits and . _ -, none of . _ - first", repr(name)
+        ) from invalid
+
+
+def cameras_by_name(
+    path: Path, cameras: list[tuple[str, CameraCalibration]]
+) -> dict[str, CameraCalibration]:
+    """The cameras by id, in file order.
+
+    Args:
+        path: the file, for messages.
+        cameras: place in the file, and camera.
+
+    Raises:
+        InputError: there is none, or two of one name.
+    """
+    by_name: dict[str, CameraCalibration] = {}
+    for where, camera in cameras:
+        if camera.id in by_name:
+            raise calibration_error(where, "a name of its own", f"{camera.id!r} a second time")
+        by_name[camera.id] = camera
+    if not by_name:
+        raise calibration_error(str(path), "at least one camera", "none")
+    return by_name
+
+
+def calibration_error(where: str, expected: str, found: str) -> InputError:
+    """The error for an entry of a calibration file."""
+    return InputError(where, expected=expected, found=found, todo="Correct the calibration file.")
+
+
+def brief(value: object) -> str:
+    """A value as it fits into a message."""
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,92 @@
+"""Match folders made from other tools' calibration and 2D poses."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Literal
+
+from data_contracts.match import MatchSpec
+from worldpose.errors import InputError
+from worldpose.ingest.calibration_files import read_calibration
+from worldpose.ingest.keypoint_files import on_frames, read_observations, seen_frames
+from worldpose.ingest.validation import validate_record
+from worldpose.ingest.writing import write_match
+
+
+def import_match(
+    calibration: Path,
+    detections: Path,
+    fps: float,
+    out: Path,
+    match_id: str | None = None,
+    pitch: Literal["none"] | None = "none",
+) -> MatchSpec:
+    """Write a match folder with the cameras of a calibration and the people they saw.
+
+    The one clip, `clip`, spans the first to the last frame with a person; frames keep the numbers
+    that they have in the files. 2D poses are checked whole and stored as npz.
+
+    Args:
+        calibration: a file that `read_calibration` reads.
+        detections: folder with `<camera>.json` or `.npz` for each camera of the calibration.
+        fps: frame rate of all cameras [1/s].
+        out: the match folder, absent or empty.
+        match_id: id of the match; None = the name of `out`.
+        pitch: "none", or None for the standard pitch, when the calibration's world is the pitch's.
+
+    Returns:
+        What stands in match.yaml.
+
+    Raises:
+        InputError: a file is not as it must be, names do not match, there are no people, or `out`
+            is not empty; nothing is written then.
+    """
+    cameras = read_calibration(calibration)
+    files = _files_by_camera(detections, list(cameras), calibration)
+    people = {name: read_observations(file) for name, file in files.items()}
+    seen = [frames for frames in map(seen_frames, people.values()) if frames is not None]
+    if not seen:
+        raise InputError(
+            str(detections), expected="people", found="none in any file", todo="Check the detector."
+        )
+    first, last = min(frame for frame, _ in seen), max(frame for _, frame in seen)
+    content = {
+        "match_id": match_id if match_id is not None else _name_of(out),
+        "fps": fps,
+        "cameras": [
+            {"id": name, "width": camera.image_size[0], "height": camera.image_size[1]}
+            for name, camera in cameras.items()
+        ],
+        "clips": [{"id": "clip", "first_frame": first, "frame_count": last - first + 1}],
+        "pitch": pitch,
+    }
+    spec = validate_record(MatchSpec, content, str(out / "match.yaml"))
+    for name, file in files.items():
+        people[name] = on_frames(file, people[name], first, last - first + 1)
+    write_match(out, spec, calibrations=cameras, observations=people)
+    return spec
+
+
+def _files_by_camera(folder: Path, cameras: list[str], calibration: Path) -> dict[str, Path]:
+    files = [
+        file
+        for file in (sorted(folder.iterdir()) if folder.is_dir() else ())
+        if file.suffix in (".json", ".npz") and not file.name.startswith(".")
+    ]
+    if sorted(file.stem for file in files) != sorted(cameras):
+        raise InputError(
+            str(folder),
+            expected=f"one .json or .npz file for each camera in {calibration.name}: "
+            + ", ".join(cameras),
+            found=", ".join(file.name for file in files) or "no such file",
+            todo="Rename the files as the cameras, and leave neither over.",
+        )
+    by_name = {file.stem: file for file in files}
+    return {name: by_name[name] for name in cameras}
+
+
+def _name_of(folder: Path) -> str:
+    """The folder's name without what an id may not hold."""
+    name = re.sub(r"[^A-Za-z0-9._-]+", "-", folder.resolve().name).strip("-._")[:64]
+    return name or "match"

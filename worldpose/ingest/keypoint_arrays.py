@@ -1,0 +1,193 @@
+"""2D poses as an npz file: the arrays of `Observations`, for matches that JSON is too slow for.
+
+Members: `frame` (frames,) int64, `keypoints` (frames, detections, 17, 2), `confidence` (frames,
+detections, 17), `boxes` (frames, detections, 4) and `score` (frames, detections), all float32 in
+little-endian order, NaN where missing (`data_contracts.observations`).
+"""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from pathlib import Path
+from typing import IO, Final, cast
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17
+from worldpose.errors import InputError
+from worldpose.ingest.observations import Observations
+from worldpose.ingest.text_files import require_file
+
+ARRAY_BYTES: Final = 4 << 30
+"""Most that the arrays of one file may fill [byte]; two hours of 25 people at 50 Hz are 2 GB."""
+
+COORDINATE_LIMIT: Final = 1e6
+"""Farthest from the picture's origin that a keypoint or box corner is believed [px]."""
+
+FRAME_LIMIT: Final = (1 << 31) - 1
+"""Largest frame number that is believed: a year at 60 frames/s."""
+
+_BLOCK: Final = 4096
+"""Frames checked at a time, which keeps the checks' own memory small."""
+
+_SHAPES: Final = {
+    "frame": ("frames",),
+    "keypoints": ("frames", "detections", len(COCO17), 2),
+    "confidence": ("frames", "detections", len(COCO17)),
+    "boxes": ("frames", "detections", 4),
+    "score": ("frames", "detections"),
+}
+
+_Header = tuple[tuple[int, ...], bool, np.dtype[np.generic]]
+
+
+def write_keypoint_arrays(path: Path, people: Observations) -> None:
+    """Write an npz file; the same arrays give the same bytes, wherever they are written.
+
+    Nothing is packed: a compressor's output changes with its version.
+    """
+    with zipfile.ZipFile(path, "w") as file:
+        for name, array in {"frame": people.frame, **people.arrays()}.items():
+            dtype = "<i8" if name == "frame" else "<f4"
+            # A ZipInfo made by name alone carries the fixed date 1980-01-01.
+            with file.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+                npy.write_array(member, np.ascontiguousarray(array, dtype), allow_pickle=False)
+
+
+def read_keypoint_arrays(path: Path) -> Observations:
+    """The people of an npz file, as written; frames rise but may leave gaps.
+
+    Every declared type, shape and size is checked before anything is unpacked.
+
+    Raises:
+        InputError: naming file and member: truncated or no npz, another type, shape or byte order,
+            too large, frames that do not rise, infinite values, or a keypoint without confidence.
+    """
+    require_file(path)
+    try:
+        with zipfile.ZipFile(path) as file:
+            infos = _members(path, file)
+            headers = {name: _header(path, file, info) for name, info in infos.items()}
+            _check_headers(path, infos, headers)
+            arrays = {name: _array(path, file, info) for name, info in infos.items()}
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
+        raise _wrong(str(path), "an npz file", f"{error}") from error
+    people = Observations(
+        frame=cast("NDArray[np.int64]", arrays["frame"]),
+        keypoints=cast("NDArray[np.float32]", arrays["keypoints"]),
+        confidence=cast("NDArray[np.float32]", arrays["confidence"]),
+        boxes=cast("NDArray[np.float32]", arrays["boxes"]),
+        score=cast("NDArray[np.float32]", arrays["score"]),
+    )
+    _check_values(path, people)
+    return people
+
+
+def _members(path: Path, file: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    names = [info.filename for info in file.infolist()]
+    expected = [f"{name}.npy" for name in _SHAPES]
+    if sorted(names) != sorted(expected):
+        found = ", ".join(names[:8]) or "nothing"
+        raise _wrong(str(path), f"the members {', '.join(expected)}", found)
+    return {name: file.getinfo(f"{name}.npy") for name in _SHAPES}
+
+
+def _header(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> _Header:
+    where = f"{path}: {info.filename}"
+    try:
+        with file.open(info) as member:
+            shape, fortran, dtype = _read_header(member)
+            start = member.tell()
+    except Exception as error:  # a hostile header can raise nearly anything in numpy and zipfile
+        raise _wrong(where, "an npy array", f"{error}" or type(error).__name__) from error
+    if start + math.prod(shape) * dtype.itemsize != info.file_size:
+        raise _wrong(
+            where,
+            f"{start + math.prod(shape) * dtype.itemsize} bytes for its shape {shape}",
+            f"{info.file_size} bytes",
+        )
+    return shape, fortran, dtype
+
+
+def _read_header(member: IO[bytes]) -> _Header:
+    if npy.read_magic(member) != (1, 0):
+        raise ValueError("another version than npy 1.0")  # later ones allow headers of 4 GB
+    return npy.read_array_header_1_0(member)
+
+
+def _check_headers(
+    path: Path, infos: dict[str, zipfile.ZipInfo], headers: dict[str, _Header]
+) -> None:
+    sizes: dict[str, int] = {}
+    for name, dims in _SHAPES.items():
+        where = f"{path}: {infos[name].filename}"
+        shape, _, dtype = headers[name]
+        wanted = np.dtype("<i8" if name == "frame" else "<f4")
+        if dtype != wanted:
+            raise _wrong(where, f"{wanted.str} ({wanted.name}, little-endian)", dtype.str)
+        fits = len(shape) == len(dims) and all(
+            n >= 0 and n == (sizes.setdefault(dim, n) if isinstance(dim, str) else dim)
+            for n, dim in zip(shape, dims, strict=True)
+        )
+        if not fits:
+            known = tuple(sizes.get(dim, dim) if isinstance(dim, str) else dim for dim in dims)
+            raise _wrong(where, f"shape {known}".replace("'", ""), f"{shape}")
+    total = sum(info.file_size for info in infos.values())
+    if total > ARRAY_BYTES:
+        raise _wrong(str(path), f"at most {ARRAY_BYTES} bytes of arrays", f"{total}")
+
+
+def _array(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[np.generic]:
+    try:
+        with file.open(info) as member:
+            array: NDArray[np.generic] = npy.read_array(member, allow_pickle=False)
+            return np.ascontiguousarray(array)
+    except Exception as error:  # see _header
+        raise _wrong(f"{path}: {info.filename}", "a whole array", f"{error}") from error
+
+
+def _check_values(path: Path, people: Observations) -> None:
+    steps = np.diff(people.frame)
+    if np.any(steps <= 0):
+        place = int(np.argmax(steps <= 0)) + 1
+        raise _wrong(f"{path}: frame[{place}]", "frame numbers that rise", f"{people.frame[place]}")
+    if np.any(np.abs(people.frame) > FRAME_LIMIT):
+        raise _wrong(f"{path}: frame", f"frame numbers up to {FRAME_LIMIT}", "larger ones")
+    for start in range(0, len(people.frame), _BLOCK):
+        _check_block(path, start, people.rows(slice(start, start + _BLOCK)))
+
+
+def _check_block(path: Path, start: int, people: Observations) -> None:
+    found = np.isfinite(people.confidence)
+    person = np.any(found, axis=-1)
+    unlike = (np.isfinite(people.keypoints) != found[..., None]).any(axis=-1)
+    far = np.abs(people.keypoints) > COORDINATE_LIMIT
+    ordered = ~np.any(people.boxes[..., :2] > people.boxes[..., 2:], axis=-1)
+    checks = (
+        ("keypoints", far.any(axis=-1), f"pixels up to {COORDINATE_LIMIT:g}"),
+        ("keypoints", unlike, "finite exactly where confidence is"),
+        (
+            "confidence",
+            (people.confidence <= 0) | (people.confidence > 1),
+            "values in (0, 1], NaN where not found",
+        ),
+        ("boxes", (np.abs(people.boxes) > COORDINATE_LIMIT).any(axis=-1) | ~ordered, "x0 y0 x1 y1"),
+        ("boxes", person & np.isnan(people.boxes).any(axis=-1), "a box for every person"),
+        ("score", np.isinf(people.score) | (people.score < 0), "finite values from 0"),
+        ("score", person & np.isnan(people.score), "a score for every person"),
+    )
+    for name, wrong, rule in checks:
+        if np.any(wrong):
+            place = tuple(int(i) for i in np.argwhere(wrong)[0])
+            value = getattr(people, name)[place]
+            where = [place[0] + start, *place[1:]]
+            raise _wrong(
+                f"{path}: {name}{where} (frame {people.frame[place[0]]})", rule, f"{value}"
+            )
+
+
+def _wrong(where: str, expected: str, found: str) -> InputError:
+    return InputError(where, expected=expected, found=found, todo="Write or export it again.")

@@ -1,0 +1,256 @@
+"""A match folder, checked: everything that it names is there, and nothing contradicts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Final
+
+from data_contracts.cameras import CameraCalibration
+from data_contracts.match import MatchSpec
+from data_contracts.pitch import PitchSpec
+from worldpose.errors import InputError
+from worldpose.ingest.calibration_files import read_calibration
+from worldpose.ingest.text_files import read_json, read_yaml
+from worldpose.ingest.validation import validate_record
+
+NO_PITCH: Final = "none"
+"""Value of `pitch` in match.yaml for footage without a pitch."""
+
+
+@dataclass(frozen=True)
+class MatchFolder:
+    """What a match folder holds.
+
+    Attributes:
+        folder: the folder as it was given.
+        spec: match.yaml.
+        calibrations: given static cameras by id; may lack some.
+        detections: given 2D poses, by id of a static camera or of a clip (its broadcast camera).
+        pitch: the surveyed or standard pitch; None where the match has none.
+        videos: video file or folder of images, by id of a static camera or of a clip.
+    """
+
+    folder: Path
+    spec: MatchSpec
+    calibrations: Mapping[str, CameraCalibration]
+    detections: Mapping[str, Path]
+    pitch: PitchSpec | None
+    videos: Mapping[str, Path]
+
+
+def read_match(folder: Path) -> MatchFolder:
+    """The checked content of a match folder; videos and detections are found, not opened.
+
+    Args:
+        folder: holds match.yaml and what that names.
+
+    Raises:
+        InputError: a file or key is missing, unknown, contradicts another or leads out of the
+            folder; a static camera has neither video nor detections.
+    """
+    file = folder / "match.yaml"
+    spec = validate_record(MatchSpec, read_yaml(file), str(file))
+    if not spec.static_cameras:
+        raise InputError(
+            f"{file}: cameras",
+            expected="at least one camera of kind static",
+            found=f"{len(spec.cameras)} broadcast",
+            todo="Add the static cameras.",
+        )
+    for index, camera in enumerate(spec.cameras):
+        if camera.still is not None:
+            _existing(folder, camera.still, f"{file}: cameras[{index}].still")
+    detections = _detections(folder, spec)
+    videos = _videos(folder, spec)
+    _require_footage(folder, spec, detections, videos)
+    return MatchFolder(
+        folder=folder,
+        spec=spec,
+        calibrations=_calibrations(folder, spec),
+        detections=detections,
+        pitch=_pitch(folder, spec),
+        videos=videos,
+    )
+
+
+def require_calibrated(match: MatchFolder) -> None:
+    """Refuse a match in which a static camera is not calibrated.
+
+    Raises:
+        InputError: naming the missing cameras and those that are there.
+    """
+    names = [camera.id for camera in match.spec.static_cameras]
+    missing = [name for name in names if name not in match.calibrations]
+    if missing:
+        raise InputError(
+            str(match.folder / "calibration.toml"),
+            expected=f"every static camera: {', '.join(names)}",
+            found=f"missing camera {', '.join(missing)}; there: {_listed(match.calibrations)}",
+            todo="Add the missing cameras, or take them out of match.yaml.",
+        )
+
+
+def pitch_file(folder: Path, spec: MatchSpec) -> Path | None:
+    """Where the surveyed pitch is written; None = no pitch, or the standard one.
+
+    Raises:
+        InputError: match.yaml names a pitch file that is not there or lies outside.
+    """
+    if spec.pitch == NO_PITCH:
+        return None
+    if spec.pitch is not None:
+        return _existing(folder, spec.pitch, f"{folder / 'match.yaml'}: pitch")
+    if not (folder / "pitch.json").exists():
+        return None
+    return _existing(folder, "pitch.json", str(folder))
+
+
+def _pitch(folder: Path, spec: MatchSpec) -> PitchSpec | None:
+    if spec.pitch == NO_PITCH:
+        return None
+    file = pitch_file(folder, spec)
+    return PitchSpec() if file is None else validate_record(PitchSpec, read_json(file), str(file))
+
+
+def _calibrations(folder: Path, spec: MatchSpec) -> dict[str, CameraCalibration]:
+    if not (folder / "calibration.toml").exists():
+        return {}
+    file = _existing(folder, "calibration.toml", str(folder))
+    calibrations = read_calibration(file)
+    static = {camera.id: camera for camera in spec.static_cameras}
+    extra = [name for name in calibrations if name not in static]
+    if extra:
+        raise InputError(
+            str(file),
+            expected=f"static cameras of match.yaml: {_listed(static)}",
+            found=f"also {', '.join(extra)}",
+            todo="Remove the further cameras, or correct their names.",
+        )
+    for name, calibration in calibrations.items():
+        size = (static[name].width, static[name].height)
+        if calibration.image_size != size:
+            raise InputError(
+                f"{file}: {name}.size",
+                expected=f"{list(size)}, the width and height in match.yaml",
+                found=str(list(calibration.image_size)),
+                todo="Calibrate at the size of the video, or correct match.yaml.",
+            )
+    return calibrations
+
+
+def _detections(folder: Path, spec: MatchSpec) -> dict[str, Path]:
+    known = [camera.id for camera in spec.static_cameras]
+    known += [clip.id for clip in spec.clips if clip.broadcast is not None]
+    found: dict[str, Path] = {}
+    files = sorted((folder / "detections").glob("*")) if (folder / "detections").is_dir() else []
+    for file in files:
+        if file.suffix not in (".json", ".npz") or file.name.startswith("."):
+            continue
+        if file.stem not in known:
+            raise InputError(
+                str(file),
+                expected=f"a static camera or a clip with a broadcast camera: {', '.join(known)}",
+                found=repr(file.stem),
+                todo="Rename or remove the file, or add the camera to match.yaml.",
+            )
+        if file.stem in found:
+            raise InputError(
+                str(file),
+                expected=f"one file for {file.stem}",
+                found=f"{found[file.stem].name} and {file.name}",
+                todo="Remove one of them.",
+            )
+        found[file.stem] = _existing(folder, f"detections/{file.name}", str(folder))
+    return found
+
+
+def _videos(folder: Path, spec: MatchSpec) -> dict[str, Path]:
+    videos: dict[str, Path] = {}
+    named: dict[str, Path] = {}
+    for index, camera in enumerate(spec.cameras):
+        if camera.video is not None:
+            where = f"{folder / 'match.yaml'}: cameras[{index}].video"
+            named[camera.id] = _existing(folder, camera.video, where, folders=True)
+    for camera in spec.static_cameras:
+        usual = f"videos/{camera.id}.mp4"
+        if camera.id in named:
+            videos[camera.id] = named[camera.id]
+        elif (folder / usual).exists():
+            videos[camera.id] = _existing(folder, usual, str(folder))
+    for clip in spec.clips:
+        usual = f"broadcast/{clip.id}.mp4"
+        if clip.broadcast is not None and (folder / usual).exists():
+            videos[clip.id] = _existing(folder, usual, str(folder))
+        elif clip.broadcast is not None and clip.broadcast in named:
+            videos[clip.id] = named[clip.broadcast]
+    return videos
+
+
+def _require_footage(
+    folder: Path, spec: MatchSpec, detections: Mapping[str, Path], videos: Mapping[str, Path]
+) -> None:
+    for camera in spec.static_cameras:
+        if camera.id not in detections and camera.id not in videos:
+            raise InputError(
+                str(folder),
+                expected=f"footage of every static camera of match.yaml, also of {camera.id}",
+                found=f"missing camera {camera.id}; there: {_listed({**videos, **detections})}",
+                todo=f"Add videos/{camera.id}.mp4 or detections/{camera.id}.json (or .npz).",
+            )
+    for clip in spec.clips:
+        if clip.broadcast is not None and clip.id not in detections and clip.id not in videos:
+            raise InputError(
+                str(folder),
+                expected=f"footage of broadcast camera {clip.broadcast} for clip {clip.id}",
+                found="none",
+                todo=f"Add broadcast/{clip.id}.mp4 or detections/{clip.id}.json (or .npz), or "
+                "take `broadcast` out of the clip.",
+            )
+
+
+def require_local(name: str, where: str) -> None:
+    """Refuse a name that is not plainly a place inside the match folder.
+
+    Raises:
+        InputError: an absolute path, one with `..`, or an empty one.
+    """
+    posix, windows = PurePosixPath(name), PureWindowsPath(name)
+    if not posix.parts or posix.is_absolute() or windows.anchor or ".." in posix.parts:
+        raise InputError(
+            where,
+            expected="a path inside the match folder, without ..",
+            found=repr(name),
+            todo="Move or copy the file into the match folder and name it from there.",
+        )
+
+
+def _existing(folder: Path, name: str, where: str, *, folders: bool = False) -> Path:
+    """The file `name` in the folder; refuses one that is absent or lies elsewhere."""
+    require_local(name, where)
+    path = folder / name
+    try:
+        there = path.is_file() or (folders and path.is_dir() and any(path.iterdir()))
+        inside = path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):  # no rights, a loop of links, a NUL in the name
+        there = False
+    if not there:
+        raise InputError(
+            where,
+            expected="a file, or a folder of images" if folders else "a file",
+            found=f"no {name!r}",
+            todo="Put it there, or correct the name.",
+        )
+    if not inside:
+        raise InputError(
+            where,
+            expected="a file inside the match folder",
+            found=f"{name!r}, a link that leads out of it",
+            todo="Copy the file into the match folder.",
+        )
+    return path
+
+
+def _listed(names: Mapping[str, object]) -> str:
+    return ", ".join(names) or "none"

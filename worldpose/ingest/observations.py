@@ -1,0 +1,59 @@
+"""The people that one camera saw, as a detector reported them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Detected people of one camera, frame by frame; absent ones are NaN.
+
+    Attributes:
+        frame: (frames,) int64, frame numbers, rising without gaps.
+        keypoints: (frames, detections, 17, 2) float32 [px], COCO-17; NaN where not found.
+        confidence: (frames, detections, 17) float32 in (0, 1]; NaN where not found.
+        boxes: (frames, detections, 4) float32 x0, y0, x1, y1 [px].
+        score: (frames, detections) float32, the detector's confidence of each person.
+    """
+
+    frame: NDArray[np.int64]
+    keypoints: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    boxes: NDArray[np.float32]
+    score: NDArray[np.float32]
+
+    def rows(self, rows: slice | NDArray[np.intp]) -> Observations:
+        """The same people on some rows of the frame dimension."""
+        return Observations(
+            frame=self.frame[rows],
+            keypoints=self.keypoints[rows],
+            confidence=self.confidence[rows],
+            boxes=self.boxes[rows],
+            score=self.score[rows],
+        )
+
+    def on_frames(self, first_frame: int, frame_count: int) -> Observations:
+        """The same people on exactly these frames; a frame that was not seen is all NaN."""
+        kept = self.rows(
+            np.flatnonzero((self.frame >= first_frame) & (self.frame < first_frame + frame_count))
+        )
+        row = kept.frame - first_frame
+        padded = {}
+        for name, array in kept.arrays().items():
+            padded[name] = np.full((frame_count, *array.shape[1:]), np.nan, dtype=np.float32)
+            padded[name][row] = array
+        frame = np.arange(first_frame, first_frame + frame_count, dtype=np.int64)
+        return Observations(frame=frame, **padded)
+
+    def arrays(self) -> dict[str, NDArray[np.float32]]:
+        """The stored arrays by name, as in `data_contracts.observations`."""
+        return {
+            "keypoints": self.keypoints,
+            "confidence": self.confidence,
+            "boxes": self.boxes,
+            "score": self.score,
+        }

@@ -1,0 +1,120 @@
+"""What a match is: the digest of every file that it consists of."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from pathlib import Path
+from typing import Final
+
+from data_contracts.match import Registration, SourceFile
+from worldpose.errors import InputError
+from worldpose.ingest.match_folder import MatchFolder, pitch_file
+
+SETTLE_SECONDS: Final = 0.5
+"""A file that changed this recently is looked at again; recorders and copies write far oftener."""
+
+
+def register_match(match: MatchFolder, previous: Registration | None) -> Registration:
+    """The match with the SHA-256 of its files, and the identity that says which match it is.
+
+    Registered are match.yaml, calibration.toml, the pitch file, videos, stills, detections and
+    annotations; `reference/` is not part of a match. The identity covers the paths and contents of
+    videos, detections and pitch alone, so neither the folder's name nor an edited click, roster or
+    calibration makes another match.
+
+    Args:
+        match: as read by `read_match`.
+        previous: the last registration of this folder, if any. A file whose size and modification
+            time are as registered keeps its digest. That is only a shortcut, as in git: a file
+            changed behind both keeps its old digest; without `previous` all is read.
+
+    Raises:
+        InputError: a file is empty, cannot be read, or is still being written.
+    """
+    folder = str(match.folder.resolve())
+    known: dict[tuple[str, int, int], str] = {}
+    if previous is not None and previous.folder == folder:
+        known = {(file.path, file.size, file.modified_ns): file.sha256 for file in previous.files}
+    identifying = _identifying_files(match)
+    paths = sorted({*identifying, *_further_files(match)})
+    files = tuple(_source_file(match.folder, path, known) for path in paths)
+    _require_settled(match.folder, files)
+    identity = hashlib.sha256()
+    for file in files:
+        if file.path in identifying:
+            identity.update(f"{file.sha256} {file.path}\n".encode())
+    return Registration(spec=match.spec, folder=folder, identity=identity.hexdigest(), files=files)
+
+
+def _identifying_files(match: MatchFolder) -> set[str]:
+    pitch = pitch_file(match.folder, match.spec)
+    roots = [*match.videos.values(), *match.detections.values(), *([pitch] if pitch else [])]
+    return {path for root in roots for path in _files_under(match.folder, root)}
+
+
+def _further_files(match: MatchFolder) -> set[str]:
+    names = ["match.yaml", "calibration.toml", "annotations"]
+    for camera in match.spec.cameras:
+        usual = f"stills/{camera.id}.png"
+        names.append(camera.still if camera.still is not None else usual)
+    roots = [match.folder / name for name in names]
+    return {path for root in roots for path in _files_under(match.folder, root)}
+
+
+def _files_under(folder: Path, root: Path) -> list[str]:
+    """`root`, or the files in and below it, relative to the match folder; hidden ones are not."""
+    if root.is_file():
+        return [root.relative_to(folder).as_posix()]
+    return [
+        (Path(parent) / name).relative_to(folder).as_posix()
+        for parent, _, names in os.walk(root)
+        for name in names
+        if not name.startswith(".")
+    ]
+
+
+def _source_file(folder: Path, path: str, known: dict[tuple[str, int, int], str]) -> SourceFile:
+    try:
+        before = (folder / path).stat()
+        if before.st_size == 0:
+            raise InputError(
+                str(folder / path),
+                expected="a file with content",
+                found="0 bytes",
+                todo="Copy it again, or wait until it is written.",
+            )
+        sha256 = known.get((path, before.st_size, before.st_mtime_ns))
+        if sha256 is None:
+            with (folder / path).open("rb") as file:
+                sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(
+            str(folder / path),
+            expected="a readable file",
+            found=str(error),
+            todo="Check its rights, or wait until it is written.",
+        ) from error
+    return SourceFile(path=path, size=before.st_size, modified_ns=before.st_mtime_ns, sha256=sha256)
+
+
+def _require_settled(folder: Path, files: tuple[SourceFile, ...]) -> None:
+    """Refuse files that changed while they were read, or that change a moment later."""
+    newest = max(file.modified_ns for file in files) / 1e9
+    wait = newest + SETTLE_SECONDS - time.time()
+    if 0 < wait <= SETTLE_SECONDS:
+        time.sleep(wait)
+    for file in files:
+        try:
+            now = (folder / file.path).stat()
+            same = (now.st_size, now.st_mtime_ns) == (file.size, file.modified_ns)
+        except OSError:
+            same = False
+        if not same:
+            raise InputError(
+                str(folder / file.path),
+                expected="a finished file",
+                found="one that is still being written",
+                todo="Wait until it is complete, then ingest again.",
+            )

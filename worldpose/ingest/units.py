@@ -1,0 +1,72 @@
+"""What a match folder brought in for one camera, on the match's clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from data_contracts.cameras import CameraCalibration
+from data_contracts.match import MatchSpec
+from worldpose.errors import InputError
+from worldpose.ingest.keypoint_files import read_observations
+from worldpose.ingest.match_folder import MatchFolder
+from worldpose.ingest.observations import Observations
+
+
+@dataclass(frozen=True)
+class UnitFrames:
+    """How the frames of a static camera, or of a clip's broadcast camera, lie in the match.
+
+    Attributes:
+        first: first match frame.
+        count: number of frames.
+        offset: match frame = camera frame - offset.
+    """
+
+    first: int
+    count: int
+    offset: int
+
+
+def unit_frames(spec: MatchSpec, unit_id: str) -> UnitFrames:
+    """The frames of a unit: all clips for a static camera, its clip for a broadcast camera.
+
+    A broadcast offset that is not whole is taken to the nearest frame; the rest stays in the
+    clip's `broadcast_offset_frames`.
+    """
+    clips = spec.clips
+    if unit_id in {clip.id for clip in clips}:
+        clip = spec.clip(unit_id)
+        clips = (clip,)
+        offset = round(clip.broadcast_offset_frames) - clip.first_frame
+    else:
+        offset = int(spec.camera(unit_id).offset_frames)
+    first = min(clip.first_frame for clip in clips)
+    stop = max(clip.first_frame + clip.frame_count for clip in clips)
+    return UnitFrames(first, stop - first, offset)
+
+
+def read_unit(match: MatchFolder, unit_id: str) -> tuple[Observations, CameraCalibration | None]:
+    """The people and the given calibration of a static camera, or of a clip's broadcast camera.
+
+    Args:
+        match: as read by `read_match`.
+        unit_id: id of a static camera, or of a clip that names a broadcast camera.
+
+    Returns:
+        Observations with `frame` in match frames, and the calibration where one is given.
+
+    Raises:
+        InputError: the match has no such unit, or no detections for it, or they are not in order.
+    """
+    if unit_id not in match.detections:
+        raise InputError(
+            str(match.folder / "detections"),
+            expected=f"2D poses of {unit_id!r} ({unit_id}.json or {unit_id}.npz)",
+            found=f"those of {', '.join(match.detections) or 'none'}",
+            todo="Add the file, or correct the name.",
+        )
+    frames = unit_frames(match.spec, unit_id)
+    people = read_observations(
+        match.detections[unit_id], frames.first + frames.offset, frames.count
+    )
+    return replace(people, frame=people.frame - frames.offset), match.calibrations.get(unit_id)

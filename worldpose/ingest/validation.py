@@ -1,0 +1,113 @@
+"""Plain data as a contract's record; what does not fit is an `InputError` naming file and key."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from difflib import get_close_matches
+from typing import Any, Final, TypeVar, get_args
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+from data_contracts.records import Record
+from worldpose.errors import InputError
+
+R = TypeVar("R", bound=Record)
+
+_NAME_RULE: Final = "up to 64 letters, digits and . _ - with a letter or digit first"
+
+
+def validate_record(model: type[R], data: object, file: str) -> R:
+    """The record that `data` from `file` describes; nothing is converted, nothing is skipped.
+
+    Args:
+        model: the contract.
+        data: mappings, lists, text and numbers, as a YAML or JSON reader returns them.
+        file: name of the file for messages.
+
+    Raises:
+        InputError: a key is unknown or missing, or a value does not fit; a misspelt key is named
+            before the key that is missing because of it.
+    """
+    try:
+        text = json.dumps(data)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            file,
+            expected="mappings, lists, text and numbers",
+            found=str(error),
+            todo="Write plain values.",
+        ) from error
+    try:
+        # Through JSON, so that strict rules hold (no "25" for 25) yet a list is a tuple.
+        return model.model_validate_json(text, strict=True)
+    except ValidationError as error:
+        details = error.errors(include_url=False)
+    # An entry that fails leaves its list "too short" as well: only the deepest errors are causes.
+    within = {detail["loc"][:n] for detail in details for n in range(len(detail["loc"]))}
+    details = [detail for detail in details if detail["loc"] not in within]
+    details.sort(key=lambda detail: detail["type"] != "extra_forbidden")
+    raise _input_error(model, details[0], file, len(details) - 1)
+
+
+def _input_error(model: type[Record], detail: ErrorDetails, file: str, others: int) -> InputError:
+    kind, value, context = detail["type"], detail["input"], detail.get("ctx", {})
+    place = _place(detail["loc"])
+    expected = detail["msg"].removeprefix("Input should be ")
+    found, todo = _brief(value), "Correct this value."
+    if kind == "extra_forbidden":
+        key = str(detail["loc"][-1])
+        known = _known_keys(model, detail["loc"][:-1])
+        close = get_close_matches(key, known, n=1)
+        expected, found = f"one of the keys {', '.join(known)}", f"the unknown key {key!r}"
+        todo = f"Did you mean {close[0]!r}?" if close else "Remove it."
+    elif kind == "model_type":
+        expected = "a mapping"
+    elif kind == "missing":
+        expected, found, todo = "a value", "nothing", "Add this key."
+    elif kind == "string_pattern_mismatch":
+        expected, todo = _NAME_RULE, "Rename it."
+    elif kind == "string_type" and isinstance(value, int | float):
+        todo = f"Put it in quotes: '{value}'."
+    elif kind in ("too_short", "too_long"):
+        bound = context.get("min_length", context.get("max_length"))
+        expected = f"{'at least' if kind == 'too_short' else 'at most'} {bound} entries"
+        found, todo = f"{context.get('actual_length')}", "Correct this list."
+    elif kind == "value_error":
+        expected, found = "entries that agree", str(context.get("error"))
+        todo = "Correct the entries that are named."
+    elif place == "contract":
+        todo = "Use the version of worldpose that this file was written for."
+    if others:
+        todo += f" ({others} more to correct in this file.)"
+    return InputError(
+        f"{file}: {place}" if place else file, expected=expected, found=found, todo=todo
+    )
+
+
+def _place(loc: tuple[int | str, ...]) -> str:
+    """Keys as a person writes them: `cameras[2].kind`."""
+    return "".join(
+        f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc
+    ).removeprefix(".")
+
+
+def _brief(value: object) -> str:
+    if isinstance(value, Mapping):
+        return "a mapping"
+    if isinstance(value, list | tuple):
+        return f"a list of {len(value)}"
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _known_keys(model: type[Record], loc: tuple[int | str, ...]) -> list[str]:
+    """Keys of the record at `loc` inside `model`."""
+    kind: Any = model
+    for part in loc:
+        if isinstance(kind, type) and issubclass(kind, Record):
+            kind = kind.model_fields[str(part)].annotation
+        else:  # tuple[Record, ...] or dict[Name, Record]
+            kind = get_args(kind)[1 if isinstance(part, str) else 0]
+    return list(kind.model_fields)

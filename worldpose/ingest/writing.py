@@ -1,0 +1,150 @@
+"""Match folders written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import yaml
+
+from data_contracts.cameras import CameraCalibration
+from data_contracts.match import MatchSpec
+from data_contracts.pitch import PitchSpec
+from worldpose.errors import InputError
+from worldpose.ingest.calibration_files import write_calibration_toml
+from worldpose.ingest.keypoint_arrays import read_keypoint_arrays, write_keypoint_arrays
+from worldpose.ingest.match_folder import NO_PITCH, read_match, require_local
+from worldpose.ingest.observations import Observations
+
+
+def write_match(
+    folder: Path,
+    spec: MatchSpec,
+    *,
+    calibrations: Mapping[str, CameraCalibration],
+    observations: Mapping[str, Observations],
+    pitch: PitchSpec | None = None,
+    references: Callable[[Path], None] | None = None,
+) -> None:
+    """Write a match folder that `read_match` accepts, all or nothing.
+
+    The folder is built and read back beside its place, synced to disk and renamed into place.
+
+    Args:
+        folder: absent, or an empty folder.
+        spec: match.yaml.
+        calibrations: static cameras by id.
+        observations: by id of a static camera or clip; `frame` is the camera's (or the broadcast
+            clip's) own frame number, as in the files, not the match frame.
+        pitch: written to the file that `spec.pitch` names, else to pitch.json.
+        references: called with the match folder under construction, to add `reference/`.
+
+    Raises:
+        InputError: the folder is there and not empty, or what is given contradicts itself.
+    """
+    _require_known(spec, [*calibrations, *observations])
+    require_local(spec.pitch or "pitch.json", "match.yaml: pitch")
+    _require_empty(folder)
+    _make_parent(folder)
+    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as workshop:
+        # One level down: a temporary folder is private, the match has the usual rights.
+        building = Path(workshop) / folder.name
+        (building / "detections").mkdir(parents=True)
+        (building / "match.yaml").write_text(_yaml(spec), encoding="utf-8")
+        if calibrations:
+            write_calibration_toml(building / "calibration.toml", calibrations)
+        for name, people in observations.items():
+            file = building / "detections" / f"{name}.npz"
+            write_keypoint_arrays(file, people)
+            read_keypoint_arrays(file)
+        if pitch is not None:
+            _write_pitch(building, spec, pitch)
+        if references is not None:
+            references(building)
+        read_match(building)
+        _sync(building)
+        try:
+            building.rename(folder)  # replaces an empty folder, fails on any other
+        except OSError:
+            _require_empty(folder)
+            raise
+    _sync_folder(folder.parent)
+
+
+def _require_known(spec: MatchSpec, names: list[str]) -> None:
+    known = [camera.id for camera in spec.cameras] + [clip.id for clip in spec.clips]
+    for name in names:
+        if name not in known:
+            raise InputError(
+                f"match {spec.match_id}",
+                expected=f"data of its cameras and clips: {', '.join(known)}",
+                found=repr(name),
+                todo="Add the camera to the match, or leave its data out.",
+            )
+
+
+def _make_parent(folder: Path) -> None:
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            str(folder),
+            expected="a place where a folder can be made",
+            found=str(error),
+            todo="Choose another place.",
+        ) from error
+
+
+def _require_empty(folder: Path) -> None:
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        found = "a link or file"
+    elif folder.is_dir() and any(folder.iterdir()):
+        found = "a folder with files in it"
+    else:
+        return
+    raise InputError(
+        str(folder),
+        expected="nothing, or an empty folder",
+        found=found,
+        todo="Choose another name, or remove it first; it was left as it was.",
+    )
+
+
+def _yaml(spec: MatchSpec) -> str:
+    content = spec.model_dump(mode="json", exclude_none=True)
+    if not spec.roster:
+        del content["roster"]
+    text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+    return text
+
+
+def _write_pitch(folder: Path, spec: MatchSpec, pitch: PitchSpec) -> None:
+    if spec.pitch == NO_PITCH:
+        raise InputError(
+            "match.yaml: pitch",
+            expected="a pitch file's name, or nothing, where a pitch is given",
+            found=repr(NO_PITCH),
+            todo="Give no pitch, or take `pitch: none` out.",
+        )
+    path = folder / (spec.pitch or "pitch.json")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(pitch.model_dump_json(indent=2) + "\n", encoding="utf-8")
+
+
+def _sync(folder: Path) -> None:
+    """Make every file of the tree and every folder entry survive a power cut."""
+    for parent, _, names in os.walk(folder):
+        for name in names:
+            with (Path(parent) / name).open("rb") as file:
+                os.fsync(file.fileno())
+        _sync_folder(Path(parent))
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,218 @@
+"""The pitch as a non-planar template: named points, markings and the crowned surface."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from data_contracts.pitch import ArcSpec, LineSpec, PitchSpec
+from worldpose.errors import InputError
+from worldpose.pitch.laws import (
+    CIRCLE_RADIUS,
+    PENALTY_AREA,
+    PENALTY_MARK_DISTANCE,
+    law_arcs,
+    law_lines,
+    law_points,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class MarkingSamples:
+    """Points along the painted markings, each with the marking that it lies on."""
+
+    points_world: NDArray[np.float64]
+    """(n, 3) [m], world."""
+    marking: NDArray[np.int64]
+    """(n,) indices into `names`."""
+    names: tuple[str, ...]
+    """The markings."""
+
+
+@dataclass(frozen=True, eq=False)
+class PitchTemplate:
+    """One stadium's pitch in the world frame: Law 1 of the Game, surveyed points, a crown.
+
+    Note:
+        C1. The surface is a parabolic ridge along x through the origin, so heights are negative
+        off the long axis; the paper states the crown's size, about 0.2 m, and not its profile.
+    """
+
+    length: float
+    """Between the centres of the goal lines [m]."""
+    width: float
+    """Between the centres of the touch lines [m]."""
+    crown: float
+    """Height of the long axis above the touch lines [m]."""
+    points: dict[str, NDArray[np.float64]]
+    """(3,) [m], world, by name. Law 1 gives, for side in left (negative x), right and end in near
+    (negative y), far: `center_mark`, `halfway_{end}`, `center_circle_{end}` (its crossings with
+    the halfway line), `corner_{side}_{end}`, `penalty_mark_{side}`, `penalty_arc_{side}_{end}`
+    (its ends on the penalty area's line), `penalty_area_{side}_{end}_back` (on the goal line) and
+    `_front`, `goal_area_{side}_{end}_back` and `_front`, `goal_post_{side}_{end}_bottom` and
+    `_top`."""
+    lines: dict[str, LineSpec]
+    """`touch_line_{end}`, `goal_line_{side}`, `halfway_line`, and for both kinds of area
+    `penalty_area_{side}_front`, `penalty_area_{side}_{end}`."""
+    arcs: dict[str, ArcSpec]
+    """`center_circle`, `penalty_arc_{side}`, `corner_arc_{side}_{end}`."""
+
+    @classmethod
+    def standard(cls) -> PitchTemplate:
+        """Return the pitch of a match without pitch.json: 105 x 68 m, a crown of 0.2 m."""
+        return cls.from_spec(PitchSpec())
+
+    @classmethod
+    def from_spec(cls, spec: PitchSpec) -> PitchTemplate:
+        """Return the pitch of pitch.json.
+
+        Raises:
+            InputError: the penalty areas do not fit, a marking names an unknown point, or an arc
+                does not run forward by at most a full circle.
+        """
+        _check_size(spec)
+        points = {
+            name: np.array([x, y, above + _ridge(y, spec.width, spec.crown)])
+            for name, (x, y, above) in law_points(spec.length, spec.width).items()
+        }
+        points.update({name: np.array(place) for name, place in spec.points.items()})
+        for place in points.values():
+            place.setflags(write=False)
+        lines = {**law_lines(), **spec.lines}
+        arcs = {**law_arcs(), **spec.arcs}
+        _check_markings(points, lines, arcs)
+        return cls(spec.length, spec.width, spec.crown, points, lines, arcs)
+
+    def height(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
+        """Return the height of the surface [m], continued beyond the touch lines.
+
+        Args:
+            x: (...) [m], world.
+            y: (...) [m], world.
+        """
+        along, across = np.broadcast_arrays(
+            np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+        )
+        # Adding 0 x keeps a missing x missing.
+        return np.asarray(_ridge(across, self.width, self.crown) + 0.0 * along)
+
+    def positions(self, names: Sequence[str]) -> NDArray[np.float64]:
+        """Return named points (n, 3) [m], world.
+
+        Raises:
+            InputError: a name is unknown.
+        """
+        for name in names:
+            if name not in self.points:
+                raise _unknown_point("PitchTemplate.positions", name, self.points)
+        return np.array([self.points[name] for name in names], dtype=np.float64).reshape(-1, 3)
+
+    def sample_lines(self, spacing: float) -> MarkingSamples:
+        """Return points along all markings, both ends included, evenly spaced in plan.
+
+        Between its ends a marking follows the crown. Where surveyed ends lie above or below the
+        crown, the marking takes their offsets, changing evenly from one end to the other.
+
+        Args:
+            spacing: largest distance in plan between neighbours on one marking [m].
+
+        Raises:
+            InputError: the spacing is not positive.
+        """
+        if not spacing > 0.0:
+            raise InputError(
+                "PitchTemplate.sample_lines: spacing",
+                expected="a positive distance [m]",
+                found=f"{spacing}",
+                todo="Give for example 0.25.",
+            )
+        samples = [self._line_points(line, spacing) for line in self.lines.values()]
+        samples += [self._arc_points(arc, spacing) for arc in self.arcs.values()]
+        counts = [len(points) for points in samples]
+        return MarkingSamples(
+            points_world=np.concatenate(samples),
+            marking=np.repeat(np.arange(len(samples)), counts),
+            names=(*self.lines, *self.arcs),
+        )
+
+    def _line_points(self, line: LineSpec, spacing: float) -> NDArray[np.float64]:
+        start, end = self.points[line.start], self.points[line.end]
+        steps = _steps(float(np.linalg.norm(end[:2] - start[:2])), spacing)
+        share = np.linspace(0.0, 1.0, steps + 1)[:, None]
+        points = (1.0 - share) * self._above_surface(start) + share * self._above_surface(end)
+        points[:, 2] += self.height(points[:, 0], points[:, 1])
+        return points
+
+    def _arc_points(self, arc: ArcSpec, spacing: float) -> NDArray[np.float64]:
+        span = arc.end_angle - arc.start_angle
+        steps = _steps(span * arc.radius, spacing)
+        angle = np.linspace(arc.start_angle, arc.end_angle, steps + 1)
+        if math.isclose(span, 2.0 * math.pi):
+            angle = angle[:-1]  # its end is its start
+        points = np.tile(self._above_surface(self.points[arc.center]), (len(angle), 1))
+        points[:, 0] += arc.radius * np.cos(angle)
+        points[:, 1] += arc.radius * np.sin(angle)
+        points[:, 2] += self.height(points[:, 0], points[:, 1])
+        return points
+
+    def _above_surface(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return (3,) x, y and the height above the crowned surface [m]."""
+        x, y, z = point
+        return np.array([x, y, z - float(self.height(x, y))])
+
+
+def _ridge(
+    y: float | NDArray[np.float64], width: float, crown: float
+) -> float | NDArray[np.float64]:
+    """Return the height of the surface at y [m]; 0 - keeps the long axis free of negative zero."""
+    return 0.0 - crown * (y / (0.5 * width)) ** 2
+
+
+def _steps(extent: float, spacing: float) -> int:
+    # Rounding of the extent must not add a step to a whole number of them.
+    return max(1, math.ceil(extent / spacing - 1e-9))
+
+
+def _check_size(spec: PitchSpec) -> None:
+    """Raise InputError unless the prescribed markings fit into the pitch."""
+    least_length = 2.0 * (PENALTY_MARK_DISTANCE + 2.0 * CIRCLE_RADIUS)
+    if spec.length <= least_length or spec.width <= PENALTY_AREA[1]:
+        raise InputError(
+            "pitch: length and width",
+            expected=f"more than {least_length:g} x {PENALTY_AREA[1]:g} m, room for the markings",
+            found=f"{spec.length:g} x {spec.width:g}",
+            todo="Give metres between the centres of the outer lines.",
+        )
+
+
+def _check_markings(
+    points: dict[str, NDArray[np.float64]], lines: dict[str, LineSpec], arcs: dict[str, ArcSpec]
+) -> None:
+    """Raise InputError unless markings name known points and arcs run once around at most."""
+    for name, line in lines.items():
+        for point in (line.start, line.end):
+            if point not in points:
+                raise _unknown_point(f"pitch: lines.{name}", point, points)
+    for name, arc in arcs.items():
+        if arc.center not in points:
+            raise _unknown_point(f"pitch: arcs.{name}", arc.center, points)
+        if not 0.0 < arc.end_angle - arc.start_angle <= 2.0 * math.pi + 1e-6:
+            raise InputError(
+                f"pitch: arcs.{name}",
+                expected="end_angle above start_angle by at most 2 pi",
+                found=f"{arc.start_angle:g} to {arc.end_angle:g} rad",
+                todo="Measure angles in radians from x towards y; add 2 pi to the end if needed.",
+            )
+
+
+def _unknown_point(where: str, name: str, points: dict[str, NDArray[np.float64]]) -> InputError:
+    return InputError(
+        where,
+        expected="the name of a point",
+        found=repr(name),
+        todo=f"Add it to points, or use one of {', '.join(sorted(points))}.",
+    )

@@ -1,0 +1,28 @@
+"""Release: results in the forms that other tools and people read.
+
+Inputs: joints, cameras, observations and figures of a run, as plain arrays and records.
+Outputs: joints files, WorldPose cameras, COCO keypoints, one HTML report; pictures are in
+`worldpose.release.pictures`, which loads matplotlib.
+"""
+
+from worldpose.release.archives import Member, read_archive, write_archive
+from worldpose.release.camera_file import write_static_camera
+from worldpose.release.coco import coco_dataset, write_coco
+from worldpose.release.files import whole_file
+from worldpose.release.joints_file import JointTracks, read_joints, write_joints
+from worldpose.release.report import Picture, report_page
+
+__all__ = [
+    "JointTracks",
+    "Member",
+    "Picture",
+    "coco_dataset",
+    "read_archive",
+    "read_joints",
+    "report_page",
+    "whole_file",
+    "write_archive",
+    "write_coco",
+    "write_joints",
+    "write_static_camera",
+]

@@ -1,0 +1,240 @@
+"""Pictures of a reconstruction: everybody's way seen from above, and one camera's view."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.patheffects import withStroke
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17_BONES
+from data_contracts.pitch import PitchSpec
+from worldpose.cameras import Camera
+from worldpose.pitch import PitchTemplate
+from worldpose.release.joints_file import JointTracks
+
+PALETTE: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6b4c9a")
+"""One colour a person, after Okabe and Ito: apart for people with any colour vision."""
+
+INK: Final = "#2b2b2b"
+PALE: Final = "#9a9a9a"
+GRASS: Final = "#f1f5ef"
+LINE: Final = "#b5c4b1"
+_HALO: Final = [withStroke(linewidth=2.5, foreground="white")]
+_HIPS: Final = (11, 12)
+
+
+def paths_picture(
+    tracks: JointTracks,
+    *,
+    truth: JointTracks | None = None,
+    cameras: Mapping[str, Camera] | None = None,
+    pitch: PitchSpec | None = None,
+) -> bytes:
+    """Return a PNG of everybody's way over the ground: the whole place, and people close up.
+
+    Args:
+        tracks: a dot a frame and person, with the person's id at the end of its way.
+        truth: true ways, as broad grey lines under the dots.
+        cameras: single cameras by id, as triangles.
+        pitch: its markings are drawn; None where there is no pitch.
+    """
+    ways = _ground(tracks)
+    true_ways = _ground(truth) if truth is not None else np.empty((0, 0, 2))
+    everywhere = np.concatenate([ways.reshape(-1, 2), true_ways.reshape(-1, 2)])
+    everywhere = everywhere[np.isfinite(everywhere[:, 0])]
+    if not len(everywhere):
+        everywhere = np.zeros((1, 2))
+    close = _frame(everywhere, 2.0)
+    centers = {name: camera.center[:2] for name, camera in (cameras or {}).items()}
+    corners = [everywhere, *(center[None] for center in centers.values())]
+    if pitch is not None:
+        corners.append(0.5 * np.array([[-pitch.length, -pitch.width], [pitch.length, pitch.width]]))
+    whole = _frame(np.concatenate(corners), 6.0)
+
+    figure = Figure(figsize=(14.0, 5.7), dpi=110, layout="constrained", facecolor="white")
+    overview, detail = figure.subplots(1, 2)
+    for axes, (low, high) in ((overview, whole), (detail, close)):
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+        axes.set_xlabel("x, along the touch line [m]", color=INK)
+        axes.set_ylabel("y, across [m]", color=INK)
+        _style(axes)
+        if pitch is not None:
+            _draw_pitch(axes, pitch)
+    for way in true_ways.swapaxes(0, 1):
+        overview.plot(*way.T, color="#c9c9c9", linewidth=2.0, zorder=3)
+        detail.plot(*way.T, color="#cfcfcf", linewidth=6.0, solid_capstyle="round", zorder=3)
+    for person_id, way in zip(tracks.person_ids, ways.swapaxes(0, 1), strict=True):
+        color = _color(int(person_id))
+        overview.plot(*way.T, color=color, linewidth=1.2, zorder=4)
+        detail.plot(*way.T, ".", color=color, markersize=4.0, zorder=4)
+        last = way[np.isfinite(way[:, 0])][-1:]
+        detail.plot(*last.T, "o", color=color, markersize=9.0, markeredgecolor="white", zorder=5)
+        for x, y in last:
+            _label(detail, f"{person_id}", (x, y), (7, 7), color)
+    for name, center in centers.items():
+        overview.plot(*center, "^", color=INK, markersize=8.0, zorder=5)
+        _label(overview, name, (center[0], center[1]), (6, 6), INK)
+    (x0, y0), (x1, y1) = close
+    overview.add_patch(
+        Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, color=PALE, linewidth=1.0, linestyle=":")
+    )
+    overview.set_title("The whole place, cameras as triangles", color=INK, loc="left", fontsize=12)
+    shown = "dots: found, grey: true" if truth is not None else "a dot a frame"
+    detail.set_title(
+        f"People close up ({shown}, id at the end)", color=INK, loc="left", fontsize=12
+    )
+    return _png(figure)
+
+
+def view_picture(
+    camera: Camera,
+    title: str,
+    *,
+    detections: NDArray[np.floating],
+    joints: NDArray[np.float64],
+    person_ids: Sequence[int] | NDArray[np.int64],
+    pitch: PitchSpec | None = None,
+) -> bytes:
+    """Return a PNG of one frame as one camera has it: what was detected and what was found.
+
+    It shows the part of the picture with people in it, at least half as wide as the picture.
+
+    Args:
+        camera: a single camera.
+        title: says which camera and frame.
+        detections: (detections, 17, 2) [px], in grey.
+        joints: (persons, 17, 3) [m], world, reprojected, one colour a person.
+        person_ids: (persons,).
+        pitch: its markings are drawn; None where there is no pitch.
+    """
+    width, height = (int(n) for n in camera.image_size)
+    figure = Figure(figsize=(14.0, 14.0 * height / width + 0.7), dpi=110, facecolor="white")
+    figure.set_layout_engine("constrained")
+    axes = figure.subplots()
+    reprojected = [camera.project(person) for person in joints]
+    (left, top), (right, bottom) = _crop(np.array([width, height]), [*detections, *reprojected])
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+    axes.set_facecolor(GRASS if pitch is not None else "#f6f6f6")
+    axes.set_xlabel("u [px]", color=INK)
+    axes.set_ylabel("v [px]", color=INK)
+    _style(axes)
+    for line in _markings(pitch) if pitch is not None else ():
+        axes.plot(*camera.project(line).T, color="white", linewidth=2.5, zorder=1)
+    for keypoints in detections:
+        _skeleton(axes, keypoints, "#8f8f8f", 4.0, zorder=2)
+    for person_id, keypoints in zip(person_ids, reprojected, strict=True):
+        color = _color(int(person_id))
+        _skeleton(axes, keypoints, color, 1.8, zorder=3)
+        seen = keypoints[np.isfinite(keypoints[:, 0])]
+        if len(seen):
+            u, v = seen[np.argmin(seen[:, 1])]
+            _label(axes, f"{person_id}", (u, v), (0, 8), color)
+    axes.set_title(f"{title} (grey: detected, colour: reprojected 3D)", color=INK, loc="left")
+    return _png(figure)
+
+
+def _ground(tracks: JointTracks) -> NDArray[np.float64]:
+    """Mid-hips on the ground (frames, persons, 2) [m]."""
+    middle: NDArray[np.float64] = tracks.joints[..., _HIPS, :2].mean(axis=-2)
+    return middle
+
+
+def _frame(
+    points: NDArray[np.float64], margin: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Corners of a box around points, widened to 4:3 so that both halves fill their place."""
+    low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
+    half = 0.5 * (high - low)
+    half = np.maximum(half, [half[1] * 4.0 / 3.0, half[0] * 3.0 / 4.0])
+    middle = 0.5 * (low + high)
+    return middle - half, middle + half
+
+
+def _crop(
+    size: NDArray[np.int64], people: Sequence[NDArray[np.floating]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Corners [px] of the part of the picture with everybody in it, cut to its proportions."""
+    whole = size.astype(np.float64)
+    points = np.concatenate([np.empty((0, 2)), *people])
+    points = points[np.all((points >= -0.5) & (points <= whole - 0.5), axis=-1)]
+    if not len(points):
+        return np.full(2, -0.5), whole - 0.5
+    low, high = points.min(axis=0), points.max(axis=0)
+    part = whole * np.clip(np.max((high - low + 160.0) / whole), 0.5, 1.0)
+    corner = np.clip(0.5 * (low + high - part), -0.5, whole - 0.5 - part)
+    return corner, corner + part
+
+
+def _draw_pitch(axes: Axes, pitch: PitchSpec) -> None:
+    corner = (-0.5 * pitch.length, -0.5 * pitch.width)
+    axes.add_patch(Rectangle(corner, pitch.length, pitch.width, color=GRASS, zorder=0))
+    for line in _markings(pitch):
+        axes.plot(line[:, 0], line[:, 1], color=LINE, linewidth=1.2, zorder=1)
+
+
+def _markings(pitch: PitchSpec) -> list[NDArray[np.float64]]:
+    """The painted lines as polylines (n, 3) [m], world; samples every half metre look smooth."""
+    template = PitchTemplate.from_spec(pitch)
+    samples = template.sample_lines(0.5)
+    lines = []
+    for marking, name in enumerate(samples.names):
+        line = samples.points_world[samples.marking == marking]
+        arc = template.arcs.get(name)
+        if arc is not None and np.isclose(arc.end_angle - arc.start_angle, 2.0 * np.pi):
+            line = np.concatenate([line, line[:1]])
+        lines.append(line)
+    return lines
+
+
+def _skeleton(
+    axes: Axes, keypoints: NDArray[np.floating], color: str, width: float, zorder: int
+) -> None:
+    """Bones and joints of one person (17, 2) [px]; what is NaN is not drawn."""
+    gap = np.full((len(COCO17_BONES), 1, 2), np.nan)
+    bones = np.concatenate([keypoints[np.array(COCO17_BONES)], gap], axis=1).reshape(-1, 2)
+    axes.plot(*bones.T, color=color, linewidth=width, solid_capstyle="round", zorder=zorder)
+    axes.plot(*keypoints.T, ".", color=color, markersize=2.2 * width, zorder=zorder)
+
+
+def _label(
+    axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, float], color: str
+) -> None:
+    axes.annotate(
+        text,
+        at,
+        xytext=offset,
+        textcoords="offset points",
+        color=color,
+        fontsize=11,
+        fontweight="bold",
+        ha="center" if offset[0] == 0 else "left",
+        path_effects=_HALO,
+        zorder=6,
+        annotation_clip=True,
+    )
+
+
+def _style(axes: Axes) -> None:
+    axes.tick_params(colors=INK, labelsize=9, length=3)
+    for spine in axes.spines.values():
+        spine.set_color("#d0d0d0")
+
+
+def _color(person_id: int) -> str:
+    return PALETTE[person_id % len(PALETTE)]
+
+
+def _png(figure: Figure) -> bytes:
+    """The figure as PNG; no date or version in it, so the same figure has the same bytes."""
+    picture = io.BytesIO()
+    FigureCanvasAgg(figure)
+    figure.savefig(picture, format="png", metadata={"Software": None})
+    return picture.getvalue()

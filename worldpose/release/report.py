@@ -1,0 +1,204 @@
+"""One HTML page about a run: what was done, how good it is, and what it looks like."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Final
+
+from data_contracts.evaluation import Evaluation
+from data_contracts.run import RunRecord
+
+MEANINGS: Final = {
+    "mpjpe_mm": (
+        "Mean joint error",
+        "mm",
+        "how far a found joint is from the true one on average, in world coordinates as they are",
+    ),
+    "pcp3d": (
+        "Correct limbs",
+        "%",
+        "limbs whose ends are off by at most half the limb's length; missing ones count as wrong",
+    ),
+    "coverage": ("People found", "%", "share of the true people of all frames that were found"),
+    "joint_coverage": ("Joints found", "%", "share of the true joints that have a found one"),
+    "false_persons_per_frame": (
+        "False people",
+        "per frame",
+        "people reported where nobody is, on average",
+    ),
+    "persons": ("True people", "", "who can be seen well enough to be scored"),
+    "frames": ("Frames scored", "", "all frames of the reference"),
+}
+"""Label, unit and plain meaning of every score; shares are shown in per cent."""
+
+_SHARES: Final = ("coverage", "joint_coverage")
+
+_STYLE: Final = """
+:root { color-scheme: light; }
+body { font: 16px/1.5 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; color: #222;
+  background: #fff; max-width: 68rem; margin: 2.5rem auto; padding: 0 1.5rem; }
+h1 { font-size: 1.9rem; line-height: 1.2; margin: 0 0 .3rem; }
+h2 { font-size: 1.25rem; margin: 2.6rem 0 .6rem; }
+p.lead { color: #555; margin: 0 0 1.2rem; }
+table { border-collapse: collapse; width: 100%; font-size: .93rem; }
+th, td { text-align: left; padding: .38rem .8rem .38rem 0; border-bottom: 1px solid #e4e4e4;
+  vertical-align: top; overflow-wrap: anywhere; }
+th { color: #555; font-weight: 600; border-bottom: 2px solid #c8c8c8; }
+td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+td.bad { color: #a33b00; font-weight: 600; }
+figure { margin: 1.4rem 0 2rem; }
+figure img { width: 100%; height: auto; border: 1px solid #e4e4e4; }
+figcaption { color: #555; font-size: .93rem; margin-top: .3rem; }
+"""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG and what it shows."""
+
+    caption: str
+    png: bytes
+
+
+class _Failure(str):
+    """Text of a table's cell that is shown as a failure."""
+
+
+def report_page(
+    title: str,
+    run: RunRecord,
+    *,
+    seconds: Mapping[str, float],
+    scores: Evaluation | None = None,
+    pictures: Sequence[Picture] = (),
+) -> str:
+    """Return a whole HTML page that needs nothing beside itself and asks for nothing outside.
+
+    Args:
+        title: heading of the page.
+        run: what was run, with the quality figures of its units.
+        seconds: how long each unit took when it was computed, by `stage/unit` [s].
+        scores: figures against truth, where there is a reference.
+        pictures: shown in this order.
+    """
+    sections = [
+        f"<h1>{escape(title)}</h1>",
+        f'<p class="lead">Match {escape(run.match_id)}, run {escape(run.run_id)}: '
+        f"{escape(run.state)}</p>",
+        *_scores(scores),
+        *(_figure(picture) for picture in pictures),
+        "<h2>What was run</h2>",
+        _table(("", ""), _about(run)),
+        "<h2>Units of work</h2>",
+        _table(("unit", "", ">seconds"), _units(run, seconds)),
+        "<h2>Quality figures</h2>",
+        _table(("unit", "figure", ">value"), _figures(run)),
+        *_settings(run),
+    ]
+    body = "\n".join(sections)
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta http-equiv="Content-Security-Policy" '
+        "content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'\">\n"
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n"
+        f"<body>\n{body}\n</body>\n</html>\n"
+    )
+
+
+def _scores(scores: Evaluation | None) -> list[str]:
+    if scores is None:
+        return []
+    rows = []
+    for name, value in scores.model_dump(exclude_none=True).items():
+        label, unit, meaning = MEANINGS.get(name, (name, "", ""))
+        shown = _number(100.0 * value if name in _SHARES else value)
+        rows.append((label, f"{shown} {unit}".strip(), meaning))
+    heading = "<h2>Against the truth</h2>"
+    return [heading, _table(("score", ">value", "what it says"), rows)]
+
+
+def _about(run: RunRecord) -> list[tuple[str, ...]]:
+    return [
+        ("started", f"{run.started_at:%Y-%m-%d %H:%M:%S %Z}".strip()),
+        ("took", f"{run.seconds:.1f} s"),
+        ("run before it", run.parent or "none"),
+        (
+            "units computed, reused, failed",
+            f"{len(run.executed)}, {len(run.reused)}, {len(run.failed)}",
+        ),
+        *((f"version of {name}", version) for name, version in run.versions.items()),
+    ]
+
+
+def _units(run: RunRecord, seconds: Mapping[str, float]) -> list[tuple[str, ...]]:
+    failed = {failure.unit: _Failure(f"failed: {failure.message}") for failure in run.failed}
+    states = {
+        **dict.fromkeys(run.executed, "computed"),
+        **dict.fromkeys(run.reused, "reused"),
+        **failed,
+    }
+    units = [unit for unit in (*run.results, *failed) if unit in states]
+    return [
+        (unit, states[unit], f"{seconds[unit]:.2f}" if unit in seconds else "") for unit in units
+    ]
+
+
+def _figures(run: RunRecord) -> list[tuple[str, ...]]:
+    return [
+        (unit if number == 0 else "", name, _number(value))
+        for unit, figures in run.figures.items()
+        for number, (name, value) in enumerate(figures.items())
+    ]
+
+
+def _settings(run: RunRecord) -> list[str]:
+    rows = [
+        (stage, name, f"{value}")
+        for stage, values in run.overrides.items()
+        for name, value in values.items()
+    ]
+    if not rows:
+        return []
+    return [
+        "<h2>Settings other than the defaults</h2>",
+        _table(("stage", "setting", "value"), rows),
+    ]
+
+
+def _figure(picture: Picture) -> str:
+    data = base64.b64encode(picture.png).decode("ascii")
+    caption = escape(picture.caption)
+    return (
+        f'<figure><img alt="{caption}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
+
+
+def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table of plain text; columns from ">" on hold numbers."""
+    kinds = [' class="number"' if column.startswith(">") else "" for column in columns]
+    lines = []
+    if any(columns):
+        cells = (
+            f"<th{kind}>{escape(column.removeprefix('>'))}</th>"
+            for kind, column in zip(kinds, columns, strict=True)
+        )
+        lines.append(f"<tr>{''.join(cells)}</tr>")
+    for row in rows:
+        cells = (
+            f'<td class="bad">{escape(cell)}</td>'
+            if isinstance(cell, _Failure)
+            else f"<td{kind}>{escape(cell)}</td>"
+            for kind, cell in zip(kinds, row, strict=True)
+        )
+        lines.append(f"<tr>{''.join(cells)}</tr>")
+    return "<table>\n" + "\n".join(lines) + "\n</table>"
+
+
+def _number(value: float) -> str:
+    """Four digits, without powers of ten where they can be helped."""
+    return f"{value:,.0f}" if float(value).is_integer() or abs(value) >= 1e4 else f"{value:.4g}"

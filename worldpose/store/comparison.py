@@ -1,0 +1,109 @@
+"""Do two projects hold the same: the checker of the promise "same answer"."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+from data_contracts.records import Record
+from worldpose.store.paths import ResultId
+from worldpose.store.store import Store
+
+_PASSING = {
+    "manifest": {"created_at", "seconds", "run_id", "checksum"},
+    "run": {"run_id", "parent", "executed", "reused", "started_at", "finished_at", "seconds"},
+    "registration": {"folder", "files"},
+}
+"""What may differ between two honest runs: times, numbers, places, and who computed what when."""
+
+
+def compare_stores(ours: Store, theirs: Store) -> list[str]:
+    """One line for each difference; empty when the projects hold the same, byte for byte.
+
+    Compared are the registered matches, every result's files and manifest, and the latest run of
+    each match, which is the one that stands after interruptions. Left out are times, run numbers
+    and places, and which units a run computed or found there.
+    """
+    return [
+        *_matches(ours, theirs),
+        *_results(ours, theirs),
+        *_runs(ours, theirs),
+    ]
+
+
+def _matches(ours: Store, theirs: Store) -> Iterator[str]:
+    yield from _structure("match", ours.matches(), theirs.matches())
+    for match_id in sorted({*ours.matches()} & {*theirs.matches()}):
+        one, other = ours.registration(match_id), theirs.registration(match_id)
+        if one and other:
+            yield from _fields(f"match {match_id}", one, other, "registration")
+            files = [{file.path: file.sha256 for file in each.files} for each in (one, other)]
+            yield from _values(f"match {match_id}", *files)
+
+
+def _results(ours: Store, theirs: Store) -> Iterator[str]:
+    yield from _structure("result", _paths(ours), _paths(theirs))
+    for result in sorted({*ours.results()} & {*theirs.results()}):
+        place = (result.match_id, result.stage, result.unit, result.key)
+        yield from _fields(result.path, ours.manifest(*place), theirs.manifest(*place), "manifest")
+        yield from _files(result, ours, theirs)
+
+
+def _runs(ours: Store, theirs: Store) -> Iterator[str]:
+    for match_id in sorted({*_matches_with_runs(ours)} | {*_matches_with_runs(theirs)}):
+        finished = [store.runs(match_id) for store in (ours, theirs)]
+        if all(finished):
+            yield from _fields(
+                f"latest run of {match_id}", ours.run(match_id), theirs.run(match_id), "run"
+            )
+        elif any(finished):
+            yield f"match {match_id}: only {'the first' if finished[0] else 'the second'} has runs"
+
+
+def _matches_with_runs(store: Store) -> Iterator[str]:
+    for entry in store.blobs.entries("runs"):
+        yield entry.path.split("/")[1]
+
+
+def _paths(store: Store) -> list[str]:
+    return [result.path for result in store.results()]
+
+
+def _files(result: ResultId, ours: Store, theirs: Store) -> Iterator[str]:
+    names = []
+    for store in (ours, theirs):
+        entries = store.blobs.entries(result.path)
+        names.append({entry.path for entry in entries} - {result.manifest_path})
+    yield from _structure("file", *names)
+    for path in sorted(names[0] & names[1]):
+        one, other = ours.blobs.read(path), theirs.blobs.read(path)
+        if one == other:
+            continue
+        if path.endswith("/zarr.json") and one and other:
+            yield from _values(path, json.loads(one), json.loads(other))
+        else:
+            yield f"{path}: other bytes"
+
+
+def _structure(kind: str, ours: Iterable[str], theirs: Iterable[str]) -> Iterator[str]:
+    yield from (f"{kind} {name}: only in the first" for name in sorted({*ours} - {*theirs}))
+    yield from (f"{kind} {name}: only in the second" for name in sorted({*theirs} - {*ours}))
+
+
+def _fields(where: str, ours: Record, theirs: Record, kind: str) -> Iterator[str]:
+    excluded = _PASSING[kind]
+    yield from _values(
+        where,
+        ours.model_dump(mode="json", exclude=excluded),
+        theirs.model_dump(mode="json", exclude=excluded),
+    )
+
+
+def _values(where: str, ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> Iterator[str]:
+    for name in sorted(ours.keys() | theirs.keys()):
+        one, other = ours.get(name), theirs.get(name)
+        if isinstance(one, Mapping) and isinstance(other, Mapping):
+            yield from _values(f"{where}: {name}", one, other)
+        elif one != other:
+            yield f"{where}: {name}: {one!r} and {other!r}"

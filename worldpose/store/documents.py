@@ -1,0 +1,69 @@
+"""Sealed records: the JSON documents of a project, each with its own checksum.
+
+A sealed document is one line of canonical JSON whose field `checksum` is the digest of the rest.
+Any other bytes, even a changed space, are refused.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+
+from data_contracts.records import CONTRACT_VERSION, Record
+from worldpose.errors import CorruptionError, InputError
+from worldpose.store.canonical import canonical_json, digest
+
+R = TypeVar("R", bound=Record)
+
+
+def checksum_of(record: Record) -> str:
+    """The digest that seals `record`: of all its fields but `checksum`."""
+    return digest(canonical_json(_fields(record)))
+
+
+def seal(record: Record) -> bytes:
+    """The document of `record`."""
+    fields = _fields(record)
+    return canonical_json({**fields, "checksum": digest(canonical_json(fields))}) + b"\n"
+
+
+def unseal(kind: type[R], data: bytes, where: str) -> R:
+    """The record in the document `data`.
+
+    Args:
+        kind: the record's class.
+        data: the document.
+        where: the document's path, for messages.
+
+    Raises:
+        CorruptionError: the bytes are not the bytes that were sealed.
+        InputError: a whole document, of another contract version than this worldpose reads.
+    """
+    try:
+        fields = json.loads(data)
+        checksum = fields.pop("checksum")
+        whole = digest(canonical_json(fields)) == checksum
+        whole = whole and canonical_json({**fields, "checksum": checksum}) + b"\n" == data
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, InputError) as error:
+        raise CorruptionError(f"{where} is damaged: not a sealed document ({error})") from error
+    if not whole:
+        raise CorruptionError(f"{where} is damaged: its checksum does not fit its content")
+    if fields.get("contract", CONTRACT_VERSION) != CONTRACT_VERSION:
+        raise InputError(
+            where,
+            expected=f"contract {CONTRACT_VERSION}",
+            found=f"contract {fields['contract']}",
+            todo="Use the worldpose version that wrote it.",
+        )
+    if "checksum" in kind.model_fields:
+        fields["checksum"] = checksum
+    try:
+        return kind.model_validate_json(json.dumps(fields))
+    except ValidationError as error:
+        raise CorruptionError(f"{where} is not a {kind.__name__}: {error}") from error
+
+
+def _fields(record: Record) -> dict[str, Any]:
+    return record.model_dump(mode="json", exclude={"checksum"})

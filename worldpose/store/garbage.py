@@ -1,0 +1,198 @@
+"""What no kept run needs: found first, removed second."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+from data_contracts.run import Reservation, RunRecord
+from worldpose.errors import InputError, StoreError
+from worldpose.store.blobs import Entry
+from worldpose.store.paths import MANIFEST, ResultId, record_path, reservation_path
+from worldpose.store.runs import may_be_at_work, run_order
+from worldpose.store.store import Store
+
+
+@dataclass(frozen=True)
+class Garbage:
+    """One thing to remove."""
+
+    path: str
+    """A result's group, a staging folder, a run record or a reservation."""
+    reason: str
+    size: int
+    """[byte]"""
+
+
+@dataclass(frozen=True)
+class GcPlan:
+    """What `collect` will remove, and why it leaves the rest of some matches alone."""
+
+    garbage: tuple[Garbage, ...]
+    held: tuple[str, ...]
+    """One line for each run that may be at work, whose match is left alone."""
+    runs: frozenset[str]
+    """The run records and reservations that the plan knows of."""
+
+    @property
+    def size(self) -> int:
+        """All that it frees [byte]."""
+        return sum(item.size for item in self.garbage)
+
+
+def plan_gc(
+    store: Store,
+    *,
+    keep_last: int | None = None,
+    forget: Collection[str] = (),
+    older_than: timedelta = timedelta(days=1),
+) -> GcPlan:
+    """What can go: results that no kept run reaches, leftovers and reservations of dead runs.
+
+    A result is reached when a kept run's record names it or something made from it. Results and
+    leftovers are spared while young, and while a run of their match may be at work: it may be
+    about to name them. Reservations stay while they hold the highest number, so that no number
+    is given twice unless `forget` frees it. Nothing is removed by planning.
+
+    Args:
+        store: the project.
+        keep_last: keep only this many of each match's newest run records; None keeps all.
+        forget: runs to drop, as `match/0003`; an unfinished one is taken to be dead.
+        older_than: the age below which results and leftovers are spared.
+
+    Raises:
+        InputError: `forget` names a run that is not there, or `keep_last` is below 1.
+        CorruptionError: a run record or manifest is damaged, so that what it reaches is unknown.
+    """
+    _check_arguments(store, keep_last, forget)
+    sizes = {entry.path: entry.size for entry in store.blobs.entries("runs")}
+    garbage: list[Garbage] = []
+    at_work: list[Reservation] = []
+    reached: set[ResultId] = set()
+    for match_id in sorted({path.split("/")[1] for path in sizes}):
+        dropped, kept = _sorted_out(store.runs(match_id), match_id, keep_last, forget)
+        for run_id in dropped:
+            path = record_path(match_id, run_id)
+            garbage.append(Garbage(path, "run forgotten", sizes[path]))
+        for run_id in kept:
+            reached |= _reached(store, store.run(match_id, run_id))
+        for path, reservation in _reservations(store, match_id, sizes):
+            if reservation is None or f"{match_id}/{reservation.run_id}" in forget:
+                garbage.append(Garbage(path, "reservation of a dead run", sizes[path]))
+            elif may_be_at_work(reservation):
+                at_work.append(reservation)
+    before = datetime.now(UTC) - older_than
+    garbage.extend(_unreached(store, reached, {run.match_id for run in at_work}, before))
+    garbage.extend(
+        Garbage(entry.path, "staging of a dead writer", entry.size)
+        for entry in store.blobs.staged()
+        if entry.modified <= before
+    )
+    held = tuple(
+        f"{run.match_id} is left alone: run {run.run_id}, process {run.pid} on {run.host}, may "
+        f"be at work since {run.started_at:%Y-%m-%d %H:%M} UTC. If it is dead, forget "
+        f"{run.match_id}/{run.run_id}."
+        for run in at_work
+    )
+    return GcPlan(tuple(garbage), held, frozenset(sizes))
+
+
+def collect(store: Store, plan: GcPlan) -> int:
+    """Removes what `plan` lists and returns the size that was freed [byte].
+
+    Records go before the results they name, manifests before their files: whatever interrupts
+    it, nothing that can be read is half, and the next plan finds the rest.
+
+    Raises:
+        StoreError: a run has begun or ended since the plan was made; nothing is removed.
+    """
+    if plan.runs != {entry.path for entry in store.blobs.entries("runs")}:
+        raise StoreError(
+            f"{store.url}: a run has begun or ended since this was planned. Nothing was removed; "
+            "plan again."
+        )
+    for item in sorted(plan.garbage, key=lambda item: not item.path.startswith("runs/")):
+        if item.path.startswith("runs/"):
+            store.blobs.delete(item.path)
+        else:
+            store.blobs.delete_tree(item.path, MANIFEST)
+    return plan.size
+
+
+def _check_arguments(store: Store, keep_last: int | None, forget: Collection[str]) -> None:
+    if keep_last is not None and keep_last < 1:
+        raise InputError(
+            "keep_last", expected="1 or more", found=str(keep_last), todo="Keep at least one run."
+        )
+    for name in forget:
+        match_id, _, run_id = name.partition("/")
+        known = {
+            *store.runs(match_id),
+            *(open_run.run_id for open_run in store.unfinished_runs(match_id)),
+        }
+        if run_id not in known:
+            raise InputError(
+                f"run to forget, {name}",
+                expected=f"match/run, with a run of {', '.join(sorted(known)) or 'no match'}",
+                found="no such run",
+                todo="List the runs with `worldpose status`.",
+            )
+
+
+def _sorted_out(
+    finished: tuple[str, ...], match_id: str, keep_last: int | None, forget: Collection[str]
+) -> tuple[list[str], list[str]]:
+    """Run records to drop, and to keep."""
+    newest = finished if keep_last is None else finished[-keep_last:]
+    kept = [run_id for run_id in newest if f"{match_id}/{run_id}" not in forget]
+    return [run_id for run_id in finished if run_id not in kept], kept
+
+
+def _reservations(
+    store: Store, match_id: str, known: Collection[str]
+) -> Iterator[tuple[str, Reservation | None]]:
+    """Paths of a match's reservations; those that serve no end come with None."""
+    finished = store.runs(match_id)
+    for run_id in finished:
+        path = reservation_path(match_id, run_id)
+        if path in known:
+            yield path, None
+    unfinished = store.unfinished_runs(match_id)
+    numbers = (*finished, *(run.run_id for run in unfinished))
+    for run in unfinished:
+        is_spent = not may_be_at_work(run) and run.run_id != max(numbers, key=run_order)
+        yield reservation_path(match_id, run.run_id), None if is_spent else run
+
+
+def _reached(store: Store, record: RunRecord) -> set[ResultId]:
+    """The results a run names, and all they were made from."""
+    waiting = [ResultId.named(record.match_id, name, key) for name, key in record.results.items()]
+    reached: set[ResultId] = set()
+    while waiting:
+        result = waiting.pop()
+        if result in reached:
+            continue
+        reached.add(result)
+        # An input of an older, forgotten run may be gone for good already.
+        if store.has(result.match_id, result.stage, result.unit, result.key):
+            recipe = store.manifest(result.match_id, result.stage, result.unit, result.key).recipe
+            waiting.extend(
+                ResultId.named(result.match_id, name, key) for name, key in recipe.inputs.items()
+            )
+    return reached
+
+
+def _unreached(
+    store: Store, reached: set[ResultId], held: Collection[str], before: datetime
+) -> Iterator[Garbage]:
+    groups: dict[ResultId, list[Entry]] = {}
+    for entry in store.blobs.entries("results"):
+        result = ResultId.at(entry.path)
+        if result and result not in reached and result.match_id not in held:
+            groups.setdefault(result, []).append(entry)
+    for result, entries in groups.items():
+        if max(entry.modified for entry in entries) <= before:
+            is_published = any(entry.path == result.manifest_path for entry in entries)
+            reason = "no kept run reaches it" if is_published else "never published"
+            yield Garbage(result.path, reason, sum(entry.size for entry in entries))

@@ -1,0 +1,102 @@
+"""A result's arrays as one Zarr group, and back as an xarray data set."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+import zarr
+from zarr.abc.store import Store
+from zarr.codecs import BloscCodec, Crc32cCodec
+from zarr.storage import LocalStore
+
+from data_contracts.arrays import ArrayLayout, GroupLayout
+from data_contracts.conventions import CONVENTIONS
+from worldpose.store.layout_checks import Arrays, checked_arrays, checked_attributes
+
+
+def write_group(
+    folder: Path,
+    layout: GroupLayout,
+    arrays: Arrays,
+    coordinates: Arrays,
+    attributes: Mapping[str, Any],
+) -> None:
+    """Writes the group into `folder`; equal arrays and attributes give equal files.
+
+    Chunks are lz4 with a CRC-32C of the compressed bytes, so that any Zarr reader refuses a
+    changed chunk. Every chunk is written, an empty one too: a lost chunk is never a fill value.
+
+    Args:
+        folder: an empty folder.
+        layout: what the arrays must be.
+        arrays: by name; those in `layout.optional` may be absent.
+        coordinates: one-dimensional arrays by name.
+        attributes: what `layout.attributes` asks for.
+
+    Raises:
+        InputError: the arrays or attributes are not what the layout says.
+    """
+    checked = checked_arrays(layout, arrays, coordinates)
+    given = checked_attributes(layout, checked, attributes)
+    group = zarr.create_group(
+        store=LocalStore(folder),
+        zarr_format=3,
+        attributes={
+            "contract": layout.contract,
+            "stage": layout.stage,
+            "about": layout.about,
+            "conventions": CONVENTIONS.model_dump(mode="json"),
+            "labels": {dim: list(names) for dim, names in layout.labels.items()},
+            "attributes": given,
+        },
+    )
+    for name, values in checked.items():
+        array = layout.layout(name)
+        stored = group.create_array(
+            name,
+            shape=values.shape,
+            chunks=array.chunks(values.shape),
+            dtype=values.dtype,
+            fill_value=_fill_value(array),
+            dimension_names=array.dims,
+            compressors=[BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"), Crc32cCodec()],
+            attributes=array.attributes(),
+            config={"write_empty_chunks": True},
+        )
+        if values.size:
+            stored[...] = values
+
+
+def read_group(files: Store) -> xr.Dataset:
+    """The group in `files`, read when it is used: labelled, with units and conventions."""
+    stored: xr.Dataset = xr.open_zarr(
+        files, zarr_format=3, consolidated=False, chunks=None, decode_cf=False
+    )
+    for variable in stored.variables.values():
+        # xarray and its plots know "units".
+        variable.attrs["units"] = variable.attrs.pop("unit")
+    attributes = dict(stored.attrs)
+    labels, given = attributes.pop("labels"), attributes.pop("attributes")
+    named = {
+        dim: names
+        for dim, names in {**labels, **given}.items()
+        if dim in stored.dims and dim not in stored.coords
+    }
+    others = {name: value for name, value in given.items() if name not in named}
+    labelled = stored.assign_coords(named)
+    labelled.attrs = {**attributes, **others}
+    return labelled
+
+
+def _fill_value(array: ArrayLayout) -> float | int | bool:
+    """What a reader that knows no manifest sees in a lost chunk: missing, not a number."""
+    kind = np.dtype(array.dtype).kind
+    if kind == "f":
+        return 0.0 if array.missing == "0" else np.nan
+    if kind == "b":
+        return False
+    return -1 if array.missing == "-1" else 0

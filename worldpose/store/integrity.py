@@ -1,0 +1,150 @@
+"""Finds every changed, lost or foreign byte of a project."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+from data_contracts.match import Registration
+from data_contracts.run import Project, Reservation, RunRecord
+from worldpose.errors import CorruptionError, InputError, StoreError
+from worldpose.store.blobs import Entry
+from worldpose.store.documents import unseal
+from worldpose.store.paths import MANIFEST, PROJECT, ResultId
+from worldpose.store.published import read_published
+from worldpose.store.store import Store
+from worldpose.store.writer import content_of
+
+Progress = Callable[[int, int], None]
+"""Told how many bytes are checked, and how many there are."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that is not as it was written."""
+
+    path: str
+    """Relative to the project."""
+    problem: str
+    result: ResultId | None = None
+    """The result it belongs to; None for records and stray files."""
+
+
+def verify(
+    store: Store, match_id: str | None = None, progress: Progress | None = None
+) -> tuple[Finding, ...]:
+    """All damage in a project, or in one match of it; empty when all is as published.
+
+    Reads everything: each result's files against its manifest, each manifest, run record,
+    reservation and registration against its own checksum, and each run record's results.
+    """
+    below = "" if match_id is None else f"/{match_id}"
+    results = store.blobs.entries(f"results{below}")
+    documents = [
+        *(store.blobs.entries("matches") if match_id is None else []),
+        *store.blobs.entries(f"runs{below}"),
+    ]
+    total = sum(entry.size for entry in (*results, *documents))
+    done = 0
+    findings: list[Finding] = []
+    groups, strays = _by_result(results)
+    findings.extend(Finding(path, "is not part of any result") for path in strays)
+    for result, entries in groups.items():
+        findings.extend(_check_result(store, result, entries))
+        done += sum(entry.size for entry in entries.values())
+        if progress:
+            progress(done, total)
+    published = {result for result, entries in groups.items() if result.manifest_path in entries}
+    if match_id is None:
+        findings.extend(_check_document(store, PROJECT, published))
+    for entry in documents:
+        findings.extend(_check_document(store, entry.path, published))
+        done += entry.size
+        if progress:
+            progress(done, total)
+    return tuple(sorted(findings, key=lambda finding: (finding.path, finding.problem)))
+
+
+def repair(store: Store, findings: Iterable[Finding]) -> tuple[ResultId, ...]:
+    """Withdraws the damaged results, so that the next run computes those, and only those, again."""
+    damaged = sorted({finding.result for finding in findings if finding.result})
+    for result in damaged:
+        store.withdraw(result)
+    return tuple(damaged)
+
+
+def _by_result(
+    entries: Iterable[Entry],
+) -> tuple[dict[ResultId, dict[str, Entry]], list[str]]:
+    groups: dict[ResultId, dict[str, Entry]] = {}
+    strays = []
+    for entry in entries:
+        result = ResultId.at(entry.path)
+        if result is None:
+            strays.append(entry.path)
+        else:
+            groups.setdefault(result, {})[entry.path] = entry
+    return groups, strays
+
+
+def _check_result(
+    store: Store, result: ResultId, entries: Mapping[str, Entry]
+) -> Iterator[Finding]:
+    if result.manifest_path not in entries:
+        # Not published: what an interrupted writer left in object storage, and `gc` removes.
+        return
+    try:
+        manifest = store.manifest(result.match_id, result.stage, result.unit, result.key)
+    except (StoreError, InputError) as error:
+        yield Finding(result.manifest_path, str(error), result)
+        return
+    if content_of(manifest.files) != manifest.content:
+        yield Finding(result.manifest_path, "its content digest is not its files'", result)
+    for file in manifest.files:
+        try:
+            read_published(store.blobs, result, file)
+        except StoreError as error:
+            yield Finding(f"{result.path}/{file.path}", str(error), result)
+    known = {
+        f"{result.path}/{name}" for name in (MANIFEST, *(file.path for file in manifest.files))
+    }
+    for path in entries.keys() - known:
+        yield Finding(path, "was not published with this result", result)
+
+
+def _check_document(store: Store, path: str, published: set[ResultId]) -> Iterator[Finding]:
+    where, parts = f"{store.url}/{path}", path.split("/")
+    try:
+        data = store.blobs.read(path)
+        if data is None:
+            raise CorruptionError(f"{where} is missing")
+        match parts:
+            case [name] if name == PROJECT:
+                unseal(Project, data, where)
+                return
+            case ["matches", name] if name.endswith(".json"):
+                registration = unseal(Registration, data, where)
+                fits = name == f"{registration.spec.match_id}.json"
+            case ["runs", match_id, name] if name.endswith(".open.json"):
+                reservation = unseal(Reservation, data, where)
+                fits = (match_id, name) == (
+                    reservation.match_id,
+                    f"{reservation.run_id}.open.json",
+                )
+            case ["runs", match_id, name] if name.endswith(".json"):
+                record = unseal(RunRecord, data, where)
+                fits = (match_id, name) == (record.match_id, f"{record.run_id}.json")
+                yield from _check_results_of(record, path, published)
+            case _:
+                raise CorruptionError(f"{where} is not a file of a project")
+        if not fits:
+            raise CorruptionError(f"{where} is the record of something else")
+    except (StoreError, InputError) as error:
+        yield Finding(path, str(error))
+
+
+def _check_results_of(record: RunRecord, path: str, published: set[ResultId]) -> Iterator[Finding]:
+    for name, key in record.results.items():
+        result = ResultId.named(record.match_id, name, key)
+        if result not in published:
+            yield Finding(path, f"names {result.path}, which is not published")

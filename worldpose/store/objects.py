@@ -1,0 +1,177 @@
+"""A project in S3-compatible object storage."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from functools import cached_property
+from pathlib import Path
+
+from worldpose.errors import InputError, NondeterminismError, StoreError
+from worldpose.store.blobs import Entry, storage_errors
+from worldpose.store.commit_points import reached
+from worldpose.store.paths import checked_path
+
+try:
+    import obstore
+    from obstore.exceptions import AlreadyExistsError, BaseError
+    from obstore.store import S3Store
+except ImportError as error:
+    raise InputError(
+        "project on s3://",
+        expected="the extra worldpose[s3]",
+        found=f"no module {error.name}",
+        todo="Run: pip install 'worldpose[s3]'.",
+    ) from error
+
+UPLOADS = 8
+"""Objects of one result sent at a time; the result exists only after the last."""
+
+
+@dataclass(frozen=True)
+class ObjectBlobs:
+    """Objects below `prefix` of `bucket`.
+
+    The endpoint, the region and the credentials are the AWS_* variables that obstore reads.
+    """
+
+    bucket: str
+    prefix: str
+
+    @classmethod
+    def at(cls, url: str) -> ObjectBlobs:
+        """The root `s3://bucket/prefix`.
+
+        Raises:
+            InputError: no bucket.
+        """
+        bucket, _, prefix = url.removeprefix("s3://").strip("/").partition("/")
+        if not bucket:
+            raise InputError(
+                f"project {url}",
+                expected="s3://bucket/prefix",
+                found="no bucket",
+                todo="Name the bucket after s3://.",
+            )
+        return cls(bucket, checked_path(prefix) if prefix else "")
+
+    @property
+    def url(self) -> str:
+        """The root: `s3://bucket/prefix`."""
+        return f"s3://{self.bucket}/{self.prefix}".rstrip("/")
+
+    def read(self, path: str) -> bytes | None:
+        """See `Blobs`."""
+        with self._errors(path):
+            try:
+                return bytes(obstore.get(self._s3, checked_path(path)).bytes())
+            except FileNotFoundError:
+                return None
+
+    def exists(self, path: str) -> bool:
+        """See `Blobs`."""
+        with self._errors(path):
+            try:
+                obstore.head(self._s3, checked_path(path))
+            except FileNotFoundError:
+                return False
+            return True
+
+    def put_new(self, path: str, data: bytes) -> bool:
+        """See `Blobs`. The service itself refuses a second creation (If-None-Match)."""
+        with self._errors(path):
+            try:
+                obstore.put(self._s3, checked_path(path), data, mode="create", use_multipart=False)
+            except AlreadyExistsError:
+                return False
+            return True
+
+    def put(self, path: str, data: bytes) -> None:
+        """See `Blobs`."""
+        with self._errors(path):
+            obstore.put(self._s3, checked_path(path), data, use_multipart=False)
+
+    def delete(self, path: str) -> None:
+        """See `Blobs`."""
+        with self._errors(path):
+            obstore.delete(self._s3, checked_path(path))
+
+    def delete_tree(self, prefix: str, first: str) -> None:
+        """See `Blobs`."""
+        self.delete(f"{prefix}/{first}")
+        paths = [entry.path for entry in self.entries(prefix)]
+        with self._errors(prefix):
+            if paths:
+                obstore.delete(self._s3, paths)
+
+    def entries(self, prefix: str) -> list[Entry]:
+        """See `Blobs`."""
+        with self._errors(prefix):
+            return sorted(
+                (
+                    Entry(item["path"], item["size"], item["last_modified"])
+                    for page in obstore.list(self._s3, checked_path(prefix))
+                    for item in page
+                ),
+                key=lambda entry: entry.path,
+            )
+
+    def staging(self) -> Path:
+        """See `Blobs`. On this machine's temporary disk."""
+        with storage_errors(tempfile.gettempdir()):
+            return Path(tempfile.mkdtemp(prefix="worldpose-"))
+
+    def staged(self) -> list[Entry]:
+        """See `Blobs`. None: staging is on the writers' own machines."""
+        return []
+
+    def publish_tree(self, folder: Path, prefix: str, manifest_name: str, manifest: bytes) -> bool:
+        """See `Blobs`. Objects first, each created once; the manifest's creation publishes.
+
+        Raises:
+            NondeterminismError: an interrupted writer left other bytes for the same result.
+        """
+        if self.exists(f"{prefix}/{manifest_name}"):
+            return False
+        paths = sorted(path for path in folder.rglob("*") if path.is_file())
+        with storage_errors(str(folder)), ThreadPoolExecutor(UPLOADS) as uploads:
+            names = [f"{prefix}/{path.relative_to(folder).as_posix()}" for path in paths]
+            for _ in uploads.map(self._put_same, names, paths):
+                reached("during_publish")
+        reached("before_commit")
+        return self.put_new(f"{prefix}/{manifest_name}", manifest)
+
+    def _put_same(self, path: str, source: Path) -> None:
+        data = source.read_bytes()
+        if not self.put_new(path, data) and self.read(path) != data:
+            raise NondeterminismError(
+                f"{self.url}/{path} was left by an interrupted writer of the same key, with other "
+                "bytes. The computation does not repeat itself exactly; remove the leftovers "
+                "with `worldpose gc` and report the stage."
+            )
+
+    @cached_property
+    def _s3(self) -> S3Store:
+        with self._errors(""):
+            return S3Store(
+                self.bucket,
+                prefix=self.prefix or None,
+                # http is what local S3 servers speak; the default endpoint is https.
+                client_options={"allow_http": True},
+                retry_config={"max_retries": 5, "retry_timeout": timedelta(seconds=30)},
+            )
+
+    @contextmanager
+    def _errors(self, path: str) -> Iterator[None]:
+        try:
+            yield
+        except (BaseError, ValueError, OSError) as error:
+            what = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise StoreError(
+                f"{self.url}/{path}: {what}. Check the bucket, AWS_ENDPOINT_URL, AWS_REGION and "
+                "the credentials, and run again; published results are untouched."
+            ) from error

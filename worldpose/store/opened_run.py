@@ -1,0 +1,78 @@
+"""A run's results as labelled arrays."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
+
+from data_contracts.run import RunRecord
+from worldpose.store.runs import LATEST
+from worldpose.store.store import Store
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class Run(Mapping[str, "xr.Dataset"]):
+    """The results of one run: `run["triangulation/clip"].joints`.
+
+    Each is opened when it is first asked for, and its values are read when they are used.
+    """
+
+    def __init__(self, store: Store, record: RunRecord) -> None:
+        self.record = record
+        """What the run did: results, settings, figures, versions, times."""
+        self._store = store
+        self._opened: dict[str, xr.Dataset] = {}
+
+    def __getitem__(self, name: str) -> xr.Dataset:
+        if name not in self.record.results:
+            failures = {failure.unit: failure for failure in self.record.failed}
+            if name in failures:
+                why = f"it failed with {failures[name].error}: {failures[name].message}"
+            else:
+                why = f"the run has {', '.join(self) or 'no results'}"
+            raise KeyError(f"run {self.record.run_id} has no result of {name!r}: {why}")
+        if name not in self._opened:
+            stage, _, unit = name.partition("/")
+            self._opened[name] = self._store.open_result(
+                self.record.match_id, stage, unit, self.record.results[name]
+            )
+        return self._opened[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(sorted(self.record.results))
+
+    def __len__(self) -> int:
+        return len(self.record.results)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.record.results
+
+    def __repr__(self) -> str:
+        record = self.record
+        title = f"Run {record.run_id} of match {record.match_id}: {record.state}"
+        return "\n".join(
+            [
+                f"{title}, finished {record.finished_at:%Y-%m-%d %H:%M} UTC, {self._store.url}",
+                *(f"  {name}  {record.results[name][:12]}" for name in self),
+                *(f"  {failure.unit}  failed: {failure.error}" for failure in record.failed),
+            ]
+        )
+
+
+def open_run(project: str | os.PathLike[str], match: str, run: str = LATEST) -> Run:
+    """The results of a match's run as labelled arrays (xarray), metres and pixels, world frame.
+
+    Args:
+        project: the project's folder or `s3://bucket/prefix`.
+        match: the match's id.
+        run: the run's number, such as `0003`, or `latest`.
+
+    Raises:
+        InputError: no such project, match or run.
+        CorruptionError: stored bytes are not the bytes that were published.
+    """
+    store = Store.open(project)
+    return Run(store, store.run(match, run))

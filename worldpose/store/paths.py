@@ -1,0 +1,129 @@
+"""Where everything lies in a project, relative to its root."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pydantic import TypeAdapter, ValidationError
+
+from data_contracts.records import Key, Name
+from data_contracts.run import Work
+from worldpose.errors import InputError
+
+PROJECT = "project.json"
+MANIFEST = "manifest.json"
+STAGING = "staging"
+
+_NAME: TypeAdapter[str] = TypeAdapter(Name)
+_KEY: TypeAdapter[str] = TypeAdapter(Key)
+
+
+@dataclass(frozen=True, order=True)
+class ResultId:
+    """Which result: match, stage, unit and key. Every part is safe as a folder's name."""
+
+    match_id: str
+    stage: str
+    unit: str
+    key: str
+
+    def __post_init__(self) -> None:
+        for name in (self.match_id, self.stage, self.unit):
+            checked_name(name)
+        try:
+            _KEY.validate_python(self.key)
+        except ValidationError as error:
+            raise InputError(
+                "key of a result",
+                expected="32 lower-case hexadecimal digits",
+                found=repr(self.key),
+                todo="Take the key from a run record or from key_of(recipe).",
+            ) from error
+
+    @classmethod
+    def of(cls, work: Work) -> ResultId:
+        """The result that `work` makes."""
+        recipe = work.recipe
+        return cls(recipe.match_id, recipe.stage, recipe.unit, work.key)
+
+    @classmethod
+    def named(cls, match_id: str, name: str, key: str) -> ResultId:
+        """The result of the unit `name`, such as `tracking/clip`."""
+        stage, _, unit = name.partition("/")
+        return cls(match_id, stage, unit, key)
+
+    @classmethod
+    def at(cls, path: str) -> ResultId | None:
+        """The result that the file at `path` belongs to, None when it is no result's."""
+        parts = path.split("/")
+        if len(parts) < 6 or parts[0] != "results":
+            return None
+        try:
+            return cls(*parts[1:5])
+        except InputError:
+            return None
+
+    @property
+    def name(self) -> str:
+        """Stage and unit: `tracking/clip`."""
+        return f"{self.stage}/{self.unit}"
+
+    @property
+    def path(self) -> str:
+        """The result's group."""
+        return f"results/{self.match_id}/{self.stage}/{self.unit}/{self.key}"
+
+    @property
+    def manifest_path(self) -> str:
+        """The file that makes the result exist."""
+        return f"{self.path}/{MANIFEST}"
+
+
+def registration_path(match_id: str) -> str:
+    """Where a match's registration lies."""
+    return f"matches/{checked_name(match_id)}.json"
+
+
+def record_path(match_id: str, run_id: str) -> str:
+    """Where the record of a finished run lies."""
+    return f"runs/{checked_name(match_id)}/{checked_name(run_id)}.json"
+
+
+def reservation_path(match_id: str, run_id: str) -> str:
+    """Where the reservation of a run's number lies until its record does."""
+    return f"runs/{checked_name(match_id)}/{checked_name(run_id)}.open.json"
+
+
+def checked_name(name: str) -> str:
+    """`name`, when it is safe as a file's name.
+
+    Raises:
+        InputError: it is not.
+    """
+    try:
+        return _NAME.validate_python(name)
+    except ValidationError as error:
+        raise InputError(
+            "name of a match, stage, unit or run",
+            expected="1 to 64 letters, digits, '.', '_' or '-', the first a letter or digit",
+            found=repr(name),
+            todo="Rename it.",
+        ) from error
+
+
+def checked_path(path: str) -> str:
+    """`path`, when it stays inside the project on every file system and object store.
+
+    Raises:
+        InputError: it is absolute or empty, or has `..`, `.`, an empty part, a NUL, a line break
+            or a backslash.
+    """
+    parts = path.split("/")
+    if any(part in ("", ".", "..") for part in parts) or set(path) & set("\0\n\r\\"):
+        raise InputError(
+            "path inside a project",
+            expected="a relative path of plain parts between '/'",
+            found=repr(path),
+            todo="Remove '..', '.', empty parts, backslashes and control characters.",
+        )
+    return path

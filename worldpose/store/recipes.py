@@ -1,0 +1,64 @@
+"""The key of a result, and why two keys differ."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from data_contracts.run import Recipe
+from worldpose.store.canonical import canonical_json, digest
+
+KEY_LENGTH = 32
+
+
+def key_of(recipe: Recipe) -> str:
+    """The name of the result that `recipe` makes: the first 128 bits of the recipe's SHA-256."""
+    return digest(canonical_json(recipe.model_dump(mode="json")))[:KEY_LENGTH]
+
+
+def explain_difference(old: Recipe, new: Recipe) -> list[str]:
+    """One line for each thing that makes `new` another result than `old`; empty when equal.
+
+    Lines read `setting gate.max_distance: 0.5 -> 0.7` or `module worldpose.tracking.tracker:
+    3f2a... -> 77b1...`; a side that lacks the thing reads `absent`.
+    """
+    lines = [
+        *_changes("contract", {"": old.contract}, {"": new.contract}),
+        *_changes("match", {"": old.match_id}, {"": new.match_id}),
+        *_changes("unit", {"": old.name}, {"": new.name}),
+        *_changes("source", old.sources, new.sources),
+        *_changes("input", old.inputs, new.inputs),
+        *_changes("setting", _flat(old.settings), _flat(new.settings)),
+        *_changes("module", old.code, new.code),
+        *_changes("library", old.libraries, new.libraries),
+    ]
+    # Digests that begin alike look the same when cut short; a difference is never silent.
+    if not lines and key_of(old) != key_of(new):
+        lines.append(f"recipe: {key_of(old)} -> {key_of(new)}")
+    return lines
+
+
+def _changes(kind: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
+    for name in sorted(old.keys() | new.keys()):
+        before, after = _shown(old, name), _shown(new, name)
+        if before != after:
+            yield f"{kind} {name}".rstrip() + f": {before} -> {after}"
+
+
+def _shown(values: Mapping[str, Any], name: str) -> str:
+    if name not in values:
+        return "absent"
+    value = values[name]
+    text = value if isinstance(value, str) else canonical_json(value).decode()
+    is_digest = len(text) in (32, 64) and set(text) <= set("0123456789abcdef")
+    return f"{text[:12]}..." if is_digest else text
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping) and value:
+            flat.update(_flat(value, f"{prefix}{name}."))
+        else:
+            flat[prefix + name] = value
+    return flat

@@ -1,0 +1,116 @@
+"""Numbers and records of runs, in their part of the project."""
+
+from __future__ import annotations
+
+import os
+import platform
+from datetime import UTC, datetime
+
+from data_contracts.run import Reservation, RunRecord
+from worldpose.errors import InputError, StoreError
+from worldpose.store.blobs import Blobs
+from worldpose.store.commit_points import reached
+from worldpose.store.documents import seal, unseal
+from worldpose.store.paths import checked_name, record_path, reservation_path
+
+LATEST = "latest"
+
+_RECORD, _RESERVATION = ".json", ".open.json"
+
+
+def may_be_at_work(reservation: Reservation) -> bool:
+    """May the run's process still be at work. True for any process on another machine."""
+    if reservation.host != platform.node():
+        return True
+    try:
+        os.kill(reservation.pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def list_runs(blobs: Blobs, match_id: str) -> tuple[list[str], list[str]]:
+    """Ids of a match's finished runs, and of those reserved but not finished, in order."""
+    top = f"runs/{checked_name(match_id)}"
+    names = [entry.path.removeprefix(f"{top}/") for entry in blobs.entries(top)]
+    reserved = {name.removesuffix(_RESERVATION) for name in names if name.endswith(_RESERVATION)}
+    finished = {
+        name.removesuffix(_RECORD)
+        for name in names
+        if name.endswith(_RECORD) and not name.endswith(_RESERVATION)
+    }
+    return sorted(finished, key=run_order), sorted(reserved - finished, key=run_order)
+
+
+def reserve_run(blobs: Blobs, match_id: str) -> str:
+    """A run number that no other run of the match has or gets: `0001`, `0002`, ..."""
+    while True:
+        finished, reserved = list_runs(blobs, match_id)
+        run_id = (
+            f"{max((run_order(name)[0] for name in (*finished, *reserved)), default=0) + 1:04d}"
+        )
+        path = reservation_path(match_id, run_id)
+        reservation = Reservation(
+            run_id=run_id,
+            match_id=match_id,
+            started_at=datetime.now(UTC),
+            host=platform.node(),
+            pid=os.getpid(),
+        )
+        if not blobs.put_new(path, seal(reservation)):
+            continue
+        # Another run may have taken this number, finished and dropped its reservation in between.
+        if not blobs.exists(record_path(match_id, run_id)):
+            return run_id
+        blobs.delete(path)
+
+
+def read_reservation(blobs: Blobs, match_id: str, run_id: str) -> Reservation | None:
+    """The reservation of a run, None when it has none, or has it no more."""
+    path = reservation_path(match_id, run_id)
+    data = blobs.read(path)
+    return None if data is None else unseal(Reservation, data, f"{blobs.url}/{path}")
+
+
+def read_record(blobs: Blobs, match_id: str, run_id: str = LATEST) -> RunRecord:
+    """The record of a finished run; `latest` is the one with the highest number.
+
+    Raises:
+        InputError: there is none.
+        CorruptionError: it is damaged.
+    """
+    finished, reserved = list_runs(blobs, match_id)
+    wanted = finished[-1] if run_id == LATEST and finished else run_id
+    if wanted not in finished:
+        raise InputError(
+            f"run {run_id} of match {match_id} in {blobs.url}",
+            expected=f"one of {', '.join(finished)}" if finished else "a finished run",
+            found="an unfinished run" if run_id in reserved else "no such run",
+            todo=f"Run: worldpose run {match_id}",
+        )
+    path = record_path(match_id, wanted)
+    return unseal(RunRecord, blobs.read(path) or b"", f"{blobs.url}/{path}")
+
+
+def write_record(blobs: Blobs, record: RunRecord) -> None:
+    """Writes a run's record, once for good, and drops its reservation.
+
+    Raises:
+        StoreError: the run has another record already.
+    """
+    path, data = record_path(record.match_id, record.run_id), seal(record)
+    reached("before_run_record")
+    if not blobs.put_new(path, data) and blobs.read(path) != data:
+        raise StoreError(
+            f"{blobs.url}/{path} exists with other content: run {record.run_id} of match "
+            f"{record.match_id} was finished before. Reserve a new run."
+        )
+    reached("after_run_record")
+    blobs.delete(reservation_path(record.match_id, record.run_id))
+
+
+def run_order(run_id: str) -> tuple[int, str]:
+    """Sorts run ids by number."""
+    return (int(run_id) if run_id.isascii() and run_id.isdigit() else 0, run_id)

@@ -1,0 +1,270 @@
+"""A project: results kept by what they were made from, whole or not at all, never overwritten."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from data_contracts.match import Registration
+from data_contracts.run import Project, Reservation, ResultManifest, RunRecord, Work
+from worldpose.errors import CorruptionError, InputError, NondeterminismError, StoreError
+from worldpose.store.blobs import Blobs, open_blobs
+from worldpose.store.commit_points import reached
+from worldpose.store.documents import seal, unseal
+from worldpose.store.fingerprint import STORE_FORMAT
+from worldpose.store.paths import MANIFEST, PROJECT, ResultId, registration_path
+from worldpose.store.published import read_published
+from worldpose.store.recipes import key_of
+from worldpose.store.runs import (
+    LATEST,
+    list_runs,
+    read_record,
+    read_reservation,
+    reserve_run,
+    write_record,
+)
+from worldpose.store.writer import ResultWriter
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class Store:
+    """The results, runs and registered matches of one project.
+
+    Results live at `results/<match>/<stage>/<unit>/<key>/`, each with a manifest written last.
+    Safe for any number of processes at once: nothing is locked and nothing is overwritten.
+    """
+
+    def __init__(self, blobs: Blobs) -> None:
+        self.blobs = blobs
+
+    def __repr__(self) -> str:
+        return f"Store({self.url!r})"
+
+    @property
+    def url(self) -> str:
+        """The project's folder or `s3://bucket/prefix`."""
+        return self.blobs.url
+
+    @classmethod
+    def create(cls, url: str | os.PathLike[str]) -> Store:
+        """The project at `url`, made if it is not there.
+
+        Raises:
+            InputError: a project of another contract version is there.
+            StoreError: the place cannot be written to.
+        """
+        blobs = open_blobs(os.fspath(url))
+        blobs.put_new(PROJECT, seal(Project(store_format=STORE_FORMAT)))
+        return cls.open(url)
+
+    @classmethod
+    def open(cls, url: str | os.PathLike[str]) -> Store:
+        """The project at `url`.
+
+        Raises:
+            InputError: no project is there, or one of another contract version or store format.
+        """
+        blobs = open_blobs(os.fspath(url))
+        data = blobs.read(PROJECT)
+        if data is None:
+            raise InputError(
+                f"no worldpose project at {blobs.url}",
+                expected=PROJECT,
+                found="no such file",
+                todo=f"Run: worldpose init {os.fspath(url)}",
+            )
+        where = f"{blobs.url}/{PROJECT}"
+        project = unseal(Project, data, where)
+        if project.store_format != STORE_FORMAT:
+            raise InputError(
+                f"{where}: store_format",
+                expected=repr(STORE_FORMAT),
+                found=repr(project.store_format),
+                todo="Use the version of worldpose that made the project, or make a new one.",
+            )
+        return cls(blobs)
+
+    def matches(self) -> tuple[str, ...]:
+        """Ids of the registered matches, sorted."""
+        names = (entry.path.split("/")[1:] for entry in self.blobs.entries("matches"))
+        return tuple(
+            parts[0].removesuffix(".json")
+            for parts in names
+            if len(parts) == 1 and parts[0].endswith(".json")
+        )
+
+    def registration(self, match_id: str) -> Registration | None:
+        """What is known of a match; None when it is not registered."""
+        path = registration_path(match_id)
+        data = self.blobs.read(path)
+        return None if data is None else unseal(Registration, data, f"{self.url}/{path}")
+
+    def register(self, registration: Registration) -> None:
+        """Takes a match in, or replaces what is known of it."""
+        match_id = registration.spec.match_id
+        if self.registration(match_id) != registration:
+            self.blobs.put(registration_path(match_id), seal(registration))
+
+    def has(self, match_id: str, stage: str, unit: str, key: str) -> bool:
+        """Is this result published."""
+        return self.blobs.exists(ResultId(match_id, stage, unit, key).manifest_path)
+
+    def results(self, match_id: str | None = None) -> tuple[ResultId, ...]:
+        """All published results, of one match or of all, sorted."""
+        top = "results" if match_id is None else f"results/{match_id}"
+        found = ((entry.path, ResultId.at(entry.path)) for entry in self.blobs.entries(top))
+        return tuple(
+            sorted(result for path, result in found if result and path == result.manifest_path)
+        )
+
+    def manifest(self, match_id: str, stage: str, unit: str, key: str) -> ResultManifest:
+        """The manifest of a published result.
+
+        Raises:
+            StoreError: it is not published.
+            CorruptionError: its manifest is damaged, or is another result's.
+        """
+        result = ResultId(match_id, stage, unit, key)
+        where = f"{self.url}/{result.manifest_path}"
+        data = self.blobs.read(result.manifest_path)
+        if data is None:
+            raise StoreError(
+                f"{where}: no such result. Run `worldpose run {match_id}` to compute it; "
+                "`worldpose gc` removes leftovers of an interrupted one."
+            )
+        manifest = unseal(ResultManifest, data, where)
+        recipe = manifest.recipe
+        named = (recipe.match_id, recipe.stage, recipe.unit, key_of(recipe))
+        if named != (match_id, stage, unit, key) or manifest.key != key:
+            raise CorruptionError(f"{where} is the manifest of another result: {'/'.join(named)}")
+        return manifest
+
+    @contextmanager
+    def publishing(self, work: Work) -> Iterator[ResultWriter]:
+        """A writer whose result is published when the block ends, and only then.
+
+        An error in the block leaves nothing behind; a killed process leaves only private staging.
+        Where the key is published already, the same content is fine and changes nothing.
+
+        Raises:
+            InputError: the work's key is not its recipe's.
+            NondeterminismError: the key is published with other content.
+            StoreError: the disk is full or not writable; nothing is published.
+        """
+        if work.key != key_of(work.recipe):
+            raise InputError(
+                f"work on {work.recipe.name}",
+                expected=f"key {key_of(work.recipe)}, its recipe's",
+                found=f"key {work.key}",
+                todo="Make the key with worldpose.store.key_of.",
+            )
+        folder = self.blobs.staging()
+        try:
+            writer = ResultWriter(work, folder)
+            yield writer
+            manifest = writer.sealed_manifest()
+            reached("before_publish")
+            result = ResultId.of(work)
+            if self.blobs.publish_tree(folder, result.path, MANIFEST, seal(manifest)):
+                reached("after_commit")
+                writer.manifest = manifest
+            else:
+                writer.manifest = self._published_twin(result, manifest)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def open_result(
+        self, match_id: str, stage: str, unit: str, key: str, verify: bool = False
+    ) -> xr.Dataset:
+        """A published result as labelled arrays, with units and conventions in the attributes.
+
+        Values are read when they are used, and every byte is checked against the manifest then.
+
+        Args:
+            match_id: the match.
+            stage: the stage.
+            unit: the unit of the stage.
+            key: the result's key.
+            verify: check every file now.
+
+        Raises:
+            StoreError: the result is not published.
+            CorruptionError: a file is missing or changed (when it is read, unless `verify`).
+        """
+        # Late: status and resumed runs read manifests only, and Zarr takes most of a second.
+        from worldpose.store.groups import read_group
+        from worldpose.store.zarr_files import PublishedFiles
+
+        result = ResultId(match_id, stage, unit, key)
+        manifest = self.manifest(match_id, stage, unit, key)
+        if verify:
+            for file in manifest.files:
+                read_published(self.blobs, result, file)
+        data = read_group(PublishedFiles(self.blobs, result, manifest))
+        data.attrs.update(match=match_id, unit=unit, key=key)
+        return data
+
+    def withdraw(self, result: ResultId) -> None:
+        """Removes a result, manifest first, so that the next run computes it again."""
+        self.blobs.delete_tree(result.path, MANIFEST)
+
+    def reserve_run(self, match_id: str) -> str:
+        """A run number that no other run of the match has or gets: `0001`, `0002`, ..."""
+        return reserve_run(self.blobs, match_id)
+
+    def finish_run(self, record: RunRecord) -> None:
+        """Writes the record of a run, once for good.
+
+        Raises:
+            StoreError: a result it names is not published, or the run has another record.
+        """
+        results = [
+            ResultId.named(record.match_id, name, key) for name, key in record.results.items()
+        ]
+        with ThreadPoolExecutor(8) as pool:
+            published = pool.map(self.blobs.exists, (result.manifest_path for result in results))
+            lost = [
+                result.path for result, there in zip(results, published, strict=True) if not there
+            ]
+        if lost:
+            raise StoreError(
+                f"run {record.run_id} of match {record.match_id} names results that are not in "
+                f"{self.url}: {', '.join(lost)}. Run `worldpose run {record.match_id}` again."
+            )
+        write_record(self.blobs, record)
+
+    def runs(self, match_id: str) -> tuple[str, ...]:
+        """Ids of the finished runs of a match, first to last."""
+        return tuple(list_runs(self.blobs, match_id)[0])
+
+    def unfinished_runs(self, match_id: str) -> tuple[Reservation, ...]:
+        """Runs of a match at work or killed at work, first to last."""
+        _, reserved = list_runs(self.blobs, match_id)
+        found = (read_reservation(self.blobs, match_id, run_id) for run_id in reserved)
+        return tuple(reservation for reservation in found if reservation)
+
+    def run(self, match_id: str, run_id: str = LATEST) -> RunRecord:
+        """The record of a finished run; `latest` is the one with the highest number.
+
+        Raises:
+            InputError: there is none.
+            CorruptionError: it is damaged.
+        """
+        return read_record(self.blobs, match_id, run_id)
+
+    def _published_twin(self, result: ResultId, ours: ResultManifest) -> ResultManifest:
+        theirs = self.manifest(result.match_id, result.stage, result.unit, result.key)
+        if theirs.content != ours.content:
+            changed = sorted({file.path for file in {*theirs.files} ^ {*ours.files}})
+            raise NondeterminismError(
+                f"{self.url}/{result.path} is published with other content than this computation "
+                f"gave; {len(changed)} files differ, the first is {changed[0]}. The same recipe "
+                "must give the same bytes: report the stage. The published result stays."
+            )
+        return theirs

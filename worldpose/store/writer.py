@@ -1,0 +1,119 @@
+"""One result on its way into the store."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from data_contracts.arrays import GroupLayout
+from data_contracts.records import CONTRACT_VERSION
+from data_contracts.run import ResultManifest, StoredFile, Work
+from worldpose.errors import InputError, StoreError
+from worldpose.store.blobs import storage_errors
+from worldpose.store.canonical import canonical_json, digest
+from worldpose.store.commit_points import reached
+from worldpose.store.documents import checksum_of
+from worldpose.store.layout_checks import Arrays
+
+
+class ResultWriter:
+    """Takes the arrays and figures of one result into private staging.
+
+    Attributes:
+        figures: quality figures by name, with the unit in the name; fill it before leaving
+            `Store.publishing`.
+        manifest: the published result's manifest; None until `Store.publishing` is left.
+    """
+
+    def __init__(self, work: Work, folder: Path) -> None:
+        self.figures: dict[str, float] = {}
+        self.manifest: ResultManifest | None = None
+        self._work, self._folder = work, folder
+        self._started = time.monotonic()
+        self._is_written = False
+
+    def write(
+        self,
+        layout: GroupLayout,
+        arrays: Arrays,
+        coordinates: Arrays | None = None,
+        attributes: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Writes the result's arrays, once; see `worldpose.store.groups.write_group`.
+
+        Raises:
+            InputError: they are not what the layout says.
+            StoreError: the disk is full or not writable, or the result was written already.
+        """
+        # Late: status and resumed runs read manifests only, and Zarr takes most of a second.
+        from worldpose.store.groups import write_group
+
+        name = self._work.recipe.name
+        if self._is_written:
+            raise StoreError(f"{name}: a result is written once; it has been written")
+        if layout.stage != self._work.recipe.stage:
+            raise InputError(
+                f"result of {name}",
+                expected=f"the layout of stage {self._work.recipe.stage}",
+                found=f"the layout of stage {layout.stage}",
+                todo="Write the layout that data_contracts has for the stage.",
+            )
+        reached("before_write")
+        with storage_errors(str(self._folder)):
+            write_group(self._folder, layout, arrays, coordinates or {}, attributes or {})
+        self._is_written = True
+        reached("after_write")
+
+    def sealed_manifest(self) -> ResultManifest:
+        """The manifest of what has been written.
+
+        Raises:
+            InputError: a figure is not finite.
+            StoreError: nothing has been written.
+        """
+        name = self._work.recipe.name
+        if not self._is_written:
+            raise StoreError(f"{name}: nothing was written, so there is nothing to publish")
+        for figure, value in self.figures.items():
+            if not math.isfinite(value):
+                raise InputError(
+                    f"figure {figure} of {name}",
+                    expected="a finite number",
+                    found=str(value),
+                    todo="Leave a figure out where there is nothing to compute it from.",
+                )
+        with storage_errors(str(self._folder)):
+            files = stored_files(self._folder)
+        manifest = ResultManifest(
+            contract=CONTRACT_VERSION,
+            key=self._work.key,
+            recipe=self._work.recipe,
+            files=files,
+            content=content_of(files),
+            figures={figure: float(value) for figure, value in self.figures.items()},
+            created_at=datetime.now(UTC),
+            seconds=time.monotonic() - self._started,
+            run_id=self._work.run_id,
+            checksum="0" * 64,
+        )
+        return manifest.model_copy(update={"checksum": checksum_of(manifest)})
+
+
+def stored_files(folder: Path) -> tuple[StoredFile, ...]:
+    """Size and checksum of every file below `folder`, sorted by path."""
+    found = []
+    for path in folder.rglob("*"):
+        if path.is_file():
+            data = path.read_bytes()
+            name = path.relative_to(folder).as_posix()
+            found.append(StoredFile(path=name, size=len(data), sha256=digest(data)))
+    return tuple(sorted(found, key=lambda file: file.path))
+
+
+def content_of(files: tuple[StoredFile, ...]) -> str:
+    """The digest that two honest computations of one key agree in."""
+    return digest(canonical_json([file.model_dump(mode="json") for file in files]))

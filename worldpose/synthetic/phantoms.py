@@ -1,0 +1,52 @@
+"""False people: what a detector takes for somebody where nobody is."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from worldpose.pitch import PitchTemplate
+from worldpose.synthetic.gait import draw_body, walk
+from worldpose.synthetic.noise import bursts
+from worldpose.synthetic.observing import Bodies
+from worldpose.synthetic.paths import wander
+from worldpose.synthetic.scenarios import Scenario
+
+PHANTOMS: Final = 2
+"""Most false people at a time in one camera."""
+
+
+def draw_phantoms(
+    scenario: Scenario, pitch: PitchTemplate, frames: int, rng: np.random.Generator
+) -> Bodies:
+    """Return still human figures that come and go at random places on and around the area.
+
+    Args:
+        scenario: area and the rates of false people.
+        pitch: what they stand on.
+        frames: number of frames.
+        rng: this camera's own: cameras are deceived independently.
+    """
+    noise, crowd = scenario.noise, scenario.crowd
+    share = noise.false_people / PHANTOMS
+    shape = (frames, PHANTOMS)
+    on = bursts(share, noise.false_people_time, shape, scenario.fps, rng)
+    body = draw_body(crowd.height, rng)
+    # Any moment of a minute's walk serves as a posture; every appearance has its own.
+    path = wander(crowd, 60.0, (), rng)
+    appeared = on & ~np.concatenate([np.zeros_like(on[:1]), on[:-1]])
+    times = rng.uniform(0.0, 60.0, appeared.shape)
+    joints = walk(body, path, times.ravel(), lambda x, y: 0.0 * x, rng)
+    joints = joints.reshape(*appeared.shape, 17, 3)
+    joints[..., :2] -= joints[..., 11:13, :2].mean(axis=2, keepdims=True)
+    place = np.array(crowd.area_center) + np.array(crowd.area_size) * rng.uniform(
+        -1.0, 1.0, (*appeared.shape, 2)
+    )
+    joints[..., :2] += place[:, :, None]
+    joints[..., 2] += pitch.height(place[..., 0], place[..., 1])[..., None]
+    # A figure stays as it was when it appeared.
+    since = np.maximum.accumulate(np.where(appeared, np.arange(frames)[:, None], 0), axis=0)
+    joints = np.take_along_axis(joints, since[..., None, None], axis=0)
+    joints[~on] = np.nan
+    return Bodies(joints, np.full(PHANTOMS, body.height))

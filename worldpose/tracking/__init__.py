@@ -1,0 +1,10 @@
+"""Tracking: which detection of every camera is which person, frame after frame (T1, T2).
+
+Inputs: cameras and the people each of them detected. Outputs: the detection of every person in
+every frame and camera, quick joints [m], and a summary of each track.
+"""
+
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import Tracking, TrackingReport, track_people
+
+__all__ = ["Tracking", "TrackingReport", "TrackingSettings", "track_people"]
