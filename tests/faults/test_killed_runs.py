@@ -79,7 +79,7 @@ def test_the_whole_process_group_killed_at_a_random_time(seed, tiny, tiny_run, t
     time.sleep(delay)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    if Store.exists(str(project)):
+    if (project / "project.json").exists():
         store = Store.open(str(project))
         for match in store.matches():
             for run in store.runs(match):

@@ -216,7 +216,7 @@ def _undistort_radius(c: Floats, radius_d: float) -> tuple[float, int]:
         # A Newton step that leaves the bracket is replaced by a bisection.
         following = radius - misfit / (1.0 + s * (3.0 * k1 + s * (5.0 * k2 + 7.0 * s * k3)))
         if not low <= following <= high:
-            following = 0.5 * (low + high) if high < np.inf else 2.0 * radius
+            following = 0.5 * (low + high)
         if following == radius:
             break
         radius = following
@@ -233,14 +233,12 @@ def _polish(
     entry says whether the fold was in the way of the last step.
     """
     at = distort(x, y, c[4], c[5], c[6], c[7], c[8])
-    # The centre of the lens is one to one, so shrinking ends.
-    while not at[2] * at[4] - at[3] * at[3] > 0.0:
-        x, y = 0.9 * x, 0.9 * y
-        at = distort(x, y, c[4], c[5], c[6], c[7], c[8])
     misfit = np.hypot(at[0] - xd, at[1] - yd)
     at_fold = False
     for _ in range(_MAX_ITERATIONS):
         determinant = at[2] * at[4] - at[3] * at[3]
+        if determinant <= 0.0:
+            return x, y, misfit, True
         step_x = (at[4] * (at[0] - xd) - at[3] * (at[1] - yd)) / determinant
         step_y = (at[2] * (at[1] - yd) - at[3] * (at[0] - xd)) / determinant
         size = 1.0

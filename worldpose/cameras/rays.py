@@ -159,8 +159,8 @@ def intersect_rays(
     with np.errstate(invalid="ignore"):
         # The eigenvalues of normal / total sum to 2 and none exceeds 1, so the determinant is
         # the smallest eigenvalue up to a factor of 3: sin^2(angle / 2) for two equal rays.
-        scaled = normal / total[..., None, None]
-        solvable = (used.sum(-1) >= 2) & (np.linalg.det(scaled) > 1e-12)
+        # One ray or none leaves it zero or NaN.
+        solvable = np.linalg.det(normal / total[..., None, None]) > 1e-12
     safe = np.where(solvable[..., None, None], normal, np.eye(3))
     points = np.linalg.solve(safe, right[..., None])[..., 0] + mean
     return np.where(solvable[..., None], points, np.nan), normal

@@ -166,6 +166,14 @@ def test_pixel_outside_the_radial_image_can_lie_inside_the_tangential_one():
     assert camera.unproject([[-1.5, 0.0]]).status.tolist() == [RayStatus.BEYOND_FOLD]
 
 
+def test_radial_fold_bounds_the_inverse_with_tangential_terms_too():
+    # Along +x, p2 = 0.05 carries the image on past the radial fold at 1: the image of 1.1.
+    camera = plane_camera(k1=-1 / 3, p2=0.05)
+    beyond = 1.1 * (1.0 - 1.21 / 3.0) + 3.0 * 0.05 * 1.21
+    assert np.isnan(camera.project([[1.1, 0.0, 1.0]])).all()
+    assert camera.unproject([[beyond, 0.0]]).status.tolist() == [RayStatus.BEYOND_FOLD]
+
+
 def test_missing_pixels_and_cameras_are_missing():
     rays = plane_camera(k1=0.1).unproject([[np.nan, 0.0], [0.0, np.inf], [0.0, 0.0]])
     assert rays.status.tolist() == [RayStatus.MISSING, RayStatus.MISSING, RayStatus.OK]

@@ -179,11 +179,12 @@ def test_cameras_ten_metres_apart_meet_a_kilometre_away():
 
 
 def test_large_world_coordinates_keep_their_digits():
-    shift = np.array([5e5, 4e6, 100.0])  # a survey grid
-    near = shift + np.array([[-5.0, 0.0, 0.0], [0.0, -5.0, 0.0]])
-    rays = rays_through(near, shift)
-    # Float64 resolves 1e-9 m at 4e6 m; the directions carry that over 5 m.
-    np.testing.assert_allclose(intersect_rays(rays)[0], shift, atol=3e-9)
+    shift = np.array([500_000.0, 4_000_000.0, 100.0])  # a survey grid
+    origins = shift + np.array([[0.0, -5.0, 0.0], [0.0, 5.0, 0.0]])
+    target = shift + np.array([1000.0, 0.0, 0.0])
+    # As ten metres apart without the shift; solving in grid coordinates would lose 1e-5 m.
+    np.testing.assert_allclose(intersect_rays(rays_through(origins, target))[0], target, rtol=0.0,
+                               atol=1e-8)  # fmt: skip
 
 
 def test_rays_broadcast_and_index():
