@@ -84,11 +84,23 @@ def plan_stage(
 
 
 def plan_run(
-    store: Store, match: Match, overrides: Overrides, stages: tuple[Stage, ...] = METHOD
+    store: Store,
+    match: Match,
+    overrides: Overrides,
+    stages: tuple[Stage, ...] = METHOD,
+    standing: Mapping[str, str] | None = None,
 ) -> list[PlannedUnit]:
-    """All units of `stages` in order, as they would be if every one succeeded."""
+    """All units of `stages` in order, as they would be if every one succeeded.
+
+    Args:
+        store: where results are looked for.
+        match: the match.
+        overrides: settings that differ from their defaults.
+        stages: the stages to plan.
+        standing: results of the stages before them, as `stage/unit` to key.
+    """
     planned: list[PlannedUnit] = []
-    results: dict[str, str] = {}
+    results = dict(standing or {})
     for stage in stages:
         units = plan_stage(store, match, stage, overrides, results)
         results |= {unit.name: unit.key for unit in units}

@@ -45,8 +45,9 @@ def prefect_server(project: str) -> Iterator[Callable[[], None]]:
     local = "://" not in project
     with tempfile.TemporaryDirectory(prefix="worldpose-prefect-") as scratch:
         home = Path(project).resolve() / "prefect" if local else Path(scratch)
+        home.mkdir(parents=True, exist_ok=True)
         os.environ["PREFECT_HOME"] = str(home)
-        with _embedded_server() as (address, wait_until_ready):
+        with _embedded_server(home / "server.log") as (address, wait_until_ready):
             os.environ["PREFECT_API_URL"] = address
             try:
                 yield wait_until_ready
@@ -55,26 +56,27 @@ def prefect_server(project: str) -> Iterator[Callable[[], None]]:
 
 
 @contextmanager
-def _embedded_server() -> Iterator[tuple[str, Callable[[], None]]]:
+def _embedded_server(log: Path) -> Iterator[tuple[str, Callable[[], None]]]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     # The server ends when its standard input does, so a killed run leaves none behind.
-    server = subprocess.Popen(
-        [sys.executable, "-m", "flows.embedded_server", str(port)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-    )
+    with log.open("wb") as output:
+        server = subprocess.Popen(
+            [sys.executable, "-m", "flows.embedded_server", str(port)],
+            stdin=subprocess.PIPE,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+        )
     address = f"http://127.0.0.1:{port}/api"
     try:
-        yield address, partial(_wait_until_healthy, server, address)
+        yield address, partial(_wait_until_healthy, server, address, log)
     finally:
         server.kill()
         server.wait()
 
 
-def _wait_until_healthy(server: subprocess.Popen[bytes], address: str) -> None:
+def _wait_until_healthy(server: subprocess.Popen[bytes], address: str, log: Path) -> None:
     """Returns when the server answers.
 
     Raises:
@@ -84,7 +86,7 @@ def _wait_until_healthy(server: subprocess.Popen[bytes], address: str) -> None:
     deadline = time.monotonic() + START_SECONDS
     while time.monotonic() < deadline:
         if server.poll() is not None:
-            output = server.stdout.read().decode(errors="replace") if server.stdout else ""
+            output = log.read_text(errors="replace")
             raise WorldposeError(f"Prefect's embedded server did not start:\n{output[-2000:]}")
         try:
             with opener.open(f"{address}/health", timeout=2) as answer:
@@ -92,4 +94,6 @@ def _wait_until_healthy(server: subprocess.Popen[bytes], address: str) -> None:
                     return
         except OSError:
             time.sleep(0.1)
-    raise WorldposeError(f"Prefect's embedded server was not ready after {START_SECONDS:.0f} s.")
+    raise WorldposeError(
+        f"Prefect's embedded server was not ready after {START_SECONDS:.0f} s: {log}"
+    )

@@ -22,6 +22,27 @@ def latest_run(store: Store, match_id: str) -> RunRecord | None:
     return store.run(match_id) if store.runs(match_id) else None
 
 
+def standing_results(store: Store, match_id: str, from_stage: str | None) -> dict[str, str]:
+    """Results of the stages before `from_stage` as the latest run has them, stale or not.
+
+    Raises:
+        UsageError: there is no run with such results.
+    """
+    names = [stage.name for stage in METHOD]
+    earlier = names[: names.index(from_stage)] if from_stage is not None else []
+    latest = latest_run(store, match_id)
+    found = {} if latest is None else latest.results
+    standing = {name: key for name, key in found.items() if name.partition("/")[0] in earlier}
+    if earlier and not standing:
+        raise UsageError(
+            f"--from {from_stage}",
+            expected=f"a run of {match_id} with results of {', '.join(earlier)}",
+            found="none",
+            todo="Run without --from first.",
+        )
+    return standing
+
+
 @dataclass
 class RunLog:
     """What a run has reused, computed and failed at so far.
@@ -47,29 +68,11 @@ class RunLog:
     ) -> Self:
         """A new run with its number reserved.
 
-        With `from_stage`, results of earlier stages are those of the latest run, stale or not.
-
         Raises:
             UsageError: `from_stage` is given and there is no run to start from.
         """
         latest = latest_run(store, match.match_id)
-        results: dict[str, str] = {}
-        if from_stage is not None:
-            earlier = [stage.name for stage in METHOD]
-            earlier = earlier[: earlier.index(from_stage)]
-            if latest is not None:
-                results = {
-                    name: key
-                    for name, key in latest.results.items()
-                    if name.partition("/")[0] in earlier
-                }
-            if earlier and not results:
-                raise UsageError(
-                    f"--from {from_stage}",
-                    expected=f"a run of {match.match_id} with results of {', '.join(earlier)}",
-                    found="none",
-                    todo="Run without --from first.",
-                )
+        results = standing_results(store, match.match_id, from_stage)
         run_id = store.reserve_run(match.match_id)
         log = cls(
             store=store,

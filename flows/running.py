@@ -11,7 +11,7 @@ from data_contracts.run import RunRecord
 from flows.planning import PlannedUnit, plan_run, selected_stages
 from flows.prefect_environment import prefect_server
 from flows.progress import reporter
-from flows.run_record import RunLog, latest_run
+from flows.run_record import RunLog, latest_run, standing_results
 from flows.stage import Match
 from worldpose.store import Store
 
@@ -44,24 +44,29 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
         UsageError: no such stage.
     """
     stages = selected_stages(request.from_stage, request.until_stage)
-    if request.from_stage is None:
-        planned = plan_run(store, match, request.settings, stages)
-        if all(unit.published for unit in planned):
-            return _without_work(store, match, request, planned)
+    standing = standing_results(store, match.match_id, request.from_stage)
+    planned = plan_run(store, match, request.settings, stages, standing)
+    if all(unit.published for unit in planned):
+        return _without_work(store, match, request, planned, standing)
     reporter().say("starting Prefect and Dask")
     with prefect_server(store.url) as wait_until_ready:
         return _through_prefect(store, match, request, wait_until_ready)
 
 
 def _without_work(
-    store: Store, match: Match, request: RunRequest, planned: list[PlannedUnit]
+    store: Store,
+    match: Match,
+    request: RunRequest,
+    planned: list[PlannedUnit],
+    standing: dict[str, str],
 ) -> RunRecord:
-    results = {unit.name: unit.key for unit in planned}
+    """The latest run's record where it has all these results, or else a new one."""
+    results = standing | {unit.name: unit.key for unit in planned}
     latest = latest_run(store, match.match_id)
-    if latest is not None and latest.state == "complete" and latest.results == results:
-        reused = tuple(sorted(results))
-        return latest.model_copy(update={"executed": (), "reused": reused, "seconds": 0.0})
-    log = RunLog.begin(store, match, request.settings)
+    is_current = latest is not None and latest.state == "complete"
+    if is_current and results.items() <= latest.results.items():
+        return latest.model_copy(update={"executed": (), "reused": tuple(sorted(results))})
+    log = RunLog.begin(store, match, request.settings, request.from_stage)
     log.reuse(planned)
     return log.close()
 

@@ -2,14 +2,15 @@
 
 import json
 import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import TINY, succeed, worldpose
+from command_line import TINY, WORLDPOSE, succeed, worldpose
 
 from worldpose import open_run
-from worldpose.store import Store
+from worldpose.store import Store, compare_stores
 
 pytestmark = pytest.mark.usefixtures("server")
 
@@ -101,3 +102,35 @@ def test_a_moved_camera_recomputes_all_that_sees_through_it(tiny, tmp_path, serv
     # One camera is taken in again; tracking and triangulation of the clip depend on it.
     assert answer["executed"] == 3
     assert answer["reused"] == len(Store.open(str(project)).run(TINY, "0001").results) - 3
+
+
+def test_from_and_until_take_what_is_there(tiny, project_copy):
+    until = run_json(tiny, "--project", project_copy, "--until", "tracking")
+    assert (until["run"], until["executed"]) == ("0001", 0)
+    # From triangulation on: tracking is taken as it stands, though another setting is asked for.
+    answer = run_json(
+        *(tiny, "--project", project_copy, "--from", "triangulation"),
+        *("--set", "tracking.gate=0.4", "--set", "triangulation.min_views=3"),
+    )
+    assert (answer["run"], answer["executed"]) == ("0002", 1)
+    store = Store.open(project_copy)
+    first, second = store.run(TINY, "0001"), store.run(TINY, "0002")
+    assert second.results["tracking/clip"] == first.results["tracking/clip"]
+    assert second.results["triangulation/clip"] != first.results["triangulation/clip"]
+
+
+def test_from_needs_a_run_to_start_from(tiny, tmp_path):
+    answer = worldpose("run", tiny, "--project", tmp_path / "new", "--from", "triangulation")
+    assert answer.code == 2
+    assert "Run without --from first" in answer.err
+
+
+def test_two_runs_of_one_match_at_once_end_with_one_result(tiny, tiny_run, tmp_path):
+    project = tmp_path / "worldpose-data"
+    command = [*WORLDPOSE, "run", str(tiny), "--project", str(project)]
+    both = [subprocess.Popen(command, stdout=subprocess.DEVNULL) for _ in range(2)]
+    assert [process.wait(timeout=240) for process in both] == [0, 0]
+    store = Store.open(project)
+    assert store.runs(TINY) == ("0001", "0002")
+    assert store.run(TINY, "0001").results == store.run(TINY, "0002").results
+    assert compare_stores(store, Store.open(tiny_run)) == []
