@@ -43,5 +43,8 @@ test-all: install check
 schemas: install
 	$(BIN)/python -m data_contracts.schemas docs/schemas
 
+benchmarks: install
+	@for script in benchmarks/*.py; do echo "$$script"; $(BIN)/python $$script || exit 1; done
+
 clean:
 	rm -rf .venv demo build dist *.egg-info

@@ -46,7 +46,9 @@ class PlayerSpec(Record):
 
     id: Name
     name: str = ""
+    """As shown to people."""
     team: str = ""
+    """Name of the team; empty for officials."""
     role: Literal["player", "goalkeeper", "official"] = "player"
 
 

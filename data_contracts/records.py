@@ -22,4 +22,6 @@ Key = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{32}$")]
 class Record(BaseModel):
     """A frozen record that refuses unknown keys, NaN and infinity."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
+    )

@@ -32,10 +32,14 @@ class ReviewDecision(Record):
     """A person's verdict. It has no default: an empty answer never approves."""
 
     contract: Literal[1] = CONTRACT_VERSION
+    match_id: Name
     request: Name
+    """Id of the `ReviewRequest`."""
     verdict: Literal["approve", "reject"]
     who: str = Field(min_length=1)
+    """Name or login of the person."""
     why: str = ""
+    """In the person's words."""
     decided_at: datetime
 
 
@@ -45,6 +49,9 @@ class MovedPoint(Record):
     kind: Literal["moved_point"] = "moved_point"
     camera: Name
     marking: Name
+    """Name of the point in the pitch template."""
+    frame: int | None = None
+    """Match frame of a moving camera's picture; None for a static camera."""
     xy: tuple[float, float]
     """[px]"""
 
@@ -55,7 +62,30 @@ class DeletedDetection(Record):
     kind: Literal["deleted_detection"] = "deleted_detection"
     camera: Name
     frame: int
+    """Match frame."""
     detection: int
+    """Its place among the camera's detections of the frame."""
+
+
+class AddedDetection(Record):
+    """A person that the detector missed."""
+
+    kind: Literal["added_detection"] = "added_detection"
+    camera: Name
+    frame: int
+    """Match frame."""
+    box: tuple[float, float, float, float]
+    """x0, y0, x1, y1 [px]."""
+
+
+class ChosenFrames(Record):
+    """The frames that a stage is to use, instead of those it proposed (B1)."""
+
+    kind: Literal["chosen_frames"] = "chosen_frames"
+    stage: Name
+    clip: Name
+    frames: tuple[int, ...]
+    """Match frames."""
 
 
 class MovedKeypoint(Record):
@@ -64,7 +94,9 @@ class MovedKeypoint(Record):
     kind: Literal["moved_keypoint"] = "moved_keypoint"
     camera: Name
     frame: int
+    """Match frame."""
     detection: int
+    """Its place among the camera's detections of the frame."""
     joint: Name
     xy: tuple[float, float] | None
     """[px]"""
@@ -89,7 +121,13 @@ class SplitTrack(Record):
 
 
 Edit = Annotated[
-    MovedPoint | DeletedDetection | MovedKeypoint | MergedTracks | SplitTrack,
+    MovedPoint
+    | DeletedDetection
+    | AddedDetection
+    | MovedKeypoint
+    | MergedTracks
+    | SplitTrack
+    | ChosenFrames,
     Field(discriminator="kind"),
 ]
 

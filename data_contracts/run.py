@@ -75,8 +75,11 @@ class ResultManifest(Record):
     figures: dict[str, float]
     """Quality figures, with the unit in the name."""
     created_at: datetime
+    """When it was published."""
     seconds: float
+    """How long it took to compute [s]."""
     run_id: Name
+    """The run that computed it."""
     checksum: Digest
     """Digest of this record without `checksum`."""
 
@@ -87,7 +90,9 @@ class UnitFailure(Record):
     unit: str
     """Stage and unit: `tracking/clip`."""
     error: str
+    """Name of the error's class."""
     message: str
+    """What the error said."""
 
 
 class Reservation(Record):
@@ -98,7 +103,9 @@ class Reservation(Record):
     match_id: Name
     started_at: datetime
     host: str
+    """Name of the machine the run is on."""
     pid: int
+    """Its process there."""
 
 
 RunState = Literal["complete", "partial", "failed"]
@@ -109,10 +116,12 @@ class RunRecord(Record):
 
     contract: Literal[1] = CONTRACT_VERSION
     run_id: Name
+    """Its number, `0001` the first."""
     match_id: Name
     parent: Name | None
     """The run before this one."""
     state: RunState
+    """partial: some units failed, but units of the last stage asked for have results."""
     results: dict[str, Key]
     """Unit, as `stage/unit`, to key."""
     settings: dict[str, dict[str, JsonValue]]
@@ -120,11 +129,18 @@ class RunRecord(Record):
     overrides: dict[str, dict[str, JsonValue]]
     """Stage to the settings that were asked for; the others are defaults."""
     executed: tuple[str, ...]
+    """Units, as `stage/unit`, that this run computed."""
     reused: tuple[str, ...]
+    """Units whose results were there."""
     failed: tuple[UnitFailure, ...]
+    """Units that have no result because their task failed."""
+    blocked: tuple[str, ...]
+    """Units that have no result because one that they are made from has none."""
     figures: dict[str, dict[str, float]]
     """Unit, as `stage/unit`, to quality figures."""
     versions: dict[str, str]
+    """Python and numeric libraries."""
     started_at: datetime
     finished_at: datetime
     seconds: float
+    """How long the run took [s]."""

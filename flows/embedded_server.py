@@ -1,4 +1,4 @@
-"""Prefect's API for one run: `python -m flows.embedded_server PORT`, ends with its standard input.
+"""Prefect's API for one run: `python -m flows.embedded_server SOCKET`, ends with standard input.
 
 Prefect's own temporary server outlives a parent that is killed; this one does not.
 """
@@ -6,6 +6,7 @@ Prefect's own temporary server outlives a parent that is killed; this one does n
 from __future__ import annotations
 
 import os
+import socket
 import sys
 import threading
 
@@ -14,10 +15,11 @@ from prefect.server.api.server import create_app
 
 
 def main() -> None:
-    """Serve on loopback until standard input is closed."""
+    """Serve on the inherited socket until standard input is closed."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     app = create_app(ephemeral=True, final=True)
-    uvicorn.run(app, host="127.0.0.1", port=int(sys.argv[1]), log_level="error", lifespan="on")
+    server = uvicorn.Server(uvicorn.Config(app, log_level="error", lifespan="on"))
+    server.run(sockets=[socket.socket(fileno=int(sys.argv[1]))])
 
 
 def _end_with_parent() -> None:

@@ -1,41 +1,99 @@
-"""Predictions and references by whatever a person names them with."""
+"""Predictions and references by whatever a person names them with, and their scores."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
+from data_contracts.evaluation import Evaluation
+from data_contracts.match import MatchSpec
 from flows.registering import find_match
-from flows.release import clips_of, joint_tracks
-from worldpose.errors import UsageError
-from worldpose.release import JointTracks, read_joints
-from worldpose.store import Store, open_run
+from flows.release import JOINT_STAGES, clips_of, joint_tracks, static_cameras
+from worldpose.cameras import Camera
+from worldpose.errors import InputError, UsageError
+from worldpose.evaluation import CameraScore, PersonScore, evaluate_cameras, evaluate_joints
+from worldpose.ingest import MatchFolder, read_match
+from worldpose.pitch import PitchTemplate
+from worldpose.release import JointTracks, read_camera, read_joints
+from worldpose.store import Run, Store, open_run
 
 
-def load_prediction(
-    name: str, project: str, *, run_id: str = "latest", stage: str | None = None
-) -> JointTracks:
-    """Joints to be scored: a joints file, a folder that holds one, or a match of the project.
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Figures against truth: all together, by true person, by camera."""
+
+    evaluation: Evaluation
+    people: tuple[PersonScore, ...]
+    cameras: tuple[CameraScore, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """What a prediction or a reference brings."""
+
+    joints: JointTracks | None
+    cameras: Mapping[str, Camera]
+    """By camera, or by clip for the broadcast camera."""
+    match: MatchFolder | None = None
+    """The match it belongs to, where that is known."""
+
+
+def score(
+    prediction: str,
+    reference: str,
+    project: str,
+    *,
+    run_id: str = "latest",
+    stage: str | None = None,
+    fps: float | None = None,
+    match_in: str | None = None,
+) -> Scores:
+    """Every score of a prediction against a reference that both sides have the data for.
+
+    Args:
+        prediction: a joints file, a folder with `joints.npz` and `cameras/`, or a match.
+        reference: a joints file, or a folder with `joints.npz`, `cameras/` or both.
+        project: where runs of matches are kept.
+        run_id: number of the run, of a match.
+        stage: whose joints are scored, of a match; None = the latest there are.
+        fps: frames in a second; None = the match's, where there is one.
+        match_in: the reference's camera in whose picture tracks are matched (E3).
 
     Raises:
-        UsageError: it is none of these, or a match with several clips.
+        UsageError: a name that does not exist, or nothing that both sides have.
+        InputError: a file is not what it must be.
     """
-    path = Path(name)
-    if path.is_file():
-        return read_joints(path)
-    if (path / "joints.npz").is_file():
-        return read_joints(path / "joints.npz")
-    store = Store.open(project)
-    match = find_match(store, name)
-    run = open_run(project, match.match_id, run_id)
-    clips = clips_of(run.record)
-    if len(clips) > 1:
+    truth = _reference(reference)
+    estimate = _prediction(prediction, project, truth, run_id=run_id, stage=stage)
+    match = estimate.match or truth.match
+    spec = None if match is None else match.spec
+    true_cameras = _sized(reference, truth, spec)
+    if match_in is not None and match_in not in true_cameras:
         raise UsageError(
-            f"--prediction {name}",
-            expected="one clip",
-            found=f"a match of {len(clips)} clips",
-            todo="Export it and score clip by clip.",
+            f"--match-in {match_in}",
+            expected=f"a camera of the reference: {', '.join(true_cameras) or 'it has none'}",
+            found=repr(match_in),
+            todo="Name one of these, or leave the option out.",
         )
-    return joint_tracks(run, clips[0], stage)
+    evaluation = Evaluation()
+    people: tuple[PersonScore, ...] = ()
+    if estimate.joints is not None and truth.joints is not None:
+        evaluation, people = evaluate_joints(
+            estimate.joints,
+            truth.joints,
+            fps=fps or (None if spec is None else spec.fps),
+            camera=None if match_in is None else true_cameras[match_in],
+        )
+    errors, cameras = evaluate_cameras(estimate.cameras, true_cameras, _pitch(match))
+    if not cameras and not people and evaluation.frames is None:
+        raise UsageError(
+            f"--prediction {prediction} --reference {reference}",
+            expected="joints on both sides, or cameras of the same names",
+            found=f"{_contents(estimate)} against {_contents(truth)}",
+            todo="Name files or folders that hold the same things.",
+        )
+    return Scores(evaluation.model_copy(update={"cameras": errors}), people, cameras)
 
 
 def load_reference(name: str) -> JointTracks:
@@ -46,3 +104,72 @@ def load_reference(name: str) -> JointTracks:
     """
     path = Path(name)
     return read_joints(path / "joints.npz" if path.is_dir() else path)
+
+
+def _reference(name: str) -> Side:
+    path = Path(name)
+    above = [folder for folder in path.resolve().parents[:2] if (folder / "match.yaml").is_file()]
+    match = read_match(above[0]) if above else None
+    files = sorted((path / "cameras").glob("*.npz"))
+    if path.is_dir() and files:
+        joints = read_joints(path / "joints.npz") if (path / "joints.npz").is_file() else None
+        return Side(joints, {file.stem: read_camera(file) for file in files}, match)
+    return Side(load_reference(name), {}, match)
+
+
+def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str | None) -> Side:
+    path = Path(name)
+    if path.is_file() or (path / "joints.npz").is_file() or (path / "cameras").is_dir():
+        return _reference(name)
+    match = find_match(Store.open(project), name)
+    run = open_run(project, match.match_id, run_id)
+    cameras = _run_cameras(run, match.folder.spec) if truth.cameras else {}
+    if cameras and not any(unit.partition("/")[0] in JOINT_STAGES for unit in run):
+        return Side(None, cameras, match.folder)
+    clips = clips_of(run.record)
+    if len(clips) > 1:
+        raise UsageError(
+            f"--prediction {name}",
+            expected="one clip",
+            found=f"a match of {len(clips)} clips",
+            todo="Export it and score clip by clip.",
+        )
+    return Side(joint_tracks(run, clips[0], stage), cameras, match.folder)
+
+
+def _run_cameras(run: Run, spec: MatchSpec) -> dict[str, Camera]:
+    """The cameras that a run used or found, by camera or clip."""
+    return static_cameras(run, spec)
+
+
+def _sized(reference: str, truth: Side, spec: MatchSpec | None) -> dict[str, Camera]:
+    """The true cameras with the pictures of the match: the files do not tell their size."""
+    if spec is None:
+        return dict(truth.cameras)
+    clips = {clip.id: clip.broadcast or clip.id for clip in spec.clips}
+    sizes = {camera.id: (camera.width, camera.height) for camera in spec.cameras}
+    cameras = {}
+    for name in truth.cameras:
+        camera_id = clips.get(name, name)
+        if camera_id not in sizes:
+            raise InputError(
+                str(Path(reference) / "cameras" / f"{name}.npz"),
+                expected=f"a camera or clip of the match: {', '.join([*sizes, *clips])}",
+                found=repr(name),
+                todo="Rename the file, or take it out.",
+            )
+        file = Path(reference) / "cameras" / f"{name}.npz"
+        cameras[name] = read_camera(file, sizes[camera_id])
+    return cameras
+
+
+def _pitch(match: MatchFolder | None) -> PitchTemplate | None:
+    """The match's pitch; the standard one where no match is known."""
+    if match is None:
+        return PitchTemplate.standard()
+    return None if match.pitch is None else PitchTemplate.from_spec(match.pitch)
+
+
+def _contents(side: Side) -> str:
+    cameras = f"cameras {', '.join(side.cameras)}" if side.cameras else "no cameras"
+    return f"{'joints' if side.joints is not None else 'no joints'} and {cameras}"

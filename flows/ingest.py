@@ -34,7 +34,8 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     calibration = folder.calibrations.get(unit)
     frames = unit_frames(folder.spec, unit)
     return {
-        "detections": match.registration.digest_of(path),
+        "detections": path,
+        "detections_sha256": match.registration.digest_of(path),
         "calibration": None if calibration is None else calibration.model_dump(mode="json"),
         "first_frame": frames.first,
         "frame_count": frames.count,

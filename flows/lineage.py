@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 from data_contracts.run import Recipe, RunRecord
-from flows.planning import Overrides, plan_run
+from flows.method import METHOD
+from flows.planning import PlannedUnit, plan_run
 from flows.registering import open_match
 from flows.run_record import latest_run
-from worldpose.errors import UsageError
+from flows.settings import Overrides
+from worldpose.errors import InputError
 from worldpose.store import Store, explain_difference
 
 
@@ -29,35 +30,28 @@ class UnitChange:
     reasons: tuple[str, ...]
     figures: tuple[tuple[str, float, float], ...]
 
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON output."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class Explanation:
-    """Whether a unit is current, and why not."""
+    """Where a unit stands (`unit_state`), the key it would have now, and why."""
 
     unit: str
     state: str
+    key: str
     reasons: tuple[str, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON output."""
-        return asdict(self)
 
 
 def find_run(store: Store, name: str) -> RunRecord:
     """The run that a person means by `match/number`, or `match` for its latest.
 
     Raises:
-        UsageError: no such run.
+        InputError: no such run.
     """
     match_id, _, number = name.partition("/")
     runs = store.runs(match_id) if match_id in store.matches() else []
     run_id = number or (runs[-1] if runs else "")
     if run_id not in runs:
-        raise UsageError(
+        raise InputError(
             name,
             expected=f"MATCH/NUMBER; matches here: {', '.join(store.matches()) or '(none)'}",
             found=f"runs {', '.join(runs)}" if runs else "no run of that match",
@@ -90,8 +84,20 @@ def run_difference(store: Store, a: RunRecord, b: RunRecord) -> list[UnitChange]
     return changes
 
 
+def unit_state(unit: PlannedUnit, latest: RunRecord | None) -> str:
+    """Where a unit stands.
+
+    current: the latest run has the result that a run would give now. ready: the store has it, the
+    latest run has not. stale: the latest run has another. missing: there is none.
+    """
+    theirs = None if latest is None else latest.results.get(unit.name)
+    if unit.published:
+        return "current" if theirs == unit.key else "ready"
+    return "missing" if theirs in (None, unit.key) else "stale"
+
+
 def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
-    """Whether the unit's result in the latest run is what a run would give now.
+    """Where a unit stands, and what made it so.
 
     Args:
         store: the store.
@@ -99,7 +105,7 @@ def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
         overrides: settings to ask for; empty = those of the latest run.
 
     Raises:
-        UsageError: no such unit.
+        InputError: no such unit.
     """
     match_id, _, unit_name = name.partition("/")
     match = open_match(store, match_id)
@@ -107,20 +113,21 @@ def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
     asked = overrides or ({} if latest is None else latest.overrides)
     planned = {unit.name: unit for unit in plan_run(store, match, asked)}
     if unit_name not in planned:
-        raise UsageError(
+        raise InputError(
             name,
             expected=f"a unit of {match_id}: {', '.join(planned)}",
             found=repr(unit_name),
             todo="Write it as MATCH/STAGE/UNIT.",
         )
     unit = planned[unit_name]
+    state = unit_state(unit, latest)
     if latest is None or unit_name not in latest.results:
-        state = "published, but in no run" if unit.published else "never computed"
-        return Explanation(name, state, ())
+        return Explanation(name, state, unit.key, ("no run has computed it",))
     if latest.results[unit_name] == unit.key:
-        return Explanation(name, f"current (run {latest.run_id}, key {unit.key})", ())
+        lost = () if unit.published else ("its result was withdrawn or removed",)
+        return Explanation(name, state, unit.key, (f"run {latest.run_id} has it", *lost))
     reasons = explain_difference(_recipe(store, latest, unit_name), unit.recipe)
-    return Explanation(name, f"stale since run {latest.run_id}", tuple(reasons))
+    return Explanation(name, state, unit.key, (f"since run {latest.run_id}:", *reasons))
 
 
 def _recipe(store: Store, run: RunRecord, unit: str) -> Recipe:
@@ -129,8 +136,6 @@ def _recipe(store: Store, run: RunRecord, unit: str) -> Recipe:
 
 
 def _method_order(unit: str) -> tuple[int, str]:
-    from flows.method import METHOD
-
     stage = unit.partition("/")[0]
     names = [each.name for each in METHOD]
     return (names.index(stage) if stage in names else len(names), unit)

@@ -6,23 +6,15 @@ key the store already holds is reused; nothing else is ever skipped.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
-from functools import cache
 
-from pydantic import JsonValue, ValidationError
-
-from data_contracts.records import Record
 from data_contracts.run import Recipe, Work
 from flows.method import METHOD
+from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
 from worldpose.errors import UsageError
 from worldpose.store import Store, code_version, key_of, libraries
-
-Overrides = Mapping[str, Mapping[str, JsonValue]]
-"""Stage to the settings that differ from their defaults."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +41,23 @@ class PlannedUnit:
         )
 
 
+@dataclass(frozen=True)
+class StagePlan:
+    """A stage's units.
+
+    Attributes:
+        units: those whose inputs are known.
+        blocked: names, as `stage/unit`, of those that are made from a unit without a result.
+    """
+
+    units: tuple[PlannedUnit, ...]
+    blocked: tuple[str, ...]
+
+
 def plan_stage(
     store: Store, match: Match, stage: Stage, overrides: Overrides, results: Mapping[str, str]
-) -> list[PlannedUnit]:
-    """The stage's units whose inputs are all known.
+) -> StagePlan:
+    """What a stage has to do.
 
     Args:
         store: where results are looked for.
@@ -62,10 +67,11 @@ def plan_stage(
         results: `stage/unit` to key of what earlier stages have, or will have, computed.
     """
     settings = settings_of(stage, overrides).model_dump(mode="json")
-    planned = []
+    units, blocked = [], []
     for unit in stage.units(match):
         inputs = stage.inputs(match, unit)
         if not all(name in results for name in inputs):
+            blocked.append(f"{stage.name}/{unit}")
             continue
         recipe = Recipe(
             match_id=match.match_id,
@@ -74,13 +80,13 @@ def plan_stage(
             sources=stage.sources(match, unit),
             inputs={name: results[name] for name in inputs},
             settings=settings,
-            code=_code_of(stage.name),
+            code=code_version(f"tasks.{stage.name}"),
             libraries=libraries(),
         )
         key = key_of(recipe)
         published = store.has(match.match_id, stage.name, unit, key)
-        planned.append(PlannedUnit(recipe, key, published))
-    return planned
+        units.append(PlannedUnit(recipe, key, published))
+    return StagePlan(tuple(units), tuple(blocked))
 
 
 def plan_run(
@@ -98,95 +104,21 @@ def plan_run(
         overrides: settings that differ from their defaults.
         stages: the stages to plan.
         standing: results of the stages before them, as `stage/unit` to key.
+
+    Raises:
+        UsageError: `standing` lacks what the stages are made from.
     """
     planned: list[PlannedUnit] = []
     results = dict(standing or {})
     for stage in stages:
-        units = plan_stage(store, match, stage, overrides, results)
-        results |= {unit.name: unit.key for unit in units}
-        planned += units
-    return planned
-
-
-def selected_stages(from_stage: str | None, until_stage: str | None) -> tuple[Stage, ...]:
-    """The stages from one to another, both included.
-
-    Raises:
-        UsageError: no such stage, or the first comes after the last.
-    """
-    names = [stage.name for stage in METHOD]
-    first = 0 if from_stage is None else _place("--from", from_stage, names)
-    last = len(names) - 1 if until_stage is None else _place("--until", until_stage, names)
-    if first > last:
-        raise UsageError(
-            f"--from {from_stage} --until {until_stage}",
-            expected=f"stages in the order {', '.join(names)}",
-            found=f"{from_stage} after {until_stage}",
-            todo="Swap them.",
-        )
-    return METHOD[first : last + 1]
-
-
-def parse_overrides(assignments: list[str]) -> dict[str, dict[str, JsonValue]]:
-    """Settings given as `stage.name=value`; values are JSON, or else text.
-
-    Raises:
-        UsageError: no such stage or setting, or a value that does not fit it.
-    """
-    overrides: dict[str, dict[str, JsonValue]] = {}
-    stages = {stage.name: stage for stage in METHOD}
-    for assignment in assignments:
-        name, equals, text = assignment.partition("=")
-        stage_name, dot, field = name.partition(".")
-        if not (equals and dot):
+        plan = plan_stage(store, match, stage, overrides, results)
+        if plan.blocked:
             raise UsageError(
-                f"--set {assignment}",
-                expected="stage.name=value",
-                found=repr(assignment),
-                todo="For example: --set triangulation.min_views=3.",
+                f"--from {stages[0].name}",
+                expected=f"a latest run with all that {plan.blocked[0]} is made from",
+                found=", ".join(sorted(results)) or "no result of an earlier stage",
+                todo="Run without --from first.",
             )
-        _place(f"--set {assignment}", stage_name, list(stages))
-        _place(f"--set {assignment}", field, list(stages[stage_name].settings.model_fields))
-        try:
-            value = json.loads(text)
-        except ValueError:
-            value = text
-        overrides.setdefault(stage_name, {})[field] = value
-    for stage_name in overrides:
-        settings_of(stages[stage_name], overrides)
-    return overrides
-
-
-def settings_of(stage: Stage, overrides: Overrides) -> Record:
-    """The stage's settings with `overrides` applied.
-
-    Raises:
-        UsageError: a value does not fit.
-    """
-    try:
-        return stage.settings.model_validate(dict(overrides.get(stage.name, {})))
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise UsageError(
-            f"--set {stage.name}.{'.'.join(map(str, first['loc']))}",
-            expected=first["msg"],
-            found=repr(first["input"]),
-            todo=f"The settings of {stage.name} are described in docs/method.md.",
-        ) from None
-
-
-@cache
-def _code_of(stage: str) -> dict[str, str]:
-    return code_version(f"tasks.{stage}")
-
-
-def _place(where: str, name: str, names: list[str]) -> int:
-    if name in names:
-        return names.index(name)
-    close = get_close_matches(name, names, n=1)
-    raise UsageError(
-        where,
-        expected=f"one of {', '.join(names) or '(this stage has no settings)'}",
-        found=repr(name),
-        todo=f"Did you mean {close[0]!r}?" if close else "Choose one of these.",
-    )
+        results |= {unit.name: unit.key for unit in plan.units}
+        planned += plan.units
+    return planned

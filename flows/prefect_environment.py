@@ -14,86 +14,124 @@ import sys
 import tempfile
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
-from worldpose.errors import WorldposeError
+from worldpose.errors import InputError, WorldposeError
 
 START_SECONDS = 120.0
 """A first start creates Prefect's database, which took 15 s on two busy cores."""
+
+ALWAYS = {
+    "DO_NOT_TRACK": "1",
+    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+}
+LOOPBACK = "127.0.0.1,localhost"
+"""Never asked for through a proxy."""
+UNLESS_GIVEN = {
+    # The server gets every line; the terminal has progress and failures of our own.
+    "PREFECT_LOGGING_EXTRA_LOGGERS": "worldpose",
+    "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "CRITICAL",
+}
 
 
 @contextmanager
 def prefect_server(project: str) -> Iterator[Callable[[], None]]:
     """Environment and server for Prefect; gives a function that returns when its API answers.
 
-    So Prefect can be imported, which takes seconds, while its server starts.
+    So Prefect can be imported, which takes seconds, while its server starts. Waiting raises
+    InputError for a given server, WorldposeError for our own, that does not answer.
 
     Args:
         project: folder or URL of the store; a local one also keeps Prefect's database.
     """
-    os.environ["DO_NOT_TRACK"] = "1"
-    os.environ["PREFECT_SERVER_ANALYTICS_ENABLED"] = "false"
-    # The server gets every line; the terminal has progress and failures of our own.
-    os.environ.setdefault("PREFECT_LOGGING_EXTRA_LOGGERS", "worldpose")
-    os.environ.setdefault("PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL", "CRITICAL")
-    if os.environ.get("PREFECT_API_URL"):
-        yield lambda: None
-        return
-    local = "://" not in project
-    with tempfile.TemporaryDirectory(prefix="worldpose-prefect-") as scratch:
-        home = Path(project).resolve() / "prefect" if local else Path(scratch)
-        home.mkdir(parents=True, exist_ok=True)
-        os.environ["PREFECT_HOME"] = str(home)
-        with _embedded_server(home / "server.log") as (address, wait_until_ready):
-            os.environ["PREFECT_API_URL"] = address
-            try:
+    no_proxy = {
+        name: ",".join(filter(None, [os.environ.get(name), LOOPBACK]))
+        for name in ("NO_PROXY", "no_proxy")
+    }
+    given = {name: os.environ.get(name, value) for name, value in UNLESS_GIVEN.items()}
+    with _environment({**ALWAYS, **given, **no_proxy}):
+        address = os.environ.get("PREFECT_API_URL")
+        if address:
+            yield partial(_require_answer, address)
+            return
+        with tempfile.TemporaryDirectory(prefix="worldpose-prefect-") as scratch:
+            local = "://" not in project
+            home = Path(project).resolve() / "prefect" if local else Path(scratch)
+            home.mkdir(parents=True, exist_ok=True)
+            with (
+                _environment({"PREFECT_HOME": str(home)}),
+                _embedded_server(Path(scratch) / "server.log") as (address, wait_until_ready),
+                _environment({"PREFECT_API_URL": address}),
+            ):
                 yield wait_until_ready
-            finally:
-                del os.environ["PREFECT_API_URL"]
+
+
+@contextmanager
+def _environment(values: Mapping[str, str]) -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
 
 @contextmanager
 def _embedded_server(log: Path) -> Iterator[tuple[str, Callable[[], None]]]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    # The server ends when its standard input does, so a killed run leaves none behind.
-    with log.open("wb") as output:
+    with socket.create_server(("127.0.0.1", 0)) as listening, log.open("wb") as output:
+        address = f"http://127.0.0.1:{listening.getsockname()[1]}/api"
+        # The server ends when its standard input does, so a killed run leaves none behind. It is
+        # given the socket rather than a port, which another process could have taken meanwhile.
         server = subprocess.Popen(
-            [sys.executable, "-m", "flows.embedded_server", str(port)],
+            [sys.executable, "-m", "flows.embedded_server", str(listening.fileno())],
             stdin=subprocess.PIPE,
             stdout=output,
             stderr=subprocess.STDOUT,
+            pass_fds=[listening.fileno()],
         )
-    address = f"http://127.0.0.1:{port}/api"
     try:
         yield address, partial(_wait_until_healthy, server, address, log)
     finally:
         server.kill()
-        server.wait()
+        server.communicate()
 
 
 def _wait_until_healthy(server: subprocess.Popen[bytes], address: str, log: Path) -> None:
-    """Returns when the server answers.
+    """Returns when the embedded server answers.
 
     Raises:
         WorldposeError: it ended, or does not answer in time.
     """
-    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     deadline = time.monotonic() + START_SECONDS
-    while time.monotonic() < deadline:
-        if server.poll() is not None:
-            output = log.read_text(errors="replace")
-            raise WorldposeError(f"Prefect's embedded server did not start:\n{output[-2000:]}")
-        try:
-            with opener.open(f"{address}/health", timeout=2) as answer:
-                if answer.status == 200:
-                    return
-        except OSError:
-            time.sleep(0.1)
-    raise WorldposeError(
-        f"Prefect's embedded server was not ready after {START_SECONDS:.0f} s: {log}"
-    )
+    while server.poll() is None and time.monotonic() < deadline:
+        if _answers(address):
+            return
+        time.sleep(0.1)
+    said = log.read_text(errors="replace")[-2000:]
+    raise WorldposeError(f"Prefect's embedded server did not start. It said:\n{said}")
+
+
+def _require_answer(address: str) -> None:
+    if not _answers(address):
+        raise InputError(
+            f"PREFECT_API_URL={address}",
+            expected="a running Prefect server",
+            found="no answer",
+            todo="Start it, or unset PREFECT_API_URL to run without one.",
+        )
+
+
+def _answers(address: str) -> bool:
+    opener = urllib.request.build_opener()
+    try:
+        with opener.open(f"{address}/health", timeout=5) as answer:
+            return bool(answer.status == 200)
+    except (OSError, ValueError):
+        return False

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from data_contracts.match import Registration, SourceFile
 from flows.stage import Match
-from worldpose.errors import InputError, UsageError
+from worldpose.errors import InputError
 from worldpose.ingest import (
     MatchFolder,
     read_match,
@@ -52,18 +52,32 @@ def open_match(store: Store, match_id: str) -> Match:
     """A registered match, with its folder read anew: annotations may have changed since.
 
     Raises:
-        UsageError: no such match.
+        InputError: no such match, or its folder is not as it must be.
     """
-    registration = store.registration(match_id) if match_id in store.matches() else None
+    return register(store, Path(find_registration(store, match_id).folder))[0]
+
+
+def find_registration(store: Store, name: str) -> Registration:
+    """What the project knows of the match that a person means by a folder or an id.
+
+    Nothing is read from the match folder but its id, and nothing is written: results stay
+    readable when the folder has moved or has been edited.
+
+    Raises:
+        InputError: no such match.
+    """
+    folder = Path(name)
+    match_id = read_match(folder).spec.match_id if (folder / "match.yaml").is_file() else name
+    known = store.matches()
+    registration = store.registration(match_id) if match_id in known else None
     if registration is None:
-        known = ", ".join(store.matches()) or "(none registered)"
-        raise UsageError(
-            f"match {match_id}",
-            expected=f"a match folder or one of {known}",
-            found=repr(match_id),
+        raise InputError(
+            f"match {name}",
+            expected=f"a match folder or one of {', '.join(known) or '(none registered)'}",
+            found=repr(name),
             todo="Register it: worldpose ingest FOLDER.",
         )
-    return register(store, Path(registration.folder))[0]
+    return registration
 
 
 def find_match(store: Store, name: str) -> Match:

@@ -25,9 +25,8 @@ def clips_of(record: RunRecord) -> tuple[str, ...]:
     Raises:
         WorldposeError: there are none.
     """
-    clips = tuple(
-        unit.partition("/")[2] for unit in record.results if unit.startswith(f"{JOINT_STAGES[-1]}/")
-    )
+    units = [unit.partition("/") for unit in record.results]
+    clips = tuple(sorted({unit for stage, _, unit in units if stage in JOINT_STAGES}))
     if not clips:
         raise WorldposeError(
             f"run {record.run_id} of {record.match_id}: expected results of {JOINT_STAGES[-1]}, "
@@ -42,8 +41,7 @@ def joint_tracks(run: Run, clip: str, stage: str | None = None) -> JointTracks:
     Raises:
         UsageError: the run has no such result.
     """
-    names = [f"{name}/{clip}" for name in ([stage] if stage else reversed(JOINT_STAGES))]
-    for name in names:
+    for name in (f"{name}/{clip}" for name in reversed(JOINT_STAGES) if stage in (None, name)):
         if name in run:
             result = run[name]
             return JointTracks(

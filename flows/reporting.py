@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from data_contracts.evaluation import Evaluation
-from flows.evaluation import load_reference
+from flows.evaluation import load_reference, score
 from flows.release import clips_of, joint_tracks, static_cameras
 from flows.stage import Match
-from worldpose.evaluation import evaluate_joints
 from worldpose.release import JointTracks, Picture, report_page, whole_file
 from worldpose.release.pictures import paths_picture, view_picture
 from worldpose.store import Run, Store, open_run
@@ -30,10 +29,11 @@ def write_report(
     """
     run = open_run(store.url, match.match_id, run_id)
     clips = clips_of(run.record)
-    truth = _truth(match, reference)
+    source = reference or _own_reference(match)
+    truth = None if source is None else load_reference(source)
     scores: Evaluation | None = None
-    if truth is not None and len(clips) == 1:
-        scores, _ = evaluate_joints(joint_tracks(run, clips[0]), truth)
+    if source is not None and len(clips) == 1:
+        scores = score(match.match_id, source, store.url, run_id=run_id).evaluation
     seconds = {}
     for name, key in run.record.results.items():
         stage, _, unit = name.partition("/")
@@ -50,11 +50,9 @@ def write_report(
         draft.write_text(page, encoding="utf-8")
 
 
-def _truth(match: Match, reference: str | None) -> JointTracks | None:
-    if reference is not None:
-        return load_reference(reference)
+def _own_reference(match: Match) -> str | None:
     folder = match.folder.folder / "reference"
-    return load_reference(str(folder)) if (folder / "joints.npz").is_file() else None
+    return str(folder) if (folder / "joints.npz").is_file() else None
 
 
 def _pictures(run: Run, match: Match, clip: str, truth: JointTracks | None) -> list[Picture]:

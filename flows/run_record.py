@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Self
 
-from data_contracts.run import RunRecord, UnitFailure
+from data_contracts.run import RunRecord, RunState, UnitFailure
 from flows.method import METHOD
-from flows.planning import Overrides, PlannedUnit, settings_of
+from flows.planning import PlannedUnit, plan_stage
 from flows.progress import reporter
-from flows.stage import Match
-from worldpose.errors import UsageError
+from flows.settings import Overrides, settings_of
+from flows.stage import Match, Stage
 from worldpose.store import Store, libraries
 
 
@@ -22,25 +22,11 @@ def latest_run(store: Store, match_id: str) -> RunRecord | None:
     return store.run(match_id) if store.runs(match_id) else None
 
 
-def standing_results(store: Store, match_id: str, from_stage: str | None) -> dict[str, str]:
-    """Results of the stages before `from_stage` as the latest run has them, stale or not.
-
-    Raises:
-        UsageError: there is no run with such results.
-    """
-    names = [stage.name for stage in METHOD]
-    earlier = names[: names.index(from_stage)] if from_stage is not None else []
-    latest = latest_run(store, match_id)
-    found = {} if latest is None else latest.results
-    standing = {name: key for name, key in found.items() if name.partition("/")[0] in earlier}
-    if earlier and not standing:
-        raise UsageError(
-            f"--from {from_stage}",
-            expected=f"a run of {match_id} with results of {', '.join(earlier)}",
-            found="none",
-            todo="Run without --from first.",
-        )
-    return standing
+def standing_results(latest: RunRecord | None, stages: tuple[Stage, ...]) -> dict[str, str]:
+    """Results of the stages before `stages` as the latest run has them, stale or not."""
+    earlier = [stage.name for stage in METHOD[: METHOD.index(stages[0])]]
+    found: Mapping[str, str] = {} if latest is None else latest.results
+    return {name: key for name, key in found.items() if name.partition("/")[0] in earlier}
 
 
 @dataclass
@@ -52,40 +38,27 @@ class RunLog:
 
     store: Store
     match: Match
+    stages: tuple[Stage, ...]
     overrides: Overrides
     run_id: str
-    parent: str | None
+    latest: RunRecord | None
     results: dict[str, str]
-    started_at: datetime
-    started: float
+    started_at: datetime = field(default_factory=lambda: datetime.now(UTC))
+    started: float = field(default_factory=time.monotonic)
     executed: list[str] = field(default_factory=list)
     reused: list[str] = field(default_factory=list)
     failed: list[UnitFailure] = field(default_factory=list)
+    blocked: list[str] = field(default_factory=list)
 
     @classmethod
     def begin(
-        cls, store: Store, match: Match, overrides: Overrides, from_stage: str | None = None
+        cls, store: Store, match: Match, stages: tuple[Stage, ...], overrides: Overrides
     ) -> Self:
-        """A new run with its number reserved.
-
-        Raises:
-            UsageError: `from_stage` is given and there is no run to start from.
-        """
+        """A new run with its number reserved; earlier stages stand as the latest run has them."""
         latest = latest_run(store, match.match_id)
-        results = standing_results(store, match.match_id, from_stage)
+        standing = standing_results(latest, stages)
         run_id = store.reserve_run(match.match_id)
-        log = cls(
-            store=store,
-            match=match,
-            overrides=overrides,
-            run_id=run_id,
-            parent=None if latest is None else latest.run_id,
-            results=results,
-            started_at=datetime.now(UTC),
-            started=time.monotonic(),
-        )
-        log.reused += results
-        return log
+        return cls(store, match, stages, overrides, run_id, latest, standing, reused=list(standing))
 
     def reuse(self, units: Iterable[PlannedUnit]) -> None:
         """Take over results that the store already holds."""
@@ -98,9 +71,8 @@ class RunLog:
         if failure is None:
             self.results[unit.name] = unit.key
             self.executed.append(unit.name)
-            manifest = self.store.manifest(
-                self.match.match_id, unit.recipe.stage, unit.recipe.unit, unit.key
-            )
+            recipe = unit.recipe
+            manifest = self.store.manifest(recipe.match_id, recipe.stage, recipe.unit, unit.key)
             reporter().unit_done(unit.name, manifest.seconds, manifest.figures)
         else:
             self.failed.append(
@@ -110,29 +82,24 @@ class RunLog:
 
     def close(self) -> RunRecord:
         """Store the record: from here on the run counts."""
-        last_stage = METHOD[-1].name
-        state = "complete"
-        if self.failed:
-            reached = any(name.startswith(f"{last_stage}/") for name in self.results)
-            state = "partial" if reached else "failed"
+        self._carry_over()
         figures = {}
-        for name, key in self.results.items():
+        for name, key in sorted(self.results.items()):
             stage, _, unit = name.partition("/")
             figures[name] = self.store.manifest(self.match.match_id, stage, unit, key).figures
+        settings, overrides = self._settings()
         record = RunRecord(
             run_id=self.run_id,
             match_id=self.match.match_id,
-            parent=self.parent,
-            state=state,
+            parent=None if self.latest is None else self.latest.run_id,
+            state=self._state(),
             results=dict(sorted(self.results.items())),
-            settings={
-                stage.name: settings_of(stage, self.overrides).model_dump(mode="json")
-                for stage in METHOD
-            },
-            overrides={stage: dict(values) for stage, values in self.overrides.items()},
+            settings=settings,
+            overrides=overrides,
             executed=tuple(sorted(self.executed)),
             reused=tuple(sorted(self.reused)),
             failed=tuple(sorted(self.failed, key=lambda failure: failure.unit)),
+            blocked=tuple(sorted(self.blocked)),
             figures=figures,
             versions=libraries(),
             started_at=self.started_at,
@@ -141,3 +108,30 @@ class RunLog:
         )
         self.store.finish_run(record)
         return record
+
+    def _carry_over(self) -> None:
+        """Keep results of later stages that are current all the same."""
+        for stage in METHOD[METHOD.index(self.stages[-1]) + 1 :]:
+            plan = plan_stage(self.store, self.match, stage, self.overrides, self.results)
+            self.reuse(unit for unit in plan.units if unit.published)
+
+    def _settings(self) -> tuple[dict[str, dict[str, object]], dict[str, dict[str, object]]]:
+        """All settings and the asked-for ones, by stage; a standing stage keeps its own."""
+        first = METHOD.index(self.stages[0])
+        settings = {
+            stage.name: settings_of(stage, self.overrides).model_dump(mode="json")
+            for stage in METHOD
+        }
+        overrides = {name: dict(values) for name, values in self.overrides.items()}
+        for stage in METHOD[:first] if self.latest is not None else ():
+            settings[stage.name] = self.latest.settings[stage.name]
+            overrides |= {
+                name: values for name, values in self.latest.overrides.items() if name == stage.name
+            }
+        return settings, overrides
+
+    def _state(self) -> RunState:
+        if not self.failed:
+            return "complete"
+        last = f"{self.stages[-1].name}/"
+        return "partial" if any(name.startswith(last) for name in self.results) else "failed"

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections import Counter
 from dataclasses import dataclass
 
-from pydantic import JsonValue
-
 from data_contracts.run import RunRecord
-from flows.planning import PlannedUnit, plan_run, selected_stages
+from flows.planning import PlannedUnit, plan_run
 from flows.prefect_environment import prefect_server
 from flows.progress import reporter
 from flows.run_record import RunLog, latest_run, standing_results
-from flows.stage import Match
+from flows.settings import Overrides, selected_stages
+from flows.stage import Match, Stage
+from worldpose.errors import InputError
 from worldpose.store import Store
+
+DASK_SECONDS = 10.0
+"""How long a Dask scheduler may take to answer."""
 
 
 @dataclass(frozen=True)
@@ -25,10 +29,11 @@ class RunRequest:
         from_stage: first stage; earlier ones are taken from the latest run as they stand.
         until_stage: last stage.
         dask: address of a running Dask scheduler; None starts workers on this machine.
-        workers: number of worker processes on this machine; None sizes it to the machine.
+        workers: number of worker processes on this machine; None = one a core, as far as there
+            is work for them.
     """
 
-    settings: dict[str, dict[str, JsonValue]]
+    settings: Overrides
     from_stage: str | None = None
     until_stage: str | None = None
     dask: str | None = None
@@ -41,64 +46,90 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
     When nothing is stale this is the latest run's own record, and neither Prefect nor Dask starts.
 
     Raises:
-        UsageError: no such stage.
+        UsageError: no such stage, or no results to start `from_stage` from.
+        InputError: the Dask scheduler or Prefect server that was named does not answer.
     """
     stages = selected_stages(request.from_stage, request.until_stage)
-    standing = standing_results(store, match.match_id, request.from_stage)
+    latest = latest_run(store, match.match_id)
+    standing = standing_results(latest, stages)
     planned = plan_run(store, match, request.settings, stages, standing)
-    if all(unit.published for unit in planned):
-        return _without_work(store, match, request, planned, standing)
-    reporter().say("starting Prefect and Dask")
-    with prefect_server(store.url) as wait_until_ready:
-        return _through_prefect(store, match, request, wait_until_ready)
+    missing = [unit for unit in planned if not unit.published]
+    if missing:
+        return _with_prefect(store, match, request, missing)
+    results = standing | {unit.name: unit.key for unit in planned}
+    is_current = latest is not None and latest.state == "complete"
+    if is_current and results.items() <= latest.results.items():
+        return latest.model_copy(update={"executed": (), "reused": tuple(sorted(results))})
+    return _without_work(store, match, stages, request.settings, planned)
 
 
 def _without_work(
     store: Store,
     match: Match,
-    request: RunRequest,
+    stages: tuple[Stage, ...],
+    overrides: Overrides,
     planned: list[PlannedUnit],
-    standing: dict[str, str],
 ) -> RunRecord:
-    """The latest run's record where it has all these results, or else a new one."""
-    results = standing | {unit.name: unit.key for unit in planned}
-    latest = latest_run(store, match.match_id)
-    is_current = latest is not None and latest.state == "complete"
-    if is_current and results.items() <= latest.results.items():
-        return latest.model_copy(update={"executed": (), "reused": tuple(sorted(results))})
-    log = RunLog.begin(store, match, request.settings, request.from_stage)
+    """A new record of results that are all there, as after going back to an earlier setting."""
+    log = RunLog.begin(store, match, stages, overrides)
     log.reuse(planned)
     return log.close()
 
 
-def _through_prefect(
-    store: Store, match: Match, request: RunRequest, wait_until_ready: Callable[[], None]
+def _with_prefect(
+    store: Store, match: Match, request: RunRequest, missing: list[PlannedUnit]
 ) -> RunRecord:
-    from prefect.logging.handlers import APILogHandler
-    from prefect_dask import DaskTaskRunner
+    reporter().say("starting Prefect and Dask")
+    with prefect_server(store.url) as wait_until_ready:
+        # Late: they take seconds to import, which pass while the server starts.
+        from prefect.logging.handlers import APILogHandler
+        from prefect_dask import DaskTaskRunner
 
-    from flows.match import process_match
+        from flows.match import IncompleteRunError, process_match
 
+        runner = DaskTaskRunner(**_cluster(request, missing))
+        wait_until_ready()
+        try:
+            run_id = process_match.with_options(task_runner=runner)(
+                project=store.url,
+                match_id=match.match_id,
+                settings=request.settings,
+                from_stage=request.from_stage,
+                until_stage=request.until_stage,
+            )
+        except IncompleteRunError as failure:
+            run_id = failure.run_id
+        finally:
+            APILogHandler().flush()  # while the server is there to take the last lines
+    return store.run(match.match_id, run_id)
+
+
+def _cluster(request: RunRequest, missing: list[PlannedUnit]) -> dict[str, object]:
+    """What `DaskTaskRunner` needs to use a running cluster, or to make one on this machine."""
     if request.dask is not None:
-        runner = DaskTaskRunner(address=request.dask)
-    else:
-        runner = DaskTaskRunner(
-            cluster_kwargs={
-                "n_workers": request.workers,
-                "threads_per_worker": 1,
-                "dashboard_address": "127.0.0.1:0",
-                "silence_logs": "CRITICAL",
-            }
-        )
-    wait_until_ready()
+        _require_scheduler(request.dask)
+        return {"address": request.dask}
+    widest = max(Counter(unit.recipe.stage for unit in missing).values())
+    return {
+        "cluster_kwargs": {
+            "n_workers": request.workers or min(os.cpu_count() or 1, widest),
+            "threads_per_worker": 1,
+            "memory_limit": 0,  # a limit of one worker's share would kill a long clip's only task
+            "dashboard_address": "127.0.0.1:0",
+            "silence_logs": "CRITICAL",
+        }
+    }
+
+
+def _require_scheduler(address: str) -> None:
+    from distributed import Client
+
     try:
-        record = process_match.with_options(task_runner=runner)(
-            project=store.url,
-            match_id=match.match_id,
-            settings=request.settings,
-            from_stage=request.from_stage,
-            until_stage=request.until_stage,
-        )
-    finally:
-        APILogHandler().flush()  # while the server is there to take the last lines
-    return RunRecord.model_validate(record)
+        Client(address, timeout=DASK_SECONDS, set_as_default=False).close()
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"--dask {address}",
+            expected="a running Dask scheduler, as tcp://host:port",
+            found=str(error).splitlines()[0],
+            todo="Start one with: dask scheduler.",
+        ) from None

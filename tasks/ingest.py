@@ -3,50 +3,60 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.cameras import CameraCalibration
 from data_contracts.ingest import INGEST
 from data_contracts.run import Work
 from tasks.unit import unit_task
 from worldpose.cameras import Camera
 from worldpose.cameras.stored import camera_arrays
 from worldpose.errors import InputError
-from worldpose.ingest import read_match, read_unit
+from worldpose.ingest import Observations, read_observations
 from worldpose.store import Store
 
 
 @unit_task
 def ingest(work: Work) -> str:
     """Publishes the observations, and the camera where it is given; returns the key."""
-    unit = work.recipe.unit
+    sources = work.recipe.sources
     with Store.open(work.project).publishing(work) as result:
-        match = read_match(Path(work.folder))
-        observations, calibration = read_unit(match, unit)
-        _require_registered(match.detections[unit], work)
+        observations = _observations(work)
         arrays: dict[str, NDArray[Any]] = dict(observations.arrays())
-        if calibration is not None:
+        if sources["calibration"] is not None:
+            calibration = CameraCalibration.model_validate(sources["calibration"])
             arrays |= camera_arrays(Camera.from_calibration(calibration))
         result.write(
             INGEST,
             arrays=arrays,
             coordinates={"frame": observations.frame},
-            attributes={"camera_id": unit},
+            attributes={"camera_id": work.recipe.unit},
         )
         result.figures["frames"] = observations.frame.size
         result.figures["detections"] = int(np.isfinite(observations.score).sum())
     return work.key
 
 
-def _require_registered(path: Path, work: Work) -> None:
-    """Refuse a file that is not, or no longer, the one that the work's key stands for."""
-    if hashlib.sha256(path.read_bytes()).hexdigest() != work.recipe.sources["detections"]:
+def _observations(work: Work) -> Observations:
+    """The unit's people on match frames, from the very file that its key stands for.
+
+    Raises:
+        InputError: the file is not, or no longer, the one that was registered.
+    """
+    sources: dict[str, Any] = work.recipe.sources
+    path = Path(work.folder) / sources["detections"]
+    first = sources["first_frame"] + sources["offset_frames"]
+    observations = read_observations(path, first, sources["frame_count"])
+    if hashlib.sha256(path.read_bytes()).hexdigest() != sources["detections_sha256"]:
         raise InputError(
             str(path),
             expected="the file that was registered when the run began",
             found="other content",
             todo="Run again when nothing writes to the match folder.",
         )
+    return replace(observations, frame=observations.frame - sources["offset_frames"])

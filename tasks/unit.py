@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import platform
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import xarray as xr
@@ -11,24 +13,44 @@ from prefect.client.schemas.objects import State, TaskRun
 
 from data_contracts.records import Record
 from data_contracts.run import Work
-from worldpose.errors import WorldposeError
-from worldpose.store import Store
+from worldpose.errors import CorruptionError, InputError, NondeterminismError, StoreError
+from worldpose.store import Store, code_version, libraries
 
 
-def _worth_retrying(task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
-    """Whether a failure may pass: the same input fails the same way, a full disk may not."""
-    failure = state.result(raise_on_failure=False)
-    return not isinstance(failure, WorldposeError)
+def unit_task(compute: Callable[[Work], str]) -> Task[[Work], str]:
+    """Make a task of a function of one `Work` that publishes its result under `work.key`."""
+
+    @functools.wraps(compute)
+    def checked(work: Work) -> str:
+        require_same_code(work)
+        return compute(work)
+
+    return task(
+        task_run_name="{work.recipe.stage} {work.recipe.unit}",
+        retries=2,
+        retry_delay_seconds=1,
+        retry_condition_fn=_may_pass,
+        persist_result=False,
+    )(checked)
 
 
-unit_task = task(
-    task_run_name="{work.recipe.stage} {work.recipe.unit}",
-    retries=2,
-    retry_delay_seconds=1,
-    retry_condition_fn=_worth_retrying,
-    persist_result=False,
-)
-"""Decorates a function of one `Work` that publishes its result under `work.key`."""
+def require_same_code(work: Work) -> None:
+    """Refuse to compute with other code than the key stands for.
+
+    Raises:
+        InputError: this process has other sources or libraries than the one that planned.
+    """
+    recipe = work.recipe
+    ours = {**code_version(f"tasks.{recipe.stage}"), **libraries()}
+    theirs = {**recipe.code, **recipe.libraries}
+    differing = sorted(name for name in ours | theirs if ours.get(name) != theirs.get(name))
+    if differing:
+        raise InputError(
+            f"worker on {platform.node()}, {recipe.name}",
+            expected="the code and libraries that the run was planned with",
+            found=f"others in {', '.join(differing)}",
+            todo="Install the same worldpose on all workers, restart them, and run again.",
+        )
 
 
 def open_input(store: Store, work: Work, name: str) -> xr.Dataset:
@@ -56,3 +78,10 @@ def figures_of(report: Record, camera_ids: Sequence[str]) -> dict[str, float]:
             if number is not None:
                 figures[f"{name}.{camera_id}" if per_camera else name] = float(number)
     return figures
+
+
+def _may_pass(task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
+    """Whether a failure may be gone next time: a disk's or network's, not an input's or a bug's."""
+    failure = state.result(raise_on_failure=False)
+    lasting = isinstance(failure, CorruptionError | NondeterminismError)
+    return isinstance(failure, StoreError | OSError) and not lasting

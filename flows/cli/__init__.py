@@ -10,8 +10,8 @@ import sys
 
 import typer
 
-from flows.cli import lineage, matches, project, results, run
-from flows.cli.console import errors
+from flows.cli import body, lineage, matches, project, results, run
+from flows.cli.console import errors, line
 from worldpose.errors import UsageError, WorldposeError
 
 app = typer.Typer(
@@ -21,7 +21,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-for module in (project, matches, run, lineage, results):
+for module in (project, matches, run, lineage, results, body):
     module.add_to(app)
 
 
@@ -32,9 +32,5 @@ def main() -> None:
     except WorldposeError as error:
         if "--json" in sys.argv:
             print(json.dumps({"error": type(error).__name__, "message": str(error)}))  # noqa: T201
-        errors.print(f"[bold red]error:[/] {_escaped(str(error))}", highlight=False)
+        line(f"error: {error}", to=errors)
         sys.exit(2 if isinstance(error, UsageError) else 1)
-
-
-def _escaped(text: str) -> str:
-    return text.replace("[", r"\[")

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from flows.progress import Reporter, in_short, reporting_to
-from worldpose.store import Store
 
 output = Console(soft_wrap=True)
 errors = Console(stderr=True, soft_wrap=True)
@@ -36,22 +36,25 @@ RunOption = Annotated[str, typer.Option("--run", help="A run's number; latest by
 DEFAULT_PROJECT = "worldpose-data"
 
 
-def open_or_create(project: str) -> Store:
-    """The project's store; one that does not exist yet is made."""
-    return Store.create(project)
-
-
 def print_json(value: Mapping[str, Any]) -> None:
     """One JSON object on standard output."""
     print(json.dumps(value, indent=2, default=str))  # noqa: T201
 
 
-def table(title: str, *columns: str) -> Table:
+def line(text: str, *, to: Console = output) -> None:
+    """Plain text as it is: names and messages may hold brackets."""
+    to.print(text, markup=False, highlight=False)
+
+
+def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """A plain table; columns that start with ">" are right-aligned."""
-    made = Table(title=title, title_justify="left", box=None, pad_edge=False, title_style="bold")
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False, title_style="bold")
     for column in columns:
-        made.add_column(column.lstrip(">"), justify="right" if column.startswith(">") else "left")
-    return made
+        justify: Literal["left", "right"] = "right" if column.startswith(">") else "left"
+        table.add_column(column.lstrip(">"), justify=justify)
+    for row in rows:
+        table.add_row(*map(Text, row))
+    output.print(table)
 
 
 class ConsoleReporter(Reporter):
@@ -85,13 +88,15 @@ class ConsoleReporter(Reporter):
         """Names the unit, its time and its figures."""
         super().unit_done(unit, seconds, figures)
         self._left -= 1
-        self.say(f"  {unit}  {seconds:.2f} s  [dim]{in_short(figures)}[/]  ({self._left} left)")
+        self.say(
+            f"  {escape(unit)}  {seconds:.2f} s  [dim]{in_short(figures)}[/]  ({self._left} left)"
+        )
 
     def unit_failed(self, unit: str, message: str) -> None:
         """Names the unit and why it failed."""
         super().unit_failed(unit, message)
         self._left -= 1
-        self.say(f"  [bold red]{unit} failed[/]  ({self._left} left)")
+        self.say(f"  [bold red]{escape(unit)} failed[/]: {escape(message)}  ({self._left} left)")
 
 
 @contextmanager
@@ -104,8 +109,3 @@ def progress() -> Iterator[ConsoleReporter]:
                 yield reporter
         else:
             yield reporter
-
-
-def match_path(folder: str) -> Path:
-    """A folder given on the command line."""
-    return Path(folder).expanduser()

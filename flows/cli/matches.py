@@ -11,14 +11,15 @@ from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
     ProjectOption,
-    open_or_create,
-    output,
+    errors,
+    line,
     print_json,
-    table,
+    print_table,
 )
 from flows.registering import register
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.ingest import import_match
+from worldpose.store import Store
 
 
 def simulate(
@@ -30,6 +31,9 @@ def simulate(
     duration: Annotated[float | None, typer.Option(min=0.2, help="Length [s].")] = None,
     cameras: Annotated[int | None, typer.Option(min=1, help="Number of static cameras.")] = None,
     players: Annotated[int | None, typer.Option(min=0, help="Number of people.")] = None,
+    trajectories: Annotated[
+        Path | None, typer.Option(help="Tracking data (npz) that drives the people.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Make a synthetic match folder with known truth.
@@ -42,10 +46,8 @@ def simulate(
         if as_json:
             print_json({"scenarios": {name: each.about for name, each in SCENARIOS.items()}})
             return
-        shown = table("scenarios", "name", "what happens")
-        for name, each in SCENARIOS.items():
-            shown.add_row(name, each.about)
-        output.print(shown)
+        rows = [(name, each.about) for name, each in SCENARIOS.items()]
+        print_table("scenarios", ("name", "what happens"), rows)
         return
     if scenario not in SCENARIOS:
         raise UsageError(
@@ -59,12 +61,18 @@ def simulate(
             "--out", expected="the folder to make", found="nothing", todo="Add --out FOLDER."
         )
     spec = simulate_match(
-        SCENARIOS[scenario], seed, out, duration=duration, cameras=cameras, players=players
+        SCENARIOS[scenario],
+        seed,
+        out,
+        duration=duration,
+        cameras=cameras,
+        players=players,
+        trajectories=trajectories,
     )
     if as_json:
         print_json({"match": spec.match_id, "folder": str(out)})
     else:
-        output.print(f"made match {spec.match_id} in {out}")
+        line(f"made match {spec.match_id} in {out}")
 
 
 def import_command(
@@ -89,7 +97,7 @@ def import_command(
         print_json({"match": spec.match_id, "folder": str(out)})
     else:
         clip = spec.clips[0]
-        output.print(
+        line(
             f"made match {spec.match_id} in {out}: {len(spec.cameras)} cameras, frames "
             f"{clip.first_frame} to {clip.first_frame + clip.frame_count - 1}"
         )
@@ -104,25 +112,24 @@ def ingest(
 
     Example: worldpose ingest matches/tiny
     """
-    store = open_or_create(project)
+    store = Store.open_or_new(project)
     rows = []
-    failures: list[WorldposeError] = []
+    refused: list[str] = []
     for folder in folders:
         try:
             match, changed = register(store, folder)
         except WorldposeError as failure:
-            failures.append(failure)
+            refused.append(str(failure))
+            line(f"error: {failure}", to=errors)
             continue
         rows.append({"match": match.match_id, "folder": str(folder), "changed": changed})
         if not as_json:
             known = "registered" if changed else "already registered, unchanged:"
-            output.print(f"{known} {match.match_id}")
+            line(f"{known} {match.match_id}")
     if as_json:
-        print_json({"matches": rows, "refused": [str(failure) for failure in failures]})
-    if failures:
-        for failure in failures[:-1]:
-            output.print(f"refused: {failure}", highlight=False)
-        raise failures[-1]
+        print_json({"matches": rows, "refused": refused})
+    if refused:
+        raise typer.Exit(4 if rows else 1)
 
 
 def add_to(app: typer.Typer) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import timedelta
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -12,14 +12,16 @@ from flows.cli.console import (
     JsonOption,
     ProjectOption,
     errors,
-    output,
+    line,
     print_json,
+    print_table,
     progress,
-    table,
 )
+from flows.lineage import unit_state
 from flows.planning import plan_run
-from flows.registering import open_match
+from flows.registering import find_registration, open_match
 from flows.run_record import latest_run
+from worldpose.errors import WorldposeError
 from worldpose.store import Store, collect, plan_gc, repair
 from worldpose.store import verify as verify_store
 
@@ -36,7 +38,7 @@ def init(
     if as_json:
         print_json({"project": store.url})
     else:
-        output.print(f"made project {store.url}")
+        line(f"made project {store.url}")
 
 
 def status(
@@ -49,37 +51,67 @@ def status(
     Example: worldpose status tiny
     """
     store = Store.open(project)
-    rows = [_match_status(store, match_id) for match_id in ([match] if match else store.matches())]
+    wanted = [find_registration(store, match).spec.match_id] if match else store.matches()
+    rows = [_match_status(store, match_id) for match_id in wanted]
     if as_json:
         print_json({"matches": rows})
         return
-    shown = table("matches", "match", "latest run", "state", ">current", ">stale", "not current")
+    if not rows:
+        line("no match registered: worldpose ingest FOLDER")
+        return
+    columns = (
+        "match",
+        "latest run",
+        "state",
+        *(f">{state}" for state in STATES),
+        ">failed",
+        "next",
+    )
+    shown = []
     for row in rows:
-        stale = row["stale"]
-        shown.add_row(
-            row["match"],
-            row["run"] or "-",
-            row["state"],
-            str(len(row["current"])),
-            str(len(stale)),
-            ", ".join(stale[:4]) + (" ..." if len(stale) > 4 else ""),
+        counts = [str(len(row["units"][state])) for state in STATES]
+        unsettled = [name for state in STATES[1:] for name in row["units"][state]]
+        shown.append(
+            (
+                row["match"],
+                row["run"] or "-",
+                row["state"],
+                *counts,
+                str(len(row["failed"])),
+                row["problem"] or ", ".join(unsettled[:3]) + (" ..." * (len(unsettled) > 3)),
+            )
         )
-    output.print(shown if rows else "no match registered: worldpose ingest FOLDER")
+    print_table("matches", columns, shown)
+    for row in rows:
+        if row["settings"]:
+            line(f"{row['match']}: judged with the settings of run {row['run']}: {row['settings']}")
 
 
-def _match_status(store: Store, match_id: str) -> dict:
-    match = open_match(store, match_id)
+STATES = ("current", "ready", "stale", "missing")
+"""Of a unit; see `worldpose why --help`."""
+
+
+def _match_status(store: Store, match_id: str) -> dict[str, Any]:
+    """One match at a glance; a folder that cannot be read is said, and hides no other match."""
     latest = latest_run(store, match_id)
-    overrides = {} if latest is None else latest.overrides
-    planned = plan_run(store, match, overrides)
+    units: dict[str, list[str]] = {state: [] for state in STATES}
+    problem = None
+    try:
+        match = open_match(store, match_id)
+    except WorldposeError as failure:
+        problem = str(failure)
+    else:
+        for unit in plan_run(store, match, {} if latest is None else latest.overrides):
+            units[unit_state(unit, latest)].append(unit.name)
     return {
         "match": match_id,
         "run": None if latest is None else latest.run_id,
         "state": "not run" if latest is None else latest.state,
-        "unfinished_runs": [run.run_id for run in store.unfinished_runs(match_id)],
-        "current": [unit.name for unit in planned if unit.published],
-        "stale": [unit.name for unit in planned if not unit.published],
+        "units": units,
         "failed": [] if latest is None else [failure.unit for failure in latest.failed],
+        "settings": {} if latest is None else latest.overrides,
+        "unfinished_runs": [run.run_id for run in store.unfinished_runs(match_id)],
+        "problem": problem,
     }
 
 
@@ -107,9 +139,9 @@ def verify(
             }
         )
     for finding in findings:
-        errors.print(f"[bold red]damaged:[/] {finding.path}: {finding.problem}", highlight=False)
+        line(f"damaged: {finding.path}: {finding.problem}", to=errors)
     for result in withdrawn:
-        errors.print(f"withdrawn: {result.path}", highlight=False)
+        line(f"withdrawn: {result.path}", to=errors)
     if findings and not mend:
         errors.print(
             "worldpose verify --repair withdraws what is damaged; then run the match again"
@@ -117,7 +149,7 @@ def verify(
     if findings:
         raise typer.Exit(1)
     if not as_json:
-        output.print("every stored byte is as it was published")
+        line("every stored byte is as it was published")
 
 
 def gc(
@@ -150,11 +182,11 @@ def gc(
         print_json({"garbage": rows, "held": plan.held, "bytes": plan.size, "freed": freed})
         return
     for garbage in plan.garbage:
-        output.print(f"{garbage.path}  {garbage.reason}", highlight=False)
-    for line in plan.held:
-        output.print(line, highlight=False)
+        line(f"{garbage.path}  {garbage.reason}")
+    for reason in plan.held:
+        line(reason)
     verb = "removed" if delete else "no run reaches"
-    output.print(f"{verb} {len(plan.garbage)} things, {plan.size / 1e6:.1f} MB")
+    line(f"{verb} {len(plan.garbage)} things, {plan.size / 1e6:.1f} MB")
 
 
 def add_to(app: typer.Typer) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -13,9 +14,9 @@ from flows.cli.console import (
     MatchArgument,
     ProjectOption,
     RunOption,
-    output,
+    line,
     print_json,
-    table,
+    print_table,
 )
 from worldpose.errors import UsageError
 from worldpose.store import Store, open_run
@@ -33,7 +34,7 @@ def export(
 
     Example: worldpose export tiny --format joints --out exported
     """
-    from flows.registering import find_match
+    from flows.registering import find_registration
     from flows.release import EXPORTS
 
     if form not in EXPORTS:
@@ -43,58 +44,103 @@ def export(
             found=repr(form),
             todo="Choose one of these.",
         )
-    known = find_match(Store.open(project), match)
-    written = EXPORTS[form](open_run(project, known.match_id, run), known.folder.spec, out)
+    spec = find_registration(Store.open(project), match).spec
+    written = EXPORTS[form](open_run(project, spec.match_id, run), spec, out)
     if as_json:
-        print_json({"match": known.match_id, "files": [str(path) for path in written]})
+        print_json({"match": spec.match_id, "files": [str(path) for path in written]})
     else:
         for path in written:
-            output.print(f"wrote {path}", highlight=False)
+            line(f"wrote {path}")
 
 
 def evaluate(
     prediction: Annotated[
-        str, typer.Option("--prediction", help="A joints file, or a match of the project.")
+        str,
+        typer.Option(
+            "--prediction",
+            help="A joints file, a folder with joints.npz and cameras/, or a match of the project.",
+        ),
     ],
     reference: Annotated[
-        str, typer.Option("--reference", help="A joints file, or a folder with joints.npz.")
+        str,
+        typer.Option(
+            "--reference", help="A joints file, or a folder with joints.npz, cameras/ or both."
+        ),
     ],
     run: RunOption = "latest",
     stage: Annotated[
         str | None, typer.Option("--stage", help="Score this stage's joints; the best by default.")
     ] = None,
+    match_in: Annotated[
+        str | None,
+        typer.Option(
+            "--match-in",
+            metavar="CAMERA",
+            help="Match whole tracks by their boxes in this camera of the reference, as the paper "
+            "does; by distance by default.",
+        ),
+    ] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option("--fps", min=0.001, help="Frames in a second; the match's by default."),
+    ] = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Score joints against a reference; definitions in docs/metrics.md.
+    """Score joints and cameras against a reference; definitions in docs/metrics.md.
 
     Example: worldpose evaluate --prediction tiny --reference matches/tiny/reference
     """
-    from flows.evaluation import load_prediction, load_reference
-    from worldpose.evaluation import evaluate_joints
-    from worldpose.release.report import MEANINGS
+    from flows.evaluation import score
+    from worldpose.release.meanings import score_rows
 
-    estimated = load_prediction(prediction, project, run_id=run, stage=stage)
-    scores, people = evaluate_joints(estimated, load_reference(reference))
-    figures = scores.model_dump(exclude_none=True)
+    scores = score(
+        prediction, reference, project, run_id=run, stage=stage, fps=fps, match_in=match_in
+    )
     if as_json:
-        print_json(figures)
+        print_json(scores.evaluation.model_dump(exclude_none=True))
         return
-    shown = table("against the reference", "figure", ">value", "meaning")
-    for name, value in figures.items():
-        shown.add_row(name, f"{value:.4g}", MEANINGS[name][2])
-    output.print(shown)
-    shown = table("", "person", ">frames", ">found", ">mpjpe_mm", ">pcp3d")
-    for person in people:
-        shown.add_row(
-            str(person.person_id),
-            str(person.frames),
-            *(
-                "-" if value is None else f"{value:.4g}"
-                for value in (person.coverage, person.mpjpe_mm, person.pcp3d)
-            ),
-        )
-    output.print(shown)
+    rows = [
+        (name, value, meaning)
+        for name, _, value, meaning in score_rows(scores.evaluation)
+        if not name.startswith("cameras.")
+    ]
+    print_table("against the reference", ("figure", ">value", "meaning"), rows)
+    people = {f"{person.person_id}": person for person in scores.people}
+    _print_rows("person", _PERSON_COLUMNS, people)
+    cameras = {camera.camera_id: camera.errors for camera in scores.cameras}
+    groups = dict(scores.evaluation.cameras or ())
+    cameras |= {f"all {kind}": errors for kind, errors in groups.items() if errors is not None}
+    _print_rows("camera", _CAMERA_COLUMNS, cameras)
+
+
+_PERSON_COLUMNS = {
+    "frames": "frames",
+    "coverage": "coverage",
+    "mpjpe_mm": "mpjpe mm",
+    "pcp3d": "pcp3d %",
+    "g_mpjpe_mm": "g-mpjpe mm",
+    "pa_mpjpe_mm": "pa-mpjpe mm",
+}
+_CAMERA_COLUMNS = {
+    "ground_error_median_m": "ground m",
+    "ground_error_p95_m": "95 % m",
+    "reprojection_error_median_px": "image px",
+    "center_error_m": "centre m",
+    "rotation_error_deg": "turn deg",
+    "focal_error_percent": "focal %",
+}
+
+
+def _print_rows(kind: str, columns: Mapping[str, str], rows: Mapping[str, object]) -> None:
+    """One row for each person or camera, where there are any."""
+    if not rows:
+        return
+    shown = []
+    for name, record in rows.items():
+        values = (getattr(record, column) for column in columns)
+        shown.append((name, *("-" if value is None else f"{value:.3g}" for value in values)))
+    print_table("", (kind, *(f">{title}" for title in columns.values())), shown)
 
 
 def report(
@@ -121,8 +167,8 @@ def report(
     if as_json:
         print_json({"match": known.match_id, "report": str(out.resolve())})
     else:
-        output.print(f"report:  {out.resolve()}", highlight=False)
-        output.print(f"results: {store.url}/results/{known.match_id}", highlight=False)
+        line(f"report:  {out.resolve()}")
+        line(f"results: {store.url}/results/{known.match_id}")
 
 
 def add_to(app: typer.Typer) -> None:

@@ -13,15 +13,14 @@ from flows.cli.console import (
     JsonOption,
     MatchArgument,
     ProjectOption,
-    errors,
-    open_or_create,
-    output,
+    line,
     print_json,
     progress,
 )
-from flows.planning import parse_overrides
 from flows.registering import find_match
 from flows.running import RunRequest, run_match
+from flows.settings import parse_overrides, selected_stages
+from worldpose.store import Store
 
 EXIT_CODES = {"complete": 0, "failed": 1, "partial": 4}
 
@@ -51,8 +50,8 @@ def run(
     Example: worldpose run matches/tiny --set triangulation.min_views=3
     """
     started = time.monotonic()
-    overrides = parse_overrides(assignments or [])
-    store = open_or_create(project)
+    overrides = parse_overrides(assignments or [], selected_stages(from_stage, until_stage))
+    store = Store.open_or_new(project)
     request = RunRequest(overrides, from_stage, until_stage, dask, workers)
     with progress():
         record = run_match(store, find_match(store, match), request)
@@ -66,6 +65,8 @@ def run(
                 "failed": len(record.failed),
                 "waiting": 0,
                 "seconds": round(seconds, 3),
+                "blocked": len(record.blocked),
+                "failures": [failure.model_dump() for failure in record.failed],
             }
         )
     else:
@@ -74,17 +75,15 @@ def run(
 
 
 def _print(record: RunRecord, project: str, seconds: float) -> None:
-    output.print(
+    blocked = f" and {len(record.blocked)} blocked by that" if record.blocked else ""
+    line(
         f"run {record.run_id} of {record.match_id} is {record.state}: "
         f"{len(record.executed)} computed, {len(record.reused)} reused, "
-        f"{len(record.failed)} failed, {seconds:.1f} s",
-        highlight=False,
+        f"{len(record.failed)} failed{blocked}, {seconds:.1f} s"
     )
     if not (record.executed or record.failed):
-        output.print("nothing to do: every result is current")
-    for failure in record.failed:
-        errors.print(f"{failure.unit}: {failure.error}: {failure.message}", highlight=False)
-    output.print(f"results: {project}/results/{record.match_id}", highlight=False)
+        line("nothing to do: every result is current")
+    line(f"results: {project}/results/{record.match_id}")
 
 
 def add_to(app: typer.Typer) -> None:

@@ -66,7 +66,12 @@ def test_chunks_hold_a_mebibyte_or_the_whole_array():
 
 
 def test_a_verdict_has_no_default():
-    decision = {"request": "r", "who": "someone", "decided_at": "2026-01-01T00:00:00Z"}
+    decision = {
+        "match_id": "m",
+        "request": "r",
+        "who": "someone",
+        "decided_at": "2026-01-01T00:00:00Z",
+    }
     with pytest.raises(ValidationError, match="verdict"):
         ReviewDecision.model_validate(decision)
     ReviewDecision.model_validate(decision | {"verdict": "approve"})

@@ -30,6 +30,8 @@ def install():
             struck.touch(exist_ok=False)
         except FileExistsError:
             return
+        if plan.get("whole_group"):
+            os.killpg(0, signal.SIGKILL)
         os.kill(os.getpid(), signal.SIGKILL)
 
     commit_points.install_fault_hook(strike)

@@ -22,10 +22,10 @@ IN_WORKER = [point for point in COMMIT_POINTS if "run_record" not in point]
 IN_MAIN = [point for point in COMMIT_POINTS if "run_record" in point]
 
 
-def fault_environment(tmp_path, point, skip=0):
+def fault_environment(tmp_path, point, **plan):
     struck = tmp_path / "struck"
-    plan = json.dumps({"point": point, "struck": str(struck), "skip": skip})
-    return {"WORLDPOSE_TEST_FAULT": plan}, struck
+    plan = json.dumps({"point": point, "struck": str(struck), **plan})
+    return {"WORLDPOSE_TEST_FAULT": plan, "DASK_DISTRIBUTED__WORKER__PRELOAD": str(FAULT)}, struck
 
 
 def assert_same_store(project, undisturbed):
@@ -42,10 +42,10 @@ def quick(points, kept):
 
 @pytest.mark.parametrize("point", quick(IN_WORKER, {"during_publish", "before_commit"}))
 def test_a_worker_killed_at_a_commit_point_is_replaced(point, tiny, tiny_run, tmp_path):
+    # Two workers share eight units, so one of them comes to the point a third time.
     environment, struck = fault_environment(tmp_path, point, skip=2)
-    environment["DASK_DISTRIBUTED__WORKER__PRELOAD"] = str(FAULT)
     project = tmp_path / "worldpose-data"
-    succeed("run", tiny, "--project", project, environment=environment)
+    succeed("run", tiny, "--project", project, "--workers", 2, environment=environment)
     assert struck.exists(), "the fault did not strike"
     assert_same_store(project, tiny_run)
 
@@ -65,28 +65,62 @@ def test_the_whole_process_killed_around_the_run_record(point, tiny, tiny_run, t
     assert_same_store(project, tiny_run)
 
 
-@pytest.mark.parametrize("seed", quick(range(20), {0, 1}))
-def test_the_whole_process_group_killed_at_a_random_time(seed, tiny, tiny_run, tmp_path):
+@pytest.mark.parametrize("point", quick(IN_WORKER, {"after_write"}))
+def test_the_whole_process_group_killed_at_a_commit_point(point, tiny, tiny_run, tmp_path):
+    environment, struck = fault_environment(tmp_path, point, skip=1, whole_group=True)
     project = tmp_path / "worldpose-data"
-    # From importing to the last stage: a run of this match takes about 9 s on two busy cores.
-    delay = random.Random(seed).uniform(1.0, 9.0)
-    process = subprocess.Popen(
-        [*WORLDPOSE, "run", str(tiny), "--project", str(project)],
+    process = start_run(tiny, project, environment)
+    assert process.wait() == -signal.SIGKILL
+    assert struck.exists()
+    assert_nothing_half_written(project)
+    succeed("run", tiny, "--project", project)
+    assert_same_store(project, tiny_run)
+
+
+@pytest.mark.parametrize("seed", quick(range(20), {0, 1}))
+def test_the_whole_process_group_killed_at_a_random_moment(seed, tiny, tiny_run, tmp_path):
+    project = tmp_path / "worldpose-data"
+    # A moment is a number of files in the project, so that it means the same on any machine.
+    moment = random.Random(seed).randrange(1, len(files_of(tiny_run)) - 1)
+    process = start_run(tiny, project, {})
+    while len(files_of(project)) < moment:
+        assert process.poll() is None, "the run ended before it was killed"
+        time.sleep(0.002)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert_nothing_half_written(project)
+    succeed("run", tiny, "--project", project)
+    assert_same_store(project, tiny_run)
+
+
+def start_run(match, project, environment):
+    """A run of two workers, leading a process group of its own."""
+    return subprocess.Popen(
+        [*WORLDPOSE, "run", str(match), "--project", str(project), "--workers", "2"],
         start_new_session=True,
+        env={**os.environ, **environment},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
-    time.sleep(delay)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+
+
+def files_of(project):
+    """All files of a project but Prefect's own; those that vanish meanwhile count or not."""
+    return [
+        path
+        for path, _, names in os.walk(project)
+        for _ in names
+        if "prefect" not in Path(path).relative_to(project).parts
+    ]
+
+
+def assert_nothing_half_written(project):
     if (project / "project.json").exists():
         store = Store.open(str(project))
         for match in store.matches():
             for run in store.runs(match):
                 assert store.run(match, run).state == "complete"
         assert verify(store) == (), "something half-written can be read"
-    succeed("run", tiny, "--project", project)
-    assert_same_store(project, tiny_run)
 
 
 def test_workers_and_server_end_with_a_killed_run(tiny, tmp_path):

@@ -24,7 +24,9 @@ def no_server(monkeypatch):
 
 def test_an_embedded_run_reaches_nothing_but_this_machine(no_server, tiny, tmp_path):
     notes = tmp_path / "notes"
-    environment = {"PYTHONPATH": LOOPBACK_ONLY, "WORLDPOSE_TEST_NOTES": str(notes)}
+    # A proxy must not be asked for this machine itself either.
+    proxies = dict.fromkeys(("HTTP_PROXY", "http_proxy"), "http://192.0.2.1:3128")
+    environment = {"PYTHONPATH": LOOPBACK_ONLY, "WORLDPOSE_TEST_NOTES": str(notes), **proxies}
     probe = [sys.executable, "-c", "import socket; socket.create_connection(('192.0.2.1', 80), 1)"]
     assert subprocess.run(probe, env={**os.environ, **environment}, capture_output=True).returncode
     assert "192.0.2.1" in notes.read_text(), "the guard does not work"
@@ -113,7 +115,13 @@ def test_a_damaged_input_fails_its_unit_and_repair_mends_it(server, tiny, tmp_pa
     record = Store.open(str(project)).run(TINY)
     assert record.state == "failed"
     assert [failure.unit for failure in record.failed] == ["triangulation/clip"]
+    lost = succeed("why", f"{TINY}/tracking/clip", "--project", project, "--json").json
+    assert lost["state"] == "current"
     # Mending it: the damaged result is withdrawn and computed again.
     assert worldpose("verify", "--repair", "--project", project).code == 1
+    lost = succeed("why", f"{TINY}/tracking/clip", "--project", project, "--json").json
+    assert lost["state"] == "missing"
+    status = succeed("status", "--project", project, "--json").json["matches"][0]["units"]
+    assert status["missing"] == ["tracking/clip", "triangulation/clip"]
     again = succeed("run", tiny, "--project", project, "--json").json
     assert (again["executed"], again["failed"]) == (2, 0)

@@ -56,7 +56,10 @@ def test_a_triangulation_setting_leaves_tracking_alone(tiny, project_copy):
     assert why["state"].startswith("current")
     asked = ("why", f"{TINY}/triangulation/clip", "--set", "triangulation.min_views=2")
     why = succeed(*asked, "--project", project_copy, "--json").json
-    assert why["state"] == "stale since run 0002"
+    assert why["state"] == "ready", "run 0001 left this result in the store"
+    asked = ("why", f"{TINY}/triangulation/clip", "--set", "triangulation.min_views=4")
+    why = succeed(*asked, "--project", project_copy, "--json").json
+    assert why["state"] == "stale"
     assert any("min_views" in reason for reason in why["reasons"])
 
     # Back to the defaults: all results are there, so a new run is recorded without any task.
@@ -107,16 +110,37 @@ def test_a_moved_camera_recomputes_all_that_sees_through_it(tiny, tmp_path, serv
 def test_from_and_until_take_what_is_there(tiny, project_copy):
     until = run_json(tiny, "--project", project_copy, "--until", "tracking")
     assert (until["run"], until["executed"]) == ("0001", 0)
-    # From triangulation on: tracking is taken as it stands, though another setting is asked for.
-    answer = run_json(
-        *(tiny, "--project", project_copy, "--from", "triangulation"),
-        *("--set", "tracking.gate=0.4", "--set", "triangulation.min_views=3"),
-    )
-    assert (answer["run"], answer["executed"]) == ("0002", 1)
+    gated = run_json(tiny, "--project", project_copy, "--set", "tracking.gate=0.4")
+    assert (gated["run"], gated["executed"]) == ("0002", 2)
+    # From triangulation on, tracking is taken as run 0002 has it, though not by default.
+    start = (tiny, "--project", project_copy, "--from", "triangulation")
+    answer = run_json(*start, "--set", "triangulation.min_views=3")
+    assert (answer["run"], answer["executed"]) == ("0003", 1)
     store = Store.open(project_copy)
-    first, second = store.run(TINY, "0001"), store.run(TINY, "0002")
-    assert second.results["tracking/clip"] == first.results["tracking/clip"]
-    assert second.results["triangulation/clip"] != first.results["triangulation/clip"]
+    second, third = store.run(TINY, "0002"), store.run(TINY, "0003")
+    assert third.results["tracking/clip"] == second.results["tracking/clip"]
+    assert third.settings["tracking"]["gate"] == 0.4
+    assert third.overrides == {"tracking": {"gate": 0.4}, "triangulation": {"min_views": 3}}
+    # A setting of a stage that does not run would have no effect, so it is refused.
+    refused = worldpose("run", *start, "--set", "tracking.gate=0.3")
+    assert refused.code == 2
+
+
+def test_until_keeps_later_results_that_are_current_all_the_same(tiny, project_copy):
+    run_json(tiny, "--project", project_copy, "--set", "triangulation.min_views=3")
+    answer = run_json(tiny, "--project", project_copy, "--until", "tracking")
+    assert answer["executed"] == 0
+    store = Store.open(project_copy)
+    assert "triangulation/clip" in store.run(TINY, answer["run"]).results
+
+
+def test_from_after_a_run_that_stopped_earlier_is_refused(tiny, tmp_path):
+    project = tmp_path / "worldpose-data"
+    run_json(tiny, "--project", project, "--until", "ingest")
+    answer = worldpose("run", tiny, "--project", project, "--from", "triangulation")
+    assert answer.code == 2
+    assert "triangulation/clip" in answer.err
+    assert Store.open(project).runs(TINY) == ("0001",)
 
 
 def test_from_needs_a_run_to_start_from(tiny, tmp_path):

@@ -1,11 +1,22 @@
 """Evaluation: how far a prediction is from the truth (definitions: docs/metrics.md).
 
-Inputs: predicted and true `JointTracks` and `EvaluationSettings`.
-Outputs: `data_contracts.evaluation.Evaluation` and one `PersonScore` per true person.
+Inputs: predicted and true `JointTracks` and cameras, the pitch, `EvaluationSettings`.
+Outputs: `data_contracts.evaluation.Evaluation`, one `PersonScore` per true person and one
+`CameraScore` per camera.
 """
 
-from worldpose.evaluation.matching import match_frame
+from worldpose.evaluation.alignment import Similarity, align
+from worldpose.evaluation.cameras import CameraScore, evaluate_cameras
 from worldpose.evaluation.metrics import PersonScore, evaluate_joints
-from worldpose.evaluation.settings import EvaluationSettings
+from worldpose.evaluation.settings import CameraErrorSettings, EvaluationSettings
 
-__all__ = ["EvaluationSettings", "PersonScore", "evaluate_joints", "match_frame"]
+__all__ = [
+    "CameraErrorSettings",
+    "CameraScore",
+    "EvaluationSettings",
+    "PersonScore",
+    "Similarity",
+    "align",
+    "evaluate_cameras",
+    "evaluate_joints",
+]

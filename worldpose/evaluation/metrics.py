@@ -1,4 +1,4 @@
-"""Scores of predicted joints against true ones, without any alignment."""
+"""Scores of predicted joints against true ones."""
 
 from __future__ import annotations
 
@@ -9,9 +9,27 @@ from numpy.typing import NDArray
 
 from data_contracts.evaluation import Evaluation
 from data_contracts.records import Record
+from worldpose.cameras import Camera
+from worldpose.errors import InputError
+from worldpose.evaluation.boxes import box_overlaps, joint_boxes
+from worldpose.evaluation.identity import identity_scores
 from worldpose.evaluation.limbs import correct_limbs, limb_ends
-from worldpose.evaluation.matching import match_frame
+from worldpose.evaluation.matching import (
+    joint_distances,
+    match_boxes,
+    match_people,
+    merge_tracks,
+    taken,
+)
+from worldpose.evaluation.registration import register_world
 from worldpose.evaluation.settings import EvaluationSettings
+from worldpose.evaluation.trajectories import (
+    acceleration_errors,
+    aligned_errors,
+    challenge_errors,
+    drift_per_meter,
+    path_lengths,
+)
 from worldpose.release import JointTracks
 
 
@@ -29,60 +47,88 @@ class PersonScore(Record):
     """Mean distance of matched joints without any alignment [mm]."""
     pcp3d: float | None = None
     """Share of correct limbs, missing limbs counted wrong [%]."""
+    g_mpjpe_mm: float | None = None
+    """Mean joint distance after the alignment of everybody's trajectories [mm]."""
+    per_person_g_mpjpe_mm: float | None = None
+    """Mean joint distance after the alignment of this person's trajectory [mm]."""
+    pa_mpjpe_mm: float | None = None
+    """Mean joint distance after alignment in each frame [mm]."""
+    path_m: float | None = None
+    """Length of the true path on which these are taken [m]."""
 
 
 def evaluate_joints(
     prediction: JointTracks,
     reference: JointTracks,
     settings: EvaluationSettings | None = None,
+    *,
+    fps: float | None = None,
+    camera: Camera | None = None,
 ) -> tuple[Evaluation, tuple[PersonScore, ...]]:
     """Return scores over all frames of the reference, and per true person.
 
     Frames are paired by number: a reference frame that the prediction lacks is all missed, a
     predicted frame that the reference lacks is not looked at. Within a frame people are paired by
-    `match_frame`; their ids play no part.
+    `match_people`; their ids play no part. Trajectories are paired by `merge_tracks` (E3).
 
     Args:
         prediction: estimated joints.
         reference: true joints; with `views`, only what enough cameras saw counts.
-        settings: gate, limb bound and what counts; the defaults if None.
+        settings: gates, limb bound and what counts; the defaults if None.
+        fps: match frames in a second [1/s]; without it there are no figures in time.
+        camera: the camera in whose picture tracks are matched by their boxes, single or one for
+            each frame of the reference; without it they are matched by distance.
+
+    Raises:
+        InputError: the camera has another number of frames than the reference.
     """
     settings = settings or EvaluationSettings()
-    aligned, false_people = _aligned(prediction, reference, settings.match_gate)
-    counts = np.isfinite(reference.joints[..., 0])
-    if reference.views is not None:
-        counts &= reference.views >= settings.min_views
-    existing = np.isfinite(reference.joints[..., 0]).sum(-1)
-    present = (existing > 0) & (counts.sum(-1) >= settings.min_joint_share * existing)
-    counts &= present[..., None]
+    people = _in_frames(prediction, reference.frames)
+    distances = joint_distances(people, reference.joints)
+    match = match_people(distances, settings.match_gate)
+    counts = _counting_joints(reference, settings)
+    present = np.asarray(counts.any(axis=-1))
+    exists = np.asarray(np.isfinite(people[..., 0]).any(axis=-1))
+    frames = len(reference.frames)
+    # Who is matched to a true person that does not count is neither right nor false.
+    idle = np.zeros_like(exists)
+    frame, person = np.nonzero((match >= 0) & ~present)
+    idle[frame, match[frame, person]] = True
 
     true = np.where(counts[..., None], reference.joints, np.nan)
-    error = np.linalg.norm(aligned - true, axis=-1)
-    tally = _Tally(
-        frames=present,
-        matched=present & np.any(np.isfinite(aligned[..., 0]), axis=-1),
-        joints=counts,
-        found=np.isfinite(error),
-        error=np.where(np.isfinite(error), error, 0.0),
-        limbs=np.all(np.isfinite(limb_ends(true)), axis=(-1, -2)),
-        correct=correct_limbs(aligned, true, settings.pcp_alpha),
+    tally = _tally(taken(people, match), true, present, settings.pcp_alpha)
+    identity = identity_scores(distances, present, exists & ~idle, settings.match_gate)
+    tracks = _match_tracks(people, reference, distances, match, camera, settings)
+    figures, persons = _track_figures(
+        taken(people, tracks), true, present, reference.frames, fps, settings
     )
-    frames = len(reference.frames)
-    people = tuple(
+    minutes = _minutes(reference.frames, fps)
+    evaluation = Evaluation(
+        **tally.scores((slice(None), slice(None))),
+        **figures,
+        false_persons_per_frame=_ratio(exists.sum() - (match >= 0).sum(), frames),
+        idf1=identity.idf1,
+        hota=identity.hota,
+        detection_accuracy=identity.detection_accuracy,
+        association_accuracy=identity.association_accuracy,
+        switches=identity.switches,
+        switches_per_minute=(
+            None if identity.switches is None or not minutes else identity.switches / minutes
+        ),
+        fragmentations=identity.fragmentations,
+        persons=int(present.any(axis=0).sum()),
+        frames=frames,
+    )
+    scores = tuple(
         PersonScore(
             person_id=int(person_id),
             frames=int(present[:, index].sum()),
             **tally.scores((slice(None), index)),
+            **persons[index],
         )
         for index, person_id in enumerate(reference.person_ids)
     )
-    evaluation = Evaluation(
-        **tally.scores((slice(None), slice(None))),
-        false_persons_per_frame=false_people / frames if frames else None,
-        persons=int(present.any(axis=0).sum()),
-        frames=frames,
-    )
-    return evaluation, people
+    return evaluation, scores
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,27 +153,138 @@ class _Tally:
         }
 
 
+def _tally(
+    predicted: NDArray[np.float64],
+    true: NDArray[np.float64],
+    present: NDArray[np.bool_],
+    alpha: float,
+) -> _Tally:
+    error = np.linalg.norm(predicted - true, axis=-1)
+    return _Tally(
+        frames=present,
+        matched=present & np.any(np.isfinite(predicted[..., 0]), axis=-1),
+        joints=np.isfinite(true[..., 0]),
+        found=np.isfinite(error),
+        error=np.where(np.isfinite(error), error, 0.0),
+        limbs=np.all(np.isfinite(limb_ends(true)), axis=(-1, -2)),
+        correct=correct_limbs(predicted, true, alpha),
+    )
+
+
 def _ratio(part: float, whole: float) -> float | None:
     return float(part / whole) if whole else None
 
 
-def _aligned(
-    prediction: JointTracks, reference: JointTracks, gate: float
-) -> tuple[NDArray[np.float64], int]:
-    """Return the prediction in the frames and persons of the reference, and the left-over people.
+def _mean(values: NDArray[np.float64], factor: float = 1.0) -> float | None:
+    """Return the mean of what is not NaN times a factor, None where there is nothing."""
+    known = np.isfinite(values)
+    return _ratio(factor * np.where(known, values, 0.0).sum(), int(known.sum()))
 
-    Left over are predicted people in a frame who match no true one, whether it counts or not.
-    """
-    aligned = np.full(reference.joints.shape, np.nan)
-    exists = np.any(np.isfinite(prediction.joints[..., 0]), axis=-1)
-    false_people = 0
-    _, rows, reference_rows = np.intersect1d(
-        prediction.frames, reference.frames, assume_unique=True, return_indices=True
+
+def _in_frames(prediction: JointTracks, frames: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return predicted joints in these frames, NaN in those that the prediction lacks."""
+    people = np.full((len(frames), *prediction.joints.shape[1:]), np.nan)
+    _, rows, places = np.intersect1d(
+        prediction.frames, frames, assume_unique=True, return_indices=True
     )
-    for row, reference_row in zip(rows, reference_rows, strict=True):
-        people = prediction.joints[row, exists[row]]
-        match = match_frame(people, reference.joints[reference_row], gate)
-        known = match >= 0
-        aligned[reference_row, known] = people[match[known]]
-        false_people += len(people) - int(known.sum())
-    return aligned, false_people
+    people[places] = prediction.joints[rows]
+    return people
+
+
+def _counting_joints(reference: JointTracks, settings: EvaluationSettings) -> NDArray[np.bool_]:
+    """Return which true joints count (frames, persons, 17)."""
+    exists = np.isfinite(reference.joints[..., 0])
+    counts = exists
+    if reference.views is not None:
+        counts = counts & (reference.views >= settings.min_views)
+    enough = counts.sum(-1) >= settings.min_joint_share * exists.sum(-1)
+    return np.asarray(counts & enough[..., None])
+
+
+def _minutes(frames: NDArray[np.int64], fps: float | None) -> float | None:
+    if fps is None or not len(frames):
+        return None
+    return float(frames[-1] - frames[0] + 1) / fps / 60.0
+
+
+def _match_tracks(
+    people: NDArray[np.float64],
+    reference: JointTracks,
+    distances: NDArray[np.float64],
+    match: NDArray[np.int64],
+    camera: Camera | None,
+    settings: EvaluationSettings,
+) -> NDArray[np.int64]:
+    """Return the predicted person of each true one (frames, true), by whole tracks (E3)."""
+    true = reference.joints
+    if camera is not None:
+        if camera.batch_shape not in ((), (1,), (len(true),)):
+            raise InputError(
+                "camera to match in",
+                expected=f"one row, or {len(true)}: one for each frame of the reference",
+                found=f"{camera.batch_shape}",
+                todo="Name the camera of the clip that the reference belongs to.",
+            )
+        overlap = box_overlaps(joint_boxes(people, camera), joint_boxes(true, camera))
+        cost = np.where(np.isnan(overlap), np.inf, 1.0 - overlap)
+        return merge_tracks(match_boxes(overlap, settings.min_overlap), cost)
+    possible = min(
+        int(np.isfinite(side[..., 0]).any(-1).sum())
+        for side in (people, true[np.isfinite(people[..., 0]).any((-1, -2))])
+    )
+    if (match >= 0).sum() < settings.min_matched_share * possible:
+        motion = register_world(people, true, settings.match_gate)
+        if motion is not None:
+            moved = motion.apply(people.reshape(len(people), -1, 3)).reshape(people.shape)
+            distances = joint_distances(moved, true)
+            match = match_people(distances, settings.match_gate)
+    return merge_tracks(match, distances)
+
+
+def _track_figures(
+    predicted: NDArray[np.float64],
+    true: NDArray[np.float64],
+    present: NDArray[np.bool_],
+    frames: NDArray[np.int64],
+    fps: float | None,
+    settings: EvaluationSettings,
+) -> tuple[dict[str, float | None], list[dict[str, float | None]]]:
+    """Return the scores of whole tracks, and those of each person."""
+    free, rigid = (
+        aligned_errors(
+            predicted, true, with_scale=with_scale, min_joints=settings.min_aligned_joints
+        )
+        for with_scale in (True, False)
+    )
+    compared = np.asarray(np.isfinite(free.shared).any(-1))
+    lengths = path_lengths(true, compared)
+    figures: dict[str, float | None] = {}
+    for errors, suffix in ((free, ""), (rigid, "_rigid")):
+        figures[f"g_mpjpe{suffix}_mm"] = _mean(errors.shared, 1000.0)
+        figures[f"per_person_g_mpjpe{suffix}_mm"] = _mean(errors.per_person, 1000.0)
+        figures[f"pa_mpjpe{suffix}_mm"] = _mean(errors.per_frame, 1000.0)
+        for name, values in (("meter", errors.shared), ("person", errors.per_person)):
+            drift = drift_per_meter(values, lengths, settings.min_trajectory)
+            figures[f"per_{name}_drift{suffix}_cm_per_m"] = None if drift is None else 100.0 * drift
+    whole, local = challenge_errors(predicted, true)
+    figures["challenge_global_m"], figures["challenge_local_m"] = _mean(whole), _mean(local)
+    if figures["challenge_global_m"] is not None and figures["challenge_local_m"] is not None:
+        figures["challenge_score"] = (
+            figures["challenge_global_m"] + 5.0 * figures["challenge_local_m"]
+        )
+    if fps is not None:
+        figures["acceleration_error_m_s2"] = _mean(
+            acceleration_errors(predicted, true, frames, fps)
+        )
+    figures["g_scale"] = free.scale if np.isfinite(free.scale) else None
+    figures["track_coverage"] = _ratio(compared.sum(), present.sum())
+    people = [
+        {
+            "g_mpjpe_mm": _mean(free.shared[:, index], 1000.0),
+            "per_person_g_mpjpe_mm": _mean(free.per_person[:, index], 1000.0),
+            "pa_mpjpe_mm": _mean(free.per_frame[:, index], 1000.0),
+            "path_m": float(lengths[index]) if compared[:, index].any() else None,
+        }
+        for index in range(true.shape[1])
+    ]
+    return figures, people

@@ -22,3 +22,26 @@ class EvaluationSettings(Record):
     min_joint_share: float = Field(default=0.5, gt=0, le=1)
     """A true person counts in a frame when at least this share of its joints does [1]: half a
     person at the border of all pictures is not missed."""
+    min_overlap: float = Field(default=0.5, gt=0, le=1)
+    """Least intersection over union of two boxes of one person [1]; the paper gives no value,
+    this is the usual one (E3)."""
+    min_aligned_joints: int = Field(default=7, ge=3)
+    """PA-MPJPE takes a person in a frame who has this many of the 14 joints [1]: three points are
+    aligned to any triangle of the same shape, and half a body flatters the other half."""
+    min_trajectory: float = Field(default=1.0, gt=0)
+    """Drift takes people whose true path is at least this long [m]: a goalkeeper who stands
+    still has any drift per metre."""
+    min_matched_share: float = Field(default=0.5, ge=0, le=1)
+    """Where fewer of the predicted and true people match in the world as it is, the prediction
+    is taken to have a world of its own, and is registered before tracks are matched [1]."""
+
+
+class CameraErrorSettings(Record):
+    """Where on the pitch cameras are compared."""
+
+    spacing: float = Field(default=2.5, gt=0)
+    """Between neighbours on the grid over the pitch [m]: some 1200 points, of which a tight
+    broadcast picture holds about a hundred."""
+    player_height: float = Field(default=1.0, gt=0)
+    """Above the surface, where the reprojection error is taken [m]: a player's middle, because
+    cameras that are right on the grass can be wrong above it."""

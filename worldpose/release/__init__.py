@@ -6,7 +6,7 @@ Outputs: joints files, WorldPose cameras, COCO keypoints, one HTML report; pictu
 """
 
 from worldpose.release.archives import Member, read_archive, write_archive
-from worldpose.release.camera_file import write_static_camera
+from worldpose.release.camera_file import read_camera, write_static_camera
 from worldpose.release.coco import coco_dataset, write_coco
 from worldpose.release.files import whole_file
 from worldpose.release.joints_file import JointTracks, read_joints, write_joints
@@ -18,6 +18,7 @@ __all__ = [
     "Picture",
     "coco_dataset",
     "read_archive",
+    "read_camera",
     "read_joints",
     "report_page",
     "whole_file",

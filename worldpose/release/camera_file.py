@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from data_contracts.cameras import CameraCalibration
-from worldpose.release.archives import write_archive
+from worldpose.cameras import Camera, Rigid
+from worldpose.cameras.rigid import nearest_rotation
+from worldpose.release.archives import Member, read_archive, write_archive, wrong
+
+MEMBERS: Final = {
+    "K": Member(("rows", 3, 3), "float"),
+    "k": Member(("rows", 5), "float"),
+    "R": Member(("rows", 3, 3), "float"),
+    "t": Member(("rows", 3), "float"),
+}
+"""Arrays of a camera file; one row for a camera that never moves, else one a frame."""
+
+RELEASE_SIZE: Final = (1920, 1080)
+"""Picture of every released camera [px]; the files do not hold it."""
 
 
 def write_static_camera(path: Path, calibration: CameraCalibration) -> None:
@@ -29,3 +43,42 @@ def write_static_camera(path: Path, calibration: CameraCalibration) -> None:
     write_archive(
         path, {name: np.array(value, dtype=np.float64)[None] for name, value in arrays.items()}
     )
+
+
+def read_camera(path: Path, image_size: tuple[int, int] = RELEASE_SIZE) -> Camera:
+    """The camera of a file: a single one where it has one row, else a batch (frames,).
+
+    A row with a NaN is a frame without a camera.
+
+    Args:
+        path: the file.
+        image_size: width and height [px].
+
+    Raises:
+        InputError: naming file and place: absent, members missing or unknown, wrong shapes, no
+            rows, a K with skew or without focal length, an R that is no rotation.
+    """
+    arrays = read_archive(path, MEMBERS)
+    k, rotation = arrays["K"], arrays["R"].copy()
+    if not len(k):
+        raise wrong(f"{path}: K", "one row, or one a frame", "none")
+    known = np.all([np.isfinite(a.reshape(len(a), -1)).all(-1) for a in arrays.values()], axis=0)
+    shape = np.isclose(k[:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0.0, 0.0, 0.0, 0.0, 1.0])
+    good = shape.all(-1) & (k[:, [0, 1], [0, 1]] > 0.0).all(-1)
+    for row in np.flatnonzero(known):
+        if not good[row]:
+            raise wrong(
+                f"{path}: K[{row}]",
+                "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal lengths",
+                f"{k[row].tolist()}",
+            )
+        rotation[row] = nearest_rotation(f"{path}: R[{row}]", rotation[row])
+    missing = ~known[:, None]
+    camera = Camera(
+        focal=np.where(missing, np.nan, k[:, [0, 1], [0, 1]]),
+        principal_point=k[:, :2, 2],
+        distortion=arrays["k"],
+        cam_from_world=Rigid(rotation, arrays["t"]),
+        image_size=np.array(image_size, dtype=np.int64),
+    )
+    return camera if len(k) > 1 else camera[0]

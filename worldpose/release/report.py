@@ -10,31 +10,7 @@ from typing import Final
 
 from data_contracts.evaluation import Evaluation
 from data_contracts.run import RunRecord
-
-MEANINGS: Final = {
-    "mpjpe_mm": (
-        "Mean joint error",
-        "mm",
-        "how far a found joint is from the true one on average, in world coordinates as they are",
-    ),
-    "pcp3d": (
-        "Correct limbs",
-        "%",
-        "limbs whose ends are off by at most half the limb's length; missing ones count as wrong",
-    ),
-    "coverage": ("People found", "%", "share of the true people of all frames that were found"),
-    "joint_coverage": ("Joints found", "%", "share of the true joints that have a found one"),
-    "false_persons_per_frame": (
-        "False people",
-        "per frame",
-        "people reported where nobody is, on average",
-    ),
-    "persons": ("True people", "", "who can be seen well enough to be scored"),
-    "frames": ("Frames scored", "", "all frames of the reference"),
-}
-"""Label, unit and plain meaning of every score; shares are shown in per cent."""
-
-_SHARES: Final = ("coverage", "joint_coverage")
+from worldpose.release.meanings import score_rows, shown_number
 
 _STYLE: Final = """
 :root { color-scheme: light; }
@@ -112,12 +88,8 @@ def report_page(
 def _scores(scores: Evaluation | None) -> list[str]:
     if scores is None:
         return []
-    rows = []
-    for name, value in scores.model_dump(exclude_none=True).items():
-        label, unit, meaning = MEANINGS.get(name, (name, "", ""))
-        shown = _number(100.0 * value if name in _SHARES else value)
-        rows.append((label, f"{shown} {unit}".strip(), meaning))
     heading = "<h2>Against the truth</h2>"
+    rows = [row[1:] for row in score_rows(scores)]
     return [heading, _table(("score", ">value", "what it says"), rows)]
 
 
@@ -149,7 +121,7 @@ def _units(run: RunRecord, seconds: Mapping[str, float]) -> list[tuple[str, ...]
 
 def _figures(run: RunRecord) -> list[tuple[str, ...]]:
     return [
-        (unit if number == 0 else "", name, _number(value))
+        (unit if number == 0 else "", name, shown_number(value))
         for unit, figures in run.figures.items()
         for number, (name, value) in enumerate(figures.items())
     ]
@@ -197,8 +169,3 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         )
         lines.append(f"<tr>{''.join(cells)}</tr>")
     return "<table>\n" + "\n".join(lines) + "\n</table>"
-
-
-def _number(value: float) -> str:
-    """Four digits, without powers of ten where they can be helped."""
-    return f"{value:,.0f}" if float(value).is_integer() or abs(value) >= 1e4 else f"{value:.4g}"

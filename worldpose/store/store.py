@@ -90,6 +90,18 @@ class Store:
             )
         return cls(blobs)
 
+    @classmethod
+    def open_or_new(cls, url: str | os.PathLike[str]) -> Store:
+        """The project at `url`; where there is none, the first `register` makes it.
+
+        So input can be checked first, and a refused one leaves nothing behind.
+
+        Raises:
+            InputError: a project of another contract version or store format is there.
+        """
+        blobs = open_blobs(os.fspath(url))
+        return cls.open(url) if blobs.exists(PROJECT) else cls(blobs)
+
     def matches(self) -> tuple[str, ...]:
         """Ids of the registered matches, sorted."""
         names = (entry.path.split("/")[1:] for entry in self.blobs.entries("matches"))
@@ -108,6 +120,7 @@ class Store:
     def register(self, registration: Registration) -> None:
         """Takes a match in, or replaces what is known of it."""
         match_id = registration.spec.match_id
+        self.blobs.put_new(PROJECT, seal(Project(store_format=STORE_FORMAT)))
         if self.registration(match_id) != registration:
             self.blobs.put(registration_path(match_id), seal(registration))
 

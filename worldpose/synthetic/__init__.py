@@ -6,16 +6,30 @@ Outputs: a `Scene` in memory, or a match folder with `reference/`.
 
 from worldpose.synthetic.matches import simulate_match
 from worldpose.synthetic.noise import ObservationNoise
-from worldpose.synthetic.scenarios import SCENARIOS, CrowdSettings, RigSettings, Scenario
-from worldpose.synthetic.scene import Scene, simulate_scene
+from worldpose.synthetic.scenarios import SCENARIOS
+from worldpose.synthetic.scene import Identities, Scene, simulate_scene
+from worldpose.synthetic.settings import (
+    BroadcastSettings,
+    CalibrationErrors,
+    CrowdSettings,
+    RigSettings,
+    Scenario,
+    Seat,
+)
+from worldpose.synthetic.trajectories import read_trajectories
 
 __all__ = [
     "SCENARIOS",
+    "BroadcastSettings",
+    "CalibrationErrors",
     "CrowdSettings",
+    "Identities",
     "ObservationNoise",
     "RigSettings",
     "Scenario",
     "Scene",
+    "Seat",
+    "read_trajectories",
     "simulate_match",
     "simulate_scene",
 ]

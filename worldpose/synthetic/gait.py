@@ -1,4 +1,4 @@
-"""People who walk and run: 17 joints from a path over the ground.
+"""People who stand, walk and run: 17 joints from a path over the ground.
 
 A kinematic model: planted feet follow the path's footholds, knees follow by two-bone inverse
 kinematics, arms swing against the legs. Bones between joints keep their lengths exactly.
@@ -36,6 +36,15 @@ _HEAD: Final = np.array(
     ]
 )
 """Forward, left, up from the mid-shoulder, as fractions of body height."""
+
+
+STANDING_SPEED: Final = 0.25
+"""Who is slower than this for `STANDING_TIME` stands [m/s]."""
+STANDING_TIME: Final = 0.3
+"""[s]"""
+TURNING_ARM: Final = 0.5
+"""Turning by 1 rad/s asks for as many steps as walking this much a second [m]; who turns by less
+than half that does it with the hips."""
 
 
 @dataclass(frozen=True)
@@ -89,24 +98,23 @@ def walk(
         ground: what feet stand on.
         rng: draws where in the stride the path begins and how the head turns.
     """
-    # Longer and faster strides with speed: 0.9 strides a second at 1 m/s, 1.4 at 4 m/s.
-    rate = 0.75 + 0.16 * path.speed
-    cycle = rng.random() + np.concatenate(
-        [[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(path.time))]
-    )
+    cycle = stride_cycle(path, rng.random())
     swing = 2.0 * np.pi * np.interp(times, path.time, cycle)
     speed, heading = (np.interp(times, path.time, x) for x in (path.speed, path.heading))
     run = _running(speed)
+    # Who hardly moves hardly swings.
+    pace = np.minimum(speed, 1.0)
+    sway = pace * np.sin(swing)
 
     up = np.array([0.0, 0.0, 1.0])
     pelvis_xy = np.stack([np.interp(times, path.time, x) for x in path.position.T], axis=-1)
     # Walkers rise over the planted leg, runners sink onto it.
-    rise = (0.945 - 0.04 * run) * body.leg + (0.015 - 0.05 * run) * np.cos(2.0 * swing)
+    rise = (0.945 - 0.04 * run) * body.leg + pace * (0.015 - 0.05 * run) * np.cos(2.0 * swing)
     pelvis = np.concatenate(
         [pelvis_xy, (ground(*pelvis_xy.T) + body.ankle_height + rise)[:, None]], axis=-1
     )
-    forward, leftward = _axes(heading + np.radians(6.0) * np.sin(swing))
-    chest_forward, chest_left = _axes(heading - np.radians(8.0) * np.sin(swing))
+    forward, leftward = _axes(heading + np.radians(6.0) * sway)
+    chest_forward, chest_left = _axes(heading - np.radians(8.0) * sway)
     lean = np.radians(2.0 + 6.0 * run)[:, None]
     spine = np.cos(lean) * up + np.sin(lean) * _axes(heading)[0]
     neck = pelvis + body.trunk * spine
@@ -116,14 +124,14 @@ def walk(
     gaze, gaze_left = _axes(heading + look)
     head = np.stack([gaze, gaze_left, np.broadcast_to(up, gaze.shape)], axis=-2)
     joints[:, :5] = neck[:, None] + body.height * _HEAD @ head
-    for side, (sign, offset) in enumerate(((1.0, 0.0), (-1.0, 0.5))):
+    for side, (sign, offset) in enumerate(((1.0, 0.0), (-1.0, 0.5))):  # left, right
         ankle = _ankles(body, path, cycle + offset, times, ground, sign)
         hip = pelvis + sign * body.hip_half_width * leftward
         joints[:, 11 + side] = hip
         joints[:, 13 + side], joints[:, 15 + side] = _leg(body, hip, ankle, forward)
         shoulder = neck + sign * body.shoulder_half_width * chest_left
         # The left arm is forward when the left leg is back.
-        raised = (0.35 + 0.35 * run) * np.sin(swing + 2.0 * np.pi * offset) - 0.15 * run
+        raised = (0.35 + 0.35 * run) * sign * sway - 0.15 * run
         bent = raised + np.radians(20.0 + 65.0 * run)
         outward = 0.15 * sign * chest_left
         joints[:, 5 + side] = shoulder
@@ -131,6 +139,55 @@ def walk(
         joints[:, 7 + side] = elbow
         joints[:, 9 + side] = elbow + body.forearm * _arm(bent, chest_forward, 0.0 * outward)
     return joints
+
+
+def stride_cycle(path: GroundPath, phase: float) -> Floats:
+    """Strides made (samples,): whole when the left foot is in mid-stance, half when the right is.
+
+    Strides get longer and faster with speed: 0.9 a second at 1 m/s, 1.4 at 4 m/s, 2.2 at 9 m/s.
+    Who stands rests a quarter of the way between the two, where both feet are on the ground.
+
+    Args:
+        path: of a person.
+        phase: stride at the path's beginning [1], for a person who never stands.
+    """
+    pace = _pace(path)
+    rate = np.where(pace < 1.0, 0.91 * np.sqrt(pace), 0.75 + 0.16 * pace)
+    cycle = phase + np.concatenate(
+        [[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(path.time))]
+    )
+    rests = _rests(path, pace)
+    if not rests:
+        return cycle
+    made = np.empty_like(cycle)
+    first = rests[0][0]
+    here = np.round(2.0 * cycle[first] - 0.5) / 2.0 + 0.25
+    made[: first + 1] = cycle[: first + 1] + here - cycle[first]
+    for (begin, end), (following, _) in zip(rests, [*rests[1:], (len(cycle), 0)], strict=True):
+        made[begin:end] = here
+        natural = cycle[end - 1 : following + 1] - cycle[end - 1]
+        if following < len(cycle):
+            # Whole steps lead from one rest to the next; a pace aside takes one or two.
+            moved = float(np.linalg.norm(path.position[following] - path.position[end - 1]))
+            steps = max(round(2.0 * natural[-1]), min(2, int(np.ceil(moved / 0.2 - 0.25))))
+            natural = natural * (0.5 * steps / natural[-1])
+        made[end - 1 : following + 1] = here + natural
+        here = made[min(following, len(cycle) - 1)]
+    return made
+
+
+def _pace(path: GroundPath) -> Floats:
+    """Speed that steps answer to (samples,) [m/s]: turning on the spot takes steps too."""
+    turning = TURNING_ARM * np.abs(np.gradient(path.heading, path.time))
+    return np.maximum(path.speed, np.minimum(turning, 1.0))
+
+
+def _rests(path: GroundPath, pace: Floats) -> list[tuple[int, int]]:
+    """Stretches of samples, first and behind the last, in which a person stands."""
+    slow = np.concatenate([[False], pace < STANDING_SPEED, [False]])
+    begins, ends = np.flatnonzero(~slow[:-1] & slow[1:]), np.flatnonzero(slow[:-1] & ~slow[1:])
+    long = path.time[np.minimum(ends, len(path.time) - 1)] - path.time[begins] >= STANDING_TIME
+    return [(int(a), int(b)) for a, b in zip(begins[long], ends[long], strict=True)]
 
 
 def _running(speed: Floats) -> Floats:

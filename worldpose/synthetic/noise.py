@@ -1,19 +1,20 @@
-"""How a detector errs: one rate per kind of error, and the random processes behind them."""
+"""How a detector errs: one rate for each kind of error."""
 
 from __future__ import annotations
 
 from typing import Self
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
-from scipy.signal import lfilter
 
 from data_contracts.records import Record
 
 
 class ObservationNoise(Record):
     """Errors of a 2D pose detector on people who are small in the picture.
+
+    A joint's error is a bias (`shared_bias`, `own_bias`, `view_bias`), a part that drifts (`slow`)
+    and one that is new in every frame (`white`, `floor`, `blur`). White noise alone would average
+    away over ten views and fifty frames a second.
 
     Spreads are standard deviations per image axis. Those relative to a person's height in the
     picture hold for a joint of average difficulty; each joint's own is in proportion to its COCO
@@ -30,6 +31,18 @@ class ObservationNoise(Record):
     """Time in which the drift forgets itself by a factor e [s]: a fraction of a stride."""
     floor: float = Field(default=0.5, ge=0)
     """Added to `white` in squares [px]: no detector beats its heatmap's grid."""
+    blur: float = Field(default=0.002, ge=0)
+    """Error along a joint's motion in the picture, as the time in which it goes that far [s]: a
+    share of the exposure, 4 to 10 ms under floodlight."""
+    shared_bias: float = Field(default=0.008, ge=0)
+    """What the detector takes for a joint differs from the joint by this much along each axis of
+    the body [m]: one vector a joint (mirrored on the other side), the same for all people and
+    cameras, for it is the training labels' idea of a joint. No number of views removes it."""
+    own_bias: float = Field(default=0.004, ge=0)
+    """The same, drawn for every person anew [m]: clothes and build."""
+    view_bias: float = Field(default=0.005, ge=0)
+    """Bias that varies with the direction a body is seen from, twice a turn (front and back are
+    alike, sides differ) [person height]; the same for all people and cameras."""
     fewest_joints: int = Field(default=5, ge=0)
     """A person with fewer joints in the picture is not found [1]: detectors want a body, not a
     hand at the border."""
@@ -44,13 +57,28 @@ class ObservationNoise(Record):
     detector guesses from the rest of the body; 1 doubles the error."""
     hidden_joint_missed: float = Field(default=0.4, ge=0, le=1)
     """Share of hidden joints not reported [1]."""
+    stolen: float = Field(default=0.1, ge=0, lt=1)
+    """Share of hidden joints reported where the person before has that joint [1]."""
+    stolen_time: float = Field(default=0.15, gt=0)
+    """Mean length of such a theft [s]."""
     hidden_person_missed: float = Field(default=0.9, ge=0, le=1)
     """Share of frames in which a mostly hidden person is not found [1]: one box is left of two
     when they overlap that much."""
+    merged: float = Field(default=0.5, ge=0, le=1)
+    """Share of persons lost so whose box is taken over: the nearer one's then holds both [1]."""
     swapped: float = Field(default=0.02, ge=0, lt=1)
     """Share of person-frames with left and right exchanged [1]: backs taken for fronts."""
     swapped_time: float = Field(default=0.15, gt=0)
     """Mean length of such an exchange [s]."""
+    small: float = Field(default=60.0, ge=0)
+    """People smaller than this in the picture are missed and exchanged twice as often [px]."""
+    displaced: float = Field(default=0.0, ge=0, lt=1)
+    """Share of joints put 4 to 10 standard deviations off, with no loss of confidence [1]; the
+    truth says which."""
+    dropped_frames: float = Field(default=0.0, ge=0, lt=1)
+    """Share of frames that a camera lost [1]."""
+    dropped_time: float = Field(default=0.06, gt=0)
+    """Mean length of such a gap [s]."""
     false_people: float = Field(default=0.1, ge=0, lt=1)
     """People reported where nobody is, mean number a frame and camera [1]: shadows, boards."""
     false_people_time: float = Field(default=0.3, gt=0)
@@ -58,7 +86,8 @@ class ObservationNoise(Record):
     false_doubt: float = Field(default=0.4, ge=0, lt=1)
     """By how much they lower the confidence, as a share of it [1]."""
     confidence_drop: float = Field(default=8.0, ge=0)
-    """A joint with error e [person height] has confidence exp(-drop e) [1]: 0.85 at 2 %."""
+    """A joint with error e [person height], biases aside, has confidence exp(-drop e) [1]: 0.85 at
+    2 %; a detector knows when it is unsure, not what it always gets wrong."""
     hidden_doubt: float = Field(default=0.5, ge=0, lt=1)
     """By how much being hidden lowers a joint's confidence, as a share of it [1]."""
     confidence_spread: float = Field(default=0.05, ge=0)
@@ -69,45 +98,3 @@ class ObservationNoise(Record):
         """A detector that reports every joint in the picture, exactly and surely."""
         rates = [name for name in cls.model_fields if not name.endswith("_time")]
         return cls(**dict.fromkeys(rates, 0.0))
-
-
-def drift(
-    shape: tuple[int, ...], time: float, fps: float, rng: np.random.Generator
-) -> NDArray[np.float64]:
-    """A stationary first-order autoregressive process of unit variance along the first axis.
-
-    Args:
-        shape: (frames, ...).
-        time: time constant [s].
-        fps: [1/s].
-        rng: draws `shape` normal numbers.
-    """
-    keep = float(np.exp(-1.0 / (time * fps)))
-    shocks = rng.standard_normal(shape)
-    shocks[1:] *= np.sqrt(1.0 - keep**2)
-    process: NDArray[np.float64] = lfilter([1.0], [1.0, -keep], shocks, axis=0)
-    return process
-
-
-def bursts(
-    share: float, time: float, shape: tuple[int, ...], fps: float, rng: np.random.Generator
-) -> NDArray[np.bool_]:
-    """A stationary on-off process along the first axis: on for a given share of the frames.
-
-    Args:
-        share: of frames that are on, below 1.
-        time: mean length of a stretch that is on [s]; at least a frame.
-        shape: (frames, ...).
-        fps: [1/s].
-        rng: draws `shape` uniform numbers.
-    """
-    draws = rng.random(shape)
-    # A draw below `start` switches on, one above 1 - stop switches off, others change nothing.
-    rate = min(1.0, 1.0 / (time * fps * (1.0 - share)))
-    start, stop = share * rate, (1.0 - share) * rate
-    event = (draws < start).astype(np.int8) - (draws >= 1.0 - stop)
-    event[:1] = np.where(draws[:1] < share, 1, -1)
-    frame = np.arange(shape[0]).reshape(-1, *(1 for _ in shape[1:]))
-    latest = np.maximum.accumulate(np.where(event != 0, frame, 0), axis=0)
-    on: NDArray[np.bool_] = np.take_along_axis(event, latest, axis=0) > 0
-    return on

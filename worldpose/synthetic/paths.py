@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.synthetic.scenarios import CrowdSettings
+from worldpose.synthetic.settings import CrowdSettings
 
 STEP: Final = 0.01
 """Time between samples of a path [s]: 4 cm at 4 m/s, a hundredth of a stride."""
@@ -21,10 +21,10 @@ TURN_RATE: Final = 2.0
 """Most a walker turns [rad/s]."""
 TURN_LAG: Final = 0.25
 """Time in which a change of turn rate takes hold [s]: about one step."""
+TURNING_SPEED: Final = 0.5
+"""Who is slower turns less, and who stands not at all [m/s]."""
 LOOK_AHEAD: Final = 1.2
 """How far ahead people see borders and other people coming [s]."""
-PERSONAL_SPACE: Final = 1.5
-"""Distance under which others are avoided [m]."""
 START_SPACE: Final = 2.5
 """Least distance between people at the start of their paths [m], where there is room."""
 
@@ -59,6 +59,7 @@ def wander(
     time = np.linspace(-MARGIN, -MARGIN + (samples - 1) * STEP, samples)
     low, high = crowd.speed
     speed = low + (high - low) * (0.5 + 0.5 * _slow_wave(time, (4.0, 9.0), rng))
+    speed = np.maximum(speed, 0.0)
     whim = 0.8 * _slow_wave(time, (3.0, 8.0), rng)
     center, half = np.array(crowd.area_center), 0.5 * np.array(crowd.area_size)
     place = np.array([other.position for other in others]).reshape(len(others), len(time), 2)
@@ -75,9 +76,10 @@ def wander(
         wish = (
             whim[i]
             + _turn_back(here + LOOK_AHEAD * velocity - center, half, angle)
-            + _turn_aside(place[:, i] - here, motion[:, i] - velocity, angle)
+            + _turn_aside(place[:, i] - here, motion[:, i] - velocity, angle, crowd.personal_space)
         )
-        limit = min(TURN_RATE, LATERAL_ACCELERATION / speed[i])
+        limit = min(TURN_RATE, LATERAL_ACCELERATION / max(speed[i], 0.1))
+        limit *= min(1.0, speed[i] / TURNING_SPEED)
         turn += (float(np.clip(wish, -limit, limit)) - turn) * STEP / TURN_LAG
         here = here + velocity * STEP
         angle = angle + turn * STEP
@@ -111,14 +113,14 @@ def _turn_back(ahead: NDArray[np.float64], half: NDArray[np.float64], heading: f
 
 
 def _turn_aside(
-    offsets: NDArray[np.float64], motions: NDArray[np.float64], heading: float
+    offsets: NDArray[np.float64], motions: NDArray[np.float64], heading: float, space: float
 ) -> float:
     """Turn rate [rad/s] away from those who would come too near; relative positions and motions."""
-    if not len(offsets):
+    if not len(offsets) or space == 0.0:
         return 0.0
     approach = -(offsets * motions).sum(-1) / np.maximum((motions**2).sum(-1), 1e-9)
     nearest = offsets + motions * np.clip(approach, 0.0, LOOK_AHEAD)[:, None]
-    urgency = np.clip(1.0 - np.linalg.norm(nearest, axis=-1) / PERSONAL_SPACE, 0.0, 1.0)
+    urgency = np.clip(1.0 - np.linalg.norm(nearest, axis=-1) / space, 0.0, 1.0)
     leftward = np.array([-np.sin(heading), np.cos(heading)])
     # Those who pass exactly through are passed on one side, rather than met undecided.
     away = np.where(nearest @ leftward > 0.0, -1.0, 1.0)

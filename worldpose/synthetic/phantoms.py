@@ -8,13 +8,15 @@ import numpy as np
 
 from worldpose.pitch import PitchTemplate
 from worldpose.synthetic.gait import draw_body, walk
-from worldpose.synthetic.noise import bursts
-from worldpose.synthetic.observing import Bodies
 from worldpose.synthetic.paths import wander
-from worldpose.synthetic.scenarios import Scenario
+from worldpose.synthetic.processes import bursts
+from worldpose.synthetic.settings import CrowdSettings, Scenario
+from worldpose.synthetic.sight import Bodies
 
 PHANTOMS: Final = 2
 """Most false people at a time in one camera."""
+POSTURES: Final = 12.0
+"""Length of the walk that postures are taken from [s]."""
 
 
 def draw_phantoms(
@@ -33,10 +35,10 @@ def draw_phantoms(
     shape = (frames, PHANTOMS)
     on = bursts(share, noise.false_people_time, shape, scenario.fps, rng)
     body = draw_body(crowd.height, rng)
-    # Any moment of a minute's walk serves as a posture; every appearance has its own.
-    path = wander(crowd, 60.0, (), rng)
+    # Any moment of a walk serves as a posture; every appearance has its own.
+    path = wander(CrowdSettings(height=crowd.height), POSTURES, (), rng)
     appeared = on & ~np.concatenate([np.zeros_like(on[:1]), on[:-1]])
-    times = rng.uniform(0.0, 60.0, appeared.shape)
+    times = rng.uniform(0.0, POSTURES, appeared.shape)
     joints = walk(body, path, times.ravel(), lambda x, y: 0.0 * x, rng)
     joints = joints.reshape(*appeared.shape, 17, 3)
     joints[..., :2] -= joints[..., 11:13, :2].mean(axis=2, keepdims=True)

@@ -4,60 +4,83 @@ from __future__ import annotations
 
 from typing import Final
 
-from pydantic import Field
-
-from data_contracts.pitch import PitchSpec
-from data_contracts.records import Name, Record
 from worldpose.synthetic.noise import ObservationNoise
+from worldpose.synthetic.settings import (
+    BroadcastSettings,
+    CalibrationErrors,
+    CrowdSettings,
+    RigSettings,
+    Scenario,
+    Seat,
+)
 
-Range = tuple[float, float]
-
-
-class CrowdSettings(Record):
-    """The people and the part of the pitch they move on."""
-
-    people: int = Field(default=5, ge=0)
-    """How many [1]."""
-    area_center: tuple[float, float] = (-20.0, 14.0)
-    """Middle of the area [m]: off both axes, so that a wrong sign or a flat pitch shows."""
-    area_size: tuple[float, float] = (20.0, 14.0)
-    """Length along x and y [m]; people turn back towards the middle at its border."""
-    speed: Range = (1.0, 4.0)
-    """Slowest and fastest [m/s]: a stroll and a steady run."""
-    height: Range = (1.70, 1.95)
-    """Shortest and tallest body height [m]: professional players."""
-
-
-class RigSettings(Record):
-    """Static cameras that stand around the area and look at it."""
-
-    cameras: int = Field(default=6, ge=1)
-    """How many [1]."""
-    image_size: tuple[int, int] = (1920, 1080)
-    """Width and height [px] (C8)."""
-    distance: Range = (30.0, 60.0)
-    """Along the ground from the area's middle [m]: stands of a stadium."""
-    height: Range = (10.0, 20.0)
-    """Above the pitch [m]: roofs and upper tiers."""
-    person_height: float = Field(default=115.0, gt=0)
-    """Height of a person of 1.8 m in the area's middle [px]; sets the focal length. Over the
-    area people then are 80 to 200 px tall."""
+_QUARTER: Final = (
+    # where in the quarter x > 0, y > 0 a camera stands, what it looks at, its focal length
+    Seat(place=(13.0, 60.0, 22.0), aim=(19.2, 11.4), focal=2254.0),
+    Seat(place=(76.0, 14.0, 19.0), aim=(41.2, -16.0), focal=2228.0),
+    Seat(place=(38.0, 57.0, 16.0), aim=(33.5, 17.7), focal=2096.0),
+    Seat(place=(66.0, 48.0, 26.0), aim=(34.6, -3.4), focal=2387.0),
+)
 
 
-class Scenario(Record):
-    """One synthetic match: everything but the seed."""
+def _mirrored(seat: Seat, x: float, y: float) -> Seat:
+    return Seat(
+        place=(x * seat.place[0], y * seat.place[1], seat.place[2]),
+        aim=(x * seat.aim[0], y * seat.aim[1]),
+        focal=seat.focal,
+    )
 
-    name: Name
-    about: str
-    """One sentence for people who choose."""
-    duration: float = Field(gt=0)
-    """[s]"""
-    fps: float = Field(default=25.0, gt=0)
-    """[1/s]"""
-    crowd: CrowdSettings = CrowdSettings()
-    rig: RigSettings = RigSettings()
-    noise: ObservationNoise = ObservationNoise()
-    pitch: PitchSpec = PitchSpec()
+
+STADIUM_SEATS: Final = (
+    *(
+        _mirrored(seat, x, y)
+        for seat in _QUARTER
+        for x, y in ((1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, 1.0))
+    ),
+    Seat(place=(0.0, 62.0, 25.0), aim=(0.0, 0.0), focal=2100.0),
+    Seat(place=(0.0, -62.0, 25.0), aim=(0.0, 0.0), focal=2100.0),
+)
+"""18 seats in stands of 13 to 27 m behind the lines and 16 to 26 m up; the first 16 see every
+point of the pitch from four sides or more with people 40 to 150 px tall."""
+
+_STADIUM: Final = RigSettings(cameras=16, seats=STADIUM_SEATS)
+_TEAMS: Final = CrowdSettings(
+    people=25, movement="football", officials=3, area_center=(0.0, 0.0), area_size=(105.0, 68.0)
+)
+_MATCH: Final = Scenario(
+    name="match",
+    about="4 s of play: 22 players, 3 officials, 16 static cameras around the pitch and the "
+    "broadcast camera.",
+    duration=4.0,
+    fps=50.0,
+    crowd=_TEAMS,
+    rig=_STADIUM,
+    broadcast=BroadcastSettings(),
+    noise=ObservationNoise(),
+)
+_BOX: Final = CrowdSettings(
+    people=6,
+    area_center=(-44.0, 2.0),
+    area_size=(8.0, 9.0),
+    speed=(-0.8, 4.5),
+    personal_space=0.5,
+)
+_TRIAL: Final = ObservationNoise(
+    white=0.025,
+    slow=0.027,
+    blur=0.004,
+    shared_bias=0.025,
+    own_bias=0.009,
+    view_bias=0.013,
+    hidden_joint_missed=0.35,
+    stolen=0.2,
+    swapped=0.03,
+)
+_SPRAWL: Final = RigSettings(cameras=10, person_height=105.0, height=(10.0, 28.0))
+
+
+def _variant(name: str, about: str, base: Scenario, **changes: object) -> Scenario:
+    return base.model_copy(update={"name": name, "about": about, **changes})
 
 
 SCENARIOS: Final = {
@@ -67,6 +90,72 @@ SCENARIOS: Final = {
             name="tiny",
             about="5 people walk and run for 4 s before 6 static cameras: seconds to reconstruct.",
             duration=4.0,
+        ),
+        _MATCH,
+        Scenario(
+            name="penalty-box",
+            about="The paper's trial: 6 players in close contact for 2 s before 10 cameras, with "
+            "a detector as rough as its errors.",
+            duration=2.0,
+            fps=50.0,
+            crowd=_BOX,
+            rig=_SPRAWL,
+            broadcast=BroadcastSettings(),
+            noise=_TRIAL,
+        ),
+        Scenario(
+            name="crossing",
+            about="8 people run through each other on 9 x 9 m: who is who when they come apart.",
+            duration=4.0,
+            fps=50.0,
+            crowd=CrowdSettings(
+                people=8,
+                area_center=(24.0, -12.0),
+                area_size=(9.0, 9.0),
+                speed=(2.0, 6.0),
+                personal_space=0.6,
+            ),
+            rig=_SPRAWL,
+            broadcast=BroadcastSettings(),
+        ),
+        Scenario(
+            name="corner-kick",
+            about="18 players jostle before a goal, as at a corner kick: most hide each other.",
+            duration=4.0,
+            fps=50.0,
+            crowd=_BOX.model_copy(
+                update={"people": 18, "area_center": (45.0, 0.0), "area_size": (11.0, 15.0)}
+            ),
+            rig=_STADIUM,
+            broadcast=BroadcastSettings(),
+        ),
+        _variant(
+            "hard",
+            "The match with 8 % of keypoints far off, clocks half a frame apart, lost frames, "
+            "an uncertain calibration and one camera ten times worse.",
+            _MATCH,
+            rig=_STADIUM.model_copy(update={"clock_spread": 0.5}),
+            noise=_TRIAL.model_copy(
+                update={"displaced": 0.08, "dropped_frames": 0.01, "false_people": 0.4}
+            ),
+            calibration=CalibrationErrors(
+                rotation=0.0003, center=0.1, focal=0.001, bad_cameras=1, bad_factor=10.0
+            ),
+        ),
+        _variant("long", "The match for two minutes.", _MATCH, duration=120.0),
+        _variant(
+            "broadcast-pan",
+            "20 s of the match, the broadcast camera panning to and fro.",
+            _MATCH,
+            duration=20.0,
+            broadcast=BroadcastSettings(sweep=22.0, focal=(3300.0, 4200.0)),
+        ),
+        _variant(
+            "broadcast-zoom",
+            "20 s of the match, the broadcast camera zooming from its widest to its closest.",
+            _MATCH,
+            duration=20.0,
+            broadcast=BroadcastSettings(focal=(2500.0, 7000.0), zoom_period=(14.0, 20.0)),
         ),
     )
 }

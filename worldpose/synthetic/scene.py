@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,87 +12,177 @@ from worldpose.cameras import Camera
 from worldpose.ingest import Observations
 from worldpose.pitch import PitchTemplate
 from worldpose.release import JointTracks
-from worldpose.synthetic.gait import draw_body, walk
-from worldpose.synthetic.observing import Bodies, detect, report, see
-from worldpose.synthetic.paths import GroundPath, wander
+from worldpose.synthetic.broadcast import film
+from worldpose.synthetic.calibrating import misjudge
+from worldpose.synthetic.crowd import Crowd, gather
+from worldpose.synthetic.detecting import (
+    Detections,
+    Habits,
+    detect,
+    draw_habits,
+    perceived_bias,
+)
+from worldpose.synthetic.paths import GroundPath
 from worldpose.synthetic.phantoms import PHANTOMS, draw_phantoms
-from worldpose.synthetic.scenarios import Scenario
+from worldpose.synthetic.processes import bursts
+from worldpose.synthetic.reporting import Report, report
+from worldpose.synthetic.settings import Scenario
+from worldpose.synthetic.sight import Bodies, Sight, see
 from worldpose.synthetic.stadium import place_camera
+
+Seed = np.random.SeedSequence
+
+
+@dataclass(frozen=True, eq=False)
+class Identities:
+    """Who every detection of one camera is.
+
+    Attributes:
+        person: (frames, detections) int16 index into the truth's `person_ids`; -1 for false
+            people and padding.
+        displaced: (frames, detections, 17) bool, keypoints put far off on purpose.
+    """
+
+    person: NDArray[np.int16]
+    displaced: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What happened, and what detectors made of it; cameras by id in the order of the rig."""
+    """What happened, and what detectors made of it.
+
+    Attributes:
+        truth: `views` counts the static cameras that have the joint in their picture with nobody
+            before it.
+        cameras: the true static cameras by id, in the order of the rig.
+        given: the same as calibration.toml has them.
+        broadcast: the moving camera, a batch (frames,); None without.
+        observations: by id of a static camera, and of the clip for the broadcast camera.
+        identities: by the same ids.
+        clocks: frames that a static camera lies behind its stated clock, by id [frame].
+    """
 
     truth: JointTracks
-    """`views` counts the cameras that have the joint in their picture with nobody before it."""
     cameras: dict[str, Camera]
+    given: dict[str, Camera]
+    broadcast: Camera | None
     observations: dict[str, Observations]
-    identities: dict[str, NDArray[np.int16]]
-    """(frames, detections) person of every detection as index into `truth.person_ids`; -1 for
-    false people and padding."""
+    identities: dict[str, Identities]
+    clocks: dict[str, float]
 
 
-def simulate_scene(scenario: Scenario, seed: int) -> Scene:
+@dataclass(frozen=True, eq=False)
+class _World:
+    """What all cameras look at, and with whose eyes."""
+
+    scenario: Scenario
+    crowd: Crowd
+    pitch: PitchTemplate
+    habits: Habits
+    own_bias: NDArray[np.float64]
+
+    def bodies(self, times: NDArray[np.float64]) -> Bodies:
+        joints, noise = self.crowd.joints(times), self.scenario.noise
+        bias = None
+        if noise.shared_bias > 0.0 or noise.own_bias > 0.0:
+            bias = perceived_bias(joints, self.habits, noise, self.own_bias)
+        return Bodies(joints, self.crowd.heights, bias)
+
+
+def simulate_scene(
+    scenario: Scenario,
+    seed: int,
+    *,
+    clip_id: str = "clip",
+    driven: Sequence[GroundPath] | None = None,
+) -> Scene:
     """Return a scene; the same scenario and seed give the same numbers.
 
     Every person and every camera draws from a stream of its own: a further camera changes nothing
-    that was there, a further person only whom it hides and the order of detections.
+    that was there; a further person, where each wanders for himself, only whom it hides and the
+    order of detections.
+
+    Args:
+        scenario: everything but the seed.
+        seed: from 0.
+        clip_id: names the broadcast camera's detections.
+        driven: ways of the people, instead of the scenario's movement.
     """
-    people_seed, rig_seed = np.random.SeedSequence(seed).spawn(2)
+    people_seed, rig_seed, habit_seed, broadcast_seed, error_seed = Seed(seed).spawn(5)
     pitch = PitchTemplate.from_spec(scenario.pitch)
-    bodies = _people(scenario, pitch, people_seed)
-    frames, persons = bodies.joints.shape[:2]
+    crowd = gather(scenario, pitch, people_seed, driven)
+    persons = len(crowd.paths)
+    common, own = habit_seed.spawn(2)
+    own_bias = np.array([_rng(each).standard_normal((17, 3)) for each in own.spawn(persons)])
+    habits = draw_habits(_rng(common))
+    world = _World(scenario, crowd, pitch, habits, own_bias.reshape(persons, 17, 3))
+    times = np.arange(round(scenario.duration * scenario.fps)) / scenario.fps
+    bodies = world.bodies(times)
     x, y = scenario.crowd.area_center
     target = np.array([x, y, float(pitch.height(x, y))])
 
     cameras: dict[str, Camera] = {}
-    observations: dict[str, Observations] = {}
-    identities: dict[str, NDArray[np.int16]] = {}
-    views = np.zeros((frames, persons, 17), dtype=np.int64)
-    for index, seeds in enumerate(rig_seed.spawn(scenario.rig.cameras)):
+    reports: dict[str, Report] = {}
+    clocks: dict[str, float] = {}
+    views = np.zeros(bodies.joints.shape[:3], dtype=np.int64)
+    for index, camera_seed in enumerate(rig_seed.spawn(scenario.rig.cameras)):
         name = f"cam{index:02d}"
-        place, order, deception, errors = seeds.spawn(4)
-        figures, *figure_errors = deception.spawn(1 + PHANTOMS)
-        camera = place_camera(scenario.rig, index, target, np.random.default_rng(place))
-        sight = see(camera, bodies)
+        place, clock, *errors = camera_seed.spawn(6)
+        camera = place_camera(scenario.rig, index, target, scenario.pitch, _rng(place))
+        late = scenario.rig.clock_spread * float(_rng(clock).standard_normal())
+        seen_bodies = bodies if late == 0.0 else world.bodies(times + late / scenario.fps)
+        sight = see(camera, seen_bodies)
         views += sight.seen
-        keypoints, confidence = detect(
-            sight, scenario.noise, scenario.fps, _generators(errors.spawn(persons))
+        cameras[name], clocks[name] = camera, late
+        reports[name] = _reported(world, camera, sight, errors)
+    broadcast = None
+    if scenario.broadcast is not None:
+        place, *errors = broadcast_seed.spawn(5)
+        size = scenario.rig.image_size
+        broadcast = film(
+            scenario.broadcast, times, crowd.action, crowd.action_times, size, _rng(place)
         )
-        phantoms = draw_phantoms(scenario, pitch, frames, np.random.default_rng(figures))
-        deceit = see(camera, phantoms)
-        false_keypoints, false_confidence = detect(
-            deceit, scenario.noise, scenario.fps, _generators(figure_errors)
-        )
-        observations[name], identity = report(
-            0,
-            np.concatenate([keypoints, false_keypoints], axis=1),
-            np.concatenate(
-                [confidence, false_confidence * (1.0 - scenario.noise.false_doubt)], axis=1
-            ),
-            np.concatenate([sight.size, deceit.size], axis=1),
-            np.random.default_rng(order),
-        )
-        cameras[name] = camera
-        identities[name] = np.where(identity < persons, identity, -1).astype(np.int16)
-    truth = JointTracks(np.arange(frames), np.arange(persons), bodies.joints, views=views)
-    return Scene(truth, cameras, observations, identities)
+        reports[clip_id] = _reported(world, broadcast, see(broadcast, bodies), errors)
+    return Scene(
+        truth=JointTracks(np.arange(len(times)), np.arange(persons), bodies.joints, views=views),
+        cameras=cameras,
+        given=misjudge(cameras, scenario.calibration, _rng(error_seed)),
+        broadcast=broadcast,
+        observations={name: each.observations for name, each in reports.items()},
+        identities={name: _identities(each, persons) for name, each in reports.items()},
+        clocks=clocks,
+    )
 
 
-def _people(scenario: Scenario, pitch: PitchTemplate, seed: np.random.SeedSequence) -> Bodies:
-    times = np.arange(round(scenario.duration * scenario.fps)) / scenario.fps
-    paths: list[GroundPath] = []
-    joints = np.empty((len(times), scenario.crowd.people, 17, 3))
-    heights = np.empty(scenario.crowd.people)
-    for person, rng in enumerate(_generators(seed.spawn(scenario.crowd.people))):
-        body = draw_body(scenario.crowd.height, rng)
-        path = wander(scenario.crowd, scenario.duration, paths, rng)
-        joints[:, person] = walk(body, path, times, pitch.height, rng)
-        heights[person] = body.height
-        paths.append(path)
-    return Bodies(joints, heights)
+def _reported(world: _World, camera: Camera, sight: Sight, seeds: list[Seed]) -> Report:
+    """What a camera's detector says of people and of nobody; `seeds` are four."""
+    order, deception, errors, loss = seeds
+    scenario, noise = world.scenario, world.scenario.noise
+    frames, persons = sight.size.shape
+    real = detect(sight, noise, world.habits, scenario.fps, _rngs(errors.spawn(persons)))
+    figures, *figure_errors = deception.spawn(1 + PHANTOMS)
+    deceit = see(camera, draw_phantoms(scenario, world.pitch, frames, _rng(figures)))
+    false = detect(deceit, noise, world.habits, scenario.fps, _rngs(figure_errors))
+    merged = np.where(false.merged_into >= 0, false.merged_into + persons, -1)
+    together = Detections(
+        np.concatenate([real.keypoints, false.keypoints], axis=1),
+        np.concatenate([real.confidence, false.confidence * (1.0 - noise.false_doubt)], axis=1),
+        np.concatenate([real.displaced, false.displaced], axis=1),
+        np.concatenate([real.merged_into, merged], axis=1),
+    )
+    dropped = bursts(noise.dropped_frames, noise.dropped_time, (frames,), scenario.fps, _rng(loss))
+    size = np.concatenate([sight.size, deceit.size], axis=1)
+    return report(0, together, size, dropped, _rng(order))
 
 
-def _generators(seeds: list[np.random.SeedSequence]) -> list[np.random.Generator]:
+def _identities(given: Report, persons: int) -> Identities:
+    person = np.where(given.person < persons, given.person, -1).astype(np.int16)
+    return Identities(person, given.displaced)
+
+
+def _rng(seed: Seed) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def _rngs(seeds: list[Seed]) -> list[np.random.Generator]:
     return [np.random.default_rng(seed) for seed in seeds]

@@ -1,4 +1,4 @@
-"""Where the cameras stand: a ring around the part of the pitch where people are."""
+"""Where the static cameras stand: in a stadium's seats, or in a ring off the pitch."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.pitch import PitchSpec
 from worldpose.cameras import Camera, Rigid
-from worldpose.synthetic.scenarios import RigSettings
+from worldpose.synthetic.settings import RigSettings
 
 STANDARD_PERSON: Final = 1.8
 """Body height that `RigSettings.person_height` speaks of [m]."""
@@ -18,38 +19,66 @@ GOLDEN: Final = (np.sqrt(5.0) - 1.0) / 2.0
 
 
 def place_camera(
-    rig: RigSettings, index: int, target: NDArray[np.float64], rng: np.random.Generator
+    rig: RigSettings,
+    index: int,
+    target: NDArray[np.float64],
+    pitch: PitchSpec,
+    rng: np.random.Generator,
 ) -> Camera:
-    """The camera with this number in the ring around a target.
+    """The static camera with this number.
 
-    It aims a few metres off the target, leans by a fraction of a degree, has its principal point
-    a few pixels off the middle and the mild barrel distortion (k1, k2) of a stadium lens (C5).
+    It has its seat's place, aim and focal length, a little off; without a seat, it stands in a
+    ring around the target behind where the pitch ends. It leans by a fraction of a degree, has its
+    principal point a few pixels off the middle and the mild barrel distortion (k1, k2) of a stadium
+    lens (C5).
 
     Args:
-        rig: distances, heights and picture.
-        index: number in the ring.
-        target: (3,) [m], world.
+        rig: seats, distances, heights and picture.
+        index: number from 0.
+        target: (3,) [m], world; what the ring looks at.
+        pitch: no camera of the ring stands on it.
         rng: this camera's own.
     """
-    azimuth = 2.0 * np.pi * (index * GOLDEN + rng.uniform(-0.02, 0.02)) - 0.5 * np.pi
-    distance, height = rng.uniform(*rig.distance), rng.uniform(*rig.height)
-    center = target + np.array([distance * np.cos(azimuth), distance * np.sin(azimuth), height])
-    aim = target + np.array([*rng.uniform(-1.5, 1.5, 2), 0.5 * STANDARD_PERSON])
-    # An upright person far below the camera is foreshortened by the cosine of the tilt.
-    far = float(np.linalg.norm(aim - center))
-    focal = rig.person_height * far / (STANDARD_PERSON * distance / far)
+    if index < len(rig.seats):
+        seat = rig.seats[index]
+        center = np.array(seat.place) + rig.seat_spread * rng.uniform(-1.0, 1.0, 3)
+        aim = np.array([*seat.aim, 0.0])
+        aim[:2] += rig.seat_spread * rng.uniform(-1.0, 1.0, 2)
+        focal = seat.focal * rng.uniform(0.99, 1.01)
+    else:
+        center, aim, focal = _in_the_ring(rig, index, target, pitch, rng)
     width, tall = rig.image_size
     middle = np.array([width - 1.0, tall - 1.0]) / 2.0
     return Camera(
         focal=np.array([focal, focal]),
         principal_point=middle + 0.004 * width * rng.standard_normal(2),
         distortion=np.array([rng.uniform(-0.12, -0.02), rng.uniform(0.0, 0.03), 0.0, 0.0, 0.0]),
-        cam_from_world=_looking(center, aim, np.radians(0.5) * rng.standard_normal()),
+        cam_from_world=looking(center, aim, np.radians(0.5) * rng.standard_normal()),
         image_size=np.array([width, tall]),
     )
 
 
-def _looking(center: NDArray[np.float64], aim: NDArray[np.float64], roll: float) -> Rigid:
+def _in_the_ring(
+    rig: RigSettings,
+    index: int,
+    target: NDArray[np.float64],
+    pitch: PitchSpec,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Center and aim (3,) [m], world, and focal length [px]."""
+    azimuth = 2.0 * np.pi * (index * GOLDEN + rng.uniform(-0.02, 0.02)) - 0.5 * np.pi
+    way = np.array([np.cos(azimuth), np.sin(azimuth)])
+    border = 0.5 * np.array([pitch.length, pitch.width])
+    to_border = float(np.min((border - np.sign(way) * target[:2]) / np.abs(way)))
+    distance = to_border + rng.uniform(*rig.distance)
+    center = target + np.array([*(distance * way), rng.uniform(*rig.height)])
+    aim = target + np.array([*rng.uniform(-1.5, 1.5, 2), 0.5 * STANDARD_PERSON])
+    # An upright person far below the camera is foreshortened by the cosine of the tilt.
+    far = float(np.linalg.norm(aim - center))
+    return center, aim, rig.person_height * far / (STANDARD_PERSON * distance / far)
+
+
+def looking(center: NDArray[np.float64], aim: NDArray[np.float64], roll: float) -> Rigid:
     """The pose of a camera at `center` that sees `aim` in its middle, rolled by an angle [rad]."""
     forward = (aim - center) / np.linalg.norm(aim - center)
     right = np.cross(forward, [0.0, 0.0, 1.0])

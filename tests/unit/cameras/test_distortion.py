@@ -153,8 +153,8 @@ def test_tangential_terms_bend_the_fold():
     found = camera.project_with_jacobians(on_plane([[0.99, 0.0], [1.01, 0.0]]))
     assert found.status.tolist() == [RayStatus.OK, RayStatus.BEYOND_FOLD]
     # The image ends at x' = 1 - 1/2.
-    rays = camera.unproject([[0.4999, 0.0], [0.51, 0.0]])
-    assert rays.status.tolist() == [RayStatus.OK, RayStatus.BEYOND_FOLD]
+    rays = camera.unproject([[0.4999, 0.0], [0.51, 0.0], [1.2, 0.0]])
+    assert rays.status.tolist() == [RayStatus.OK, RayStatus.BEYOND_FOLD, RayStatus.BEYOND_FOLD]
 
 
 def test_pixel_outside_the_radial_image_can_lie_inside_the_tangential_one():

@@ -1,6 +1,16 @@
 import numpy as np
 
-from worldpose.evaluation import match_frame
+from worldpose.evaluation.matching import (
+    joint_distances,
+    match_boxes,
+    match_people,
+    merge_tracks,
+    taken,
+)
+
+
+def match_frame(predicted, true, gate):
+    return match_people(joint_distances(predicted[None], true[None]), gate)[0]
 
 
 def people(*positions):
@@ -42,3 +52,60 @@ def test_every_prediction_is_used_once():
         0,
         1,
     ]
+
+
+def test_distances_of_many_frames_are_those_of_each():
+    rng = np.random.default_rng(0)
+    predicted, true = rng.normal(size=(150, 2, 4, 3)), rng.normal(size=(150, 3, 4, 3))
+    predicted[70, 1, :3] = np.nan
+    true[149, 2] = np.nan
+    distances = joint_distances(predicted, true)
+    assert distances[149, 2].tolist() == [np.inf, np.inf]
+    expected = np.linalg.norm(predicted[149, 1] - true[149, 0], axis=-1).mean()
+    # Means of up to four numbers near 1.
+    lone = np.linalg.norm(predicted[70, 1, 3] - true[70, 0, 3])
+    np.testing.assert_allclose(distances[70, 0, 1], lone, rtol=1e-15)
+    np.testing.assert_allclose(distances[149, 0, 1], expected, rtol=1e-15)
+
+
+def test_boxes_are_matched_greedily():
+    # The best pair 0.9 comes first and leaves 0.5 to the other, though 0.8 twice would be more.
+    overlap = np.array([[[0.9, 0.8], [0.8, 0.5]]])
+    assert match_boxes(overlap, 0.5).tolist() == [[0, 1]]
+    assert match_boxes(overlap, 0.6).tolist() == [[0, -1]]
+
+
+def test_missing_boxes_match_nothing():
+    assert match_boxes(np.array([[[np.nan, 0.7], [np.nan, 0.6]]]), 0.5).tolist() == [[1, -1]]
+    assert match_boxes(np.empty((2, 1, 0)), 0.5).tolist() == [[-1], [-1]]
+    assert match_boxes(np.empty((2, 0, 3)), 0.5).shape == (2, 0)
+
+
+def test_a_track_belongs_to_whom_it_is_paired_with_most():
+    # Prediction 0 is paired with person 0 in three frames and with person 1 in two.
+    pairs = np.array([[0, -1], [0, -1], [0, -1], [-1, 0], [-1, 0]])
+    cost = np.full((5, 2, 1), 0.3)
+    assert merge_tracks(pairs, cost).tolist() == [[0, -1]] * 5
+
+
+def test_split_tracks_are_merged_and_the_nearer_of_two_counts():
+    pairs = np.array([[0], [0], [1], [1]])
+    cost = np.array([[[0.1, np.inf]], [[0.1, np.inf]], [[0.3, 0.2]], [[np.inf, 0.2]]])
+    assert merge_tracks(pairs, cost).tolist() == [[0], [0], [1], [1]]
+    cost[2, 0] = [0.1, 0.2]
+    assert merge_tracks(pairs, cost).tolist() == [[0], [0], [0], [1]]
+
+
+def test_a_track_that_is_never_paired_belongs_to_nobody():
+    assert merge_tracks(np.full((2, 1), -1), np.full((2, 1, 1), 5.0)).tolist() == [[-1], [-1]]
+    assert merge_tracks(np.full((2, 1), -1), np.empty((2, 1, 0))).tolist() == [[-1], [-1]]
+    assert merge_tracks(np.empty((2, 0), dtype=int), np.empty((2, 0, 3))).shape == (2, 0)
+
+
+def test_people_are_taken_into_the_places_of_the_true_ones():
+    predicted = people(1.0, 2.0)[None]
+    found = taken(predicted, np.array([[1, -1, 0]]))
+    assert found[0, 0, 0, 0] == 2.0
+    assert np.isnan(found[0, 1]).all()
+    assert found[0, 2, 0, 0] == 1.0
+    assert np.isnan(taken(predicted[:, :0], np.array([[-1]]))).all()

@@ -8,7 +8,7 @@ import pytest
 from data_contracts.evaluation import Evaluation
 from data_contracts.run import RunRecord, UnitFailure
 from worldpose.release import Picture, report_page
-from worldpose.release.report import MEANINGS
+from worldpose.release.meanings import MEANINGS
 
 PNG = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJg"
@@ -29,6 +29,7 @@ def run(**changes):
         "failed": (
             UnitFailure(unit="triangulation/clip", error="E", message="<script>no</script>"),
         ),
+        "blocked": (),
         "figures": {"tracking/clip": {"persons": 5.0, "mean_views": 5.8125}},
         "versions": {"numpy": "2.4.0"},
         "started_at": datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC),

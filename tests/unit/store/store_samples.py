@@ -162,6 +162,7 @@ def sample_record(run_id: str, *recipes: Recipe, **changes: Any) -> RunRecord:
         "executed": tuple(recipe.name for recipe in recipes),
         "reused": (),
         "failed": (),
+        "blocked": (),
         "figures": {},
         "versions": {"worldpose": "0.1.0"},
         "started_at": now,

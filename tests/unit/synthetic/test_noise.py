@@ -3,7 +3,7 @@ import pytest
 from pydantic import ValidationError
 
 from worldpose.synthetic import ObservationNoise
-from worldpose.synthetic.noise import bursts, drift
+from worldpose.synthetic.processes import bursts, drift
 
 
 def lengths_of_stretches(on):
@@ -57,6 +57,8 @@ def test_none_switches_every_rate_off():
     assert {name for name, value in rates.items() if value != 0} == {
         "slow_time",
         "person_missed_time",
+        "stolen_time",
+        "dropped_time",
         "swapped_time",
         "false_people_time",
     }

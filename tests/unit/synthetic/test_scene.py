@@ -51,7 +51,7 @@ def test_feet_are_on_the_crowned_pitch(scene):
 
 def test_without_noise_every_detection_is_its_persons_projection(exact):
     for name, camera in exact.cameras.items():
-        people, identity = exact.observations[name], exact.identities[name]
+        people, identity = exact.observations[name], exact.identities[name].person
         assert (identity >= 0).any()
         for frame in range(0, 100, 7):
             for place in np.flatnonzero(identity[frame] >= 0):
@@ -68,7 +68,7 @@ def test_without_noise_everybody_in_the_picture_is_there_and_nobody_else(exact):
     for name, camera in exact.cameras.items():
         pixels = camera.project(exact.truth.joints.reshape(-1, 3)).reshape(100, 5, 17, 2)
         inside = ((pixels >= -0.5) & (pixels <= [1919.5, 1079.5])).all(-1).any(-1)
-        identity = exact.identities[name]
+        identity = exact.identities[name].person
         found = np.stack([(identity == person).sum(axis=1) for person in range(5)], axis=1)
         np.testing.assert_array_equal(found, inside.astype(int))
         assert (np.isfinite(exact.observations[name].score) == (identity >= 0)).all()
@@ -88,7 +88,7 @@ def test_the_same_seed_gives_the_same_scene_and_another_seed_another(scene):
     np.testing.assert_array_equal(again.truth.joints, scene.truth.joints)
     for name in scene.cameras:
         equal(again.observations[name], scene.observations[name])
-        np.testing.assert_array_equal(again.identities[name], scene.identities[name])
+        np.testing.assert_array_equal(again.identities[name].person, scene.identities[name].person)
     assert np.abs(other.truth.joints - scene.truth.joints).max() > 1.0
 
 
@@ -113,7 +113,7 @@ def test_noise_changes_neither_people_nor_cameras(scene, exact):
 def test_detections_are_about_as_noisy_as_announced(scene):
     errors = []
     for name, camera in scene.cameras.items():
-        identity = scene.identities[name]
+        identity = scene.identities[name].person
         frame, place = np.nonzero(identity >= 0)
         joints = scene.truth.joints[frame, identity[frame, place]]
         truth = camera.project(joints.reshape(-1, 3)).reshape(-1, 17, 2)
@@ -131,8 +131,8 @@ def test_detections_are_about_as_noisy_as_announced(scene):
 def test_false_people_show_up_with_low_scores(scene):
     false, real = [], []
     for name, people in scene.observations.items():
-        false.append(people.score[(scene.identities[name] < 0) & np.isfinite(people.score)])
-        real.append(people.score[scene.identities[name] >= 0])
+        false.append(people.score[(scene.identities[name].person < 0) & np.isfinite(people.score)])
+        real.append(people.score[scene.identities[name].person >= 0])
     assert len(np.concatenate(false)) > 5
     assert np.concatenate(false).mean() < np.concatenate(real).mean() - 0.2
 

@@ -71,7 +71,7 @@ def test_the_truth_is_beside_it(match, scene):
             np.testing.assert_array_equal(file["t"][0], camera.cam_from_world.translation)
         with np.load(match / "reference" / "identities" / f"{name}.npz") as file:
             np.testing.assert_array_equal(file["frame"], np.arange(100))
-            np.testing.assert_array_equal(file["person"], scene.identities[name])
+            np.testing.assert_array_equal(file["person"], scene.identities[name].person)
             assert file["person"].dtype == np.int16
 
 

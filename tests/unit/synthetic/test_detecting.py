@@ -4,7 +4,15 @@ import pytest
 from data_contracts.conventions import COCO17
 from worldpose.cameras import Camera, Rigid
 from worldpose.synthetic import ObservationNoise
-from worldpose.synthetic.observing import DIFFICULTY, MIRRORED, Bodies, detect, report, see
+from worldpose.synthetic.detecting import (
+    DIFFICULTY,
+    MIRRORED,
+    Habits,
+    detect,
+    draw_habits,
+    perceived_bias,
+)
+from worldpose.synthetic.sight import Bodies, facing, see
 
 FPS = 25.0
 FRAMES = 2000
@@ -30,6 +38,9 @@ def standing(x, y):
     return np.stack([x + across, np.full(17, y), height - 1.0], axis=-1)
 
 
+EVEN = Habits(np.zeros((17, 3)), np.ones((17, 2, 2)))
+
+
 def bodies(*people, frames=1):
     return Bodies(np.tile(np.stack(people), (frames, 1, 1, 1)), np.full(len(people), 1.8))
 
@@ -44,7 +55,8 @@ def one_setting(**settings):
 
 def detected(camera, noise, *people, frames=FRAMES):
     sight = see(camera, bodies(*people, frames=frames))
-    return sight, *detect(sight, noise, FPS, rngs(len(people)))
+    found = detect(sight, noise, EVEN, FPS, rngs(len(people)))
+    return sight, found.keypoints, found.confidence
 
 
 def test_pixels_and_size_of_a_person_straight_ahead(camera):
@@ -80,7 +92,7 @@ def test_what_is_behind_the_camera_or_out_of_the_picture_is_neither_seen_nor_hid
     assert not sight.seen[0, :2].any()
     assert sight.seen[0, 2].all()
     noise = ObservationNoise.none()
-    assert np.isnan(detect(sight, noise, FPS, rngs(3))[0][0, :2]).all()
+    assert np.isnan(detect(sight, noise, EVEN, FPS, rngs(3)).keypoints[0, :2]).all()
 
 
 def test_without_noise_detections_are_the_projections(camera):
@@ -180,8 +192,8 @@ def test_a_few_joints_at_the_border_are_no_person(camera):
     inside = int(sight.seen.sum())
     assert 5 < inside < 17
     for fewest, found in ((inside, inside), (inside + 1, 0)):
-        keypoints, _ = detect(sight, one_setting(fewest_joints=fewest), FPS, rngs(1))
-        assert np.isfinite(keypoints[..., 0]).sum() == found
+        some = detect(sight, one_setting(fewest_joints=fewest), EVEN, FPS, rngs(1))
+        assert np.isfinite(some.keypoints[..., 0]).sum() == found
 
 
 def test_a_further_person_changes_nobodys_errors(camera):
@@ -191,56 +203,135 @@ def test_a_further_person_changes_nobodys_errors(camera):
     np.testing.assert_array_equal(alone[:, 0], together[:, 0])
 
 
-def reported(found, seed=0):
-    """People that are found or not (frames, bodies), each with its number as coordinate."""
-    found = np.array(found, dtype=bool)
-    keypoints = np.where(
-        found[..., None, None], np.arange(found.shape[1])[:, None, None] * np.ones((17, 2)), np.nan
+def test_the_nearest_of_those_before_a_joint_hides_it(camera):
+    sight = see(camera, bodies(standing(0.0, 40.0), standing(0.0, 20.0), standing(0.0, 30.0)))
+    assert (sight.hider[0, 0] == 1).all()
+    assert (sight.hider[0, 2] == 1).all()
+    assert (sight.hider[0, 1] == -1).all()
+
+
+def test_azimuth_is_where_the_camera_is_seen_from_the_body(camera):
+    # With his left at positive x he faces the camera, which then passes to his right.
+    front, left = facing(standing(0.0, 20.0))
+    np.testing.assert_allclose(front, [0.0, -1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(left, [1.0, 0.0, 0.0], atol=1e-12)
+    sight = see(camera, bodies(standing(0.0, 20.0), standing(20.0, 20.0)))
+    np.testing.assert_allclose(sight.azimuth[0], [0.0, -np.pi / 4], atol=1e-12)
+
+
+def test_a_camera_for_every_frame_sees_as_each_of_them(camera):
+    moving = Camera(
+        focal=np.array([[2000.0, 2000.0], [3000.0, 3000.0]]),
+        principal_point=np.array([959.5, 539.5]),
+        distortion=np.array([0.1, 0.0, 0.0, 0.0, 0.0]),
+        cam_from_world=Rigid(camera.cam_from_world.rotation, np.array([[0.0] * 3, [1.0, 0, 2]])),
+        image_size=np.array([1920, 1080]),
     )
-    confidence = np.where(found[..., None], np.full(17, 0.5), np.nan)
-    size = np.full(found.shape, 100.0)
-    return report(40, keypoints, confidence, size, np.random.default_rng(seed))
+    people = bodies(standing(0.0, 40.0), standing(0.3, 20.0), frames=2)
+    together = see(moving, people)
+    for frame in (0, 1):
+        alone = see(moving[frame], bodies(standing(0.0, 40.0), standing(0.3, 20.0)))
+        for name in ("keypoints", "hider", "size", "azimuth"):
+            np.testing.assert_array_equal(
+                getattr(together, name)[frame], getattr(alone, name)[0], err_msg=name
+            )
 
 
-def test_identities_name_the_body_of_every_detection():
-    observations, identity = reported(np.random.default_rng(1).random((300, 4)) < 0.7)
-    number = observations.keypoints[..., 0, 0]
-    np.testing.assert_array_equal(np.where(np.isnan(number), -1, number), identity)
-    assert observations.frame.tolist() == list(range(40, 340))
+def test_a_detector_errs_alike_left_and_right():
+    bias = draw_habits(np.random.default_rng(0)).joint_bias
+    np.testing.assert_array_equal(bias[MIRRORED], bias * [1.0, -1.0, 1.0])
+    assert np.abs(bias).max() < 4.0
+    assert len(np.unique(bias[:, 0])) == 9  # the nose and eight pairs
 
 
-def test_padding_comes_last_and_is_all_missing():
-    observations, identity = reported([[1, 0, 1], [0, 0, 0], [0, 1, 0]])
-    assert observations.keypoints.shape == (3, 2, 17, 2)
-    assert (identity >= 0).tolist() == [[True, True], [False, False], [True, False]]
-    for array in observations.arrays().values():
-        assert np.isnan(array[1]).all()
-        assert np.isnan(array[2, 1]).all()
+def test_the_shared_bias_turns_with_the_body_and_is_in_metres():
+    joints = bodies(standing(0.0, 20.0)).joints
+    habits = Habits(np.tile([1.0, 0.0, 2.0], (17, 1)), np.zeros((17, 2, 2)))
+    offset = perceived_bias(joints, habits, one_setting(shared_bias=0.03), np.zeros((1, 17, 3)))
+    # Forward is towards the camera, along negative y.
+    np.testing.assert_allclose(offset, np.broadcast_to([0.0, -0.03, 0.06], offset.shape))
+    own = perceived_bias(joints, habits, one_setting(own_bias=0.01), np.ones((1, 17, 3)))
+    np.testing.assert_allclose(own, np.broadcast_to([0.01, -0.01, 0.01], own.shape))
 
 
-def test_order_tells_nothing_about_identity():
-    _, identity = reported(np.ones((6000, 3)))
-    for place in range(3):
-        counts = np.bincount(identity[:, place], minlength=3)
-        # 6000 draws: standard deviation of a count of 2000 is 37.
-        np.testing.assert_allclose(counts, 2000, atol=150)
-    # Whoever is first says nothing about the next frame: a third of the time the same.
-    assert (identity[1:, 0] == identity[:-1, 0]).mean() == pytest.approx(1 / 3, abs=0.03)
-
-
-def test_boxes_hold_the_keypoints_with_room_of_six_percent_of_the_height():
-    keypoints = np.full((1, 1, 17, 2), np.nan)
-    keypoints[0, 0, 0], keypoints[0, 0, 1] = (10.0, 20.0), (30.0, 60.0)
-    confidence = np.where(np.isnan(keypoints[..., 0]), np.nan, 0.5)
-    confidence[0, 0, 1] = 1.0
-    observations, _ = report(
-        0, keypoints, confidence, np.array([[100.0]]), np.random.default_rng(0)
+def test_bias_shifts_what_is_reported_but_not_what_is_seen(camera):
+    people = bodies(standing(0.0, 20.0))
+    shifted = Bodies(
+        people.joints, people.heights, np.zeros((1, 1, 17, 3)) + np.array([0.1, 0.0, 0.0])
     )
-    assert observations.boxes[0, 0].tolist() == [4.0, 14.0, 36.0, 66.0]
-    assert observations.score[0, 0] == 0.75
+    sight, plain = see(camera, shifted), see(camera, people)
+    np.testing.assert_array_equal(sight.keypoints, plain.keypoints)
+    found = detect(sight, ObservationNoise.none(), EVEN, FPS, rngs(1))
+    # 0.1 m at 100 px a metre.
+    np.testing.assert_allclose(found.keypoints - sight.keypoints, [[[[10.0, 0.0]] * 17]], atol=1e-9)
+    assert (found.confidence == 1.0).all()
 
 
-def test_nobody_found_leaves_no_detections():
-    observations, identity = reported(np.zeros((4, 2)))
-    assert observations.keypoints.shape == (4, 0, 17, 2)
-    assert identity.shape == (4, 0)
+def test_the_view_bias_is_the_same_from_opposite_sides_and_changes_sign_from_the_flank(camera):
+    person = standing(0.0, 20.0)
+    middle = person[[5, 6]].mean(axis=0) * [1.0, 1.0, 0.0]
+    seen = []
+    for quarter in range(4):
+        cos, sin = np.cos(quarter * np.pi / 2), np.sin(quarter * np.pi / 2)
+        turned = (person - middle) @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]) + middle
+        sight, keypoints, _ = detected(camera, one_setting(view_bias=0.01), turned, frames=1)
+        seen.append((keypoints - sight.keypoints)[0, 0, 5, 0] / sight.size[0, 0])
+    # cos 2a + sin 2a with coefficients of 1, and an azimuth that is exact at the trunk's middle.
+    np.testing.assert_allclose(seen, 0.01 * DIFFICULTY[5] * np.array([1, -1, 1, -1]), rtol=1e-6)
+
+
+def test_blur_goes_along_the_motion_and_grows_with_it(camera):
+    x = np.linspace(-4.0, 4.0, FRAMES)
+    people = Bodies(np.array([[standing(at, 20.0)] for at in x]), np.array([1.8]))
+    sight = see(camera, people)
+    found = detect(sight, one_setting(blur=0.005), EVEN, FPS, rngs(1))
+    error = (found.keypoints - sight.keypoints)[:, 0]
+    speed = 8.0 / (FRAMES - 1) * FPS * 100.0  # [px/s]
+    assert np.abs(error[..., 1]).max() < 1e-9  # the motion is level: rounding
+    # 34000 draws: standard error 0.4 %.
+    assert error[..., 0].std() == pytest.approx(0.005 * speed, rel=0.03)
+
+
+def test_stolen_joints_are_the_nearer_persons(camera):
+    sight, keypoints, _ = detected(
+        camera, one_setting(stolen=0.3), standing(0.0, 40.0), standing(0.0, 20.0)
+    )
+    moved = (keypoints != sight.keypoints).any(-1)
+    assert not moved[:, 1].any()
+    # 17 joints in bursts of 4 frames: some 8500 independent draws; the level of the camera's
+    # center is the same pixel for both.
+    assert moved[:, 0].mean() == pytest.approx(0.3, abs=0.03)
+    frame, joint = np.nonzero(moved[:, 0])
+    np.testing.assert_array_equal(keypoints[frame, 0, joint], sight.keypoints[frame, 1, joint])
+
+
+def test_displaced_joints_are_flagged_and_far_off_and_no_less_confident(camera):
+    sight = see(camera, bodies(standing(0.0, 20.0), frames=FRAMES))
+    noise = one_setting(white=0.01, displaced=0.08, confidence_drop=8.0)
+    found = detect(sight, noise, EVEN, FPS, rngs(1))
+    error = np.linalg.norm(found.keypoints - sight.keypoints, axis=-1)
+    sigmas = error / (0.01 * 180.0 * DIFFICULTY)
+    assert found.displaced.mean() == pytest.approx(0.08, abs=0.005)
+    # 4 to 10 standard deviations, on top of white noise that itself rarely exceeds 4.
+    assert np.percentile(sigmas[found.displaced], [5, 95]) == pytest.approx([4.2, 9.8], abs=0.6)
+    assert sigmas[~found.displaced].max() < 5.5
+    honest = found.confidence[~found.displaced].mean()
+    assert found.confidence[found.displaced].mean() == pytest.approx(honest, abs=0.01)
+
+
+def test_small_people_are_missed_and_exchanged_twice_as_often(camera):
+    for small, share in ((0.0, 0.2), (1000.0, 0.36)):
+        _, keypoints, _ = detected(
+            camera, one_setting(person_missed=0.2, small=small), standing(0.0, 20.0), frames=20000
+        )
+        # One source in five, or either of two: 1 - 0.8^2; 800 bursts or more.
+        assert np.isnan(keypoints[..., 0]).mean() == pytest.approx(share, abs=0.04)
+
+
+def test_a_lost_persons_box_goes_to_whoever_stands_before(camera):
+    noise = one_setting(hidden_person_missed=1.0, merged=0.5)
+    sight = see(camera, bodies(standing(0.0, 40.0), standing(0.0, 20.0), frames=FRAMES))
+    merged = detect(sight, noise, EVEN, FPS, rngs(2)).merged_into
+    assert set(merged[:, 0]) == {-1, 1}
+    assert (merged[:, 0] == 1).mean() == pytest.approx(0.5, abs=0.05)  # 2000 draws
+    assert (merged[:, 1] == -1).all()

@@ -1,0 +1,41 @@
+"""Commands on body models: body install."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flows.cli.console import JsonOption, line, print_json
+from worldpose.body import BODY_FOLDER, body_path, install_body
+
+body = typer.Typer(help="Body models: bring your own.", no_args_is_help=True)
+
+
+@body.command()
+def install(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="SMPL's .pkl or .npz.")],
+    name: Annotated[
+        str | None, typer.Option(help="What results call it; from the file's name by default.")
+    ] = None,
+    body_folder: Annotated[
+        Path, typer.Option(envvar="WORLDPOSE_BODY_FOLDER", help="Where bodies are kept.")
+    ] = BODY_FOLDER,
+    as_json: JsonOption = False,
+) -> None:
+    """Convert your licensed SMPL file once to a safe one; nothing in it is run.
+
+    Example: worldpose body install SMPL_NEUTRAL.pkl
+    """
+    model = install_body(file, body_folder, name)
+    path = body_path(model.name, body_folder)
+    if as_json:
+        print_json({"body_model": model.name, "file": str(path)})
+    else:
+        line(f"installed body model {model.name} as {path}")
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register these commands."""
+    app.add_typer(body, name="body")

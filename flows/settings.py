@@ -1,0 +1,100 @@
+"""What a person chooses for a run: stages and settings, checked before anything starts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from difflib import get_close_matches
+
+from pydantic import JsonValue, ValidationError
+
+from data_contracts.records import Record
+from flows.method import METHOD
+from flows.stage import Stage
+from worldpose.errors import UsageError
+
+Overrides = Mapping[str, Mapping[str, JsonValue]]
+"""Stage to the settings that differ from their defaults."""
+
+
+def selected_stages(from_stage: str | None, until_stage: str | None) -> tuple[Stage, ...]:
+    """The stages from one to another, both included.
+
+    Raises:
+        UsageError: no such stage, or the first comes after the last.
+    """
+    names = [stage.name for stage in METHOD]
+    first = 0 if from_stage is None else _place("--from", from_stage, names)
+    last = len(names) - 1 if until_stage is None else _place("--until", until_stage, names)
+    if first > last:
+        raise UsageError(
+            f"--from {from_stage} --until {until_stage}",
+            expected=f"stages in the order {', '.join(names)}",
+            found=f"{from_stage} after {until_stage}",
+            todo="Swap them.",
+        )
+    return METHOD[first : last + 1]
+
+
+def parse_overrides(assignments: list[str], stages: tuple[Stage, ...] = METHOD) -> Overrides:
+    """Settings given as `stage.name=value`; values are JSON, or else text.
+
+    Args:
+        assignments: one for each setting.
+        stages: those that will run; a setting of another would have no effect.
+
+    Raises:
+        UsageError: no such stage or setting, or a value that does not fit it.
+    """
+    overrides: dict[str, dict[str, JsonValue]] = {}
+    by_name = {stage.name: stage for stage in stages}
+    for assignment in assignments:
+        name, equals, text = assignment.partition("=")
+        stage_name, dot, field = name.partition(".")
+        if not (equals and dot):
+            raise UsageError(
+                f"--set {assignment}",
+                expected="stage.name=value",
+                found=repr(assignment),
+                todo="For example: --set triangulation.min_views=3.",
+            )
+        _place(f"--set {assignment}", stage_name, list(by_name))
+        _place(f"--set {assignment}", field, list(by_name[stage_name].settings.model_fields))
+        try:
+            value = json.loads(text)
+        except ValueError:
+            value = text
+        overrides.setdefault(stage_name, {})[field] = value
+    for stage_name in overrides:
+        settings_of(by_name[stage_name], overrides)
+    return overrides
+
+
+def settings_of(stage: Stage, overrides: Overrides) -> Record:
+    """The stage's settings with `overrides` applied.
+
+    Raises:
+        UsageError: a value does not fit.
+    """
+    try:
+        return stage.settings.model_validate(dict(overrides.get(stage.name, {})))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise UsageError(
+            f"--set {stage.name}.{'.'.join(map(str, first['loc']))}",
+            expected=first["msg"],
+            found=repr(first["input"]),
+            todo=f"The settings of {stage.name} are described in docs/method.md.",
+        ) from None
+
+
+def _place(where: str, name: str, names: list[str]) -> int:
+    if name in names:
+        return names.index(name)
+    close = get_close_matches(name, names, n=1)
+    raise UsageError(
+        where,
+        expected=f"one of {', '.join(names) or '(this stage has no settings)'}",
+        found=repr(name),
+        todo=f"Did you mean {close[0]!r}?" if close else "Choose one of these.",
+    )

@@ -1,0 +1,51 @@
+import json
+
+import numpy as np
+import pytest
+from smpl_pickles import pickled, smpl_like
+from typer.testing import CliRunner
+
+from flows.cli import app
+from worldpose.body import find_body
+from worldpose.errors import InputError
+
+
+@pytest.fixture
+def file(open_body, tmp_path):
+    parents = np.where(open_body.parents < 0, 2**32 - 1, open_body.parents)
+    arrays = {
+        "v_template": open_body.template,
+        "shapedirs": open_body.shape_directions,
+        "posedirs": np.zeros((6890, 3, 207)),
+        "J_regressor": open_body.joint_regressor,
+        "weights": open_body.weights,
+        "kintree_table": np.stack([parents, np.arange(24)]),
+        "f": open_body.faces,
+    }
+    path = tmp_path / "SMPL_FEMALE.pkl"
+    path.write_bytes(pickled(smpl_like(arrays)))
+    return path
+
+
+def test_body_install_says_where_the_body_is(file, tmp_path):
+    folder = tmp_path / "bodies"
+    command = ["body", "install", str(file), "--body-folder", str(folder)]
+    plain = CliRunner().invoke(app, command)
+    assert plain.exit_code == 0
+    assert find_body("smpl-female", folder).name == "smpl-female"
+    named = CliRunner().invoke(app, [*command, "--name", "mine", "--json"])
+    assert json.loads(named.stdout) == {"body_model": "mine", "file": str(folder / "mine.npz")}
+
+
+def test_body_install_keeps_bodies_in_the_users_folder(file, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    assert CliRunner().invoke(app, ["body", "install", str(file)]).exit_code == 0
+    kept = tmp_path / "home" / ".local" / "share" / "worldpose" / "bodies" / "smpl-female.npz"
+    assert kept.is_file()
+
+
+def test_body_install_refuses_another_file(tmp_path):
+    (tmp_path / "other.pkl").write_text("not a pickle")
+    refused = CliRunner().invoke(app, ["body", "install", str(tmp_path / "other.pkl")])
+    assert isinstance(refused.exception, InputError)
+    assert "other.pkl" in str(refused.exception)

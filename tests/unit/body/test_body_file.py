@@ -1,0 +1,119 @@
+import zipfile
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from worldpose.body import OPEN_BODY, find_body, load_body, save_body
+from worldpose.body.body_file import KEYS, read_arrays
+from worldpose.errors import InputError, UsageError
+
+
+def rewritten(path, body, **changes):
+    """The body's file with some arrays changed or, where None, left out."""
+    save_body(path, body)
+    arrays = {**read_arrays(path, (*KEYS, "name")), **changes}
+    np.savez(path, **{key: array for key, array in arrays.items() if array is not None})
+    return path
+
+
+def test_a_saved_body_comes_back(tmp_path, corrected_body):
+    save_body(tmp_path / "body.npz", corrected_body)
+    back = load_body(tmp_path / "body.npz")
+    assert back.name == corrected_body.name
+    for field in fields(back)[1:]:
+        # The fixture's numbers are in single precision, so nothing is lost.
+        np.testing.assert_array_equal(
+            getattr(back, field.name), getattr(corrected_body, field.name), err_msg=field.name
+        )
+    assert [path.name for path in tmp_path.iterdir()] == ["body.npz"]
+
+
+def test_saving_in_vain_leaves_what_was_there(tmp_path, open_body, monkeypatch):
+    path = tmp_path / "body.npz"
+    save_body(path, open_body)
+    before = path.read_bytes()
+
+    def fail(*args, **kwargs):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(np, "savez_compressed", fail)
+    with pytest.raises(OSError, match="disk full"):
+        save_body(path, replace(open_body, name="other"))
+    assert path.read_bytes() == before
+    assert [each.name for each in tmp_path.iterdir()] == ["body.npz"]
+
+
+def test_only_ten_shapes_are_read(tmp_path, open_body):
+    wide = np.tile(open_body.shape_directions, (1, 1, 3)).astype(np.float32)
+    path = rewritten(tmp_path / "wide.npz", open_body, shapedirs=wide)
+    np.testing.assert_array_equal(load_body(path).shape_directions, open_body.shape_directions)
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"weights": None}, "none named 'weights"),
+        ({"name": None}, "none named 'name"),
+        ({"weights": np.zeros((24, 6890))}, "weights"),
+        ({"weights": np.zeros(6890)}, "weights of shape"),
+        ({"v_template": np.array([["text"]])}, "v_template of shape"),
+        ({"kintree_table": np.zeros((0, 24), int)}, "parents"),
+        ({"kintree_table": np.full((2, 24), np.nan)}, "kintree_table of shape"),
+        ({"kintree_table": np.zeros((2, 24), int)}, "parents"),
+        ({"f": np.array([{"a": 1}], dtype=object)}, "cannot be read"),
+        ({"shapedirs": np.zeros((6890, 3))}, "shapedirs of shape"),
+    ],
+)
+def test_a_file_that_is_no_body_is_refused(tmp_path, open_body, changes, found):
+    path = rewritten(tmp_path / "body.npz", open_body, **changes)
+    with pytest.raises(InputError, match=found) as refused:
+        load_body(path)
+    assert str(path) in str(refused.value)
+
+
+def test_damaged_files_are_refused(tmp_path, open_body):
+    path = tmp_path / "body.npz"
+    save_body(path, open_body)
+    whole = path.read_bytes()
+    for length in (0, 1, 100, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:length])
+        with pytest.raises(InputError, match="body model"):
+            load_body(path)
+    middle = len(whole) // 2
+    path.write_bytes(whole[:middle] + bytes(1000) + whole[middle + 1000 :])
+    with pytest.raises(InputError, match="cannot be read"):
+        load_body(path)
+
+
+def test_other_files_are_refused(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        load_body(tmp_path / "none.npz")
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    with pytest.raises(InputError, match="single array"):
+        load_body(tmp_path / "array.npy")
+
+
+def test_an_array_that_claims_a_petabyte_is_refused(tmp_path):
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000000,), }"
+    header += b" " * (117 - len(header)) + b"\n"
+    with zipfile.ZipFile(tmp_path / "body.npz", "w") as file:
+        npy = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+        file.writestr("v_template.npy", npy)
+    with pytest.raises(InputError, match="cannot be read"):
+        load_body(tmp_path / "body.npz")
+
+
+def test_bodies_are_found_by_name(tmp_path, open_body):
+    assert find_body(OPEN_BODY, tmp_path / "nowhere").name == OPEN_BODY
+    save_body(tmp_path / "mine.npz", replace(open_body, name="mine"))
+    assert find_body("mine", tmp_path).name == "mine"
+
+
+@pytest.mark.parametrize("name", ["yours", "../mine", "", "/mine"])
+def test_a_body_that_is_not_installed_is_refused(tmp_path, open_body, name):
+    (tmp_path / "bodies").mkdir()
+    save_body(tmp_path / "mine.npz", open_body)
+    save_body(tmp_path / "bodies" / "other.npz", open_body)
+    with pytest.raises(UsageError, match="one of open-neutral/1, other"):
+        find_body(name, tmp_path / "bodies")

@@ -1,0 +1,137 @@
+import os
+import pickle
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from smpl_pickles import pickled, smpl_like
+
+from worldpose.body import BodyParameters, find_body, install_body
+from worldpose.body.body_file import KEYS, read_arrays, save_body
+from worldpose.errors import InputError, UsageError
+
+
+@pytest.fixture(scope="module")
+def arrays(open_body, tmp_path_factory):
+    """Arrays under SMPL's keys, with correctives that compress well."""
+    directions = np.zeros((6890, 3, 207))
+    directions[::7, :, ::5] = 0.001
+    path = tmp_path_factory.mktemp("arrays") / "body.npz"
+    save_body(path, replace(open_body, pose_directions=directions))
+    return read_arrays(path, KEYS)
+
+
+@pytest.fixture(scope="module")
+def official(arrays, tmp_path_factory):
+    path = tmp_path_factory.mktemp("downloads") / "SMPL_NEUTRAL.pkl"
+    path.write_bytes(pickled(smpl_like(arrays)))
+    return path
+
+
+def test_a_pickle_like_smpls_is_installed_and_found(official, arrays, tmp_path, open_body):
+    folder = tmp_path / "share" / "bodies"
+    made = install_body(official, folder)
+    assert made.name == "smpl-neutral"
+    found = find_body("smpl-neutral", folder)
+    np.testing.assert_array_equal(found.template, arrays["v_template"])
+    np.testing.assert_array_equal(found.shape_directions, arrays["shapedirs"])
+    np.testing.assert_array_equal(found.pose_directions, arrays["posedirs"])
+    np.testing.assert_array_equal(found.joint_regressor, arrays["J_regressor"])
+    np.testing.assert_array_equal(found.weights, arrays["weights"])
+    np.testing.assert_array_equal(found.faces, arrays["f"])
+    np.testing.assert_array_equal(found.parents, open_body.parents)
+    rest = BodyParameters.rest()
+    np.testing.assert_array_equal(found.joints(rest), open_body.joints(rest))
+
+
+def test_what_is_installed_holds_no_pickle(official, tmp_path):
+    install_body(official, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["smpl-neutral.npz"]
+    with zipfile.ZipFile(tmp_path / "smpl-neutral.npz") as file:
+        for member in file.namelist():
+            with file.open(member) as array:
+                # Reads plain arrays alone.
+                np.lib.format.read_array(array, allow_pickle=False)
+
+
+def test_installing_twice_and_under_another_name(official, tmp_path):
+    install_body(official, tmp_path)
+    install_body(official, tmp_path)
+    install_body(official, tmp_path, name="mine.2")
+    assert {path.stem for path in tmp_path.iterdir()} == {"smpl-neutral", "mine.2"}
+    assert find_body("mine.2", tmp_path).name == "mine.2"
+
+
+def test_an_npz_is_installed_too(arrays, tmp_path):
+    np.savez(tmp_path / "SMPL_MALE.npz", **arrays, betas=np.zeros(3))
+    made = install_body(tmp_path / "SMPL_MALE.npz", tmp_path / "bodies")
+    assert made.name == "smpl-male"
+    np.testing.assert_array_equal(made.weights, arrays["weights"])
+
+
+class Attack:
+    def __init__(self, command):
+        self.command = command
+
+    def __reduce__(self):
+        return os.system, (self.command,)
+
+
+def test_a_hostile_file_is_refused_and_nothing_is_installed(arrays, tmp_path):
+    canary = tmp_path / "canary"
+    file = tmp_path / "SMPL_NEUTRAL.pkl"
+    file.write_bytes(pickled({**smpl_like(arrays), "weights_prior": Attack(f"touch {canary}")}))
+    with pytest.raises(InputError, match="system, which is not allowed"):
+        install_body(file, tmp_path / "bodies")
+    assert not canary.exists()
+    assert not (tmp_path / "bodies").exists()
+    # The attack is real: the standard reading does run it.
+    pickle.loads(pickled(Attack(f"touch {canary}")))
+    assert canary.exists()
+
+
+def test_a_hostile_npz_is_refused(arrays, tmp_path):
+    canary = tmp_path / "canary"
+    hostile = np.array([Attack(f"touch {canary}")], dtype=object)
+    np.savez(tmp_path / "bad.npz", **{**arrays, "weights": hostile})
+    with pytest.raises(InputError, match="cannot be read"):
+        install_body(tmp_path / "bad.npz", tmp_path / "bodies")
+    assert not canary.exists()
+
+
+def test_a_truncated_file_is_refused(official, tmp_path):
+    stream = official.read_bytes()
+    for length in (0, 1000, len(stream) // 2, len(stream) - 1):
+        (tmp_path / "cut.pkl").write_bytes(stream[:length])
+        with pytest.raises(InputError, match="as a pickle"):
+            install_body(tmp_path / "cut.pkl", tmp_path / "bodies")
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"v_template": np.zeros((6889, 3))}, "expected shape"),
+        ({"weights": np.zeros((6890, 55))}, "weights"),
+        ({"posedirs": np.zeros((6890, 3, 0))}, "6890, 0 and 10"),
+        ({"shapedirs": np.zeros((6890, 3, 0))}, "6890, 207 and 0"),
+        ({"posedirs": "text"}, "posedirs that is not an array"),
+    ],
+)
+def test_arrays_of_another_shape_are_refused(arrays, tmp_path, changes, found):
+    (tmp_path / "other.pkl").write_bytes(pickled({**arrays, **changes}))
+    with pytest.raises(InputError, match=found) as refused:
+        install_body(tmp_path / "other.pkl", tmp_path / "bodies")
+    assert "other.pkl" in str(refused.value)
+    assert not (tmp_path / "bodies").exists()
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"none\.pkl"):
+        install_body(tmp_path / "none.pkl", tmp_path)
+
+
+@pytest.mark.parametrize("name", ["open-neutral/1", "../up", "Capital", ".hidden"])
+def test_a_name_that_cannot_be_a_file_is_refused(official, tmp_path, name):
+    with pytest.raises(UsageError, match="--name"):
+        install_body(official, tmp_path, name)

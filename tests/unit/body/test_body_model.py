@@ -1,0 +1,187 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from worldpose.body import BodyParameters
+from worldpose.body.skeletons import JOINT_NAMES
+from worldpose.cameras.rigid import Rigid
+from worldpose.errors import InputError
+
+# The file is in single precision, and the regressors' rows sum to 1 only that well.
+SINGLE = 1e-6
+# Double precision at tens of metres.
+ROUNDING = 1e-12
+
+
+def test_a_body_at_rest_is_the_template(open_body):
+    rest = BodyParameters.rest()
+    np.testing.assert_allclose(open_body.vertices(rest), open_body.template, atol=SINGLE)
+    np.testing.assert_allclose(open_body.joints(rest), open_body.joint_template, atol=ROUNDING)
+
+
+def test_the_open_body_stands_as_smpl_does(open_body):
+    joints = dict(zip(JOINT_NAMES, open_body.joint_template, strict=True))
+    height = np.ptp(open_body.template[:, 1])
+    assert open_body.name == "open-neutral/1"
+    assert open_body.template.shape == (6890, 3)
+    # An adult: MakeHuman's mean over both sexes.
+    assert 1.70 < height < 1.90
+    assert joints["left_wrist"][0] > 0.6 > -0.6 > joints["right_wrist"][0]
+    assert joints["head"][1] > joints["pelvis"][1] > joints["left_ankle"][1]
+    # Toes are in front of the ankles: the body looks along +z.
+    assert joints["left_foot"][2] > joints["left_ankle"][2] + 0.1
+
+
+def test_the_open_body_is_symmetric(open_body):
+    mirrored = [
+        name.replace("left", "?").replace("right", "left").replace("?", "right")
+        for name in JOINT_NAMES
+    ]
+    other_side = open_body.joint_template[[JOINT_NAMES.index(name) for name in mirrored]]
+    # MakeHuman is symmetric; the reduced surface, from which joints are regressed, is not quite.
+    np.testing.assert_allclose(open_body.joint_template, other_side * [-1.0, 1.0, 1.0], atol=0.003)
+
+
+def test_faces_look_outwards(open_body):
+    corners = open_body.template[open_body.faces]
+    volume = np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    # People weigh 60 to 100 kg at the density of water; an inside-out surface gives it negative.
+    assert 0.05 < volume < 0.1
+
+
+def test_weights_and_regressor_are_means(open_body):
+    assert (open_body.weights >= 0).all()
+    assert (open_body.joint_regressor >= 0).all()
+    np.testing.assert_allclose(open_body.weights.sum(1), 1.0, atol=SINGLE)
+    np.testing.assert_allclose(open_body.joint_regressor.sum(1), 1.0, atol=SINGLE)
+
+
+def test_the_first_beta_makes_the_open_body_taller(open_body):
+    def height(first: float) -> float:
+        betas = np.zeros(10)
+        betas[0] = first
+        return np.ptp(open_body.template[:, 1] + open_body.shape_directions[:, 1] @ betas)
+
+    # One standard deviation of adults' height is 7 to 10 cm.
+    assert 0.05 < height(1.0) - height(0.0) < 0.12
+
+
+def test_orientation_turns_about_the_pelvis_and_translation_comes_after(open_body):
+    turned = replace(
+        BodyParameters.rest(), global_orient=np.array([0.3, -1.0, 2.0]), transl=np.array([9, 8, 7])
+    )
+    pelvis = open_body.joint_template[0]
+    joints = open_body.joints(turned)
+    np.testing.assert_allclose(joints[0], pelvis + turned.transl, atol=ROUNDING)
+    rotation = Rigid.from_rotvec(turned.global_orient, np.zeros(3)).rotation
+    expected = (open_body.joint_template - pelvis) @ rotation.T + pelvis + turned.transl
+    np.testing.assert_allclose(joints, expected, atol=ROUNDING)
+    expected = (open_body.template - pelvis) @ rotation.T + pelvis + turned.transl
+    np.testing.assert_allclose(open_body.vertices(turned), expected, atol=SINGLE)
+
+
+def test_a_quarter_turn_about_x_stands_the_body_up_in_a_world_with_z_up(open_body):
+    upright = replace(BodyParameters.rest(), global_orient=np.array([np.pi / 2, 0, 0]))
+    joints = dict(zip(JOINT_NAMES, open_body.joints(upright), strict=True))
+    assert joints["head"][2] - joints["left_ankle"][2] > 1.4
+    # +z of the model, its front, becomes -y of the world.
+    assert joints["left_foot"][1] < joints["left_ankle"][1] - 0.1
+
+
+def test_bending_an_elbow_moves_the_forearm_alone(open_body):
+    pose = np.zeros((23, 3))
+    pose[JOINT_NAMES.index("left_elbow") - 1] = [0, -np.pi / 2, 0]
+    bent = open_body.joints(replace(BodyParameters.rest(), body_pose=pose.ravel()))
+    moved = np.linalg.norm(bent - open_body.joint_template, axis=1) > 1e-9
+    assert {JOINT_NAMES[k] for k in np.flatnonzero(moved)} == {"left_wrist", "left_hand"}
+    # From +x the forearm turns to the front.
+    elbow, wrist = (bent[JOINT_NAMES.index(f"left_{name}")] for name in ("elbow", "wrist"))
+    assert wrist[2] - elbow[2] > 0.2
+
+
+def test_a_batch_is_its_people_one_by_one(corrected_body, people):
+    together = corrected_body.vertices(people)
+    assert together.shape == (5, 6890, 3)
+    for row in range(5):
+        alone = corrected_body.vertices(people[row])
+        # The order of additions in matrix products may depend on the batch.
+        np.testing.assert_allclose(together[row], alone, atol=ROUNDING)
+        np.testing.assert_allclose(
+            corrected_body.joints(people)[row], corrected_body.joints(people[row]), atol=ROUNDING
+        )
+
+
+def test_batches_broadcast_and_longer_ones_than_a_chunk_work(open_body):
+    frames = BodyParameters(
+        betas=np.zeros((1, 10)),
+        global_orient=np.zeros(3),
+        body_pose=np.zeros(69),
+        transl=np.arange(2.0 * 20 * 3).reshape(2, 20, 3),
+    )
+    vertices = open_body.vertices(frames)
+    assert vertices.shape == (2, 20, 6890, 3)
+    expected = open_body.template + frames.transl[:, :, None]
+    # Single precision of the weights' sums, at a metre from the origin.
+    np.testing.assert_allclose(vertices, expected, atol=SINGLE)
+    assert open_body.joints(frames).shape == (2, 20, 24, 3)
+    assert frames[1].batch_shape == (20,)
+    assert frames[..., 3].batch_shape == (2,)
+
+
+def test_a_person_with_missing_parameters_is_nan_and_the_others_are_not(open_body, people):
+    pose = people.body_pose.copy()
+    pose[2] = np.nan
+    joints = open_body.joints(replace(people, body_pose=pose))
+    vertices = open_body.vertices(replace(people, body_pose=pose))
+    assert np.isnan(joints[2, 1:]).any()
+    assert np.isnan(vertices[2]).all()
+    assert np.isfinite(np.delete(joints, 2, axis=0)).all()
+    assert np.isfinite(np.delete(vertices, 2, axis=0)).all()
+
+
+def test_no_people_give_no_surface(open_body, people):
+    assert open_body.vertices(people[:0]).shape == (0, 6890, 3)
+    assert open_body.joints(people[:0]).shape == (0, 24, 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "expected"),
+    [
+        ("body_pose", np.zeros(72), "shape (..., 69)"),
+        ("transl", np.zeros((4, 2)), "shape (..., 3)"),
+    ],
+)
+def test_parameters_of_a_wrong_shape_are_refused(name, array, expected):
+    with pytest.raises(InputError, match=f"BodyParameters.{name}") as refused:
+        replace(BodyParameters.rest(), **{name: array})
+    assert refused.value.expected == expected
+
+
+def test_betas_of_another_model_are_refused(open_body):
+    with pytest.raises(InputError, match="10 betas of open-neutral/1"):
+        open_body.joints(BodyParameters.rest(shapes=16))
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("template", lambda array: array[:100]),
+        ("template", lambda array: array * np.nan),
+        ("shape_directions", lambda array: array[:, :2]),
+        ("pose_directions", lambda array: np.zeros((6890, 3, 100))),
+        ("pose_directions", lambda array: np.zeros(6890)),
+        ("joint_regressor", lambda array: array[:23]),
+        ("joint_regressor", lambda array: 2.0 * array),
+        ("weights", lambda array: array.T),
+        ("weights", lambda array: 0.0 * array),
+        ("parents", lambda array: array[::-1]),
+        ("parents", lambda array: np.full(24, -1)),
+        ("faces", lambda array: array + 6000),
+        ("faces", lambda array: array - 5),
+        ("faces", lambda array: array[0]),
+    ],
+)
+def test_arrays_that_are_no_body_are_refused(open_body, name, change):
+    with pytest.raises(InputError, match="body model open-neutral/1"):
+        replace(open_body, **{name: change(getattr(open_body, name))})

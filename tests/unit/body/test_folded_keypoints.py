@@ -1,0 +1,113 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from worldpose.body import SKELETONS, BodyParameters, fold_keypoints, fold_regressor
+from worldpose.body.skeletons import JOINT_OF_POINT, VERTEX_OF_POINT
+from worldpose.errors import InputError
+
+# 0.02 mm is asked for; double precision at tens of metres gives 1e-11.
+ROUNDING = 1e-10
+
+
+def keypoints_of_the_surface(model, parameters, points):
+    """The same points picked out of the mesh and the joints."""
+    joints, vertices = model.joints(parameters), model.vertices(parameters)
+    return np.stack(
+        [
+            joints[..., JOINT_OF_POINT[point], :]
+            if point in JOINT_OF_POINT
+            else vertices[..., VERTEX_OF_POINT[point], :]
+            for point in points
+        ],
+        axis=-2,
+    )
+
+
+@pytest.mark.parametrize("name", list(SKELETONS))
+def test_folded_keypoints_are_those_of_the_surface(open_body, people, name):
+    folded = fold_keypoints(open_body, SKELETONS[name])(people)
+    expected = keypoints_of_the_surface(open_body, people, SKELETONS[name])
+    np.testing.assert_allclose(folded, expected, atol=ROUNDING)
+
+
+def test_folded_keypoints_are_those_of_the_surface_with_pose_correctives(corrected_body, people):
+    folded = fold_keypoints(corrected_body, SKELETONS["body25"])(people)
+    expected = keypoints_of_the_surface(corrected_body, people, SKELETONS["body25"])
+    np.testing.assert_allclose(folded, expected, atol=ROUNDING)
+    # The correctives take part: they move the face by millimetres.
+    plain = replace(corrected_body, pose_directions=np.zeros((6890, 3, 0)))
+    moved = np.abs(fold_keypoints(plain, SKELETONS["body25"])(people) - folded)
+    assert moved.max() > 1e-3
+
+
+def test_a_regressor_over_a_thousand_vertices_is_folded_too(corrected_body, people):
+    rng = np.random.default_rng(2)
+    shares = np.zeros((4, 6890))
+    for row in shares:
+        row[rng.choice(6890, 1000, replace=False)] = rng.normal(0.001, 0.001, 1000)
+    shares /= shares.sum(1, keepdims=True)
+    folded = fold_regressor(corrected_body, np.zeros((4, 24)), shares)(people)
+    np.testing.assert_allclose(folded, shares @ corrected_body.vertices(people), atol=ROUNDING)
+
+
+def test_a_keypoint_may_lie_between_joints_and_vertices(open_body, people):
+    joints, vertices = np.zeros((1, 24)), np.zeros((1, 6890))
+    joints[0, 15], vertices[0, 332] = 0.25, 0.75
+    folded = fold_regressor(open_body, joints, vertices)(people)[:, 0]
+    expected = 0.25 * open_body.joints(people)[:, 15] + 0.75 * open_body.vertices(people)[:, 332]
+    np.testing.assert_allclose(folded, expected, atol=ROUNDING)
+
+
+def test_batches_keep_their_shape(open_body, people):
+    folded = fold_keypoints(open_body, SKELETONS["coco17"])
+    grid = BodyParameters(people.betas, people.global_orient, people.body_pose, np.zeros((3, 1, 3)))
+    assert folded(grid).shape == (3, 5, 17, 3)
+    assert folded(people[0]).shape == (17, 3)
+    assert folded(people[:0]).shape == (0, 17, 3)
+
+
+def test_a_missing_person_is_nan_and_the_others_are_not(open_body, people):
+    transl = people.transl.copy()
+    transl[1] = np.nan
+    keypoints = fold_keypoints(open_body, SKELETONS["coco17"])(replace(people, transl=transl))
+    assert np.isnan(keypoints[1]).all()
+    assert np.isfinite(np.delete(keypoints, 1, axis=0)).all()
+
+
+def test_no_points_are_no_keypoints(open_body, people):
+    assert fold_keypoints(open_body, ())(people).shape == (5, 0, 3)
+
+
+def test_an_unknown_point_is_refused(open_body):
+    with pytest.raises(InputError, match="keypoint 'tail'"):
+        fold_keypoints(open_body, ("nose", "tail"))
+
+
+def test_a_vertex_of_a_model_of_another_size_is_refused(open_body):
+    cut = replace(
+        open_body,
+        template=open_body.template[:6000],
+        shape_directions=open_body.shape_directions[:6000],
+        pose_directions=open_body.pose_directions[:6000],
+        joint_regressor=np.full((24, 6000), 1 / 6000),
+        weights=open_body.weights[:6000],
+        faces=open_body.faces[:0],
+    )
+    with pytest.raises(InputError, match="6000 vertices"):
+        fold_keypoints(cut, ("nose",))
+    assert fold_keypoints(cut, ("neck",)).joint_shares[0, 12] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("joints", "vertices"),
+    [
+        (np.zeros((2, 24)), np.zeros((2, 6890))),
+        (np.full((2, 24), 1 / 24), np.zeros((3, 6890))),
+        (np.full((2, 23), 1 / 23), np.zeros((2, 6890))),
+    ],
+)
+def test_a_regressor_that_is_no_mean_is_refused(open_body, joints, vertices):
+    with pytest.raises(InputError, match="keypoint regressor"):
+        fold_regressor(open_body, joints, vertices)

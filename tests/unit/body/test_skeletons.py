@@ -1,0 +1,73 @@
+import numpy as np
+import pytest
+
+from data_contracts.conventions import COCO17
+from worldpose.body import BODY25, CHALLENGE15, EVALUATED14, SKELETONS, places_of
+from worldpose.body.skeletons import JOINT_NAMES, JOINT_OF_POINT, VERTEX_OF_POINT
+from worldpose.errors import InputError
+
+
+def test_the_skeletons_have_their_number_of_points():
+    counts = {name: len(points) for name, points in SKELETONS.items()}
+    assert counts == {
+        "coco17": 17,
+        "body25": 25,
+        "evaluated14": 14,
+        "challenge15": 15,
+        "smpl24": 24,
+    }
+
+
+@pytest.mark.parametrize("name", list(SKELETONS))
+def test_every_point_is_a_joint_or_a_vertex_and_appears_once(name):
+    points = SKELETONS[name]
+    assert len(set(points)) == len(points)
+    for point in points:
+        assert (point in JOINT_OF_POINT) != (point in VERTEX_OF_POINT)
+
+
+def test_joints_keep_the_order_of_smpl():
+    # Public documentation of SMPL: elbows are 18 and 19, wrists 20 and 21, knees 4 and 5.
+    assert [JOINT_OF_POINT[f"{side}_elbow"] for side in ("left", "right")] == [18, 19]
+    assert [JOINT_OF_POINT[f"{side}_wrist"] for side in ("left", "right")] == [20, 21]
+    assert [JOINT_OF_POINT[f"{side}_knee"] for side in ("left", "right")] == [4, 5]
+    assert JOINT_OF_POINT["mid_hip"] == JOINT_NAMES.index("pelvis") == 0
+
+
+def test_the_challenge_picks_its_points_out_of_body25():
+    picked = [0, 2, 5, 3, 6, 4, 7, 9, 12, 10, 13, 11, 14, 22, 19]
+    np.testing.assert_array_equal(places_of(CHALLENGE15, BODY25), picked)
+
+
+def test_the_evaluated_joints_are_those_of_the_paper():
+    limbs = {"shoulder", "elbow", "wrist", "hip", "knee", "ankle"}
+    sided = {f"{side}_{limb}" for side in ("left", "right") for limb in limbs}
+    assert set(EVALUATED14) == {"nose", "neck"} | sided
+
+
+def test_a_point_that_a_skeleton_lacks_is_named():
+    with pytest.raises(InputError, match="none named neck"):
+        places_of(EVALUATED14, COCO17)
+
+
+def test_left_points_are_on_the_left_of_the_open_body(open_body):
+    for point, vertex in VERTEX_OF_POINT.items():
+        x = open_body.template[vertex, 0]
+        side = {"left": 1, "right": -1}.get(point.split("_")[0], 0)
+        # The nose is in the middle within a centimetre.
+        assert np.sign(x) == side if side else abs(x) < 0.01
+
+
+def test_face_and_feet_of_the_open_body_are_where_they_belong(open_body):
+    at = {point: open_body.template[vertex] for point, vertex in VERTEX_OF_POINT.items()}
+    for side in ("left", "right"):
+        ankle = open_body.joint_template[JOINT_OF_POINT[f"{side}_ankle"]]
+        assert at[f"{side}_heel"][2] < ankle[2] < at[f"{side}_big_toe"][2]
+        assert abs(at[f"{side}_big_toe"][0]) < abs(at[f"{side}_small_toe"][0])
+        # The sole: within 4 cm of the lowest point of the body.
+        for point in ("heel", "big_toe", "small_toe"):
+            assert at[f"{side}_{point}"][1] < open_body.template[:, 1].min() + 0.04
+        assert at["nose"][2] > at[f"{side}_eye"][2] > at[f"{side}_ear"][2] + 0.05
+        assert at[f"{side}_eye"][1] > at["nose"][1]
+        # The ears are 13 to 20 cm apart.
+        assert 0.065 < abs(at[f"{side}_ear"][0]) < 0.1

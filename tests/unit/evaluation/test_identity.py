@@ -1,0 +1,117 @@
+"""Cases P to S of docs/metrics.md, and what must hold for any input."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from worldpose.evaluation.identity import identity_scores
+
+
+def scores(distances, gate=1.0):
+    """Scores where infinite distances to all others mean that a person is absent."""
+    distances = np.array(distances, dtype=np.float64)
+    near = np.isfinite(distances)
+    return identity_scores(distances, near.any(-1), near.any(-2), gate)
+
+
+def line(*ids, persons=1, predicted=2, distance=0.0):
+    """One person who is found under these ids, -1 for not at all; true in every frame."""
+    distances = np.full((len(ids), persons, predicted), np.inf)
+    for frame, person_id in enumerate(ids):
+        if person_id >= 0:
+            distances[frame, 0, person_id] = distance
+    exists = np.ones((len(ids), persons), dtype=bool)
+    return identity_scores(distances, exists, np.isfinite(distances).any(1), 1.0)
+
+
+def test_case_p_one_person_under_two_ids():
+    split = line(*[0] * 6, *[1] * 4)
+    assert (split.switches, split.fragmentations) == (1, 0)
+    # Ratios of small whole numbers, rounded once or twice, here and below.
+    assert split.idf1 == pytest.approx(0.6, abs=1e-15)
+    assert split.detection_accuracy == 1.0
+    assert split.association_accuracy == pytest.approx(0.52, abs=1e-15)
+    assert split.hota == pytest.approx(np.sqrt(0.52), abs=1e-15)
+
+
+def test_case_q_one_person_lost_for_two_frames():
+    lost = line(*[0] * 4, -1, -1, *[0] * 4)
+    assert (lost.switches, lost.fragmentations) == (0, 1)
+    assert lost.idf1 == pytest.approx(16 / 18, abs=1e-15)
+    assert lost.detection_accuracy == pytest.approx(0.8, abs=1e-15)
+    assert lost.association_accuracy == pytest.approx(0.8, abs=1e-15)
+    assert lost.hota == pytest.approx(0.8, abs=1e-15)
+
+
+def test_case_r_hota_counts_the_distances_that_are_reached():
+    near = line(*[0] * 10, distance=0.3)
+    # 0.7 alike: the levels 0.05, 0.10, ..., 0.70 are reached, 14 of 19.
+    assert near.hota == pytest.approx(14 / 19, abs=1e-15)
+    assert near.idf1 == 1.0
+
+
+def test_case_s_two_people_exchange_ids():
+    distances = np.full((10, 2, 2), np.inf)
+    for frame in range(10):
+        first = 0 if frame < 7 else 1
+        distances[frame, 0, first] = distances[frame, 1, 1 - first] = 0.0
+    exchanged = scores(distances)
+    assert exchanged.switches == 2
+    assert exchanged.idf1 == pytest.approx(0.7, abs=1e-15)
+    # Seven frames share 7 / (10 + 10 - 7), three share 3 / 17.
+    assert exchanged.association_accuracy == pytest.approx(0.7 * 7 / 13 + 0.3 * 3 / 17, abs=1e-15)
+
+
+def test_an_id_that_comes_back_after_another_switches_twice():
+    assert line(0, 1, 0).switches == 2
+
+
+def test_a_gap_before_the_first_and_after_the_last_frame_is_no_fragmentation():
+    assert line(-1, 0, 0, -1).fragmentations == 0
+
+
+def test_absence_of_the_true_person_is_no_fragmentation():
+    distances = np.zeros((5, 1, 1))
+    distances[2] = np.inf
+    assert scores(distances).fragmentations == 0
+
+
+def test_a_person_keeps_the_prediction_of_the_frame_before_though_another_is_nearer():
+    distances = np.array([[[0.1, 0.5]], [[0.4, 0.2]], [[0.4, 0.2]]])
+    assert scores(distances).switches == 0
+    distances[1:, :, 0] = 1.1
+    assert scores(distances).switches == 1
+
+
+def test_false_people_lower_idf1_and_detection():
+    distances = np.full((4, 1, 2), np.inf)
+    distances[:, 0, 0] = 0.0
+    exists = np.ones((4, 2), dtype=bool)
+    found = identity_scores(distances, np.ones((4, 1), dtype=bool), exists, 1.0)
+    assert found.idf1 == pytest.approx(8 / 12, abs=1e-15)
+    assert (found.detection_accuracy, found.association_accuracy) == (0.5, 1.0)
+
+
+def test_nobody_anywhere_has_no_scores():
+    empty = scores(np.empty((3, 0, 0)))
+    assert (empty.idf1, empty.hota, empty.switches) == (None, None, None)
+
+
+def test_nobody_found_scores_zero():
+    missed = identity_scores(
+        np.empty((3, 1, 0)), np.ones((3, 1), dtype=bool), np.empty((3, 0), dtype=bool), 1.0
+    )
+    assert (missed.idf1, missed.hota, missed.switches) == (0.0, 0.0, 0)
+
+
+@given(seed=st.integers(0, 999), order=st.permutations(range(3)))
+def test_scores_do_not_depend_on_the_order_of_people(seed, order):
+    distances = np.random.default_rng(seed).uniform(0.0, 2.0, (6, 2, 3))
+    plain, other = scores(distances), scores(distances[:, ::-1, list(order)])
+    for name in ("idf1", "hota", "switches", "fragmentations"):
+        # Sums in another order.
+        assert getattr(plain, name) == pytest.approx(getattr(other, name), abs=1e-12)
+        assert getattr(plain, name) >= 0.0
+    assert plain.idf1 <= 1.0
+    assert plain.hota <= 1.0

@@ -1,0 +1,265 @@
+"""Cases H to O of docs/metrics.md: whole trajectories, moved in ways that can be solved by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from people_samples import crowd, e4, person, score, tracks
+
+from worldpose.cameras import Camera, Rigid
+from worldpose.errors import InputError
+from worldpose.evaluation import evaluate_joints
+from worldpose.release import JointTracks
+
+# Sums of a few thousand rounded distances, after a decomposition of 3 x 3 matrices: 1e-8 mm is
+# some thousand roundings of the metres they are made of.
+MM = 1e-8
+ALIGNED = ("g_mpjpe_mm", "per_person_g_mpjpe_mm", "pa_mpjpe_mm")
+RIGID = tuple(name.replace("_mm", "_rigid_mm") for name in ALIGNED)
+
+
+def moved(truth, rotvec, shift, scale=1.0):
+    turned = Rigid.from_rotvec(rotvec, np.zeros(3)).apply(truth.joints.reshape(-1, 17, 3))
+    joints = scale * turned.reshape(truth.joints.shape) + np.array(shift)
+    return replace(truth, joints=joints)
+
+
+def scatter(points):
+    """Mean distance of points (n, 3) from their middle."""
+    return np.linalg.norm(points - points.mean(axis=0), axis=-1).mean()
+
+
+def walk(positions_x, y=0.0):
+    """One person over time, (frames, 17, 3)."""
+    return np.array([person(x, y) for x in positions_x])
+
+
+def test_case_h_a_similarity_costs_its_size_alone_where_size_is_kept():
+    truth = crowd(frames=6)
+    scores = score(moved(truth, [0.2, -0.4, 1.5], [7.0, -90.0, 3.0], scale=1.25), truth)
+    assert [getattr(scores, name) for name in ALIGNED] == pytest.approx([0.0] * 3, abs=MM)
+    assert scores.g_scale == pytest.approx(0.8, abs=1e-12)
+    assert scores.track_coverage == 1.0
+    # Turned and shifted back, every joint is a quarter of its distance from the middle too far.
+    joints = e4(truth.joints)
+    everybody = 250.0 * scatter(joints.reshape(-1, 3))
+    each = np.mean([250.0 * scatter(joints[:, i].reshape(-1, 3)) for i in range(3)])
+    pose = 250.0 * scatter(joints[0, 0])
+    found = [getattr(scores, name) for name in RIGID]
+    assert found == pytest.approx([everybody, each, pose], rel=1e-12)
+    assert (scores.coverage, scores.mpjpe_mm) == (0.0, None)
+
+
+def test_a_rigid_motion_costs_nothing_aligned_and_its_length_otherwise():
+    truth = crowd(frames=6)
+    scores = score(moved(truth, [0.0, 0.0, 0.0], [3.0, 0.0, 4.0]), truth)
+    found = [getattr(scores, name) for name in (*ALIGNED, *RIGID)]
+    assert found == pytest.approx([0.0] * 6, abs=MM)
+    assert scores.challenge_global_m == pytest.approx(5.0, abs=1e-12)
+    assert scores.challenge_local_m == pytest.approx(0.0, abs=1e-12)
+
+
+def case_i():
+    """Two people walk across, 20 and 10 m; each is predicted 10 cm too far out."""
+    steps = np.linspace(-1.0, 1.0, 21)
+    truth = tracks(np.stack([[person(5.0, 10.0 * s), person(-5.0, 5.0 * s)] for s in steps]))
+    outward = np.array([[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0]])[:, None]
+    return replace(truth, joints=truth.joints + outward), truth
+
+
+def test_case_i_wrong_relative_positions_show_in_the_shared_alignment_alone():
+    scores, people = evaluate_joints(*case_i())
+    assert scores.g_mpjpe_rigid_mm == pytest.approx(100.0, abs=MM)
+    assert scores.per_person_g_mpjpe_rigid_mm == pytest.approx(0.0, abs=MM)
+    assert scores.pa_mpjpe_rigid_mm == pytest.approx(0.0, abs=MM)
+    assert scores.g_mpjpe_mm < 100.0
+    assert [each.path_m for each in people] == pytest.approx([20.0, 10.0], abs=1e-12)
+
+
+def test_case_j_drift_is_the_mean_of_each_person_s_own():
+    prediction, truth = case_i()
+    # 10 cm / 20 m and 10 cm / 10 m.
+    scores = score(prediction, truth)
+    assert scores.per_meter_drift_rigid_cm_per_m == pytest.approx(0.75, abs=MM)
+    assert scores.per_person_drift_rigid_cm_per_m == pytest.approx(0.0, abs=MM)
+    far = score(prediction, truth, min_trajectory=15.0)
+    assert far.per_meter_drift_rigid_cm_per_m == pytest.approx(0.5, abs=MM)
+    assert score(prediction, truth, min_trajectory=30.0).per_meter_drift_cm_per_m is None
+
+
+def test_case_k_one_frame_late_is_one_step_off():
+    at = 2.0 / 25.0 * np.arange(20)
+    truth = tracks(walk(at)[:, None])
+    late = replace(truth, frames=truth.frames + 1)
+    scores = score(late, truth, fps=25.0)
+    assert scores.mpjpe_mm == pytest.approx(80.0, abs=MM)
+    assert scores.challenge_score == pytest.approx(0.08, abs=1e-12)
+    found = [getattr(scores, name) for name in (*ALIGNED, *RIGID)]
+    assert found == pytest.approx([0.0] * 6, abs=MM)
+    assert scores.acceleration_error_m_s2 == pytest.approx(0.0, abs=1e-9)
+    assert scores.coverage == 0.95
+
+
+def test_case_l_one_frame_late_turns_two_people_who_pass_each_other():
+    step, apart, half = 0.08, 3.0, 10
+    times = np.arange(-half, half + 1)
+    truth = tracks(np.stack([walk(step * times, apart), walk(-step * times, -apart)], axis=1))
+    late = np.stack([walk(step * (times - 1), apart), walk(-step * (times - 1), -apart)], axis=1)
+    # In plan, sums over frames, people and joints of true times predicted offsets from the middle.
+    across = e4(person())[:, 1]
+    count = 2 * len(times)
+    along = 2 * step**2 * np.square(times).sum()
+    both = along + count * (apart**2 + np.square(across).mean())
+    angle = np.arctan2(count * apart * step, both)
+    cos, sin = np.cos(angle), np.sin(angle)
+    x = step * (times[:, None] - 1)
+    y = apart + across
+    errors = np.hypot(cos * x + sin * y - (x + step), cos * y - sin * x - y)
+    scores = score(replace(truth, joints=late), truth)
+    assert scores.g_mpjpe_rigid_mm == pytest.approx(1000.0 * errors.mean(), abs=MM)
+    assert scores.per_person_g_mpjpe_rigid_mm == pytest.approx(0.0, abs=MM)
+    assert scores.mpjpe_mm == pytest.approx(80.0, abs=MM)
+
+
+def test_case_m_exchanged_axes():
+    truth = tracks([[person(0.3, 0.1)]])
+    exchanged = replace(truth, joints=truth.joints[..., [1, 0, 2]])
+    scores = score(exchanged, truth)
+    assert scores.mpjpe_mm == pytest.approx(200.0 * np.sqrt(2.0), abs=MM)
+    # This person is flat, so that a turn undoes the mirror; one with a foot ahead is not.
+    assert scores.pa_mpjpe_rigid_mm == pytest.approx(0.0, abs=MM)
+    stepping = truth.joints.copy()
+    stepping[..., 15, 0] += 0.4
+    stepping[..., 7, 0] -= 0.3
+    mirrored = score(tracks(stepping[..., [1, 0, 2]]), tracks(stepping))
+    assert mirrored.pa_mpjpe_rigid_mm > 50.0
+
+
+def test_case_n_poses_turned_about_the_world_s_origin():
+    angle, x = 0.02, 20.0
+    turn = Rigid.from_rotvec([[0.0, 0.0, angle], [0.0, 0.0, -angle]] * 5, np.zeros((10, 3)))
+    truth = tracks([[person(x)]] * 10)
+    prediction = replace(truth, joints=turn.apply(truth.joints[:, 0])[:, None])
+    scores = score(prediction, truth)
+    radius = np.hypot(x, person()[:, 1])
+    assert scores.mpjpe_mm == pytest.approx(2000.0 * np.sin(angle / 2) * radius.mean(), abs=MM)
+    # Left and right by turns, so no shared turn helps; the shift to the middle does.
+    y = e4(person())[:, 1]
+    errors = np.hypot(y * np.sin(angle), x * np.sin(angle) + y * (np.cos(angle) - 1.0))
+    assert scores.g_mpjpe_rigid_mm == pytest.approx(1000.0 * errors.mean(), abs=MM)
+    assert scores.pa_mpjpe_rigid_mm == pytest.approx(0.0, abs=MM)
+    # All turned alike are one motion of the world, which G-MPJPE does not see.
+    alike = score(moved(truth, [0.0, 0.0, angle], [0.0, 0.0, 0.0]), truth)
+    assert alike.mpjpe_mm == pytest.approx(scores.mpjpe_mm, abs=MM)
+    assert alike.g_mpjpe_rigid_mm == pytest.approx(0.0, abs=MM)
+
+
+def test_case_o_challenge_score():
+    truth = tracks([[person()]])
+    for joint, expected in ((9, 0.01 + 5 * 0.01), (11, 0.01 + 5 * 0.065)):
+        joints = truth.joints.copy()
+        joints[..., joint, 0] += 0.13
+        found = score(replace(truth, joints=joints), truth)
+        assert found.challenge_score == pytest.approx(expected, abs=1e-12)
+    joints[..., 11, :] = np.nan
+    # Without a hip there is no middle to compare with.
+    assert score(replace(truth, joints=joints), truth).challenge_score is None
+
+
+def test_acceleration_of_a_trembling_joint():
+    truth = tracks([[person()]] * 10)
+    tremble = 0.01 * (-1.0) ** np.arange(10)
+    joints = truth.joints + tremble[:, None, None, None] * np.array([1.0, 0.0, 0.0])
+    prediction = replace(truth, joints=joints)
+    # -0.01, 0.01, -0.01: the second difference is 0.04 m in (1/25 s)^2.
+    scores = score(prediction, truth, fps=25.0)
+    assert scores.acceleration_error_m_s2 == pytest.approx(25.0, abs=1e-9)
+    assert score(prediction, truth).acceleration_error_m_s2 is None
+    # Every second frame alone: 0.04 m in (2/25 s)^2; a hole of four frames is not bridged.
+    frames = np.array([0, 2, 4, 6, 8, 14, 16, 18, 20, 22])
+    sparse = score(replace(prediction, frames=frames), replace(truth, frames=frames), fps=25.0)
+    assert sparse.acceleration_error_m_s2 == pytest.approx(6.25, abs=1e-9)
+    two = JointTracks(truth.frames[:2], truth.person_ids, truth.joints[:2])
+    assert score(two, two, fps=25.0).acceleration_error_m_s2 is None
+
+
+def test_switches_per_minute_count_match_time():
+    truth = tracks([[person()]] * 10)
+    joints = np.full((10, 2, 17, 3), np.nan)
+    joints[:6, 0], joints[6:, 1] = truth.joints[:6, 0], truth.joints[6:, 0]
+    scores = score(tracks(joints), truth, fps=25.0)
+    # One in 10 / 25 s.
+    assert (scores.switches, scores.switches_per_minute) == (1, pytest.approx(150.0, rel=1e-12))
+    # Both pieces are the same person: merged, nothing is missing and nothing is off.
+    assert scores.track_coverage == 1.0
+    assert scores.g_mpjpe_mm == pytest.approx(0.0, abs=MM)
+
+
+def test_exchanged_identities_show_in_whole_tracks_though_every_frame_is_right():
+    truth = tracks([[person(0.0), person(3.0)]] * 10)
+    joints = truth.joints.copy()
+    joints[7:] = joints[7:, ::-1]
+    scores = score(tracks(joints), truth)
+    assert (scores.mpjpe_mm, scores.switches) == (0.0, 2)
+    # Three of ten frames are 3 m off.
+    assert scores.challenge_global_m == pytest.approx(0.9, abs=1e-12)
+    assert scores.challenge_local_m == pytest.approx(0.0, abs=1e-12)
+    assert scores.g_mpjpe_rigid_mm > 500.0
+
+
+def test_people_who_do_not_count_are_neither_lost_nor_false_in_identity():
+    views = np.full((10, 2, 17), 3)
+    views[:, 1] = 1
+    truth = tracks([[person(0.0), person(5.0)]] * 10, views=views)
+    scores = score(tracks(truth.joints), truth)
+    assert (scores.idf1, scores.hota, scores.track_coverage) == (1.0, 1.0, 1.0)
+
+
+SIDE_VIEW = Camera(
+    focal=np.array([1000.0, 1000.0]),
+    principal_point=np.array([959.5, 539.5]),
+    distortion=np.zeros(5),
+    cam_from_world=Rigid(
+        np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), np.array([0.0, 1.5, 50.0])
+    ),
+    image_size=np.array([1920, 1080]),
+)
+
+
+def test_boxes_match_people_who_are_far_off_along_the_line_of_sight():
+    truth = tracks([[person(-4.0), person(4.0)]] * 5)
+    # A tenth nearer to the camera and a tenth smaller: the same picture.
+    center = SIDE_VIEW.center
+    prediction = replace(truth, joints=center + 0.9 * (truth.joints - center))
+    by_boxes = score(prediction, truth, camera=SIDE_VIEW)
+    assert by_boxes.track_coverage == 1.0
+    assert by_boxes.g_mpjpe_mm == pytest.approx(0.0, abs=MM)
+    # The mean over joints of a tenth of the distance to the camera.
+    joints = np.concatenate([truth.joints[..., :1, :], truth.joints[..., 5:, :]], axis=-2)
+    expected = 0.1 * np.linalg.norm(joints - center, axis=-1).mean()
+    assert by_boxes.challenge_global_m == pytest.approx(expected, rel=1e-12)
+    exchanged = score(tracks(prediction.joints[:, ::-1]), truth, camera=SIDE_VIEW)
+    assert exchanged.g_mpjpe_mm == pytest.approx(0.0, abs=MM)
+
+
+def test_a_camera_of_another_clip_is_refused():
+    truth = tracks([[person()]] * 5)
+    with pytest.raises(InputError, match="one row, or 5"):
+        score(truth, truth, camera=Camera.stack([SIDE_VIEW] * 4))
+
+
+def test_worlds_of_their_own_are_registered_despite_noise_and_split_tracks():
+    rng = np.random.default_rng(3)
+    steps = np.cumsum(rng.normal(0.0, 0.1, (60, 6, 1, 2)), axis=0)
+    places = rng.uniform(-30.0, 30.0, (1, 6, 1, 2)) + steps
+    truth = tracks(person() + np.concatenate([places, np.zeros_like(places[..., :1])], axis=-1))
+    foreign = moved(truth, [0.3, 0.0, 2.0], [100.0, 50.0, -20.0], scale=0.3).joints
+    foreign = foreign + rng.normal(0.0, 0.3 * 0.02, foreign.shape)
+    split = np.full((60, 7, 17, 3), np.nan)
+    split[:, :6] = foreign
+    split[30:, 6], split[30:, 2] = split[30:, 2].copy(), np.nan
+    scores = score(tracks(split), truth)
+    assert scores.track_coverage == 1.0
+    # The mean length of three normal errors of 20 mm is 20 sqrt(8 / pi) = 31.9 mm, of the neck
+    # 1 / sqrt(2) of it: 31.2 over the 14; 5000 joints leave less than one per cent of that.
+    assert scores.g_mpjpe_mm == pytest.approx(31.2, rel=0.01)

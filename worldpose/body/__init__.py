@@ -1,0 +1,33 @@
+"""The body model: from shape, joint angles and place to joints, keypoints and surface in metres.
+
+Input: `BodyParameters`, and the open body or one that the user brought. Output: world points.
+`worldpose.body.differentiable` is the same for gradients; only that file needs torch.
+"""
+
+from worldpose.body.body_file import OPEN_BODY, load_body, load_open_body, save_body
+from worldpose.body.installing import BODY_FOLDER, body_path, find_body, install_body
+from worldpose.body.keypoints import FoldedKeypoints, fold_keypoints, fold_regressor
+from worldpose.body.model import BodyModel
+from worldpose.body.parameters import BodyParameters
+from worldpose.body.skeletons import BODY25, CHALLENGE15, EVALUATED14, SKELETONS, places_of
+
+__all__ = [
+    "BODY25",
+    "BODY_FOLDER",
+    "CHALLENGE15",
+    "EVALUATED14",
+    "OPEN_BODY",
+    "SKELETONS",
+    "BodyModel",
+    "BodyParameters",
+    "FoldedKeypoints",
+    "body_path",
+    "find_body",
+    "fold_keypoints",
+    "fold_regressor",
+    "install_body",
+    "load_body",
+    "load_open_body",
+    "places_of",
+    "save_body",
+]

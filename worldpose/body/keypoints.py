@@ -1,0 +1,126 @@
+"""Keypoints of a posed body without its surface.
+
+A keypoint that is a weighted mean of skinned vertices, sum_v r_v sum_j w_vj (R_j x_v + o_j), only
+needs the sums over v, and those do not depend on the pose:
+sum_j R_j (sum_v r_v w_vj x_v) + (sum_v r_v w_vj) o_j. As x_v is linear in the betas and the pose
+feature, so are the sums. The result equals that of the surface up to rounding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.body.model import JOINTS, SMPL_VERTICES, BodyModel
+from worldpose.body.parameters import BodyParameters
+from worldpose.body.skeletons import JOINT_OF_POINT, VERTEX_OF_POINT
+from worldpose.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class FoldedKeypoints:
+    """Keypoints of one body model, ready for many poses."""
+
+    model: BodyModel
+    joint_shares: NDArray[np.float64]
+    """(keypoints, 24), the part of each keypoint that is a mean of joints."""
+    keypoint: NDArray[np.int64]
+    """(pairs,), ascending: the keypoint of each pair of keypoint and joint that moves it."""
+    joint: NDArray[np.int64]
+    """(pairs,)."""
+    mass: NDArray[np.float64]
+    """(pairs,), the share of the pair's joint in its keypoint."""
+    basis: NDArray[np.float64]
+    """(pairs, 3, 1 + shapes + pose features) [m]: sums over vertices, times their weights, of the
+    template, its shape directions and its pose directions."""
+
+    def __call__(self, parameters: BodyParameters) -> NDArray[np.float64]:
+        """Return the keypoints (..., keypoints, 3) [m], world; NaN where a parameter is."""
+        posed = self.model.articulate(parameters)
+        features = [np.ones((*parameters.batch_shape, 1)), parameters.betas]
+        if self.model.pose_directions.shape[-1]:
+            features.append(posed.pose_feature)
+        feature = np.concatenate(features, axis=-1)
+        unposed = (feature @ self.basis.reshape(-1, feature.shape[-1]).T).reshape(
+            *parameters.batch_shape, len(self.joint), 3
+        )
+        parts = np.einsum("...pab,...pb->...pa", posed.rotations[..., self.joint, :, :], unposed)
+        parts += self.mass[:, None] * posed.offsets[..., self.joint, :]
+        keypoints: NDArray[np.float64] = self.joint_shares @ posed.joints + self.gather @ parts
+        keypoints += parameters.transl[..., None, :]
+        return keypoints
+
+    @cached_property
+    def gather(self) -> NDArray[np.float64]:
+        """Ones that add each pair to its keypoint (keypoints, pairs)."""
+        own: NDArray[np.bool_] = self.keypoint == np.arange(len(self.joint_shares))[:, None]
+        return own.astype(np.float64)
+
+
+def fold_keypoints(model: BodyModel, points: tuple[str, ...]) -> FoldedKeypoints:
+    """Return named points of a model, for instance those of `skeletons.COCO17`.
+
+    Raises:
+        InputError: a point has no name here, or the model has another number of vertices than
+            SMPL, where no vertex has a meaning.
+    """
+    joint_shares = np.zeros((len(points), JOINTS))
+    vertex_shares = np.zeros((len(points), len(model.template)))
+    for row, point in enumerate(points):
+        if point in JOINT_OF_POINT:
+            joint_shares[row, JOINT_OF_POINT[point]] = 1.0
+        elif point in VERTEX_OF_POINT and len(model.template) == SMPL_VERTICES:
+            vertex_shares[row, VERTEX_OF_POINT[point]] = 1.0
+        else:
+            raise InputError(
+                f"keypoint {point!r}",
+                expected="a point of skeletons.JOINT_OF_POINT or VERTEX_OF_POINT, on a model of "
+                f"{SMPL_VERTICES} vertices",
+                found=f"no such point on {model.name} with {len(model.template)} vertices",
+                todo="Name another point or use fold_regressor with weights of your own.",
+            )
+    return fold_regressor(model, joint_shares, vertex_shares)
+
+
+def fold_regressor(
+    model: BodyModel, joint_shares: NDArray[np.float64], vertex_shares: NDArray[np.float64]
+) -> FoldedKeypoints:
+    """Return keypoints that are weighted means of joints and vertices.
+
+    Args:
+        model: the body.
+        joint_shares: (keypoints, 24), weights of the posed joints.
+        vertex_shares: (keypoints, vertices), weights of the posed vertices; the two together have
+            the sum 1 for every keypoint.
+
+    Raises:
+        InputError: the shapes differ from these, or a sum from 1.
+    """
+    shapes = (len(joint_shares), JOINTS), (len(joint_shares), len(model.template))
+    fitting = (joint_shares.shape, vertex_shares.shape) == shapes
+    sums = joint_shares.sum(1) + vertex_shares.sum(1) if fitting else np.zeros(1)
+    if not (fitting and np.allclose(sums, 1.0, atol=1e-3)):
+        raise InputError(
+            "keypoint regressor",
+            expected=f"shapes {shapes[0]} and {shapes[1]} and sums of 1 over both",
+            found=f"shapes {joint_shares.shape} and {vertex_shares.shape}"
+            + (f" and sums {sums}" if fitting else ""),
+            todo="Give one row a keypoint, for the joints and the vertices of this model.",
+        )
+    moved_by = (np.abs(vertex_shares) @ np.abs(model.weights)) > 0.0
+    keypoint, joint = np.nonzero(moved_by)
+    shares = vertex_shares[keypoint] * model.weights[:, joint].T
+    used = np.flatnonzero(shares.any(axis=0))
+    parts = [model.template[:, :, None], model.shape_directions, model.pose_directions]
+    content = np.concatenate([part[used] for part in parts], axis=-1)
+    return FoldedKeypoints(
+        model=model,
+        joint_shares=joint_shares,
+        keypoint=keypoint,
+        joint=joint,
+        mass=shares.sum(1),
+        basis=np.einsum("pv,vcf->pcf", shares[:, used], content, optimize=True),
+    )

@@ -1,0 +1,163 @@
+"""The body model: a surface and 24 joints, shaped by betas and posed by joint angles.
+
+Loper et al., "SMPL: A Skinned Multi-Person Linear Model" (2015), describes the function; any model
+in that layout can be its content.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.body.articulation import Articulation, articulate
+from worldpose.body.parameters import BODY_POSE, BodyParameters
+from worldpose.cameras.rigid import Rigid
+from worldpose.errors import InputError
+
+JOINTS: Final = 24
+SMPL_VERTICES: Final = 6890
+"""Vertices of every model in SMPL's layout; only there do vertex numbers have a meaning."""
+POSE_FEATURES: Final = 9 * (JOINTS - 1)
+"""Length of the pose feature: the 23 rotation matrices minus the identity."""
+
+_CHUNK: Final = 32
+"""Bodies whose surfaces are computed at a time; 24 MB of transforms in SMPL's layout."""
+
+
+@dataclass(frozen=True, eq=False)
+class BodyModel:
+    """A body in the layout of SMPL.
+
+    Raises:
+        InputError: the arrays do not fit each other or are not a body model.
+    """
+
+    name: str
+    """Name and version that results carry, such as `open-neutral/1`."""
+    template: NDArray[np.float64]
+    """(vertices, 3) [m], the mean body in T-pose: y up, facing +z, left arm along +x."""
+    shape_directions: NDArray[np.float64]
+    """(vertices, 3, shapes) [m] for each unit of the betas."""
+    pose_directions: NDArray[np.float64]
+    """(vertices, 3, 207) [m] for each unit of the pose feature, or (vertices, 3, 0) for none."""
+    joint_regressor: NDArray[np.float64]
+    """(24, vertices), rows with sum 1."""
+    weights: NDArray[np.float64]
+    """(vertices, 24), the share of each joint in each vertex, rows with sum 1."""
+    parents: NDArray[np.int64]
+    """(24,), each smaller than its joint; -1 for the pelvis."""
+    faces: NDArray[np.int64]
+    """(triangles, 3) indices of vertices, counter-clockwise seen from outside."""
+
+    def __post_init__(self) -> None:
+        floats = ("template", "shape_directions", "pose_directions", "joint_regressor", "weights")
+        for name in floats:
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+        for name in ("parents", "faces"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.int64))
+        count = self.template.shape[0] if self.template.ndim else 0
+        features = POSE_FEATURES if self.pose_directions.shape[-1:] != (0,) else 0
+        shapes = {
+            "template": (count, 3),
+            "shape_directions": (count, 3, self.shape_directions.shape[-1]),
+            "pose_directions": (count, 3, features),
+            "joint_regressor": (JOINTS, count),
+            "weights": (count, JOINTS),
+            "parents": (JOINTS,),
+            "faces": (self.faces.shape[0], 3),
+        }
+        for name, shape in shapes.items():
+            self._require(getattr(self, name).shape == shape, name, f"shape {shape}")
+        for name in floats:
+            self._require(bool(np.isfinite(getattr(self, name)).all()), name, "finite numbers")
+        # Files in single precision sum to 1 within the rounding of some thousand additions.
+        for name in ("joint_regressor", "weights"):
+            sums = getattr(self, name).sum(-1)
+            self._require(bool(np.allclose(sums, 1.0, atol=1e-3)), name, "rows with sum 1")
+        chain = (self.parents[0] == -1) & (self.parents[1:] >= 0).all()
+        chain &= (self.parents < np.arange(JOINTS)).all()
+        self._require(bool(chain), "parents", "-1 first, then parents before their children")
+        inside = ((self.faces >= 0) & (self.faces < count)).all()
+        self._require(bool(inside), "faces", f"indices below {count}")
+
+    def _require(self, holds: bool, name: str, expected: str) -> None:
+        if not holds:
+            array = getattr(self, name)
+            raise InputError(
+                f"body model {self.name}: {name}",
+                expected=expected,
+                found=f"shape {array.shape}" if expected.startswith("shape") else "others",
+                todo="Give the file of a body model with SMPL's 24 joints.",
+            )
+
+    @property
+    def shapes(self) -> int:
+        """Number of betas."""
+        return int(self.shape_directions.shape[-1])
+
+    @cached_property
+    def joint_template(self) -> NDArray[np.float64]:
+        """The joints of the mean body in T-pose (24, 3) [m]."""
+        return self.joint_regressor @ self.template
+
+    @cached_property
+    def joint_directions(self) -> NDArray[np.float64]:
+        """How the joints move with the betas (24, 3, shapes) [m]."""
+        moved: NDArray[np.float64] = np.einsum(
+            "jv,vcs->jcs", self.joint_regressor, self.shape_directions, optimize=True
+        )
+        return moved
+
+    def articulate(self, parameters: BodyParameters) -> Articulation:
+        """Return where every joint's frame goes, before `transl`.
+
+        Raises:
+            InputError: the number of betas is not this model's.
+        """
+        if parameters.betas.shape[-1] != self.shapes:
+            raise InputError(
+                "BodyParameters.betas",
+                expected=f"{self.shapes} betas of {self.name}",
+                found=str(parameters.betas.shape[-1]),
+                todo="Betas belong to one body model; fit them again for another.",
+            )
+        angles = np.concatenate([parameters.global_orient, parameters.body_pose], axis=-1)
+        rotvecs = angles.reshape(*parameters.batch_shape, JOINTS, BODY_POSE // (JOINTS - 1))
+        rest = self.joint_template + np.einsum(
+            "jcs,...s->...jc", self.joint_directions, parameters.betas
+        )
+        return articulate(rest, Rigid.from_rotvec(rotvecs, np.zeros(3)).rotation, self.parents)
+
+    def joints(self, parameters: BodyParameters) -> NDArray[np.float64]:
+        """Return the 24 joints (..., 24, 3) [m], world; NaN where a parameter is."""
+        return self.articulate(parameters).joints + parameters.transl[..., None, :]
+
+    def vertices(self, parameters: BodyParameters) -> NDArray[np.float64]:
+        """Return the surface (..., vertices, 3) [m], world; NaN where a parameter is."""
+        flat = parameters.flat()
+        count = len(self.template)
+        surfaces = np.empty((*flat.batch_shape, count, 3))
+        for start in range(0, len(surfaces), _CHUNK):
+            chunk = slice(start, start + _CHUNK)
+            surfaces[chunk] = self._surface(flat[chunk])
+        return surfaces.reshape(*parameters.batch_shape, count, 3)
+
+    def _surface(self, parameters: BodyParameters) -> NDArray[np.float64]:
+        """The surfaces (n, vertices, 3) of a flat batch."""
+        posed = self.articulate(parameters)
+        unposed = self.template + np.einsum(
+            "vcs,ns->nvc", self.shape_directions, parameters.betas, optimize=True
+        )
+        if self.pose_directions.shape[-1]:
+            unposed += np.einsum(
+                "vcp,np->nvc", self.pose_directions, posed.pose_feature, optimize=True
+            )
+        motions = np.concatenate([posed.rotations, posed.offsets[..., None]], axis=-1)
+        blended = (self.weights @ motions.reshape(-1, JOINTS, 12)).reshape(*unposed.shape, 4)
+        turned = np.einsum("nvab,nvb->nva", blended[..., :3], unposed)
+        surface: NDArray[np.float64] = turned + blended[..., 3] + parameters.transl[:, None]
+        return surface

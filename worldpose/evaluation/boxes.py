@@ -1,0 +1,45 @@
+"""Boxes of people in a picture and how much they overlap (E3)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.cameras import Camera
+
+
+def joint_boxes(joints: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """Return boxes around projected joints (frames, persons, 4) x0 y0 x1 y1 [px].
+
+    NaN where no joint is in front of the camera. Boxes are not cut at the border of the picture.
+
+    Args:
+        joints: (frames, persons, joints, 3) [m], world; NaN where missing.
+        camera: one camera, or one for every frame.
+    """
+    frames, persons, count, _ = joints.shape
+    image = camera.project(joints.reshape(frames, persons * count, 3))
+    image = image.reshape(frames, persons, count, 2)
+    known = np.isfinite(image)
+    low = np.where(known, image, np.inf).min(axis=-2, initial=np.inf)
+    high = np.where(known, image, -np.inf).max(axis=-2, initial=-np.inf)
+    boxes = np.concatenate([low, high], axis=-1)
+    return np.where(np.isfinite(boxes), boxes, np.nan)
+
+
+def box_overlaps(predicted: NDArray[np.float64], true: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return intersection over union of all pairs (frames, true, predicted) [0..1].
+
+    NaN where a box is missing; 0 for boxes without area.
+
+    Args:
+        predicted: (frames, predicted persons, 4) x0 y0 x1 y1 [px].
+        true: (frames, true persons, 4) [px].
+    """
+    a, b = predicted[:, None], true[:, :, None]
+    sides = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
+    shared = np.maximum(sides, 0.0).prod(axis=-1)
+    union = (a[..., 2:] - a[..., :2]).prod(-1) + (b[..., 2:] - b[..., :2]).prod(-1) - shared
+    overlaps = np.where(np.isnan(union), np.nan, 0.0)
+    np.divide(shared, union, out=overlaps, where=union > 0.0)
+    return overlaps

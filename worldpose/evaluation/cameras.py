@@ -1,0 +1,262 @@
+"""Errors of estimated cameras: their parameters, and what these do on the pitch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.evaluation import CameraErrors, CameraEvaluation
+from data_contracts.records import Record
+from worldpose.cameras import Camera, Rays
+from worldpose.errors import InputError
+from worldpose.evaluation.settings import CameraErrorSettings
+from worldpose.pitch import PitchTemplate
+
+
+class CameraScore(Record):
+    """Errors of one camera, over all its frames."""
+
+    camera_id: str
+    kind: str
+    """`broadcast` where the true camera has several rows, else `static`."""
+    errors: CameraErrors
+
+
+@dataclass(frozen=True, eq=False)
+class CameraSamples:
+    """Single errors of one camera, from which the figures are taken."""
+
+    center: NDArray[np.float64]
+    """(frames,) distance of the centres [m]; NaN where the estimate is missing, as below."""
+    rotation: NDArray[np.float64]
+    """(frames,) angle between the orientations [rad]."""
+    focal: NDArray[np.float64]
+    """(frames,) error over true focal length, mean of x and y [1]."""
+    ground: NDArray[np.float64]
+    """(points,) on the pitch surface [m], of all frames."""
+    reprojection: NDArray[np.float64]
+    """(points,) at player height [px], of all frames."""
+
+
+def evaluate_cameras(
+    estimated: Mapping[str, Camera],
+    true: Mapping[str, Camera],
+    pitch: PitchTemplate | None,
+    settings: CameraErrorSettings | None = None,
+) -> tuple[CameraEvaluation | None, tuple[CameraScore, ...]]:
+    """Return errors of static and broadcast cameras, and of each camera.
+
+    Args:
+        estimated: single cameras or batches (frames,), by camera or clip id.
+        true: single cameras or batches (frames,); ids that only one side has are left out.
+        pitch: the surface; without one there are neither ground nor reprojection errors.
+        settings: the defaults if None.
+
+    Raises:
+        InputError: a camera's two sides have different numbers of frames.
+    """
+    settings = settings or CameraErrorSettings()
+    names = [name for name in true if name in estimated]
+    if not names:
+        return None, ()
+    samples = {
+        name: camera_samples(name, estimated[name], true[name], pitch, settings) for name in names
+    }
+    kinds = {name: _kind(true[name]) for name in names}
+    people = tuple(
+        CameraScore(camera_id=name, kind=kinds[name], errors=_figures([samples[name]]))
+        for name in names
+    )
+    groups = {
+        kind: _figures([samples[name] for name in names if kinds[name] == kind])
+        for kind in sorted(set(kinds.values()))
+    }
+    return CameraEvaluation(**groups), people
+
+
+def camera_samples(
+    name: str,
+    estimated: Camera,
+    true: Camera,
+    pitch: PitchTemplate | None,
+    settings: CameraErrorSettings,
+) -> CameraSamples:
+    """Return the errors of one camera in its frames and in the points that it truly sees.
+
+    Args:
+        name: camera or clip, for messages.
+        estimated: one camera, or one a frame; NaN in frames without an estimate.
+        true: one camera, or one a frame.
+        pitch: the surface; without one there are no points.
+        settings: which points are looked at.
+
+    Raises:
+        InputError: the two sides have different numbers of frames.
+    """
+    frames = max(_frames(estimated), _frames(true))
+    if {_frames(estimated), _frames(true)} - {1, frames}:
+        raise InputError(
+            f"camera {name}",
+            expected=f"{_frames(true)} frames, as the true camera has",
+            found=f"{_frames(estimated)}",
+            todo="Evaluate the clip that the reference belongs to.",
+        )
+    center = np.linalg.norm(estimated.center - true.center, axis=-1)
+    turn = estimated.cam_from_world @ true.cam_from_world.inverse()
+    focal = np.abs(estimated.focal / true.focal - 1.0).mean(-1)
+    known = np.isfinite(center) & np.isfinite(focal)
+    angle = np.where(known, _angle(turn.rotation), np.nan)
+    ground: list[NDArray[np.float64]] = []
+    reprojection: list[NDArray[np.float64]] = []
+    if pitch is not None:
+        surface, raised = _points(pitch, settings)
+        reach = float(np.hypot(pitch.length, pitch.width))
+        for frame in np.flatnonzero(np.atleast_1d(known)):
+            one, exact = _at(estimated, int(frame)), _at(true, int(frame))
+            ground.append(_ground_errors(one, exact, surface, pitch, reach))
+            reprojection.append(_reprojection_errors(one, exact, raised))
+    return CameraSamples(
+        center=np.broadcast_to(np.where(known, center, np.nan), (frames,)),
+        rotation=np.broadcast_to(angle, (frames,)),
+        focal=np.broadcast_to(np.where(known, focal, np.nan), (frames,)),
+        ground=np.concatenate([*ground, np.empty(0)]),
+        reprojection=np.concatenate([*reprojection, np.empty(0)]),
+    )
+
+
+def surface_points(rays: Rays, pitch: PitchTemplate) -> NDArray[np.float64]:
+    """Return where rays from above first meet the pitch surface (..., 3) [m], world.
+
+    NaN where a ray is missing or goes over the horizon.
+
+    Args:
+        rays: (...) rays.
+        pitch: the surface, continued beyond the touch lines.
+    """
+    origins, directions = rays.origins, rays.directions
+    down = directions[..., 2] < 0.0
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        # The surface lies below z = 0 and curves away, so Newton's steps never pass it.
+        along = np.where(down, -origins[..., 2] / directions[..., 2], np.nan)
+        for _ in range(_NEWTON_STEPS):
+            above = _above(origins, directions, along, pitch)
+            ahead = _above(origins, directions, along + 0.5, pitch)
+            behind = _above(origins, directions, along - 0.5, pitch)
+            along = along - above / (ahead - behind)
+        points = origins + along[..., None] * directions
+        height = pitch.height(points[..., 0], points[..., 1])
+        # A tenth of a millimetre: what is not there after the steps will never be.
+        met = (along > 0.0) & (np.abs(points[..., 2] - height) < 1e-4)
+    return np.where(met[..., None], points, np.nan)
+
+
+_NEWTON_STEPS = 8
+"""Squares the error every time; the surface is within 0.2 m of the plane of the start."""
+
+
+def _above(
+    origins: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    along: NDArray[np.float64],
+    pitch: PitchTemplate,
+) -> NDArray[np.float64]:
+    points = origins + along[..., None] * directions
+    return np.asarray(points[..., 2] - pitch.height(points[..., 0], points[..., 1]))
+
+
+def _ground_errors(
+    estimated: Camera,
+    true: Camera,
+    surface: NDArray[np.float64],
+    pitch: PitchTemplate,
+    reach: float,
+) -> NDArray[np.float64]:
+    """Return the distance on the surface between true points and those of their true pixels [m].
+
+    A pixel that the estimated camera does not put on the pitch's plain is off by `reach`.
+    """
+    seen, pixels = _seen(true, surface)
+    found = surface_points(estimated.unproject(pixels), pitch)
+    distance = np.linalg.norm(found - seen, axis=-1)
+    return np.minimum(np.where(np.isnan(distance), reach, distance), reach)
+
+
+def _reprojection_errors(
+    estimated: Camera, true: Camera, points: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return pixel distances; a point that the estimated camera cannot see is off by a picture."""
+    seen, pixels = _seen(true, points)
+    diagonal = float(np.linalg.norm(true.image_size))
+    distance = np.linalg.norm(estimated.project(seen) - pixels, axis=-1)
+    return np.minimum(np.where(np.isnan(distance), diagonal, distance), diagonal)
+
+
+def _seen(
+    camera: Camera, points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the points inside the camera's picture, and their pixels."""
+    pixels = camera.project(points)
+    with np.errstate(invalid="ignore"):
+        inside = ((pixels >= -0.5) & (pixels <= camera.image_size - 0.5)).all(-1)
+    return points[inside], pixels[inside]
+
+
+def _points(
+    pitch: PitchTemplate, settings: CameraErrorSettings
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return a grid (n, 3) on the surface, and the same at player height [m]."""
+    along, across = (
+        np.linspace(-0.5 * side, 0.5 * side, int(np.ceil(side / settings.spacing)) + 1)
+        for side in (pitch.length, pitch.width)
+    )
+    x, y = (values.ravel() for values in np.meshgrid(along, across, indexing="ij"))
+    surface = np.stack([x, y, pitch.height(x, y)], axis=-1)
+    return surface, surface + np.array([0.0, 0.0, settings.player_height])
+
+
+def _figures(samples: Sequence[CameraSamples]) -> CameraErrors:
+    """Return the figures over all frames and points of some cameras."""
+    center, rotation, focal, ground, reprojection = (
+        np.concatenate([getattr(each, name) for each in samples])
+        for name in ("center", "rotation", "focal", "ground", "reprojection")
+    )
+    known = np.isfinite(center)
+    figures: dict[str, float] = {}
+    if known.any():
+        figures["center_error_m"] = float(center[known].mean())
+        figures["rotation_error_deg"] = float(np.degrees(rotation[known].mean()))
+        figures["focal_error_percent"] = float(100.0 * focal[known].mean())
+    if len(ground):
+        figures["ground_error_median_m"] = float(np.median(ground))
+        figures["ground_error_p95_m"] = float(np.percentile(ground, 95.0))
+    if len(reprojection):
+        figures["reprojection_error_median_px"] = float(np.median(reprojection))
+        figures["reprojection_error_p95_px"] = float(np.percentile(reprojection, 95.0))
+    return CameraErrors(cameras=len(samples), coverage=float(known.mean()), **figures)
+
+
+def _angle(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the angle of rotation matrices (...) [rad], exact for small ones too."""
+    trace = np.trace(rotation, axis1=-2, axis2=-1)
+    skew = rotation - np.swapaxes(rotation, -1, -2)
+    # The skew part's norm is 2 sqrt(2) sin(angle), the trace 1 + 2 cos(angle).
+    sine = np.linalg.norm(skew, axis=(-1, -2)) / np.sqrt(2.0)
+    return np.asarray(np.arctan2(sine, trace - 1.0))
+
+
+def _kind(camera: Camera) -> str:
+    return "broadcast" if _frames(camera) > 1 else "static"
+
+
+def _frames(camera: Camera) -> int:
+    return int(np.prod(camera.batch_shape))
+
+
+def _at(camera: Camera, frame: int) -> Camera:
+    """Return the camera of one frame; a camera that never moves has all frames."""
+    if not camera.batch_shape:
+        return camera
+    return camera[frame if _frames(camera) > 1 else 0]

@@ -1,0 +1,48 @@
+"""The joints that the paper and the challenge score, taken from COCO-17."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17
+
+LIMB_JOINTS: Final = COCO17[5:]
+"""Shoulders, elbows, wrists, hips, knees and ankles, left before right."""
+
+PAPER_JOINTS: Final = ("nose", "neck", *LIMB_JOINTS)
+"""E4. COCO-17 has no neck: it is the middle of the shoulders by construction, on both sides."""
+
+CHALLENGE_JOINTS: Final = ("nose", *LIMB_JOINTS)
+"""The challenge's 15 joints but the big toes, which COCO-17 lacks."""
+
+
+def paper_joints(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the joints of E4 (..., 14, 3) [m], NaN where missing.
+
+    Args:
+        joints: (..., 17, 3) [m], COCO-17.
+    """
+    neck = joints[..., 5:7, :].mean(axis=-2, keepdims=True)
+    return np.concatenate([joints[..., :1, :], neck, joints[..., 5:, :]], axis=-2)
+
+
+def challenge_joints(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the joints that the challenge and COCO-17 share (..., 13, 3) [m].
+
+    Args:
+        joints: (..., 17, 3) [m], COCO-17.
+    """
+    return np.concatenate([joints[..., :1, :], joints[..., 5:, :]], axis=-2)
+
+
+def mid_hip(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the middle of the hips (..., 3) [m], NaN where one is missing.
+
+    Args:
+        joints: (..., 17, 3) [m], COCO-17.
+    """
+    middle: NDArray[np.float64] = joints[..., 11:13, :].mean(axis=-2)
+    return middle

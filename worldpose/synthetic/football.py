@@ -1,0 +1,211 @@
+"""Where footballers go: two teams and officials who follow a ball, with bounded accelerations."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import interp1d
+
+from worldpose.synthetic.paths import MARGIN, STEP, GroundPath
+from worldpose.synthetic.processes import drift
+from worldpose.synthetic.settings import CrowdSettings
+
+Floats = NDArray[np.float64]
+
+FORMATION: Final = np.array(
+    # goalkeeper, four defenders, three midfielders, three forwards
+    [
+        [-47.0, 0.0],
+        *([-22.0, 21.0], [-25.0, 7.0], [-25.0, -7.0], [-22.0, -21.0]),
+        *([-8.0, 13.0], [-11.0, 0.0], [-8.0, -13.0]),
+        *([9.0, 19.0], [12.0, 0.0], [9.0, -19.0]),
+    ]
+)
+"""Places of a 4-3-3 that attacks towards positive x, while the ball is at the centre spot [m]."""
+FOLLOW: Final = np.array([0.60, 0.45])
+"""Share of the ball's way along x and y that the formation goes with it [1]: teams stay compact."""
+KEEPER_FOLLOW: Final = np.array([0.12, 0.12])
+"""The same for goalkeepers, who stay at home [1]."""
+ROAM: Final = 8.0
+"""How far players drift from their place in the formation [m], standard deviation per axis."""
+ROAM_TIME: Final = 10.0
+"""Time in which they change their mind about it [s]."""
+PRESSING: Final = 2
+"""Players of each team who go for the ball: one on it, one in support."""
+PASS_EVERY: Final = (2.0, 4.5)
+"""Time between passes [s]."""
+PASS_LENGTH: Final = 12.0
+"""Of a pass per axis [m], standard deviation."""
+SPRINT_EVERY: Final = 45.0
+"""Mean time between a player's sprints [s]."""
+SPRINT_TIME: Final = 2.5
+"""How long a sprint is meant to last [s]."""
+TOP_SPEED: Final = (7.8, 9.2)
+"""Of players, who differ [m/s]."""
+ACCELERATION: Final = 5.0
+"""Most at a standstill, falling to nothing at top speed; most in braking and turns [m/s^2]."""
+REACTION: Final = 0.5
+"""Time in which a wished change of velocity takes hold [s]."""
+JERK_TIME: Final = 0.12
+"""Time in which an acceleration builds up [s]."""
+EAGERNESS: Final = 0.35
+"""Speed wished per metre to the target [1/s]: 10 m away they jog, 20 m away they run hard."""
+NEAR_ENOUGH: Final = 2.0
+"""Who is that near his target stands [m], until it is `WORTH_GOING` away."""
+WORTH_GOING: Final = 5.0
+"""[m]"""
+BODY_SPACE: Final = 1.3
+"""Distance under which players make way for each other [m]."""
+TURN_TIME: Final = 0.15
+"""Time in which a body turns to where it moves or looks [s]."""
+TURN_RATE: Final = 7.0
+"""Most a body turns [rad/s]."""
+
+
+def play(
+    crowd: CrowdSettings, duration: float, rng: np.random.Generator
+) -> tuple[list[GroundPath], GroundPath]:
+    """Return the ways of all people, players by team and then officials, and the ball's.
+
+    Everybody steers for a target that moves: players for their place in a formation that shifts
+    with the ball, the nearest of each team for the ball, a sprinter for open space, the referee
+    for a place near play, assistants along the touch lines. Targets need not be smooth: people
+    accelerate within human bounds (docs/synthetic.md).
+
+    Args:
+        crowd: number of people and of officials among them.
+        duration: time covered besides the margins [s].
+        rng: draws play; the same for any number of cameras.
+    """
+    samples = round((duration + 2.0 * MARGIN) / STEP) + 1
+    time = np.linspace(-MARGIN, -MARGIN + (samples - 1) * STEP, samples)
+    players = max(crowd.people - crowd.officials, 0)
+    team = np.arange(crowd.people) % 2
+    side = np.where(team == 0, 1.0, -1.0)
+    ball = _ball(time, rng)
+    targets, hurry = _targets(time, ball, players, crowd.people, side, rng)
+    top = rng.uniform(*TOP_SPEED, crowd.people)
+
+    position, velocity = targets[0].copy(), np.zeros((crowd.people, 2))
+    push, moving = np.zeros((crowd.people, 2)), np.ones(crowd.people, dtype=bool)
+    look = ball[0] - position
+    heading = np.arctan2(look[:, 1], look[:, 0])
+    places = np.empty((samples, crowd.people, 2))
+    speeds, headings = np.empty((2, samples, crowd.people))
+    for i in range(samples):
+        target = targets[i].copy()
+        for which in (0, 1):
+            mates = np.flatnonzero((team[:players] == which) & (np.arange(players) >= 2))
+            far = np.linalg.norm(position[mates] - ball[i], axis=-1)
+            for rank, mate in enumerate(mates[np.argsort(far, kind="stable")[:PRESSING]]):
+                target[mate] = ball[i] - side[mate] * np.array([0.8 + 4.0 * rank, 0.5 * rank])
+        velocity, push, moving = _steer(
+            position, velocity, push, moving, target - position, hurry[i], top
+        )
+        places[i], headings[i] = position, heading
+        speeds[i] = np.linalg.norm(velocity, axis=-1)
+        look = np.where(speeds[i][:, None] > 0.6, velocity, ball[i] - position)
+        turn = np.arctan2(look[:, 1], look[:, 0]) - heading
+        turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
+        heading = heading + np.clip(turn / TURN_TIME, -TURN_RATE, TURN_RATE) * STEP
+        position = position + velocity * STEP
+    paths = [
+        GroundPath(time, places[:, n], headings[:, n], speeds[:, n]) for n in range(crowd.people)
+    ]
+    way = np.gradient(ball, STEP, axis=0)
+    course = np.unwrap(np.arctan2(way[:, 1], way[:, 0]))
+    return paths, GroundPath(time, ball, course, np.linalg.norm(way, axis=-1))
+
+
+def _ball(time: Floats, rng: np.random.Generator) -> Floats:
+    """Ball (samples, 2) [m] that rolls from pass to pass and stays in play."""
+    place = rng.uniform(-1.0, 1.0, 2) * [30.0, 18.0]
+    when, places = [time[0]], [place]
+    while when[-1] < time[-1]:
+        # Play drifts back to the middle third rather than stick to a corner.
+        place = 0.9 * place + PASS_LENGTH * rng.standard_normal(2)
+        place = np.clip(place, [-46.0, -29.0], [46.0, 29.0])
+        when.append(when[-1] + rng.uniform(*PASS_EVERY))
+        places.append(place)
+    # Rounded over a third of a second: nothing that people look at jumps.
+    raw = np.stack([np.interp(time, when, axis) for axis in np.array(places).T], axis=-1)
+    half = round(0.35 / STEP)
+    kernel = np.hanning(2 * half + 1)
+    padded = np.pad(raw, ((half, half), (0, 0)), mode="edge")
+    return np.stack(
+        [np.convolve(axis, kernel / kernel.sum(), mode="valid") for axis in padded.T], axis=-1
+    )
+
+
+def _targets(
+    time: Floats,
+    ball: Floats,
+    players: int,
+    people: int,
+    side: Floats,
+    rng: np.random.Generator,
+) -> tuple[Floats, Floats]:
+    """Targets (samples, people, 2) [m], and how much more than usual each hurries there."""
+    samples = len(time)
+    # A thought a second, and none of the jitter of a random walk between.
+    knots = np.arange(time[0], time[-1] + 2.0)
+    roam = ROAM * drift((len(knots), people, 2), ROAM_TIME, 1.0, rng)
+    roam = interp1d(knots, roam, axis=0)(time)
+    start = rng.random((samples, people)) < STEP / SPRINT_EVERY
+    aims = rng.uniform([12.0, -10.0], [26.0, 10.0], (people, 2))
+    sprinting = np.zeros((samples, people), dtype=bool)
+    for sample, person in np.argwhere(start):
+        sprinting[sample : sample + round(SPRINT_TIME / STEP), person] = True
+    hurry = np.where(sprinting, 3.0, 1.0)
+    targets = np.empty((samples, people, 2))
+    for person in range(people):
+        role = person // 2
+        if person < players:
+            home = FORMATION[role % len(FORMATION)]
+            follow, roaming = (KEEPER_FOLLOW, 0.3) if role == 0 else (FOLLOW, 1.0)
+            targets[:, person] = side[person] * home + follow * ball + roaming * roam[:, person]
+            if role > 0:
+                run = side[person] * aims[person]
+                targets[:, person] += np.where(sprinting[:, person, None], run, 0.0)
+        elif person == players:
+            targets[:, person] = 0.9 * ball + [-4.0, 7.0] + 0.4 * roam[:, person]
+        else:
+            # An assistant keeps level with the last defender of his half.
+            half = 1.0 if (person - players) % 2 else -1.0
+            line = half * np.clip(25.0 + half * FOLLOW[0] * ball[:, 0], 0.0, 50.0)
+            targets[:, person] = np.stack([line, np.full(samples, half * 35.2)], axis=-1)
+    low, high = np.array([-51.0, -35.5]), np.array([51.0, 35.5])
+    return np.clip(targets, low, high), hurry
+
+
+def _steer(
+    position: Floats,
+    velocity: Floats,
+    push: Floats,
+    moving: NDArray[np.bool_],
+    way: Floats,
+    hurry: Floats,
+    top: Floats,
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Velocity, acceleration and who is on the move, one step later."""
+    far = np.linalg.norm(way, axis=-1)
+    moving = far > np.where(moving, NEAR_ENOUGH, WORTH_GOING)
+    wish = np.where(moving, np.minimum(EAGERNESS * hurry * far, top), 0.0)
+    wished = way * (wish / np.maximum(far, 1e-9))[:, None]
+    apart = position[:, None] - position
+    gap = np.linalg.norm(apart, axis=-1)
+    near = np.clip(1.0 - gap / BODY_SPACE, 0.0, 1.0)
+    wished = wished + 5.0 * (apart * (near / np.maximum(gap, 1e-9))[..., None]).sum(axis=1)
+    change = (wished - velocity) / REACTION
+    # What drives on falls with speed, what brakes or turns does not.
+    speed = np.linalg.norm(velocity, axis=-1)
+    ahead = velocity / np.maximum(speed, 1e-9)[:, None]
+    drive = (change * ahead).sum(-1)
+    most = ACCELERATION * np.maximum(1.0 - speed / top, 0.0)
+    change = change + (np.minimum(drive, most) - drive)[:, None] * ahead
+    size = np.linalg.norm(change, axis=-1)
+    change = change * np.minimum(1.0, ACCELERATION / np.maximum(size, 1e-9))[:, None]
+    push = push + (change - push) * STEP / JERK_TIME
+    return velocity + push * STEP, push, moving
