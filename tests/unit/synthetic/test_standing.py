@@ -76,7 +76,7 @@ def test_who_turns_on_the_spot_takes_steps():
     cycle = stride_cycle(path, 0.0)
     # Half a turn within a second: two steps or three.
     assert 2.0 * (cycle[-1] - cycle[0]) in (1.0, 2.0, 3.0)
-    body, joints = walked(path)
+    _, joints = walked(path)
     for joint, side in zip(ANKLES, (1.0, -1.0), strict=True):
         before, after = joints[0, joint], joints[-1, joint]
         assert before[1] * side > 0.05
