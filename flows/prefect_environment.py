@@ -7,6 +7,7 @@ sets the environment; it must be called before Prefect is imported.
 
 from __future__ import annotations
 
+import fcntl
 import os
 import socket
 import subprocess
@@ -57,16 +58,34 @@ def prefect_server(project: str) -> Iterator[Callable[[], None]]:
         if address:
             yield partial(_require_answer, address)
             return
-        with tempfile.TemporaryDirectory(prefix="worldpose-prefect-") as scratch:
-            local = "://" not in project
-            home = Path(project).resolve() / "prefect" if local else Path(scratch)
-            home.mkdir(parents=True, exist_ok=True)
-            with (
-                _environment({"PREFECT_HOME": str(home)}),
-                _embedded_server(Path(scratch) / "server.log") as (address, wait_until_ready),
-                _environment({"PREFECT_API_URL": address}),
-            ):
-                yield wait_until_ready
+        with (
+            tempfile.TemporaryDirectory(prefix="worldpose-prefect-") as scratch,
+            _home(project, Path(scratch)) as home,
+            _environment({"PREFECT_HOME": str(home)}),
+            _embedded_server(Path(scratch) / "server.log") as (address, wait_until_ready),
+            _environment({"PREFECT_API_URL": address}),
+        ):
+            yield wait_until_ready
+
+
+@contextmanager
+def _home(project: str, scratch: Path) -> Iterator[Path]:
+    """Where Prefect's database lies: with a local project, which saves making it anew.
+
+    While another run of the project uses that one, or on object storage, it is a passing one: two
+    servers that make one database at once destroy it.
+    """
+    if "://" in project:
+        yield scratch
+        return
+    home = Path(project).resolve() / "prefect"
+    home.mkdir(parents=True, exist_ok=True)
+    with (home / "in-use").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            home = scratch
+        yield home
 
 
 @contextmanager
@@ -95,6 +114,7 @@ def _embedded_server(log: Path) -> Iterator[tuple[str, Callable[[], None]]]:
             stdout=output,
             stderr=subprocess.STDOUT,
             pass_fds=[listening.fileno()],
+            start_new_session=True,  # Ctrl-C is for the run, which then ends its server
         )
     try:
         yield address, partial(_wait_until_healthy, server, address, log)

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
+import sys
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from types import FrameType
 
 from data_contracts.run import RunRecord
 from flows.planning import PlannedUnit, plan_run
@@ -80,7 +85,7 @@ def _with_prefect(
     store: Store, match: Match, request: RunRequest, missing: list[PlannedUnit]
 ) -> RunRecord:
     reporter().say("starting Prefect and Dask")
-    with prefect_server(store.url) as wait_until_ready:
+    with _ending_at_once(), prefect_server(store.url) as wait_until_ready:
         # Late: they take seconds to import, which pass while the server starts.
         from prefect.logging.handlers import APILogHandler
         from prefect_dask import DaskTaskRunner
@@ -102,6 +107,27 @@ def _with_prefect(
         finally:
             APILogHandler().flush()  # while the server is there to take the last lines
     return store.run(match.match_id, run_id)
+
+
+@contextmanager
+def _ending_at_once() -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM end the run without ceremony.
+
+    A killed run loses nothing that was finished, and its workers and server end with it. An orderly
+    end would wait for the tasks at work, which can take minutes.
+    """
+
+    def end(number: int, frame: FrameType | None) -> None:
+        sys.stderr.write("\ninterrupted: run again to go on from what is finished\n")
+        sys.stderr.flush()
+        os._exit(128 + number)
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _cluster(request: RunRequest, missing: list[PlannedUnit]) -> dict[str, object]:

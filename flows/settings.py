@@ -84,7 +84,7 @@ def settings_of(stage: Stage, overrides: Overrides) -> Record:
             f"--set {stage.name}.{'.'.join(map(str, first['loc']))}",
             expected=first["msg"],
             found=repr(first["input"]),
-            todo=f"The settings of {stage.name} are described in docs/method.md.",
+            todo="See worldpose run MATCH --set list.",
         ) from None
 
 

@@ -20,6 +20,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
+    rich_markup_mode=None,  # help names units in brackets
 )
 for module in (project, matches, run, lineage, results, body):
     module.add_to(app)
@@ -29,6 +30,9 @@ def main() -> None:
     """Run the command line; user errors become one message and an exit code."""
     try:
         app()
+    except OSError as error:
+        line(f"error: {error.filename or 'a file'}: {error.strerror or error}", to=errors)
+        sys.exit(1)
     except WorldposeError as error:
         if "--json" in sys.argv:
             print(json.dumps({"error": type(error).__name__, "message": str(error)}))  # noqa: T201

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from typing import Annotated
 
@@ -13,10 +14,13 @@ from flows.cli.console import (
     JsonOption,
     MatchArgument,
     ProjectOption,
+    errors,
     line,
     print_json,
+    print_table,
     progress,
 )
+from flows.method import METHOD
 from flows.registering import find_match
 from flows.running import RunRequest, run_match
 from flows.settings import parse_overrides, selected_stages
@@ -34,7 +38,11 @@ def run(
     until_stage: Annotated[str | None, typer.Option("--until", help="Last stage.")] = None,
     assignments: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="STAGE.NAME=VALUE", help="A setting; may be repeated."),
+        typer.Option(
+            "--set",
+            metavar="STAGE.NAME=VALUE",
+            help="A setting for this run; may be repeated; `list` shows them all.",
+        ),
     ] = None,
     dask: Annotated[
         str | None, typer.Option(metavar="ADDR", help="A running Dask scheduler, tcp://host:port.")
@@ -50,6 +58,9 @@ def run(
     Example: worldpose run matches/tiny --set triangulation.min_views=3
     """
     started = time.monotonic()
+    if assignments == ["list"]:
+        _print_settings(as_json)
+        return
     overrides = parse_overrides(assignments or [], selected_stages(from_stage, until_stage))
     store = Store.open_or_new(project)
     request = RunRequest(overrides, from_stage, until_stage, dask, workers)
@@ -74,6 +85,27 @@ def run(
     raise typer.Exit(EXIT_CODES[record.state])
 
 
+def _print_settings(as_json: bool) -> None:
+    rows = [
+        (
+            f"{stage.name}.{name}",
+            json.dumps(field.default),
+            " ".join((field.description or "").split()),
+        )
+        for stage in METHOD
+        for name, field in stage.settings.model_fields.items()
+    ]
+    if as_json:
+        print_json(
+            {
+                name: {"default": json.loads(default), "about": about}
+                for name, default, about in rows
+            }
+        )
+    else:
+        print_table("settings", ("setting", "default", "what it says"), rows)
+
+
 def _print(record: RunRecord, project: str, seconds: float) -> None:
     blocked = f" and {len(record.blocked)} blocked by that" if record.blocked else ""
     line(
@@ -83,6 +115,13 @@ def _print(record: RunRecord, project: str, seconds: float) -> None:
     )
     if not (record.executed or record.failed):
         line("nothing to do: every result is current")
+    for name, figures in record.figures.items():
+        if figures.get("joints") == 0:
+            line(
+                f"warning: {name} found nobody. Are translations in metres, the cameras in step, "
+                "and the settings within reach of these cameras?",
+                to=errors,
+            )
     line(f"results: {project}/results/{record.match_id}")
 
 

@@ -156,3 +156,30 @@ def processes_with(marker):
         except OSError:
             continue
     return [pid for pid in found if pid != os.getpid()]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_ends_at_once_and_says_how_to_go_on(number, tiny, tmp_path):
+    environment = {**os.environ, "WORLDPOSE_TEST_MARK": tmp_path.name}
+    environment.pop("PREFECT_API_URL")
+    process = subprocess.Popen(
+        [*WORLDPOSE, "run", str(tiny), "--project", str(tmp_path / "worldpose-data")],
+        start_new_session=True,
+        env=environment,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    for line in process.stderr:
+        if "ingest:" in line:
+            break
+    os.killpg(process.pid, number)  # as a terminal does: to the run and its workers
+    started = time.monotonic()
+    _, said = process.communicate(timeout=60)
+    # SIGTERM goes through Prefect, which took 3 s; Ctrl-C ends the process itself.
+    assert time.monotonic() - started < 30
+    assert process.returncode not in (0, None)
+    assert "Traceback" not in said, said
+    if number == signal.SIGINT:
+        assert "run again to go on" in said
+        assert process.returncode == 128 + number
+    succeed("run", tiny, "--project", tmp_path / "worldpose-data")

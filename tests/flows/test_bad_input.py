@@ -208,3 +208,28 @@ def test_a_flipped_byte_is_named(project_copy):
     answer = worldpose("verify", "--project", project_copy)
     assert answer.code == 1
     assert chunk.relative_to(project_copy).as_posix() in answer.err
+
+
+def test_a_place_that_cannot_be_written_is_one_message(tiny_run, tmp_path):
+    taken = tmp_path / "taken"
+    taken.write_text("mine")
+    out = ("--out", taken, "--project", tiny_run)
+    answer = worldpose("export", TINY, "--format", "joints", *out)
+    assert answer.code == 1
+    assert "taken" in answer.err
+    assert "Traceback" not in answer.err
+    assert taken.read_text() == "mine"
+
+
+def test_finding_nobody_is_said(tiny, tmp_path):
+    asked = ("--set", "triangulation.min_views=9")
+    answer = worldpose("run", tiny, "--project", tmp_path / "new", *asked)
+    assert answer.code == 0
+    assert "triangulation/clip found nobody" in answer.err
+
+
+def test_settings_can_be_looked_up(tmp_path):
+    answer = worldpose("run", "any", "--set", "list", "--json")
+    assert answer.code == 0
+    assert answer.json["triangulation.min_views"]["default"] == 2
+    assert "cameras" in answer.json["triangulation.min_views"]["about"]

@@ -26,7 +26,7 @@ def explain_difference(old: Recipe, new: Recipe) -> list[str]:
         *_changes("contract", {"": old.contract}, {"": new.contract}),
         *_changes("match", {"": old.match_id}, {"": new.match_id}),
         *_changes("unit", {"": old.name}, {"": new.name}),
-        *_changes("source", old.sources, new.sources),
+        *_changes("source", _flat(old.sources), _flat(new.sources)),
         *_changes("input", old.inputs, new.inputs),
         *_changes("setting", _flat(old.settings), _flat(new.settings)),
         *_changes("module", old.code, new.code),
@@ -55,10 +55,14 @@ def _shown(values: Mapping[str, Any], name: str) -> str:
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Every leaf by its place: `camera.focal_px[0]`."""
     flat: dict[str, Any] = {}
     for name, value in values.items():
         if isinstance(value, Mapping) and value:
             flat.update(_flat(value, f"{prefix}{name}."))
+        elif isinstance(value, list | tuple) and value:
+            items = {f"{name}[{index}]": item for index, item in enumerate(value)}
+            flat.update(_flat(items, prefix))
         else:
             flat[prefix + name] = value
     return flat

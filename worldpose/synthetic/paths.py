@@ -25,6 +25,11 @@ TURNING_SPEED: Final = 0.5
 """Who is slower turns less, and who stands not at all [m/s]."""
 LOOK_AHEAD: Final = 1.2
 """How far ahead people see borders and other people coming [s]."""
+BODY_WIDTH: Final = 0.7
+"""Distance between the middles of two people who touch shoulder to shoulder [m]."""
+SHOVE: Final = 9.0
+"""Speed at which somebody would be pushed out of another's middle [m/s]; who touches less is
+pushed less."""
 START_SPACE: Final = 2.5
 """Least distance between people at the start of their paths [m], where there is room."""
 
@@ -72,7 +77,9 @@ def wander(
     here, angle, turn = starts[start], rng.uniform(-np.pi, np.pi), 0.0
     for i in range(len(time)):
         position[i], heading[i] = here, angle
-        velocity = speed[i] * np.array([np.cos(angle), np.sin(angle)])
+        own = speed[i] * np.array([np.cos(angle), np.sin(angle)])
+        velocity = own + _shove(here - place[:, i])
+        speed[i] = np.linalg.norm(velocity)
         wish = (
             whim[i]
             + _turn_back(here + LOOK_AHEAD * velocity - center, half, angle)
@@ -84,6 +91,14 @@ def wander(
         here = here + velocity * STEP
         angle = angle + turn * STEP
     return GroundPath(time, position, heading, speed)
+
+
+def _shove(apart: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Velocity (2,) [m/s] that bodies (others, 2) [m] away give to somebody who touches them."""
+    gap = np.linalg.norm(apart, axis=-1, keepdims=True)
+    push = SHOVE * np.clip(1.0 - gap / BODY_WIDTH, 0.0, 1.0)
+    velocity: NDArray[np.float64] = (push * apart / np.maximum(gap, 1e-9)).sum(axis=0)
+    return velocity
 
 
 def _slow_wave(

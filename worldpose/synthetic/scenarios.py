@@ -63,13 +63,13 @@ _BOX: Final = CrowdSettings(
     area_center=(-44.0, 2.0),
     area_size=(8.0, 9.0),
     speed=(-0.8, 4.5),
-    personal_space=0.5,
+    personal_space=0.9,
 )
 _TRIAL: Final = ObservationNoise(
-    white=0.025,
-    slow=0.027,
+    white=0.026,
+    slow=0.028,
     blur=0.004,
-    shared_bias=0.025,
+    shared_bias=0.032,
     own_bias=0.009,
     view_bias=0.013,
     hidden_joint_missed=0.35,

@@ -52,3 +52,9 @@ def test_digests_that_begin_alike_are_still_a_difference() -> None:
     one = sample_recipe(sources={"pitch": "a" * 64})
     other = sample_recipe(sources={"pitch": "a" * 63 + "b"})
     assert len(explain_difference(one, other)) == 1
+
+
+def test_a_difference_inside_a_list_is_named_by_its_place() -> None:
+    old = sample_recipe().model_copy(update={"sources": {"camera": {"focal_px": [1000.0, 1001.0]}}})
+    new = sample_recipe().model_copy(update={"sources": {"camera": {"focal_px": [1000.0, 1002.0]}}})
+    assert explain_difference(old, new) == ["source camera.focal_px[1]: 1001.0 -> 1002.0"]
