@@ -40,7 +40,7 @@ def quick(points, kept):
     ]
 
 
-@pytest.mark.parametrize("point", quick(IN_WORKER, {"during_publish", "before_commit"}))
+@pytest.mark.parametrize("point", quick(IN_WORKER, {"before_commit"}))
 def test_a_worker_killed_at_a_commit_point_is_replaced(point, tiny, tiny_run, tmp_path):
     # Two workers share eight units, so one of them comes to the point a third time.
     environment, struck = fault_environment(tmp_path, point, skip=2)
@@ -77,7 +77,7 @@ def test_the_whole_process_group_killed_at_a_commit_point(point, tiny, tiny_run,
     assert_same_store(project, tiny_run)
 
 
-@pytest.mark.parametrize("seed", quick(range(20), {0, 1}))
+@pytest.mark.parametrize("seed", quick(range(20), {0}))
 def test_the_whole_process_group_killed_at_a_random_moment(seed, tiny, tiny_run, tmp_path):
     project = tmp_path / "worldpose-data"
     # A moment is a number of files in the project, so that it means the same on any machine.
