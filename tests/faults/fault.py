@@ -1,8 +1,9 @@
 """Kills the process at a named commit point, once.
 
 A Dask worker loads this file as its preload; `python tests/faults/fault.py ARGS` runs the command
-line with it. WORLDPOSE_TEST_FAULT holds the plan as JSON: the point, at which of its visits, and a
-file that is made when the fault has struck, so that it strikes once over all processes.
+line with it. WORLDPOSE_TEST_FAULT holds the plan as JSON: the point, how many of its visits in
+a process to skip, whether the whole process group dies, and a file that is made when the fault has
+struck, so that it strikes once over all processes.
 """
 
 import json
