@@ -1,0 +1,71 @@
+"""The numbers that a static camera is solved for, and how pixels move with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldpose.cameras import Camera
+
+PARAMETERS: Final = ("rx", "ry", "rz", "tx", "ty", "tz", "log_focal", "cx", "cy", "k1", "k2", "k3")
+"""Steps of a camera: rotation about its center [rad] and shift [m] in its own axes
+(`Rigid.updated`), the logarithm of the focal length, principal point [px], distortion [1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraEstimate:
+    """A camera and how well it is known.
+
+    Attributes:
+        camera: a single camera with square pixels.
+        covariance: (12, 12) of a step in the order of `PARAMETERS`; rows and columns of parameters
+            that were not solved for are zero.
+    """
+
+    camera: Camera
+    covariance: NDArray[np.float64]
+
+
+def stepped(camera: Camera, step: ArrayLike) -> Camera:
+    """Return the camera after a step.
+
+    Args:
+        camera: a single camera with square pixels.
+        step: (12,) in the order of `PARAMETERS`.
+    """
+    step = np.asarray(step, dtype=np.float64)
+    distortion = camera.distortion.copy()
+    distortion[[0, 1, 4]] += step[9:]
+    return replace(
+        camera,
+        focal=camera.focal * np.exp(step[6]),
+        principal_point=camera.principal_point + step[7:9],
+        distortion=distortion,
+        cam_from_world=camera.cam_from_world.updated(step[:6]),
+    )
+
+
+def project_with_jacobian(
+    camera: Camera, points_world: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return pixels (n, 2) [px] of world points and their derivatives (n, 2, 12) by a step.
+
+    Args:
+        camera: a single camera with square pixels.
+        points_world: (n, 3) [m].
+
+    Returns:
+        NaN for points behind the camera, and where the lens model is not one to one.
+    """
+    seen = camera.project_with_jacobians(points_world)
+    by_focal = (seen.d_intrinsics[..., :2] * camera.focal).sum(axis=-1, keepdims=True)
+    parts = (
+        seen.d_pose,
+        by_focal,
+        seen.d_intrinsics[..., 2:],
+        seen.d_distortion[..., [0, 1, 4]],
+    )
+    return seen.points_image, np.concatenate(parts, axis=-1)
