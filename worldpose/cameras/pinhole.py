@@ -174,6 +174,21 @@ class Camera:
         """Camera centres (..., 3) [m], world."""
         return self.cam_from_world.inverse().translation
 
+    @property
+    def numbers(self) -> NDArray[np.float64]:
+        """Rows (..., 22) as the compiled kernels of `worldpose.cameras.projection` take them."""
+        return np.concatenate(
+            [
+                self.focal,
+                self.principal_point,
+                self.distortion,
+                self.cam_from_world.rotation.reshape(*self.batch_shape, 9),
+                self.cam_from_world.translation,
+                fold_radius(self.distortion)[..., None],
+            ],
+            axis=-1,
+        )
+
     def __getitem__(self, index: Index) -> Camera:
         return Camera(
             **{name: getattr(self, name)[leading(index, 1)] for name in _PARTS},
@@ -268,19 +283,8 @@ class Camera:
         """Return the common batch shape, cameras (batch, 22) and points (batch, n, width)."""
         values = checked(where, points, (-1, width))
         batch = common_batch(where, self.batch_shape, values.shape[:-2])
-        numbers = np.concatenate(
-            [
-                self.focal,
-                self.principal_point,
-                self.distortion,
-                self.cam_from_world.rotation.reshape(*self.batch_shape, 9),
-                self.cam_from_world.translation,
-                fold_radius(self.distortion)[..., None],
-            ],
-            axis=-1,
-        )
         size = int(np.prod(batch))
-        cameras = np.broadcast_to(numbers, (*batch, 22)).reshape(size, 22)
+        cameras = np.broadcast_to(self.numbers, (*batch, 22)).reshape(size, 22)
         shape = values.shape[-2:]
         return batch, cameras, np.broadcast_to(values, (*batch, *shape)).reshape(size, *shape)
 

@@ -42,7 +42,7 @@ def project(cameras: Floats, points: Floats, image: Floats) -> None:
     for row in range(points.shape[0]):
         c = cameras[row]
         for i in range(points.shape[1]):
-            at = _project_point(c, points[row, i, 0], points[row, i, 1], points[row, i, 2])
+            at = project_point(c, points[row, i, 0], points[row, i, 1], points[row, i, 2])
             image[row, i, 0] = c[0] * at[1] + c[2] if at[0] == _OK else np.nan
             image[row, i, 1] = c[1] * at[2] + c[3] if at[0] == _OK else np.nan
 
@@ -65,7 +65,7 @@ def project_with_jacobians(
         c = cameras[row]
         finite = _is_finite(c)
         for i in range(points.shape[1]):
-            code, xd, yd, a, b, z, dxx, dxy, dyy = _project_point(
+            code, xd, yd, a, b, z, dxx, dxy, dyy = project_point(
                 c, points[row, i, 0], points[row, i, 1], points[row, i, 2]
             )
             status[row, i] = code if finite else _MISSING
@@ -149,7 +149,7 @@ def _is_finite(c: Floats) -> bool:
 
 
 @compiled
-def _project_point(
+def project_point(
     c: Floats, px: float, py: float, pz: float
 ) -> tuple[int, float, float, float, float, float, float, float, float]:
     """Return status, distorted x y, undistorted x y, depth z, and the distortion's Jacobian."""

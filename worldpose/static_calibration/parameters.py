@@ -8,9 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from data_contracts.static_calibration import CAMERA_STEP
 from worldpose.cameras import Camera
 
-PARAMETERS: Final = ("rx", "ry", "rz", "tx", "ty", "tz", "log_focal", "cx", "cy", "k1", "k2", "k3")
+PARAMETERS: Final = CAMERA_STEP
 """Steps of a camera: rotation about its center [rad] and shift [m] in its own axes
 (`Rigid.updated`), the logarithm of the focal length, principal point [px], distortion [1]."""
 
@@ -33,18 +34,18 @@ def stepped(camera: Camera, step: ArrayLike) -> Camera:
     """Return the camera after a step.
 
     Args:
-        camera: a single camera with square pixels.
-        step: (12,) in the order of `PARAMETERS`.
+        camera: cameras (...) with square pixels.
+        step: (..., 12) in the order of `PARAMETERS`.
     """
     step = np.asarray(step, dtype=np.float64)
     distortion = camera.distortion.copy()
-    distortion[[0, 1, 4]] += step[9:]
+    distortion[..., [0, 1, 4]] += step[..., 9:]
     return replace(
         camera,
-        focal=camera.focal * np.exp(step[6]),
-        principal_point=camera.principal_point + step[7:9],
+        focal=camera.focal * np.exp(step[..., 6:7]),
+        principal_point=camera.principal_point + step[..., 7:9],
         distortion=distortion,
-        cam_from_world=camera.cam_from_world.updated(step[:6]),
+        cam_from_world=camera.cam_from_world.updated(step[..., :6]),
     )
 
 

@@ -1,0 +1,119 @@
+"""Cameras and points adjusted together, against known truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from worldpose.bundle_adjustment import SolverSettings, solve
+from worldpose.errors import InputError
+from worldpose.static_calibration import PARAMETERS, stepped
+
+DISTURBED = np.array([2e-3, 2e-3, 2e-3, 0.1, 0.1, 0.1, 5e-3, 3.0, 3.0, 0.01, 0.005, 0.0])
+
+
+def disturbed(problem, seed=7):
+    rng = np.random.default_rng(seed)
+    step = DISTURBED * rng.standard_normal((len(problem.free), len(PARAMETERS)))
+    free = np.where(np.isinf(problem.point_information), 0.0, 0.1)[:, None]
+    points = problem.points + free * rng.standard_normal(problem.points.shape)
+    return replace(problem, cameras=stepped(problem.cameras, step), points=points)
+
+
+def test_nothing_fixes_the_scene_is_refused(scene):
+    problem, *_ = scene(markings=0)
+    with pytest.raises(InputError, match="hold in place"):
+        solve(disturbed(problem))
+
+
+def test_one_camera_alone_cannot_place_points(scene):
+    problem, *_ = scene()
+    kept = problem.camera_of == 0
+    alone = replace(
+        problem,
+        cameras=problem.cameras[:1],
+        free=problem.free[:1],
+        camera_information=problem.camera_information[:1],
+        point_of=problem.point_of[kept],
+        camera_of=problem.camera_of[kept],
+        image=problem.image[kept],
+        weight=problem.weight[kept],
+        scale=problem.scale[kept],
+    )
+    with pytest.raises(InputError, match="two cameras"):
+        solve(alone)
+
+
+def test_a_point_behind_its_camera_is_refused(scene):
+    problem, *_ = scene()
+    points = problem.points.copy()
+    points[-1] = 2.0 * problem.cameras.center[0] - points[-1]
+    with pytest.raises(InputError, match="in front"):
+        solve(replace(problem, points=points))
+
+
+def test_exact_observations_give_back_the_truth(scene):
+    problem, true, points = scene(joints=60)
+    solved = solve(disturbed(problem))
+    assert solved.converged
+    # 1e-8 of the cost at the start is left: far below a hundredth of a pixel.
+    np.testing.assert_allclose(solved.points, points, atol=1e-5)
+    np.testing.assert_allclose(solved.cameras.center, true.center, atol=1e-4)
+    np.testing.assert_allclose(solved.cameras.focal, true.focal, rtol=1e-6)
+
+
+def test_a_wrong_observation_hardly_counts_with_a_robust_loss(scene):
+    problem, _, points = scene(noise=0.5, joints=60, seen=1.0)
+    image = problem.image.copy()
+    image[np.flatnonzero(problem.point_of >= 24)[::25]] += 80.0
+    start = disturbed(problem)
+
+    def error(**changes):
+        return np.linalg.norm(solve(replace(start, **changes)).points - points, axis=1).mean()
+
+    clean = error()
+    assert error(image=image) > 5.0 * clean
+    # Cauchy's loss at three standard deviations costs a few per cent of efficiency.
+    assert error(image=image, scale=np.full(len(image), 3.0)) < 1.5 * clean
+
+
+def test_fixed_parameters_and_fixed_points_stay(scene):
+    problem, *_ = scene(noise=1.0)
+    free = problem.free.copy()
+    free[:, PARAMETERS.index("cx") : PARAMETERS.index("cy") + 1] = False
+    start = disturbed(replace(problem, free=free))
+    solved = solve(start)
+    np.testing.assert_array_equal(solved.cameras.principal_point, start.cameras.principal_point)
+    np.testing.assert_array_equal(solved.points[:24], start.points[:24])
+
+
+def test_prior_knowledge_of_a_camera_holds_where_observations_say_nothing(scene):
+    problem, true, _ = scene(markings=0, noise=0.5)
+    information = np.tile(np.diag(1.0 / np.maximum(DISTURBED, 1e-9) ** 2), (4, 1, 1))
+    information[:2] *= 1e8  # two cameras are known: they fix the gauge
+    solved = solve(replace(disturbed(problem), cameras=true, camera_information=information))
+    np.testing.assert_allclose(solved.cameras.center[:2], true.center[:2], atol=1e-3)
+
+
+def test_covariance_of_the_cameras_is_what_repetition_shows(scene):
+    errors, covariance = [], None
+    for seed in range(60):
+        problem, true, _ = scene(noise=1.0, seed=1)
+        rng = np.random.default_rng(100 + seed)
+        exact, *_ = scene(noise=0.0, seed=1)
+        noisy = replace(problem, image=exact.image + rng.standard_normal(exact.image.shape))
+        solved = solve(noisy)
+        errors.append(solved.cameras.center[0] - true.center[0])
+        covariance = solved.camera_covariance
+    rotation = true.cam_from_world.rotation[0]
+    # A shift t in the camera's axes moves the center by -R^T t.
+    stated = rotation.T @ covariance[3:6, 3:6] @ rotation
+    # 60 repetitions tell a standard deviation to 9 %; three of them.
+    np.testing.assert_allclose(np.std(errors, axis=0), np.sqrt(np.diag(stated)), rtol=0.28)
+
+
+def test_it_stops_when_told_and_says_so(scene):
+    problem, *_ = scene(noise=1.0)
+    solved = solve(disturbed(problem), SolverSettings(iterations=1))
+    assert solved.iterations == 1
+    assert not solved.converged

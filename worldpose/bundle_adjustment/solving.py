@@ -1,0 +1,229 @@
+"""Cameras and points adjusted together (B2): Levenberg-Marquardt on the reduced camera system."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
+from scipy.linalg.blas import dsyrk
+
+from data_contracts.records import Record
+from worldpose.bundle_adjustment.elimination import STEPS, Evidence, cost, eliminate, substitute
+from worldpose.cameras import Camera
+from worldpose.errors import InputError
+from worldpose.static_calibration import stepped
+
+Floats = NDArray[np.float64]
+
+BLOCK: Final = 256
+"""Points eliminated at a time: their rows for 18 cameras (1.3 MB) stay in the cache."""
+
+
+class SolverSettings(Record):
+    """When the solver stops, and how it begins."""
+
+    iterations: int = Field(default=50, ge=1)
+    """At most so many steps [1]; a dozen are usual."""
+    cost_change: float = Field(default=1e-8, gt=0)
+    """Relative gain of a step below which it is the last [1]: two orders below what moves a joint
+    by a tenth of a millimetre."""
+    damping: float = Field(default=1e-4, gt=0)
+    """Marquardt's, at the start [1]: starts are a few pixels off, where plain steps work."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is known: cameras and points roughly, pixels and priors.
+
+    Attributes:
+        cameras: (cameras,) batch with square pixels.
+        free: (cameras, 12) bool, parameters that may move, in the order of `PARAMETERS`.
+        camera_information: (cameras, 12, 12) of a step from `cameras`: what is known of them
+            beside the observations here.
+        points: (points, 3) [m], world.
+        point_information: (points,) [1/m^2] per axis; 0 = free, infinite = fixed where it is.
+        point_of: (n,) point of every observation, ascending.
+        camera_of: (n,) its camera.
+        image: (n, 2) [px].
+        weight: (n,) [1/px^2], one over the variance per image axis.
+        scale: (n,) standard deviations beyond which an observation counts less (Cauchy's loss);
+            infinite = plain squares.
+    """
+
+    cameras: Camera
+    free: NDArray[np.bool_]
+    camera_information: NDArray[np.float64]
+    points: NDArray[np.float64]
+    point_information: NDArray[np.float64]
+    point_of: NDArray[np.int64]
+    camera_of: NDArray[np.int64]
+    image: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    scale: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """The solution.
+
+    Attributes:
+        cameras: (cameras,) batch.
+        points: (points, 3) [m], world.
+        cost: robust sum of squares with priors.
+        start_cost: the same before.
+        iterations: steps that were tried.
+        converged: the last step gained less than asked for.
+        camera_covariance: (12 cameras, 12 cameras) of steps from the solution, the points being
+            free; zero for parameters that may not move.
+    """
+
+    cameras: Camera
+    points: NDArray[np.float64]
+    cost: float
+    start_cost: float
+    iterations: int
+    converged: bool
+    camera_covariance: NDArray[np.float64]
+
+
+def solve(problem: Problem, settings: SolverSettings | None = None) -> Adjusted:
+    """Return the cameras and points that explain all observations and priors best.
+
+    Raises:
+        InputError: a free point has fewer than two cameras, a point lies behind a camera that sees
+            it, or nothing fixes the cameras.
+    """
+    settings = settings or SolverSettings()
+    _require_two_views(problem)
+    system = _System(problem)
+    cameras, points = problem.cameras, problem.points
+    offset = np.zeros(problem.free.shape)
+    start_cost = system.cost(cameras, points, offset)
+    if not np.isfinite(start_cost):
+        raise InputError(
+            "bundle adjustment: start",
+            expected="every point in front of the cameras that see it",
+            found="points behind a camera, or beyond its lens model",
+            todo="Give cameras and points that project near their observations.",
+        )
+    reached, damping, converged, iteration = start_cost, settings.damping, False, 0
+    while iteration < settings.iterations and not converged:
+        iteration += 1
+        step, trial = system.step(cameras, points, damping, offset)
+        moved = stepped(cameras, step)
+        tried = system.cost(moved, trial, offset + step)
+        gain = reached - tried
+        # Where no step gains more than rounding can tell, it is at rest.
+        converged = abs(gain) < settings.cost_change * reached
+        if gain > 0.0:
+            cameras, points, offset, reached = moved, trial, offset + step, tried
+            damping = max(damping / 5.0, 1e-9)
+        else:
+            damping *= 8.0
+    covariance = system.covariance(cameras, points)
+    return Adjusted(cameras, points, reached, start_cost, iteration, converged, covariance)
+
+
+def _require_two_views(problem: Problem) -> None:
+    pairs = np.unique(problem.point_of * len(problem.free) + problem.camera_of)
+    views = np.bincount(pairs // len(problem.free), minlength=len(problem.points))
+    few = np.flatnonzero((problem.point_information == 0.0) & (views < 2))
+    if few.size:
+        raise InputError(
+            "bundle adjustment: points",
+            expected="two cameras or more for every point of unknown place",
+            found=f"{few.size} points with fewer, the first is number {few[0]}",
+            todo="Leave them out; one view tells no depth.",
+        )
+
+
+class _System:
+    """The normal equations of a problem, the points eliminated, with scratch arrays."""
+
+    def __init__(self, problem: Problem) -> None:
+        first_of = np.searchsorted(problem.point_of, np.arange(len(problem.points) + 1))
+        self.prior = problem.camera_information
+        self.evidence = Evidence(
+            problem.points,
+            problem.point_information,
+            first_of,
+            problem.camera_of,
+            problem.image,
+            problem.weight,
+            problem.scale,
+        )
+        self.free = np.flatnonzero(problem.free.ravel())
+        self.rows = np.zeros((3 * BLOCK, problem.free.size))
+        self.reduced = np.zeros(3 * BLOCK)
+
+    def cost(self, cameras: Camera, points: Floats, offset: Floats) -> float:
+        """The robust sum of squares with all priors."""
+        known = float(np.einsum("ci,cij,cj->", offset, self.prior, offset))
+        return cost(cameras.numbers, points, self.evidence) + known
+
+    def step(
+        self, cameras: Camera, points: Floats, damping: float, offset: Floats
+    ) -> tuple[Floats, Floats]:
+        """A damped step of the cameras (cameras, 12), and where the points go with it."""
+        matrix, diagonal, slope = self._assembled(cameras, points, damping)
+        matrix[np.diag_indices_from(matrix)] += damping * diagonal
+        slope += np.einsum("cij,cj->ci", self.prior, offset).ravel()
+        step = np.zeros(offset.shape)
+        step.ravel()[self.free] = -self._solved(matrix, slope[self.free])
+        trial = np.empty_like(points)
+        substitute(cameras.numbers, points, self.evidence, damping, step, trial)
+        return step, trial
+
+    def covariance(self, cameras: Camera, points: Floats) -> Floats:
+        """The inverse of the undamped system, zero where nothing is free."""
+        matrix, _, _ = self._assembled(cameras, points, 0.0)
+        covariance = np.zeros_like(matrix)
+        covariance[np.ix_(self.free, self.free)] = self._solved(matrix, np.eye(self.free.size))
+        return covariance
+
+    def _solved(self, matrix: Floats, right: Floats) -> Floats:
+        """The free part of the system solved; scaled, for its units differ by many powers of 10.
+
+        Raises:
+            InputError: the system is singular.
+        """
+        matrix = matrix[np.ix_(self.free, self.free)]
+        scale = 1.0 / np.sqrt(np.diag(matrix))
+        columns = scale if right.ndim == 1 else scale[:, None]
+        try:
+            factor = cho_factor(matrix * scale * scale[:, None])
+        except (LinAlgError, ValueError):
+            raise InputError(
+                "bundle adjustment",
+                expected="cameras that markings or prior knowledge hold in place",
+                found="a camera or the whole scene that can move without any residual",
+                todo="Add clicked markings, or fix what cannot be told.",
+            ) from None
+        return np.asarray(columns * cho_solve(factor, columns * right))
+
+    def _assembled(
+        self, cameras: Camera, points: Floats, damping: float
+    ) -> tuple[Floats, Floats, Floats]:
+        """The reduced matrix, the diagonal before the reduction, and the slope."""
+        numbers = cameras.numbers
+        width = self.rows.shape[1]
+        blocks = np.zeros((len(numbers), STEPS, STEPS))
+        gradient = np.zeros((len(numbers), STEPS))
+        loss = np.zeros((width, width), order="F")
+        lowered = np.zeros(width)
+        for first in range(0, len(points), BLOCK):
+            last = min(first + BLOCK, len(points))
+            rows, reduced = self.rows[: 3 * (last - first)], self.reduced[: 3 * (last - first)]
+            eliminate(
+                *(numbers, points, self.evidence, damping, first, last),
+                *(rows, reduced, blocks, gradient),
+            )
+            loss = dsyrk(1.0, rows.T, beta=1.0, c=loss, overwrite_c=True)
+            lowered += rows.T @ reduced
+        blocks = np.tril(blocks) + np.tril(blocks, -1).swapaxes(1, 2) + self.prior
+        matrix = block_diag(*blocks) - (np.triu(loss) + np.triu(loss, 1).T)
+        return matrix, np.diagonal(blocks, axis1=1, axis2=2).ravel(), gradient.ravel() - lowered
