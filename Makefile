@@ -17,13 +17,13 @@ $(INSTALLED): pyproject.toml constraints.txt
 demo: install
 	@rm -rf demo
 	@echo "1/4  a synthetic match with known truth"
-	@$(BIN)/worldpose simulate --scenario tiny --seed 1 --out demo/tiny
+	@$(BIN)/worldpose simulate --scenario match --seed 1 --duration 4 --out demo/match
 	@echo "2/4  the factory: Prefect flow, Dask tasks, Zarr store"
-	@$(BIN)/worldpose run demo/tiny --project demo/project
+	@$(BIN)/worldpose run demo/match --project demo/project
 	@echo "3/4  figures against truth"
-	@$(BIN)/worldpose evaluate --prediction demo/tiny --reference demo/tiny/reference --project demo/project
+	@$(BIN)/worldpose evaluate --prediction demo/match --reference demo/match/reference --project demo/project
 	@echo "4/4  the report"
-	@$(BIN)/worldpose report demo/tiny --project demo/project --out demo/report.html
+	@$(BIN)/worldpose report demo/match --project demo/project --out demo/report.html
 
 check: install
 	$(BIN)/ruff check .

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from data_contracts.arrays import GroupLayout
-from data_contracts.cameras import CAMERA_ARRAYS, CAMERA_LABELS
 from data_contracts.observations import FRAME, OBSERVATION_ARRAYS, OBSERVATION_LABELS
 
 INGEST = GroupLayout(
     stage="ingest",
-    about="Given calibration and given 2D poses of one camera, on the match's clock.",
+    about="Given 2D poses of one camera, on the match's clock.",
     coordinates=(FRAME,),
-    arrays=(*OBSERVATION_ARRAYS, *CAMERA_ARRAYS),
-    labels={**OBSERVATION_LABELS, **CAMERA_LABELS},
+    arrays=OBSERVATION_ARRAYS,
+    labels=OBSERVATION_LABELS,
     attributes={"camera_id": "camera of the match, or clip of its broadcast camera"},
-    optional=tuple(array.name for array in CAMERA_ARRAYS),
 )

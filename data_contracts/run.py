@@ -47,7 +47,7 @@ class Work(Record):
     project: str
     """Folder or URL of the store."""
     folder: str
-    """The match folder; read by `ingest` alone."""
+    """The match folder; read by `ingest` and `static_calibration` alone."""
     recipe: Recipe
     key: Key
     run_id: Name

@@ -9,6 +9,7 @@ from typing import Any
 
 from data_contracts.arrays import GroupLayout
 from data_contracts.body_fitting import BODY_FITTING
+from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
 from data_contracts.cameras import CameraCalibration
 from data_contracts.conventions import CONVENTIONS, Conventions
 from data_contracts.evaluation import Evaluation
@@ -18,7 +19,8 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.records import Record
 from data_contracts.review import Correction, ReviewDecision, ReviewRequest
 from data_contracts.run import Project, Reservation, ResultManifest, RunRecord
-from data_contracts.tracking import TRACKING, Track
+from data_contracts.static_calibration import STATIC_CALIBRATION, ClickedMarkings
+from data_contracts.tracking import TRACKING, Join, Track
 from data_contracts.triangulation import TRIANGULATION
 
 RECORDS: dict[str, type[Record]] = {
@@ -26,7 +28,9 @@ RECORDS: dict[str, type[Record]] = {
     "registration": Registration,
     "camera": CameraCalibration,
     "pitch": PitchSpec,
+    "clicked_markings": ClickedMarkings,
     "track": Track,
+    "join": Join,
     "review_request": ReviewRequest,
     "review_decision": ReviewDecision,
     "correction": Correction,
@@ -39,7 +43,14 @@ RECORDS: dict[str, type[Record]] = {
     "layout": GroupLayout,
 }
 
-LAYOUTS: tuple[GroupLayout, ...] = (INGEST, TRACKING, TRIANGULATION, BODY_FITTING)
+LAYOUTS: tuple[GroupLayout, ...] = (
+    INGEST,
+    STATIC_CALIBRATION,
+    TRACKING,
+    TRIANGULATION,
+    BUNDLE_ADJUSTMENT,
+    BODY_FITTING,
+)
 
 
 def documents() -> dict[str, Any]:

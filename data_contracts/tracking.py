@@ -50,7 +50,11 @@ TRACKING = GroupLayout(
         ),
     ),
     labels={"joint": COCO17, "coordinate": ("x", "y", "z")},
-    attributes={"camera": "camera ids in the order of the camera dimension"},
+    attributes={
+        "camera": "camera ids in the order of the camera dimension",
+        "tracks": "one `track` record a person",
+        "joins": "`join` records: the undecided first, then the dearest",
+    },
 )
 
 
@@ -66,3 +70,22 @@ class Track(Record):
     """Mean number of cameras in those frames."""
     name: Name | None = None
     """Roster id, where known."""
+
+
+class Join(Record):
+    """Two tracks that are, or may be, one person."""
+
+    before: int
+    """Person of the track that stops."""
+    after: int
+    """Person of the track that begins; the same where it was decided."""
+    last_frame: int
+    """Last frame of the first track, counted from the clip's first."""
+    first_frame: int
+    """First frame of the second."""
+    cost: float
+    """Minus the logarithm of the odds that they are one person and not two strangers [1]."""
+    margin: float | None
+    """Logarithm of the odds of this join against every other way [1]; None = beyond doubt."""
+    decided: bool
+    """Whether they were joined; otherwise a person has to say."""

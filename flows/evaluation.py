@@ -16,7 +16,7 @@ from worldpose.evaluation import CameraScore, PersonScore, evaluate_cameras, eva
 from worldpose.ingest import MatchFolder, read_match
 from worldpose.pitch import PitchTemplate
 from worldpose.release import JointTracks, read_camera, read_joints
-from worldpose.store import Run, Store, open_run
+from worldpose.store import Store, open_run
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +123,9 @@ def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str
         return _reference(name)
     match = find_match(Store.open(project), name)
     run = open_run(project, match.match_id, run_id)
-    cameras = _run_cameras(run, match.folder.spec) if truth.cameras else {}
-    if cameras and not any(unit.partition("/")[0] in JOINT_STAGES for unit in run):
+    spec = match.folder.spec
+    placed = any(unit.partition("/")[0] in JOINT_STAGES for unit in run)
+    if not placed and truth.cameras and (cameras := static_cameras(run, spec)):
         return Side(None, cameras, match.folder)
     clips = clips_of(run.record)
     if len(clips) > 1:
@@ -134,12 +135,8 @@ def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str
             found=f"a match of {len(clips)} clips",
             todo="Export it and score clip by clip.",
         )
+    cameras = static_cameras(run, spec, clips[0], stage) if truth.cameras else {}
     return Side(joint_tracks(run, clips[0], stage), cameras, match.folder)
-
-
-def _run_cameras(run: Run, spec: MatchSpec) -> dict[str, Camera]:
-    """The cameras that a run used or found, by camera or clip."""
-    return static_cameras(run, spec)
 
 
 def _sized(reference: str, truth: Side, spec: MatchSpec | None) -> dict[str, Camera]:

@@ -28,15 +28,13 @@ def inputs(match: Match, unit: str) -> tuple[str, ...]:
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The unit's detections and calibration, and how its frames lie on the match's clock."""
+    """The unit's detections, and how its frames lie on the match's clock."""
     folder = match.folder
     path = folder.detections[unit].relative_to(folder.folder).as_posix()
-    calibration = folder.calibrations.get(unit)
     frames = unit_frames(folder.spec, unit)
     return {
         "detections": path,
         "detections_sha256": match.registration.digest_of(path),
-        "calibration": None if calibration is None else calibration.model_dump(mode="json"),
         "first_frame": frames.first,
         "frame_count": frames.count,
         "offset_frames": frames.offset,
@@ -45,7 +43,7 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
 
 STAGE = Stage(
     name="ingest",
-    about="take in given cameras and 2D poses",
+    about="take in 2D poses",
     settings=IngestSettings,
     units=units,
     inputs=inputs,

@@ -6,12 +6,12 @@ hold the places of those to come, with their units and checklist ids.
 
 from __future__ import annotations
 
-from flows import ingest, tracking, triangulation
+from flows import ingest, static_calibration, tracking, triangulation
 from flows.stage import Stage
 
 METHOD: tuple[Stage, ...] = (
     ingest.STAGE,  # [camera]
-    # static_calibration [camera]       clicked markings to cameras, C1-C5; then a gate, C7
+    static_calibration.STAGE,  # [camera]  C1-C5; then a gate, C7
     # detection [camera, chunk]         people and keypoints from pixels, D1-D5; then a gate, D6
     tracking.STAGE,  # [clip]           T1, T2
     triangulation.STAGE,  # [clip]      T3, T4; then a gate

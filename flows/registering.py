@@ -14,6 +14,7 @@ from worldpose.ingest import (
     register_match,
     require_calibrated,
 )
+from worldpose.ingest.stills import read_still
 from worldpose.store import Store
 
 
@@ -43,7 +44,7 @@ def register(store: Store, folder: Path) -> tuple[Match, bool]:
         if previous == registration:
             return match, False
     _refuse_duplicate(store, registration)
-    _read_new_detections(match_folder, registration, previous)
+    _read_new_files(match_folder, registration, previous)
     store.register(registration)
     return match, True
 
@@ -116,14 +117,22 @@ def _refuse_duplicate(store: Store, registration: Registration) -> None:
             )
 
 
-def _read_new_detections(
+def _read_new_files(
     match: MatchFolder, registration: Registration, previous: Registration | None
 ) -> None:
-    """Refuse broken 2D poses now, by file and place, rather than in the middle of a run."""
+    """Refuse broken 2D poses and stills now, by file and place, not in the middle of a run."""
     known = {source.sha256 for source in previous.files} if previous is not None else set()
+
+    def is_new(path: Path) -> bool:
+        return registration.digest_of(path.relative_to(match.folder).as_posix()) not in known
+
     for unit, path in match.detections.items():
-        if registration.digest_of(path.relative_to(match.folder).as_posix()) not in known:
+        if is_new(path):
             read_unit(match, unit)
+    for name, path in match.stills.items():
+        camera = match.spec.camera(name)
+        if is_new(path):
+            read_still(path, (camera.width, camera.height))
 
 
 def _changes(before: tuple[SourceFile, ...], after: tuple[SourceFile, ...]) -> str:

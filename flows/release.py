@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,7 +16,10 @@ from worldpose.errors import UsageError, WorldposeError
 from worldpose.release import JointTracks, coco_dataset, write_coco, write_joints
 from worldpose.store import Run
 
-JOINT_STAGES = ("triangulation",)
+if TYPE_CHECKING:
+    import xarray as xr
+
+JOINT_STAGES = ("triangulation", "bundle_adjustment")
 """Stages that give 3D joints, the best last."""
 
 
@@ -41,16 +45,25 @@ def joint_tracks(run: Run, clip: str, stage: str | None = None) -> JointTracks:
     Raises:
         UsageError: the run has no such result.
     """
+    result = joint_result(run, clip, stage)
+    return JointTracks(
+        frames=result["frame"].values,
+        person_ids=result["person"].values.astype(np.int64),
+        joints=result["joints"].values,
+        covariance=result["covariance"].values,
+        views=result["views"].values.astype(np.int64),
+    )
+
+
+def joint_result(run: Run, clip: str, stage: str | None = None) -> xr.Dataset:
+    """The result with the joints of one clip, of the best stage or of the stage asked for.
+
+    Raises:
+        UsageError: the run has no such result.
+    """
     for name in (f"{name}/{clip}" for name in reversed(JOINT_STAGES) if stage in (None, name)):
         if name in run:
-            result = run[name]
-            return JointTracks(
-                frames=result["frame"].values,
-                person_ids=result["person"].values.astype(np.int64),
-                joints=result["joints"].values,
-                covariance=result["covariance"].values,
-                views=result["views"].values.astype(np.int64),
-            )
+            return run[name]
     raise UsageError(
         f"--stage {stage}" if stage else f"clip {clip}",
         expected=f"a result with joints: {', '.join(JOINT_STAGES)}",
@@ -76,8 +89,8 @@ def export_coco(run: Run, spec: MatchSpec, out: Path) -> list[Path]:
     written = []
     for clip in clips:
         tracks = joint_tracks(run, clip)
-        inliers = run[f"triangulation/{clip}"]["inliers"]
-        for camera_id, camera in static_cameras(run, spec).items():
+        inliers = joint_result(run, clip)["inliers"]
+        for camera_id, camera in static_cameras(run, spec, clip).items():
             dataset = coco_dataset(
                 camera_id,
                 camera,
@@ -91,12 +104,29 @@ def export_coco(run: Run, spec: MatchSpec, out: Path) -> list[Path]:
     return written
 
 
-def static_cameras(run: Run, spec: MatchSpec) -> dict[str, Camera]:
-    """The static cameras that a run used, by id."""
-    return {
-        camera.id: camera_from_arrays(run[f"ingest/{camera.id}"].data_vars)
-        for camera in spec.static_cameras
+def static_cameras(
+    run: Run, spec: MatchSpec, clip: str | None = None, stage: str | None = None
+) -> dict[str, Camera]:
+    """The static cameras that a run has, by id; all of them where it has joints.
+
+    Args:
+        run: the run.
+        spec: the match.
+        clip: as the joints of this clip were placed with them; None = as they were calibrated.
+        stage: as the joints of this stage were, instead of the best one's.
+    """
+    units = {camera.id: f"static_calibration/{camera.id}" for camera in spec.static_cameras}
+    cameras = {
+        camera_id: camera_from_arrays(run[unit].data_vars)
+        for camera_id, unit in units.items()
+        if unit in run
     }
+    adjusted = f"bundle_adjustment/{clip}"
+    if adjusted in run and stage in (None, "bundle_adjustment"):
+        result = run[adjusted]
+        batch = camera_from_arrays(result.data_vars)
+        cameras |= {str(name): batch[k] for k, name in enumerate(result["camera"].values)}
+    return cameras
 
 
 EXPORTS: dict[str, Callable[[Run, MatchSpec, Path], list[Path]]] = {

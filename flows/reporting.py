@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from data_contracts.evaluation import Evaluation
+from flows.camera_reporting import camera_pictures, camera_summaries, still_of
 from flows.evaluation import load_reference, score
-from flows.release import clips_of, joint_tracks, static_cameras
+from flows.release import clips_of, joint_result, joint_tracks, static_cameras
 from flows.stage import Match
+from worldpose.cameras import Camera
 from worldpose.release import JointTracks, Picture, report_page, whole_file
 from worldpose.release.pictures import paths_picture, view_picture
+from worldpose.release.stadium_pictures import camera_picture, stadium_picture
 from worldpose.store import Run, Store, open_run
 
 
@@ -38,13 +42,21 @@ def write_report(
     for name, key in run.record.results.items():
         stage, _, unit = name.partition("/")
         seconds[name] = store.manifest(match.match_id, stage, unit, key).seconds
-    pictures = [picture for clip in clips for picture in _pictures(run, match, clip, truth)]
+    cameras = static_cameras(run, match.folder.spec)
     page = report_page(
         f"{match.match_id}, run {run.record.run_id}",
         run.record,
         seconds=seconds,
         scores=scores,
-        pictures=pictures,
+        pictures=[
+            picture
+            for clip in clips
+            for picture in _pictures(
+                run, match, clip, static_cameras(run, match.folder.spec, clip), truth
+            )
+        ],
+        cameras=camera_summaries(run, match.folder.spec),
+        camera_pictures=camera_pictures(store, run, match, cameras),
     )
     with whole_file(out) as draft:
         draft.write_text(page, encoding="utf-8")
@@ -55,14 +67,35 @@ def _own_reference(match: Match) -> str | None:
     return str(folder) if (folder / "joints.npz").is_file() else None
 
 
-def _pictures(run: Run, match: Match, clip: str, truth: JointTracks | None) -> list[Picture]:
-    """People from above, and the frame and camera in which most of them were seen."""
-    cameras = static_cameras(run, match.folder.spec)
+def _pictures(
+    run: Run, match: Match, clip: str, cameras: Mapping[str, Camera], truth: JointTracks | None
+) -> list[Picture]:
+    """The stadium from a camera and from above, people's ways, and the view with most people."""
     tracks = joint_tracks(run, clip)
     pitch = match.folder.pitch
+    seen = joint_result(run, clip)["inliers"].any("joint").sum("person").values
+    pictures = []
+    if len(tracks.frames):
+        first = int(tracks.frames[0])
+        widest = list(cameras)[int(seen[0].argmax())]
+        still = still_of(match, widest)
+        here = f"Clip {clip}, frame {first}"
+        beneath = "" if still is None else ", over its still"
+        pictures = [
+            Picture(
+                f"{here}, from camera {widest}: markings and people as the found cameras and "
+                f"joints put them{beneath}.",
+                camera_picture(
+                    cameras[widest], f"camera {widest}", tracks, 0, still=still, pitch=pitch
+                ),
+            ),
+            Picture(
+                f"{here}, from above. The more cameras see a place, the darker it is.",
+                stadium_picture(cameras, "", tracks, 0, pitch=pitch),
+            ),
+        ]
     above = paths_picture(tracks, truth=truth, cameras=cameras, pitch=pitch)
-    pictures = [Picture(f"Clip {clip} from above.", above)]
-    seen = run[f"triangulation/{clip}"]["inliers"].any("joint").sum("person").values
+    pictures.append(Picture(f"Clip {clip}: everybody's way.", above))
     if not seen.any():
         return pictures
     frame, camera = np.unravel_index(int(seen.argmax()), seen.shape)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import JsonValue
 
 from flows.stage import Match, Stage
-from worldpose.tracking import TrackingSettings
+from worldpose.tracking import TrackingSettings, people_allowed
 
 
 def units(match: Match) -> tuple[str, ...]:
@@ -14,12 +14,14 @@ def units(match: Match) -> tuple[str, ...]:
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """What every static camera brought in."""
-    return tuple(f"ingest/{camera.id}" for camera in match.folder.spec.static_cameras)
+    """Every static camera, and what it brought in."""
+    cameras = [camera.id for camera in match.folder.spec.static_cameras]
+    stages = ("ingest", "static_calibration")
+    return tuple(f"{stage}/{camera}" for stage in stages for camera in cameras)
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The clip's place in the match, the clock, and the order of the cameras."""
+    """The clip's place in the match, the clock, the order of the cameras, the pitch, the roster."""
     spec = match.folder.spec
     clip = spec.clip(unit)
     return {
@@ -27,6 +29,8 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
         "first_frame": clip.first_frame,
         "frame_count": clip.frame_count,
         "fps": spec.fps,
+        "ground": match.folder.pitch is not None,
+        "people": people_allowed(spec.roster),
     }
 
 

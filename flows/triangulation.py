@@ -1,4 +1,4 @@
-"""Stage `triangulation`: one unit a clip, from its tracks and all static cameras (T3)."""
+"""Stage `triangulation`: one unit a clip, from its tracks and all static cameras (T3, T4)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from worldpose.triangulation import TriangulationSettings
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """What every static camera brought in, and who is who."""
+    """Every static camera, what it brought in, and who is who."""
     return (*tracking.inputs(match, unit), f"tracking/{unit}")
 
 

@@ -41,8 +41,8 @@ def open_clip(store: Store, work: Work) -> ClipInputs:
     camera_ids = tuple(sources["cameras"])
     first, count = sources["first_frame"], sources["frame_count"]
     frame = np.arange(first, first + count)
-    ingested = [open_input(store, work, f"ingest/{camera}") for camera in camera_ids]
-    clips = [camera.sel(frame=frame) for camera in ingested]
+    clips = [open_input(store, work, f"ingest/{camera}").sel(frame=frame) for camera in camera_ids]
+    cameras = [open_input(store, work, f"static_calibration/{camera}") for camera in camera_ids]
     detections = max(1, *(clip.sizes["detection"] for clip in clips))
     shape = (count, len(camera_ids), detections, clips[0].sizes["joint"])
     keypoints = np.full((*shape, 2), np.nan)
@@ -53,7 +53,7 @@ def open_clip(store: Store, work: Work) -> ClipInputs:
         confidence[:, index, :present] = clip["confidence"].values
     return ClipInputs(
         camera_ids=camera_ids,
-        cameras=Camera.stack([camera_from_arrays(camera) for camera in ingested]),
+        cameras=Camera.stack([camera_from_arrays(camera.data_vars) for camera in cameras]),
         frame=frame,
         keypoints=keypoints,
         confidence=confidence,

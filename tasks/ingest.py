@@ -1,4 +1,4 @@
-"""Task of stage `ingest`: one camera's given calibration and 2D poses into the store."""
+"""Task of stage `ingest`: one camera's 2D poses into the store."""
 
 from __future__ import annotations
 
@@ -8,14 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.cameras import CameraCalibration
 from data_contracts.ingest import INGEST
 from data_contracts.run import Work
 from tasks.unit import unit_task
-from worldpose.cameras import Camera
-from worldpose.cameras.stored import camera_arrays
 from worldpose.errors import InputError
 from worldpose.ingest import Observations, read_observations
 from worldpose.store import Store
@@ -23,17 +19,12 @@ from worldpose.store import Store
 
 @unit_task
 def ingest(work: Work) -> str:
-    """Publishes the observations, and the camera where it is given; returns the key."""
-    sources = work.recipe.sources
+    """Publishes the observations; returns the key."""
     with Store.open(work.project).publishing(work) as result:
         observations = _observations(work)
-        arrays: dict[str, NDArray[Any]] = dict(observations.arrays())
-        if sources["calibration"] is not None:
-            calibration = CameraCalibration.model_validate(sources["calibration"])
-            arrays |= camera_arrays(Camera.from_calibration(calibration))
         result.write(
             INGEST,
-            arrays=arrays,
+            arrays=observations.arrays(),
             coordinates={"frame": observations.frame},
             attributes={"camera_id": work.recipe.unit},
         )

@@ -22,6 +22,8 @@ def tracking(work: Work) -> str:
             clip.confidence,
             clip.fps,
             TrackingSettings.model_validate(work.recipe.settings),
+            ground=bool(work.recipe.sources["ground"]),
+            people=work.recipe.sources["people"],
         )
         result.write(
             TRACKING,
@@ -31,7 +33,11 @@ def tracking(work: Work) -> str:
                 "joints": tracks.joints,
             },
             coordinates={"frame": clip.frame, "person": tracks.person},
-            attributes={"camera": list(clip.camera_ids)},
+            attributes={
+                "camera": list(clip.camera_ids),
+                "tracks": [track.model_dump(mode="json") for track in tracks.tracks],
+                "joins": [join.model_dump(mode="json") for join in tracks.joins],
+            },
         )
         result.figures.update(figures_of(tracks.report, clip.camera_ids))
     return work.key

@@ -7,7 +7,7 @@ from data_contracts.triangulation import TRIANGULATION
 from tasks.clip_inputs import open_clip
 from tasks.unit import figures_of, open_input, unit_task
 from worldpose.store import Store
-from worldpose.triangulation import TriangulationSettings, triangulate_joints
+from worldpose.triangulation import TriangulationSettings, reconstruct_joints
 
 
 @unit_task
@@ -17,24 +17,34 @@ def triangulation(work: Work) -> str:
     with store.publishing(work) as result:
         clip = open_clip(store, work)
         tracks = open_input(store, work, f"tracking/{work.recipe.unit}")
-        joints = triangulate_joints(
+        found = reconstruct_joints(
             clip.cameras,
             clip.keypoints,
             clip.confidence,
             tracks["detection_index"].values,
+            clip.fps,
             TriangulationSettings.model_validate(work.recipe.settings),
         )
+        joints, smooth = found.triangulation, found.smoothing
         result.write(
             TRIANGULATION,
             arrays={
                 "joints": joints.joints,
                 "covariance": joints.covariance,
                 "views": joints.views,
+                "spread": joints.spread,
                 "reprojection_error": joints.reprojection_error,
                 "inliers": joints.inliers,
+                "offsets": joints.offsets.astype("float32"),
+                "smoothed": smooth.joints,
+                "smoothed_covariance": smooth.covariance,
+                "filled": smooth.filled,
+                "clock_late": found.clocks.late,
+                "clock_error": found.clocks.standard_error,
             },
             coordinates={"frame": clip.frame, "person": tracks["person"].values},
             attributes={"camera": list(clip.camera_ids)},
         )
-        result.figures.update(figures_of(joints.report, clip.camera_ids))
+        for report in (joints.report, smooth.report, found.clocks.report):
+            result.figures.update(figures_of(report, clip.camera_ids))
     return work.key

@@ -28,7 +28,8 @@ def server(tmp_path_factory):
 def tiny(tmp_path_factory):
     """A small synthetic match folder with truth; read only."""
     folder = tmp_path_factory.mktemp("matches") / "tiny"
-    succeed("simulate", "--scenario", "tiny", "--seed", 3, "--duration", 1.2, "--out", folder)
+    tiny = ("--scenario", "tiny", "--seed", 3, "--duration", 1.2, "--no-stills")
+    succeed("simulate", *tiny, "--out", folder)
     return folder
 
 

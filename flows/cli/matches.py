@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isnan
 from pathlib import Path
 from typing import Annotated
 
@@ -34,6 +35,15 @@ def simulate(
     trajectories: Annotated[
         Path | None, typer.Option(help="Tracking data (npz) that drives the people.")
     ] = None,
+    mocap: Annotated[
+        Path | None, typer.Option(help="Motion capture (BVH) that one of the people plays.")
+    ] = None,
+    calibrated: Annotated[
+        bool, typer.Option("--calibrated", help="Give the exact static cameras too.")
+    ] = False,
+    stills: Annotated[
+        bool, typer.Option(help="Draw one picture of every static camera, about 1 s each.")
+    ] = True,
     as_json: JsonOption = False,
 ) -> None:
     """Make a synthetic match folder with known truth.
@@ -68,6 +78,9 @@ def simulate(
         cameras=cameras,
         players=players,
         trajectories=trajectories,
+        mocap=mocap,
+        calibrated=calibrated,
+        stills=stills,
     )
     if as_json:
         print_json({"match": spec.match_id, "folder": str(out)})
@@ -76,22 +89,48 @@ def simulate(
 
 
 def import_command(
+    out: Annotated[Path, typer.Option("--out", help="Match folder to make, or to add to.")],
     calibration: Annotated[
-        Path,
+        Path | None,
         typer.Option(help="Cameras: Anipose, Pose2Sim or caliscope TOML, or Qualisys XML."),
-    ],
-    detections: Annotated[Path, typer.Option(help="COCO keypoint results, <camera>.json.")],
-    fps: Annotated[float, typer.Option(help="Frames a second.")],
-    out: Annotated[Path, typer.Option("--out", help="Match folder to make.")],
+    ] = None,
+    detections: Annotated[
+        Path | None, typer.Option(help="COCO keypoint results, <camera>.json.")
+    ] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames a second.")] = None,
     match_id: Annotated[
         str | None, typer.Option(help="Id of the match; the folder's name by default.")
     ] = None,
+    pitch: Annotated[
+        Path | None,
+        typer.Option(help="Survey of the markings, CSV: writes pitch.json, asks for no more."),
+    ] = None,
+    left_handed: Annotated[
+        bool, typer.Option("--left-handed", help="The survey's x, y and height are left-handed.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Bring calibration and 2D poses of other tools into a match folder.
+    """Bring calibration and 2D poses of other tools, or a surveyed pitch, into a match folder.
 
     Example: worldpose import --calibration cal.toml --detections poses --fps 25 --out matches/lab
     """
+    if pitch is not None:
+        if calibration or detections or fps or match_id:
+            raise UsageError(
+                "--pitch",
+                expected="--pitch with --out alone",
+                found="options of a match",
+                todo="Import the match first, then the pitch into its folder.",
+            )
+        import_pitch(pitch, out, left_handed=left_handed, as_json=as_json)
+        return
+    if calibration is None or detections is None or fps is None:
+        raise UsageError(
+            "worldpose import",
+            expected="--calibration, --detections and --fps, or --pitch",
+            found="some of them missing",
+            todo="See worldpose import --help.",
+        )
     spec = import_match(calibration, detections, fps, out, match_id=match_id)
     if as_json:
         print_json({"match": spec.match_id, "folder": str(out)})
@@ -101,6 +140,56 @@ def import_command(
             f"made match {spec.match_id} in {out}: {len(spec.cameras)} cameras, frames "
             f"{clip.first_frame} to {clip.first_frame + clip.frame_count - 1}"
         )
+
+
+def import_pitch(survey: Path, out: Path, *, left_handed: bool, as_json: bool) -> None:
+    """Lay a survey onto the world frame, write pitch.json and say how it fits."""
+    from worldpose.pitch.survey import fit_survey
+    from worldpose.pitch.survey_file import read_survey
+    from worldpose.pitch.survey_settings import SurveySettings
+    from worldpose.release import whole_file
+
+    file = out / "pitch.json"
+    if file.exists():
+        raise UsageError(
+            str(file),
+            expected="no pitch there yet",
+            found="one",
+            todo="Move it away first; another pitch makes another match.",
+        )
+    fit = fit_survey(read_survey(survey), SurveySettings(left_handed=left_handed))
+    with whole_file(file) as draft:
+        draft.write_text(fit.pitch.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    rows = sorted(
+        zip(fit.names, fit.offset_plan.tolist(), fit.offset_height.tolist(), strict=True),
+        key=lambda row: -row[1],
+    )
+    size = {name: getattr(fit.pitch, name) for name in ("length", "width", "crown")}
+    if as_json:
+        heights = {name: None if isnan(height) else height for name, _, height in rows}
+        print_json(
+            {
+                "pitch": str(file),
+                **size,
+                "measured": fit.measured,
+                "scale": fit.scale,
+                "slope": fit.slope,
+                "offset_plan_m": {name: plan for name, plan, _ in rows},
+                "offset_height_m": heights,
+            }
+        )
+        return
+    line(f"wrote {file}")
+    for name, value in size.items():
+        line(f"{name}: {value:.3f} m{'' if name in fit.measured else ' (the survey cannot tell)'}")
+    line(f"lengths of the survey over true ones: {fit.scale:.5f} (kept as they are)")
+    line(f"levelled a slope of {100 * fit.slope[0]:.2f} % along x, {100 * fit.slope[1]:.2f} % in y")
+    shown = [(name, f"{1e3 * plan:.0f}", _millimetres(height)) for name, plan, height in rows]
+    print_table("off the Laws of the Game", ("point", ">in plan mm", ">above surface mm"), shown)
+
+
+def _millimetres(height: float) -> str:
+    return "-" if isnan(height) else f"{1e3 * height:+.0f}"
 
 
 def ingest(

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from flows.cli.ablation import print_ablation
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -55,18 +56,18 @@ def export(
 
 def evaluate(
     prediction: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--prediction",
             help="A joints file, a folder with joints.npz and cameras/, or a match of the project.",
         ),
-    ],
+    ] = None,
     reference: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--reference", help="A joints file, or a folder with joints.npz, cameras/ or both."
         ),
-    ],
+    ] = None,
     run: RunOption = "latest",
     stage: Annotated[
         str | None, typer.Option("--stage", help="Score this stage's joints; the best by default.")
@@ -84,6 +85,15 @@ def evaluate(
         float | None,
         typer.Option("--fps", min=0.001, help="Frames in a second; the match's by default."),
     ] = None,
+    ablation: Annotated[
+        int,
+        typer.Option(
+            "--ablation",
+            metavar="SEEDS",
+            min=0,
+            help="Simulate so many penalty-box trials and print the paper's ablation instead.",
+        ),
+    ] = 0,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -91,6 +101,16 @@ def evaluate(
 
     Example: worldpose evaluate --prediction tiny --reference matches/tiny/reference
     """
+    if ablation:
+        print_ablation(ablation, as_json=as_json)
+        return
+    if prediction is None or reference is None:
+        raise UsageError(
+            "worldpose evaluate",
+            expected="--prediction and --reference",
+            found="one of them or none",
+            todo="Name what is scored and the truth, or ask for --ablation 10.",
+        )
     from flows.evaluation import score
     from worldpose.release.meanings import score_rows
 

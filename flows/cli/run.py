@@ -89,7 +89,7 @@ def _print_settings(as_json: bool) -> None:
     rows = [
         (
             f"{stage.name}.{name}",
-            json.dumps(field.default),
+            json.dumps(stage.settings().model_dump(mode="json")[name]),
             " ".join((field.description or "").split()),
         )
         for stage in METHOD

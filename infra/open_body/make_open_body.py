@@ -5,7 +5,8 @@
 Needs an environment of its own: numpy scipy torch anny==0.6.2 trimesh rtree fast-simplification.
 docs/body_model.md says what is made and under which terms. Bodies are drawn from the MakeHuman
 phenotypes of adults, brought to one T-pose, reduced to 6890 vertices, and their variation written
-as ten principal components. Metres, y up, facing +z, left arm at +x.
+as ten principal components; pose correctives are in `pose_correctives`. Metres, y up, facing +z,
+left arm at +x.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import scipy.sparse
 import torch
 import trimesh
 from numpy.typing import NDArray
+from pose_correctives import fit_correctives
 from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 
@@ -28,6 +30,8 @@ Array = NDArray[np.float64]
 
 VERTICES, SHAPES, SAMPLES, SEED = 6890, 10, 400, 0
 JOINTS = 24
+GRAIN = 2.0**-16
+"""Shape directions are multiples of that [m], so that the file stays small."""
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 
 CENTRAL_BONES = {0: "root", 3: "spine04", 6: "spine02", 9: "spine01", 12: "neck01", 15: "head"}
@@ -289,6 +293,16 @@ def _t_pose_bones(joints: Array) -> tuple[Array, Array]:
     return rotations, posed
 
 
+def sculpted_pose(joints: Array) -> Array:
+    """Rotations (24, 3, 3) relative to the parents that take the T-pose to MakeHuman's own."""
+    back = _t_pose_bones(joints.mean(0, keepdims=True))[0][0].transpose(0, 2, 1)
+    local = back.copy()
+    for joint, parent in enumerate(PARENTS):
+        if parent >= 0:
+            local[joint] = back[parent].T @ back[joint]
+    return local
+
+
 def _unit(vectors: Array) -> Array:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
@@ -339,6 +353,10 @@ def main(out: Path) -> None:
     # SMPL's pelvis stands about there; only habit, as the pivot is the pelvis joint itself.
     shift = np.array([0, -0.22, 0]) - joints[:, :1]
     vertices, joints = vertices + shift, joints + shift
+    offsets, correctives = fit_correctives(
+        vertices.mean(0), joints.mean(0), weights, faces, sculpted_pose(bodies.joints())
+    )
+    vertices = vertices + offsets
 
     template = vertices.mean(0)
     spread = (vertices - template).reshape(SAMPLES, -1)
@@ -347,14 +365,15 @@ def main(out: Path) -> None:
     directions = directions.reshape(SHAPES, VERTICES, 3)
     top = np.argmax(template[:, 1])
     directions *= np.where(directions[:, top, 1] < 0, -1, 1)[:, None, None]  # positive is taller
+    directions = np.round(directions / GRAIN) * GRAIN
     regressor = fit_joint_regressor(vertices, joints, weights)
 
     np.savez_compressed(
         out,
-        name="open-neutral/1",
+        name="open-neutral/2",
         v_template=template.astype(np.float32),
         shapedirs=directions.transpose(1, 2, 0).astype(np.float32),
-        posedirs=np.zeros((VERTICES, 3, 0), np.float32),
+        posedirs=correctives.astype(np.float32),
         J_regressor=regressor.astype(np.float32),
         weights=weights.astype(np.float32),
         kintree_table=np.array([PARENTS, range(JOINTS)], dtype=np.int64),
@@ -365,6 +384,7 @@ def main(out: Path) -> None:
     lines = (
         f"variance explained {np.round((sizes**2).cumsum()[:SHAPES] / (sizes**2).sum(), 4)}",
         f"joint regression error [mm] {np.round(1e3 * errors, 1)}",
+        f"corrected vertices {correctives.any(axis=(1, 2)).sum()}",
         f"height [m] mean {heights.mean():.3f} sd {heights.std():.3f}, {len(faces)} triangles",
     )
     sys.stdout.write("\n".join(lines) + "\n")

@@ -23,6 +23,7 @@ STAGES_IN_WORLDPOSE = (
     "cameras",
     "pitch",
     "ingest",
+    "static_calibration",
     "tracking",
     "triangulation",
     "release",

@@ -42,7 +42,7 @@ def quick(points, kept):
 
 @pytest.mark.parametrize("point", quick(IN_WORKER, {"before_commit"}))
 def test_a_worker_killed_at_a_commit_point_is_replaced(point, tiny, tiny_run, tmp_path):
-    # Two workers share eight units, so one of them comes to the point a third time.
+    # Two workers share more than a dozen units, so one of them comes to the point a third time.
     environment, struck = fault_environment(tmp_path, point, skip=2)
     project = tmp_path / "worldpose-data"
     succeed("run", tiny, "--project", project, "--workers", 2, environment=environment)

@@ -1,5 +1,6 @@
 """Bad input: one clear message with file, key, expected, found and what to do; nothing changed."""
 
+import json
 import shutil
 
 import numpy as np
@@ -64,17 +65,30 @@ def missing_camera(match):
     return [f"missing camera {path.stem}", f"detections/{path.stem}.json"]
 
 
-def missing_calibration(match):
-    import tomllib
+def a_clicked_file(match):
+    return sorted((match / "annotations" / "static_calibration").iterdir())[1]
 
-    path = match / "calibration.toml"
-    cameras = tomllib.loads(path.read_text())
-    first = next(iter(cameras))
-    text = path.read_text()
-    start = text.index(f"[{first}]")
-    end = text.index("\n[", start + 1)
-    path.write_text(text[:start] + text[end + 1 :])
-    return ["calibration.toml", "missing camera"]
+
+def missing_clicks(match):
+    path = a_clicked_file(match)
+    path.unlink()
+    return [f"missing camera {path.stem}", path.name, "at least four points", "calibration.toml"]
+
+
+def unknown_marking(match):
+    path = a_clicked_file(match)
+    content = json.loads(path.read_text())
+    content["points"][2]["name"] = "corner_left_nera"
+    path.write_text(json.dumps(content))
+    return [f"{path.name}: points[2].name", "'corner_left_nera'", "Did you mean"]
+
+
+def click_outside(match):
+    path = a_clicked_file(match)
+    content = json.loads(path.read_text())
+    content["points"][0]["xy"] = [5000, 3]
+    path.write_text(json.dumps(content))
+    return [f"{path.name}: points[0].xy", "in the picture", "5000"]
 
 
 def unknown_key(match):
@@ -84,7 +98,11 @@ def unknown_key(match):
 
 
 @pytest.mark.parametrize(
-    "spoil", [truncate, nan_keypoint, missing_camera, missing_calibration, unknown_key]
+    "spoil",
+    [
+        *(truncate, nan_keypoint, missing_camera, unknown_key),
+        *(missing_clicks, unknown_marking, click_outside),
+    ],
 )
 def test_a_spoilt_match_is_refused(spoil, match, project_copy):
     rename_match(match)
@@ -141,7 +159,7 @@ def test_ingesting_twice_says_so_and_changes_nothing(tiny, project_copy):
         (["--set", "triangulation.min_views=many"], "integer"),
         (["--set", "min_views"], "stage.name=value"),
         (["--from", "triangulation", "--until", "tracking"], "Swap them"),
-        (["--until", "body"], "one of ingest, tracking, triangulation"),
+        (["--until", "body"], "one of ingest, static_calibration, tracking, triangulation"),
     ],
 )
 def test_a_setting_or_stage_that_does_not_exist_is_a_usage_error(

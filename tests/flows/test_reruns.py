@@ -92,8 +92,12 @@ def test_an_edited_detection_file_is_another_match(tiny, project_copy, tmp_path)
 
 def test_a_moved_camera_recomputes_all_that_sees_through_it(tiny, tmp_path, server):
     moved = shutil.copytree(tiny, tmp_path / "tiny")
+    shutil.copy(moved / "reference" / "calibration.toml", moved)  # given cameras win over clicks
     project = tmp_path / "worldpose-data"
     run_json(moved, "--project", project)
+    run = open_run(str(project), TINY)
+    cameras = [name for name in run if name.startswith("static_calibration/")]
+    assert {run[name].attrs["origin"] for name in cameras} == {"given"}
     calibration = moved / "calibration.toml"
     lines = calibration.read_text().splitlines()
     row = next(number for number, line in enumerate(lines) if line.startswith("translation"))
@@ -102,7 +106,7 @@ def test_a_moved_camera_recomputes_all_that_sees_through_it(tiny, tmp_path, serv
     lines[row] = f"translation = {json.dumps(numbers)}"
     calibration.write_text("\n".join(lines) + "\n")
     answer = run_json(moved, "--project", project)
-    # One camera is taken in again; tracking and triangulation of the clip depend on it.
+    # One camera is taken anew; tracking and triangulation of the clip depend on it.
     assert answer["executed"] == 3
     assert answer["reused"] == len(Store.open(str(project)).run(TINY, "0001").results) - 3
 

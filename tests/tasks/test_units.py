@@ -1,7 +1,9 @@
 """A task computes what its key stands for, or refuses."""
 
+import json
 import shutil
 
+import numpy as np
 import pytest
 from prefect.states import Failed
 
@@ -11,16 +13,30 @@ from flows.planning import plan_run, plan_stage
 from flows.registering import register
 from flows.run_record import RunLog
 from tasks.ingest import ingest
+from tasks.static_calibration import static_calibration
 from tasks.unit import unit_task
+from worldpose.cameras.stored import camera_from_arrays
 from worldpose.errors import CorruptionError, InputError, StoreError
-from worldpose.store import Store
+from worldpose.ingest.stills import write_still
+from worldpose.release import read_camera
+from worldpose.store import Store, explain_difference, key_of
+
+
+@pytest.fixture
+def clicked(tiny, tmp_path):
+    """A store, a match of its own folder, and its plan by unit."""
+    store = Store.create(tmp_path / "project")
+    match, _ = register(store, shutil.copytree(tiny, tmp_path / "match"))
+    return store, match, {unit.name: unit for unit in plan_run(store, match, {})}
 
 
 @pytest.fixture
 def planned(tiny, tmp_path):
-    """A store, a match of its own folder, and the plan of its first camera."""
+    """The same with given cameras, which are quick, and the plan of its first unit."""
+    folder = shutil.copytree(tiny, tmp_path / "match")
+    shutil.copy(folder / "reference" / "calibration.toml", folder)
     store = Store.create(tmp_path / "project")
-    match, _ = register(store, shutil.copytree(tiny, tmp_path / "match"))
+    match, _ = register(store, folder)
     return store, match, plan_run(store, match, {})[0]
 
 
@@ -30,15 +46,108 @@ def test_every_stage_has_its_task(stage):
 
 
 def test_an_edit_after_planning_does_not_reach_the_result(planned, tmp_path):
-    store, match, unit = planned
+    store, match, _ = planned
+    unit = next(u for u in plan_run(store, match, {}) if u.recipe.stage == "static_calibration")
     calibration = tmp_path / "match" / "calibration.toml"
     text = calibration.read_text()
     calibration.write_text(text.replace("translation = [", "translation = [1", 1))
     assert calibration.read_text() != text
-    ingest.fn(unit.work(store.url, match, "0001"))
-    stored = store.open_result(match.match_id, "ingest", unit.recipe.unit, unit.key)
+    static_calibration.fn(unit.work(store.url, match, "0001"))
+    stored = store.open_result(match.match_id, "static_calibration", unit.recipe.unit, unit.key)
     planned_translation = unit.recipe.sources["calibration"]["translation"]
     assert stored["translation"].values.tolist() == pytest.approx(planned_translation)
+    assert stored.attrs["origin"] == "given"
+
+
+def test_a_clicked_camera_says_how_well_it_is_known(clicked, tiny):
+    store, match, units = clicked
+    unit = units["static_calibration/cam00"]
+    assert unit.recipe.inputs == {}  # what was detected decides nothing
+    static_calibration.fn(unit.work(store.url, match, "0001"))
+    stored = store.open_result(match.match_id, "static_calibration", "cam00", unit.key)
+    figures = store.manifest(match.match_id, "static_calibration", "cam00", unit.key).figures
+    clicks = match.folder.clicked["cam00"].points
+    assert set(stored["point"].values) == {point.name for point in clicks}
+    assert figures["clicks_used"] + figures["clicks_wrong"] == len(clicks)
+    assert 0.0 < figures["expected_ground_error_median_m"] < figures["expected_ground_error_p95_m"]
+    assert 0.0 < figures["reprojection_rms_px"] < 3.0
+    true = read_camera(tiny / "reference" / "cameras" / "cam00.npz", (1920, 1080))
+    found = camera_from_arrays(stored.data_vars)
+    # Clicked at 1 px from 60 m and more: metres would be a wrong camera, not an uncertain one.
+    assert np.linalg.norm(found.center - true.center) < 3.0
+
+
+def test_a_moved_click_reaches_its_camera_and_what_sees_through_it_alone(clicked, tmp_path):
+    store, match, before = clicked
+    file = sorted((tmp_path / "match" / "annotations" / "static_calibration").iterdir())[2]
+    content = json.loads(file.read_text())
+    content["points"].reverse()  # their order is no part of what was clicked
+    file.write_text(json.dumps(content))
+    match, _ = register(store, tmp_path / "match")
+    after = {unit.name: unit for unit in plan_run(store, match, {})}
+    assert [unit.key for unit in after.values()] == [unit.key for unit in before.values()]
+
+    point = content["points"][1]
+    point["xy"][0] += 0.5
+    file.write_text(json.dumps(content))
+    match, _ = register(store, tmp_path / "match")
+    after = {unit.name: unit for unit in plan_run(store, match, {})}
+    changed = {name for name, unit in after.items() if unit.key != before[name].key}
+    camera = f"static_calibration/{file.stem}"
+    assert changed == {camera, "tracking/clip", "triangulation/clip"}
+    # What `worldpose why` and `worldpose diff` say.
+    (reason,) = explain_difference(before[camera].recipe, after[camera].recipe)
+    assert f"annotations/static_calibration/{file.name}.points.{point['name']}[0]: " in reason
+    assert reason.endswith(f" -> {point['xy'][0]}")
+
+
+def test_a_given_camera_wins_over_clicks(clicked, tmp_path):
+    store, match, before = clicked
+    folder = tmp_path / "match"
+    shutil.copy(folder / "reference" / "calibration.toml", folder)
+    match, _ = register(store, folder)
+    given = {unit.name: unit for unit in plan_run(store, match, {})}
+    sources = given["static_calibration/cam00"].recipe.sources
+    assert list(sources) == ["calibration"]
+    assert given["ingest/cam00"].key == before["ingest/cam00"].key
+    # Then its clicks decide nothing any more.
+    (folder / "annotations" / "static_calibration" / "cam00.json").unlink()
+    match, _ = register(store, folder)
+    assert [u.key for u in plan_run(store, match, {})] == [u.key for u in given.values()]
+
+
+def test_clicks_that_determine_no_camera_fail_by_the_file_s_name(clicked):
+    store, match, units = clicked
+    recipe = units["static_calibration/cam00"].recipe
+    ((file, listed),) = recipe.sources["clicked"].items()
+    few = {"points": dict(list(listed["points"].items())[:2]), "drawn": {}}
+    recipe = recipe.model_copy(update={"sources": recipe.sources | {"clicked": {file: few}}})
+    work = units["static_calibration/cam00"].work(store.url, match, "0001")
+    changes = {"recipe": recipe, "key": key_of(recipe)}
+    with pytest.raises(InputError, match=file):
+        static_calibration.fn(work.model_copy(update=changes))
+
+
+def test_a_broken_still_is_refused_before_anything_runs(clicked, tmp_path):
+    store, _, _ = clicked
+    path = tmp_path / "match" / "stills" / "cam01.png"
+    path.parent.mkdir()
+    path.write_bytes(b"no picture")
+    with pytest.raises(InputError, match=r"cam01\.png.*PNG picture"):
+        register(store, tmp_path / "match")
+
+
+def test_a_still_that_changed_after_planning_is_refused(clicked, tmp_path):
+    store, _, _ = clicked
+    folder = tmp_path / "match"
+    picture = np.zeros((1080, 1920, 3), dtype=np.uint8)
+    write_still(folder / "stills" / "cam00.png", picture)
+    match, changed = register(store, folder)
+    assert changed
+    unit = {u.name: u for u in plan_run(store, match, {})}["static_calibration/cam00"]
+    write_still(folder / "stills" / "cam00.png", picture + 1)
+    with pytest.raises(InputError, match="registered when the run began"):
+        static_calibration.fn(unit.work(store.url, match, "0001"))
 
 
 def test_detections_that_changed_after_planning_are_refused(planned, tmp_path):
@@ -75,20 +184,24 @@ def test_what_may_pass_is_tried_again(failure, retried):
     assert task.retry_condition_fn(task, None, Failed(data=failure)) is retried
 
 
-def test_units_behind_a_failed_one_are_recorded_as_blocked(planned):
+@pytest.mark.parametrize("failing", ["ingest", "static_calibration"])
+def test_units_behind_a_failed_one_are_recorded_as_blocked(planned, failing):
     store, match, first = planned
+    failed = f"{failing}/{first.recipe.unit}"
     log = RunLog.begin(store, match, METHOD, {})
     for stage in METHOD:
         plan = plan_stage(store, match, stage, {}, log.results)
         log.blocked += plan.blocked
         for unit in plan.units:
-            if unit.name != first.name:
-                ingest.fn(unit.work(store.url, match, log.run_id))
-            log.finished(unit, RuntimeError("x") if unit.name == first.name else None)
+            if unit.name != failed:
+                task_of(stage).fn(unit.work(store.url, match, log.run_id))
+            log.finished(unit, RuntimeError("x") if unit.name == failed else None)
     record = log.close()
     assert record.state == "failed"
-    assert [failure.unit for failure in record.failed] == [first.name]
+    assert [failure.unit for failure in record.failed] == [failed]
     assert record.blocked == ("tracking/clip", "triangulation/clip")
+    # The other cameras have their results: only what needs all of them waits.
+    assert len(record.executed) == len(plan_run(store, match, {})) - 3
 
 
 def test_a_run_until_a_stage_is_partial_when_some_of_its_units_are_there(planned):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from worldpose.body.model import BodyModel
 from worldpose.errors import InputError
 
-OPEN_BODY: Final = "open-neutral/1"
+OPEN_BODY: Final = "open-neutral/2"
 """The body that ships with worldpose: SMPL's layout, not SMPL (docs/body_model.md)."""
 
 KEYS: Final = (

@@ -42,6 +42,7 @@ class DifferentiableBody:
         self._joint = torch.as_tensor(keypoints.joint, device=device)
         self._joint_shares, self._gather = tensor(keypoints.joint_shares), tensor(keypoints.gather)
         self._mass, self._basis = tensor(keypoints.mass)[:, None], tensor(keypoints.basis)
+        self._corrected = keypoints.corrected
         self._tensor = tensor
 
     def joints(
@@ -56,7 +57,7 @@ class DifferentiableBody:
     ) -> Tensor:
         """Return the keypoints (..., keypoints, 3) [m], world."""
         local, rotations, joints, offsets = self._articulate(betas, global_orient, body_pose)
-        feature = self._feature(betas, local)
+        feature = self._feature(betas, local, self._corrected)
         unposed = _split(feature @ self._basis.flatten(0, 1).T, -1, 3)
         parts = (rotations[..., self._joint, :, :] @ unposed[..., None])[..., 0]
         parts = parts + self._mass * offsets[..., self._joint, :]
@@ -67,7 +68,8 @@ class DifferentiableBody:
     ) -> Tensor:
         """Return the surface (..., vertices, 3) [m], world."""
         local, rotations, _, offsets = self._articulate(betas, global_orient, body_pose)
-        feature = self._feature(betas, local)
+        corrected = self.model.pose_directions.shape[-1] > 0
+        feature = self._feature(betas, local, corrected)
         unposed = _split(feature @ self._surface_basis.flatten(0, 1).T, -1, 3)
         motions = torch.cat([rotations, offsets[..., None]], dim=-1).flatten(-2)
         blended = _split(self._weights @ motions, 3, 4)
@@ -85,11 +87,11 @@ class DifferentiableBody:
     def _weights(self) -> Tensor:
         return self._tensor(self.model.weights)
 
-    def _feature(self, betas: Tensor, local: Tensor) -> Tensor:
+    def _feature(self, betas: Tensor, local: Tensor, corrected: bool) -> Tensor:
         """What the unposed surface is linear in (..., 1 + shapes + pose features)."""
         batch = local.shape[:-3]
         parts = [betas.new_ones((*batch, 1)), betas.expand(*batch, -1)]
-        if self.model.pose_directions.shape[-1]:
+        if corrected:
             parts.append((local[..., 1:, :, :] - self._identity).flatten(-3))
         return torch.cat(parts, dim=-1)
 

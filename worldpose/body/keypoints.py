@@ -35,13 +35,13 @@ class FoldedKeypoints:
     """(pairs,), the share of the pair's joint in its keypoint."""
     basis: NDArray[np.float64]
     """(pairs, 3, 1 + shapes + pose features) [m]: sums over vertices, times their weights, of the
-    template, its shape directions and its pose directions."""
+    template, its shape directions and, unless these vertices have none, its pose directions."""
 
     def __call__(self, parameters: BodyParameters) -> NDArray[np.float64]:
         """Return the keypoints (..., keypoints, 3) [m], world; NaN where a parameter is."""
         posed = self.model.articulate(parameters)
         features = [np.ones((*parameters.batch_shape, 1)), parameters.betas]
-        if self.model.pose_directions.shape[-1]:
+        if self.corrected:
             features.append(posed.pose_feature)
         feature = np.concatenate(features, axis=-1)
         unposed = (feature @ self.basis.reshape(-1, feature.shape[-1]).T).reshape(
@@ -52,6 +52,11 @@ class FoldedKeypoints:
         keypoints: NDArray[np.float64] = self.joint_shares @ posed.joints + self.gather @ parts
         keypoints += parameters.transl[..., None, :]
         return keypoints
+
+    @property
+    def corrected(self) -> bool:
+        """Whether pose correctives move the keypoints."""
+        return bool(self.basis.shape[-1] > 1 + self.model.shapes)
 
     @cached_property
     def gather(self) -> NDArray[np.float64]:
@@ -116,6 +121,8 @@ def fold_regressor(
     used = np.flatnonzero(shares.any(axis=0))
     parts = [model.template[:, :, None], model.shape_directions, model.pose_directions]
     content = np.concatenate([part[used] for part in parts], axis=-1)
+    if not model.pose_directions[used].any():
+        content = content[..., : 1 + model.shapes]
     return FoldedKeypoints(
         model=model,
         joint_shares=joint_shares,

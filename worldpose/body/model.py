@@ -37,7 +37,7 @@ class BodyModel:
     """
 
     name: str
-    """Name and version that results carry, such as `open-neutral/1`."""
+    """Name and version that results carry, such as `open-neutral/2`."""
     template: NDArray[np.float64]
     """(vertices, 3) [m], the mean body in T-pose: y up, facing +z, left arm along +x."""
     shape_directions: NDArray[np.float64]

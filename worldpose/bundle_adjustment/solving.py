@@ -118,7 +118,7 @@ def solve(problem: Problem, settings: SolverSettings | None = None) -> Adjusted:
         tried = system.cost(moved, trial, offset + step)
         gain = reached - tried
         # Where no step gains more than rounding can tell, it is at rest.
-        converged = abs(gain) < settings.cost_change * reached
+        converged = abs(gain) <= settings.cost_change * reached
         if gain > 0.0:
             cameras, points, offset, reached = moved, trial, offset + step, tried
             damping = max(damping / 5.0, 1e-9)

@@ -1,6 +1,7 @@
 """Ingest: a match folder on disk becomes checked records and dense arrays.
 
-Inputs: match.yaml, calibration.toml, detections/, pitch.json, videos; or other tools' files.
+Inputs: match.yaml, calibration.toml, clicked markings, detections/, pitch.json, videos; or other
+tools' files.
 Outputs: `MatchFolder`, `Registration`, `Observations` on match frames.
 """
 

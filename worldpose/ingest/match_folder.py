@@ -4,19 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 from typing import Final
 
 from data_contracts.cameras import CameraCalibration
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
+from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
+from worldpose.ingest.annotations import clicked_file, read_clicked
 from worldpose.ingest.calibration_files import read_calibration
+from worldpose.ingest.places import existing_file
 from worldpose.ingest.text_files import read_json, read_yaml
 from worldpose.ingest.validation import validate_record
 
 NO_PITCH: Final = "none"
 """Value of `pitch` in match.yaml for footage without a pitch."""
+
+CLICKS_NEEDED: Final = "at least four points of the pitch, better 8 to 12 all over the picture,"
+"""What a person is asked for where a camera has no calibration."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +36,8 @@ class MatchFolder:
         detections: given 2D poses, by id of a static camera or of a clip (its broadcast camera).
         pitch: the surveyed or standard pitch; None where the match has none.
         videos: video file or folder of images, by id of a static camera or of a clip.
+        clicked: what people clicked, by id of a static camera; may lack some.
+        stills: one picture, by id of a static camera; may lack some.
     """
 
     folder: Path
@@ -38,10 +46,12 @@ class MatchFolder:
     detections: Mapping[str, Path]
     pitch: PitchSpec | None
     videos: Mapping[str, Path]
+    clicked: Mapping[str, ClickedMarkings]
+    stills: Mapping[str, Path]
 
 
 def read_match(folder: Path) -> MatchFolder:
-    """The checked content of a match folder; videos and detections are found, not opened.
+    """The checked content of a match folder; videos, stills and detections are found, not opened.
 
     Args:
         folder: holds match.yaml and what that names.
@@ -59,36 +69,42 @@ def read_match(folder: Path) -> MatchFolder:
             found=f"{len(spec.cameras)} broadcast",
             todo="Add the static cameras.",
         )
-    for index, camera in enumerate(spec.cameras):
-        if camera.still is not None:
-            _existing(folder, camera.still, f"{file}: cameras[{index}].still")
     detections = _detections(folder, spec)
     videos = _videos(folder, spec)
     _require_footage(folder, spec, detections, videos)
+    pitch = _pitch(folder, spec)
     return MatchFolder(
         folder=folder,
         spec=spec,
         calibrations=_calibrations(folder, spec),
         detections=detections,
-        pitch=_pitch(folder, spec),
+        pitch=pitch,
         videos=videos,
+        clicked=read_clicked(folder, spec, pitch),
+        stills=_stills(folder, spec),
     )
 
 
 def require_calibrated(match: MatchFolder) -> None:
-    """Refuse a match in which a static camera is not calibrated.
+    """Refuse a match with a static camera that is neither given nor clicked.
 
     Raises:
-        InputError: naming the missing cameras and those that are there.
+        InputError: naming the missing cameras and what each needs.
     """
-    names = [camera.id for camera in match.spec.static_cameras]
-    missing = [name for name in names if name not in match.calibrations]
+    known = {**match.calibrations, **match.clicked}
+    missing = [camera.id for camera in match.spec.static_cameras if camera.id not in known]
     if missing:
+        needed = f"Add the missing cameras to {match.folder / 'calibration.toml'}"
+        if match.pitch is not None:
+            needed = (
+                f"Click {CLICKS_NEEDED} into {match.folder / clicked_file(missing[0])}, or add the "
+                "camera to calibration.toml"
+            )
         raise InputError(
-            str(match.folder / "calibration.toml"),
-            expected=f"every static camera: {', '.join(names)}",
-            found=f"missing camera {', '.join(missing)}; there: {_listed(match.calibrations)}",
-            todo="Add the missing cameras, or take them out of match.yaml.",
+            str(match.folder),
+            expected="a given calibration or clicked markings of every static camera",
+            found=f"missing camera {', '.join(missing)}; there: {_listed(known)}",
+            todo=f"{needed}, or take it out of match.yaml.",
         )
 
 
@@ -101,10 +117,10 @@ def pitch_file(folder: Path, spec: MatchSpec) -> Path | None:
     if spec.pitch == NO_PITCH:
         return None
     if spec.pitch is not None:
-        return _existing(folder, spec.pitch, f"{folder / 'match.yaml'}: pitch")
+        return existing_file(folder, spec.pitch, f"{folder / 'match.yaml'}: pitch")
     if not (folder / "pitch.json").exists():
         return None
-    return _existing(folder, "pitch.json", str(folder))
+    return existing_file(folder, "pitch.json", str(folder))
 
 
 def _pitch(folder: Path, spec: MatchSpec) -> PitchSpec | None:
@@ -117,7 +133,7 @@ def _pitch(folder: Path, spec: MatchSpec) -> PitchSpec | None:
 def _calibrations(folder: Path, spec: MatchSpec) -> dict[str, CameraCalibration]:
     if not (folder / "calibration.toml").exists():
         return {}
-    file = _existing(folder, "calibration.toml", str(folder))
+    file = existing_file(folder, "calibration.toml", str(folder))
     calibrations = read_calibration(file)
     static = {camera.id: camera for camera in spec.static_cameras}
     extra = [name for name in calibrations if name not in static]
@@ -138,6 +154,18 @@ def _calibrations(folder: Path, spec: MatchSpec) -> dict[str, CameraCalibration]
                 todo="Calibrate at the size of the video, or correct match.yaml.",
             )
     return calibrations
+
+
+def _stills(folder: Path, spec: MatchSpec) -> dict[str, Path]:
+    stills = {}
+    for index, camera in enumerate(spec.cameras):
+        usual = f"stills/{camera.id}.png"
+        if camera.still is not None:
+            where = f"{folder / 'match.yaml'}: cameras[{index}].still"
+            stills[camera.id] = existing_file(folder, camera.still, where)
+        elif (folder / usual).exists():
+            stills[camera.id] = existing_file(folder, usual, str(folder))
+    return stills
 
 
 def _detections(folder: Path, spec: MatchSpec) -> dict[str, Path]:
@@ -162,7 +190,7 @@ def _detections(folder: Path, spec: MatchSpec) -> dict[str, Path]:
                 found=f"{found[file.stem].name} and {file.name}",
                 todo="Remove one of them.",
             )
-        found[file.stem] = _existing(folder, f"detections/{file.name}", str(folder))
+        found[file.stem] = existing_file(folder, f"detections/{file.name}", str(folder))
     return found
 
 
@@ -172,17 +200,17 @@ def _videos(folder: Path, spec: MatchSpec) -> dict[str, Path]:
     for index, camera in enumerate(spec.cameras):
         if camera.video is not None:
             where = f"{folder / 'match.yaml'}: cameras[{index}].video"
-            named[camera.id] = _existing(folder, camera.video, where, folders=True)
+            named[camera.id] = existing_file(folder, camera.video, where, folders=True)
     for camera in spec.static_cameras:
         usual = f"videos/{camera.id}.mp4"
         if camera.id in named:
             videos[camera.id] = named[camera.id]
         elif (folder / usual).exists():
-            videos[camera.id] = _existing(folder, usual, str(folder))
+            videos[camera.id] = existing_file(folder, usual, str(folder))
     for clip in spec.clips:
         usual = f"broadcast/{clip.id}.mp4"
         if clip.broadcast is not None and (folder / usual).exists():
-            videos[clip.id] = _existing(folder, usual, str(folder))
+            videos[clip.id] = existing_file(folder, usual, str(folder))
         elif clip.broadcast is not None and clip.broadcast in named:
             videos[clip.id] = named[clip.broadcast]
     return videos
@@ -208,48 +236,6 @@ def _require_footage(
                 todo=f"Add broadcast/{clip.id}.mp4 or detections/{clip.id}.json (or .npz), or "
                 "take `broadcast` out of the clip.",
             )
-
-
-def require_local(name: str, where: str) -> None:
-    """Refuse a name that is not plainly a place inside the match folder.
-
-    Raises:
-        InputError: an absolute path, one with `..`, or an empty one.
-    """
-    posix, windows = PurePosixPath(name), PureWindowsPath(name)
-    if not posix.parts or posix.is_absolute() or windows.anchor or ".." in posix.parts:
-        raise InputError(
-            where,
-            expected="a path inside the match folder, without ..",
-            found=repr(name),
-            todo="Move or copy the file into the match folder and name it from there.",
-        )
-
-
-def _existing(folder: Path, name: str, where: str, *, folders: bool = False) -> Path:
-    """The file `name` in the folder; refuses one that is absent or lies elsewhere."""
-    require_local(name, where)
-    path = folder / name
-    try:
-        there = path.is_file() or (folders and path.is_dir() and any(path.iterdir()))
-        inside = path.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError, ValueError):  # no rights, a loop of links, a NUL in the name
-        there = False
-    if not there:
-        raise InputError(
-            where,
-            expected="a file, or a folder of images" if folders else "a file",
-            found=f"no {name!r}",
-            todo="Put it there, or correct the name.",
-        )
-    if not inside:
-        raise InputError(
-            where,
-            expected="a file inside the match folder",
-            found=f"{name!r}, a link that leads out of it",
-            todo="Copy the file into the match folder.",
-        )
-    return path
 
 
 def _listed(names: Mapping[str, object]) -> str:

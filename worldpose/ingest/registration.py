@@ -21,8 +21,8 @@ def register_match(match: MatchFolder, previous: Registration | None) -> Registr
 
     Registered are match.yaml, calibration.toml, the pitch file, videos, stills, detections and
     annotations; `reference/` is not part of a match. The identity covers the paths and contents of
-    videos, detections and pitch alone, so neither the folder's name nor an edited click, roster or
-    calibration makes another match.
+    videos, detections and pitch alone, so neither the folder's name nor an edited click, still,
+    roster or calibration makes another match.
 
     Args:
         match: as read by `read_match`.
@@ -55,11 +55,8 @@ def _identifying_files(match: MatchFolder) -> set[str]:
 
 
 def _further_files(match: MatchFolder) -> set[str]:
-    names = ["match.yaml", "calibration.toml", "annotations"]
-    for camera in match.spec.cameras:
-        usual = f"stills/{camera.id}.png"
-        names.append(camera.still if camera.still is not None else usual)
-    roots = [match.folder / name for name in names]
+    names = ("match.yaml", "calibration.toml", "annotations")
+    roots = [*(match.folder / name for name in names), *match.stills.values()]
     return {path for root in roots for path in _files_under(match.folder, root)}
 
 

@@ -6,17 +6,24 @@ import os
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
+import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from data_contracts.cameras import CameraCalibration
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
+from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
+from worldpose.ingest.annotations import write_clicked_markings
 from worldpose.ingest.calibration_files import write_calibration_toml
 from worldpose.ingest.keypoint_arrays import read_keypoint_arrays, write_keypoint_arrays
-from worldpose.ingest.match_folder import NO_PITCH, read_match, require_local
+from worldpose.ingest.match_folder import NO_PITCH, read_match
 from worldpose.ingest.observations import Observations
+from worldpose.ingest.places import require_local
+from worldpose.ingest.stills import write_still
 
 
 def write_match(
@@ -26,6 +33,8 @@ def write_match(
     calibrations: Mapping[str, CameraCalibration],
     observations: Mapping[str, Observations],
     pitch: PitchSpec | None = None,
+    clicked: Mapping[str, ClickedMarkings] = MappingProxyType({}),
+    stills: Mapping[str, NDArray[np.uint8]] = MappingProxyType({}),
     references: Callable[[Path], None] | None = None,
 ) -> None:
     """Write a match folder that `read_match` accepts, all or nothing.
@@ -39,13 +48,18 @@ def write_match(
         observations: by id of a static camera or clip; `frame` is the camera's (or the broadcast
             clip's) own frame number, as in the files, not the match frame.
         pitch: written to the file that `spec.pitch` names, else to pitch.json.
+        clicked: what was clicked in static cameras, by id.
+        stills: pictures (height, width, 3), RGB, by camera id; written to the file that the
+            camera's `still` names, else to stills/<camera>.png.
         references: called with the match folder under construction, to add `reference/`.
 
     Raises:
         InputError: the folder is there and not empty, or what is given contradicts itself.
     """
-    _require_known(spec, [*calibrations, *observations])
+    _require_known(spec, [*calibrations, *observations, *clicked, *stills])
     require_local(spec.pitch or "pitch.json", "match.yaml: pitch")
+    for camera_id in stills:
+        require_local(_still_name(spec, camera_id), f"match.yaml: camera {camera_id}: still")
     _require_empty(folder)
     _make_parent(folder)
     with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as workshop:
@@ -61,6 +75,9 @@ def write_match(
             read_keypoint_arrays(file)
         if pitch is not None:
             _write_pitch(building, spec, pitch)
+        write_clicked_markings(building, clicked)
+        for camera_id, picture in stills.items():
+            write_still(building / _still_name(spec, camera_id), picture)
         if references is not None:
             references(building)
         read_match(building)
@@ -83,6 +100,10 @@ def _require_known(spec: MatchSpec, names: list[str]) -> None:
                 found=repr(name),
                 todo="Add the camera to the match, or leave its data out.",
             )
+
+
+def _still_name(spec: MatchSpec, camera_id: str) -> str:
+    return spec.camera(camera_id).still or f"stills/{camera_id}.png"
 
 
 def _make_parent(folder: Path) -> None:

@@ -83,6 +83,19 @@ def law_lines() -> dict[str, LineSpec]:
     return lines
 
 
+def law_goals() -> dict[str, LineSpec]:
+    """Return the goals' posts and crossbars by name: straight and white, but not painted."""
+    frames = {}
+    for side in SIDES:
+        for end in ENDS:
+            post = f"goal_post_{side}_{end}"
+            frames[post] = LineSpec(start=f"{post}_bottom", end=f"{post}_top")
+        frames[f"crossbar_{side}"] = LineSpec(
+            start=f"goal_post_{side}_near_top", end=f"goal_post_{side}_far_top"
+        )
+    return frames
+
+
 def law_arcs() -> dict[str, ArcSpec]:
     """Return the curved markings by name."""
     arcs = {

@@ -16,6 +16,7 @@ from worldpose.pitch.laws import (
     PENALTY_AREA,
     PENALTY_MARK_DISTANCE,
     law_arcs,
+    law_goals,
     law_lines,
     law_points,
 )
@@ -60,6 +61,9 @@ class PitchTemplate:
     `penalty_area_{side}_front`, `penalty_area_{side}_{end}`."""
     arcs: dict[str, ArcSpec]
     """`center_circle`, `penalty_arc_{side}`, `corner_arc_{side}_{end}`."""
+    goals: dict[str, LineSpec]
+    """`goal_post_{side}_{end}`, `crossbar_{side}`: seen and drawn like markings, but not painted on
+    the surface."""
 
     @classmethod
     def standard(cls) -> PitchTemplate:
@@ -85,7 +89,7 @@ class PitchTemplate:
         lines = {**law_lines(), **spec.lines}
         arcs = {**law_arcs(), **spec.arcs}
         _check_markings(points, lines, arcs)
-        return cls(spec.length, spec.width, spec.crown, points, lines, arcs)
+        return cls(spec.length, spec.width, spec.crown, points, lines, arcs, law_goals())
 
     def height(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
         """Return the height of the surface [m], continued beyond the touch lines.
@@ -110,6 +114,41 @@ class PitchTemplate:
             if name not in self.points:
                 raise _unknown_point("PitchTemplate.positions", name, self.points)
         return np.array([self.points[name] for name in names], dtype=np.float64).reshape(-1, 3)
+
+    @property
+    def marking_names(self) -> tuple[str, ...]:
+        """Names of all that can be drawn: lines, arcs, and the goals' posts and crossbars."""
+        return (*self.lines, *self.arcs, *self.goals)
+
+    def marking_points(self, name: str, spacing: float) -> NDArray[np.float64]:
+        """Return points (n, 3) [m], world, along one marking, both ends included.
+
+        Args:
+            name: one of `marking_names`; a full circle ends where it begins.
+            spacing: largest distance between neighbours [m].
+
+        Raises:
+            InputError: the name is unknown.
+        """
+        if name in self.lines:
+            return self._line_points(self.lines[name], spacing)
+        if name in self.arcs:
+            points = self._arc_points(self.arcs[name], spacing)
+            span = self.arcs[name].end_angle - self.arcs[name].start_angle
+            full = math.isclose(span, 2.0 * math.pi)
+            return np.concatenate([points, points[:1]]) if full else points
+        if name not in self.goals:
+            raise InputError(
+                "PitchTemplate.marking_points",
+                expected="the name of a marking",
+                found=repr(name),
+                todo=f"Use one of {', '.join(sorted(self.marking_names))}.",
+            )
+        start, end = (self.points[getattr(self.goals[name], key)] for key in ("start", "end"))
+        steps = _steps(float(np.linalg.norm(end - start)), spacing)
+        share = np.linspace(0.0, 1.0, steps + 1)[:, None]
+        bar: NDArray[np.float64] = (1.0 - share) * start + share * end
+        return bar
 
     def sample_lines(self, spacing: float) -> MarkingSamples:
         """Return points along all markings, both ends included, evenly spaced in plan.

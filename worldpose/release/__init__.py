@@ -2,17 +2,18 @@
 
 Inputs: joints, cameras, observations and figures of a run, as plain arrays and records.
 Outputs: joints files, WorldPose cameras, COCO keypoints, one HTML report; pictures are in
-`worldpose.release.pictures`, which loads matplotlib.
+`worldpose.release.*pictures`, which load matplotlib.
 """
 
 from worldpose.release.archives import Member, read_archive, write_archive
-from worldpose.release.camera_file import read_camera, write_static_camera
+from worldpose.release.camera_file import read_camera, write_moving_camera, write_static_camera
 from worldpose.release.coco import coco_dataset, write_coco
 from worldpose.release.files import whole_file
 from worldpose.release.joints_file import JointTracks, read_joints, write_joints
-from worldpose.release.report import Picture, report_page
+from worldpose.release.report import CameraSummary, Picture, report_page
 
 __all__ = [
+    "CameraSummary",
     "JointTracks",
     "Member",
     "Picture",
@@ -25,5 +26,6 @@ __all__ = [
     "write_archive",
     "write_coco",
     "write_joints",
+    "write_moving_camera",
     "write_static_camera",
 ]

@@ -45,6 +45,24 @@ def write_static_camera(path: Path, calibration: CameraCalibration) -> None:
     )
 
 
+def write_moving_camera(path: Path, camera: Camera) -> None:
+    """Write a camera that moves as npz with one row a frame, in the same layout.
+
+    Args:
+        path: the file.
+        camera: a batch (frames,); a frame with a NaN is one without a camera.
+    """
+    intrinsics = np.zeros((len(camera.focal), 3, 3))
+    intrinsics[:, (0, 1), (0, 1)] = camera.focal
+    intrinsics[:, :2, 2] = camera.principal_point
+    intrinsics[:, 2, 2] = 1.0
+    pose = camera.cam_from_world
+    write_archive(
+        path,
+        {"K": intrinsics, "k": camera.distortion, "R": pose.rotation, "t": pose.translation},
+    )
+
+
 def read_camera(path: Path, image_size: tuple[int, int] = RELEASE_SIZE) -> Camera:
     """The camera of a file: a single one where it has one row, else a batch (frames,).
 

@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
-from typing import Final
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
 from worldpose.cameras import Camera
-from worldpose.pitch import PitchTemplate
+from worldpose.release.drawing import (
+    GRASS,
+    HIPS,
+    INK,
+    PALE,
+    draw_label,
+    draw_pitch,
+    draw_skeleton,
+    markings,
+    person_color,
+    png,
+    style,
+)
 from worldpose.release.joints_file import JointTracks
-
-PALETTE: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6b4c9a")
-"""One colour a person, after Okabe and Ito: apart for people with any colour vision."""
-
-INK: Final = "#2b2b2b"
-PALE: Final = "#9a9a9a"
-GRASS: Final = "#f1f5ef"
-LINE: Final = "#b5c4b1"
-_HALO: Final = [withStroke(linewidth=2.5, foreground="white")]
-_HIPS: Final = (11, 12)
 
 
 def paths_picture(
@@ -65,23 +61,23 @@ def paths_picture(
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
         axes.set_xlabel("x, along the touch line [m]", color=INK)
         axes.set_ylabel("y, across [m]", color=INK)
-        _style(axes)
+        style(axes)
         if pitch is not None:
-            _draw_pitch(axes, pitch)
+            draw_pitch(axes, pitch)
     for way in true_ways.swapaxes(0, 1):
         overview.plot(*way.T, color="#c9c9c9", linewidth=2.0, zorder=3)
         detail.plot(*way.T, color="#cfcfcf", linewidth=6.0, solid_capstyle="round", zorder=3)
     for person_id, way in zip(tracks.person_ids, ways.swapaxes(0, 1), strict=True):
-        color = _color(int(person_id))
+        color = person_color(int(person_id))
         overview.plot(*way.T, color=color, linewidth=1.2, zorder=4)
         detail.plot(*way.T, ".", color=color, markersize=4.0, zorder=4)
         last = way[np.isfinite(way[:, 0])][-1:]
         detail.plot(*last.T, "o", color=color, markersize=9.0, markeredgecolor="white", zorder=5)
         for x, y in last:
-            _label(detail, f"{person_id}", (x, y), (7, 7), color)
+            draw_label(detail, f"{person_id}", (x, y), (7, 7), color)
     for name, center in centers.items():
         overview.plot(*center, "^", color=INK, markersize=8.0, zorder=5)
-        _label(overview, name, (center[0], center[1]), (6, 6), INK)
+        draw_label(overview, name, (center[0], center[1]), (6, 6), INK)
     (x0, y0), (x1, y1) = close
     overview.add_patch(
         Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, color=PALE, linewidth=1.0, linestyle=":")
@@ -91,7 +87,7 @@ def paths_picture(
     detail.set_title(
         f"People close up ({shown}, id at the end)", color=INK, loc="left", fontsize=12
     )
-    return _png(figure)
+    return png(figure)
 
 
 def view_picture(
@@ -125,25 +121,25 @@ def view_picture(
     axes.set_facecolor(GRASS if pitch is not None else "#f6f6f6")
     axes.set_xlabel("u [px]", color=INK)
     axes.set_ylabel("v [px]", color=INK)
-    _style(axes)
-    for line in _markings(pitch) if pitch is not None else ():
+    style(axes)
+    for line in markings(pitch) if pitch is not None else ():
         axes.plot(*camera.project(line).T, color="white", linewidth=2.5, zorder=1)
     for keypoints in detections:
-        _skeleton(axes, keypoints, "#8f8f8f", 4.0, zorder=2)
+        draw_skeleton(axes, keypoints, "#8f8f8f", 4.0, zorder=2)
     for person_id, keypoints in zip(person_ids, reprojected, strict=True):
-        color = _color(int(person_id))
-        _skeleton(axes, keypoints, color, 1.8, zorder=3)
+        color = person_color(int(person_id))
+        draw_skeleton(axes, keypoints, color, 1.8, zorder=3)
         seen = keypoints[np.isfinite(keypoints[:, 0])]
         if len(seen):
             u, v = seen[np.argmin(seen[:, 1])]
-            _label(axes, f"{person_id}", (u, v), (0, 8), color)
+            draw_label(axes, f"{person_id}", (u, v), (0, 8), color)
     axes.set_title(f"{title} (grey: detected, colour: reprojected 3D)", color=INK, loc="left")
-    return _png(figure)
+    return png(figure)
 
 
 def _ground(tracks: JointTracks) -> NDArray[np.float64]:
     """Mid-hips on the ground (frames, persons, 2) [m]."""
-    middle: NDArray[np.float64] = tracks.joints[..., _HIPS, :2].mean(axis=-2)
+    middle: NDArray[np.float64] = tracks.joints[..., HIPS, :2].mean(axis=-2)
     return middle
 
 
@@ -171,70 +167,3 @@ def _crop(
     part = whole * np.clip(np.max((high - low + 160.0) / whole), 0.5, 1.0)
     corner = np.clip(0.5 * (low + high - part), -0.5, whole - 0.5 - part)
     return corner, corner + part
-
-
-def _draw_pitch(axes: Axes, pitch: PitchSpec) -> None:
-    corner = (-0.5 * pitch.length, -0.5 * pitch.width)
-    axes.add_patch(Rectangle(corner, pitch.length, pitch.width, color=GRASS, zorder=0))
-    for line in _markings(pitch):
-        axes.plot(line[:, 0], line[:, 1], color=LINE, linewidth=1.2, zorder=1)
-
-
-def _markings(pitch: PitchSpec) -> list[NDArray[np.float64]]:
-    """The painted lines as polylines (n, 3) [m], world; samples every half metre look smooth."""
-    template = PitchTemplate.from_spec(pitch)
-    samples = template.sample_lines(0.5)
-    lines = []
-    for marking, name in enumerate(samples.names):
-        line = samples.points_world[samples.marking == marking]
-        arc = template.arcs.get(name)
-        if arc is not None and np.isclose(arc.end_angle - arc.start_angle, 2.0 * np.pi):
-            line = np.concatenate([line, line[:1]])
-        lines.append(line)
-    return lines
-
-
-def _skeleton(
-    axes: Axes, keypoints: NDArray[np.floating], color: str, width: float, zorder: int
-) -> None:
-    """Bones and joints of one person (17, 2) [px]; what is NaN is not drawn."""
-    gap = np.full((len(COCO17_BONES), 1, 2), np.nan)
-    bones = np.concatenate([keypoints[np.array(COCO17_BONES)], gap], axis=1).reshape(-1, 2)
-    axes.plot(*bones.T, color=color, linewidth=width, solid_capstyle="round", zorder=zorder)
-    axes.plot(*keypoints.T, ".", color=color, markersize=2.2 * width, zorder=zorder)
-
-
-def _label(
-    axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, float], color: str
-) -> None:
-    axes.annotate(
-        text,
-        at,
-        xytext=offset,
-        textcoords="offset points",
-        color=color,
-        fontsize=11,
-        fontweight="bold",
-        ha="center" if offset[0] == 0 else "left",
-        path_effects=_HALO,
-        zorder=6,
-        annotation_clip=True,
-    )
-
-
-def _style(axes: Axes) -> None:
-    axes.tick_params(colors=INK, labelsize=9, length=3)
-    for spine in axes.spines.values():
-        spine.set_color("#d0d0d0")
-
-
-def _color(person_id: int) -> str:
-    return PALETTE[person_id % len(PALETTE)]
-
-
-def _png(figure: Figure) -> bytes:
-    """The figure as PNG; no date or version in it, so the same figure has the same bytes."""
-    picture = io.BytesIO()
-    FigureCanvasAgg(figure)
-    figure.savefig(picture, format="png", metadata={"Software": None})
-    return picture.getvalue()

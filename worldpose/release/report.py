@@ -19,15 +19,24 @@ body { font: 16px/1.5 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; color: #
 h1 { font-size: 1.9rem; line-height: 1.2; margin: 0 0 .3rem; }
 h2 { font-size: 1.25rem; margin: 2.6rem 0 .6rem; }
 p.lead { color: #555; margin: 0 0 1.2rem; }
+div.table { overflow-x: auto; }
 table { border-collapse: collapse; width: 100%; font-size: .93rem; }
 th, td { text-align: left; padding: .38rem .8rem .38rem 0; border-bottom: 1px solid #e4e4e4;
-  vertical-align: top; overflow-wrap: anywhere; }
+  vertical-align: top; overflow-wrap: break-word; }
 th { color: #555; font-weight: 600; border-bottom: 2px solid #c8c8c8; }
-td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; }
+td.number { white-space: nowrap; }
 td.bad { color: #a33b00; font-weight: 600; }
 figure { margin: 1.4rem 0 2rem; }
 figure img { width: 100%; height: auto; border: 1px solid #e4e4e4; }
 figcaption { color: #555; font-size: .93rem; margin-top: .3rem; }
+@media (max-width: 40rem) {
+  body { margin: 1.2rem auto; padding: 0 .9rem; }
+  h1 { font-size: 1.5rem; overflow-wrap: anywhere; }
+  table { font-size: .86rem; }
+  td:not(.number) { min-width: 4.5rem; }
+  td:last-child:not(.number) { min-width: 10rem; }
+}
 """
 
 
@@ -37,6 +46,31 @@ class Picture:
 
     caption: str
     png: bytes
+
+
+@dataclass(frozen=True)
+class CameraSummary:
+    """What is known of one static camera.
+
+    Attributes:
+        camera_id: the camera.
+        origin: `given`, or what it was calibrated from.
+        ground_error_median_m: expected on the pitch, over what the camera sees [m].
+        ground_error_p95_m: the same; exceeded on a twentieth of it [m].
+        reprojection_rms_px: of the clicks that the camera rests on [px].
+        clicks_used: number of clicked points that it rests on.
+        clicks_wrong: names of those that it does not.
+        weak: why a person should look at it; empty where nothing is the matter.
+    """
+
+    camera_id: str
+    origin: str
+    ground_error_median_m: float | None = None
+    ground_error_p95_m: float | None = None
+    reprojection_rms_px: float | None = None
+    clicks_used: int | None = None
+    clicks_wrong: tuple[str, ...] = ()
+    weak: tuple[str, ...] = ()
 
 
 class _Failure(str):
@@ -50,6 +84,8 @@ def report_page(
     seconds: Mapping[str, float],
     scores: Evaluation | None = None,
     pictures: Sequence[Picture] = (),
+    cameras: Sequence[CameraSummary] = (),
+    camera_pictures: Sequence[Picture] = (),
 ) -> str:
     """Return a whole HTML page that needs nothing beside itself and asks for nothing outside.
 
@@ -59,6 +95,8 @@ def report_page(
         seconds: how long each unit took when it was computed, by `stage/unit` [s].
         scores: figures against truth, where there is a reference.
         pictures: shown in this order.
+        cameras: the static cameras, in the order of the match.
+        camera_pictures: shown below their table.
     """
     sections = [
         f"<h1>{escape(title)}</h1>",
@@ -66,6 +104,8 @@ def report_page(
         f"{escape(run.state)}</p>",
         *_scores(scores),
         *(_figure(picture) for picture in pictures),
+        *_cameras(cameras),
+        *(_figure(picture) for picture in camera_pictures),
         "<h2>What was run</h2>",
         _table(("", ""), _about(run)),
         "<h2>Units of work</h2>",
@@ -91,6 +131,37 @@ def _scores(scores: Evaluation | None) -> list[str]:
     heading = "<h2>Against the truth</h2>"
     rows = [row[1:] for row in score_rows(scores)]
     return [heading, _table(("score", ">value", "what it says"), rows)]
+
+
+def _cameras(cameras: Sequence[CameraSummary]) -> list[str]:
+    if not cameras:
+        return []
+    columns = (
+        "camera",
+        "from",
+        ">expected ground error m",
+        ">95 % m",
+        ">clicks rms px",
+        ">clicks",
+        "wrong clicks",
+        "weak because",
+    )
+    rows = [
+        (
+            camera.camera_id,
+            camera.origin,
+            *_or_dash(camera.ground_error_median_m, camera.ground_error_p95_m),
+            *_or_dash(camera.reprojection_rms_px, camera.clicks_used),
+            ", ".join(camera.clicks_wrong),
+            _Failure("; ".join(camera.weak)),
+        )
+        for camera in cameras
+    ]
+    return ["<h2>Static cameras</h2>", _table(columns, rows)]
+
+
+def _or_dash(*values: float | None) -> list[str]:
+    return ["-" if value is None else shown_number(value) for value in values]
 
 
 def _about(run: RunRecord) -> list[tuple[str, ...]]:
@@ -168,4 +239,4 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
             for kind, cell in zip(kinds, row, strict=True)
         )
         lines.append(f"<tr>{''.join(cells)}</tr>")
-    return "<table>\n" + "\n".join(lines) + "\n</table>"
+    return '<div class="table"><table>\n' + "\n".join(lines) + "\n</table></div>"

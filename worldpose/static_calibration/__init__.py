@@ -3,11 +3,42 @@
 Input: a pitch template and what a person clicked. Output: a camera with its uncertainty.
 """
 
+from worldpose.static_calibration.calibrate import calibrate
+from worldpose.static_calibration.ground_error import GroundErrorMap, ground_error_map
 from worldpose.static_calibration.parameters import (
     PARAMETERS,
     CameraEstimate,
     project_with_jacobian,
     stepped,
 )
+from worldpose.static_calibration.report import (
+    CalibrationReport,
+    MarkingResidual,
+    PointResidual,
+    StaticCalibration,
+)
+from worldpose.static_calibration.settings import CameraPrior, StaticCalibrationSettings
+from worldpose.static_calibration.stored import (
+    calibration_arrays,
+    calibration_attributes,
+    calibration_coordinates,
+)
 
-__all__ = ["PARAMETERS", "CameraEstimate", "project_with_jacobian", "stepped"]
+__all__ = [
+    "PARAMETERS",
+    "CalibrationReport",
+    "CameraEstimate",
+    "CameraPrior",
+    "GroundErrorMap",
+    "MarkingResidual",
+    "PointResidual",
+    "StaticCalibration",
+    "StaticCalibrationSettings",
+    "calibrate",
+    "calibration_arrays",
+    "calibration_attributes",
+    "calibration_coordinates",
+    "ground_error_map",
+    "project_with_jacobian",
+    "stepped",
+]

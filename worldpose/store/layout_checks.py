@@ -76,7 +76,7 @@ def checked_attributes(
                 found=f"{len(value)} of them" if isinstance(value, list) else repr(value),
                 todo=f"Give the labels in the order of the {name} dimension.",
             )
-    return {name: plain[name] for name in layout.attributes}
+    return {name: plain[name] for name in layout.attributes if name in plain}
 
 
 def _check_names(

@@ -4,17 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from worldpose.body import BodyParameters
+from worldpose.body.parameters import BODY_POSE
 from worldpose.pitch import PitchTemplate
+from worldpose.synthetic.bodies import Body, draw_body
+from worldpose.synthetic.bvh import Clip
+from worldpose.synthetic.clips import clip_path
+from worldpose.synthetic.contests import run_through, take_corner
+from worldpose.synthetic.embodying import Embodied, embody
 from worldpose.synthetic.football import play
-from worldpose.synthetic.gait import Body, draw_body, walk
+from worldpose.synthetic.gait import tread
+from worldpose.synthetic.idling import stand_about
 from worldpose.synthetic.paths import GroundPath, wander
 from worldpose.synthetic.settings import Scenario
 
 Floats = NDArray[np.float64]
+
+CONTESTS: Final = {"corner": take_corner, "crossing": run_through}
+"""Movements in which people touch."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +50,25 @@ class Crowd:
     def joints(self, times: Floats) -> Floats:
         """Joints (frames, persons, 17, 3) [m], world, at `times` [s]; always the same ones."""
         joints = np.empty((len(times), len(self.paths), 17, 3))
-        for person, seed in enumerate(self.gaits):
-            rng = np.random.default_rng(seed)
-            joints[:, person] = walk(
-                self.bodies[person], self.paths[person], times, self.pitch.height, rng
-            )
+        for person in range(len(self.paths)):
+            joints[:, person] = self._embodied(person, times).keypoints()
         return joints
+
+    def poses(self, times: Floats) -> BodyParameters:
+        """The bodies (persons, frames) whose keypoints the joints are."""
+        shape = (len(self.paths), len(times))
+        betas, orient, transl = np.empty((*shape, 10)), np.empty((*shape, 3)), np.empty((*shape, 3))
+        angles = np.empty((*shape, BODY_POSE))
+        for person in range(len(self.paths)):
+            body = self._embodied(person, times).parameters()
+            betas[person], orient[person] = body.betas, body.global_orient
+            angles[person], transl[person] = body.body_pose, body.transl
+        return BodyParameters(betas, orient, angles, transl)
+
+    def _embodied(self, person: int, times: Floats) -> Embodied:
+        body, rng = self.bodies[person], np.random.default_rng(self.gaits[person])
+        joints, courses = tread(body, self.paths[person], times, self.pitch.height, rng)
+        return embody(body.figure, joints, self.pitch.height, courses)
 
     @property
     def heights(self) -> Floats:
@@ -56,6 +81,7 @@ def gather(
     pitch: PitchTemplate,
     seed: np.random.SeedSequence,
     driven: Sequence[GroundPath] | None = None,
+    clip: Clip | None = None,
 ) -> Crowd:
     """Return the people of a scenario.
 
@@ -64,6 +90,8 @@ def gather(
         pitch: what they stand on.
         seed: every person draws from a stream of their own; only football ties their ways.
         driven: their ways, where tracking data gives them; there are as many people.
+        clip: motion capture that the third person plays, the first who is no goalkeeper, or the
+            last of fewer.
     """
     settings = scenario.crowd
     count = settings.people if driven is None else len(driven)
@@ -78,6 +106,11 @@ def gather(
         (game,) = seed.spawn(1)
         paths, ball = play(settings, scenario.duration, np.random.default_rng(game))
         action = ball.position
+    elif settings.movement in CONTESTS:
+        (contest,) = seed.spawn(1)
+        paths = CONTESTS[settings.movement](
+            settings, scenario.duration, np.random.default_rng(contest)
+        )
     else:
         for rng in generators:
             paths.append(wander(settings, scenario.duration, paths, rng))
@@ -86,5 +119,14 @@ def gather(
         action = np.broadcast_to(np.array(settings.area_center), (len(times), 2))
         if paths:
             action = np.mean([path.position for path in paths], axis=0)
-    gaits = [each.spawn(1)[0] for each in person_seeds]
+    if clip is not None and paths:
+        actor = min(2, count - 1)
+        paths[actor] = clip_path(clip, paths[actor], bodies[actor])
+    gaits, moods = (
+        zip(*(each.spawn(2) for each in person_seeds), strict=True) if count else ((), ())
+    )
+    paths = [
+        stand_about(path, settings.actions, np.random.default_rng(mood))
+        for path, mood in zip(paths, moods, strict=True)
+    ]
     return Crowd(bodies, paths, action, times, pitch, gaits)

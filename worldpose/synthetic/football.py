@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import interp1d
 
+from worldpose.synthetic.ball import roll_ball
+from worldpose.synthetic.duels import (
+    AT_EASE,
+    COASTING,
+    PUSHING,
+    STOPPING,
+    Duels,
+    in_order,
+)
+from worldpose.synthetic.idling import keep_ready
 from worldpose.synthetic.paths import MARGIN, STEP, GroundPath
 from worldpose.synthetic.processes import drift
 from worldpose.synthetic.settings import CrowdSettings
@@ -34,10 +45,6 @@ ROAM_TIME: Final = 10.0
 """Time in which they change their mind about it [s]."""
 PRESSING: Final = 2
 """Players of each team who go for the ball: one on it, one in support."""
-PASS_EVERY: Final = (2.0, 4.5)
-"""Time between passes [s]."""
-PASS_LENGTH: Final = 12.0
-"""Of a pass per axis [m], standard deviation."""
 SPRINT_EVERY: Final = 45.0
 """Mean time between a player's sprints [s]."""
 SPRINT_TIME: Final = 2.5
@@ -50,7 +57,7 @@ REACTION: Final = 0.5
 """Time in which a wished change of velocity takes hold [s]."""
 JERK_TIME: Final = 0.12
 """Time in which an acceleration builds up [s]."""
-EAGERNESS: Final = 0.35
+EAGERNESS: Final = 0.38
 """Speed wished per metre to the target [1/s]: 10 m away they jog, 20 m away they run hard."""
 NEAR_ENOUGH: Final = 2.0
 """Who is that near his target stands [m], until it is `WORTH_GOING` away."""
@@ -84,9 +91,11 @@ def play(
     players = max(crowd.people - crowd.officials, 0)
     team = np.arange(crowd.people) % 2
     side = np.where(team == 0, 1.0, -1.0)
-    ball = _ball(time, rng)
+    game = roll_ball(time, crowd.actions, rng)
+    ball = game.position
     targets, hurry = _targets(time, ball, players, crowd.people, side, rng)
     top = rng.uniform(*TOP_SPEED, crowd.people)
+    duels = Duels(time, game.touches, team, players, crowd.actions, rng)
 
     position, velocity = targets[0].copy(), np.zeros((crowd.people, 2))
     push, moving = np.zeros((crowd.people, 2)), np.ones(crowd.people, dtype=bool)
@@ -101,42 +110,38 @@ def play(
             far = np.linalg.norm(position[mates] - ball[i], axis=-1)
             for rank, mate in enumerate(mates[np.argsort(far, kind="stable")[:PRESSING]]):
                 target[mate] = ball[i] - side[mate] * np.array([0.8 + 4.0 * rank, 0.5 * rank])
+        haste = np.full(crowd.people, np.nan)
+        for person, (place, left) in duels.advance(i, position, velocity, heading).items():
+            target[person] = place
+            haste[person] = np.linalg.norm(place - position[person]) / max(left, 0.3)
+        mode = duels.mode[i]
         velocity, push, moving = _steer(
-            position, velocity, push, moving, target - position, hurry[i], top
+            position,
+            velocity,
+            push,
+            moving,
+            target - position,
+            _Wishes(hurry[i], haste, np.minimum(duels.most[i], top), mode, duels.push[i]),
+            top,
         )
         places[i], headings[i] = position, heading
         speeds[i] = np.linalg.norm(velocity, axis=-1)
         look = np.where(speeds[i][:, None] > 0.6, velocity, ball[i] - position)
         turn = np.arctan2(look[:, 1], look[:, 0]) - heading
         turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
-        heading = heading + np.clip(turn / TURN_TIME, -TURN_RATE, TURN_RATE) * STEP
+        turn = np.clip(turn / TURN_TIME, -TURN_RATE, TURN_RATE)
+        heading = heading + np.where(mode == AT_EASE, turn, 0.0) * STEP
         position = position + velocity * STEP
     paths = [
-        GroundPath(time, places[:, n], headings[:, n], speeds[:, n]) for n in range(crowd.people)
+        GroundPath(time, places[:, n], headings[:, n], speeds[:, n], in_order(duels.actions[n]))
+        for n in range(crowd.people)
     ]
+    for keeper in range(min(2, players)):
+        goal = np.array([-52.5, 0.0]) * side[keeper]
+        paths[keeper] = keep_ready(paths[keeper], goal, ball)
     way = np.gradient(ball, STEP, axis=0)
     course = np.unwrap(np.arctan2(way[:, 1], way[:, 0]))
     return paths, GroundPath(time, ball, course, np.linalg.norm(way, axis=-1))
-
-
-def _ball(time: Floats, rng: np.random.Generator) -> Floats:
-    """Ball (samples, 2) [m] that rolls from pass to pass and stays in play."""
-    place = rng.uniform(-1.0, 1.0, 2) * [30.0, 18.0]
-    when, places = [time[0]], [place]
-    while when[-1] < time[-1]:
-        # Play drifts back to the middle third rather than stick to a corner.
-        place = 0.9 * place + PASS_LENGTH * rng.standard_normal(2)
-        place = np.clip(place, [-46.0, -29.0], [46.0, 29.0])
-        when.append(when[-1] + rng.uniform(*PASS_EVERY))
-        places.append(place)
-    # Rounded over a third of a second: nothing that people look at jumps.
-    raw = np.stack([np.interp(time, when, axis) for axis in np.array(places).T], axis=-1)
-    half = round(0.35 / STEP)
-    kernel = np.hanning(2 * half + 1)
-    padded = np.pad(raw, ((half, half), (0, 0)), mode="edge")
-    return np.stack(
-        [np.convolve(axis, kernel / kernel.sum(), mode="valid") for axis in padded.T], axis=-1
-    )
 
 
 def _targets(
@@ -180,24 +185,46 @@ def _targets(
     return np.clip(targets, low, high), hurry
 
 
+@dataclass(frozen=True, eq=False)
+class _Wishes:
+    """How everybody (people,) would go.
+
+    Attributes:
+        hurry: how much more than usual they hurry to their target [1].
+        haste: speed at which they would be there in time [m/s]; NaN = as they like.
+        most: speed that they keep to [m/s].
+        mode: at ease, coasting, stopping or pushing off.
+        off_leg: (people, 2), acceleration of those who push off [m/s^2].
+    """
+
+    hurry: Floats
+    haste: Floats
+    most: Floats
+    mode: NDArray[np.int8]
+    off_leg: Floats
+
+
 def _steer(
     position: Floats,
     velocity: Floats,
     push: Floats,
     moving: NDArray[np.bool_],
     way: Floats,
-    hurry: Floats,
+    wishes: _Wishes,
     top: Floats,
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Velocity, acceleration and who is on the move, one step later."""
     far = np.linalg.norm(way, axis=-1)
-    moving = far > np.where(moving, NEAR_ENOUGH, WORTH_GOING)
-    wish = np.where(moving, np.minimum(EAGERNESS * hurry * far, top), 0.0)
+    called = ~np.isnan(wishes.haste)
+    moving = (far > np.where(moving, NEAR_ENOUGH, WORTH_GOING)) | called
+    wish = np.where(called, wishes.haste, EAGERNESS * wishes.hurry * far)
+    wish = np.where(moving, np.minimum(wish, wishes.most), 0.0)
     wished = way * (wish / np.maximum(far, 1e-9))[:, None]
     apart = position[:, None] - position
     gap = np.linalg.norm(apart, axis=-1)
     near = np.clip(1.0 - gap / BODY_SPACE, 0.0, 1.0)
     wished = wished + 5.0 * (apart * (near / np.maximum(gap, 1e-9))[..., None]).sum(axis=1)
+    wished = np.where((wishes.mode == STOPPING)[:, None], 0.0, wished)
     change = (wished - velocity) / REACTION
     # What drives on falls with speed, what brakes or turns does not.
     speed = np.linalg.norm(velocity, axis=-1)
@@ -207,5 +234,10 @@ def _steer(
     change = change + (np.minimum(drive, most) - drive)[:, None] * ahead
     size = np.linalg.norm(change, axis=-1)
     change = change * np.minimum(1.0, ACCELERATION / np.maximum(size, 1e-9))[:, None]
+    change = np.where((wishes.mode == COASTING)[:, None], 0.0, change)
     push = push + (change - push) * STEP / JERK_TIME
+    push = np.where((wishes.mode == PUSHING)[:, None], wishes.off_leg, push)
+    # A leg that pushed somebody off the ground pushes no more.
+    thrown = (wishes.mode == COASTING) & (np.linalg.norm(push, axis=-1) > ACCELERATION)
+    push = np.where(thrown[:, None], 0.0, push)
     return velocity + push * STEP, push, moving

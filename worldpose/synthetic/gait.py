@@ -1,4 +1,4 @@
-"""People who stand, walk and run: 17 joints from a path over the ground.
+"""People who stand, walk, run and act: 17 joints from a path over the ground.
 
 A kinematic model: planted feet follow the path's footholds, knees follow by two-bone inverse
 kinematics, arms swing against the legs. Bones between joints keep their lengths exactly.
@@ -7,13 +7,16 @@ kinematics, arms swing against the legs. Bones between joints keep their lengths
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from worldpose.synthetic.actions import act
+from worldpose.synthetic.bodies import Body
+from worldpose.synthetic.clips import play_clip
 from worldpose.synthetic.paths import GroundPath
+from worldpose.synthetic.poses import Pose, level_axes, pose_joints, unit
 
 Floats = NDArray[np.float64]
 Ground = Callable[[Floats, Floats], Floats]
@@ -25,19 +28,11 @@ RIGID_BONES: Final = (
 )
 """Pairs of joints whose distance never changes in a person; the spine twists and the head turns."""
 
-_HEAD: Final = np.array(
-    # nose, left eye, right eye, left ear, right ear
-    [
-        [0.060, 0.0, 0.095],
-        [0.048, 0.018, 0.115],
-        [0.048, -0.018, 0.115],
-        [-0.004, 0.042, 0.105],
-        [-0.004, -0.042, 0.105],
-    ]
+STRIDES: Final = (
+    (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.0, 9.0),
+    (0.91, 1.0, 1.10, 1.26, 1.36, 1.43, 1.53, 1.68, 1.85, 2.2),
 )
-"""Forward, left, up from the mid-shoulder, as fractions of body height."""
-
-
+"""Speeds [m/s] and strides a second at them: walkers up to 2 m/s, runners beyond."""
 STANDING_SPEED: Final = 0.25
 """Who is slower than this for `STANDING_TIME` stands [m/s]."""
 STANDING_TIME: Final = 0.3
@@ -47,41 +42,6 @@ TURNING_ARM: Final = 0.5
 than half that does it with the hips."""
 
 
-@dataclass(frozen=True)
-class Body:
-    """A person's constant measures [m]."""
-
-    height: float
-    thigh: float
-    shank: float
-    ankle_height: float
-    """Ankle above the sole."""
-    hip_half_width: float
-    trunk: float
-    """Mid-hip to mid-shoulder."""
-    shoulder_half_width: float
-    upper_arm: float
-    forearm: float
-
-    @property
-    def leg(self) -> float:
-        """Hip to ankle when stretched [m]."""
-        return self.thigh + self.shank
-
-
-def draw_body(height: tuple[float, float], rng: np.random.Generator) -> Body:
-    """A person of random height [m] and slightly random proportions.
-
-    Mean segment lengths as fractions of height after Drillis and Contini (1966) as tabulated in
-    Winter, Biomechanics and Motor Control of Human Movement; hips and shoulders between joint
-    centres. Each varies by 2 % between people.
-    """
-    tall = rng.uniform(*height)
-    fractions = np.array([0.245, 0.246, 0.045, 0.050, 0.288, 0.110, 0.186, 0.146])
-    lengths = tall * fractions * (1.0 + 0.02 * rng.standard_normal(len(fractions)))
-    return Body(tall, *(float(length) for length in lengths))
-
-
 def walk(
     body: Body,
     path: GroundPath,
@@ -89,7 +49,21 @@ def walk(
     ground: Ground,
     rng: np.random.Generator,
 ) -> Floats:
-    """Joints (frames, 17, 3) [m], world, of a person who follows a path.
+    """Joints (frames, 17, 3) [m], world, of a person who follows a path; see `tread`."""
+    return tread(body, path, times, ground, rng)[0]
+
+
+def tread(
+    body: Body,
+    path: GroundPath,
+    times: Floats,
+    ground: Ground,
+    rng: np.random.Generator,
+) -> tuple[Floats, Floats]:
+    """Joints (frames, 17, 3) [m], world, of a person who follows a path, and where the feet point.
+
+    Feet point (frames, 2) [rad], left and right, from the x axis towards y, as the path did where
+    they were set down. Actions of the path are blended in.
 
     Args:
         body: measures.
@@ -113,38 +87,45 @@ def walk(
     pelvis = np.concatenate(
         [pelvis_xy, (ground(*pelvis_xy.T) + body.ankle_height + rise)[:, None]], axis=-1
     )
-    forward, leftward = _axes(heading + np.radians(6.0) * sway)
-    chest_forward, chest_left = _axes(heading - np.radians(8.0) * sway)
+    forward, leftward = level_axes(heading + np.radians(6.0) * sway)
+    chest_forward, chest_left = level_axes(heading - np.radians(8.0) * sway)
     lean = np.radians(2.0 + 6.0 * run)[:, None]
-    spine = np.cos(lean) * up + np.sin(lean) * _axes(heading)[0]
-    neck = pelvis + body.trunk * spine
-
-    joints = np.empty((len(times), 17, 3))
     look = np.radians(35.0) * np.sin(2.0 * np.pi * (times / rng.uniform(3.0, 6.0) + rng.random()))
-    gaze, gaze_left = _axes(heading + look)
-    head = np.stack([gaze, gaze_left, np.broadcast_to(up, gaze.shape)], axis=-2)
-    joints[:, :5] = neck[:, None] + body.height * _HEAD @ head
+    gaze, gaze_left = level_axes(heading + look)
+    arms, ankles = np.empty((len(times), 2, 2, 3)), np.empty((len(times), 2, 3))
+    courses = np.empty((len(times), 2))
     for side, (sign, offset) in enumerate(((1.0, 0.0), (-1.0, 0.5))):  # left, right
-        ankle = _ankles(body, path, cycle + offset, times, ground, sign)
-        hip = pelvis + sign * body.hip_half_width * leftward
-        joints[:, 11 + side] = hip
-        joints[:, 13 + side], joints[:, 15 + side] = _leg(body, hip, ankle, forward)
-        shoulder = neck + sign * body.shoulder_half_width * chest_left
+        ankles[:, side], courses[:, side] = _ankles(body, path, cycle + offset, times, ground, sign)
         # The left arm is forward when the left leg is back.
         raised = (0.35 + 0.35 * run) * sign * sway - 0.15 * run
         bent = raised + np.radians(20.0 + 65.0 * run)
         outward = 0.15 * sign * chest_left
-        joints[:, 5 + side] = shoulder
-        elbow = shoulder + body.upper_arm * _arm(raised, chest_forward, outward)
-        joints[:, 7 + side] = elbow
-        joints[:, 9 + side] = elbow + body.forearm * _arm(bent, chest_forward, 0.0 * outward)
-    return joints
+        arms[:, side, 0] = _arm(raised, chest_forward, outward)
+        arms[:, side, 1] = _arm(bent, chest_forward, 0.0 * outward)
+    pose = Pose(
+        pelvis=pelvis,
+        hips_left=leftward,
+        trunk=np.cos(lean) * up + np.sin(lean) * level_axes(heading)[0],
+        shoulders_left=chest_left,
+        head=np.stack([gaze, gaze_left, np.broadcast_to(up, gaze.shape)], axis=-2),
+        arms=arms,
+        ankles=ankles,
+        knees=np.stack([forward, forward], axis=1),
+        feet=courses,
+    )
+    for action in path.actions:
+        act(body, path, action, times, ground, pose)
+    joints = pose_joints(body, pose)
+    if path.clip is not None:
+        joints = play_clip(body, path.clip, times, ground, joints)
+    return joints, pose.feet
 
 
 def stride_cycle(path: GroundPath, phase: float) -> Floats:
     """Strides made (samples,): whole when the left foot is in mid-stance, half when the right is.
 
     Strides get longer and faster with speed: 0.9 a second at 1 m/s, 1.4 at 4 m/s, 2.2 at 9 m/s.
+    Sources are in docs/synthetic.md.
     Who stands rests a quarter of the way between the two, where both feet are on the ground.
 
     Args:
@@ -152,7 +133,7 @@ def stride_cycle(path: GroundPath, phase: float) -> Floats:
         phase: stride at the path's beginning [1], for a person who never stands.
     """
     pace = _pace(path)
-    rate = np.where(pace < 1.0, 0.91 * np.sqrt(pace), 0.75 + 0.16 * pace)
+    rate = np.where(pace < 1.0, 0.91 * np.sqrt(pace), np.interp(pace, *STRIDES))
     cycle = phase + np.concatenate(
         [[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(path.time))]
     )
@@ -195,19 +176,11 @@ def _running(speed: Floats) -> Floats:
     return np.clip((speed - 1.0) / 3.0, 0.0, 1.5)
 
 
-def _axes(heading: Floats) -> tuple[Floats, Floats]:
-    """Unit vectors (frames, 3) forward and to the left, level."""
-    zero = np.zeros_like(heading)
-    forward = np.stack([np.cos(heading), np.sin(heading), zero], axis=-1)
-    return forward, np.stack([-np.sin(heading), np.cos(heading), zero], axis=-1)
-
-
 def _arm(angle: Floats, forward: Floats, outward: Floats) -> Floats:
     """Unit vectors from hanging down, raised forward by `angle` [rad] and a little outward."""
     down = np.array([0.0, 0.0, -1.0])
     vector = np.cos(angle)[:, None] * down + np.sin(angle)[:, None] * forward + outward
-    unit: Floats = vector / np.linalg.norm(vector, axis=-1, keepdims=True)
-    return unit
+    return unit(vector)
 
 
 def _ankles(
@@ -217,38 +190,28 @@ def _ankles(
     times: Floats,
     ground: Ground,
     sign: float,
-) -> Floats:
-    """Ankles (frames, 3): planted around whole cycles, in between carried to the next foothold."""
+) -> tuple[Floats, Floats]:
+    """Ankles (frames, 3) and where the feet point (frames,) [rad].
+
+    Planted around whole cycles, in between carried to the next foothold.
+    """
     now = np.interp(times, path.time, cycle)
     before = np.floor(now)
-    places, stance = [], []
+    places, courses, stance = [], [], []
     for count in (before, before + 1.0):
         when = np.interp(count, cycle, path.time)
         speed, heading = (np.interp(when, path.time, x) for x in (path.speed, path.heading))
         beneath = np.stack([np.interp(when, path.time, x) for x in path.position.T], axis=-1)
-        places.append(beneath + sign * 0.8 * body.hip_half_width * _axes(heading)[1][:, :2])
+        courses.append(heading)
+        places.append(beneath + sign * 0.8 * body.hip_half_width * level_axes(heading)[1][:, :2])
         # Share of the cycle on the ground: 62 % at a walk, 30 % at 4 m/s.
         stance.append(0.62 - 0.32 * _running(speed))
     leave, land = before + 0.5 * stance[0], before + 1.0 - 0.5 * stance[1]
     done = np.clip((now - leave) / (land - leave), 0.0, 1.0)
-    moved = (done**2 * (3.0 - 2.0 * done))[:, None]
-    place = (1.0 - moved) * places[0] + moved * places[1]
+    moved = done**2 * (3.0 - 2.0 * done)
+    course = (1.0 - moved) * courses[0] + moved * courses[1]
+    place = (1.0 - moved)[:, None] * places[0] + moved[:, None] * places[1]
     run = _running(np.interp(times, path.time, path.speed))
     lift = (0.08 + 0.27 * run) * np.sin(np.pi * done) ** 2
-    return np.concatenate([place, (ground(*place.T) + body.ankle_height + lift)[:, None]], axis=-1)
-
-
-def _leg(body: Body, hip: Floats, ankle: Floats, forward: Floats) -> tuple[Floats, Floats]:
-    """Knee and ankle (frames, 3); an ankle out of reach is drawn to the hip: the heel rises."""
-    along = ankle - hip
-    far = np.linalg.norm(along, axis=-1, keepdims=True)
-    along = along / far
-    # Reach ends softly and short of a straight leg, whose knee would snap.
-    free, spare = 0.965 * body.leg, 0.03 * body.leg
-    beyond = np.maximum(far - free, 0.0)
-    reach = np.minimum(far, free) + spare * (1.0 - np.exp(-beyond / spare))
-    to_knee = (body.thigh**2 - body.shank**2 + reach**2) / (2.0 * reach)
-    aside = np.sqrt(body.thigh**2 - to_knee**2)
-    front = forward - (forward * along).sum(-1, keepdims=True) * along
-    front /= np.linalg.norm(front, axis=-1, keepdims=True)
-    return hip + to_knee * along + aside * front, hip + reach * along
+    height = ground(*place.T) + body.ankle_height + lift
+    return np.concatenate([place, height[:, None]], axis=-1), course

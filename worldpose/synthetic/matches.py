@@ -9,11 +9,19 @@ from pathlib import Path
 import numpy as np
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from worldpose.cameras import Camera
-from worldpose.ingest import write_match
-from worldpose.release import write_archive, write_joints, write_static_camera
+from worldpose.body import OPEN_BODY, BodyParameters
+from worldpose.ingest import write_calibration_toml, write_match
+from worldpose.pitch import PitchTemplate
+from worldpose.release import (
+    write_archive,
+    write_joints,
+    write_moving_camera,
+    write_static_camera,
+)
+from worldpose.synthetic.clips import read_clip
+from worldpose.synthetic.rendering import render_pitch
 from worldpose.synthetic.scene import Scene, simulate_scene
-from worldpose.synthetic.settings import Scenario
+from worldpose.synthetic.settings import CalibrationErrors, Scenario
 from worldpose.synthetic.trajectories import read_trajectories
 
 CLIP_ID = "clip"
@@ -29,16 +37,28 @@ def simulate_match(
     cameras: int | None = None,
     players: int | None = None,
     trajectories: Path | None = None,
+    mocap: Path | None = None,
+    calibrated: bool = False,
+    stills: bool = True,
 ) -> MatchSpec:
     """Write a synthetic match folder with its truth; the same arguments give the same bytes.
 
-    Besides what every match folder has (match.yaml, pitch.json, calibration.toml, detections/) it
-    holds, under reference/: joints.npz (`worldpose.release.write_joints`); cameras/<camera>.npz
-    (`worldpose.release.write_static_camera`) and, the same with a row a frame, cameras/clip.npz of
-    the broadcast camera; identities/<camera or clip>.npz: `frame` (frames,) int64, `person`
-    (frames, detections) int16, the index into the joints file's `person_ids` of every detection,
-    -1 for false people and padding, and `displaced` (frames, detections, 17) uint8, keypoints put
-    far off; clocks.json: frames that each static camera lies behind its stated clock.
+    Besides what a match folder to be calibrated has (match.yaml, pitch.json, detections/,
+    annotations/, stills/) it holds, under reference/:
+
+    - joints.npz (`worldpose.release.write_joints`);
+    - poses/clip.npz, the bodies that these joints are keypoints of, as the WorldPose release has
+      them: betas (N, 10), global_orient (N, T, 3), body_pose (N, T, 69), transl (N, T, 3) in single
+      precision, and the name of the `body_model`;
+    - calibration.toml and cameras/<camera>.npz (`worldpose.release.write_static_camera`) and, with
+      a row a frame, cameras/clip.npz of the broadcast camera;
+    - pitch.json as it is painted;
+    - clicks.json: of every static camera, `wrong` clicks (`Clicks.wrong`), and whether they are
+      `clustered` in one part of the picture;
+    - identities/<camera or clip>.npz: `frame` (frames,) int64, `person` (frames, detections) int16,
+      the index into the joints file's `person_ids` of every detection, -1 for false people and
+      padding, and `displaced` (frames, detections, 17) uint8, keypoints put far off;
+    - clocks.json: frames that each static camera lies behind its stated clock.
 
     Args:
         scenario: what happens.
@@ -49,12 +69,16 @@ def simulate_match(
         players: number of people, instead of the scenario's.
         trajectories: tracking data (`read_trajectories`) that drives the people instead; the clip
             ends with it.
+        calibrated: give the true static cameras, as calibration.toml; else there is such a file
+            only where the scenario misjudges cameras.
+        stills: add one picture of every static camera, about a second each.
+        mocap: motion capture (`worldpose.synthetic.clips.read_clip`) that one person plays.
 
     Returns:
         The match's match.yaml. Its id names scenario, seed and what differs from the scenario.
 
     Raises:
-        InputError: `out` holds files, or the trajectories cannot be used.
+        InputError: `out` holds files, or the trajectories or the capture cannot be used.
     """
     changes = []
     if duration is not None:
@@ -73,10 +97,28 @@ def simulate_match(
         driven, length = read_trajectories(trajectories, scenario.duration, most=players)
         scenario = scenario.model_copy(update={"duration": length})
         changes.append(f"tracks{hashlib.sha256(trajectories.read_bytes()).hexdigest()[:8]}")
-    scene = simulate_scene(scenario, seed, clip_id=CLIP_ID, driven=driven)
-    calibrations = {name: camera.to_calibration(name) for name, camera in scene.given.items()}
+    clip = None
+    if mocap is not None:
+        clip = read_clip(mocap)
+        changes.append(f"mocap{hashlib.sha256(mocap.read_bytes()).hexdigest()[:8]}")
+    if calibrated:
+        scenario = scenario.model_copy(update={"calibration": CalibrationErrors()})
+        changes.append("calibrated")
+    scene = simulate_scene(scenario, seed, clip_id=CLIP_ID, driven=driven, clip=clip)
+    given = scene.given if calibrated or scenario.calibration != CalibrationErrors() else {}
+    painted = PitchTemplate.from_spec(scenario.pitch)
+    people = scene.truth.joints[0]
+    pictures = {
+        name: render_pitch(camera, painted, people, seed)
+        for name, camera in (scene.cameras if stills else {}).items()
+    }
     width, height = scenario.rig.image_size
-    specs = [CameraSpec(id=name, width=width, height=height) for name in scene.cameras]
+    specs = [
+        CameraSpec(
+            id=name, width=width, height=height, still=f"stills/{name}.png" if stills else None
+        )
+        for name in scene.cameras
+    ]
     if scene.broadcast is not None:
         specs.append(CameraSpec(id=BROADCAST_ID, kind="broadcast", width=width, height=height))
     spec = MatchSpec(
@@ -94,21 +136,24 @@ def simulate_match(
     write_match(
         out,
         spec,
-        calibrations=calibrations,
+        calibrations={name: camera.to_calibration(name) for name, camera in given.items()},
         observations=scene.observations,
-        pitch=scenario.pitch,
-        references=lambda folder: write_references(folder / "reference", scene),
+        pitch=scene.surveyed,
+        clicked={name: clicks.markings for name, clicks in scene.clicks.items()},
+        stills=pictures,
+        references=lambda folder: write_references(folder / "reference", scenario, scene),
     )
     return spec
 
 
-def write_references(folder: Path, scene: Scene) -> None:
-    """Write the truth of a scene: joints, cameras, clocks and who every detection is."""
+def write_references(folder: Path, scenario: Scenario, scene: Scene) -> None:
+    """Write the truth of a scene: joints, cameras, clocks, pitch and who every detection is."""
     write_joints(folder / "joints.npz", scene.truth)
+    _write_poses(folder / "poses" / f"{CLIP_ID}.npz", scene.poses)
     for name, camera in scene.cameras.items():
         write_static_camera(folder / "cameras" / f"{name}.npz", camera.to_calibration(name))
     if scene.broadcast is not None:
-        _write_moving_camera(folder / "cameras" / f"{CLIP_ID}.npz", scene.broadcast)
+        write_moving_camera(folder / "cameras" / f"{CLIP_ID}.npz", scene.broadcast)
     for name, identities in scene.identities.items():
         write_archive(
             folder / "identities" / f"{name}.npz",
@@ -118,18 +163,32 @@ def write_references(folder: Path, scene: Scene) -> None:
                 "displaced": identities.displaced.astype(np.uint8),
             },
         )
-    clocks = json.dumps(scene.clocks, indent=2)
-    (folder / "clocks.json").write_text(clocks + "\n", encoding="utf-8")
-
-
-def _write_moving_camera(path: Path, camera: Camera) -> None:
-    """Write K (T,3,3), k (T,5), R (T,3,3) and t (T,3), as the WorldPose release has them."""
-    intrinsics = np.zeros((len(camera.focal), 3, 3))
-    intrinsics[:, (0, 1), (0, 1)] = camera.focal
-    intrinsics[:, :2, 2] = camera.principal_point
-    intrinsics[:, 2, 2] = 1.0
-    pose = camera.cam_from_world
-    write_archive(
-        path,
-        {"K": intrinsics, "k": camera.distortion, "R": pose.rotation, "t": pose.translation},
+    write_calibration_toml(
+        folder / "calibration.toml",
+        {name: camera.to_calibration(name) for name, camera in scene.cameras.items()},
     )
+    painted = PitchTemplate.from_spec(scenario.pitch).points
+    pitch = scenario.pitch.model_copy(update={"points": {n: tuple(p) for n, p in painted.items()}})
+    (folder / "pitch.json").write_text(pitch.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    _write_json(folder / "clocks.json", scene.clocks)
+    clicks = {
+        name: {"wrong": dict(each.wrong), "clustered": each.clustered}
+        for name, each in scene.clicks.items()
+    }
+    _write_json(folder / "clicks.json", clicks)
+
+
+def _write_json(path: Path, content: object) -> None:
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def _write_poses(path: Path, poses: BodyParameters) -> None:
+    """Write bodies (N, T), 4 um at most beside the truth: float32 on a pitch of 105 m."""
+    arrays = {
+        "betas": poses.betas[:, 0],
+        "global_orient": poses.global_orient,
+        "body_pose": poses.body_pose,
+        "transl": poses.transl,
+    }
+    single = {name: array.astype(np.float32) for name, array in arrays.items()}
+    write_archive(path, {**single, "body_model": np.array([OPEN_BODY])})

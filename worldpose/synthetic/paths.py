@@ -9,6 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from worldpose.synthetic.bvh import Clip
+from worldpose.synthetic.motions import Action
+from worldpose.synthetic.outbursts import draw_actions, steadied
 from worldpose.synthetic.settings import CrowdSettings
 
 STEP: Final = 0.01
@@ -46,6 +49,10 @@ class GroundPath:
     """(samples,) [rad] from the x axis towards y, without jumps."""
     speed: NDArray[np.float64]
     """(samples,) [m/s]."""
+    actions: tuple[Action, ...] = ()
+    """What the person does besides, in order of their beginning."""
+    clip: Clip | None = None
+    """Motion capture that the person plays from time 0 on, instead of a gait."""
 
 
 def wander(
@@ -75,10 +82,12 @@ def wander(
     start = int(np.argmax(np.minimum(clear, START_SPACE)))  # the first with room, else the best
     position, heading = np.empty((len(time), 2)), np.empty(len(time))
     here, angle, turn = starts[start], rng.uniform(-np.pi, np.pi), 0.0
+    actions = draw_actions(time, speed, crowd.actions, rng)
+    speed, steady = steadied(time, speed, actions)
     for i in range(len(time)):
         position[i], heading[i] = here, angle
         own = speed[i] * np.array([np.cos(angle), np.sin(angle)])
-        velocity = own + _shove(here - place[:, i])
+        velocity = own if steady[i] else own + _shove(here - place[:, i])
         speed[i] = np.linalg.norm(velocity)
         wish = (
             whim[i]
@@ -88,9 +97,11 @@ def wander(
         limit = min(TURN_RATE, LATERAL_ACCELERATION / max(speed[i], 0.1))
         limit *= min(1.0, speed[i] / TURNING_SPEED)
         turn += (float(np.clip(wish, -limit, limit)) - turn) * STEP / TURN_LAG
+        # In the air, and on the ground, nobody turns.
+        turn *= 0.92 if steady[i] else 1.0
         here = here + velocity * STEP
         angle = angle + turn * STEP
-    return GroundPath(time, position, heading, speed)
+    return GroundPath(time, position, heading, speed, actions)
 
 
 def _shove(apart: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,7 +7,8 @@ from typing import Final
 import numpy as np
 
 from worldpose.pitch import PitchTemplate
-from worldpose.synthetic.gait import draw_body, walk
+from worldpose.synthetic.bodies import draw_body
+from worldpose.synthetic.gait import walk
 from worldpose.synthetic.paths import wander
 from worldpose.synthetic.processes import bursts
 from worldpose.synthetic.settings import CrowdSettings, Scenario

@@ -8,12 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.pitch import PitchSpec
+from worldpose.body import BodyParameters
 from worldpose.cameras import Camera
 from worldpose.ingest import Observations
 from worldpose.pitch import PitchTemplate
 from worldpose.release import JointTracks
 from worldpose.synthetic.broadcast import film
+from worldpose.synthetic.bvh import Clip
 from worldpose.synthetic.calibrating import misjudge
+from worldpose.synthetic.clicking import Clicks, click, every
 from worldpose.synthetic.crowd import Crowd, gather
 from worldpose.synthetic.detecting import (
     Detections,
@@ -29,6 +33,7 @@ from worldpose.synthetic.reporting import Report, report
 from worldpose.synthetic.settings import Scenario
 from worldpose.synthetic.sight import Bodies, Sight, see
 from worldpose.synthetic.stadium import place_camera
+from worldpose.synthetic.surveying import survey
 
 Seed = np.random.SeedSequence
 
@@ -54,21 +59,27 @@ class Scene:
     Attributes:
         truth: `views` counts the static cameras that have the joint in their picture with nobody
             before it.
+        poses: the bodies (persons, frames) whose keypoints the truth's joints are.
         cameras: the true static cameras by id, in the order of the rig.
         given: the same as calibration.toml has them.
         broadcast: the moving camera, a batch (frames,); None without.
         observations: by id of a static camera, and of the clip for the broadcast camera.
         identities: by the same ids.
         clocks: frames that a static camera lies behind its stated clock, by id [frame].
+        clicks: what a person clicked in the first frame of every static camera, by id.
+        surveyed: the pitch as pitch.json has it; the scenario has it as it is painted.
     """
 
     truth: JointTracks
+    poses: BodyParameters
     cameras: dict[str, Camera]
     given: dict[str, Camera]
     broadcast: Camera | None
     observations: dict[str, Observations]
     identities: dict[str, Identities]
     clocks: dict[str, float]
+    clicks: dict[str, Clicks]
+    surveyed: PitchSpec
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +106,7 @@ def simulate_scene(
     *,
     clip_id: str = "clip",
     driven: Sequence[GroundPath] | None = None,
+    clip: Clip | None = None,
 ) -> Scene:
     """Return a scene; the same scenario and seed give the same numbers.
 
@@ -107,10 +119,13 @@ def simulate_scene(
         seed: from 0.
         clip_id: names the broadcast camera's detections.
         driven: ways of the people, instead of the scenario's movement.
+        clip: motion capture that one of them plays.
     """
-    people_seed, rig_seed, habit_seed, broadcast_seed, error_seed = Seed(seed).spawn(5)
+    people_seed, rig_seed, habit_seed, broadcast_seed, error_seed, survey_seed, click_seed = Seed(
+        seed
+    ).spawn(7)
     pitch = PitchTemplate.from_spec(scenario.pitch)
-    crowd = gather(scenario, pitch, people_seed, driven)
+    crowd = gather(scenario, pitch, people_seed, driven, clip)
     persons = len(crowd.paths)
     common, own = habit_seed.spawn(2)
     own_bias = np.array([_rng(each).standard_normal((17, 3)) for each in own.spawn(persons)])
@@ -124,15 +139,26 @@ def simulate_scene(
     cameras: dict[str, Camera] = {}
     reports: dict[str, Report] = {}
     clocks: dict[str, float] = {}
+    clicks: dict[str, Clicks] = {}
     views = np.zeros(bodies.joints.shape[:3], dtype=np.int64)
+    from_wrong, from_clustered = _rng(click_seed).random(2)
     for index, camera_seed in enumerate(rig_seed.spawn(scenario.rig.cameras)):
         name = f"cam{index:02d}"
-        place, clock, *errors = camera_seed.spawn(6)
+        place, clock, *errors, hand = camera_seed.spawn(7)
         camera = place_camera(scenario.rig, index, target, scenario.pitch, _rng(place))
         late = scenario.rig.clock_spread * float(_rng(clock).standard_normal())
         seen_bodies = bodies if late == 0.0 else world.bodies(times + late / scenario.fps)
         sight = see(camera, seen_bodies)
         views += sight.seen
+        clicks[name] = click(
+            camera,
+            pitch,
+            bodies.joints[0],
+            scenario.clicks,
+            clustered=every(scenario.clicks.clustered, index, from_clustered),
+            mistaken=every(scenario.clicks.wrong, index, from_wrong),
+            rng=_rng(hand),
+        )
         cameras[name], clocks[name] = camera, late
         reports[name] = _reported(world, camera, sight, errors)
     broadcast = None
@@ -145,12 +171,15 @@ def simulate_scene(
         reports[clip_id] = _reported(world, broadcast, see(broadcast, bodies), errors)
     return Scene(
         truth=JointTracks(np.arange(len(times)), np.arange(persons), bodies.joints, views=views),
+        poses=crowd.poses(times),
         cameras=cameras,
         given=misjudge(cameras, scenario.calibration, _rng(error_seed)),
         broadcast=broadcast,
         observations={name: each.observations for name, each in reports.items()},
         identities={name: _identities(each, persons) for name, each in reports.items()},
         clocks=clocks,
+        clicks=clicks,
+        surveyed=survey(scenario.pitch, scenario.survey_error, _rng(survey_seed)),
     )
 
 

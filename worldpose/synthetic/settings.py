@@ -13,18 +13,49 @@ from worldpose.synthetic.noise import ObservationNoise
 Range = tuple[float, float]
 
 
+class ActionRates(Record):
+    """How often people do something besides going somewhere.
+
+    Shares are of the ball's touches, of which there are 18 a minute. Rates and what was measured
+    in matches: docs/synthetic.md.
+    """
+
+    headers: float = Field(default=0.12, ge=0, le=1)
+    """Share of balls that two opponents jump for [1]: 9 headers a player and match."""
+    tackles: float = Field(default=0.06, ge=0, le=1)
+    """Share of balls that an opponent slides into [1]."""
+    tripped: float = Field(default=0.5, ge=0, le=1)
+    """Share of those slid into who fall [1]; the others hurdle the leg."""
+    shots: float = Field(default=0.12, ge=0, le=1)
+    """Share of balls within 28 m of a goal that are shot at it [1]."""
+    jumps: float = Field(default=3.0, ge=0)
+    """Of everybody who wanders [1/min]: as in a penalty area."""
+    falls: float = Field(default=0.4, ge=0)
+    """Of everybody who wanders [1/min]."""
+    standing_about: float = Field(default=0.7, ge=0, le=1)
+    """Share of the time of standing, rests under 1.6 s left out, in which people shift their
+    weight, look around or rest their hands on their hips [1]."""
+
+    @classmethod
+    def none(cls) -> ActionRates:
+        """Nobody does anything but go and stand."""
+        return cls(headers=0, tackles=0, shots=0, jumps=0, falls=0, standing_about=0)
+
+
 class CrowdSettings(Record):
     """The people and the part of the pitch they move on."""
 
     people: int = Field(default=5, ge=0)
     """How many [1]."""
-    movement: Literal["wander", "football"] = "wander"
-    """Each for himself within the area, or two teams that follow a ball; area, speed and
-    personal space hold for those who wander."""
+    movement: Literal["wander", "football", "corner", "crossing"] = "wander"
+    """Each for himself within the area, two teams that follow a ball, a contest for it in the
+    area, or runs to and fro through its middle; personal space holds for those who wander, area and
+    speed for all but teams."""
     officials: int = Field(default=0, ge=0)
     """How many of them are a referee and assistants [1], the last ones; only in football."""
-    area_center: tuple[float, float] = (-20.0, 14.0)
-    """Middle of the area [m]: off both axes, so that a wrong sign or a flat pitch shows."""
+    area_center: tuple[float, float] = (-41.0, 12.0)
+    """Middle of the area [m]: off both axes, so that a wrong sign or a flat pitch shows, and at a
+    corner of a penalty area, so that cameras have markings to be calibrated from."""
     area_size: tuple[float, float] = (20.0, 14.0)
     """Length along x and y [m]; people turn back towards the middle at its border."""
     speed: Range = (1.0, 4.0)
@@ -33,6 +64,8 @@ class CrowdSettings(Record):
     """Distance under which others are avoided [m]."""
     height: Range = (1.70, 1.95)
     """Shortest and tallest body height [m]: professional players."""
+    actions: ActionRates = ActionRates()
+    """What people do besides."""
 
 
 class Seat(Record):
@@ -114,6 +147,32 @@ class CalibrationErrors(Record):
     """[1]"""
 
 
+class ClickSettings(Record):
+    """How a person clicks named pitch points in the picture of a static camera."""
+
+    points: tuple[int, int] = (8, 12)
+    """Fewest and most in one camera [1], as far as there are that many to see."""
+    noise: float = Field(default=1.0, ge=0)
+    """Error of a click, standard deviation along each image axis [px]: a click on the middle of a
+    painted corner at the picture's own size."""
+    clustered: float = Field(default=0.0, ge=0, le=1)
+    """Share of cameras in which all points lie within `window` [1]: where one part of the picture
+    holds most of the markings, as behind a goal, people look no farther."""
+    window: float = Field(default=0.34, gt=0, le=1)
+    """Of the picture's width [1]."""
+    clustered_points: tuple[int, int] = (5, 7)
+    """Fewest and most points in such a camera [1]."""
+    wrong: float = Field(default=0.2, ge=0, le=1)
+    """Share of cameras with one wrong click [1]: every second of them a point named for another,
+    the other a slip."""
+    wrong_distance: Range = (20.0, 60.0)
+    """How far a slip goes [px]."""
+    enough: int = Field(default=8, ge=0)
+    """Where fewer points can be seen, lines and arcs are drawn too [1]."""
+    drawn_points: int = Field(default=8, ge=2)
+    """Most points along a drawn marking [1]; they err as the others do."""
+
+
 class Scenario(Record):
     """One synthetic match: everything but the seed."""
 
@@ -130,4 +189,9 @@ class Scenario(Record):
     """None = no moving camera."""
     calibration: CalibrationErrors = CalibrationErrors()
     noise: ObservationNoise = ObservationNoise()
+    clicks: ClickSettings = ClickSettings()
     pitch: PitchSpec = PitchSpec()
+    """As it is painted."""
+    survey_error: float = Field(default=0.006, ge=0)
+    """Of the points in pitch.json, standard deviation along each axis [m], together about 1 cm: a
+    total station knows millimetres, what is the middle of a painted corner does not."""

@@ -4,7 +4,8 @@ Inputs: cameras and the people each of them detected. Outputs: the detection of 
 every frame and camera, quick joints [m], and a summary of each track.
 """
 
+from worldpose.tracking.rosters import people_allowed
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import Tracking, TrackingReport, track_people
 
-__all__ = ["Tracking", "TrackingReport", "TrackingSettings", "track_people"]
+__all__ = ["Tracking", "TrackingReport", "TrackingSettings", "people_allowed", "track_people"]

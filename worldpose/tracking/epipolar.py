@@ -10,28 +10,43 @@ from numpy.typing import NDArray
 from worldpose.compiled import compiled
 from worldpose.tracking.affinity import ray_affinity
 from worldpose.tracking.intersection import intersect_people
+from worldpose.tracking.limbs import plausible
 from worldpose.tracking.person import Sighting
 from worldpose.tracking.settings import TrackingSettings
 
-LIMBS = np.array(
-    [
-        (5, 6),
-        (5, 7),
-        (6, 8),
-        (7, 9),
-        (8, 10),
-        (5, 11),
-        (6, 12),
-        (11, 13),
-        (12, 14),
-        (13, 15),
-        (14, 16),
-    ]
-)
-"""Pairs of COCO-17 joints whose distances tell a person's size."""
-LIMB_LENGTHS = np.array([0.36, 0.30, 0.30, 0.25, 0.25, 0.51, 0.51, 0.42, 0.42, 0.42, 0.42])
-"""Their lengths in an adult of 1.75 m [m]: Drillis and Contini's segment ratios, with the torso
-and shoulders measured between joint centres."""
+
+@compiled
+def footprints(
+    centers: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    ground: tuple[float, float],
+) -> NDArray[np.float64]:
+    """Return where on the ground each detection's person stands (n, 3): x, y and doubt [m].
+
+    The mean ray is cut at the height of a body's middle; the doubt is how far it travels through
+    the heights which that may have.
+
+    Args:
+        centers: (n, 3) [m], world, of each detection's camera.
+        directions: (n, joints, 3) unit rays, world; NaN where not seen.
+        ground: middle and half extent of those heights [m]; an infinite extent = no ground.
+    """
+    n, joint_count, _ = directions.shape
+    places = np.zeros((n, 3))
+    for a in range(n):
+        x = y = z = 0.0
+        for joint in range(joint_count):
+            if not math.isnan(directions[a, joint, 0]):
+                x += directions[a, joint, 0]
+                y += directions[a, joint, 1]
+                z += directions[a, joint, 2]
+        way = (ground[0] - centers[a, 2]) / z if z != 0.0 else -1.0
+        if ground[1] < math.inf and way > 0.0:
+            places[a, 0], places[a, 1] = centers[a, 0] + way * x, centers[a, 1] + way * y
+            places[a, 2] = ground[1] * math.hypot(x, y) / abs(z)
+        else:
+            places[a, 2] = math.inf
+    return places
 
 
 @compiled
@@ -39,8 +54,10 @@ def pair_distances(
     centers: NDArray[np.float64],
     directions: NDArray[np.float64],
     camera: NDArray[np.int64],
+    places: NDArray[np.float64],
     min_joints: int,
     min_sine: float,
+    gate: float,
 ) -> NDArray[np.float64]:
     """Return the mean distance between the rays of every two detections of different cameras.
 
@@ -48,12 +65,15 @@ def pair_distances(
         centers: (n, 3) [m], world, of each detection's camera.
         directions: (n, joints, 3) unit rays, world; NaN where not seen.
         camera: (n,) index of each detection's camera.
+        places: (n, 3) [m], footprints; two farther apart than their doubts are two people.
         min_joints: least joints seen by both.
         min_sine: least mean sine of the angle between the rays.
+        gate: distance beyond which a pair is of no interest [m].
 
     Returns:
         (n, n) [m], upper triangle; infinite where two detections cannot start a group: same
-        camera, too few joints in common, or rays so parallel that they meet everywhere.
+        camera, other places on the ground, too few joints in common, beyond the gate, or rays so
+        parallel that they meet everywhere.
     """
     n, joint_count, _ = directions.shape
     distances = np.full((n, n), np.inf)
@@ -61,18 +81,26 @@ def pair_distances(
         for b in range(a + 1, n):
             if camera[a] == camera[b]:
                 continue
-            x, y, z = centers[b] - centers[a]
+            reach = places[a, 2] + places[b, 2] + gate
+            if math.hypot(places[a, 0] - places[b, 0], places[a, 1] - places[b, 1]) > reach:
+                continue
+            x, y = centers[b, 0] - centers[a, 0], centers[b, 1] - centers[a, 1]
+            z = centers[b, 2] - centers[a, 2]
             total, sines, count = 0.0, 0.0, 0
             for joint in range(joint_count):
-                p, q = directions[a, joint], directions[b, joint]
-                nx, ny = p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2]
-                nz = p[0] * q[1] - p[1] * q[0]
+                px, py = directions[a, joint, 0], directions[a, joint, 1]
+                pz = directions[a, joint, 2]
+                qx, qy = directions[b, joint, 0], directions[b, joint, 1]
+                qz = directions[b, joint, 2]
+                nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
                 sine = math.sqrt(nx * nx + ny * ny + nz * nz)
                 if sine > 0.0:
                     total += abs(x * nx + y * ny + z * nz) / sine
                     sines += sine
                     count += 1
-            if count >= min_joints and sines >= min_sine * count:
+                    if total > gate * joint_count:
+                        break
+            if count >= min_joints and sines >= min_sine * count and total <= gate * count:
                 distances[a, b] = total / count
     return distances
 
@@ -81,6 +109,7 @@ def associate(
     centers: NDArray[np.float64],
     directions: NDArray[np.float64],
     weights: NDArray[np.float64],
+    ground: bool,
     settings: TrackingSettings,
 ) -> list[Sighting]:
     """Return the people that detections of at least `birth_views` cameras agree on.
@@ -92,48 +121,59 @@ def associate(
         centers: (cameras, 3) [m], world.
         directions: (cameras, detections, 17, 3) unit rays, world; NaN where not seen or taken.
         weights: (cameras, detections, 17), of the squared angle; 0 where not seen or taken.
+        ground: whether people stand on z = 0.
         settings: gates and least views.
 
     Note:
         T2. Each detection joins one group at most.
     """
     cameras = len(centers)
-    birth_views = min(settings.birth_views, max(2, cameras))
-    usable = np.isfinite(directions[..., 0]).sum(axis=-1) >= settings.min_joints
-    if np.count_nonzero(usable.any(axis=1)) < birth_views:
+    usual = min(settings.birth_views, max(2, cameras))
+    fewest = 2 if settings.pair_evidence > 0.0 else usual
+    usable = np.count_nonzero(weights > 0.0, axis=-1) >= settings.min_joints
+    if np.count_nonzero(usable.any(axis=1)) < fewest:
         return []
     camera, detection = np.nonzero(usable)
+    origins, rays = centers[camera], directions[camera, detection]
+    low, high = settings.body_heights
+    extent = 0.5 * (high - low) if ground else math.inf
     distances = pair_distances(
-        centers[camera],
-        directions[camera, detection],
+        origins,
+        rays,
         camera,
+        footprints(origins, rays, (0.5 * (low + high), extent)),
         settings.min_joints,
         math.sin(settings.min_angle),
+        settings.epipolar_gate,
     )
-    first, second = np.nonzero(distances <= settings.epipolar_gate)
+    first, second = np.nonzero(distances < np.inf)
     order = np.argsort(distances[first, second], kind="stable")
-    free = np.where(usable[..., None, None], directions, np.nan)
+    free = np.where(usable[..., None], weights, 0.0)
     groups: list[Sighting] = []
-    for a, b in zip(first[order], second[order], strict=True):
-        if not (usable[camera[a], detection[a]] and usable[camera[b], detection[b]]):
-            continue
-        seed = np.full(cameras, -1)
-        seed[camera[[a, b]]] = detection[[a, b]]
-        group = _grown(seed, centers, free, weights, settings)
-        if np.count_nonzero(group.index >= 0) >= birth_views and plausible(group.joints, settings):
-            groups.append(group)
-            members = np.flatnonzero(group.index >= 0)
-            usable[members, group.index[members]] = False
-            free[members, group.index[members]] = np.nan
+    # Pairs that no third camera confirms take what the others leave.
+    for needed in sorted({usual, fewest}, reverse=True):
+        for a, b in zip(first[order], second[order], strict=True):
+            if not (usable[camera[a], detection[a]] and usable[camera[b], detection[b]]):
+                continue
+            seed = np.full(cameras, -1)
+            seed[camera[[a, b]]] = detection[[a, b]]
+            group = _grown(seed, centers, directions, free, settings)
+            views = np.count_nonzero(group.index >= 0)
+            if views >= needed and _person(group.joints, ground, settings):
+                groups.append(group)
+                members = np.flatnonzero(group.index >= 0)
+                usable[members, group.index[members]] = False
+                free[members, group.index[members]] = 0.0
     return groups
 
 
-def plausible(joints: NDArray[np.float64], settings: TrackingSettings) -> bool:
-    """Return whether joints (17, 3) [m] have the size of a person: the median over known limbs."""
-    lengths = np.linalg.norm(joints[LIMBS[:, 0]] - joints[LIMBS[:, 1]], axis=-1)
-    ratios = (lengths / LIMB_LENGTHS)[np.isfinite(lengths)]
-    low, high = settings.size_range
-    return bool(len(ratios)) and low <= float(np.median(ratios)) <= high
+def _person(joints: NDArray[np.float64], ground: bool, settings: TrackingSettings) -> bool:
+    """Return whether joints (17, 3) [m] have the size of a person, and stand where people do."""
+    known = np.isfinite(joints[:, 2])
+    if not plausible(joints, settings.size_range):
+        return False
+    low, high = settings.body_heights
+    return not ground or low <= float(joints[known, 2].mean()) <= high
 
 
 def _grown(
@@ -153,7 +193,10 @@ def _grown(
         joints = intersect_people(
             centers, directions, weights, index[:, None], unknown, settings.gate, sine
         )
-        distances = -ray_affinity(joints, centers, directions, settings.min_joints)[:, 0]
+        gates = np.array([gate])
+        distances = -ray_affinity(joints, centers, directions, weights, gates, settings.min_joints)[
+            :, 0
+        ]
         best = distances.argmin(axis=1)
         ray_distance = distances[np.arange(len(centers)), best]
         index = np.where(ray_distance <= gate, best, -1)

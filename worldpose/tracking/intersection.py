@@ -11,8 +11,12 @@ from worldpose.compiled import compiled
 from worldpose.tracking.affinity import distance
 
 ITERATIONS = 5
+CONVERGED = 1e-3
+"""Length of a step that ends the iteration [m]: a tenth of what the rays can tell."""
 FEW_RAYS = 1e-9
 """Determinant, of a system whose diagonal is about 1, that counts as singular [1]."""
+
+Point = tuple[float, float, float]
 
 
 @compiled
@@ -53,21 +57,29 @@ def intersect_people(
             for c in range(cameras):
                 detection = index[c, person]
                 if detection >= 0 and weights[c, detection, joint] > 0.0:
-                    origin[count], ray[count] = centers[c], directions[c, detection, joint]
+                    for axis in range(3):
+                        origin[count, axis] = centers[c, axis]
+                        ray[count, axis] = directions[c, detection, joint, axis]
                     weight[count] = weights[c, detection, joint]
                     count += 1
             if count < 2:
                 continue
-            point = near[person, joint].copy()
+            x, y, z = near[person, joint]
             scale = 0.5 * gate
-            if math.isnan(point[0]):
-                point = _nearest_point(origin, ray, weight, count, point, math.inf)
+            if math.isnan(x):
+                x, y, z = _nearest_point(origin, ray, weight, count, (x, y, z), math.inf)
                 scale *= 4.0
             for _ in range(ITERATIONS):
-                point = _nearest_point(origin, ray, weight, count, point, scale)
+                u, v, w = x, y, z
+                x, y, z = _nearest_point(origin, ray, weight, count, (x, y, z), scale)
+                settled = scale <= 0.5 * gate
                 scale = max(0.5 * gate, 0.5 * scale)
-            if _spread(origin, ray, count, point, gate) >= min_sine:
-                joints[person, joint] = point
+                if settled and (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2 <= CONVERGED**2:
+                    break
+            if _spread(origin, ray, count, (x, y, z), gate, min_sine):
+                joints[person, joint, 0] = x
+                joints[person, joint, 1] = y
+                joints[person, joint, 2] = z
     return joints
 
 
@@ -77,25 +89,21 @@ def _nearest_point(
     ray: NDArray[np.float64],
     weight: NDArray[np.float64],
     count: int,
-    point: NDArray[np.float64],
+    point: Point,
     scale: float,
-) -> NDArray[np.float64]:
+) -> Point:
     """Return the point nearest to the rays, reweighted at `point`; NaN if they are parallel."""
     a = b = c = d = e = f = g0 = g1 = g2 = total = 0.0
     for k in range(count):
         w = weight[k]
+        x, y, z = ray[k, 0], ray[k, 1], ray[k, 2]
+        ox, oy, oz = origin[k, 0], origin[k, 1], origin[k, 2]
         if scale < math.inf:
-            away = distance(point, origin[k], ray[k])
-            length = (
-                (point[0] - origin[k, 0]) ** 2
-                + (point[1] - origin[k, 1]) ** 2
-                + (point[2] - origin[k, 2]) ** 2
-            )
+            away = distance(point[0], point[1], point[2], origin[k], ray[k])
+            length = (point[0] - ox) ** 2 + (point[1] - oy) ** 2 + (point[2] - oz) ** 2
             w *= (scale * scale / (scale * scale + away * away)) ** 2 / length
-        x, y, z = ray[k]
         xx, yy, zz = w * (1.0 - x * x), w * (1.0 - y * y), w * (1.0 - z * z)
         xy, xz, yz = -w * x * y, -w * x * z, -w * y * z
-        ox, oy, oz = origin[k]
         a, b, c, d, e, f = a + xx, b + xy, c + xz, d + yy, e + yz, f + zz
         g0 += xx * ox + xy * oy + xz * oz
         g1 += xy * ox + yy * oy + yz * oz
@@ -104,12 +112,13 @@ def _nearest_point(
     p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
     s, t, u = a * f - c * c, b * c - a * e, a * d - b * b
     determinant = a * p + b * q + c * r
-    out = np.full(3, np.nan)
-    if determinant > FEW_RAYS * total**3:
-        out[0] = (p * g0 + q * g1 + r * g2) / determinant
-        out[1] = (q * g0 + s * g1 + t * g2) / determinant
-        out[2] = (r * g0 + t * g1 + u * g2) / determinant
-    return out
+    if not determinant > FEW_RAYS * total**3:
+        return (math.nan, math.nan, math.nan)
+    return (
+        (p * g0 + q * g1 + r * g2) / determinant,
+        (q * g0 + s * g1 + t * g2) / determinant,
+        (r * g0 + t * g1 + u * g2) / determinant,
+    )
 
 
 @compiled
@@ -117,16 +126,19 @@ def _spread(
     origin: NDArray[np.float64],
     ray: NDArray[np.float64],
     count: int,
-    point: NDArray[np.float64],
+    point: Point,
     gate: float,
-) -> float:
-    """Return the largest sine of an angle between two rays that pass within the gate."""
-    largest = 0.0
+    min_sine: float,
+) -> bool:
+    """Return whether two rays that pass within the gate are `min_sine` apart."""
+    x, y, z = point
     for k in range(count):
-        if not distance(point, origin[k], ray[k]) <= gate:
+        if not distance(x, y, z, origin[k], ray[k]) <= gate:
             continue
         for other in range(k):
-            if distance(point, origin[other], ray[other]) <= gate:
-                cosine = np.dot(ray[k], ray[other])
-                largest = max(largest, 1.0 - cosine * cosine)
-    return math.sqrt(largest)
+            cosine = ray[k, 0] * ray[other, 0] + ray[k, 1] * ray[other, 1]
+            cosine += ray[k, 2] * ray[other, 2]
+            apart = 1.0 - cosine * cosine >= min_sine * min_sine
+            if apart and distance(x, y, z, origin[other], ray[other]) <= gate:
+                return True
+    return False

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from worldpose.compiled import compiled
 from worldpose.tracking.settings import TrackingSettings
 
 
@@ -47,6 +48,8 @@ class Person:
         velocity: (3,) [m/s], of the whole body.
         sightings: by frame.
         fixed: number of frames whose rays determined the place.
+        evidence: the same with frames of fewer views than a birth takes counted as parts [1].
+        shown_from: first frame with the evidence of a birth; -1 = none so far.
     """
 
     number: int
@@ -55,6 +58,8 @@ class Person:
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     sightings: dict[int, Sighting] = field(default_factory=dict)
     fixed: int = 0
+    evidence: float = 0.0
+    shown_from: int = -1
 
     def advance(self, frame: int, fps: float, settings: TrackingSettings) -> None:
         """Move the pose on to `frame`, one frame later."""
@@ -63,22 +68,34 @@ class Person:
             if self.last_fixed < frame - 1:
                 self.velocity = self.velocity * math.exp(-1.0 / (fps * settings.coast_time))
 
-    def see(self, frame: int, sighting: Sighting, fps: float, settings: TrackingSettings) -> None:
+    def see(
+        self,
+        frame: int,
+        sighting: Sighting,
+        fps: float,
+        settings: TrackingSettings,
+        evidence: float = 1.0,
+    ) -> None:
         """Take over what was seen in `frame`; joints not determined follow the others."""
         self.sightings[frame] = sighting
-        known = np.isfinite(sighting.joints[:, 0])
-        if not known.any():
-            return
-        both = known & np.isfinite(self.pose[:, 0])
         elapsed = (frame - self.last_fixed) / fps
-        if both.any() and elapsed > 0.0:
-            shift = np.median((sighting.joints - self.pose)[both], axis=0)
+        pose, shift, known = _moved(self.pose, sighting.joints, elapsed > 0.0)
+        if not known:
+            return
+        if elapsed > 0.0:
             gain = 1.0 - math.exp(-elapsed / settings.velocity_time)
             self.velocity = self.velocity + gain * shift / elapsed
-            self.pose = self.pose + shift
-        self.pose = np.where(known[:, None], sighting.joints, self.pose)
+        self.pose = pose
         self.last_fixed = frame
         self.fixed += 1
+        self.evidence += evidence
+        if self.shown_from < 0 and self.evidence >= 1.0 - 1e-9:
+            self.shown_from = frame
+
+    def uncertainty(self, frame: int, fps: float, settings: TrackingSettings) -> float:
+        """Return the standard deviation of the predicted place at `frame` [m]: it grows unseen."""
+        unseen = max(0.0, (frame - 1 - self.last_fixed) / fps)
+        return settings.agility * math.sqrt(unseen**3 / 3.0)
 
     def absorb(self, other: Person, since: int) -> None:
         """Take over the other's sightings from frame `since` on: they show this person."""
@@ -87,6 +104,31 @@ class Person:
             own = self.sightings.get(frame)
             self.sightings[frame] = theirs if own is None else own.filled_from(theirs)
             other.fixed -= bool(np.isfinite(theirs.joints).any())
+        other.evidence = min(other.evidence, float(other.fixed))
+
+
+@compiled
+def _moved(
+    pose: NDArray[np.float64], joints: NDArray[np.float64], move: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64], bool]:
+    """Return the pose with known joints replaced and others moved along, the shift, any known."""
+    both, known = np.empty((len(pose), 3)), False
+    count = 0
+    for joint in range(len(pose)):
+        if not math.isnan(joints[joint, 0]):
+            known = True
+            if not math.isnan(pose[joint, 0]):
+                both[count] = joints[joint] - pose[joint]
+                count += 1
+    shift = np.zeros(3)
+    if move and count:
+        for axis in range(3):
+            shift[axis] = np.median(both[:count, axis])
+    out = pose + shift
+    for joint in range(len(pose)):
+        if not math.isnan(joints[joint, 0]):
+            out[joint] = joints[joint]
+    return out, shift, known
 
 
 def separations(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

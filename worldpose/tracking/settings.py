@@ -10,6 +10,10 @@ from data_contracts.records import Record
 class TrackingSettings(Record):
     """How near, how many and how long. The paper gives no values; these suit people in metres."""
 
+    causal: bool = False
+    """Decide every frame from it and those before it; else the whole clip decides who is who."""
+    hungarian: bool = True
+    """Match people and detections of a camera by the Hungarian method instead of greedily (T1)."""
     gate: float = Field(default=0.5, gt=0)
     """Largest mean distance of a detection's rays to the person it is matched with [m] (T1): half
     the shoulder width of two people side by side, and a sprinter's way in two frames of 50 Hz."""
@@ -20,11 +24,16 @@ class TrackingSettings(Record):
     birth_views: int = Field(default=3, ge=2)
     """Cameras that must agree on a new person [1]; two on a rig of two. Two rays alone meet at
     ghosts as well as at people."""
+    pair_evidence: float = Field(default=0.2, ge=0, le=1)
+    """What a frame with fewer views, two at least, counts towards `min_track` [1]: people whom
+    only two cameras see are found as well, five times as slowly. 0 = not at all."""
     min_angle: float = Field(default=0.1, gt=0)
     """Least angle between rays that are to fix a position [rad]."""
     size_range: tuple[float, float] = (0.65, 1.4)
     """Accepted size of a new person relative to an adult of 1.75 m [1]: false intersections are
     mostly giants or dwarfs."""
+    body_heights: tuple[float, float] = (0.2, 1.6)
+    """Heights over the ground that the middle of a body may have, lying and leaping [m]."""
     predict_motion: bool = True
     """Match with the position predicted at constant velocity instead of the last one; not in the
     paper, for sprinters and for frame rates under 50 Hz."""
@@ -32,14 +41,38 @@ class TrackingSettings(Record):
     """Time over which a person's velocity is averaged [s]."""
     coast_time: float = Field(default=0.5, gt=0)
     """Time in which the predicted velocity of an unseen person falls to 37 % [s]."""
+    agility: float = Field(default=2.5, gt=0)
+    """Standard deviation of the change of velocity in the first second [m/s]: what footballers do
+    between two sightings."""
+    max_coast: float = Field(default=0.2, ge=0)
+    """Time for which an unseen person takes detections at the predicted place [s]; later only a
+    new sighting in several views can be that person."""
     max_lost: float = Field(default=2.0, ge=0)
-    """Time after which an unseen person's track ends [s]."""
-    refound_speed: float = Field(default=3.0, ge=0)
-    """A new person within `gate` plus this times the time unseen of a lost one's predicted place
-    is that one [m/s]."""
+    """Causal: time after which an unseen person's track ends [s]."""
     min_track: float = Field(default=0.2, ge=0)
     """Tracks with less time in two or more views are ghosts and dropped [s]."""
     merge_distance: float = Field(default=0.2, ge=0)
     """Two tracks with mean joint distance below this are on one person [m]: bodies cannot."""
     merge_time: float = Field(default=0.2, gt=0)
     """Time for which they must be so near to be merged [s]."""
+    end_time: float = Field(default=0.3, gt=0)
+    """Time over which place and velocity at either end of a track are fitted [s]."""
+    max_gap: float = Field(default=60.0, gt=0)
+    """Longest time between two tracks of one person that are joined [s]."""
+    velocity_memory: float = Field(default=1.0, gt=0)
+    """Time after which a velocity says nothing about the next [s]."""
+    mean_speed: float = Field(default=2.0, gt=0)
+    """Root mean square speed of people on the pitch, per axis [m/s]."""
+    paces: tuple[tuple[float, float], ...] = ((0.5, 1.0), (0.5, 0.3))
+    """Shares of time, and what agility and speed are then times [1]: at play, and standing or
+    walking, which is half of a match."""
+    limb_noise: float = Field(default=0.02, gt=0)
+    """Standard deviation of a limb's length between two long tracks of one person [m]."""
+    limb_spread: float = Field(default=0.025, gt=0)
+    """Standard deviation of a limb's length among people [m]: 6 % of 0.42 m."""
+    newcomer_odds: float = Field(default=0.01, gt=0)
+    """Odds, before looking, that who appears is new to the clip and not somebody lost [1]."""
+    roster_odds: float = Field(default=0.001, gt=0)
+    """The same when as many people as the roster allows are known already [1]."""
+    join_odds: float = Field(default=10.0, ge=1)
+    """Odds against every other way that decide a join [1]; less goes to review."""

@@ -1,19 +1,29 @@
-"""Triangulation: where every joint of every tracked person is, and how sure that is (T3).
+"""Triangulation: where every joint of every tracked person is, and how sure that is (T3, T4).
 
-Inputs: cameras, detected keypoints, and which detection is which person. Outputs: joints [m] with
-covariance, agreeing views and reprojection error.
+Inputs: cameras, detected keypoints, and which detection is which person. Outputs: joints [m] of
+every frame and of whole tracks, with covariance and agreeing views; by how much clocks are late.
 """
 
+from worldpose.triangulation.clocks import CameraClocks, estimate_clocks, moved_in_time
+from worldpose.triangulation.reconstruction import Reconstruction, reconstruct_joints
 from worldpose.triangulation.robust import (
     Triangulation,
     TriangulationReport,
     triangulate_joints,
 )
 from worldpose.triangulation.settings import TriangulationSettings
+from worldpose.triangulation.smoothing import Smoothing, smooth_joints
 
 __all__ = [
+    "CameraClocks",
+    "Reconstruction",
+    "Smoothing",
     "Triangulation",
     "TriangulationReport",
     "TriangulationSettings",
+    "estimate_clocks",
+    "moved_in_time",
+    "reconstruct_joints",
+    "smooth_joints",
     "triangulate_joints",
 ]

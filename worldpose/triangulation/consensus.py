@@ -1,183 +1,174 @@
-"""Which views of one joint agree, and the point that suits them best.
+"""Which views of a joint agree, and the point that suits them best, for 64 joints at a time.
 
-Rows, poses and noise are those of `reprojection`; `weights` and `squared` are scratch.
+Tiles, states and their rows are those of `lanes`.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.compiled import compiled
-from worldpose.triangulation.reprojection import (
-    Point,
-    deviations,
-    linear_point,
-    normal_equations,
-    solve,
+from worldpose.triangulation.lanes import (
+    CHANGED,
+    INSIDE,
+    LANES,
+    LOSS,
+    POINT,
+    PRECISION,
+    ROWS,
+    SEEN,
+    SQUARED,
+    STATE,
+    STEP,
+    USED,
+    WORST,
+    largest,
+    select,
+    start,
+    step,
+    survey,
 )
 
-MAX_STEPS = 8
-CONVERGED = 1e-9
+Floats = NDArray[np.float64]
+
+MAX_STEPS: Final = 8
+CONVERGED: Final = 1e-6
 """Length of a step that ends the iteration [m]."""
-MAX_REVISIONS = 5
+MAX_REVISIONS: Final = 5
 """Corrections of the set of agreeing views; it settles after one or two."""
-
-
-@compiled
-def refined(
-    point: Point,
-    rows: NDArray[np.float64],
-    poses: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    noise: tuple[float, float],
-    count: int,
-) -> Point:
-    """Return the weighted least-squares point near `point`, by Gauss-Newton on reprojection."""
-    for _ in range(MAX_STEPS):
-        n, g, _ = normal_equations(point, rows, poses, weights, noise, count)
-        step = solve(n, g)
-        point = (point[0] + step[0], point[1] + step[1], point[2] + step[2])
-        if not step[0] ** 2 + step[1] ** 2 + step[2] ** 2 > CONVERGED**2:
-            break
-    return point
-
-
-@compiled
-def graduated_point(
-    point: Point,
-    rows: NDArray[np.float64],
-    poses: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    noise: tuple[float, float],
-    count: int,
-    limit: float,
-    squared: NDArray[np.float64],
-) -> Point:
-    """Return the point under a Geman-McClure loss of shrinking scale.
-
-    The scale goes from the worst error to `limit`: early steps see nearly a quadratic, so that
-    the start may be far away (graduated non-convexity, Blake and Zisserman 1987).
-    """
-    scale = limit
-    for k in range(count):
-        if squared[k] < math.inf:
-            scale = max(scale, squared[k])
-    while True:
-        for k in range(count):
-            weights[k] = (scale / (scale + squared[k])) ** 2 if squared[k] < math.inf else 0.0
-        n, g, _ = normal_equations(point, rows, poses, weights, noise, count)
-        step = solve(n, g)
-        point = (point[0] + step[0], point[1] + step[1], point[2] + step[2])
-        deviations(point, rows, poses, noise, count, squared)
-        if scale <= limit:
-            return point
-        scale = max(limit, 0.25 * scale)
-
-
-@compiled
-def best_pair_point(
-    rows: NDArray[np.float64],
-    poses: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    noise: tuple[float, float],
-    count: int,
-    limit: float,
-    squared: NDArray[np.float64],
-) -> Point:
-    """Return the two-view point with the smallest truncated error over all views."""
-    best, best_cost = (math.nan, math.nan, math.nan), math.inf
-    for i in range(count):
-        for j in range(i + 1, count):
-            weights[:count] = 0.0
-            weights[i] = weights[j] = 1.0
-            point = linear_point(rows, poses, weights, count)
-            deviations(point, rows, poses, noise, count, squared)
-            cost = 0.0
-            for k in range(count):
-                cost += min(squared[k], limit)
-            if cost < best_cost:
-                best, best_cost = point, cost
-    return best
-
-
-@compiled
-def agreeing(squared: NDArray[np.float64], count: int, limit: float) -> int:
-    """Return the number of views within the limit."""
-    inside = 0
-    for k in range(count):
-        if squared[k] <= limit:
-            inside += 1
-    return inside
+SHRINK: Final = 0.1
+"""Of the loss's scale from step to step [1]."""
 
 
 @compiled
 def consensus(
-    rows: NDArray[np.float64],
-    poses: NDArray[np.float64],
+    tiles: Floats,
+    depths: Floats,
     noise: tuple[float, float],
-    count: int,
     limit: float,
-    min_views: int,
-    weights: NDArray[np.float64],
-    squared: NDArray[np.float64],
-) -> tuple[Point, int]:
-    """Return the least-squares point of the views that agree with it, and their number.
+    state: Floats,
+) -> None:
+    """Write the least-squares points of the views that agree, NaN where there are none.
 
-    Writes 1 for an agreeing view and 0 for another to `weights`. Number 0 = no agreement.
+    All views are tried together; where they do not agree, a Geman-McClure loss whose scale shrinks
+    from the worst error to `limit` finds a majority (graduated non-convexity, Blake and Zisserman
+    1987); where there is none, the two views that the others contradict least decide.
+
+    Args:
+        tiles: (cameras, ROWS x LANES); writes `USED`.
+        depths: (cameras, 4).
+        noise: [px], [m].
+        limit: largest squared error that agrees, in variances.
+        state: written: points, and the inverse matrices there.
     """
-    weights[:count] = 1.0
-    point = linear_point(rows, poses, weights, count)
-    point = refined(point, rows, poses, weights, noise, count)
-    deviations(point, rows, poses, noise, count, squared)
-    if agreeing(squared, count, limit) < count:
-        point = graduated_point(point, rows, poses, weights, noise, count, limit, squared)
-        inside = agreeing(squared, count, limit)
-        # A majority of three or more agrees by chance too rarely to look further.
-        if inside < 3 or 2 * inside <= count:
-            point = best_pair_point(rows, poses, weights, noise, count, limit, squared)
-            deviations(point, rows, poses, noise, count, squared)
+    for tile in tiles:
+        # All there are are used.
+        tile[SQUARED : SQUARED + LANES] = 0.0
+    select(tiles, limit, state)
+    state[LOSS : LOSS + LANES] = math.inf
+    start(tiles, state)
+    step(tiles, depths, noise, state)
+    if _graduate(tiles, depths, noise, limit, state):
+        survey(tiles, limit, state)
+        for j in range(LANES):
+            if state[LOSS + j] < math.inf:
+                inside = state[INSIDE + j]
+                # A majority of three or more agrees by chance too rarely to look further.
+                if inside < 3 or 2 * inside <= state[SEEN + j]:
+                    _take_best_pair(tiles, depths, noise, limit, j, state)
+        state[LOSS : LOSS + LANES] = math.inf
     for _ in range(MAX_REVISIONS):
-        inside, changed = 0, False
-        for k in range(count):
-            weight = 1.0 if squared[k] <= limit else 0.0
-            changed = changed or weight != weights[k]
-            weights[k] = weight
-            inside += weight > 0.0
-        if inside < min_views:
-            return (math.nan, math.nan, math.nan), 0
-        if not changed:
+        select(tiles, limit, state)
+        if not largest(state, CHANGED) > 0.0:
             break
-        point = refined(point, rows, poses, weights, noise, count)
-        deviations(point, rows, poses, noise, count, squared)
-    return point, inside
+        step(tiles, depths, noise, state)
+        step(tiles, depths, noise, state)
+    for _ in range(MAX_STEPS):
+        step(tiles, depths, noise, state)
+        if not largest(state, STEP) > CONVERGED**2:
+            break
 
 
 @compiled
-def spread(
-    point: Point, poses: NDArray[np.float64], weights: NDArray[np.float64], count: int
-) -> float:
-    """Return the largest sine of an angle between two agreeing views' rays to the point."""
-    rays = np.zeros((count, 3))
-    largest = 0.0
+def _graduate(
+    tiles: Floats, depths: Floats, noise: tuple[float, float], limit: float, state: Floats
+) -> bool:
+    """Move lanes whose views do not agree to where a majority does; is there such a lane?
+
+    Their loss stays at `limit`; that of the others is infinite.
+    """
+    survey(tiles, limit, state)
+    most = 0.0
+    for j in range(LANES):
+        if state[INSIDE + j] < state[SEEN + j]:
+            state[LOSS + j] = max(state[WORST + j], limit)
+            most = max(most, state[LOSS + j])
+    if most == 0.0:
+        return False
+    while True:
+        step(tiles, depths, noise, state)
+        if most <= limit:
+            break
+        most *= SHRINK
+        for j in range(LANES):
+            if state[LOSS + j] < math.inf:
+                state[LOSS + j] = max(limit, SHRINK * state[LOSS + j])
+    # Errors are those before a step: one more shows where the last one led.
+    step(tiles, depths, noise, state)
+    return True
+
+
+@compiled
+def _take_best_pair(
+    tiles: Floats,
+    depths: Floats,
+    noise: tuple[float, float],
+    limit: float,
+    lane: int,
+    state: Floats,
+) -> None:
+    """Set a lane to the two-view point with the smallest truncated error over all views."""
+    views = np.empty(len(tiles), np.int64)
+    count = 0
+    for camera in range(len(tiles)):
+        if tiles[camera, PRECISION + lane] > 0.0:
+            views[count] = camera
+            count += 1
+    pairs = np.empty((LANES, 2), np.int64)
+    trial, trial_depths = np.empty((count, ROWS * LANES)), np.empty((count, 4))
     for k in range(count):
-        if weights[k] <= 0.0:
-            continue
-        r = poses[k].reshape(3, 4)
-        for i in range(3):
-            y = r[i, 0] * point[0] + r[i, 1] * point[1] + r[i, 2] * point[2] + r[i, 3]
-            for j in range(3):
-                rays[k, j] += r[i, j] * y
-        rays[k] /= math.sqrt(rays[k, 0] ** 2 + rays[k, 1] ** 2 + rays[k, 2] ** 2)
-        for other in range(k):
-            if weights[other] > 0.0:
-                p, q = rays[k], rays[other]
-                x, y, z = (
-                    p[1] * q[2] - p[2] * q[1],
-                    p[2] * q[0] - p[0] * q[2],
-                    p[0] * q[1] - p[1] * q[0],
-                )
-                largest = max(largest, x * x + y * y + z * z)
-    return math.sqrt(largest)
+        trial_depths[k] = depths[views[k]]
+        for row in range(ROWS):
+            trial[k, row * LANES : (row + 1) * LANES] = tiles[views[k], row * LANES + lane]
+    points = np.empty(STATE * LANES)
+    best, filled = math.inf, 0
+    for one in range(count):
+        for two in range(one + 1, count):
+            pairs[filled, 0], pairs[filled, 1] = one, two
+            filled += 1
+            if filled < LANES and (one, two) != (count - 2, count - 1):
+                continue
+            for k in range(count):
+                for j in range(LANES):
+                    among = j < filled and (pairs[j, 0] == k or pairs[j, 1] == k)
+                    trial[k, USED + j] = 1.0 if among else 0.0
+            points[LOSS : LOSS + LANES] = math.inf
+            start(trial, points)
+            at = points[POINT : POINT + 3 * LANES].copy()
+            step(trial, trial_depths, noise, points)
+            for j in range(filled):
+                cost = 0.0
+                for k in range(count):
+                    squared = trial[k, SQUARED + j]
+                    cost += squared if squared < limit else limit
+                if cost < best:
+                    best = cost
+                    for axis in range(3):
+                        state[POINT + axis * LANES + lane] = at[axis * LANES + j]
+                    for k in range(count):
+                        tiles[views[k], SQUARED + lane] = trial[k, SQUARED + j]
+            filled = 0

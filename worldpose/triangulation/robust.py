@@ -1,8 +1,7 @@
-"""Robust weighted triangulation of every joint of every person (T3)."""
+"""Robust weighted triangulation of every joint of every person (T3, T4)."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,15 +9,16 @@ from numpy.typing import NDArray
 
 from data_contracts.records import Record
 from worldpose.cameras import Camera
-from worldpose.cameras.distortion import distort
-from worldpose.compiled import compiled
-from worldpose.errors import InputError
-from worldpose.triangulation.consensus import consensus, spread
-from worldpose.triangulation.reprojection import inverse, normal_equations
+from worldpose.triangulation.array_checks import check_arrays
+from worldpose.triangulation.calibration_errors import stated_errors
+from worldpose.triangulation.midhip import midhip_shift
+from worldpose.triangulation.noise_model import NoiseModel, learn_noise
+from worldpose.triangulation.observations import Rig
+from worldpose.triangulation.offsets import estimate_offsets
 from worldpose.triangulation.settings import TriangulationSettings
+from worldpose.triangulation.solving import Solution, no_shift, solve
 
-BLOCK = 256
-"""Frames undistorted at a time: bounds the memory, not the result."""
+Floats = NDArray[np.float64]
 
 
 class TriangulationReport(Record):
@@ -38,6 +38,11 @@ class TriangulationReport(Record):
     """Median over joints [px]."""
     standard_deviation_m: float | None
     """Median over joints of the root of the covariance's trace [m]."""
+    noise_factor: float
+    """Median over joints of the learned noise of a confident keypoint over the stated one [1]."""
+    misplacement_m: tuple[float | None, ...]
+    """By how much each camera misplaces people, root mean square per axis at the median person
+    [m]; None where it sees nobody or offsets are off."""
 
 
 @dataclass(frozen=True)
@@ -46,19 +51,31 @@ class Triangulation:
 
     Attributes:
         joints: (frames, persons, 17, 3) [m], world; NaN where not determined.
-        covariance: (frames, persons, 17, 3, 3) [m^2], of `joints` from the stated noise.
+        covariance: (frames, persons, 17, 3, 3) [m^2], of `joints`: the noise that the residuals
+            show, calibration, and the bias that all views share.
         views: (frames, persons, 17) uint8, agreeing cameras; 0 where not determined.
+        spread: (frames, persons, 17) float32 [rad], widest angle between agreeing rays, at most a
+            right one; NaN where not determined.
         reprojection_error: (frames, persons, 17) float32 [px], root mean square length over the
-            agreeing cameras.
+            agreeing cameras, offsets taken off.
         inliers: (frames, cameras, persons, 17) bool, does this camera agree.
+        offsets: (frames, cameras, persons, 2) [px], by how much the camera sees the person beside
+            where all cameras put him; 0 where unknown.
+        calibration_covariance: (frames, persons, 17, 3, 3) [m^2], the part of `covariance` that
+            observations of more frames do not lessen: offsets and the shared bias.
+        noise: what the detector's errors were taken to be.
         report: figures for the whole clip.
     """
 
-    joints: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    joints: Floats
+    covariance: Floats
     views: NDArray[np.uint8]
+    spread: NDArray[np.float32]
     reprojection_error: NDArray[np.float32]
     inliers: NDArray[np.bool_]
+    offsets: Floats
+    calibration_covariance: Floats
+    noise: NoiseModel
     report: TriangulationReport
 
 
@@ -68,114 +85,97 @@ def triangulate_joints(
     confidence: NDArray[np.floating],
     detection_index: NDArray[np.int16],
     settings: TriangulationSettings,
+    camera_covariance: Floats | None = None,
 ) -> Triangulation:
     """Return every joint of every tracked person where the views that agree put it.
 
-    Each joint is the weighted least-squares point on reprojection over the cameras that agree.
-    When not all do, a Geman-McClure loss of shrinking scale finds a majority; without one, the
-    two views that the others contradict least. Nothing is filled in.
+    Each joint is the weighted least-squares point on reprojection over the cameras that agree
+    (`consensus`). Nothing is filled in.
 
     Args:
         cameras: batch (cameras,).
         keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
-        confidence: (frames, cameras, detections, 17) in (0, 1]; NaN or 0 leaves a keypoint out.
+        confidence: (frames, cameras, detections, 17) in (0, 1]; NaN, 0 or less leaves a keypoint
+            out.
         detection_index: (frames, cameras, persons), place among the detections; -1 = not seen.
         settings: noise, agreement and least views.
+        camera_covariance: (cameras, 12, 12) of steps in the order of
+            `static_calibration.parameters.PARAMETERS`; None = not known.
 
     Raises:
         InputError: the shapes do not fit together.
 
     Note:
-        T3. Residuals are pixels to first order in their length: the lens is linearised at the
+        T3, T4. Residuals are pixels to first order in their length: the lens is linearised at the
         observation, exact enough for any residual that can agree.
     """
-    _check(cameras, keypoints, confidence, detection_index)
-    frames, count, persons = detection_index.shape
-    joint_count = confidence.shape[-1]
-    shape = (frames, persons, joint_count)
-    joints = np.full((*shape, 3), np.nan)
-    covariance = np.full((*shape, 3, 3), np.nan)
-    views = np.zeros(shape, np.uint8)
-    error = np.full(shape, np.nan, np.float32)
-    inliers = np.zeros((frames, count, persons, joint_count), np.bool_)
-    seen = np.zeros_like(inliers)
-    pose = cameras.cam_from_world
-    poses = np.concatenate([pose.rotation, pose.translation[..., None]], axis=-1).reshape(count, 12)
-    for start in range(0, frames, BLOCK):
-        block = slice(start, start + BLOCK)
-        image = np.ascontiguousarray(keypoints[block], dtype=np.float64)
-        plane = cameras.normalize(image.reshape(*image.shape[:2], -1, 2)).reshape(image.shape)
-        _triangulate(
-            plane,
-            np.ascontiguousarray(confidence[block], dtype=np.float64),
-            np.ascontiguousarray(detection_index[block], dtype=np.int64),
-            np.ascontiguousarray(cameras.focal),
-            np.ascontiguousarray(cameras.distortion),
-            poses,
-            (settings.pixel_noise, settings.joint_noise),
-            settings.max_deviation**2,
-            settings.min_views,
-            math.sin(settings.min_angle),
-            joints[block],
-            covariance[block],
-            views[block],
-            error[block],
-            inliers[block],
-            seen[block],
-        )
-    report = _report(covariance, views, error, inliers, seen)
-    return Triangulation(joints, covariance, views, error, inliers, report)
+    check_arrays(cameras, keypoints, confidence, detection_index, camera_covariance)
+    rig, limit = Rig.of(cameras), settings.max_deviation**2
 
+    def modelled(shift: Floats) -> NoiseModel:
+        if not settings.learn_noise:
+            return NoiseModel.stated(confidence.shape[-1])
+        at = (rig, keypoints, confidence, detection_index, shift)
+        return learn_noise(*at, settings.noise, limit)
 
-def _check(
-    cameras: Camera,
-    keypoints: NDArray[np.floating],
-    confidence: NDArray[np.floating],
-    detection_index: NDArray[np.int16],
-) -> None:
-    """Raise InputError unless the arrays belong together."""
-    if (
-        confidence.ndim != 4
-        or keypoints.shape != (*confidence.shape, 2)
-        or detection_index.ndim != 3
-        or detection_index.shape[:2] != confidence.shape[:2]
-        or cameras.batch_shape != confidence.shape[1:2]
-    ):
-        raise InputError(
-            "triangulation",
-            expected="keypoints (frames, cameras, detections, joints, 2), confidence without the "
-            "last, detection_index (frames, cameras, persons), cameras (cameras,)",
-            found=f"{keypoints.shape}, {confidence.shape}, {detection_index.shape}, "
-            f"{cameras.batch_shape}",
-            todo="Give arrays of the same clip and cameras.",
-        )
-    detections = confidence.shape[2]
-    if (
-        detection_index.size
-        and not -1 <= detection_index.min() <= detection_index.max() < detections
-    ):
-        raise InputError(
-            "triangulation: detection_index",
-            expected=f"-1 or the place of one of {detections} detections",
-            found=f"{detection_index.min()} to {detection_index.max()}",
-            todo="Give the index that was made from these detections.",
-        )
+    def solved(shift: Floats) -> tuple[NoiseModel, Solution]:
+        model = modelled(shift)
+        precision = model.precision(confidence)
+        return model, solve(rig, keypoints, precision, detection_index, shift, settings)
+
+    shift = no_shift()
+    if settings.offsets == "midhip":
+        shift = midhip_shift(rig, keypoints, confidence, detection_index, settings)
+    model, solution = solved(shift)
+    further: Floats | float = 0.0
+    misplaced: tuple[float | None, ...] = (None,) * len(rig.cameras)
+    stated = stated_errors(cameras, solution.joints, settings, camera_covariance)
+    if camera_covariance is not None and settings.offsets != "midhip":
+        # What calibration explains is not the detector's noise, nor a reason to reject a view.
+        shift = np.zeros((*stated.variance.shape, 3))
+        shift[..., 2] = stated.variance
+        model, solution = solved(shift)
+    if settings.offsets == "body":
+        at = (rig, keypoints, model.precision(confidence), detection_index)
+        learn = camera_covariance is None
+        found = estimate_offsets(*at, settings.noise, solution, stated.variance, learn)
+        shift, further = found.shift, found.covariance
+        misplaced = stated.misplacement(found.factor)
+        model, solution = solved(shift)
+    offsets = shift[..., :2] if len(shift) else np.zeros((*detection_index.shape, 2))
+    lasting = np.broadcast_to(
+        further + settings.common_bias**2 * np.eye(3), solution.covariance.shape
+    )
+    covariance = solution.covariance + lasting
+    return Triangulation(
+        joints=solution.joints,
+        covariance=covariance,
+        views=solution.views,
+        spread=solution.spread,
+        reprojection_error=solution.reprojection_error,
+        inliers=solution.inliers,
+        offsets=offsets,
+        calibration_covariance=lasting,
+        noise=model,
+        report=_report(solution, covariance, model, misplaced),
+    )
 
 
 def _report(
-    covariance: NDArray[np.float64],
-    views: NDArray[np.uint8],
-    error: NDArray[np.float32],
-    inliers: NDArray[np.bool_],
-    seen: NDArray[np.bool_],
+    solution: Solution,
+    covariance: Floats,
+    model: NoiseModel,
+    misplaced: tuple[float | None, ...],
 ) -> TriangulationReport:
     """Return the clip's figures from its arrays."""
+    views, seen = solution.views, solution.seen
     found = views > 0
     used = seen & found[:, None]
     observations = used.sum(axis=(0, 2, 3)).tolist()
-    agreed = inliers.sum(axis=(0, 2, 3)).tolist()
+    agreed = solution.inliers.sum(axis=(0, 2, 3)).tolist()
     trace = np.trace(covariance[found], axis1=-2, axis2=-1)
     some = bool(found.any())
+    error = solution.reprojection_error[found]
     return TriangulationReport(
         joints=int(found.sum()),
         undetermined=int((seen.any(axis=1) & ~found).sum()),
@@ -184,72 +184,8 @@ def _report(
             1.0 - a / n if n else None for a, n in zip(agreed, observations, strict=True)
         ),
         mean_views=float(views[found].mean()) if some else None,
-        reprojection_error_px=float(np.median(error[found])) if some else None,
+        reprojection_error_px=float(np.median(error)) if some else None,
         standard_deviation_m=float(np.median(np.sqrt(trace))) if some else None,
+        noise_factor=float(np.median(np.sqrt(model.joint * model.factor[-1]))),
+        misplacement_m=misplaced,
     )
-
-
-@compiled
-def _triangulate(
-    plane: NDArray[np.float64],
-    confidence: NDArray[np.float64],
-    detection_index: NDArray[np.int64],
-    focal: NDArray[np.float64],
-    distortion: NDArray[np.float64],
-    poses: NDArray[np.float64],
-    noise: tuple[float, float],
-    limit: float,
-    min_views: int,
-    min_sine: float,
-    joints: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    views: NDArray[np.uint8],
-    error: NDArray[np.float32],
-    inliers: NDArray[np.bool_],
-    seen: NDArray[np.bool_],
-) -> None:
-    """Solve joint after joint and writes the last six arguments."""
-    frames, cameras, persons = detection_index.shape
-    rows, solved_poses = np.empty((cameras, 7)), np.empty((cameras, 12))
-    camera = np.empty(cameras, np.int64)
-    weights, squared = np.empty(cameras), np.empty(cameras)
-    for t in range(frames):
-        for person in range(persons):
-            for joint in range(joints.shape[2]):
-                count = 0
-                for c in range(cameras):
-                    detection = detection_index[t, c, person]
-                    if detection < 0:
-                        continue
-                    u, v = plane[t, c, detection, joint]
-                    weight = confidence[t, c, detection, joint]
-                    if not (weight > 0.0 and math.isfinite(u) and math.isfinite(v)):
-                        continue
-                    k = distortion[c]
-                    _, _, dxx, dxy, dyy = distort(u, v, k[0], k[1], k[2], k[3], k[4])
-                    fx, fy = focal[c]
-                    rows[count, 0], rows[count, 1] = u, v
-                    rows[count, 2], rows[count, 3] = fx * dxx, fx * dxy
-                    rows[count, 4], rows[count, 5] = fy * dxy, fy * dyy
-                    rows[count, 6] = weight
-                    solved_poses[count] = poses[c]
-                    camera[count] = c
-                    seen[t, c, person, joint] = True
-                    count += 1
-                point, agreed = consensus(
-                    rows, solved_poses, noise, count, limit, min_views, weights, squared
-                )
-                if agreed == 0 or spread(point, solved_poses, weights, count) < min_sine:
-                    continue
-                matrix, _, squares = normal_equations(
-                    point, rows, solved_poses, weights, noise, count
-                )
-                joints[t, person, joint] = point
-                xx, xy, xz, yy, yz, zz = inverse(matrix)
-                covariance[t, person, joint, 0] = xx, xy, xz
-                covariance[t, person, joint, 1] = xy, yy, yz
-                covariance[t, person, joint, 2] = xz, yz, zz
-                views[t, person, joint] = agreed
-                error[t, person, joint] = math.sqrt(squares / agreed)
-                for k in range(count):
-                    inliers[t, camera[k], person, joint] = weights[k] > 0.0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from data_contracts.records import Record
@@ -10,17 +12,24 @@ from data_contracts.records import Record
 class TriangulationSettings(Record):
     """What counts as noise, as agreement and as enough views.
 
-    A keypoint of confidence c is expected to err by
-    sqrt(pixel_noise^2 + (pixels per metre at the joint x joint_noise)^2) / sqrt(c) [px] per axis,
-    so that one setting serves people of 60 and of 600 pixels.
+    A keypoint is expected to err by sqrt(pixel_noise^2 + (pixels per metre at the joint x
+    joint_noise)^2) [px] per axis, so that one setting serves people of 60 and of 600 pixels; times
+    factors for its joint and its confidence.
     """
 
     pixel_noise: float = Field(default=1.5, gt=0)
     """Standard deviation per image axis that does not depend on distance [px]: the grid
-    of a detector, and calibration."""
+    of a detector."""
     joint_noise: float = Field(default=0.04, ge=0)
     """Standard deviation per axis that scales with the person [m]: what a human labels as a hip
     spreads by 2 to 3 % of body height (COCO's keypoint sigmas)."""
+    learn_noise: bool = True
+    """Learn the factors from how the clip's views disagree; False takes the noise as stated and
+    its variance as one over the confidence."""
+    common_bias: float = Field(default=0.01, ge=0)
+    """Standard deviation per axis of what all views of a joint err in common [m]: a detector's
+    labels mean another point than the joint's centre. No residual shows it; it is added to the
+    covariance."""
     max_deviation: float = Field(default=3.5, gt=0)
     """Observations farther than this from the joint, in standard deviations, are rejected [1]:
     0.2 % of honest ones (chi-square, two degrees of freedom)."""
@@ -29,3 +38,21 @@ class TriangulationSettings(Record):
     min_angle: float = Field(default=0.1, gt=0)
     """Least angle between the most different agreeing rays [rad]: below it a pixel moves the
     joint ten times as far along the rays as across them."""
+    offsets: Literal["none", "midhip", "body"] = "body"
+    """How calibration errors are kept from a person's pose (T4): "none" takes the cameras as
+    exact; "midhip" moves every picture of a person so that the mid-hips meet, as the paper does;
+    "body" moves it by what all joints together make probable."""
+    calibration_error: float = Field(default=0.03, gt=0)
+    """Where "body" starts to learn how far cameras misplace people [m], when they come without
+    covariance: what careful calibration from pitch markings leaves in the middle of the pitch."""
+    max_gap: float = Field(default=0.5, ge=0)
+    """Longest time without a triangulated joint that smoothing fills [s]: a stride."""
+    clock_error: float = Field(default=0.05, gt=0)
+    """A camera's clock counts as known when its offset's standard error is below this [frame]."""
+    correct_clocks: bool = False
+    """Shift every camera's observations in time by the offset that the tracks show."""
+
+    @property
+    def noise(self) -> tuple[float, float]:
+        """The stated noise [px], [m]."""
+        return self.pixel_noise, self.joint_noise

@@ -115,5 +115,5 @@ def test_a_body_that_is_not_installed_is_refused(tmp_path, open_body, name):
     (tmp_path / "bodies").mkdir()
     save_body(tmp_path / "mine.npz", open_body)
     save_body(tmp_path / "bodies" / "other.npz", open_body)
-    with pytest.raises(UsageError, match="one of open-neutral/1, other"):
+    with pytest.raises(UsageError, match="one of open-neutral/2, other"):
         find_body(name, tmp_path / "bodies")

@@ -131,7 +131,7 @@ def test_a_missing_file_is_refused(tmp_path):
         install_body(tmp_path / "none.pkl", tmp_path)
 
 
-@pytest.mark.parametrize("name", ["open-neutral/1", "../up", "Capital", ".hidden"])
+@pytest.mark.parametrize("name", ["open-neutral/2", "../up", "Capital", ".hidden"])
 def test_a_name_that_cannot_be_a_file_is_refused(official, tmp_path, name):
     with pytest.raises(UsageError, match="--name"):
         install_body(official, tmp_path, name)

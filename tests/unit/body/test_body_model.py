@@ -23,7 +23,7 @@ def test_a_body_at_rest_is_the_template(open_body):
 def test_the_open_body_stands_as_smpl_does(open_body):
     joints = dict(zip(JOINT_NAMES, open_body.joint_template, strict=True))
     height = np.ptp(open_body.template[:, 1])
-    assert open_body.name == "open-neutral/1"
+    assert open_body.name == "open-neutral/2"
     assert open_body.template.shape == (6890, 3)
     # An adult: MakeHuman's mean over both sexes.
     assert 1.70 < height < 1.90
@@ -159,7 +159,7 @@ def test_parameters_of_a_wrong_shape_are_refused(name, array, expected):
 
 
 def test_betas_of_another_model_are_refused(open_body):
-    with pytest.raises(InputError, match="10 betas of open-neutral/1"):
+    with pytest.raises(InputError, match="10 betas of open-neutral/2"):
         open_body.joints(BodyParameters.rest(shapes=16))
 
 
@@ -183,5 +183,5 @@ def test_betas_of_another_model_are_refused(open_body):
     ],
 )
 def test_arrays_that_are_no_body_are_refused(open_body, name, change):
-    with pytest.raises(InputError, match="body model open-neutral/1"):
+    with pytest.raises(InputError, match="body model open-neutral/2"):
         replace(open_body, **{name: change(getattr(open_body, name))})

@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
 
-from worldpose.bundle_adjustment import Problem
+from worldpose.bundle_adjustment import Clicks, Clip, Problem
 from worldpose.cameras import Camera, Rigid
-from worldpose.static_calibration import PARAMETERS
+from worldpose.static_calibration import PARAMETERS, stepped
 from worldpose.synthetic.stadium import looking
+from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
 
 def rig(count, rng):
@@ -56,5 +57,63 @@ def scene():
             scale=np.full(len(image), np.inf),
         )
         return problem, true, points
+
+    return make
+
+
+KNOWN = np.array([1e-3, 1e-3, 1e-3, 0.1, 0.1, 0.1, 3e-3, 2.0, 2.0, 0.01, 0.003, 0.0])
+"""Standard deviations of the calibrated cameras' steps."""
+STATED = TriangulationSettings(pixel_noise=1.0, joint_noise=0.0)
+
+
+def people(frames, persons, rng):
+    """Joints (frames, persons, 17, 3) of people who walk straight on."""
+    start = rng.uniform([-12.0, -12.0, 0.0], [12.0, 12.0, 0.0], (persons, 3))
+    way = rng.uniform([-3.0, -3.0, 0.0], [3.0, 3.0, 0.0], (persons, 3))
+    body = rng.uniform([-0.4, -0.4, 0.1], [0.4, 0.4, 1.8], (persons, 17, 3))
+    times = np.arange(frames)[:, None, None] / 25.0
+    return (start + times * way)[:, :, None] + body
+
+
+@pytest.fixture
+def clip():
+    """A function that makes a clip of people before cameras that are not quite right.
+
+    Returns the clip, the true cameras and the true joints.
+    """
+
+    def make(cameras=5, persons=6, frames=24, noise=1.0, seed=1, lasting=0.0, clicked=12):
+        rng = np.random.default_rng(seed)
+        true = rig(cameras, rng)
+        step = KNOWN * rng.standard_normal((cameras, len(PARAMETERS)))
+        base = stepped(true, step)
+        joints = people(frames, persons, rng)
+        keypoints = true.project(joints.reshape(-1, 3)).reshape(cameras, frames, persons, 17, 2)
+        keypoints = keypoints + noise * rng.standard_normal(keypoints.shape)
+        keypoints += lasting * rng.standard_normal((cameras, 1, persons, 17, 2))
+        keypoints = np.ascontiguousarray(keypoints.swapaxes(0, 1))
+        index = np.broadcast_to(np.arange(persons), (frames, cameras, persons)).astype(np.int16)
+        confidence = np.ones(keypoints.shape[:-1])
+        placed = triangulate_joints(base, keypoints, confidence, index, STATED)
+        clicks = []
+        for c in range(cameras):
+            points = rng.uniform([-18.0, -18.0, 0.0], [18.0, 18.0, 0.3], (clicked, 3))
+            pixels = true[c].project(points) + rng.standard_normal((clicked, 2))
+            names = tuple(f"point_{k}" for k in range(clicked))
+            clicks.append(Clicks(names, points, pixels, np.ones(clicked, dtype=bool)))
+        made = Clip(
+            cameras=base,
+            covariance=np.tile(np.diag(KNOWN**2), (cameras, 1, 1)),
+            clicks=tuple(clicks),
+            frame=100 + np.arange(frames),
+            fps=25.0,
+            keypoints=keypoints,
+            confidence=confidence,
+            detection_index=index.astype(np.int64),
+            joints=placed.joints,
+            views=placed.views.astype(np.int64),
+            triangulation=STATED,
+        )
+        return made, true, joints
 
     return make

@@ -5,7 +5,8 @@ import pytest
 from data_contracts.pitch import PitchSpec
 from worldpose.cameras import Camera, Rigid
 from worldpose.release import JointTracks
-from worldpose.release.pictures import PALETTE, paths_picture, view_picture
+from worldpose.release.drawing import PALETTE
+from worldpose.release.pictures import paths_picture, view_picture
 
 
 def decoded(png):

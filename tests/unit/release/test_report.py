@@ -7,7 +7,7 @@ import pytest
 
 from data_contracts.evaluation import Evaluation
 from data_contracts.run import RunRecord, UnitFailure
-from worldpose.release import Picture, report_page
+from worldpose.release import CameraSummary, Picture, report_page
 from worldpose.release.meanings import MEANINGS
 
 PNG = base64.b64decode(
@@ -117,3 +117,18 @@ def test_only_settings_that_were_asked_for_are_listed(shown):
     overrides = {"tracking": {"gate": 0.5}} if shown else {}
     text = report_page("A run", run(overrides=overrides), seconds={})
     assert (["tracking", "gate", "0.5"] in Page(text).rows) == shown
+
+
+def test_static_cameras_are_listed_with_what_is_wrong_with_them():
+    cameras = [
+        CameraSummary("cam0", "given"),
+        CameraSummary("cam1", "clicks", 0.0213, 0.35, 1.125, 9, ("corner_left_far",), ("few",)),
+    ]
+    text = report_page(
+        "A run", run(), seconds={}, cameras=cameras, camera_pictures=[Picture("cam1", PNG)]
+    )
+    rows = Page(text).rows
+    assert ["cam0", "given", "-", "-", "-", "-", "", ""] in rows
+    assert ["cam1", "clicks", "0.0213", "0.35", "1.125", "9", "corner_left_far", "few"] in rows
+    assert text.index("Static cameras") < text.index("<figcaption>cam1") < text.index("was run")
+    assert "Static cameras" not in report_page("A run", run(), seconds={})

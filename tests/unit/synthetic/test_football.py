@@ -3,7 +3,9 @@ import pytest
 
 from worldpose.synthetic import SCENARIOS
 from worldpose.synthetic.football import ACCELERATION, TURN_RATE, play
+from worldpose.synthetic.gait import stride_cycle
 from worldpose.synthetic.paths import MARGIN, STEP
+from worldpose.synthetic.settings import ActionRates
 
 CROWD = SCENARIOS["match"].crowd
 PLAYERS = 22
@@ -12,6 +14,11 @@ PLAYERS = 22
 @pytest.fixture(scope="module")
 def minute():
     return play(CROWD, 60.0, np.random.default_rng(1))
+
+
+def field_players(minute):
+    """Everybody but goalkeepers, who push off sideward with more than legs that run give."""
+    return minute[0][2:]
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +63,7 @@ def test_nobody_is_faster_than_footballers_are(speeds):
 
 
 def test_accelerations_are_those_of_footballers(minute):
-    for path in minute[0]:
+    for path in field_players(minute):
         velocity = np.diff(path.position, axis=0) / STEP
         acceleration = np.linalg.norm(np.diff(velocity, axis=0), axis=-1) / STEP
         # A lagged mean of accelerations within the limit is within the limit; rounding.
@@ -66,7 +73,7 @@ def test_accelerations_are_those_of_footballers(minute):
 
 
 def test_accelerations_build_up_over_a_tenth_of_a_second(minute):
-    for path in minute[0]:
+    for path in field_players(minute):
         velocity = np.diff(path.position, axis=0) / STEP
         jerk = np.linalg.norm(np.diff(velocity, 2, axis=0), axis=-1) / STEP**2
         # From full braking to full drive within the time constant of 0.12 s.
@@ -117,3 +124,63 @@ def test_fewer_people_and_nobody_can_play():
     assert play(CROWD.model_copy(update={"people": 0}), 1.0, np.random.default_rng(0))[0] == []
     few = CROWD.model_copy(update={"people": 3, "officials": 0})
     assert len(play(few, 1.0, np.random.default_rng(0))[0]) == 3
+
+
+def test_strides_are_as_long_as_people_of_that_speed_make_them(minute):
+    speed, rate = [], []
+    for path in minute[0][:PLAYERS]:
+        speed.append(path.speed[::10])
+        rate.append(np.gradient(stride_cycle(path, 0.0), STEP)[::10])
+    speed, rate = np.concatenate(speed), np.concatenate(rate)
+    # Published (docs/synthetic.md): a walker of 1.4 m/s makes 1.35 to 1.6 m, runners of 3 m/s 75
+    # to 95 strides a minute, sprinters at 7 to 9 m/s 1.8 to 2.3 a second.
+    for at, shortest, longest in ((1.4, 1.35, 1.6), (3.0, 1.9, 2.4), (6.0, 3.2, 4.0)):
+        near = np.abs(speed - at) < 0.1
+        assert near.sum() > 20
+        assert shortest < at / np.median(rate[near]) < longest
+
+
+def test_the_ball_is_played_by_those_who_are_there(minute):
+    paths, ball = minute
+    kicks = headers = 0
+    for path in paths[:PLAYERS]:
+        for action in path.actions:
+            when = action.begin + action.motion.blow
+            if action.motion.name in ("kick", "jump") and 0.0 < when < 60.0:
+                place, at = (
+                    np.array([np.interp(when, path.time, axis) for axis in way.position.T])
+                    for way in (path, ball)
+                )
+                # The ball's way is rounded over a third of a second: 2 m at 7 m/s.
+                assert np.linalg.norm(place - at) < 3.5
+                kicks += action.motion.name == "kick"
+                headers += action.motion.name == "jump"
+    # 18 touches a minute, of which some find nobody near enough.
+    assert 6 <= kicks <= 20
+    assert headers <= 10
+
+
+def test_nobody_does_two_things_at_once(minute):
+    for path in minute[0]:
+        for one, following in zip(path.actions, path.actions[1:], strict=False):
+            assert one.end <= following.begin + 1e-9
+
+
+def test_who_is_in_the_air_keeps_his_pace_and_who_lies_stays():
+    rates = ActionRates(headers=0.4, tackles=0.4, shots=1.0, tripped=1.0)
+    crowd = CROWD.model_copy(update={"actions": rates})
+    paths = [path for seed in (4, 7) for path in play(crowd, 30.0, np.random.default_rng(seed))[0]]
+    done = dict.fromkeys(("jump", "slide", "fall", "dive", "kick"), 0)
+    for path in paths:
+        velocity = np.diff(path.position, axis=0) / STEP
+        for action in path.actions:
+            motion, since = action.motion, path.time[:-1] - action.begin
+            done[motion.name] = done.get(motion.name, 0) + 1
+            if motion.flight is not None:
+                flies = (since > motion.flight[0]) & (since < motion.flight[1])
+                # Legs' last push dies down with 0.12 s: after a third of a second 6 % of it.
+                assert np.ptp(velocity[flies], axis=0).max(initial=0.0) < 0.15
+            if motion.stops is not None:
+                lies = (since > motion.stops + 1.6) & (since < motion.moves_again)
+                assert np.linalg.norm(velocity[lies], axis=-1).max(initial=0.0) < 0.3
+    assert min(done.values()) > 0, done

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from data_contracts.conventions import COCO17
-from worldpose.synthetic.gait import RIGID_BONES, draw_body, walk
+from worldpose.synthetic.bodies import draw_body
+from worldpose.synthetic.gait import RIGID_BONES, walk
 from worldpose.synthetic.paths import MARGIN, STEP, GroundPath
 
 J = {name: index for index, name in enumerate(COCO17)}

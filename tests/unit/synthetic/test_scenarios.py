@@ -3,7 +3,9 @@ import pytest
 
 from worldpose.cameras import Camera, Rigid
 from worldpose.ingest import read_match, read_unit
+from worldpose.pitch import PitchTemplate
 from worldpose.synthetic import SCENARIOS, ObservationNoise, simulate_match, simulate_scene
+from worldpose.synthetic.settings import ActionRates, CrowdSettings
 
 SHORT = 0.4
 
@@ -30,14 +32,16 @@ def moving(folder):
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_every_scenario_makes_a_match(name, tmp_path):
     scenario = short(name)
-    spec = simulate_match(scenario, 2, tmp_path / name, duration=SHORT, cameras=4)
+    spec = simulate_match(scenario, 2, tmp_path / name, duration=SHORT, cameras=4, stills=False)
     read = read_match(tmp_path / name)
     assert read.spec == spec
     frames = round(SHORT * scenario.fps)
     for camera in spec.static_cameras:
         people, calibration = read_unit(read, camera.id)
-        assert calibration is not None
+        assert (calibration is not None) == (name == "hard")
         assert len(people.frame) == frames
+        clicks = read.clicked[camera.id]
+        assert len(clicks.points) + len(clicks.drawn) > 1
     if scenario.broadcast is not None:
         people, calibration = read_unit(read, "clip")
         assert calibration is None
@@ -51,10 +55,35 @@ def test_every_scenario_makes_a_match(name, tmp_path):
         }
 
 
+def test_all_scenarios_but_those_for_static_calibration_have_a_broadcast_clip():
+    without = [name for name, each in SCENARIOS.items() if each.broadcast is None]
+    assert without == ["sparse-corner"]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_cameras_of_sparse_corner_see_one_or_two_corners_and_lines(seed):
+    scene = simulate_scene(short("sparse-corner", crowd=CrowdSettings(people=0)), seed)
+    pitch = PitchTemplate.standard()
+    for name, camera in scene.cameras.items():
+        pixels = camera.project(pitch.positions(list(pitch.points)))
+        inside = ((pixels > 0.0) & (pixels < [1919.0, 1079.0])).all(axis=-1)
+        assert 1 <= inside.sum() <= 2
+        assert len(scene.clicks[name].markings.drawn) >= 3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_in_five_cameras_of_the_match_has_one_wrong_click(seed):
+    scene = simulate_scene(short("match", duration=0.04, broadcast=None), seed)
+    wrong = [len(clicks.wrong) for clicks in scene.clicks.values()]
+    assert all(sum(wrong[first : first + 5]) == 1 for first in range(len(wrong) - 4))
+    for clicks in scene.clicks.values():
+        assert 8 <= len(clicks.markings.points) <= 12
+
+
 def test_the_same_seed_gives_the_same_bytes_with_everything_switched_on(tmp_path):
     contents = []
     for name in ("a", "b"):
-        simulate_match(short("hard"), 3, tmp_path / name, cameras=3)
+        simulate_match(short("hard"), 3, tmp_path / name, cameras=3, stills=False)
         contents.append(
             {
                 path.relative_to(tmp_path / name).as_posix(): path.read_bytes()
@@ -77,7 +106,7 @@ def test_the_match_has_two_teams_officials_and_16_cameras(match):
 
 def test_the_moving_camera_is_written_as_it_filmed(tmp_path):
     scenario = short("broadcast-zoom", noise=ObservationNoise.none())
-    simulate_match(scenario, 1, tmp_path / "m", cameras=1)
+    simulate_match(scenario, 1, tmp_path / "m", cameras=1, stills=False)
     scene = simulate_scene(
         scenario.model_copy(update={"rig": scenario.rig.model_copy(update={"cameras": 1})}), 1
     )
@@ -147,7 +176,7 @@ def test_the_hard_match_is_hard_in_every_way(hard):
 
 
 def test_nothing_of_the_truth_is_where_the_factory_looks(tmp_path):
-    simulate_match(short("hard"), 1, tmp_path / "m", cameras=3)
+    simulate_match(short("hard"), 1, tmp_path / "m", cameras=3, stills=False)
     for file in (tmp_path / "m" / "detections").iterdir():
         with np.load(file) as content:
             assert set(content) == {"frame", "keypoints", "confidence", "boxes", "score"}
@@ -166,7 +195,9 @@ def test_people_touch_in_the_penalty_box():
 
 def test_all_bias_and_no_noise_is_the_same_in_all_frames_for_who_stands():
     noise = ObservationNoise.none().model_copy(update={"shared_bias": 0.03})
-    crowd = SCENARIOS["tiny"].crowd.model_copy(update={"speed": (0.0, 0.0), "people": 1})
+    crowd = SCENARIOS["tiny"].crowd.model_copy(
+        update={"speed": (0.0, 0.0), "people": 1, "actions": ActionRates.none()}
+    )
     scene = simulate_scene(short("tiny", noise=noise, crowd=crowd), 1)
     steady = scene.observations["cam00"].keypoints[:, 0, 5:]
     # float32 pixels.

@@ -46,7 +46,7 @@ def test_feet_are_on_the_crowned_pitch(scene):
     assert lowest.min() > 0.070
     assert lowest.max() < 0.095
     # The area lies 3 to 6 cm below the centre spot: on a flat pitch this would show.
-    assert ankles[..., 2].min(axis=0).max() < 0.07
+    assert ankles[..., 2].min(axis=0).mean() < 0.06
 
 
 def test_without_noise_every_detection_is_its_persons_projection(exact):

@@ -1,0 +1,251 @@
+"""Prints accuracy and time of static calibration's stages next to OpenCV and SciPy, in one run.
+
+    python benchmarks/static_calibration.py [--cameras 4] [--rounds 5]
+
+Clicks: ten named points with 1 px of noise. Lines: a rendered picture and a start 5 px off, 2000
+samples. The peers of the line refinement minimise the paper's distance map (Canny edges near the
+start's lines, `cv2.distanceTransform`), looked up between pixels, with SciPy's
+Levenberg-Marquardt and with a plain Gauss-Newton. Errors are root mean squares over the visible
+markings against the true camera. All take turns in one process with one thread; the best round
+counts. The map is made before the clock starts and timed by itself.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from worldpose.cameras import Camera, Rigid
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration.line_refinement import LineRefinementSettings, refine_on_lines
+from worldpose.static_calibration.parameters import (
+    CameraEstimate,
+    project_with_jacobian,
+    stepped,
+)
+from worldpose.synthetic.rendering import render_pitch
+from worldpose.synthetic.scenarios import SCENARIOS
+from worldpose.synthetic.stadium import place_camera
+
+PITCH = PitchTemplate.standard()
+SPREAD = np.array([1e-3, 1e-3, 1e-3, 0.1, 0.1, 0.1, 2e-3, 4.0, 4.0, 0.01, 0.01, 0.0])
+"""Of a start about 5 px off, in the order of `PARAMETERS`; all methods have it as their prior."""
+FREE = SPREAD > 0.0
+START_ERROR = 5.0
+FARTHEST = 30.0
+"""Where the distance map ends [px]."""
+
+Floats = NDArray[np.float64]
+
+
+def line_points(camera: Camera, count: int) -> Floats:
+    """Return evenly chosen points of the markings in a camera's picture (count, 3)."""
+    points = PITCH.sample_lines(0.1).points_world
+    pixels = camera.project(points)
+    points = points[((pixels > 3.0) & (pixels < camera.image_size - 4.0)).all(axis=-1)]
+    return points[np.linspace(0, len(points) - 1, count).astype(int)]
+
+
+def line_error(camera: Camera, true: Camera) -> float:
+    """Return the root mean square over the markings [px]."""
+    points = line_points(true, 2000)
+    off = camera.project(points) - true.project(points)
+    return float(np.sqrt((off**2).sum(axis=-1).mean()))
+
+
+def some_pixels_off(true: Camera, rng: np.random.Generator) -> Camera:
+    """Return a camera whose markings are 5 px off."""
+    step = SPREAD * rng.standard_normal(12)
+    for _ in range(4):
+        step *= START_ERROR / line_error(stepped(true, step), true)
+    return stepped(true, step)
+
+
+def distance_map(picture: NDArray[np.uint8], start: Camera) -> NDArray[np.float32]:
+    """Return the distance to the nearest edge within 15 px of the start's lines [px] (C4)."""
+    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    edges = cv2.Canny(cv2.GaussianBlur(grey, (0, 0), 1.0), 40, 100)
+    near = np.zeros_like(grey)
+    for x, y in np.rint(start.project(line_points(start, 6000))).astype(int):
+        cv2.circle(near, (int(x), int(y)), 15, 255, -1)
+    away = cv2.distanceTransform(255 - (edges & near), cv2.DIST_L2, 5)
+    return np.minimum(away, FARTHEST).astype(np.float32)
+
+
+def looked_up(away: NDArray[np.float32], pixels: Floats) -> Floats:
+    """Return the map between its pixels (n,)."""
+    at = pixels.astype(np.float32)[None]
+    return cv2.remap(away, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0].astype(
+        np.float64
+    )
+
+
+def by_scipy(away: NDArray[np.float32], start: Camera, points: Floats) -> Camera:
+    """Return SciPy's Levenberg-Marquardt on the map; steps are 0.01 of the prior's spread."""
+
+    def whole(scaled: Floats) -> Floats:
+        step = np.zeros(12)
+        step[FREE] = scaled * SPREAD[FREE]
+        return step
+
+    def residuals(scaled: Floats) -> Floats:
+        pixels = stepped(start, whole(scaled)).project(points)
+        return np.concatenate([looked_up(away, pixels), 3.0 * scaled])
+
+    zero = np.zeros(int(FREE.sum()))
+    found = least_squares(residuals, zero, method="lm", diff_step=1e-2, max_nfev=300)
+    return stepped(start, whole(found.x))
+
+
+def by_gauss_newton(away: NDArray[np.float32], start: Camera, points: Floats) -> Camera:
+    """Return a damped Gauss-Newton on the map, with its gradient and our Jacobian."""
+    gx = cv2.Sobel(away, cv2.CV_32F, 1, 0, ksize=3) / 8.0
+    gy = cv2.Sobel(away, cv2.CV_32F, 0, 1, ksize=3) / 8.0
+    prior = 9.0 / SPREAD[FREE] ** 2
+    best, cost, damping = np.zeros(int(FREE.sum())), np.inf, 1e-2
+    trial, camera = best, start
+    normal, right = np.diag(prior), best
+    for _ in range(15):
+        step = np.zeros(12)
+        step[FREE] = trial
+        moved = stepped(start, step)
+        pixels, jacobian = project_with_jacobian(moved, points)
+        value = looked_up(away, pixels)
+        new = float((value**2).sum() + (prior * trial**2).sum())
+        if new < cost:
+            best, cost, camera, damping = trial, new, moved, damping / 4.0
+            slope = np.stack([looked_up(gx, pixels), looked_up(gy, pixels)], axis=-1)
+            rows = np.einsum("ni,nij->nj", slope, jacobian)[:, FREE]
+            normal = rows.T @ rows + np.diag(prior)
+            right = rows.T @ value + prior * best
+        else:
+            damping *= 8.0
+        trial = best - np.linalg.solve(normal + damping * np.diag(np.diag(normal)), right)
+    return camera
+
+
+def clicks_by_opencv(world: Floats, pixels: Floats, size: tuple[int, int]) -> Camera | None:
+    """Return `cv2.calibrateCamera` with one view, square pixels, k1 and k2; None if it fails."""
+    width, height = size
+    guess = np.array([[2200.0, 0.0, width / 2], [0.0, 2200.0, height / 2], [0.0, 0.0, 1.0]])
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_K3
+    flags |= cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_PRINCIPAL_POINT
+    try:
+        _, matrix, lens, rotations, shifts = cv2.calibrateCamera(
+            [world.astype(np.float32)], [pixels.astype(np.float32)], size, guess, None, flags=flags
+        )
+    except cv2.error:
+        return None
+    return _camera(matrix, np.ravel(lens)[:5], np.ravel(rotations[0]), np.ravel(shifts[0]), size)
+
+
+def clicks_by_scipy(world: Floats, pixels: Floats, size: tuple[int, int]) -> Camera:
+    """Return `cv2.solvePnP` at the usual focal length, then SciPy on all but the middle."""
+    width, height = size
+    middle = np.array([(width - 1) / 2, (height - 1) / 2])
+    matrix = np.array([[2200.0, 0.0, middle[0]], [0.0, 2200.0, middle[1]], [0.0, 0.0, 1.0]])
+    _, rotvec, shift = cv2.solvePnP(world, pixels, matrix, None, flags=cv2.SOLVEPNP_SQPNP)
+    start = _camera(matrix, np.zeros(5), rotvec.ravel(), shift.ravel(), size)
+    scale = np.array([1e-2, 1e-2, 1e-2, 1.0, 1.0, 1.0, 1e-1, 0.0, 0.0, 0.05, 0.02, 0.0])
+    used = scale > 0.0
+
+    def moved(scaled: Floats) -> Camera:
+        step = np.zeros(12)
+        step[used] = scaled * scale[used]
+        return stepped(start, step)
+
+    def residuals(scaled: Floats) -> Floats:
+        off = np.nan_to_num(moved(scaled).project(world) - pixels, nan=1e4).ravel()
+        return np.concatenate([off, scaled[-2:]])
+
+    found = least_squares(residuals, np.zeros(int(used.sum())), method="lm", max_nfev=2000)
+    return moved(found.x)
+
+
+def _camera(
+    matrix: Floats, lens: Floats, rotvec: Floats, shift: Floats, size: tuple[int, int]
+) -> Camera:
+    return Camera(
+        focal=np.array([matrix[0, 0], matrix[1, 1]]),
+        principal_point=matrix[:2, 2],
+        distortion=np.resize(lens, 5),
+        cam_from_world=Rigid.from_rotvec(rotvec, shift),
+        image_size=np.array(size),
+    )
+
+
+def measured(
+    sides: dict[str, Callable[[], Camera | None]], rounds: int
+) -> dict[str, tuple[Camera | None, float]]:
+    """Return each side's camera and best time [s], taken in turns after one unmeasured call."""
+    results: dict[str, tuple[Camera | None, float]] = {
+        name: (run(), np.inf) for name, run in sides.items()
+    }
+    for _ in range(rounds):
+        for name, run in sides.items():
+            begin = time.perf_counter()
+            run()
+            seconds = time.perf_counter() - begin
+            results[name] = results[name][0], min(results[name][1], seconds)
+    return results
+
+
+def main() -> None:
+    """Print one line per method."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cameras", type=int, default=4)
+    parser.add_argument("--rounds", type=int, default=5)
+    options = parser.parse_args()
+    cv2.setNumThreads(1)
+    scenario = SCENARIOS["match"]
+    table: dict[str, list[tuple[float, float]]] = {}
+    for index in range(options.cameras):
+        rng = np.random.default_rng(index)
+        true = place_camera(scenario.rig, index, np.zeros(3), scenario.pitch, rng)
+        picture = render_pitch(true, PITCH, None, index)
+        start = some_pixels_off(true, rng)
+        points = line_points(start, 2000)
+        away = distance_map(picture, start)
+        prior = CameraEstimate(start, np.diag(SPREAD**2))
+        settings = LineRefinementSettings(survey_error=0.0)
+        places = PITCH.positions(list(PITCH.points))
+        seen = true.project(places)
+        inside = ((seen > 4.0) & (seen < true.image_size - 5.0)).all(axis=-1)
+        chosen = rng.permutation(np.flatnonzero(inside))[:10]
+        world, clicked = places[chosen], seen[chosen] + rng.standard_normal((len(chosen), 2))
+        size = (int(true.image_size[0]), int(true.image_size[1]))
+        sides: dict[str, Callable[[], Camera | None]] = {
+            "start": lambda start=start: start,
+            "lines: ours, from the picture": lambda p=prior, i=picture, s=settings: (
+                refine_on_lines(p, PITCH, i, s).estimate.camera
+            ),
+            "lines: Gauss-Newton, from the map": lambda a=away, s=start, x=points: by_gauss_newton(
+                a, s, x
+            ),
+            "lines: SciPy LM, from the map": lambda a=away, s=start, x=points: by_scipy(a, s, x),
+            "lines: making the map": lambda i=picture, s=start: (distance_map(i, s), None)[1],
+            "clicks: calibrateCamera": lambda w=world, c=clicked, z=size: clicks_by_opencv(w, c, z),
+            "clicks: solvePnP + SciPy": lambda w=world, c=clicked, z=size: clicks_by_scipy(w, c, z),
+        }
+        for name, (camera, seconds) in measured(sides, options.rounds).items():
+            error = np.nan if camera is None else line_error(camera, true)
+            table.setdefault(name, []).append((seconds, error))
+        print(f"\r  camera {index + 1} of {options.cameras}", end="", file=sys.stderr, flush=True)
+    print("\r" + " " * 30, end="\r", file=sys.stderr, flush=True)
+    print(f"{options.cameras} cameras, best of {options.rounds} rounds, one thread; medians")
+    for name, rows in table.items():
+        seconds, errors = np.array(rows).T
+        error = "" if np.isnan(errors).all() else f"{np.nanmedian(errors):8.3f} px"
+        worst = "" if np.isnan(errors).all() else f"  worst {np.nanmax(errors):8.3f} px"
+        print(f"{name:36s} {1e3 * np.median(seconds):8.1f} ms {error}{worst}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,223 @@
+"""The paper's ablation of bundle adjustment, on simulated trials with known truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from data_contracts.static_calibration import ClickedPoint
+from worldpose.bundle_adjustment import (
+    BundleAdjustmentSettings,
+    Clicks,
+    Clip,
+    adjust_cameras,
+    marking_errors,
+)
+from worldpose.cameras import Camera
+from worldpose.errors import InputError
+from worldpose.evaluation import evaluate_cameras, evaluate_joints
+from worldpose.pitch import PitchTemplate
+from worldpose.release import JointTracks
+from worldpose.static_calibration import (
+    StaticCalibration,
+    StaticCalibrationSettings,
+    calibrate,
+)
+from worldpose.synthetic.scenarios import SCENARIOS
+from worldpose.synthetic.scene import Scene, simulate_scene
+from worldpose.synthetic.settings import ClickSettings
+from worldpose.tracking import TrackingSettings, track_people
+from worldpose.triangulation import TriangulationSettings, triangulate_joints
+
+SCENARIO: Final = "penalty-box"
+CLICKS: Final = {
+    "few clicks": ClickSettings(
+        clustered=1.0, window=0.35, clustered_points=(5, 6), noise=1.5, wrong=0.0
+    ),
+    "many clicks": ClickSettings(),
+}
+"""Five or six in a third of the picture, 1.5 px off; and eight to twelve all over it, 1 px off,
+some of them wrong."""
+
+PAPER: Final = {
+    "base": (83.5, 70.8),
+    "+ BA (S and P)": (86.2, 70.7),
+    "+ BA (S only), no guard": (548.4, 75.4),
+    "+ BA + SMPL": (80.0, 66.3),
+}
+"""G-MPJPE and PA-MPJPE of the paper's table [mm]."""
+
+_PLAIN: Final = ", plain least squares"
+
+
+@dataclass(frozen=True)
+class Score:
+    """One row of one trial.
+
+    Attributes:
+        g_mpjpe_mm: mean joint distance after the alignment of everybody [mm].
+        pa_mpjpe_mm: mean joint distance after alignment of each pose [mm].
+        ground_error_m: median over the cameras' pitch [m].
+        marking_error_px: of the clicks that calibration rests on, mean over cameras [px].
+        changed: share of cameras that the adjustment changed [1].
+    """
+
+    g_mpjpe_mm: float
+    pa_mpjpe_mm: float
+    ground_error_m: float
+    marking_error_px: float
+    changed: float
+
+
+def trial(seed: int, clicks: ClickSettings) -> dict[str, Score]:
+    """The rows of one simulated trial by name.
+
+    Base is calibration from clicks alone, without painted lines, as the paper's was. `S only`
+    frees the whole lens and forgets what is known of cameras, as people do it; its rows without
+    guard are what the guard is for. Every row is triangulated from the same tracks.
+
+    Args:
+        seed: of the trial.
+        clicks: how people click.
+
+    Note:
+        Paper, table of the Vicon trial.
+    """
+    scenario = SCENARIOS[SCENARIO].model_copy(update={"clicks": clicks})
+    scene = simulate_scene(scenario, seed)
+    pitch = PitchTemplate.from_spec(scene.surveyed)
+    calibrations = _calibrated(scene, pitch)
+    clip = _clip(scene, calibrations, pitch)
+    true = Camera.stack([scene.cameras[name] for name in calibrations])
+    both = adjust_cameras(clip)
+    markings = adjust_cameras(clip, BundleAdjustmentSettings(evidence="markings"))
+    everyone = np.ones(len(calibrations), dtype=np.bool_)
+    rows = {
+        "true cameras": (true, ~everyone),
+        "base": (clip.cameras, ~everyone),
+        "+ BA (S and P)": (both.cameras, both.accepted),
+        "+ BA (S only)": (markings.cameras, markings.accepted),
+        "+ BA (S only), no guard": (markings.refused, everyone),
+    }
+    scores = {
+        name: _score(scene, clip, tuple(calibrations), *row, clip.triangulation)
+        for name, row in rows.items()
+    }
+    # Beyond any distance: every camera counts fully.
+    plain = clip.triangulation.model_copy(update={"max_deviation": 1e6})
+    for name in ("true cameras", "base", "+ BA (S only), no guard"):
+        scores[name + _PLAIN] = _score(scene, clip, tuple(calibrations), *rows[name], plain)
+    return scores
+
+
+def ablation(
+    seeds: Iterable[int],
+    progress: Callable[[str, int], None] = lambda clicks, seed: None,
+    clicks: Mapping[str, ClickSettings] = CLICKS,
+) -> dict[str, list[dict[str, Score]]]:
+    """The trials of all seeds, by how people click."""
+    trials: dict[str, list[dict[str, Score]]] = {}
+    numbers = tuple(seeds)
+    for name, settings in clicks.items():
+        trials[name] = []
+        for seed in numbers:
+            trials[name].append(trial(seed, settings))
+            progress(name, seed)
+    return trials
+
+
+def _calibrated(scene: Scene, pitch: PitchTemplate) -> dict[str, StaticCalibration]:
+    """The cameras whose clicks determine them: of the others a person would be asked for more."""
+    found = {}
+    for name, camera in scene.cameras.items():
+        size = (int(camera.image_size[0]), int(camera.image_size[1]))
+        settings = StaticCalibrationSettings(lines=False)
+        try:
+            found[name] = calibrate(
+                pitch, scene.clicks[name].markings, size, settings=settings, where=name
+            )
+        except InputError:
+            continue
+    return found
+
+
+def _clip(
+    scene: Scene, calibrations: Mapping[str, StaticCalibration], pitch: PitchTemplate
+) -> Clip:
+    """The trial as bundle adjustment takes it: tracked and triangulated with the base cameras."""
+    observations = [scene.observations[name] for name in calibrations]
+    frame = scene.truth.frames
+    detections = max(seen.keypoints.shape[1] for seen in observations)
+    keypoints = np.full((len(frame), len(observations), detections, 17, 2), np.nan)
+    confidence = np.full(keypoints.shape[:-1], np.nan)
+    for c, seen in enumerate(observations):
+        rows = np.searchsorted(seen.frame, frame)
+        keypoints[:, c, : seen.keypoints.shape[1]] = seen.keypoints[rows]
+        confidence[:, c, : seen.keypoints.shape[1]] = seen.confidence[rows]
+    cameras = Camera.stack([known.estimate.camera for known in calibrations.values()])
+    fps = SCENARIOS[SCENARIO].fps
+    tracks = track_people(cameras, keypoints, confidence, fps, TrackingSettings())
+    settings = TriangulationSettings()
+    placed = triangulate_joints(cameras, keypoints, confidence, tracks.detection_index, settings)
+    return Clip(
+        cameras=cameras,
+        covariance=np.stack([known.estimate.covariance for known in calibrations.values()]),
+        clicks=tuple(
+            _clicks(known, scene.clicks[name].markings.points, pitch)
+            for name, known in calibrations.items()
+        ),
+        frame=frame,
+        fps=fps,
+        keypoints=keypoints,
+        confidence=confidence,
+        detection_index=tracks.detection_index.astype(np.int64),
+        joints=placed.joints,
+        views=placed.views.astype(np.int64),
+        triangulation=settings,
+    )
+
+
+def _clicks(
+    known: StaticCalibration, points: Iterable[ClickedPoint], pitch: PitchTemplate
+) -> Clicks:
+    inlier = {point.name: point.inlier for point in known.report.points}
+    places = {point.name: point.xy for point in points}
+    return Clicks(
+        names=tuple(places),
+        points_world=pitch.positions(list(places)),
+        points_image=np.array(list(places.values())).reshape(-1, 2),
+        inlier=np.array([inlier[name] for name in places], dtype=np.bool_),
+    )
+
+
+def _score(
+    scene: Scene,
+    clip: Clip,
+    names: tuple[str, ...],
+    cameras: Camera,
+    changed: np.ndarray,
+    settings: TriangulationSettings,
+) -> Score:
+    """The score of cameras and of the joints that they give."""
+    index = clip.detection_index.astype(np.int16)
+    joints = triangulate_joints(cameras, clip.keypoints, clip.confidence, index, settings).joints
+    people = np.arange(index.shape[2])
+    found, _ = evaluate_joints(JointTracks(clip.frame, people, joints), scene.truth, fps=clip.fps)
+    estimated = {name: cameras[c] for c, name in enumerate(names)}
+    pitch = PitchTemplate.from_spec(SCENARIOS[SCENARIO].pitch)
+    errors, _ = evaluate_cameras(estimated, scene.cameras, pitch)
+    ground = None if errors is None or errors.static is None else errors.static
+    return Score(
+        g_mpjpe_mm=_number(found.g_mpjpe_mm),
+        pa_mpjpe_mm=_number(found.pa_mpjpe_mm),
+        ground_error_m=_number(None if ground is None else ground.ground_error_median_m),
+        marking_error_px=float(np.nanmean(marking_errors(clip, cameras))),
+        changed=float(changed.mean()),
+    )
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else value

@@ -1,0 +1,114 @@
+"""What the page about a run says of its static cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.match import MatchSpec
+from flows.stage import Match
+from worldpose.cameras import Camera
+from worldpose.ingest.stills import read_still
+from worldpose.release import CameraSummary, Picture
+from worldpose.release.calibration_pictures import Click, ErrorMap, calibration_picture
+from worldpose.store import Run, Store
+
+SHOWN = 2
+"""Cameras that are shown with their clicks: the weakest."""
+
+_ORIGINS = {"given": "given", "points": "clicks", "lines": "clicks and painted lines"}
+
+
+def camera_summaries(run: Run, spec: MatchSpec) -> list[CameraSummary]:
+    """One summary for each static camera, in the order of the match."""
+    summaries = []
+    for camera in spec.static_cameras:
+        unit = f"static_calibration/{camera.id}"
+        attributes, figures = run[unit].attrs, run.record.figures.get(unit, {})
+        used = figures.get("clicks_used")
+        summaries.append(
+            CameraSummary(
+                camera.id,
+                _ORIGINS[attributes["origin"]],
+                figures.get("expected_ground_error_median_m"),
+                figures.get("expected_ground_error_p95_m"),
+                figures.get("reprojection_rms_px"),
+                None if used is None else int(used),
+                _wrong_clicks(run, unit),
+                tuple(attributes.get("reasons") or ()),
+            )
+        )
+    return summaries
+
+
+def camera_pictures(
+    store: Store, run: Run, match: Match, cameras: Mapping[str, Camera]
+) -> list[Picture]:
+    """The weakest calibrated cameras: their clicks, and the expected error over the pitch."""
+    errors = {
+        name: run.record.figures.get(f"static_calibration/{name}", {}).get(
+            "expected_ground_error_median_m", 0.0
+        )
+        for name in cameras
+    }
+    weakest = sorted((name for name in cameras if errors[name]), key=lambda name: -errors[name])
+    pictures = []
+    for name in weakest[:SHOWN] if match.folder.pitch is not None else ():
+        result = run[f"static_calibration/{name}"]
+        inlier = dict(zip(_names(run, name), result["point_inlier"].values.tolist(), strict=True))
+        ground_error = ErrorMap(
+            result["ground_x"].values, result["ground_y"].values, result["ground_error"].values
+        )
+        png = calibration_picture(
+            cameras[name],
+            f"camera {name}",
+            match.folder.pitch,
+            clicks=[
+                Click(point, place, inlier[point])
+                for point, place in _clicked_places(store, run, name).items()
+            ],
+            still=still_of(match, name),
+            error_map=ground_error,
+        )
+        pictures.append(
+            Picture(
+                f"One of the least certain cameras, {name}: the pitch as it projects it, clicks "
+                "as circles, clicks that it does not rest on as crosses; below, its expected "
+                f"error on the ground, median {errors[name]:.2g} m.",
+                png,
+            )
+        )
+    return pictures
+
+
+def still_of(match: Match, camera_id: str) -> NDArray[np.uint8] | None:
+    """The camera's picture, where the match folder has one."""
+    still = match.folder.stills.get(camera_id)
+    if still is None:
+        return None
+    camera = match.folder.spec.camera(camera_id)
+    return read_still(still, (camera.width, camera.height))
+
+
+def _names(run: Run, camera_id: str) -> list[str]:
+    """Clicked points in the order of the result's arrays."""
+    return [str(name) for name in run[f"static_calibration/{camera_id}"]["point"].values]
+
+
+def _wrong_clicks(run: Run, unit: str) -> tuple[str, ...]:
+    result = run[unit]
+    if "point_inlier" not in result:
+        return ()
+    wrong = ~result["point_inlier"].values
+    return tuple(str(name) for name in result["point"].values[wrong])
+
+
+def _clicked_places(store: Store, run: Run, camera_id: str) -> dict[str, NDArray[np.float64]]:
+    """Where the run's own clicks were made: those of the folder may have been edited since."""
+    record = run.record
+    key = record.results[f"static_calibration/{camera_id}"]
+    recipe = store.manifest(record.match_id, "static_calibration", camera_id, key).recipe
+    ((_, clicked),) = recipe.sources["clicked"].items()  # type: ignore[union-attr]
+    return {name: np.array(place) for name, place in clicked["points"].items()}

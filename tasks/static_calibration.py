@@ -1,0 +1,114 @@
+"""Task of stage `static_calibration`: one camera as it was given, or from its clicked markings."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.cameras import CameraCalibration
+from data_contracts.pitch import PitchSpec
+from data_contracts.run import Work
+from data_contracts.static_calibration import (
+    STATIC_CALIBRATION,
+    ClickedMarkings,
+    ClickedPoint,
+    DrawnMarking,
+)
+from tasks.unit import unit_task
+from worldpose.cameras import Camera
+from worldpose.cameras.stored import camera_arrays
+from worldpose.errors import InputError
+from worldpose.ingest.stills import read_still
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration import (
+    CalibrationReport,
+    StaticCalibrationSettings,
+    calibrate,
+    calibration_arrays,
+    calibration_attributes,
+    calibration_coordinates,
+)
+from worldpose.store import Store
+
+
+@unit_task
+def static_calibration(work: Work) -> str:
+    """Publishes the camera, and how well it is known where it was calibrated; returns the key."""
+    sources: dict[str, Any] = work.recipe.sources
+    with Store.open(work.project).publishing(work) as result:
+        if sources["calibration"] is not None:
+            given = CameraCalibration.model_validate(sources["calibration"])
+            result.write(
+                STATIC_CALIBRATION,
+                arrays=camera_arrays(Camera.from_calibration(given)),
+                attributes=calibration_attributes(work.recipe.unit, None),
+            )
+            return work.key
+        ((file, clicked),) = sources["clicked"].items()
+        width, height = sources["image_size"]
+        calibration = calibrate(
+            PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"])),
+            _clicked_markings(clicked),
+            (width, height),
+            picture=_still(work),
+            settings=StaticCalibrationSettings.model_validate(work.recipe.settings),
+            where=file,
+        )
+        result.write(
+            STATIC_CALIBRATION,
+            arrays=calibration_arrays(calibration),
+            coordinates=calibration_coordinates(calibration),
+            attributes=calibration_attributes(work.recipe.unit, calibration),
+        )
+        result.figures.update(_figures(calibration.report))
+    return work.key
+
+
+def _clicked_markings(listed: Mapping[str, Any]) -> ClickedMarkings:
+    """The clicks of a recipe, by name: their order in the file decides nothing."""
+    points, drawn = listed["points"], listed["drawn"]
+    return ClickedMarkings(
+        points=tuple(ClickedPoint(name=name, xy=points[name]) for name in sorted(points)),
+        drawn=tuple(DrawnMarking(name=name, xy=drawn[name]) for name in sorted(drawn)),
+    )
+
+
+def _still(work: Work) -> NDArray[np.uint8] | None:
+    """The unit's picture, from the very file that its key stands for.
+
+    Raises:
+        InputError: the file is not, or no longer, the one that was registered, or no picture.
+    """
+    sources: dict[str, Any] = work.recipe.sources
+    if sources["still"] is None:
+        return None
+    path = Path(work.folder) / sources["still"]
+    width, height = sources["image_size"]
+    picture = read_still(path, (width, height))
+    if hashlib.sha256(path.read_bytes()).hexdigest() != sources["still_sha256"]:
+        raise InputError(
+            str(path),
+            expected="the file that was registered when the run began",
+            found="other content",
+            todo="Run again when nothing writes to the match folder.",
+        )
+    return picture
+
+
+def _figures(report: CalibrationReport) -> dict[str, float]:
+    """Figures of a calibrated camera; what could not be computed is left out."""
+    used = [point.residual for point in report.points if point.inlier]
+    figures = {
+        "expected_ground_error_median_m": report.ground_error.median,
+        "expected_ground_error_p95_m": report.ground_error.p95,
+        "reprojection_rms_px": float(np.sqrt(np.mean(np.square(used)) * 2.0)) if used else np.nan,
+        "clicks_used": float(len(used)),
+        "clicks_wrong": float(len(report.wrong)),
+        "weak": float(report.weak),
+    }
+    return {name: value for name, value in figures.items() if np.isfinite(value)}

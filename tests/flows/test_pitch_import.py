@@ -1,0 +1,66 @@
+"""`worldpose import --pitch`: a survey becomes a match's pitch.json, or one clear message."""
+
+import json
+
+import numpy as np
+import pytest
+from command_line import succeed, worldpose
+
+from worldpose.pitch import PitchTemplate
+
+NAMES = (
+    *(f"corner_{side}_{end}" for side in ("left", "right") for end in ("near", "far")),
+    *(f"penalty_area_{side}_near_front" for side in ("left", "right")),
+    "center_mark",
+)
+
+
+@pytest.fixture
+def survey(tmp_path):
+    """A national grid's easting and northing of the standard pitch, turned by 90 degrees."""
+    rows = ["name,northing,easting,height"]
+    for name, (x, y, z) in zip(NAMES, PitchTemplate.standard().positions(NAMES), strict=True):
+        rows.append(f"{name},{5345000.0 + x:.4f},{512000.0 - y:.4f},{517.0 + z:.4f}")
+    path = tmp_path / "survey.csv"
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def test_a_survey_becomes_pitch_json(survey, tmp_path):
+    match = tmp_path / "match"
+    answer = succeed("import", "--pitch", survey, "--out", match, "--json").json
+    pitch = json.loads((match / "pitch.json").read_text())
+    assert (pitch["length"], pitch["width"]) == pytest.approx((105.0, 68.0), abs=1e-3)
+    assert pitch["crown"] == pytest.approx(0.2, abs=0.005)
+    # x along the touch line, y away from the main camera, whatever the grid's axes are
+    assert pitch["points"]["corner_right_far"] == pytest.approx([52.5, 34.0, -0.2], abs=0.005)
+    assert set(answer["offset_plan_m"]) == set(NAMES)
+    assert max(answer["offset_plan_m"].values()) < 0.001
+    again = worldpose("import", "--pitch", survey, "--out", match)
+    assert again.code == 2
+    assert "expected no pitch there yet" in again.err
+
+
+def test_a_survey_in_feet_is_refused_and_nothing_is_written(survey, tmp_path):
+    header, *rows = survey.read_text().splitlines()
+    places = np.array([[float(cell) for cell in row.split(",")[1:]] for row in rows]) / 0.3048
+    feet = [",".join([name, *map(str, place)]) for name, place in zip(NAMES, places, strict=True)]
+    survey.write_text("\n".join([header, *feet]) + "\n")
+    answer = worldpose("import", "--pitch", survey, "--out", tmp_path / "match")
+    assert answer.code == 1
+    assert "as feet are" in answer.err
+    assert "Traceback" not in answer.err
+    assert not (tmp_path / "match").exists()
+
+
+@pytest.mark.parametrize("more", [["--fps", 25], ["--detections", "x"]])
+def test_a_pitch_is_imported_on_its_own(survey, tmp_path, more):
+    answer = worldpose("import", "--pitch", survey, "--out", tmp_path / "match", *more)
+    assert answer.code == 2
+    assert "--pitch with --out alone" in answer.err
+
+
+def test_a_match_needs_its_calibration_and_detections(tmp_path):
+    answer = worldpose("import", "--out", tmp_path / "match", "--fps", 25)
+    assert answer.code == 2
+    assert "--calibration, --detections and --fps, or --pitch" in answer.err

@@ -1,0 +1,113 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from worldpose.body import BODY25, SKELETONS, BodyParameters, fold_keypoints
+from worldpose.body.jacobian import ChainedKeypoints
+
+NAMES = ("betas", "global_orient", "body_pose", "transl")
+STEP = 1e-6
+
+
+@pytest.fixture(params=["open_body", "corrected_body"])
+def folded(request):
+    return fold_keypoints(request.getfixturevalue(request.param), BODY25)
+
+
+def differences(folded, people, name):
+    """Central differences (..., keypoints, 3, parameters)."""
+    given = getattr(people, name)
+    columns = []
+    for column in range(given.shape[-1]):
+        step = STEP * np.eye(given.shape[-1])[column]
+        up, down = (replace(people, **{name: given + sign * step}) for sign in (1, -1))
+        columns.append((folded(up) - folded(down)) / (2.0 * STEP))
+    return np.stack(columns, axis=-1)
+
+
+def test_keypoints_are_those_of_folding(folded, people):
+    found = ChainedKeypoints.of(folded).differentiate(people).keypoints
+    # Rounding of coordinates below 100 m.
+    np.testing.assert_allclose(found, folded(people), atol=2e-13)
+
+
+@pytest.mark.parametrize("name", NAMES[:3])
+def test_derivatives_are_those_of_differences(folded, people, name):
+    jacobian = ChainedKeypoints.of(folded).differentiate(people)
+    # Rounding at 100 m over a step of 1e-6: 1e-8; the step's own error is far below.
+    np.testing.assert_allclose(
+        getattr(jacobian, name), differences(folded, people, name), atol=5e-8
+    )
+
+
+def test_a_translation_moves_all_keypoints_by_itself(folded, people):
+    moved = differences(folded, people, "transl")
+    np.testing.assert_allclose(moved, np.broadcast_to(np.eye(3), moved.shape), atol=5e-8)
+
+
+def test_derivatives_are_those_of_torch(folded, people):
+    torch = pytest.importorskip("torch")
+    from worldpose.body.differentiable import DifferentiableBody
+
+    body = DifferentiableBody(folded)
+    given = [torch.tensor(np.array(getattr(people, name)), requires_grad=True) for name in NAMES]
+    weights = np.random.default_rng(0).normal(size=(5, len(BODY25), 3))
+    (body.keypoints(*given) * torch.tensor(weights)).sum().backward()
+    jacobian = ChainedKeypoints.of(folded).differentiate(people)
+    for name, tensor in zip(NAMES[:3], given, strict=False):
+        pulled = np.einsum("nka,nkap->np", weights, getattr(jacobian, name))
+        np.testing.assert_allclose(pulled, tensor.grad.numpy(), atol=1e-11)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.0999, 0.1001, 3.0, np.pi, 6.0])
+def test_angles_of_any_size_have_exact_derivatives(folded, angle):
+    axis = np.array([0.48, -0.6, 0.64])
+    pose = np.zeros((23, 3))
+    pose[[0, 3, 8, 16]] = angle * axis
+    person = BodyParameters(np.zeros(10), angle * axis, pose.ravel(), np.zeros(3))
+    jacobian = ChainedKeypoints.of(folded).differentiate(person)
+    np.testing.assert_allclose(jacobian.keypoints, folded(person), atol=1e-14)
+    for name in ("global_orient", "body_pose"):
+        # Rounding at 1 m over a step of 1e-6, and the step's own error of 1e-12.
+        np.testing.assert_allclose(
+            getattr(jacobian, name), differences(folded, person, name), atol=2e-9
+        )
+
+
+def test_a_bent_elbow_moves_the_wrist_across_the_forearm(open_body):
+    folded = fold_keypoints(open_body, ("left_wrist", "left_elbow"))
+    jacobian = ChainedKeypoints.of(folded).differentiate(BodyParameters.rest())
+    elbow, wrist = open_body.joint_template[[18, 20]]
+    turning = jacobian.body_pose.reshape(2, 3, 23, 3)[:, :, 17]  # the elbow is joint 18
+    np.testing.assert_allclose(turning[0, :, 1], np.cross([0, 1, 0], wrist - elbow), atol=1e-15)
+    np.testing.assert_array_equal(turning[1], 0.0)
+
+
+def test_what_lies_elsewhere_in_the_body_moves_nothing(open_body, people):
+    folded = fold_keypoints(open_body, ("left_ankle",))
+    pose = ChainedKeypoints.of(folded).differentiate(people).body_pose.reshape(5, 3, 23, 3)
+    moving = np.flatnonzero(np.abs(pose).max(axis=(0, 1, 3)) > 0) + 1
+    assert moving.tolist() == [1, 4]  # left hip and knee; an ankle does not move itself
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (2, 3), (0,)])
+def test_batches_keep_their_shape(open_body, shape):
+    rng = np.random.default_rng(0)
+    person = BodyParameters(*(rng.normal(size=(*shape, length)) for length in (10, 3, 69, 3)))
+    jacobian = ChainedKeypoints.of(fold_keypoints(open_body, SKELETONS["coco17"])).differentiate(
+        person
+    )
+    assert jacobian.keypoints.shape == (*shape, 17, 3)
+    assert jacobian.betas.shape == (*shape, 17, 3, 10)
+    assert jacobian.global_orient.shape == (*shape, 17, 3, 3)
+    assert jacobian.body_pose.shape == (*shape, 17, 3, 69)
+
+
+def test_a_missing_person_is_missing_and_the_next_is_not(open_body, people):
+    pose = people.body_pose.copy()
+    pose[1] = np.nan
+    chained = ChainedKeypoints.of(fold_keypoints(open_body, ("left_wrist",)))
+    jacobian = chained.differentiate(replace(people, body_pose=pose))
+    assert np.isnan(jacobian.keypoints[1]).all()
+    np.testing.assert_array_equal(jacobian.pose[2], chained.differentiate(people).pose[2])

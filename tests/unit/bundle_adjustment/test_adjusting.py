@@ -1,0 +1,146 @@
+"""Cameras adjusted to people and markings, against known truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from worldpose.bundle_adjustment import (
+    BundleAdjustmentSettings,
+    Clicks,
+    SolverSettings,
+    adjust_cameras,
+)
+from worldpose.static_calibration import stepped
+
+QUICK = BundleAdjustmentSettings(frames=8, folds=2, solver=SolverSettings(cost_change=1e-6))
+
+
+def errors(cameras, true):
+    """Mean distance [px] by which cameras put people's places beside the true ones."""
+    places = np.array([[x, y, 1.0] for x in (-8.0, 0.0, 8.0) for y in (-8.0, 0.0, 8.0)])
+    off = np.linalg.norm(cameras.project(places) - true.project(places), axis=-1)
+    return off.mean(axis=-1)
+
+
+def test_people_bring_cameras_together(clip):
+    made, true, _ = clip()
+    adjusted = adjust_cameras(made, QUICK)
+    assert adjusted.accepted.all()
+    assert adjusted.converged
+    # Scatter of a pixel's rotation and of decimetres becomes what 800 keypoints a camera leave;
+    # what all cameras share stays as calibration has it.
+    assert errors(adjusted.cameras, true).mean() < 0.4 * errors(made.cameras, true).mean()
+    assert (adjusted.verdict.loss[:, 1] < adjusted.verdict.loss[:, 0]).all()
+    assert all(reason.startswith("accepted") for reason in adjusted.reasons)
+
+
+def test_covariance_covers_the_error(clip):
+    squared = []
+    for seed in range(8):
+        made, true, _ = clip(seed=seed, lasting=0.7)
+        adjusted = adjust_cameras(made, QUICK)
+        center = adjusted.cameras.center - true.center
+        rotation = true.cam_from_world.rotation
+        spread = rotation.swapaxes(1, 2) @ adjusted.covariance[:, 3:6, 3:6] @ rotation
+        squared += [off @ np.linalg.solve(s, off) for off, s in zip(center, spread, strict=True)]
+    # Chi-square with three degrees of freedom: 40 values have a mean of 3 +- 0.4 if they were
+    # independent, and those of one trial share the world's place.
+    assert 1.8 < np.mean(squared) < 4.5
+
+
+def test_markings_alone_are_refused_where_they_bend_the_camera(clip):
+    made, true, _ = clip(clicked=6, seed=2)
+    clustered = []
+    for clicks in made.clicks:
+        # All in a tenth of the pitch: the lens is free to do anything elsewhere.
+        near = 0.3 * clicks.points_world + [14.0, 14.0, 0.0]
+        clustered.append(near)
+    rng = np.random.default_rng(5)
+    made = replace(
+        made,
+        clicks=tuple(
+            replace(
+                clicks,
+                points_world=near,
+                points_image=true[c].project(near) + 1.5 * rng.standard_normal((6, 2)),
+            )
+            for c, (clicks, near) in enumerate(zip(made.clicks, clustered, strict=True))
+        ),
+    )
+    adjusted = adjust_cameras(made, QUICK.model_copy(update={"evidence": "markings"}))
+    assert errors(adjusted.refused, true).max() > 2.0 * errors(made.cameras, true).max()
+    assert not adjusted.accepted.any()
+    np.testing.assert_array_equal(adjusted.cameras.numbers, made.cameras.numbers)
+    np.testing.assert_array_equal(adjusted.covariance, made.covariance)
+    assert all(reason.startswith("refused: loss of") for reason in adjusted.reasons)
+
+
+def test_a_camera_whose_clock_is_wrong_stands_and_the_others_improve(clip):
+    made, true, _ = clip(cameras=6)
+    # The last camera is right, and shows people as they were a second ago.
+    cameras = made.cameras.numbers.copy()
+    assert len(cameras) == 6
+    step = np.zeros((6, 12))
+    late = made.keypoints.copy()
+    rng = np.random.default_rng(4)
+    late[:, 5] += rng.normal(0.0, 40.0, (24, 6, 1, 2))
+    mixed = replace(made, keypoints=late, cameras=stepped(made.cameras, step))
+    adjusted = adjust_cameras(mixed, QUICK)
+    assert adjusted.accepted[:5].all()
+    assert errors(adjusted.cameras, true)[:5].mean() < 0.5 * errors(made.cameras, true)[:5].mean()
+
+
+def test_given_cameras_are_adjusted_as_far_as_their_prior_lets_them(clip):
+    made, true, _ = clip()
+    step = 5e-4 * np.random.default_rng(2).standard_normal((5, 12))
+    step[:, 3:] = 0.0
+    given = replace(made, cameras=stepped(true, step), covariance=np.zeros_like(made.covariance))
+    adjusted = adjust_cameras(given, QUICK)
+    assert adjusted.accepted.all()
+    np.testing.assert_array_equal(adjusted.cameras.principal_point, given.cameras.principal_point)
+    assert errors(adjusted.cameras, true).mean() < 0.7 * errors(given.cameras, true).mean()
+
+
+def test_frames_that_a_person_chose_are_used_and_the_proposal_kept(clip):
+    made, *_ = clip()
+    adjusted = adjust_cameras(made, QUICK.model_copy(update={"chosen_frames": (101, 110, 999)}))
+    assert adjusted.used.tolist() == [101, 110]
+    assert len(adjusted.proposed) == 8
+    assert not set(adjusted.judged) & {101, 110}
+
+
+def test_one_person_judges_in_other_parts_of_the_time(clip):
+    made, true, _ = clip(persons=1)
+    adjusted = adjust_cameras(made, QUICK)
+    assert adjusted.accepted.any()
+    assert (adjusted.verdict.judges >= 100).all()
+
+
+@pytest.mark.parametrize("case", ["nobody", "one camera", "two cameras in line", "no markings"])
+def test_what_tells_nothing_leaves_cameras_as_they_were_and_says_why(clip, case):
+    if case == "one camera":
+        made, *_ = clip(cameras=1)
+    elif case == "two cameras in line":
+        made, *_ = clip(cameras=2)
+    else:
+        made, *_ = clip(frames=6)
+    settings, reason = QUICK, "nobody is seen by enough cameras"
+    if case == "nobody":
+        made = replace(made, joints=np.full_like(made.joints, np.nan))
+    if case == "no markings":
+        count = len(made.clicks)
+        made = replace(made, clicks=(Clicks.none(),) * count)
+        settings = QUICK.model_copy(update={"evidence": "markings"})
+        reason = "nobody clicked a marking"
+    adjusted = adjust_cameras(made, settings)
+    assert not adjusted.accepted.any()
+    np.testing.assert_array_equal(adjusted.cameras.numbers, made.cameras.numbers)
+    assert all(reason in said for said in adjusted.reasons)
+
+
+def test_too_few_judges_refuse(clip):
+    made, *_ = clip()
+    adjusted = adjust_cameras(made, QUICK.model_copy(update={"min_judges": 10**6}))
+    assert not adjusted.accepted.any()
+    assert "1000000 are asked for" in adjusted.reasons[0]

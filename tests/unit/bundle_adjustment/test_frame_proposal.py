@@ -1,0 +1,46 @@
+"""Which frames cameras are adjusted on."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from worldpose.bundle_adjustment import propose_frames
+
+
+def test_frames_keep_their_distance_and_rise(clip):
+    made, *_ = clip()
+    chosen = propose_frames(made, count=40, gap=0.16, min_views=3)
+    # 0.16 s are four frames of 25 Hz: at most six fit into 24.
+    assert 4 <= len(chosen) <= 6
+    assert np.diff(chosen).min() >= 4
+
+
+def test_no_frame_is_proposed_twice(clip):
+    made, *_ = clip()
+    first = propose_frames(made, count=3, gap=0.1, min_views=3)
+    second = propose_frames(made, count=3, gap=0.1, min_views=3, taken=first)
+    assert len(first) == len(second) == 3
+    assert not set(first) & set(second)
+
+
+def test_frames_without_well_seen_people_are_left_out(clip):
+    made, *_ = clip()
+    views = made.views.copy()
+    views[5:] = 2
+    chosen = propose_frames(replace(made, views=views), count=40, gap=0.0, min_views=3)
+    assert set(chosen) <= set(range(5))
+
+
+def test_a_frame_that_shows_another_part_of_the_pitch_comes_before_more_of_the_same(clip):
+    made, *_ = clip(persons=1, frames=6)
+    joints = made.joints.copy()
+    joints[:] = joints[0]
+    joints[3] += [20.0, 0.0, 0.0]
+    chosen = propose_frames(replace(made, joints=joints), count=2, gap=0.0, min_views=3)
+    assert 3 in chosen
+
+
+def test_nobody_means_no_frames(clip):
+    made, *_ = clip()
+    gone = replace(made, joints=np.full_like(made.joints, np.nan))
+    assert len(propose_frames(gone, count=5, gap=0.1, min_views=3)) == 0

@@ -1,0 +1,81 @@
+"""The review list against planted mistakes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from worldpose.bundle_adjustment import keypoint_outliers, review_clicks
+from worldpose.bundle_adjustment.building import KeypointNoise
+
+
+def found(made, cameras, limit=4.2, longest=10_000):
+    return keypoint_outliers(made, cameras, KeypointNoise(), limit, longest)
+
+
+def test_planted_keypoints_come_first(clip):
+    made, true, _ = clip(cameras=8, frames=20, noise=0.9)
+    rng = np.random.default_rng(8)
+    image = made.keypoints.copy()
+    planted = {
+        tuple(row)
+        for row in np.column_stack(
+            [rng.integers(0, 20, 60), rng.integers(0, 8, 60), rng.integers(0, 6, 60)]
+        )
+    }
+    planted = {(*row, int(rng.integers(0, 17))) for row in sorted(planted)}
+    for row in planted:
+        image[row] += rng.choice([-1.0, 1.0], 2) * rng.uniform(6.0, 30.0, 2)
+    listed = found(replace(made, keypoints=image), true)
+    first = list(zip(listed.frame, listed.camera, listed.person, listed.joint, strict=True))
+    assert (np.diff(listed.surprise) <= 0).all()
+    hits = planted & set(first[: len(planted)])
+    # Errors of 8 standard deviations and more among 16,320 honest keypoints.
+    assert len(hits) >= 0.95 * len(planted)
+
+
+def test_a_person_taken_for_another_is_one_entry(clip):
+    made, true, _ = clip(cameras=8, noise=0.9)
+    index = made.detection_index.copy()
+    index[7, 3, [0, 1]] = [1, 0]
+    listed = found(replace(made, detection_index=index), true)
+    entries = set(zip(listed.frame, listed.camera, listed.person, listed.joint, strict=True))
+    assert {(7, 3, 0, -1), (7, 3, 1, -1)} <= entries
+    assert listed.surprise[0] > 10.0
+
+
+def test_the_list_ends_where_it_is_told_and_still_counts(clip):
+    made, true, _ = clip(noise=1.5)
+    everything = found(made, true, limit=1.0)
+    short = found(made, true, limit=1.0, longest=5)
+    assert len(short.frame) == 5
+    assert short.found == everything.found > 1000
+    np.testing.assert_array_equal(short.surprise, everything.surprise[:5])
+
+
+def test_honest_people_are_hardly_listed(clip):
+    made, true, _ = clip(cameras=8, noise=0.8)
+    # Chi-square with two degrees of freedom, and the joint's own uncertainty: under 1 in 10,000.
+    assert found(made, true).found <= 2
+
+
+@pytest.mark.parametrize("rests", [True, False])
+def test_a_wrong_click_is_more_surprising_than_honest_ones(clip, rests):
+    made, true, _ = clip()
+    clicks = made.clicks[2]
+    image, inlier = clicks.points_image.copy(), clicks.inlier.copy()
+    image[4] += [12.0, -9.0]
+    inlier[4] = rests
+    changed = replace(clicks, points_image=image, inlier=inlier)
+    all_clicks = (*made.clicks[:2], changed, *made.clicks[3:])
+    review = review_clicks(all_clicks, true, 0.0 * made.covariance, click_noise=1.0)
+    assert (review.camera[0], review.name[0]) == (2, "point_4")
+    # 15 px in standard deviations of 1 px, give or take the click's own noise of up to three.
+    assert review.surprise[0] == pytest.approx(15.0, abs=3.0)
+    assert review.surprise[1] < 4.2
+
+
+def test_cameras_without_clicks_have_nothing_to_review(clip):
+    made, true, _ = clip(clicked=0)
+    review = review_clicks(made.clicks, true, made.covariance, click_noise=1.0)
+    assert len(review.camera) == len(review.surprise) == len(review.name) == 0

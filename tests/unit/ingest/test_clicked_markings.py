@@ -1,0 +1,161 @@
+"""Clicked markings and stills: read back as written, or refused by file and entry."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from data_contracts.pitch import PitchSpec
+from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
+from worldpose.errors import InputError
+from worldpose.ingest.match_folder import read_match, require_calibrated
+from worldpose.ingest.registration import register_match
+from worldpose.ingest.stills import read_still
+from worldpose.ingest.writing import write_match
+
+CLICKED = ClickedMarkings(
+    points=(
+        ClickedPoint(name="corner_left_near", xy=(12.25, 900.5)),
+        ClickedPoint(name="center_mark", xy=(-0.5, 1079.5)),
+    ),
+    drawn=(DrawnMarking(name="center_circle", xy=((3.0, 4.0), (5.5, 6.5))),),
+)
+
+
+@pytest.fixture
+def clicked_folder(tmp_path, spec, make_people, make_camera):
+    """A match whose second camera is clicked and has a still."""
+
+    def write(clicked=CLICKED, **keywords):
+        folder = tmp_path / "clicked"
+        write_match(
+            folder,
+            spec,
+            calibrations={"cam1": make_camera("cam1")},
+            observations={
+                "cam1": make_people(5, 6, seed=1),
+                "cam2": make_people(15, 6, seed=2),
+                "goal": make_people(0, 3, seed=3),
+            },
+            clicked={"cam2": clicked},
+            **keywords,
+        )
+        return folder
+
+    return write
+
+
+def file_of(folder):
+    return folder / "annotations" / "static_calibration" / "cam2.json"
+
+
+def refusal(folder):
+    with pytest.raises(InputError) as caught:
+        read_match(folder)
+    return caught.value
+
+
+def test_clicks_are_read_as_written(clicked_folder):
+    match = read_match(clicked_folder())
+    assert match.clicked == {"cam2": CLICKED}
+    require_calibrated(match)
+
+
+def test_a_still_is_read_as_written(clicked_folder, spec):
+    # Every channel its own value, so that swapped channels are seen.
+    picture = np.zeros((1080, 1920, 3), dtype=np.uint8)
+    picture[10, 20] = (250, 120, 5)
+    match = read_match(clicked_folder(stills={"cam2": picture}))
+    assert match.stills == {"cam2": match.folder / "stills" / "cam2.png"}
+    np.testing.assert_array_equal(read_still(match.stills["cam2"], (1920, 1080)), picture)
+
+
+def test_a_still_of_another_size_or_no_picture_is_refused(tmp_path):
+    path = tmp_path / "cam.png"
+    cv2.imwrite(str(path), np.zeros((20, 30, 3), np.uint8))
+    with pytest.raises(InputError, match=r"cam.png.*1920 x 1080 px.*found 30 x 20"):
+        read_still(path, (1920, 1080))
+    path.write_bytes(path.read_bytes()[:40])
+    with pytest.raises(InputError, match="40 bytes that are none"):
+        read_still(path, (30, 20))
+    path.write_bytes(b"")
+    with pytest.raises(InputError, match="0 bytes that are none"):
+        read_still(path, (30, 20))
+
+
+def entries(**changes):
+    content = {"points": [{"name": "center_mark", "xy": [100.0, 200.0]}], "drawn": []}
+    return json.dumps(content | changes)
+
+
+@pytest.mark.parametrize(
+    ("content", "place", "told"),
+    [
+        (entries(points=[{"name": "corner_left_nea", "xy": [1, 2]}]), "points[0].name", "near"),
+        (entries(drawn=[{"name": "halfway", "xy": [[1, 2]]}]), "drawn[0].name", "halfway_line"),
+        (entries(drawn=[{"name": "center_mark", "xy": [[1, 2]]}]), "drawn[0].name", "a marking"),
+        (entries(points=[{"name": "center_mark", "xy": [1920, 2]}]), "points[0].xy", "1920 x 1080"),
+        (
+            entries(drawn=[{"name": "center_circle", "xy": [[1, 2], [3, -0.6]]}]),
+            "drawn[0].xy[1]",
+            "in the picture",
+        ),
+        (entries(points=[{"name": "center_mark", "xy": [np.nan, 2]}]), "points[0].xy[0]", "finite"),
+        (entries(points=[{"name": "center_mark", "xy": [1, 2]}] * 2), "points[1].name", "again"),
+        (entries(points=[]), "", "points or drawn markings"),
+        (entries(drawn=[{"name": "center_circle", "xy": []}]), "drawn[0].xy", "at least 1"),
+        ('{"pionts": []}', "pionts", "points"),
+        ("{", "", "JSON"),
+    ],
+)
+def test_a_wrong_entry_is_refused_by_file_and_place(clicked_folder, content, place, told):
+    folder = clicked_folder()
+    file_of(folder).write_text(content)
+    error = refusal(folder)
+    assert error.where == (f"{file_of(folder)}: {place}" if place else str(file_of(folder)))
+    assert told in str(error)
+
+
+def test_a_file_of_no_static_camera_is_refused(clicked_folder):
+    folder = clicked_folder()
+    file_of(folder).rename(file_of(folder).with_name("main.json"))  # the broadcast camera
+    error = refusal(folder)
+    assert error.where.endswith("main.json")
+    assert "a static camera: cam1, cam2" in error.expected
+
+
+def test_clicks_without_a_pitch_are_refused(clicked_folder):
+    folder = clicked_folder()
+    match_file = folder / "match.yaml"
+    match_file.write_text(match_file.read_text() + "pitch: none\n")
+    assert "pitch: none" in refusal(folder).expected
+
+
+def test_the_names_are_those_of_the_surveyed_pitch(clicked_folder):
+    clicked = ClickedMarkings(points=(ClickedPoint(name="dug_out", xy=(5.0, 6.0)),))
+    with pytest.raises(InputError, match="dug_out"):
+        clicked_folder(clicked)
+    folder = clicked_folder(clicked, pitch=PitchSpec(points={"dug_out": (0.0, -36.0, -0.2)}))
+    assert read_match(folder).clicked == {"cam2": clicked}
+
+
+def test_a_camera_neither_given_nor_clicked_is_named_with_what_to_do(clicked_folder):
+    folder = clicked_folder()
+    file_of(folder).unlink()
+    with pytest.raises(InputError, match="missing camera cam2; there: cam1") as caught:
+        require_calibrated(read_match(folder))
+    assert "at least four points" in caught.value.todo
+    assert str(file_of(folder)) in caught.value.todo
+
+
+def test_edited_clicks_and_stills_leave_the_match_what_it_is(clicked_folder):
+    folder = clicked_folder(stills={"cam2": np.zeros((1080, 1920, 3), np.uint8)})
+    before = register_match(read_match(folder), None)
+    file_of(folder).write_text(entries())
+    (folder / "stills" / "cam2.png").write_bytes(b"another")
+    after = register_match(read_match(folder), None)
+    assert after.identity == before.identity
+    changed = set(after.files) ^ set(before.files)
+    name = "annotations/static_calibration/cam2.json"
+    assert {file.path for file in changed} == {name, "stills/cam2.png"}

@@ -1,0 +1,227 @@
+"""A pitch with known truth, surveyed in other frames, comes back; a wrong survey is refused."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from data_contracts.pitch import PitchSpec
+from worldpose.errors import InputError
+from worldpose.pitch import PitchTemplate
+from worldpose.pitch.survey import fit_survey
+from worldpose.pitch.survey_file import Survey, read_survey
+from worldpose.pitch.survey_settings import SurveySettings
+
+TRUE = PitchSpec(length=101.3, width=66.2, crown=0.31)
+CORNERS = [f"corner_{side}_{end}" for side in ("left", "right") for end in ("near", "far")]
+NAMES = (
+    *CORNERS,
+    "center_mark",
+    "halfway_near",
+    "halfway_far",
+    "goal_post_left_near_top",
+    *(f"penalty_area_{s}_{e}_front" for s in ("left", "right") for e in ("near", "far")),
+    "penalty_mark_left",
+)
+
+
+def surveyed(
+    pitch=TRUE, names=NAMES, angle=0.0, shift=(0.0, 0.0, 0.0), slope=(0.0, 0.0), noise=0.0, seed=0
+):
+    """The pitch in another frame: tilted by a slope along its own axes, turned, shifted."""
+    places = PitchTemplate.from_spec(pitch).positions(names)
+    normal = np.array([-slope[0], -slope[1], 1.0])
+    normal /= np.linalg.norm(normal)
+    # The smallest rotation that takes z to the normal of the sloping plane.
+    axis = np.cross([0.0, 0.0, 1.0], normal)
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    tilt = np.eye(3) + cross + cross @ cross / (1.0 + normal[2])
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    moved = places @ tilt.T @ turn.T + shift
+    moved += np.random.default_rng(seed).normal(0.0, noise, moved.shape)
+    return Survey("survey.csv", tuple(names), moved)
+
+
+def points(fit):
+    return np.array([fit.pitch.points[name] for name in fit.names])
+
+
+# A grid's zone, a pitch that falls by 0.6 %; places are rounded to 0.1 mm in the record.
+@pytest.mark.parametrize("angle", [0.0, 1.0, np.pi, -2.5])
+@pytest.mark.parametrize("slope", [(0.0, 0.0), (0.006, -0.003)])
+def test_an_exact_survey_in_any_frame_gives_the_pitch_back(angle, slope):
+    fit = fit_survey(surveyed(angle=angle, shift=(512345.6, 5345678.9, 517.25), slope=slope))
+    assert fit.pitch.length == pytest.approx(TRUE.length, abs=1e-3)
+    assert fit.pitch.width == pytest.approx(TRUE.width, abs=1e-3)
+    # Slope and crown are held by priors of 1 % and 0.1 m against 0.03 m of the marks.
+    assert fit.pitch.crown == pytest.approx(TRUE.crown, abs=5e-3)
+    assert fit.slope == pytest.approx(slope, abs=2e-4)
+    assert fit.scale == pytest.approx(1.0, abs=1e-4)
+    assert fit.measured == ("length", "width", "crown")
+    truth = PitchTemplate.from_spec(TRUE).positions(NAMES)
+    np.testing.assert_allclose(points(fit), truth, atol=8e-3)
+    assert PitchTemplate.from_spec(fit.pitch).positions(NAMES) == pytest.approx(points(fit))
+
+
+@settings(max_examples=25, deadline=None)
+@given(angle=st.floats(-np.pi, np.pi), seed=st.integers(0, 1000))
+def test_a_noisy_survey_keeps_its_own_distances(angle, seed):
+    survey = surveyed(angle=angle, noise=0.02, seed=seed, shift=(10.0, -20.0, 3.0))
+    fit = fit_survey(survey)
+    ours, theirs = points(fit), survey.places
+    # Rigid: nothing is stretched, whatever the residuals; 0.1 mm is the record's rounding.
+    distances = [np.linalg.norm(each[:, None] - each, axis=-1) for each in (ours, theirs)]
+    np.testing.assert_allclose(*distances, atol=5e-4)
+    # 13 points of 2 cm: the fitted size is well within 5 cm.
+    assert fit.pitch.length == pytest.approx(TRUE.length, abs=0.05)
+    assert fit.pitch.width == pytest.approx(TRUE.width, abs=0.05)
+    assert 0.005 < np.sqrt(np.mean(fit.offset_plan**2)) < 0.06
+
+
+def test_without_heights_the_crown_is_the_standard_one():
+    survey = surveyed()
+    survey.places[:, 2] = np.nan
+    fit = fit_survey(survey)
+    assert fit.pitch.crown == 0.2
+    assert fit.measured == ("length", "width")
+    assert np.isnan(fit.offset_height).all()
+    # corners lie the crown below the centre, the crossbar's end 2.44 m above its own ground
+    assert fit.pitch.points["corner_left_near"][2] == pytest.approx(-0.2, abs=1e-3)
+    assert fit.pitch.points["goal_post_left_near_top"][2] == pytest.approx(2.4376, abs=1e-3)
+
+
+def test_some_heights_missing_change_nothing_else():
+    survey = surveyed(angle=0.4, slope=(0.004, 0.0), shift=(0.0, 0.0, 50.0))
+    survey.places[[1, 5], 2] = np.nan
+    fit = fit_survey(survey)
+    assert np.isnan(fit.offset_height).tolist() == [n in (1, 5) for n in range(len(NAMES))]
+    truth = PitchTemplate.from_spec(TRUE).positions(NAMES)
+    np.testing.assert_allclose(points(fit), truth, atol=0.015)
+
+
+def test_what_the_survey_cannot_tell_stays_standard():
+    # The left half alone: nothing says how far away the other goal is.
+    names = [name for name in NAMES if "_left" in name]
+    fit = fit_survey(surveyed(names=names))
+    assert "length" not in fit.measured
+    assert fit.pitch.length == pytest.approx(105.0, abs=0.01)
+    assert fit.pitch.width == pytest.approx(TRUE.width, abs=1e-3)
+
+
+def mirrored(survey):
+    return Survey(survey.where, survey.names, survey.places * (1.0, -1.0, 1.0))
+
+
+def test_a_left_handed_frame_is_refused_unless_it_is_said():
+    survey = mirrored(surveyed(angle=0.7))
+    with pytest.raises(InputError, match=r"mirror image.*left and right.*left-handed"):
+        fit_survey(survey)
+    fit = fit_survey(survey, SurveySettings(left_handed=True))
+    assert fit.pitch.length == pytest.approx(TRUE.length, abs=1e-3)
+    with pytest.raises(InputError, match="right-handed"):
+        fit_survey(surveyed(), SurveySettings(left_handed=True))
+
+
+def test_names_with_left_and_right_exchanged_are_a_mirror_image():
+    swap = {"left": "right", "right": "left"}
+    survey = surveyed()
+    names = tuple("_".join(swap.get(part, part) for part in n.split("_")) for n in survey.names)
+    with pytest.raises(InputError, match="mirror image"):
+        fit_survey(Survey("survey.csv", names, survey.places))
+
+
+@pytest.mark.parametrize(
+    ("unit", "said"), [(1 / 0.3048, "feet"), (1 / 0.9144, "yards"), (100, "centimetres"), (1e3, "")]
+)
+def test_other_units_are_named(unit, said):
+    survey = surveyed()
+    with pytest.raises(InputError, match=f"times too large.*{said}") as caught:
+        fit_survey(Survey("survey.csv", survey.names, survey.places * unit))
+    assert caught.value.expected == "metres"
+
+
+def test_the_scale_is_reported_and_taken_out_on_request():
+    survey = surveyed()
+    grid = Survey("survey.csv", survey.names, survey.places * 1.0004)
+    fit = fit_survey(grid)
+    assert fit.scale == pytest.approx(1.0004, abs=5e-5)
+    # Rigid, the penalty areas take a part of the 4 cm: they keep their prescribed size.
+    assert fit.pitch.length == pytest.approx(TRUE.length * 1.0004, abs=0.01)
+    fit = fit_survey(grid, SurveySettings(fit_scale=True))
+    assert fit.pitch.length == pytest.approx(TRUE.length, abs=5e-3)
+
+
+def test_two_exchanged_names_are_found():
+    survey = surveyed(angle=0.3, noise=0.01)
+    names = list(survey.names)
+    a, b = names.index("penalty_mark_left"), names.index("penalty_area_left_near_front")
+    names[a], names[b] = names[b], names[a]
+    with pytest.raises(InputError, match="farther off") as caught:
+        fit_survey(Survey("survey.csv", tuple(names), survey.places))
+    found = caught.value.found
+    assert found.count(" m)") == 2
+    assert "penalty_mark_left" in found and "penalty_area_left_near_front" in found
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        (),
+        CORNERS[:3],
+        ("halfway_near", "center_circle_near", "center_mark", "center_circle_far", "halfway_far"),
+    ],
+)
+def test_too_few_points_or_a_line_of_them_are_refused(names):
+    survey = surveyed(names=names) if names else Survey("survey.csv", (), np.zeros((0, 3)))
+    with pytest.raises(InputError, match="at least four points"):
+        fit_survey(survey)
+
+
+def test_a_file_is_read_by_its_header(tmp_path):
+    path = tmp_path / "survey.csv"
+    path.write_text(
+        "Northing;Easting;Name;Height\n"
+        "20;10;corner_left_near;1.5\n"
+        "21;11;halfway_line.end;\n"
+        "\n"
+        "22;12;touch_line_near.end;-2\n"
+    )
+    survey = read_survey(path)
+    assert survey.names == ("corner_left_near", "halfway_far", "corner_right_near")
+    np.testing.assert_array_equal(survey.places, [[10, 20, 1.5], [11, 21, np.nan], [12, 22, -2]])
+    path.write_text("name,x,y\ncenter_mark,1,2\n")
+    np.testing.assert_array_equal(read_survey(path).places, [[1, 2, np.nan]])
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "told"),
+    [
+        ("", "", "nothing"),
+        ("name,x\n", "row 1", "columns name, x, y"),
+        ("name,x,y,easting\n", "row 1", "columns name, x, y"),
+        ("name,x,y\ncenter_mrk,1,2\n", "row 2: name", "Did you mean 'center_mark'"),
+        ("name,x,y\ncenter_mark,1,2\ncenter_mark,1,2\n", "row 3: name", "again"),
+        (
+            "name,x,y\ncorner_left_near,1,2\ntouch_line_near.start,1,2\n",
+            "row 3: name",
+            "which is corner_left_near again",
+        ),
+        ("name,x,y\ncenter_mark,1\n", "row 2", "3 columns"),
+        ('name,x,y\ncenter_mark,"1,5",2\n', "row 2: x", "'1,5'"),
+        ("name,x,y\ncenter_mark,nan,2\n", "row 2: x", "number"),
+        ("name,x,y\ncenter_mark,,2\n", "row 2: x", "number"),
+    ],
+)
+def test_a_wrong_file_is_refused_by_row(tmp_path, text, place, told):
+    path = tmp_path / "survey.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"survey\.csv") as caught:
+        read_survey(path)
+    assert caught.value.where == (f"{path}: {place}" if place else str(path))
+    assert told in str(caught.value)
+
+
+def test_an_absent_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match="Check the path"):
+        read_survey(tmp_path / "nowhere.csv")

@@ -1,0 +1,106 @@
+"""What a person would click in the picture of a known camera."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from data_contracts.pitch import PitchSpec
+from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
+from worldpose.pitch import PitchTemplate
+from worldpose.synthetic.scenarios import SCENARIOS
+from worldpose.synthetic.stadium import place_camera
+
+SIZE = (1920, 1080)
+PITCH = PitchTemplate.standard()
+
+
+def seat(index: int, seed: int = 0):
+    """A camera of the synthetic stadium, and the generator that goes on from it."""
+    rng = np.random.default_rng([seed, index])
+    rig = SCENARIOS["match"].rig
+    return place_camera(rig, index, np.zeros(3), PitchSpec(), rng), rng
+
+
+def visible(camera, names=None):
+    """Pixels by name of the template's points that the camera sees well inside its picture."""
+    names = list(PITCH.points) if names is None else names
+    pixels = camera.project(PITCH.positions(names))
+    inside = np.isfinite(pixels).all(axis=1)
+    inside[inside] = ((pixels[inside] > 4) & (pixels[inside] < np.array(SIZE) - 5)).all(axis=1)
+    return {name: xy for name, xy, seen in zip(names, pixels, inside, strict=True) if seen}
+
+
+def click(camera, rng, count=10, noise=1.0, wrong=0.0):
+    """Clicks on random visible points; with `wrong`, the first lies that many pixels off."""
+    seen = visible(camera)
+    names = list(rng.permutation(list(seen)))[:count]
+    pixels = {name: seen[name] + noise * rng.standard_normal(2) for name in names}
+    if wrong:
+        angle = rng.uniform(0, 2 * np.pi)
+        pixels[names[0]] = pixels[names[0]] + wrong * np.array([np.cos(angle), np.sin(angle)])
+    limit = np.array(SIZE) - 1
+    return SimpleNamespace(
+        clicked=points({name: np.clip(xy, 0, limit) for name, xy in pixels.items()}),
+        first=str(names[0]),
+    )
+
+
+def points(pixels) -> ClickedMarkings:
+    return ClickedMarkings(
+        points=tuple(
+            ClickedPoint(name=str(k), xy=(float(x), float(y))) for k, (x, y) in pixels.items()
+        )
+    )
+
+
+def draw(camera, names, rng, count=4, noise=0.0, pitch=PITCH) -> tuple[DrawnMarking, ...]:
+    """Pixels on the visible part of markings."""
+    drawn = []
+    for name in names:
+        pixels = camera.project(pitch.marking_points(name, 0.2))
+        inside = np.isfinite(pixels).all(axis=1)
+        inside[inside] = ((pixels[inside] > 4) & (pixels[inside] < np.array(SIZE) - 5)).all(axis=1)
+        pixels = pixels[inside]
+        if len(pixels) < 2:
+            continue
+        chosen = pixels[np.linspace(0, len(pixels) - 1, count).astype(int)]
+        chosen = chosen + noise * rng.standard_normal(chosen.shape)
+        drawn.append(DrawnMarking(name=name, xy=tuple((float(x), float(y)) for x, y in chosen)))
+    return tuple(drawn)
+
+
+def ground_errors(estimate, truth, places):
+    """Distance on the surface between places and where the estimate puts their true pixels [m]."""
+    pixels = truth.project(places)
+    inside = np.isfinite(pixels).all(axis=1)
+    inside[inside] = ((pixels[inside] > 0) & (pixels[inside] < np.array(SIZE) - 1)).all(axis=1)
+    rays, places = estimate.unproject(pixels[inside]), places[inside]
+    height = places[:, 2]
+    for _ in range(4):  # the crown's slope is 1 %: each round is a hundred times closer
+        depth = (height - rays.origins[:, 2]) / rays.directions[:, 2]
+        found = rays.origins + depth[:, None] * rays.directions
+        height = PITCH.height(found[:, 0], found[:, 1])
+    return np.linalg.norm(found - places, axis=1)
+
+
+def on_the_pitch(rng, count=60):
+    x, y = rng.uniform(-52.5, 52.5, count), rng.uniform(-34, 34, count)
+    return np.stack([x, y, PITCH.height(x, y)], axis=1)
+
+
+def surprise_of(estimate, truth):
+    """Squared Mahalanobis distance of the true camera, and its degrees of freedom."""
+    off = truth.cam_from_world @ estimate.camera.cam_from_world.inverse()
+    camera = estimate.camera
+    step = np.concatenate(
+        [
+            off.rotvec,
+            off.translation,
+            [np.log(truth.focal[0] / camera.focal[0])],
+            truth.principal_point - camera.principal_point,
+            (truth.distortion - camera.distortion)[[0, 1, 4]],
+        ]
+    )
+    free = np.diag(estimate.covariance) > 0
+    inner = estimate.covariance[np.ix_(free, free)]
+    return float(step[free] @ np.linalg.solve(inner, step[free])), int(free.sum())

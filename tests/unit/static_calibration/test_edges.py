@@ -1,0 +1,153 @@
+"""Bars in pictures drawn here by area coverage, so that their middles are exact."""
+
+import cv2
+import numpy as np
+import pytest
+
+from worldpose.errors import InputError
+from worldpose.static_calibration.edges import (
+    CANDIDATES,
+    brightness,
+    find_bars,
+    fit_bars,
+    median_picture,
+)
+
+
+def bars(middle, width, *, left=80.0, right=80.0, paint=200.0, shape=(40, 80)):
+    """A picture with a vertical bar: the mean of what each pixel covers, through a sharp lens."""
+    low, high = middle - 0.5 * width, middle + 0.5 * width
+    x = np.arange(shape[1])
+    before = np.clip(low - (x - 0.5), 0.0, 1.0)
+    after = np.clip(x + 0.5 - high, 0.0, 1.0)
+    row = left * before + right * after + paint * (1.0 - before - after)
+    row = cv2.GaussianBlur(row[None], (0, 0), 0.7, borderType=cv2.BORDER_REPLICATE)[0]
+    return np.tile(np.rint(row).astype(np.uint8), (shape[0], 1))
+
+
+def found(picture, x, width, reach=10.0, contrast=6.0):
+    offsets, strengths = np.empty((1, CANDIDATES)), np.empty((1, CANDIDATES))
+    place, normal = np.array([[x, 20.0]]), np.array([[1.0, 0.0]])
+    find_bars(
+        picture, place, normal, np.array([width]), np.array([reach]), contrast, offsets, strengths
+    )
+    return offsets[0]
+
+
+def fitted(picture, x, width, start, contrast=6.0):
+    offset, variance = np.empty(1), np.empty(1)
+    place, normal = np.array([[x, 20.0]]), np.array([[1.0, 0.0]])
+    fit_bars(
+        picture, place, normal, np.array([width]), np.array([start]), contrast, offset, variance
+    )
+    return offset[0], variance[0]
+
+
+@pytest.mark.parametrize("width", [0.8, 1.5, 3.0, 6.0])
+@pytest.mark.parametrize("middle", [40.0, 40.27, 40.5, 40.81])
+def test_middle_of_a_bar_is_found_whatever_its_width(width, middle):
+    picture = bars(middle, width)
+    offsets = found(picture, 36.0, width)
+    # Readings are half a pixel apart and pixels one: 0.75 px is their sum's half.
+    assert abs(36.0 + offsets[0] - middle) <= 0.75
+    offset, _ = fitted(picture, 36.0, width, offsets[0])
+    # Whole grey levels and a lens that is not quite a logistic curve: hundredths of a pixel. A bar
+    # below a pixel, just along the columns, is also as far off as straight interpolation is.
+    assert abs(36.0 + offset - middle) < (0.05 if width > 1.0 else 0.15)
+
+
+@pytest.mark.parametrize("slip", [-0.2, 0.2])
+def test_width_that_is_wrong_moves_no_middle(slip):
+    offset, _ = fitted(bars(40.3, 3.0), 39.0, 3.0 + slip, 1.0)
+    assert abs(39.0 + offset - 40.3) < 0.05  # as with the right width
+
+
+def test_grass_of_two_shades_moves_no_middle():
+    picture = bars(40.3, 3.0, left=110.0, right=70.0)
+    offset, _ = fitted(picture, 39.0, 3.0, 1.0)
+    # A tenth of what an edge detector's half width would give.
+    assert abs(39.0 + offset - 40.3) < 0.1
+
+
+def test_edge_of_a_stripe_or_shadow_is_no_bar():
+    for left, right in ((80.0, 120.0), (120.0, 80.0)):
+        picture = bars(40.0, 2.0, left=left, right=right, paint=right)
+        assert np.isnan(found(picture, 38.0, 2.0)).all()
+
+
+def test_dark_bar_is_none():
+    assert np.isnan(found(bars(40.0, 3.0, left=200.0, right=200.0, paint=80.0), 38.0, 3.0)).all()
+
+
+def test_stronger_of_two_bars_comes_first():
+    picture = np.minimum(
+        bars(30.0, 3.0, paint=140.0).astype(int) + bars(46.0, 3.0).astype(int) - 80, 255
+    ).astype(np.uint8)
+    offsets = found(picture, 38.0, 3.0, reach=12.0)
+    assert offsets[:2] == pytest.approx([8.0, -8.0], abs=0.5)  # one reading
+    assert np.isnan(offsets[2:]).all()
+
+
+def test_bar_out_of_reach_is_not_found():
+    assert np.isnan(found(bars(40.0, 3.0), 20.0, 3.0, reach=10.0)).all()
+    assert np.isnan(found(bars(40.0, 3.0), 40.0, 3.0, reach=-1.0)).all()
+
+
+def test_place_at_the_border_is_read_as_far_as_there_is_picture():
+    assert found(bars(12.0, 3.0), 5.0, 3.0)[0] == pytest.approx(7.0, abs=0.5)  # one reading
+    assert np.isnan(found(bars(12.0, 3.0), -30.0, 3.0)).all()
+    assert np.isnan(fitted(bars(1.0, 3.0), 1.0, 3.0, 0.0)[0])
+
+
+def test_noisier_picture_tells_the_middle_worse():
+    rng = np.random.default_rng(0)
+    clean = bars(40.3, 3.0)
+    noisy = np.clip(clean + 12.0 * rng.standard_normal(clean.shape), 0, 255).astype(np.uint8)
+    assert fitted(noisy, 39.0, 3.0, 1.0)[1] > 1.5 * fitted(clean, 39.0, 3.0, 1.0)[1]
+
+
+def test_variance_is_that_of_the_offsets():
+    rng = np.random.default_rng(1)
+    clean = bars(40.3, 3.0).astype(np.float64)
+    fits = np.array(
+        [
+            fitted(
+                np.clip(np.rint(clean + 6.0 * rng.standard_normal(clean.shape)), 0, 255).astype(
+                    np.uint8
+                ),
+                39.0,
+                3.0,
+                1.0,
+            )
+            for _ in range(300)
+        ]
+    )
+    # 300 draws give a variance to 8 %, and the fit's rest holds the lens's misfit besides noise.
+    assert 0.6 < fits[:, 0].var() / fits[:, 1].mean() < 1.5
+
+
+def test_median_of_pictures_is_without_who_passes():
+    grass = np.full((20, 30, 3), 90, dtype=np.uint8)
+    pictures = [grass.copy() for _ in range(5)]
+    for index, picture in enumerate(pictures):
+        picture[5:15, 5 * index : 5 * index + 5] = 200
+    assert (median_picture(pictures) == grass).all()
+
+
+def test_median_of_nothing_or_of_two_sizes_is_refused():
+    for pictures in ([], [np.zeros((4, 4), np.uint8), np.zeros((4, 5), np.uint8)]):
+        with pytest.raises(InputError, match="one size"):
+            median_picture(pictures)
+
+
+def test_brightness_is_luma_of_rgb():
+    picture = np.zeros((2, 3, 3), dtype=np.uint8)
+    picture[..., 1] = 100
+    assert (brightness(picture) == 59).all()  # 0.587 of green
+    assert (brightness(picture[..., 1]) == 100).all()
+
+
+def test_picture_of_other_numbers_is_refused():
+    for picture in (np.zeros((4, 4)), np.zeros((4, 4, 4), np.uint8), np.zeros(4, np.uint8)):
+        with pytest.raises(InputError, match="8-bit"):
+            brightness(picture)

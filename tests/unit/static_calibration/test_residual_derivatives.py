@@ -1,0 +1,123 @@
+"""Every derivative of stages 1 and 2 against finite differences."""
+
+import clicking_people as people
+import numpy as np
+
+from worldpose.cameras import Camera
+from worldpose.static_calibration import stepped
+from worldpose.static_calibration.adjustment import problem_of, row_of
+from worldpose.static_calibration.descent import step_row
+from worldpose.static_calibration.evidence import gather
+from worldpose.static_calibration.ground_error import surface_motion
+from worldpose.static_calibration.parameters import PARAMETERS
+from worldpose.static_calibration.residuals import (
+    drawn_residuals,
+    point_residuals,
+    prior_residuals,
+)
+from worldpose.static_calibration.settings import StaticCalibrationSettings
+
+# Steps at which truncation and rounding of a central difference balance, by parameter.
+STEPS = np.array([1e-6] * 3 + [1e-4] * 3 + [1e-6] + [1e-3] * 2 + [1e-6] * 3)
+
+
+def problem_and_row(index=1):
+    camera, rng = people.seat(index)
+    clicks = people.click(camera, rng, count=6).clicked
+    drawn = people.draw(camera, people.PITCH.marking_names, rng, noise=5.0)
+    clicked = clicks.model_copy(update={"drawn": drawn})
+    evidence = gather(people.PITCH, clicked, people.SIZE, 0.5, "test")
+    off = stepped(camera, [0.01, -0.01, 0.02, 0.3, 0.2, -0.4, 0.02, 3.0, -4.0, 0.01, 0.002, 0.001])
+    return problem_of(evidence, people.SIZE, StaticCalibrationSettings()), off
+
+
+def differences(function, camera: Camera):
+    columns = []
+    for index, size in enumerate(STEPS):
+        step = np.zeros(12)
+        step[index] = size
+        forward, backward = function(stepped(camera, step)), function(stepped(camera, -step))
+        columns.append((forward - backward) / (2 * size))
+    return np.stack(columns, axis=-1)
+
+
+def test_the_compiled_step_is_that_of_the_camera():
+    _, camera = problem_and_row()
+    step = np.array([0.1, -0.2, 0.3, 1.0, 2.0, -3.0, 0.1, 5.0, 6.0, 0.01, 0.02, 0.03])
+    row = np.empty(22)
+    step_row(row_of(camera), step, row)
+    # Rotations of 0.4 rad and numbers up to 1e3 at double precision.
+    np.testing.assert_allclose(row[:21], row_of(stepped(camera, step))[:21], rtol=1e-12, atol=1e-12)
+
+
+def test_residuals_of_clicks():
+    problem, camera = problem_and_row()
+    evidence = problem.evidence
+
+    def residual(at):
+        out = np.empty((len(evidence.points), 2)), np.empty((len(evidence.points), 2, 12))
+        point_residuals(row_of(at), evidence.points_world, evidence.points_image, *out)
+        return out
+
+    np.testing.assert_allclose(
+        residual(camera)[1],
+        differences(lambda at: residual(at)[0], camera),
+        rtol=1e-5,
+        atol=1e-3,  # of derivatives up to 1e4 px/rad
+    )
+
+
+def test_distances_of_drawn_pixels():
+    problem, camera = problem_and_row()
+    evidence = problem.evidence
+
+    def residual(at):
+        count = len(evidence.drawn_image)
+        out = np.empty(count), np.empty((count, 12))
+        drawn_residuals(
+            row_of(at),
+            problem.reach,
+            evidence.samples_world,
+            evidence.bounds,
+            evidence.drawn_image,
+            evidence.drawn_marking,
+            *out,
+        )
+        return out
+
+    analytic = residual(camera)[1]
+    numeric = differences(lambda at: np.abs(residual(at)[0]), camera)
+    sign = np.sign(residual(camera)[0])[:, None]
+    # The normal is a chord's: it turns by up to a few milliradians within one.
+    size = np.abs(analytic).max(axis=0)
+    np.testing.assert_allclose(sign * analytic / size, numeric / size, atol=0.01)
+
+
+def test_residuals_of_the_prior():
+    problem, camera = problem_and_row()
+
+    def residual(at):
+        out = np.empty(9), np.empty((9, 12))
+        prior_residuals(row_of(at), problem.prior, *out)
+        return out
+
+    numeric = differences(lambda at: residual(at)[0], camera)
+    np.testing.assert_allclose(residual(camera)[1], numeric, rtol=1e-5, atol=1e-6)
+
+
+def test_the_motion_of_the_ground_under_a_step():
+    camera, rng = people.seat(2)
+    places = people.on_the_pitch(rng, 40)
+    seen = camera.project(places)
+    places = places[((seen > 0) & (seen < np.array(people.SIZE))).all(axis=1)]
+    motion = surface_motion(camera, people.PITCH, places)
+    rng = np.random.default_rng(1)
+    step = 1e-6 * rng.standard_normal(12)
+    moved = people.ground_errors(stepped(camera, step), camera, places)
+    predicted = np.linalg.norm(motion @ step, axis=1)
+    assert len(places) > 10
+    np.testing.assert_allclose(moved, predicted, rtol=1e-3, atol=1e-9)
+
+
+def test_every_parameter_has_a_step():
+    assert len(STEPS) == len(PARAMETERS)

@@ -1,0 +1,109 @@
+import math
+
+import numpy as np
+import pytest
+
+from worldpose.tracking import TrackingSettings
+from worldpose.tracking.joining import End, decide, ends_of, join_costs
+
+SETTINGS = TrackingSettings()
+UNKNOWN = np.full(11, np.nan)
+FPS = 50.0
+AREA = 7140.0
+
+
+def end(number, frame, place, velocity=(0.0, 0.0), limbs=UNKNOWN):
+    variance = np.where(np.isfinite(limbs), 1e-6, np.nan)
+    return End(number, frame, np.array(place), np.array(velocity), limbs, variance)
+
+
+def cost(old, new, settings=SETTINGS):
+    return join_costs([old], [new], FPS, AREA, settings).item()
+
+
+def test_ends_are_where_the_torso_is_and_as_fast_as_it_moves(people):
+    frames = np.arange(10, 40)
+    time = (frames - 10) / FPS
+    joints = people(np.stack([2.0 * time, 1.0 - time], axis=-1))
+    start, stop = ends_of(3, frames, joints, FPS, SETTINGS)
+    torso = people(np.zeros(2))[[5, 6, 11, 12], :2].mean(axis=0)
+    # A line through exact points: rounding.
+    np.testing.assert_allclose(start.place, torso + [0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(stop.place, torso + [2.0 * 0.58, 1.0 - 0.58], atol=1e-12)
+    np.testing.assert_allclose([start.velocity, stop.velocity], [[2.0, -1.0]] * 2, atol=1e-10)
+    assert (start.number, start.frame, stop.frame) == (3, 10, 39)
+    np.testing.assert_allclose(start.limbs[0], 0.36, atol=1e-12)
+
+
+def test_single_frame_has_no_velocity(people):
+    start, stop = ends_of(0, np.array([7]), people(np.zeros((1, 2))), FPS, SETTINGS)
+    assert np.isnan(start.velocity).all()
+    assert start.frame == stop.frame == 7
+
+
+@pytest.mark.parametrize(("first", "possible"), [(150, True), (100, False), (90, False)])
+def test_only_what_comes_later_can_go_on(first, possible):
+    assert math.isfinite(cost(end(0, 100, (0, 0)), end(1, first, (0, 0)))) is possible
+
+
+def test_nobody_outruns_the_fastest_or_stays_away_longer_than_the_gap():
+    assert cost(end(0, 0, (0.0, 0.0)), end(1, 50, (10.0, 0.0))) == np.inf
+    assert cost(end(0, 0, (0.0, 0.0)), end(1, 3001, (0.0, 0.0))) == np.inf
+
+
+def test_who_goes_on_as_expected_costs_less_than_who_turned_and_than_who_is_elsewhere():
+    runner = end(0, 0, (0.0, 0.0), (5.0, 0.0))
+    # Half the way that both velocities would take, with the memory of one second.
+    ahead = 5.0 * (1.0 - math.exp(-0.5))
+    on = cost(runner, end(1, 25, (ahead, 0.0), (5.0, 0.0)))
+    turned = cost(runner, end(1, 25, (ahead, 0.0), (-5.0, 0.0)))
+    elsewhere = cost(runner, end(1, 25, (0.0, ahead), (5.0, 0.0)))
+    assert on < 0.0
+    assert turned > on + 3.0
+    assert elsewhere > on + 3.0
+
+
+def test_longer_gap_tells_less():
+    still = [cost(end(0, 0, (0, 0)), end(1, frames, (0, 0))) for frames in (5, 50, 500, 2500)]
+    assert still == sorted(still)
+
+
+def test_other_limbs_are_another_person():
+    limbs = np.full(11, 0.4)
+    same = cost(end(0, 0, (0, 0), limbs=limbs), end(1, 100, (0, 0), limbs=limbs))
+    taller = cost(end(0, 0, (0, 0), limbs=limbs), end(1, 100, (0, 0), limbs=limbs + 0.1))
+    nothing = cost(end(0, 0, (0, 0)), end(1, 100, (0, 0)))
+    assert same < nothing < taller
+
+
+def decided(costs, odds=1.0):
+    before = [end(n, 0, (0, 0)) for n in range(len(costs))]
+    after = [end(10 + n, 50, (0, 0)) for n in range(len(costs[0]))]
+    newcomers = np.full(len(after), odds)
+    return [
+        (join.before, join.after, join.decided, join.margin)
+        for join in decide(before, after, np.array(costs), newcomers, SETTINGS)
+    ]
+
+
+def test_likeliest_way_is_taken_and_told_by_its_margin():
+    # 0-10 and 1-11 cost -14 together, 0-11 and 1-10 cost -4, one join alone -8 at best.
+    assert decided([[-8.0, -2.0], [-2.0, -6.0]]) == [(0, 10, True, 8.0), (1, 11, True, 6.0)]
+
+
+def test_even_chances_decide_nothing():
+    joins = decided([[-8.0, -8.0], [-8.0, -8.0]])
+    assert [(join[2], join[3]) for join in joins] == [(False, 0.0)] * 2
+
+
+def test_newcomer_is_nobody_who_was_lost_unless_the_roster_is_full():
+    assert decided([[4.0]], odds=0.05) == []
+    (join,) = decided([[4.0]], odds=0.001)
+    assert join[:3] == (0, 10, True)
+    # Odds of 1000 to 1 beforehand, of e^-4 after looking.
+    assert join[3] == pytest.approx(math.log(1000.0) - 4.0)
+
+
+def test_nobody_to_join_is_no_join():
+    assert decide([], [], np.empty((0, 0)), np.empty(0), SETTINGS) == []
+    assert decided([[np.inf]]) == []

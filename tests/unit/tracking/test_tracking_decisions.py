@@ -1,0 +1,114 @@
+import numpy as np
+import pytest
+
+from worldpose.tracking import TrackingSettings, track_people
+
+SETTINGS = TrackingSettings()
+FPS = 50.0
+PLACES = np.array([[0.0, 0.0], [0.9, 0.2], [-3.0, 2.0], [4.0, -3.0]])
+
+
+def still(people, frames=20, places=PLACES):
+    return people(np.broadcast_to(places, (frames, *places.shape)))
+
+
+def owners(tracking):
+    """The detection that each track holds everywhere it holds one: n is person n."""
+    index = tracking.detection_index
+    values = [np.unique(index[:, :, n][index[:, :, n] >= 0]) for n in range(index.shape[2])]
+    assert all(len(value) == 1 for value in values)
+    return [int(value[0]) for value in values]
+
+
+def test_person_found_again_beyond_the_gate_is_counted(ring, people, seen):
+    # Stands, is unseen for 1 s, stands 1.2 m further: a step or two.
+    places = np.zeros((90, 1, 2))
+    places[70:] = [1.2, 0.0]
+    keypoints, confidence = seen(ring(5), people(places))
+    keypoints[20:70] = np.nan
+    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    assert len(result.tracks) == 1
+    assert result.report.joined == 1
+    (join,) = result.joins
+    assert (join.before, join.after, join.decided) == (0, 0, True)
+    assert (join.last_frame, join.first_frame) == (19, 70)
+    slow = SETTINGS.model_copy(update={"agility": 0.2, "mean_speed": 0.1})
+    assert len(track_people(ring(5), keypoints, confidence, FPS, slow).tracks) == 2
+
+
+def test_join_that_may_be_either_way_is_left_to_review(ring, people, seen):
+    # Two people face each other, are unseen for 1 s, and stand across: each may be either.
+    places = np.zeros((100, 2, 2))
+    places[:30] = [[-0.8, 0.0], [0.8, 0.0]]
+    places[80:] = [[0.0, -0.8], [0.0, 0.8]]
+    keypoints, confidence = seen(ring(5), people(places))
+    keypoints[30:80] = np.nan
+    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    assert len(result.tracks) == 4
+    assert result.report.undecided == len(result.joins) == 2
+    assert {(join.before, join.after) for join in result.joins} in (
+        {(0, 2), (1, 3)},
+        {(0, 3), (1, 2)},
+    )
+    for join in result.joins:
+        assert not join.decided
+        assert join.margin < np.log(SETTINGS.join_odds)
+    assert result.joins[0].cost >= result.joins[1].cost
+
+
+def test_roster_leaves_out_who_is_too_many(ring, people, seen):
+    keypoints, confidence = seen(ring(5), still(people, 40))
+    keypoints[:15, :, 1] = np.nan
+    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS, people=3)
+    assert sorted(owners(result)) == [0, 2, 3]
+    assert result.report.dropped == 1
+
+
+def test_causal_mode_knows_nothing_of_later_frames(ring, people, seen):
+    time = np.arange(0, 2.4, 1 / FPS)[:, None, None]
+    places = PLACES + np.concatenate([np.sin(time), 0.5 * time], axis=-1)
+    keypoints, confidence = seen(ring(5), people(places))
+    keypoints[30:60, :, :2] = np.nan
+    causal = SETTINGS.model_copy(update={"causal": True})
+    whole = track_people(ring(5), keypoints, confidence, FPS, causal)
+    for end in (20, 50, 62, 90):
+        part = track_people(ring(5), keypoints[:end], confidence[:end], FPS, causal)
+        known = len(part.person)
+        np.testing.assert_array_equal(part.detection_index, whole.detection_index[:end, :, :known])
+        np.testing.assert_array_equal(part.joints, whole.joints[:end, :known])
+        assert (whole.detection_index[:end, :, known:] == -1).all()
+    assert sorted(owners(whole)) == [0, 1, 2, 3]
+
+
+def test_person_whom_two_cameras_see_is_found_but_slowly(ring, people, seen):
+    keypoints, confidence = seen(ring(5), still(people, 60))
+    keypoints[:, 2:, 2] = np.nan
+    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS, ground=True)
+    assert sorted(owners(result)) == [0, 1, 2, 3]
+    short = track_people(ring(5), keypoints[:40], confidence[:40], FPS, SETTINGS, ground=True)
+    assert sorted(owners(short)) == [0, 1, 3]
+
+
+def test_cameras_that_drop_out_lose_nobody(ring, people, seen):
+    keypoints, confidence = seen(ring(5), still(people, 60))
+    keypoints[20:, :3] = np.nan
+    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    assert sorted(owners(result)) == [0, 1, 2, 3]
+    assert (result.detection_index[20:, 3:] >= 0).all()
+    assert (result.detection_index[20:, :3] == -1).all()
+
+
+def test_negative_confidence_counts_as_not_seen(ring, people, seen):
+    keypoints, confidence = seen(ring(5), still(people))
+    confidence[:, :, 1] = -0.5
+    confidence[:, 0, 2] = np.nan
+    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    assert sorted(owners(result)) == [0, 2, 3]
+    assert (result.detection_index[:, 0, owners(result).index(2)] == -1).all()
+
+
+@pytest.mark.parametrize("hungarian", [True, False])
+def test_both_matchings_keep_people_apart(ring, people, seen, hungarian):
+    matching = SETTINGS.model_copy(update={"hungarian": hungarian})
+    result = track_people(ring(5), *seen(ring(5), still(people)), FPS, matching)
+    assert sorted(owners(result)) == [0, 1, 2, 3]

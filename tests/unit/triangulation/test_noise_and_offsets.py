@@ -1,0 +1,133 @@
+import numpy as np
+import pytest
+from people_samples import detections, runner
+
+from worldpose.cameras import Camera
+from worldpose.static_calibration.parameters import project_with_jacobian, stepped
+from worldpose.triangulation import TriangulationSettings, triangulate_joints
+from worldpose.triangulation.calibration_errors import stated_errors
+
+SETTINGS = TriangulationSettings(common_bias=0.0)
+PLAIN = SETTINGS.model_copy(update={"offsets": "none"})
+
+
+def test_noise_is_learned_by_joint(ring):
+    camera, joints = ring(8), runner(60)
+    keypoints, confidence, index = detections(camera, joints, 1.0)
+    more = np.random.default_rng(2).normal(size=keypoints[..., 3, :].shape)
+    keypoints[..., 3, :] += np.sqrt(8.0) * more
+    result = triangulate_joints(camera, keypoints, confidence, index, PLAIN)
+    factor = result.noise.joint
+    # 1 px and 3 px; 1900 residuals a joint: 2 % each. Doubtful views of the worse are cut at 3.5
+    # deviations.
+    assert np.sqrt(factor[3] / np.median(factor)) == pytest.approx(3.0, rel=0.1)
+
+
+def test_noise_is_learned_by_confidence(ring):
+    camera, joints = ring(8), runner(60)
+    keypoints, confidence, index = detections(camera, joints, 1.0)
+    rng = np.random.default_rng(3)
+    doubtful = rng.random(confidence.shape) < 0.3
+    confidence[doubtful] = 0.5
+    keypoints += np.where(doubtful, 3.0, 0.0)[..., None] * rng.normal(size=keypoints.shape)
+    result = triangulate_joints(camera, keypoints, confidence, index, PLAIN)
+    sure, doubt = result.noise.precision(np.ones(17)), result.noise.precision(np.full(17, 0.5))
+    # sqrt(10) times the noise; knots average over classes of confidence.
+    assert np.sqrt(np.median(sure / doubt)) == pytest.approx(np.sqrt(10), rel=0.15)
+    worse = triangulate_joints(
+        camera, keypoints, confidence, index, PLAIN.model_copy(update={"learn_noise": False})
+    )
+    error = [np.linalg.norm(r.joints - joints, axis=-1).mean() for r in (result, worse)]
+    assert error[0] < 0.95 * error[1]
+
+
+def test_few_observations_change_the_stated_noise_little(ring):
+    camera = ring(4)
+    keypoints, confidence, index = detections(camera, runner(1, 1)[:, :, :2], 1.0)
+    result = triangulate_joints(camera, keypoints, confidence, index, PLAIN)
+    assert (np.abs(np.log(result.noise.joint)) < 1.0).all()
+
+
+def test_variance_of_places_is_that_of_the_camera_covariance(ring):
+    camera, joints = ring(3), runner(2)
+    root = np.random.default_rng(4).normal(size=(3, 12, 12)) * 1e-3
+    covariance = root @ root.swapaxes(1, 2)
+    found = stated_errors(camera, joints, SETTINGS, covariance)
+    for c in range(3):
+        square = Camera(
+            camera.focal[c],
+            camera.principal_point[c],
+            camera.distortion[c],
+            camera.cam_from_world[c],
+            camera.image_size[c],
+        )
+        places = joints.mean(axis=2).reshape(-1, 3)
+        _, jacobian = project_with_jacobian(square, places)
+        expected = np.einsum("nap,pq,naq->n", jacobian, covariance[c], jacobian) / 2
+        np.testing.assert_allclose(found.variance[:, c].ravel(), expected, rtol=1e-9)
+
+
+def misjudged(camera, seed, size):
+    rng = np.random.default_rng(seed)
+    sigma = np.array([size] * 3 + [0.0] * 9)
+    count = len(camera.focal)
+    cameras = [stepped(camera[c], sigma * rng.normal(size=12)) for c in range(count)]
+    return Camera.stack(cameras), np.broadcast_to(np.diag(sigma**2), (count, 12, 12)).copy()
+
+
+def shape_error(joints, truth):
+    """Mean error [m] of joints about their mean: calibration errors move a person as a whole."""
+    return np.linalg.norm(
+        (joints - joints.mean(axis=2, keepdims=True))
+        - (truth - truth.mean(axis=2, keepdims=True)),
+        axis=-1,
+    ).mean()
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_offsets_keep_calibration_errors_from_the_pose(ring, known):
+    truth, joints = ring(6), runner(40)
+    arrays = detections(truth, joints, 1.0)
+    given, covariance = misjudged(truth, 5, 2e-3)
+    covariance = covariance if known else None
+    errors = {}
+    for offsets in ("none", "midhip", "body"):
+        # Views taken or left would show as shape; 2 mrad are 6 cm at 30 m.
+        settings = SETTINGS.model_copy(update={"offsets": offsets})
+        result = triangulate_joints(given, *arrays, settings, covariance)
+        errors[offsets] = shape_error(result.joints, joints)
+    exact = shape_error(triangulate_joints(truth, *arrays, SETTINGS).joints, joints)
+    assert errors["body"] < 1.1 * exact
+    assert errors["body"] < errors["midhip"]
+    assert errors["body"] < errors["none"]
+
+
+def test_offsets_do_nothing_to_exact_cameras(ring):
+    truth, joints = ring(6), runner(40)
+    arrays = detections(truth, joints, 1.0)
+    with_offsets = triangulate_joints(truth, *arrays, SETTINGS)
+    without = triangulate_joints(truth, *arrays, PLAIN)
+    errors = [np.linalg.norm(r.joints - joints, axis=-1).mean() for r in (with_offsets, without)]
+    assert errors[0] < 1.02 * errors[1]
+    # Where the detector errs by 2 cm, nothing says that cameras misplace people by a centimetre.
+    assert max(with_offsets.report.misplacement_m) < 0.01
+
+
+def test_given_camera_covariance_widens_that_of_the_joints(ring):
+    truth, joints = ring(6), runner(10)
+    arrays = detections(truth, joints, 1.0)
+    given, covariance = misjudged(truth, 6, 2e-3)
+    result = triangulate_joints(given, *arrays, SETTINGS, covariance)
+    error = result.joints - joints
+    inverse = np.linalg.inv(result.covariance)
+    squared = np.einsum("...i,...ij,...j->...", error, inverse, error)
+    # One draw of six cameras moves everybody alike: the mean of three chi squares, wide.
+    assert 0.3 < squared.mean() < 9.0
+
+
+def test_nobody_seen_gives_empty_results(ring):
+    keypoints, confidence, index = detections(ring(4), runner(5), 0.0)
+    index[:] = -1
+    result = triangulate_joints(ring(4), keypoints, confidence, index, SETTINGS)
+    assert np.isnan(result.joints).all()
+    assert result.report.misplacement_m == (None,) * 4

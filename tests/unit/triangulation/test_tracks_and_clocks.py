@@ -1,0 +1,150 @@
+import numpy as np
+import pytest
+from people_samples import FPS, detections, runner
+
+from worldpose.triangulation import (
+    TriangulationSettings,
+    estimate_clocks,
+    moved_in_time,
+    reconstruct_joints,
+    smooth_joints,
+    triangulate_joints,
+)
+from worldpose.triangulation.smoothing import segments
+from worldpose.triangulation.track_solver import _factorize, _invert, _substitute
+
+SETTINGS = TriangulationSettings(common_bias=0.0, offsets="none")
+
+
+def test_banded_solution_and_inverse_are_the_dense_ones():
+    rng = np.random.default_rng(0)
+    lower = np.triu(np.tril(rng.normal(size=(30, 30))), -6)
+    lower[np.diag_indices(30)] = 2.0 + rng.random(30)
+    matrix = lower @ lower.T
+    band = np.array([[matrix[i, i - k] if i >= k else 0.0 for k in range(7)] for i in range(30)])
+    right = rng.normal(size=30)
+    solution = right.copy()
+    _factorize(band)
+    _substitute(band, solution)
+    np.testing.assert_allclose(matrix @ solution, right, atol=1e-12)
+    _invert(band)
+    inverse = np.linalg.inv(matrix)
+    for i in range(30):
+        for k in range(min(6, i) + 1):
+            assert band[i, k] == pytest.approx(inverse[i, i - k], abs=1e-12)
+
+
+def test_segments_break_at_long_gaps_only():
+    there = np.array([0, 1, 1, 0, 0, 1, 0, 0, 0, 1, 0], dtype=bool)
+    assert segments(there, 2) == [slice(1, 6), slice(9, 10)]
+    assert segments(there[:1], 2) == []
+
+
+def test_smoothing_is_nearer_and_steadier_than_single_frames(ring):
+    camera, joints = ring(4), runner(100)
+    arrays = detections(camera, joints, 2.0)
+    raw = triangulate_joints(camera, *arrays, SETTINGS)
+    smooth = smooth_joints(camera, *arrays, raw, FPS, SETTINGS)
+    error = [np.linalg.norm(r.joints - joints, axis=-1).mean() for r in (raw, smooth)]
+    jerk = [np.abs(np.diff(r.joints - joints, 2, axis=0)).mean() for r in (raw, smooth)]
+    # White noise at 50 frames/s and swings of 2 Hz: several frames count as one.
+    assert error[1] < 0.7 * error[0]
+    assert jerk[1] < 0.1 * jerk[0]
+    assert not smooth.filled.any()
+    squared = np.einsum(
+        "...i,...ij,...j->...",
+        smooth.joints - joints,
+        np.linalg.inv(smooth.covariance),
+        smooth.joints - joints,
+    )
+    assert 0.9 < (squared < 7.815).mean() < 0.995
+
+
+def test_short_gaps_are_filled_and_marked_and_long_ones_left(ring):
+    camera, joints = ring(4), runner(100, 1)
+    keypoints, confidence, index = detections(camera, joints, 1.0)
+    index[20:30, 1:] = -1  # one view
+    index[50:90] = -1  # 0.8 s without any
+    raw = triangulate_joints(camera, keypoints, confidence, index, SETTINGS)
+    smooth = smooth_joints(camera, keypoints, confidence, index, raw, FPS, SETTINGS)
+    assert np.isnan(raw.joints[20:30]).all()
+    assert smooth.filled[20:30].all()
+    assert smooth.filled.sum() == 10 * 17
+    assert np.isnan(smooth.joints[50:90]).all()
+    # Limbs that swing by 15 cm, over 0.2 s seen by one camera.
+    assert np.linalg.norm(smooth.joints[20:30] - joints[20:30], axis=-1).max() < 0.15
+    size = np.trace(smooth.covariance, axis1=-2, axis2=-1)
+    assert (size[25] > size[15]).all()
+    assert smooth.report.filled == 170
+
+
+def test_single_frame_and_no_joint_are_passed_through(ring):
+    camera = ring(4)
+    keypoints, confidence, index = detections(camera, runner(1, 1), 1.0)
+    raw = triangulate_joints(camera, keypoints, confidence, index, SETTINGS)
+    smooth = smooth_joints(camera, keypoints, confidence, index, raw, FPS, SETTINGS)
+    np.testing.assert_allclose(smooth.joints, raw.joints, atol=1e-2)
+    index[:] = -1
+    raw = triangulate_joints(camera, keypoints, confidence, index, SETTINGS)
+    smooth = smooth_joints(camera, keypoints, confidence, index, raw, FPS, SETTINGS)
+    assert np.isnan(smooth.joints).all()
+    assert smooth.report.filled_share is None
+
+
+def late_detections(camera, frames, late):
+    """What cameras see whose frame t shows the time t + late."""
+    fine = runner(frames * 2 + 20)  # half frames, from 5 frames before
+    fine = runner_at(np.arange(-10, 2 * frames + 10) / 2.0)
+    views = [
+        detections(camera[c : c + 1], fine[10 + int(2 * d) :: 2][:frames], 1.0, seed=c)
+        for c, d in enumerate(late)
+    ]
+    return [np.concatenate([view[k] for view in views], axis=1) for k in range(3)]
+
+
+def runner_at(frames):
+    whole = runner(2000, 3)
+    at = np.asarray(frames) + 500.0
+    low = np.floor(at).astype(int)
+    share = (at - low)[:, None, None, None]
+    return (1.0 - share) * whole[low] + share * whole[low + 1]
+
+
+def test_late_clocks_are_found(ring):
+    late = np.array([0.0, 3.0, -3.0, 0.5, -0.5, 1.0])
+    camera = ring(6)
+    arrays = late_detections(camera, 100, late)
+    clocks = estimate_clocks(camera, *arrays, FPS, SETTINGS)
+    assert clocks.determined.all()
+    np.testing.assert_allclose(clocks.late, late - late.mean(), atol=0.1)
+    corrected = SETTINGS.model_copy(update={"correct_clocks": True})
+    result = reconstruct_joints(camera, *arrays, FPS, corrected)
+    plain = reconstruct_joints(camera, *arrays, FPS, SETTINGS)
+    assert (
+        result.triangulation.report.reprojection_error_px
+        < 0.7 * plain.triangulation.report.reprojection_error_px
+    )
+
+
+def test_clocks_of_cameras_before_people_who_stand_are_unknown(ring):
+    camera = ring(4)
+    still = np.broadcast_to(runner(1), (60, 2, 17, 3))
+    clocks = estimate_clocks(camera, *detections(camera, still, 1.0), FPS, SETTINGS)
+    assert not clocks.determined.any()
+    assert np.isnan(clocks.late).all()
+    assert clocks.report.clock_late_frames == (None,) * 4
+
+
+def test_whole_frames_are_moved_exactly_and_half_frames_lie_between(ring):
+    keypoints, confidence, index = detections(ring(3), runner(10), 0.0)
+    index[4, 1, 0] = -1
+    late = np.array([0.0, 2.0, -0.5])
+    pixels, weights, moved = moved_in_time(keypoints, confidence, index, late)
+    np.testing.assert_array_equal(pixels[:, 0], keypoints[:, 0])
+    np.testing.assert_array_equal(pixels[2:, 1, 1], keypoints[:-2, 1, 1])
+    assert (moved[:2, 1] == -1).all()
+    assert moved[6, 1, 0] == -1
+    np.testing.assert_allclose(
+        pixels[:-1, 2], 0.5 * (keypoints[:-1, 2] + keypoints[1:, 2]), atol=1e-9
+    )
+    assert (moved[-1, 2] == -1).all()

@@ -1,0 +1,257 @@
+"""Keypoints of a posed body together with their derivatives, for least squares.
+
+Unfolding the kinematic chain writes a keypoint as `transl + pelvis + sum_q R_q a_q`: R_q is the
+turn of joint q in the world, and a_q is linear in the betas and the pose feature, with constants
+that depend on body and keypoint only. So betas move a keypoint by turned constants, and a turn of a
+joint moves it by the axis times the lever: the sum of the terms of that joint and all below it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.body.keypoints import FoldedKeypoints
+from worldpose.body.model import JOINTS, BodyModel
+from worldpose.body.parameters import BodyParameters
+from worldpose.compiled import compiled
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointJacobian:
+    """Keypoints and how they change with the parameters; `transl` changes them all alike."""
+
+    keypoints: Floats
+    """(..., keypoints, 3) [m], world."""
+    betas: Floats
+    """(..., keypoints, 3, shapes) [m]."""
+    pose: Floats
+    """(..., keypoints, 3, 72) [m/rad], of `global_orient` and then `body_pose`."""
+
+    @property
+    def global_orient(self) -> Floats:
+        """(..., keypoints, 3, 3) [m/rad]."""
+        return self.pose[..., :3]
+
+    @property
+    def body_pose(self) -> Floats:
+        """(..., keypoints, 3, 69) [m/rad]."""
+        return self.pose[..., 3:]
+
+
+@dataclass(frozen=True, eq=False)
+class ChainedKeypoints:
+    """Keypoints as sums of turned vectors, ready for many poses."""
+
+    model: BodyModel
+    pelvis: Floats
+    """(3, 1 + shapes) [m]: the unposed pelvis by 1 and the betas."""
+    vectors: Floats
+    """(keypoints, 24, 3, 1 + shapes + pose features) [m]: a_q by 1, betas and pose feature."""
+
+    @classmethod
+    def of(cls, keypoints: FoldedKeypoints) -> ChainedKeypoints:
+        """Return keypoints of a model, unfolded."""
+        model = keypoints.model
+        rest = np.concatenate([model.joint_template[..., None], model.joint_directions], axis=-1)
+        linear = rest.shape[-1]
+        vectors = np.zeros((len(keypoints.joint_shares), JOINTS, *keypoints.basis.shape[1:]))
+        # Each keypoint is a mean of joints, with these shares, and of vectors fixed to joints.
+        shares = keypoints.joint_shares.copy()
+        pairs = keypoints.keypoint, keypoints.joint
+        np.add.at(shares, pairs, keypoints.mass)
+        np.add.at(vectors, pairs, keypoints.basis)
+        fixed = keypoints.mass[:, None, None] * rest[keypoints.joint]
+        np.subtract.at(vectors[..., :linear], pairs, fixed)
+        # A joint hangs on the bones of all joints above it, and a bone turns with its parent.
+        for joint in range(JOINTS - 1, 0, -1):
+            parent = model.parents[joint]
+            bone = rest[joint] - rest[parent]
+            vectors[:, parent, :, :linear] += shares[:, joint, None, None] * bone
+            shares[:, parent] += shares[:, joint]
+        return cls(model, rest[0], vectors)
+
+    def differentiate(self, parameters: BodyParameters) -> KeypointJacobian:
+        """Return the keypoints and their Jacobian; NaN where a parameter is."""
+        flat, batch, count = parameters.flat(), parameters.batch_shape, len(self.vectors)
+        angles = np.concatenate([flat.global_orient, flat.body_pose], axis=-1)
+        local, turns, axes = _turned(angles.reshape(-1, JOINTS, 3), self.model.parents)
+        feature = np.concatenate([np.ones((len(angles), 1)), flat.betas], axis=-1)
+        linear = feature.shape[-1]
+        corrected = self.vectors.shape[-1] > linear
+        if corrected:
+            away = (local[:, 1:] - np.eye(3)).reshape(len(angles), 9 * (JOINTS - 1))
+            feature = np.concatenate([feature, away], axis=-1)
+        keypoint, joint, constants, moves = self._terms
+        terms = (feature @ constants.reshape(-1, feature.shape[-1]).T).reshape(
+            len(angles), len(joint), 3
+        )
+        keypoints, by_pose = _levered(
+            turns, axes, terms, keypoint, joint, moves, self.model.parents
+        )
+        keypoints += (feature[:, :linear] @ self.pelvis.T + flat.transl)[:, None]
+
+        rows = turns.transpose(0, 2, 1, 3).reshape(len(angles), 3, 3 * JOINTS)
+        by_betas = (rows @ self._shaping).reshape(len(angles), 3, count, linear - 1)
+        by_betas = by_betas.transpose(0, 2, 1, 3) + self.pelvis[:, 1:]
+        if corrected:
+            by_feature = np.einsum("nac,cf->naf", rows, self._correctives, optimize=True)
+            by_feature = by_feature.reshape(len(angles), 3, count, JOINTS - 1, 9)
+            own = _own_change(local, turns, axes, self.model.parents)
+            by_pose[..., 3:] += np.einsum(
+                "nakjf,njfd->nkajd", by_feature, own, optimize=True
+            ).reshape(by_pose[..., 3:].shape)
+        return KeypointJacobian(
+            keypoints.reshape(*batch, count, 3),
+            by_betas.reshape(*batch, count, 3, linear - 1),
+            by_pose.reshape(*batch, count, 3, 3 * JOINTS),
+        )
+
+    @cached_property
+    def _terms(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats, NDArray[np.bool_]]:
+        """Keypoint, joint (terms,) and constants (terms, 3, features) of every term that is not 0.
+
+        And which joints move which keypoint (keypoints, 24).
+        """
+        there: NDArray[np.bool_] = (self.vectors != 0.0).any(axis=(2, 3))
+        keypoint, joint = np.nonzero(there)
+        moves = there.copy()
+        for below in range(JOINTS - 1, 0, -1):
+            moves[:, self.model.parents[below]] |= moves[:, below]
+        return keypoint, joint, self.vectors[keypoint, joint], moves
+
+    @cached_property
+    def _shaping(self) -> Floats:
+        """(72, keypoints x shapes) [m]: a_q by the betas."""
+        constants = self.vectors[..., 1 : 1 + self.model.shapes]
+        return constants.transpose(1, 2, 0, 3).reshape(3 * JOINTS, -1)
+
+    @cached_property
+    def _correctives(self) -> Floats:
+        """(72, keypoints x pose features) [m]: a_q by the pose feature."""
+        constants = self.vectors[..., 1 + self.model.shapes :]
+        return constants.transpose(1, 2, 0, 3).reshape(3 * JOINTS, -1)
+
+
+def _own_change(local: Floats, turns: Floats, axes: Floats, parents: NDArray[np.int64]) -> Floats:
+    """Change of the pose feature's parts by their own joint's angles (n, 23, 9, 3) [1/rad]."""
+    # Axes relative to the parent, in which the local rotation is.
+    inward = turns[:, parents[1:]].swapaxes(-1, -2) @ axes[:, 1:]
+    changed = np.cross(inward[..., None, :], local[:, 1:, :, :, None], axis=-3)
+    return changed.reshape(*inward.shape[:2], 9, 3)
+
+
+@compiled
+def _turned(angles: Floats, parents: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
+    """Turns of joints relative to their parents and in the world, and axes of their angles.
+
+    Args:
+        angles: (n, joints, 3) [rad], axis-angle vectors relative to the parent.
+        parents: (joints,).
+
+    Returns:
+        Local and world turns (n, joints, 3, 3), and axes (n, joints, 3, 3): column c is the
+        angular velocity in the world while angle c grows.
+    """
+    count, joints = angles.shape[:2]
+    local = np.empty((count, joints, 3, 3))
+    turns = np.empty((count, joints, 3, 3))
+    axes = np.empty((count, joints, 3, 3))
+    left = np.empty((3, 3))
+    for n in range(count):
+        for j in range(joints):
+            x, y, z = angles[n, j]
+            square = x * x + y * y + z * z
+            angle = np.sqrt(square)
+            if angle > 0.1:
+                first = np.sin(angle) / angle
+                third = (1.0 - first) / square
+            else:
+                # Series beyond which double precision sees nothing.
+                first = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
+                third = (1.0 - square / 20.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0))) / 6.0
+            half = np.sin(0.5 * angle)
+            second = 2.0 * half * half / square if angle > 1e-6 else 0.5
+            cosine = 1.0 - second * square
+            r = angles[n, j]
+            for a in range(3):
+                for b in range(3):
+                    outer = r[a] * r[b]
+                    local[n, j, a, b] = second * outer
+                    left[a, b] = third * outer
+                local[n, j, a, a] += cosine
+                left[a, a] += first
+            for a, b, c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+                local[n, j, a, b] -= first * r[c]
+                local[n, j, b, a] += first * r[c]
+                left[a, b] -= second * r[c]
+                left[b, a] += second * r[c]
+            parent = parents[j]
+            for a in range(3):
+                for b in range(3):
+                    if parent < 0:
+                        turns[n, j, a, b] = local[n, j, a, b]
+                        axes[n, j, a, b] = left[a, b]
+                    else:
+                        turned, axis = 0.0, 0.0
+                        for c in range(3):
+                            turned += turns[n, parent, a, c] * local[n, j, c, b]
+                            axis += turns[n, parent, a, c] * left[c, b]
+                        turns[n, j, a, b] = turned
+                        axes[n, j, a, b] = axis
+    return local, turns, axes
+
+
+@compiled
+def _levered(
+    turns: Floats,
+    axes: Floats,
+    terms: Floats,
+    keypoint: NDArray[np.int64],
+    joint: NDArray[np.int64],
+    moves: NDArray[np.bool_],
+    parents: NDArray[np.int64],
+) -> tuple[Floats, Floats]:
+    """Sums of turned terms (n, keypoints, 3) [m] and their change (n, keypoints, 3, 72) [m/rad].
+
+    Args:
+        turns: (n, 24, 3, 3), world.
+        axes: (n, 24, 3, 3), of the angles.
+        terms: (n, terms, 3) [m], unturned, by ascending keypoint.
+        keypoint: (terms,).
+        joint: (terms,), which turns the term.
+        moves: (keypoints, 24), whether a joint has any part in a keypoint.
+        parents: (24,).
+    """
+    count, joints = turns.shape[:2]
+    keypoints = np.zeros((count, len(moves), 3))
+    by_pose = np.zeros((count, len(moves), 3, 3 * joints))
+    lever = np.empty((joints, 3))
+    for n in range(count):
+        p = 0
+        for k in range(len(moves)):
+            lever[:] = 0.0
+            while p < len(keypoint) and keypoint[p] == k:
+                j = joint[p]
+                for a in range(3):
+                    for b in range(3):
+                        lever[j, a] += turns[n, j, a, b] * terms[n, p, b]
+                p += 1
+            for j in range(joints - 1, -1, -1):
+                if moves[k, j]:
+                    if j > 0:
+                        for a in range(3):
+                            lever[parents[j], a] += lever[j, a]
+                    x, y, z = lever[j]
+                    for c in range(3):
+                        u, v, w = axes[n, j, 0, c], axes[n, j, 1, c], axes[n, j, 2, c]
+                        by_pose[n, k, 0, 3 * j + c] = v * z - w * y
+                        by_pose[n, k, 1, 3 * j + c] = w * x - u * z
+                        by_pose[n, k, 2, 3 * j + c] = u * y - v * x
+            keypoints[n, k] = lever[0]
+    return keypoints, by_pose

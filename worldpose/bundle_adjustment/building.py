@@ -1,0 +1,124 @@
+"""The problem that people and markings pose (B2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.bundle_adjustment.clip import Clip, Observed
+from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, GivenCameraPrior
+from worldpose.bundle_adjustment.solving import Problem
+from worldpose.static_calibration import PARAMETERS
+
+_SIZE: Final = len(PARAMETERS)
+_UNKNOWN: Final = np.array([1.0] * 3 + [100.0] * 3 + [1.0, 300.0, 300.0, 3.0, 30.0, 300.0])
+"""Spreads that say nothing [rad, m, 1, px, 1]: what a few clicks leave open stays where it is."""
+
+
+@dataclass(frozen=True)
+class KeypointNoise:
+    """How far keypoints really are off, and how long.
+
+    Attributes:
+        scale: factor on the stated standard deviation [1].
+        correlation: observations that are worth one independent one [1], at least 1: a joint that
+            a detector puts too low in one frame, it puts too low in the next.
+    """
+
+    scale: float = 1.0
+    correlation: float = 1.0
+
+
+def players_problem(
+    clip: Clip,
+    observed: Observed,
+    noise: KeypointNoise,
+    standing: NDArray[np.bool_],
+    settings: BundleAdjustmentSettings,
+) -> Problem:
+    """Return the adjustment of cameras to people, on top of what calibration knows.
+
+    Clicks, painted lines and priors enter as the Gaussian that calibration left; people as free
+    points under Cauchy's loss. An observation's weight is divided by the correlation, so that
+    twenty frames in which a detector errs alike count as the few that they are.
+
+    Args:
+        clip: cameras and how well they are known.
+        observed: keypoints.
+        noise: their scale and correlation.
+        standing: (cameras,) bool, those that may not move.
+        settings: robust scale, and the prior of given cameras.
+    """
+    information, free = camera_knowledge(clip.covariance, settings.given)
+    variance = (observed.noise * noise.scale) ** 2 * noise.correlation
+    scale = settings.robust_scale / np.sqrt(noise.correlation)
+    return Problem(
+        cameras=clip.cameras,
+        free=free & ~standing[:, None],
+        camera_information=information,
+        points=observed.points,
+        point_information=np.zeros(len(observed.points)),
+        point_of=observed.point_of,
+        camera_of=observed.camera_of,
+        image=observed.image,
+        weight=1.0 / variance,
+        scale=np.full(len(variance), scale),
+    )
+
+
+def markings_problem(
+    clip: Clip, standing: NDArray[np.bool_], settings: BundleAdjustmentSettings
+) -> Problem:
+    """Return the adjustment of cameras to clicks alone, everything free, nothing known (trap 1).
+
+    Args:
+        clip: cameras and clicks.
+        standing: (cameras,) bool, those that may not move.
+        settings: noise of clicks.
+    """
+    clicked = [np.flatnonzero(clicks.inlier) for clicks in clip.clicks]
+    points = [clicks.points_world[i] for clicks, i in zip(clip.clicks, clicked, strict=True)]
+    image = [clicks.points_image[i] for clicks, i in zip(clip.clicks, clicked, strict=True)]
+    world = np.concatenate(points)
+    has = np.array([len(i) > 0 for i in clicked])
+    return Problem(
+        cameras=clip.cameras,
+        free=np.repeat((has & ~standing)[:, None], _SIZE, axis=1),
+        camera_information=np.tile(np.diag(_UNKNOWN**-2.0), (len(has), 1, 1)),
+        points=world,
+        point_information=np.full(len(world), np.inf),
+        point_of=np.arange(len(world)),
+        camera_of=np.repeat(np.arange(len(has)), [len(i) for i in clicked]),
+        image=np.concatenate(image),
+        weight=np.full(len(world), settings.click_noise**-2.0),
+        scale=np.full(len(world), np.inf),
+    )
+
+
+def camera_knowledge(
+    covariance: NDArray[np.float64], given: GivenCameraPrior
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the information (cameras, 12, 12) about a step, and what may move (cameras, 12).
+
+    Args:
+        covariance: (cameras, 12, 12); zero for what was not solved for, all zero where given.
+        given: spreads of those cameras.
+    """
+    spread = np.zeros(_SIZE)
+    spread[:7] = [given.rotation] * 3 + [given.center] * 3 + [given.focal]
+    information = np.zeros_like(covariance)
+    free = np.diagonal(covariance, axis1=1, axis2=2) > 0.0
+    for c, known in enumerate(covariance):
+        if not free[c].any():
+            free[c] = spread > 0.0
+            known = np.diag(spread**2)
+        block = np.ix_(free[c], free[c])
+        # Lens coefficients and meters differ by many powers of ten.
+        size = np.sqrt(np.diag(known[block]))
+        information[c][block] = np.linalg.inv(known[block] / np.outer(size, size)) / np.outer(
+            size, size
+        )
+    return 0.5 * (information + information.swapaxes(1, 2)), free

@@ -1,0 +1,71 @@
+"""Which frames cameras are adjusted on (B1): many views, well spread over pitch and time."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.bundle_adjustment.clip import Clip
+
+_CELL: Final = 8.0
+"""Of the pitch, side [m]: a quarter of what a static camera sees across."""
+_WORTH: Final = 17.0
+"""Keypoints of one cell in one camera after which more of them count half [1]: one person."""
+
+
+def propose_frames(
+    clip: Clip,
+    count: int,
+    gap: float,
+    min_views: int,
+    taken: NDArray[np.int64] | None = None,
+) -> NDArray[np.int64]:
+    """Return indices of frames that tell most about all cameras, ascending.
+
+    Each frame adds keypoints of well-seen joints to cells of the pitch, camera by camera; what a
+    cell has already makes more of it worth less (the sum of logarithms). The next frame is always
+    the one that adds most, `gap` away from those before.
+
+    Args:
+        clip: cameras, joints and who saw them.
+        count: at most this many.
+        gap: between two of them [s].
+        min_views: least agreeing cameras of a joint that counts.
+        taken: (k,) indices that are not to be proposed.
+
+    Note:
+        B1.
+    """
+    offered = _offered(clip, min_views)
+    left: NDArray[np.bool_] = np.asarray(offered.any(axis=1))
+    left[[] if taken is None else taken] = False
+    collected = np.zeros(offered.shape[1])
+    chosen: list[int] = []
+    while len(chosen) < count and left.any():
+        rest = np.flatnonzero(left)
+        gain = np.log1p(offered[rest] / (_WORTH + collected)).sum(axis=1)
+        best = int(rest[np.argmax(gain)])
+        chosen.append(best)
+        collected += offered[best]
+        near = np.abs(np.arange(len(left)) - best) < gap * clip.fps - 1e-9
+        left[near] = False
+        left[best] = False
+    return np.array(sorted(chosen), dtype=np.int64)
+
+
+def _offered(clip: Clip, min_views: int) -> NDArray[np.float64]:
+    """Keypoints (frames, cells) of every camera's cells; only cells that anybody enters."""
+    good = np.isfinite(clip.joints[..., 0]) & (clip.views >= min_views)
+    number = good.sum(axis=-1)
+    place = np.where(good[..., None], clip.joints, 0.0)[..., :2].sum(axis=-2)
+    place /= np.maximum(number, 1)[..., None]
+    cell = np.floor(place / _CELL).astype(np.int64)
+    _, cell_of = np.unique(cell.reshape(-1, 2), axis=0, return_inverse=True)
+    cell_of = cell_of.reshape(number.shape)
+    frames, cameras, _ = clip.detection_index.shape
+    offered = np.zeros((frames, cameras, int(cell_of.max(initial=0)) + 1))
+    f, c, p = np.nonzero(clip.detection_index >= 0)
+    np.add.at(offered, (f, c, cell_of[f, p]), number[f, p])
+    return offered.reshape(frames, -1)

@@ -1,0 +1,62 @@
+"""Settings of bundle adjustment."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from data_contracts.records import Record
+from worldpose.bundle_adjustment.solving import SolverSettings
+
+
+class GivenCameraPrior(Record):
+    """How far off a camera may be that was given without saying how well it is known.
+
+    Standard deviations; lens and principal point are taken as they are.
+    """
+
+    rotation: float = Field(default=0.0005, gt=0)
+    """About each axis [rad]: a pixel at a focal length of 2000 px."""
+    center: float = Field(default=0.15, gt=0)
+    """Along each axis [m]: what careful calibration from pitch markings leaves."""
+    focal: float = Field(default=0.002, gt=0)
+    """Relative [1]: five zoom steps of a survey's rounding, 2 px at the picture's border."""
+
+
+class BundleAdjustmentSettings(Record):
+    """Which people are adjusted to, how much they count, and what is accepted."""
+
+    evidence: Literal["markings_and_players", "markings"] = "markings_and_players"
+    """What cameras are adjusted to. `markings` alone, with every parameter of the lens free and
+    nothing known beforehand, is the paper's warning (trap 1): it is there to be measured."""
+    frames: int = Field(default=40, ge=1)
+    """Most frames that people are taken from [1]; more add seconds and little knowledge."""
+    frame_gap: float = Field(default=0.1, ge=0)
+    """Least time between two of them [s]: errors of a detector last about 0.3 s."""
+    chosen_frames: tuple[int, ...] = ()
+    """Match frames that a person chose instead; those outside a clip are left out of it."""
+    min_views: int = Field(default=3, ge=2)
+    """Least agreeing cameras of a joint that cameras are adjusted to [1]: two views hardly
+    contradict each other."""
+    robust_scale: float = Field(default=3.0, gt=0)
+    """Standard deviations of an observation beyond which it counts less (Cauchy's loss) [1]: a few
+    per cent of efficiency for honest ones."""
+    folds: int = Field(default=4, ge=2)
+    """Groups of people, each of which is left out once to judge cameras adjusted without them
+    [1]."""
+    min_judges: int = Field(default=100, ge=1)
+    """Least left-out keypoints in a camera that can accept its change [1]: six people once."""
+    given: GivenCameraPrior = GivenCameraPrior()
+    """Of cameras that nobody calibrated here."""
+    click_noise: float = Field(default=1.0, gt=0)
+    """Standard deviation of a clicked point, each axis [px]: a careful click in a zoomed view."""
+    wrong_click: float = Field(default=4.2, gt=0)
+    """Standard deviations from which a click is proposed for removal [1]: 0.015 % of honest ones
+    (chi-square, two degrees of freedom)."""
+    wrong_keypoint: float = Field(default=4.2, gt=0)
+    """Standard deviations from which a keypoint is on the review list [1]."""
+    review: int = Field(default=1000, ge=0)
+    """Longest review list of keypoints and people [1]; the worst come first."""
+    solver: SolverSettings = SolverSettings()
+    """When the solver stops."""

@@ -1,0 +1,59 @@
+"""Files that a match folder names: they are there, and nowhere else."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from worldpose.errors import InputError
+
+
+def require_local(name: str, where: str) -> None:
+    """Refuse a name that is not plainly a place inside the match folder.
+
+    Raises:
+        InputError: an absolute path, one with `..`, or an empty one.
+    """
+    posix, windows = PurePosixPath(name), PureWindowsPath(name)
+    if not posix.parts or posix.is_absolute() or windows.anchor or ".." in posix.parts:
+        raise InputError(
+            where,
+            expected="a path inside the match folder, without ..",
+            found=repr(name),
+            todo="Move or copy the file into the match folder and name it from there.",
+        )
+
+
+def existing_file(folder: Path, name: str, where: str, *, folders: bool = False) -> Path:
+    """The file `name` in the folder.
+
+    Args:
+        folder: the match folder.
+        name: relative to it.
+        where: what names it, for messages.
+        folders: whether a folder with something in it will do.
+
+    Raises:
+        InputError: there is no such file, or it lies outside.
+    """
+    require_local(name, where)
+    path = folder / name
+    try:
+        there = path.is_file() or (folders and path.is_dir() and any(path.iterdir()))
+        inside = path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):  # no rights, a loop of links, a NUL in the name
+        there = False
+    if not there:
+        raise InputError(
+            where,
+            expected="a file, or a folder of images" if folders else "a file",
+            found=f"no {name!r}",
+            todo="Put it there, or correct the name.",
+        )
+    if not inside:
+        raise InputError(
+            where,
+            expected="a file inside the match folder",
+            found=f"{name!r}, a link that leads out of it",
+            todo="Copy the file into the match folder.",
+        )
+    return path

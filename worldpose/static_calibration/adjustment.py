@@ -1,0 +1,177 @@
+"""Levenberg-Marquardt on clicks, drawn markings and priors, compiled (C3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.cameras import Camera, Rigid
+from worldpose.static_calibration.descent import descend
+from worldpose.static_calibration.evidence import Evidence
+from worldpose.static_calibration.parameters import PARAMETERS
+from worldpose.static_calibration.residuals import SIZE
+from worldpose.static_calibration.settings import StaticCalibrationSettings
+
+_ITERATIONS: Final = 60
+"""Enough from any start in the basin; most end after ten."""
+_LEAST_HEIGHT: Final = 0.5
+"""A camera below it is pushed up as if it were there [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """All that a camera is fitted to, in the form of the compiled kernels.
+
+    Attributes:
+        evidence: clicks and drawn markings.
+        image_size: width, height [px].
+        prior: (15,), see `prior_residuals`.
+        free: (12,) which parameters are solved for.
+        click_noise: standard deviation of clicks [px].
+        drawn_noise: standard deviation of drawn points [px].
+        drawn_loss: Cauchy scale of drawn points [standard deviations].
+    """
+
+    evidence: Evidence
+    image_size: tuple[int, int]
+    prior: NDArray[np.float64]
+    free: NDArray[np.bool_]
+    click_noise: float
+    drawn_noise: float
+    drawn_loss: float
+
+    @property
+    def reach(self) -> float:
+        """Half the picture's diagonal [px]."""
+        return 0.5 * float(np.hypot(*self.image_size))
+
+
+@dataclass(frozen=True, eq=False)
+class Fits:
+    """Cameras after some iterations.
+
+    Attributes:
+        rows: (b, 22) cameras, see `worldpose.cameras.projection`.
+        cost: (b,) half the sum of squared, loss-weighted residuals and priors.
+        information: (b, 12, 12) inverse covariance of a step from the evidence and the prior.
+        evidence_information: (b, 12, 12) the evidence's share of it.
+    """
+
+    rows: NDArray[np.float64]
+    cost: NDArray[np.float64]
+    information: NDArray[np.float64]
+    evidence_information: NDArray[np.float64]
+
+
+def problem_of(
+    evidence: Evidence,
+    image_size: tuple[int, int],
+    settings: StaticCalibrationSettings,
+    distortion: str | None = None,
+) -> Problem:
+    """Return the problem that the settings make of the evidence.
+
+    Args:
+        evidence: clicks and drawn markings.
+        image_size: width, height [px].
+        settings: noise, prior, free coefficients.
+        distortion: radial coefficients to solve for, if not those of the settings.
+    """
+    width, height = image_size
+    known = settings.prior
+    radial = {"none": 0, "k1": 1, "k1_k2": 2, "k1_k2_k3": 3}[distortion or settings.distortion]
+    free = np.ones(len(PARAMETERS), dtype=np.bool_)
+    free[9 + radial :] = False
+    middle = (0.5 * (width - 1), 0.5 * (height - 1))
+    prior = [np.log(known.focal * width), known.focal_spread]
+    prior += [*middle, known.principal_point_spread * width, 0.5 * np.hypot(width, height)]
+    prior += [known.k1_spread, known.k2_spread, known.k3_spread]
+    prior += [np.log(known.height), known.height_spread]
+    prior += [np.log(known.distance), known.distance_spread, known.roll_spread, _LEAST_HEIGHT]
+    return Problem(
+        evidence=evidence,
+        image_size=image_size,
+        prior=np.array(prior),
+        free=free,
+        click_noise=settings.click_noise,
+        drawn_noise=settings.drawn_noise,
+        drawn_loss=settings.drawn_loss,
+    )
+
+
+def adjust(
+    problem: Problem,
+    rows: NDArray[np.float64],
+    *,
+    click_loss: float = np.inf,
+    iterations: int = _ITERATIONS,
+) -> Fits:
+    """Return cameras fitted from starts.
+
+    Args:
+        problem: what to fit to.
+        rows: (b, 22) starts.
+        click_loss: Cauchy scale of clicks [standard deviations]; infinite = least squares.
+        iterations: at most; 0 only weighs the starts.
+    """
+    fitted = rows.copy()
+    count = len(rows)
+    cost = np.empty(count)
+    information = np.empty((count, SIZE, SIZE))
+    observed = np.empty((count, SIZE, SIZE))
+    evidence = problem.evidence
+    descend(
+        fitted,
+        evidence.points_world,
+        evidence.points_image,
+        evidence.samples_world,
+        evidence.bounds,
+        evidence.drawn_image,
+        evidence.drawn_marking,
+        problem.prior,
+        problem.free,
+        np.array(
+            [
+                problem.reach,
+                problem.click_noise,
+                click_loss,
+                problem.drawn_noise,
+                problem.drawn_loss,
+            ]
+        ),
+        iterations,
+        cost,
+        information,
+        observed,
+    )
+    return Fits(fitted, cost, information, observed)
+
+
+def row_of(camera: Camera) -> NDArray[np.float64]:
+    """Return the (22,) row of a single camera; the solver keeps its own watch on folds."""
+    pose = camera.cam_from_world
+    return np.concatenate(
+        [
+            camera.focal,
+            camera.principal_point,
+            camera.distortion,
+            pose.rotation.ravel(),
+            pose.translation,
+            [np.inf],
+        ]
+    )
+
+
+def camera_of_row(row: NDArray[np.float64], image_size: tuple[int, int]) -> Camera:
+    """Return the camera of a row."""
+    u, _, v = np.linalg.svd(row[9:18].reshape(3, 3))
+    return Camera(
+        focal=row[:2],
+        principal_point=row[2:4],
+        distortion=row[4:9],
+        cam_from_world=Rigid(u @ v, row[18:21]),
+        image_size=np.array(image_size),
+    )

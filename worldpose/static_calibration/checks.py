@@ -1,0 +1,158 @@
+"""Errors of a calibration that say what to add, and where."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from worldpose.errors import InputError
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration.adjustment import Problem, adjust, camera_of_row
+from worldpose.static_calibration.advice import most_helpful, off_the_line
+from worldpose.static_calibration.evidence import Evidence
+from worldpose.static_calibration.parameters import CameraEstimate
+from worldpose.static_calibration.screening import Screened
+from worldpose.static_calibration.settings import StaticCalibrationSettings
+from worldpose.static_calibration.starts import from_homographies, plausible_cameras
+
+_POINTS: Final = 4
+"""Fewest clicked points without a drawn marking [1]: a homography's."""
+_CONSTRAINTS: Final = 6
+"""Fewest independent numbers with a drawn marking [1]: pose; the prior holds the focal length."""
+_LINE: Final = 2
+"""Numbers that a straight marking gives, however long it is drawn [1]."""
+_ARC: Final = 4
+"""Numbers that an arc gives [1]: five of its ellipse, less one that turning the circle leaves."""
+_OFF_LINE: Final = 1.0
+"""Points whose root mean square distance from one line is below this are on it [m]."""
+_POSE_SPREAD: Final = np.array([1.0, 1.0, 1.0, 30.0, 30.0, 30.0, 0.7])
+"""What is not known of pose and focal length at all [rad, m, 1]: directions told less than this
+are not determined by the clicks."""
+_UNTOLD: Final = 2
+"""Directions of pose and focal length that the clicks may not leave to the prior [1]."""
+_MIRRORED_GAIN: Final = 0.25
+"""Names are mirrored where mirroring them leaves less than this share of the cost [1]."""
+_SUSPICIOUS: Final = 0.2
+"""Share of wrong clicks above which mirrored names are looked for [1]."""
+_MANY: Final = 9.0
+"""Mean loss of an observation [1] above which mirrored names are looked for."""
+
+
+def check_amount(evidence: Evidence, pitch: PitchTemplate, where: str) -> None:
+    """Raise InputError when the clicks are too few, or on one line, for any camera."""
+    points, found = len(evidence.points), _found(evidence)
+    if not evidence.markings:
+        if points < _POINTS:
+            more = off_the_line(pitch, evidence.points_world)
+            new = [name for name in more if name not in evidence.points]
+            raise InputError(
+                where,
+                expected=f"{_POINTS} clicked points or more, better 8, or drawn markings as well",
+                found=found,
+                todo=f"Add what the picture shows of {', '.join(new)}, far from the others.",
+            )
+        plan = evidence.points_world[:, :2]
+        spread = np.linalg.svd(plan - plan.mean(axis=0), compute_uv=False)[1]
+        if spread < _OFF_LINE * np.sqrt(points):
+            more = off_the_line(pitch, evidence.points_world)
+            raise InputError(
+                where,
+                expected="points off one line",
+                found=f"{found}, all on one line of the pitch",
+                todo=f"Add what the picture shows of {', '.join(more)}, off that line.",
+            )
+        return
+    numbers = 2 * points
+    for index in range(len(evidence.markings)):
+        pixels = int((evidence.drawn_marking == index).sum())
+        numbers += min(pixels, _LINE if evidence.straight[index] else _ARC)
+    if numbers < _CONSTRAINTS:
+        places = np.concatenate([evidence.points_world, evidence.samples_world])
+        more = off_the_line(pitch, places)
+        raise InputError(
+            where,
+            expected="three straight markings in two directions, or two points and a marking",
+            found=found,
+            todo=f"Draw another marking, or add what the picture shows of {', '.join(more)}.",
+        )
+
+
+def check_agreement(
+    problem: Problem, fit: Screened, settings: StaticCalibrationSettings, where: str
+) -> None:
+    """Raise InputError when mirroring the names explains the clicks, or no camera does."""
+    evidence = problem.evidence
+    wrong = 1.0 - float(fit.inliers.mean()) if len(fit.inliers) else 0.0
+    if wrong <= _SUSPICIOUS and fit.misfit < _MANY:
+        return
+    if _mirrored_fits(problem, fit, settings):
+        raise InputError(
+            where,
+            expected="names as seen from this camera's side of the pitch",
+            found=f"{_found(evidence)} that fit only with left and right exchanged",
+            todo="Exchange left and right (or near and far) in all names: left is negative x, "
+            "near is negative y, the main camera's side.",
+        )
+    if wrong > settings.max_wrong_share:
+        kept = [n for n, inlier in zip(evidence.points, fit.inliers, strict=True) if inlier]
+        raise InputError(
+            where,
+            expected=f"at most {settings.max_wrong_share:.0%} wrong clicks",
+            found=f"{wrong:.0%}: no camera sees more of them in place than {', '.join(kept)}",
+            todo="Check the names of the others, and image_size.",
+        )
+
+
+def check_determined(
+    problem: Problem,
+    fit: Screened,
+    pitch: PitchTemplate,
+    settings: StaticCalibrationSettings,
+    where: str,
+) -> None:
+    """Raise InputError when the clicks leave several directions of the camera to the prior."""
+    block = fit.evidence_information[:7, :7] * np.outer(_POSE_SPREAD, _POSE_SPREAD)
+    untold = int((np.linalg.eigvalsh(block) < 1.0).sum())
+    if untold < _UNTOLD:
+        return
+    evidence = problem.evidence
+    estimate = CameraEstimate(camera_of_row(fit.row, problem.image_size), fit.covariance)
+    clicked = (*evidence.points, *evidence.markings)
+    more = most_helpful(estimate, pitch, clicked, settings.click_noise)
+    if not more:
+        more = off_the_line(pitch, np.concatenate([evidence.points_world, evidence.samples_world]))
+    raise InputError(
+        where,
+        expected="clicks that determine where the camera stands and looks",
+        found=f"{_found(evidence)}, which leave {untold} of its 7 degrees of freedom open",
+        todo=f"Add what the picture shows of {', '.join(more)}: these would tell most.",
+    )
+
+
+def _mirrored_fits(problem: Problem, fit: Screened, settings: StaticCalibrationSettings) -> bool:
+    flip = np.array([-1.0, 1.0, 1.0])
+    evidence = replace(
+        problem.evidence,
+        points_world=problem.evidence.points_world * flip,
+        samples_world=problem.evidence.samples_world * flip,
+    )
+    mirrored = replace(problem, evidence=evidence)
+    rows = from_homographies(mirrored, settings.prior, leave_out=False)
+    if not len(rows):
+        rows = plausible_cameras(mirrored, settings.prior)
+        weighed = adjust(mirrored, rows, click_loss=_MANY, iterations=0)
+        rows = rows[np.argsort(weighed.cost, kind="stable")[: settings.search_cameras]]
+    best = adjust(mirrored, rows, click_loss=_MANY).cost.min()
+    given = adjust(problem, fit.row[None], click_loss=_MANY).cost[0]
+    return bool(best < _MIRRORED_GAIN * given)
+
+
+def _found(evidence: Evidence) -> str:
+    parts = []
+    if evidence.points:
+        parts.append(f"{len(evidence.points)} points ({', '.join(evidence.points)})")
+    if evidence.markings:
+        parts.append(f"{len(evidence.markings)} markings ({', '.join(evidence.markings)})")
+    return " and ".join(parts)

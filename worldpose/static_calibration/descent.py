@@ -1,0 +1,223 @@
+"""The compiled Levenberg-Marquardt loop of stage 2."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.compiled import compiled
+from worldpose.static_calibration.residuals import (
+    PRIORS,
+    SIZE,
+    Floats,
+    Integers,
+    drawn_residuals,
+    point_residuals,
+    prior_residuals,
+)
+
+TOLERANCE: Final = 1e-10
+"""Relative fall of the cost at which a minimum counts as reached."""
+
+
+@compiled
+def descend(
+    rows: Floats,
+    world: Floats,
+    pixels: Floats,
+    samples: Floats,
+    bounds: Integers,
+    drawn: Floats,
+    marking: Integers,
+    prior: Floats,
+    free: NDArray[np.bool_],
+    noise: Floats,
+    iterations: int,
+    cost: Floats,
+    information: Floats,
+    observed: Floats,
+) -> None:
+    """Minimise from each row in place; see `adjustment.adjust`."""
+    trial = np.empty(22)
+    system = np.empty((SIZE, SIZE))
+    gradient = np.empty(SIZE)
+    new_information = np.empty((SIZE, SIZE))
+    new_observed = np.empty((SIZE, SIZE))
+    new_gradient = np.empty(SIZE)
+    step = np.empty(SIZE)
+    for b in range(len(rows)):
+        trial[:] = rows[b]
+        cost[b] = np.inf
+        damping = 1e-3
+        stalled = 0
+        iteration = 0
+        while True:
+            reached = _linearize(
+                trial,
+                world,
+                pixels,
+                samples,
+                bounds,
+                drawn,
+                marking,
+                prior,
+                free,
+                noise,
+                new_information,
+                new_observed,
+                new_gradient,
+            )
+            if reached < cost[b] or iteration == 0:
+                stalled = stalled + 1 if cost[b] - reached < TOLERANCE * cost[b] else 0
+                rows[b] = trial
+                cost[b] = reached
+                information[b] = new_information
+                observed[b] = new_observed
+                gradient[:] = new_gradient
+                damping = max(0.1 * damping, 1e-9)
+            else:
+                damping *= 8.0
+            if iteration >= iterations or stalled >= 2 or damping > 1e8:
+                break
+            iteration += 1
+            system[:] = information[b]
+            for j in range(SIZE):
+                system[j, j] = system[j, j] * (1.0 + damping) if free[j] else 1.0
+            step[:] = gradient
+            _solve(system, step)
+            step_row(rows[b], step, trial)
+
+
+@compiled
+def _linearize(
+    c: Floats,
+    world: Floats,
+    pixels: Floats,
+    samples: Floats,
+    bounds: Integers,
+    drawn: Floats,
+    marking: Integers,
+    prior: Floats,
+    free: NDArray[np.bool_],
+    noise: Floats,
+    information: Floats,
+    observed: Floats,
+    gradient: Floats,
+) -> float:
+    """Return the cost at a camera; write its information and gradient, zero where not free."""
+    n, d = len(world), len(drawn)
+    click = np.empty((n, 2))
+    by_click = np.empty((n, 2, SIZE))
+    off = np.empty(d)
+    by_off = np.empty((d, SIZE))
+    known = np.empty(PRIORS)
+    by_known = np.empty((PRIORS, SIZE))
+    point_residuals(c, world, pixels, click, by_click)
+    drawn_residuals(c, noise[0], samples, bounds, drawn, marking, off, by_off)
+    prior_residuals(c, prior, known, by_known)
+    gradient[:] = 0.0
+    observed[:] = 0.0
+    for i in range(n):
+        weight = _weight((click[i, 0] ** 2 + click[i, 1] ** 2) / noise[1] ** 2, noise[2])
+        weight /= noise[1] ** 2
+        for k in range(2):
+            _add(by_click[i, k], click[i, k], weight, observed, gradient)
+    for i in range(d):
+        weight = _weight((off[i] / noise[3]) ** 2, noise[4]) / noise[3] ** 2
+        _add(by_off[i], off[i], weight, observed, gradient)
+    information[:] = observed
+    for i in range(PRIORS):
+        _add(by_known[i], known[i], 1.0, information, gradient)
+    for j in range(SIZE):
+        if not free[j]:
+            information[j, :] = information[:, j] = 0.0
+            observed[j, :] = observed[:, j] = 0.0
+            gradient[j] = 0.0
+    return _cost(click, off, known, noise)
+
+
+@compiled
+def _solve(system: Floats, right: Floats) -> None:
+    """Solve a damped system in place by Cholesky's factors; write minus the solution.
+
+    The step is NaN, and so refused, where rounding has left the system indefinite.
+    """
+    for j in range(SIZE):
+        for k in range(j + 1):
+            value = system[j, k]
+            for m in range(k):
+                value -= system[j, m] * system[k, m]
+            system[j, k] = np.sqrt(value) if j == k else value / system[k, k]
+    for j in range(SIZE):
+        for k in range(j):
+            right[j] -= system[j, k] * right[k]
+        right[j] /= system[j, j]
+    for j in range(SIZE - 1, -1, -1):
+        for k in range(j + 1, SIZE):
+            right[j] -= system[k, j] * right[k]
+        right[j] /= system[j, j]
+    for j in range(SIZE):
+        right[j] = -right[j]
+
+
+@compiled
+def _add(by: Floats, residual: float, weight: float, system: Floats, gradient: Floats) -> None:
+    for j in range(SIZE):
+        scaled = weight * by[j]
+        gradient[j] += scaled * residual
+        for k in range(SIZE):
+            system[j, k] += scaled * by[k]
+
+
+@compiled
+def _weight(squared: float, scale: float) -> float:
+    """Return Cauchy's weight of a squared residual; 1 for an infinite scale."""
+    return 1.0 / (1.0 + squared / (scale * scale))
+
+
+@compiled
+def _loss(squared: float, scale: float) -> float:
+    return scale * scale * np.log1p(squared / (scale * scale)) if scale < np.inf else squared
+
+
+@compiled
+def _cost(click: Floats, off: Floats, known: Floats, noise: Floats) -> float:
+    total = 0.0
+    for i in range(len(click)):
+        total += _loss((click[i, 0] ** 2 + click[i, 1] ** 2) / noise[1] ** 2, noise[2])
+    for i in range(len(off)):
+        total += _loss((off[i] / noise[3]) ** 2, noise[4])
+    for i in range(len(known)):
+        total += known[i] ** 2
+    return 0.5 * total if total < np.inf else np.inf
+
+
+@compiled
+def step_row(c: Floats, step: Floats, out: Floats) -> None:
+    """Write the row after a step, as `stepped` does."""
+    out[:] = c
+    out[0] = c[0] * np.exp(step[6])
+    out[1] = c[1] * np.exp(step[6])
+    out[2] += step[7]
+    out[3] += step[8]
+    out[4] += step[9]
+    out[5] += step[10]
+    out[8] += step[11]
+    angle = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+    first = np.sin(angle) / angle if angle > 1e-12 else 1.0
+    second = (1.0 - np.cos(angle)) / angle**2 if angle > 1e-6 else 0.5
+    # Rodrigues' formula on every column of the rotation, and on the translation.
+    for k in range(4):
+        i = 18 if k == 3 else 9 + k
+        s = 1 if k == 3 else 3
+        x, y, z = c[i], c[i + s], c[i + 2 * s]
+        cx = step[1] * z - step[2] * y
+        cy = step[2] * x - step[0] * z
+        cz = step[0] * y - step[1] * x
+        out[i] = x + first * cx + second * (step[1] * cz - step[2] * cy)
+        out[i + s] = y + first * cy + second * (step[2] * cx - step[0] * cz)
+        out[i + 2 * s] = z + first * cz + second * (step[0] * cy - step[1] * cx)
+    for k in range(3):
+        out[18 + k] += step[3 + k]

@@ -1,0 +1,139 @@
+"""What was clicked, as positions on the template and in the picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.static_calibration import ClickedMarkings
+from worldpose.errors import InputError
+from worldpose.pitch import PitchTemplate
+
+_OUTSIDE = 1.0
+"""Pixels by which a click may lie off the picture: rounding at its border."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Clicked points and drawn markings with their places on the template.
+
+    Attributes:
+        points: names of the clicked points.
+        points_world: (n, 3) [m], world.
+        points_image: (n, 2) [px].
+        markings: names of the drawn markings, each once.
+        samples_world: (s, 3) [m], world, along the drawn markings one after another.
+        bounds: (m + 1,) where each marking's samples begin and end.
+        drawn_image: (d, 2) [px].
+        drawn_marking: (d,) indices into `markings`.
+        straight: (m,) is the marking a straight one on the pitch's surface.
+    """
+
+    points: tuple[str, ...]
+    points_world: NDArray[np.float64]
+    points_image: NDArray[np.float64]
+    markings: tuple[str, ...]
+    samples_world: NDArray[np.float64]
+    bounds: NDArray[np.int64]
+    drawn_image: NDArray[np.float64]
+    drawn_marking: NDArray[np.int64]
+    straight: NDArray[np.bool_]
+
+    def only(self, points: NDArray[np.bool_], markings: NDArray[np.bool_]) -> Evidence:
+        """Return the evidence of some clicked points (n,) and drawn markings (m,) only."""
+        keep, on = points, markings[self.drawn_marking]
+        return replace(
+            self,
+            points=tuple(name for name, kept in zip(self.points, keep, strict=True) if kept),
+            points_world=self.points_world[keep],
+            points_image=self.points_image[keep],
+            drawn_image=self.drawn_image[on],
+            drawn_marking=self.drawn_marking[on],
+        )
+
+
+def gather(
+    pitch: PitchTemplate,
+    clicked: ClickedMarkings,
+    image_size: tuple[int, int],
+    spacing: float,
+    where: str,
+) -> Evidence:
+    """Return the evidence of one picture.
+
+    Args:
+        pitch: template that the names are of.
+        clicked: points and drawn markings.
+        image_size: width, height [px].
+        spacing: of the samples along markings [m].
+        where: file or camera, for messages.
+
+    Raises:
+        InputError: nothing was clicked, a name is unknown or given twice, or a pixel lies outside
+            the picture.
+    """
+    if not clicked.points and not clicked.drawn:
+        raise InputError(
+            where,
+            expected="clicked points or drawn markings",
+            found="none",
+            todo="Click four or more named points of the pitch, spread over the picture, such as "
+            "penalty_area_left_near_front, and draw the lines between them.",
+        )
+    names = [point.name for point in clicked.points]
+    for index, point in enumerate(clicked.points):
+        place = f"{where}: points[{index}] {point.name}"
+        if point.name not in pitch.points:
+            raise _unknown(place, point.name, tuple(pitch.points))
+        if point.name in names[:index]:
+            raise InputError(
+                place,
+                expected="every point once",
+                found=f"{point.name} clicked {names.count(point.name)} times",
+                todo="Delete all but the best click, or give the others their own names.",
+            )
+        _check_inside(place, point.xy, image_size)
+    pixels: dict[str, list[tuple[float, float]]] = {}
+    for index, marking in enumerate(clicked.drawn):
+        place = f"{where}: drawn[{index}] {marking.name}"
+        if marking.name not in pitch.marking_names:
+            raise _unknown(place, marking.name, pitch.marking_names)
+        for pixel in marking.xy:
+            _check_inside(place, pixel, image_size)
+        pixels.setdefault(marking.name, []).extend(marking.xy)
+    samples = [pitch.marking_points(name, spacing) for name in pixels]
+    counts = [len(drawn) for drawn in pixels.values()]
+    return Evidence(
+        points=tuple(names),
+        points_world=pitch.positions(names),
+        points_image=np.array([point.xy for point in clicked.points]).reshape(-1, 2),
+        markings=tuple(pixels),
+        samples_world=np.concatenate([np.empty((0, 3)), *samples]),
+        bounds=np.cumsum([0, *(len(part) for part in samples)]),
+        drawn_image=np.array([xy for drawn in pixels.values() for xy in drawn]).reshape(-1, 2),
+        drawn_marking=np.repeat(np.arange(len(pixels)), counts),
+        straight=np.array([name in pitch.lines for name in pixels], dtype=np.bool_),
+    )
+
+
+def _check_inside(where: str, pixel: tuple[float, float], image_size: tuple[int, int]) -> None:
+    width, height = image_size
+    inside = all(-_OUTSIDE <= v <= n for v, n in zip(pixel, (width, height), strict=True))
+    if not inside:
+        raise InputError(
+            where,
+            expected=f"a pixel of the picture, 0 to {width - 1} by 0 to {height - 1}",
+            found=f"{pixel[0]:g}, {pixel[1]:g}",
+            todo="Click it again, or check that the picture has the camera's image_size.",
+        )
+
+
+def _unknown(where: str, name: str, known: tuple[str, ...]) -> InputError:
+    return InputError(
+        where,
+        expected="a name of the pitch template",
+        found=repr(name),
+        todo=f"Use one of {', '.join(sorted(known))}.",
+    )

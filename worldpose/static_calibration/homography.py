@@ -1,0 +1,215 @@
+"""From the pitch's plane to the picture: normalised DLT, and the camera in it (C2)."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.cameras import Camera, Rigid
+from worldpose.static_calibration.evidence import Evidence
+
+_PLANE_SCALE = 50.0
+"""Half a pitch [m]: coordinates of order one keep the DLT well conditioned."""
+_ON_SURFACE = 0.5
+"""Greatest height off the flattened plane of what the homography uses [m]: crowns stay, goals'
+upper ends go."""
+_MAX_SUBSETS = 300
+"""Of four clicks [1]: with two of twelve wrong, 40 % of them are clean."""
+
+
+def plane_from_image(
+    points_image: NDArray[np.float64],
+    points_plane: NDArray[np.float64],
+    line_pixels: NDArray[np.float64],
+    lines: NDArray[np.float64],
+    scale: float,
+    middle: NDArray[np.float64],
+) -> NDArray[np.float64] | None:
+    """Return the (3, 3) homography from pixels to the plane [m] by the DLT, or None.
+
+    A point gives two equations; a pixel drawn anywhere on a straight line gives one, which is
+    linear as well in this direction: line . (H pixel) = 0.
+
+    Args:
+        points_image: (n, 2) [px].
+        points_plane: (n, 2) [m].
+        line_pixels: (d, 2) [px].
+        lines: (d, 3) the line of each, a x + b y + c = 0 with a^2 + b^2 = 1 [m].
+        scale: half the picture [px].
+        middle: (2,) of the picture [px].
+
+    Returns:
+        None where the equations leave more than one homography.
+    """
+    pixel = _homogeneous((points_image - middle) / scale)
+    x, y = (points_plane / _PLANE_SCALE).T
+    zero = np.zeros_like(pixel)
+    rows = [
+        np.concatenate([pixel, zero, -x[:, None] * pixel], axis=1),
+        np.concatenate([zero, pixel, -y[:, None] * pixel], axis=1),
+    ]
+    drawn = _homogeneous((line_pixels - middle) / scale)
+    line = lines * np.array([1.0, 1.0, 1.0 / _PLANE_SCALE])
+    rows.append((line[:, :, None] * drawn[:, None, :]).reshape(-1, 9))
+    system = np.concatenate(rows)
+    if len(system) < 8:
+        return None
+    _, values, basis = np.linalg.svd(system)
+    if values[7] < 1e-3 * values[0] / np.sqrt(len(system)):
+        return None
+    homography: NDArray[np.float64] = (
+        np.diag([_PLANE_SCALE, _PLANE_SCALE, 1.0])
+        @ basis[8].reshape(3, 3)
+        @ np.array([[1.0, 0.0, -middle[0]], [0.0, 1.0, -middle[1]], [0.0, 0.0, scale]])
+    )
+    return homography
+
+
+def camera_of(
+    image_from_plane: NDArray[np.float64],
+    image_size: tuple[int, int],
+    seen: NDArray[np.float64],
+    focal_range: tuple[float, float],
+) -> Camera | None:
+    """Return the camera that sees the plane z = 0 through a homography, or None.
+
+    Assumes square pixels and the principal point in the picture's middle: a plane gives two
+    equations for the internal parameters, here both for the focal length. Where they contradict
+    or do not tell (a view straight down), the focal length comes from the ends of its range.
+
+    Args:
+        image_from_plane: (3, 3).
+        image_size: width, height [px].
+        seen: (2,) [px], a pixel on the pitch: the plane lies before the camera there.
+        focal_range: smallest and largest believable focal length [px].
+
+    Note:
+        C2, trap 10.
+    """
+    width, height = image_size
+    middle = np.array([0.5 * (width - 1), 0.5 * (height - 1)])
+    centred = np.array([[1.0, 0.0, -middle[0]], [0.0, 1.0, -middle[1]], [0.0, 0.0, 1.0]])
+    h = centred @ image_from_plane
+    if not np.isfinite(h).all() or abs(np.linalg.det(h)) < 1e-12 * np.abs(h).max() ** 3:
+        return None
+    # With w = 1 / f^2: the columns are orthogonal, and of one length.
+    factors = np.array(
+        [h[0, 0] * h[0, 1] + h[1, 0] * h[1, 1], (h[:2, 0] ** 2 - h[:2, 1] ** 2).sum()]
+    )
+    constants = np.array([h[2, 0] * h[2, 1], h[2, 0] ** 2 - h[2, 1] ** 2])
+    squared = float(factors @ factors)
+    inverse = -float(factors @ constants) / squared if squared > 0.0 else 0.0
+    low, high = focal_range
+    focal = 1.0 / np.sqrt(np.clip(inverse, high**-2.0, low**-2.0))
+    columns = np.diag([1.0 / focal, 1.0 / focal, 1.0]) @ h
+    columns = columns / np.sqrt(np.linalg.norm(columns[:, 0]) * np.linalg.norm(columns[:, 1]))
+    # The plane point behind `seen` has positive depth.
+    place = np.linalg.solve(h, np.append(seen - middle, 1.0))
+    depth = columns[2] @ (place / place[2])
+    columns = columns * (1.0 if depth > 0.0 else -1.0)
+    across = np.cross(columns[:, 0], columns[:, 1])
+    u, _, v = np.linalg.svd(np.stack([columns[:, 0], columns[:, 1], across], axis=1))
+    rotation = u @ v
+    if np.linalg.det(rotation) < 0.0:
+        return None
+    return Camera(
+        focal=np.array([focal, focal]),
+        principal_point=middle,
+        distortion=np.zeros(5),
+        cam_from_world=Rigid(rotation, columns[:, 2]),
+        image_size=np.array(image_size),
+    )
+
+
+def homographies(
+    evidence: Evidence, image_size: tuple[int, int], tolerance: float, *, leave_out: bool
+) -> list[NDArray[np.float64]]:
+    """Return homographies (3, 3) from the plane to pixels worth a try, the best one first.
+
+    RANSAC over four clicks at a time where there are five or more, then the DLT over all clicks
+    that agree and all straight markings; and the DLT over straight markings alone.
+
+    Args:
+        evidence: what was clicked.
+        image_size: width, height [px].
+        tolerance: largest distance of an agreeing click [px]; covers distortion and the crown.
+        leave_out: try as well without each straight marking in turn.
+    """
+    middle = np.array([0.5 * (image_size[0] - 1), 0.5 * (image_size[1] - 1)])
+    scale = 0.5 * float(np.hypot(*image_size))
+    low = np.abs(evidence.points_world[:, 2]) < _ON_SURFACE
+    plane, pixels = evidence.points_world[low, :2], evidence.points_image[low]
+    line_pixels, lines, marking = _surface_lines(evidence)
+    consensus = _consensus(pixels, plane, middle, scale, tolerance)
+    everything, nothing = np.ones(len(plane), dtype=np.bool_), np.zeros(len(plane), dtype=np.bool_)
+    every_line = np.ones(len(lines), dtype=np.bool_)
+    choices = [(kept, every_line) for kept in (consensus, everything, nothing)]
+    if leave_out:
+        choices += [(consensus, marking != index) for index in np.unique(marking)]
+    candidates: list[NDArray[np.float64]] = []
+    for kept, on in choices:
+        found = plane_from_image(
+            pixels[kept], plane[kept], line_pixels[on], lines[on], scale, middle
+        )
+        if found is not None and np.linalg.cond(found) < 1e12:
+            candidates.append(np.asarray(np.linalg.inv(found), dtype=np.float64))
+    return candidates
+
+
+def _consensus(
+    pixels: NDArray[np.float64],
+    plane: NDArray[np.float64],
+    middle: NDArray[np.float64],
+    scale: float,
+    tolerance: float,
+) -> NDArray[np.bool_]:
+    """Return which clicks agree with the four clicks that most others agree with."""
+    best = np.ones(len(plane), dtype=np.bool_)
+    if len(plane) < 5:
+        return best
+    subsets = np.array(list(itertools.combinations(range(len(plane)), 4)))
+    if len(subsets) > _MAX_SUBSETS:
+        chosen = np.random.default_rng(0).choice(len(subsets), _MAX_SUBSETS, replace=False)
+        subsets = subsets[chosen]
+    source = plane / _PLANE_SCALE
+    target = (pixels - middle) / scale
+    ones = np.ones(len(source))
+    rows = np.zeros((len(source), 2, 8))
+    rows[:, 0, :3] = rows[:, 1, 3:6] = np.stack([*source.T, ones], axis=1)
+    rows[:, :, 6:] = -target[:, :, None] * source[:, None, :]
+    systems = rows[subsets].reshape(-1, 8, 8)
+    usable = np.abs(np.linalg.det(systems)) > 1e-9
+    if not usable.any():
+        return best
+    answers = target[subsets[usable]].reshape(-1, 8, 1)
+    solved = np.linalg.solve(systems[usable], answers)[..., 0]
+    homography = np.concatenate([solved, np.ones((len(solved), 1))], axis=1).reshape(-1, 3, 3)
+    mapped = np.einsum("hij,nj->hni", homography, _homogeneous(source))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        errors = np.linalg.norm(mapped[..., :2] / mapped[..., 2:] - target, axis=-1) * scale
+    errors = np.where(np.isfinite(errors), errors, np.inf)
+    # Clipped squared errors rank equal consensus by how well it agrees.
+    costs = np.minimum(errors, tolerance) ** 2
+    winner = int(np.argmin(costs.sum(axis=1)))
+    return np.asarray(errors[winner] < tolerance)
+
+
+def _surface_lines(
+    evidence: Evidence,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Return pixels (d, 2) on straight surface markings, the line (d, 3) and marking of each."""
+    straight = evidence.straight[evidence.drawn_marking]
+    lines = np.zeros((len(evidence.markings), 3))
+    for index, (first, stop) in enumerate(itertools.pairwise(evidence.bounds)):
+        start, end = evidence.samples_world[first, :2], evidence.samples_world[stop - 1, :2]
+        along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
+        normal = np.array([-along[1], along[0]])
+        lines[index] = [*normal, -normal @ start]
+    marking = evidence.drawn_marking[straight]
+    return evidence.drawn_image[straight], lines[marking], marking
+
+
+def _homogeneous(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.concatenate([points, np.ones((len(points), 1))], axis=1)

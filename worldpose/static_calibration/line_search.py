@@ -1,0 +1,265 @@
+"""The search for painted lines: what is known well first, and closer and closer (C4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from data_contracts.records import Record
+from worldpose.cameras import Camera
+from worldpose.static_calibration.edges import CANDIDATES, find_bars, fit_bars
+from worldpose.static_calibration.line_adjustment import Adjusted, adjust
+from worldpose.static_calibration.line_samples import LineSamples, SeenLines, see_lines
+from worldpose.static_calibration.parameters import CameraEstimate, stepped
+
+Floats = NDArray[np.float64]
+
+_ROUNDS: Final = 8
+"""Of searching and fitting at most; one or two from ordinary clicks."""
+_COARSE_ERROR: Final = 1.0
+"""Of a bar that was found but not fitted yet [px]."""
+_FEW: Final = 500
+"""Samples that are enough while bars are found to a pixel, about [1]."""
+_LEAST_REACH: Final = 1.5
+"""Bars are looked for this far beyond three standard deviations [px]."""
+_FINE: Final = 5.5
+"""Bars within this reach are measured exactly [px]."""
+_BEST: Final = 1.0 / 3.0
+"""Share of the samples that is looked for where all are known badly [1]."""
+_MOSTLY: Final = 0.8
+"""Share of the samples that must be within it [1]."""
+_TURNS: Final = 4
+"""Times that exact bars are fitted to, each time from where the camera has come to."""
+_SETTLED: Final = 0.02
+"""Largest move of a sample in the last of them [px]."""
+_READING: Final = 0.05
+"""What a fitted bar is off by at least [px]."""
+_COARSE_SCALES: Final = (np.inf, 12.0, 6.0, 4.0, 3.0, 3.0)
+_FINE_SCALES: Final = (12.0, 6.0)
+"""Scales of the loss while it tightens [standard deviations]: outliers lose their pull one by
+one, and the fit does not fall into the nearest minimum."""
+
+
+class LineRefinementSettings(Record):
+    """What is looked for, how far off, and what is believed."""
+
+    line_width: float = Field(default=0.12, gt=0)
+    """Of the paint [m]: Law 1 allows no more, and most pitches have it."""
+    survey_error: float = Field(default=0.006, ge=0)
+    """Standard deviation of the template's ends of lines from the paint, each axis [m]: a laser
+    scan, and paint that wanders by a twentieth of its width."""
+    line_shift: float = Field(default=0.05, ge=0)
+    """Standard deviation of what moves a whole marking in the picture [px], such as sharpening or
+    a rest of the lens that k1 and k2 leave."""
+    samples: int = Field(default=2000, ge=100)
+    """Samples in the picture at most, about [1]."""
+    spacing: float = Field(default=4.0, gt=0)
+    """Between neighbouring samples in the picture [px]."""
+    reach: float = Field(default=40.0, gt=0)
+    """A sample is looked for where its projection is known to within this [px], three standard
+    deviations; others wait until nearer ones have been found."""
+    contrast: float = Field(default=6.0, gt=0)
+    """Least brightness of paint above the grass on either side [levels of 255]."""
+    loss: float = Field(default=3.0, gt=0)
+    """Scale of the robust loss in the end [standard deviations]."""
+    least_found: int = Field(default=30, ge=1)
+    """Fewer samples found make no line [1]."""
+    least_share: float = Field(default=0.25, ge=0, le=1)
+    """Least share of the samples in the picture that is found where the fit puts it [1]; people
+    hide some, and worn paint."""
+    contradiction: float = Field(default=1e-6, gt=0, lt=1)
+    """A fit that the start and its covariance give less than this probability is refused [1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Bars across samples: offsets (n,) along the normals [px] and their variances (n,) [px^2]."""
+
+    offsets: Floats
+    variances: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A camera, the samples as it has them, the bars measured there, and the last fit."""
+
+    camera: Camera
+    seen: SeenLines
+    measured: Measured
+    adjusted: Adjusted
+
+
+class LineSearch:
+    """One camera's start, picture and settings."""
+
+    def __init__(
+        self, start: CameraEstimate, grey: NDArray[np.uint8], settings: LineRefinementSettings
+    ) -> None:
+        self.start, self.grey, self.settings = start, grey, settings
+        spread = np.sqrt(np.diag(start.covariance))
+        self.free = spread > 0.0
+        self.covariance = start.covariance[np.ix_(self.free, self.free)]
+        scale = spread[self.free]
+        # Scaled, since radians and pixels differ by a million in their squares.
+        shape = self.covariance / np.outer(scale, scale)
+        inverse: Floats = np.linalg.inv(shape + 1e-12 * np.eye(len(scale)))
+        self.information = inverse / np.outer(scale, scale)
+
+    def look(self, camera: Camera, samples: LineSamples) -> SeenLines:
+        """Return the samples as a camera has them."""
+        s = self.settings
+        return see_lines(camera, samples, s.line_width, s.survey_error, s.line_shift)
+
+    def run(self, samples: LineSamples) -> Found | None:
+        """Return the camera found by looking closer and closer; None where there are no lines."""
+        camera, covariance = self.start.camera, self.covariance
+        few = samples[np.arange(0, len(samples.marking), max(1, len(samples.marking) // _FEW))]
+        found = None
+        for left in reversed(range(_ROUNDS)):
+            chosen = few
+            seen = self.look(camera, few)
+            if seen.visible.sum() < 0.5 * self.settings.least_found:
+                return None
+            reach = self._reach(seen, covariance)
+            fine = left == 0 or bool((reach <= _FINE)[seen.visible].mean() >= _MOSTLY)
+            if fine:
+                chosen, seen = samples, self.look(camera, samples)
+                reach = self._reach(seen, covariance)
+            measured = self._measure(seen, reach, fine)
+            least = self.settings.least_found * len(chosen.marking) / len(samples.marking)
+            if np.isfinite(measured.offsets).sum() < least:
+                return None
+            found = self._settle(camera, chosen, seen, measured, fine)
+            if fine:
+                break
+            camera = found.camera
+            covariance = np.asarray(np.linalg.inv(found.adjusted.information))
+        return found
+
+    def reweighed(self, found: Found, samples: LineSamples, inflation: float) -> Found:
+        """Return the fit with the variances of all samples multiplied."""
+        measured = replace(found.measured, variances=found.measured.variances * inflation)
+        scales = (2.0 * self.settings.loss, *(self.settings.loss,) * 2)
+        adjusted = self._adjust(found.camera, samples, found.seen, measured, scales)
+        camera = stepped(found.camera, self._whole(adjusted.step))
+        return Found(camera, found.seen, measured, adjusted)
+
+    def distance(self, camera: Camera) -> float:
+        """Return how far a camera is from the start [standard deviations]."""
+        gone = difference(self.start.camera, camera)[self.free]
+        return float(np.sqrt(gone @ self.information @ gone))
+
+    def covariance_of(self, found: Found) -> Floats:
+        """Return the (12, 12) covariance of a fit."""
+        whole = np.zeros_like(self.start.covariance)
+        whole[np.ix_(self.free, self.free)] = np.linalg.inv(found.adjusted.information)
+        return np.asarray(0.5 * (whole + whole.T))
+
+    def _settle(
+        self,
+        camera: Camera,
+        samples: LineSamples,
+        seen: SeenLines,
+        measured: Measured,
+        fine: bool,
+    ) -> Found:
+        """Return the fit to bars that stay where they were measured."""
+        bars = seen.places + measured.offsets[:, None] * seen.normals
+        final = (self.settings.loss,) * 3
+        scales: tuple[float, ...] = (*_FINE_SCALES, *final) if fine else _COARSE_SCALES
+        for _ in range(_TURNS if fine else 1):
+            adjusted = self._adjust(camera, samples, seen, measured, scales)
+            scales = (2.0 * self.settings.loss, self.settings.loss, self.settings.loss)
+            camera = stepped(camera, self._whole(adjusted.step))
+            moved = np.abs(seen.by_camera[:, self.free] @ adjusted.step)[seen.visible]
+            seen = self.look(camera, samples)
+            measured = replace(measured, offsets=((bars - seen.places) * seen.normals).sum(-1))
+            if moved.max() < _SETTLED:
+                break
+        return Found(camera, seen, measured, adjusted)
+
+    def _reach(self, seen: SeenLines, covariance: Floats) -> Floats:
+        """Return how far samples are looked for along their normals [px]."""
+        rows = np.where(seen.visible[:, None], seen.by_camera[:, self.free], 0.0)
+        own = np.where(seen.visible, (seen.by_paint**2).sum(-1), 0.0)
+        variance = ((rows @ covariance) * rows).sum(-1) + own
+        return np.asarray(3.0 * np.sqrt(variance) + _LEAST_REACH)
+
+    def _measure(self, seen: SeenLines, reach: Floats, fine: bool) -> Measured:
+        """Return the bars that the samples are taken to be, exactly or to a pixel."""
+        s, count = self.settings, len(reach)
+        # Where nothing is known well, the best known third begins.
+        limit = max(s.reach, float(np.quantile(reach[seen.visible], _BEST)))
+        usable = seen.visible & (reach <= limit)
+        offsets, strengths = np.empty((count, CANDIDATES)), np.empty((count, CANDIDATES))
+        across = seen.places, seen.normals, seen.widths
+        looked = np.where(usable, reach, -1.0)
+        find_bars(self.grey, *across, looked, s.contrast, offsets, strengths)
+        # The likelier is the nearer, in standard deviations, and the stronger.
+        away = 3.0 * offsets / reach[:, None]
+        with np.errstate(divide="ignore"):
+            merit = np.where(np.isnan(offsets), -np.inf, np.log(strengths) - 0.5 * away**2)
+        best = offsets[np.arange(count), merit.argmax(axis=1)]
+        if not fine:
+            return Measured(best, np.full(count, _COARSE_ERROR**2))
+        exact, variances = np.empty(count), np.empty(count)
+        fit_bars(self.grey, *across, best, s.contrast, exact, variances)
+        return Measured(exact, variances + _READING**2)
+
+    def _adjust(
+        self,
+        camera: Camera,
+        samples: LineSamples,
+        seen: SeenLines,
+        measured: Measured,
+        scales: tuple[float, ...],
+    ) -> Adjusted:
+        """Return the step from a camera to the best one."""
+        known = np.flatnonzero(seen.visible)
+        adjusted = adjust(
+            measured.offsets[known],
+            measured.variances[known],
+            np.ascontiguousarray(seen.by_camera[np.ix_(known, np.flatnonzero(self.free))]),
+            np.ascontiguousarray(seen.by_paint[known]),
+            samples.marking[known],
+            self._prior(camera),
+            scales,
+        )
+        residuals, weights = np.full(len(seen.visible), np.nan), np.zeros(len(seen.visible))
+        residuals[known], weights[known] = adjusted.residuals, adjusted.weights
+        return replace(adjusted, residuals=residuals, weights=weights)
+
+    def _prior(self, camera: Camera) -> tuple[Floats, Floats]:
+        """Return information and expected step of the free parameters, at a camera."""
+        gone = difference(self.start.camera, camera)
+        # A further turn also turns the way gone so far.
+        chain = np.eye(len(gone))
+        x, y, z = gone[3:6]
+        chain[3:6, :3] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        chain = chain[np.ix_(self.free, self.free)]
+        information: Floats = chain.T @ self.information @ chain
+        expected = np.linalg.solve(chain, -gone[self.free])
+        return information, np.asarray(expected, dtype=np.float64)
+
+    def _whole(self, step: Floats) -> Floats:
+        whole = np.zeros(len(self.free))
+        whole[self.free] = step
+        return whole
+
+
+def difference(start: Camera, camera: Camera) -> Floats:
+    """Return the (12,) step from one camera to another."""
+    moved = camera.cam_from_world @ start.cam_from_world.inverse()
+    return np.concatenate(
+        [
+            moved.rotvec,
+            moved.translation,
+            np.log(camera.focal[:1] / start.focal[:1]),
+            camera.principal_point - start.principal_point,
+            (camera.distortion - start.distortion)[[0, 1, 4]],
+        ]
+    )

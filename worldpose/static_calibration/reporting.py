@@ -1,0 +1,112 @@
+"""The report of a calibration out of its fit."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration.adjustment import Problem, row_of
+from worldpose.static_calibration.advice import most_helpful
+from worldpose.static_calibration.ground_error import ground_error_map
+from worldpose.static_calibration.line_refinement import LineRefinement
+from worldpose.static_calibration.parameters import PARAMETERS, CameraEstimate
+from worldpose.static_calibration.report import (
+    CalibrationReport,
+    MarkingResidual,
+    PointResidual,
+)
+from worldpose.static_calibration.screening import Screened, residual_rows
+from worldpose.static_calibration.settings import StaticCalibrationSettings
+
+_TRUSTED: Final = 4.0
+"""Mean loss of an observation [1] to which a camera's residuals are not surprising: twice the
+stated noise."""
+
+
+def report_of(
+    estimate: CameraEstimate,
+    problem: Problem,
+    fit: Screened,
+    decisions: tuple[str, ...],
+    lines: LineRefinement | None,
+    pitch: PitchTemplate,
+    settings: StaticCalibrationSettings,
+) -> CalibrationReport:
+    """Return what there is to say about a camera.
+
+    Args:
+        estimate: the final one.
+        problem: what stage 2 fitted to.
+        fit: stage 2.
+        decisions: what was chosen so far.
+        lines: stage 3, where there was a picture.
+        pitch: the template.
+        settings: thresholds.
+    """
+    evidence = problem.evidence
+    rows = residual_rows(problem, row_of(estimate.camera))
+    ranked = np.argsort(-fit.surprise, kind="stable")
+    points = tuple(
+        PointResidual(
+            evidence.points[i], rows.click[i], float(fit.surprise[i]), bool(fit.inliers[i])
+        )
+        for i in ranked
+    )
+    drawn = [
+        _marking_residual(
+            name, rows.drawn[evidence.drawn_marking == index], bool(fit.markings[index])
+        )
+        for index, name in enumerate(evidence.markings)
+    ]
+    known = ground_error_map(estimate, pitch, settings.map_step)
+    reasons = []
+    if known.median > settings.weak_median:
+        reasons.append(
+            f"expected ground error {known.median:.2f} m (median over the seen pitch), "
+            f"over {settings.weak_median:g} m"
+        )
+    if known.p95 > settings.weak_p95:
+        reasons.append(
+            f"expected ground error {known.p95:.2f} m on the worst twentieth of the seen pitch, "
+            f"over {settings.weak_p95:g} m"
+        )
+    if fit.misfit > _TRUSTED:
+        reasons.append(
+            f"residuals {np.sqrt(fit.misfit):.1f} times the stated noise: a name may be wrong"
+        )
+    if lines is not None:
+        found = f"{lines.effective_samples:.0f} independent samples" if lines.refined else "none"
+        decisions = (*decisions, f"painted lines: {lines.reason or found}")
+    clicked = (*evidence.points, *evidence.markings)
+    return CalibrationReport(
+        stage="lines" if lines is not None and lines.refined else "points",
+        free=tuple(name for name, free in zip(PARAMETERS, problem.free, strict=True) if free),
+        decisions=decisions,
+        points=points,
+        drawn=tuple(sorted(drawn, key=lambda marking: -marking.rms)),
+        wrong=(
+            *(point.name for point in points if not point.inlier),
+            *(marking.name for marking in drawn if not marking.inlier),
+        ),
+        noise_scale=fit.noise_scale,
+        condition=_condition(fit.covariance, problem.free),
+        ground_error=known,
+        weak=bool(reasons),
+        reasons=tuple(reasons),
+        add_next=most_helpful(estimate, pitch, clicked, settings.click_noise),
+        lines=lines,
+    )
+
+
+def _marking_residual(name: str, off: NDArray[np.float64], inlier: bool) -> MarkingResidual:
+    rms, worst = float(np.sqrt(np.mean(off**2))), float(np.abs(off).max())
+    return MarkingResidual(name, len(off), rms, worst, inlier)
+
+
+def _condition(covariance: NDArray[np.float64], free: NDArray[np.bool_]) -> float:
+    inner = covariance[np.ix_(free, free)]
+    spread = np.sqrt(np.diag(inner))
+    return float(np.linalg.cond(inner / np.outer(spread, spread)))

@@ -1,0 +1,197 @@
+"""Compiled residuals of clicks, drawn points and priors, with derivatives.
+
+A camera is the row of 22 numbers of `worldpose.cameras.projection`; a step has the order of
+`PARAMETERS`. Residuals are in standard deviations.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.cameras.projection import project_with_jacobians
+from worldpose.compiled import compiled
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+SIZE: Final = 12
+"""Parameters of a step."""
+PRIORS: Final = 9
+"""Rows of the prior: focal, cx, cy, k1, k2, k3, height, distance, roll."""
+
+_LOST: Final = 1e3
+"""Residual [px] of what the camera does not see at all: farther off than any pixel."""
+_NEAR: Final = 0.5
+"""Least depth of a drawn marking's sample [m]."""
+_REACH: Final = 1.5
+"""Radius, in half diagonals of the picture, to which distortion is followed for samples: beyond,
+polynomials may fold a marking back into the picture."""
+
+
+@compiled
+def point_residuals(
+    c: Floats, world: Floats, pixels: Floats, residual: Floats, jacobian: Floats
+) -> None:
+    """Write pixel residuals (n, 2) of points and their derivatives (n, 2, 12) by a step [px]."""
+    n = len(world)
+    image = np.empty((1, n, 2))
+    full = np.empty((1, n, 2, 18))
+    status = np.empty((1, n), dtype=np.uint8)
+    project_with_jacobians(c.reshape(1, 22), world.reshape(1, n, 3), image, full, status)
+    for i in range(n):
+        for k in range(2):
+            if status[0, i] != 0:
+                residual[i, k] = _LOST
+                jacobian[i, k] = 0.0
+                continue
+            d = full[0, i, k]
+            residual[i, k] = image[0, i, k] - pixels[i, k]
+            for j in range(6):
+                jacobian[i, k, j] = d[3 + j]
+            jacobian[i, k, 6] = d[9] * c[0] + d[10] * c[1]
+            jacobian[i, k, 7], jacobian[i, k, 8] = d[11], d[12]
+            jacobian[i, k, 9], jacobian[i, k, 10], jacobian[i, k, 11] = d[13], d[14], d[17]
+
+
+@compiled
+def nearest_on_markings(
+    c: Floats,
+    reach: float,
+    samples: Floats,
+    bounds: Integers,
+    pixels: Floats,
+    marking: Integers,
+    place: Floats,
+    normal: Floats,
+) -> None:
+    """Write where each drawn pixel lies on its marking, and the unit normal from there.
+
+    Args:
+        c: (22,) camera.
+        reach: half the picture's diagonal [px].
+        samples: (s, 3) [m], world.
+        bounds: (m + 1,) of the markings' samples.
+        pixels: (d, 2) [px].
+        marking: (d,).
+        place: (d, 3) [m], world, written; NaN where the marking is not before the camera.
+        normal: (d, 2), written: from the marking to the pixel, either sign.
+    """
+    cap = (_REACH * reach / c[0]) ** 2
+    image = np.empty((len(samples), 2))
+    for i in range(len(samples)):
+        p = samples[i]
+        z = c[15] * p[0] + c[16] * p[1] + c[17] * p[2] + c[20]
+        if z < _NEAR:
+            image[i] = np.nan
+            continue
+        x = (c[9] * p[0] + c[10] * p[1] + c[11] * p[2] + c[18]) / z
+        y = (c[12] * p[0] + c[13] * p[1] + c[14] * p[2] + c[19]) / z
+        s = min(x * x + y * y, cap)
+        radial = 1.0 + s * (c[4] + s * (c[5] + s * c[8]))
+        image[i, 0] = c[0] * x * radial + c[2]
+        image[i, 1] = c[1] * y * radial + c[3]
+    for i in range(len(pixels)):
+        best = np.inf
+        place[i] = np.nan
+        normal[i] = 0.0
+        for j in range(bounds[marking[i]], bounds[marking[i] + 1] - 1):
+            ax, ay = image[j, 0], image[j, 1]
+            dx, dy = image[j + 1, 0] - ax, image[j + 1, 1] - ay
+            ex, ey = pixels[i, 0] - ax, pixels[i, 1] - ay
+            length = max(dx * dx + dy * dy, 1e-18)
+            share = min(max((ex * dx + ey * dy) / length, 0.0), 1.0)
+            ox, oy = ex - share * dx, ey - share * dy
+            distance = ox * ox + oy * oy
+            # A NaN on either end compares false.
+            if distance < best:
+                best = distance
+                for k in range(3):
+                    place[i, k] = (1.0 - share) * samples[j, k] + share * samples[j + 1, k]
+                root = np.sqrt(length)
+                normal[i, 0], normal[i, 1] = -dy / root, dx / root
+                off = np.sqrt(distance)
+                # Beyond the marking's end the nearest point is the end itself.
+                if (share == 0.0 or share == 1.0) and off > 1e-9:
+                    normal[i, 0], normal[i, 1] = ox / off, oy / off
+
+
+@compiled
+def drawn_residuals(
+    c: Floats,
+    reach: float,
+    samples: Floats,
+    bounds: Integers,
+    pixels: Floats,
+    marking: Integers,
+    residual: Floats,
+    jacobian: Floats,
+) -> None:
+    """Write distances (d,) of drawn pixels to their projected markings, and derivatives (d, 12).
+
+    The place along the marking is eliminated: at the nearest point the distance does not change
+    with it, so that the derivative is the normal times that of the point's pixel.
+    """
+    n = len(pixels)
+    place = np.empty((n, 3))
+    normal = np.empty((n, 2))
+    nearest_on_markings(c, reach, samples, bounds, pixels, marking, place, normal)
+    both = np.empty((n, 2))
+    by_step = np.empty((n, 2, SIZE))
+    point_residuals(c, place, pixels, both, by_step)
+    for i in range(n):
+        if np.isnan(place[i, 0]) or both[i, 0] == _LOST:
+            residual[i] = _LOST
+            jacobian[i] = 0.0
+            continue
+        residual[i] = normal[i, 0] * both[i, 0] + normal[i, 1] * both[i, 1]
+        for j in range(SIZE):
+            jacobian[i, j] = normal[i, 0] * by_step[i, 0, j] + normal[i, 1] * by_step[i, 1, j]
+
+
+@compiled
+def prior_residuals(c: Floats, prior: Floats, residual: Floats, jacobian: Floats) -> None:
+    """Write the prior's residuals (9,) and derivatives (9, 12).
+
+    Args:
+        c: (22,) camera.
+        prior: (15,) log focal, its spread; cx, cy, their spread; half diagonal [px]; spreads of
+            k1, k2, k3; log height, its spread; log distance, its spread; spread of the roll; the
+            least height [m] that counts.
+        residual: (9,), written.
+        jacobian: (9, 12), written.
+    """
+    jacobian[:] = 0.0
+    residual[0] = (np.log(c[0]) - prior[0]) / prior[1]
+    jacobian[0, 6] = 1.0 / prior[1]
+    for k in range(2):
+        residual[1 + k] = (c[2 + k] - prior[2 + k]) / prior[4]
+        jacobian[1 + k, 7 + k] = 1.0 / prior[4]
+    squared = (prior[5] / c[0]) ** 2
+    power = 1.0
+    for k in range(3):
+        power *= squared
+        # The corner's displacement: the same lens bends a long picture's corner less.
+        value = c[8] if k == 2 else c[4 + k]
+        residual[3 + k] = value * power / prior[6 + k]
+        jacobian[3 + k, 9 + k] = power / prior[6 + k]
+        jacobian[3 + k, 6] = -2.0 * (k + 1.0) * residual[3 + k]
+    # The center moves by -R^T d with the step's shift d, and not with its rotation.
+    x = -(c[9] * c[18] + c[12] * c[19] + c[15] * c[20])
+    y = -(c[10] * c[18] + c[13] * c[19] + c[16] * c[20])
+    z = -(c[11] * c[18] + c[14] * c[19] + c[17] * c[20])
+    high = max(z, prior[14])
+    # Below the least height the logarithm goes on as its tangent: no camera is underground, where
+    # mirrored names would put it.
+    residual[6] = (np.log(high) + (z - high) / high - prior[9]) / prior[10]
+    far = max(np.sqrt(x * x + y * y), 1.0)
+    residual[7] = (np.log(far) - prior[11]) / prior[12]
+    for k in range(3):
+        jacobian[6, 3 + k] = -c[11 + 3 * k] / high / prior[10]
+        along = (x * c[9 + 3 * k] + y * c[10 + 3 * k]) / far
+        jacobian[7, 3 + k] = -along / far / prior[12]
+    residual[8] = c[11] / prior[13]
+    jacobian[8, 1] = c[17] / prior[13]
+    jacobian[8, 2] = -c[14] / prior[13]

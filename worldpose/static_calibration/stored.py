@@ -1,0 +1,58 @@
+"""A calibration as the arrays and attributes of `data_contracts.static_calibration`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.cameras.stored import camera_arrays
+from worldpose.static_calibration.report import StaticCalibration
+
+
+def calibration_arrays(calibration: StaticCalibration) -> dict[str, NDArray[Any]]:
+    """The stored arrays of a calibrated camera, by name.
+
+    A given camera has those of `camera_arrays` alone.
+    """
+    report = calibration.report
+    return {
+        **camera_arrays(calibration.estimate.camera),
+        "covariance": calibration.estimate.covariance,
+        "point_residual": np.array([p.residual for p in report.points]).reshape(-1, 2),
+        "point_surprise": np.array([p.surprise for p in report.points], dtype=np.float64),
+        "point_inlier": np.array([p.inlier for p in report.points], dtype=np.bool_),
+        "marking_rms": np.array([m.rms for m in report.drawn], dtype=np.float64),
+        "marking_worst": np.array([m.worst for m in report.drawn], dtype=np.float64),
+        "marking_inlier": np.array([m.inlier for m in report.drawn], dtype=np.bool_),
+        "ground_error": report.ground_error.expected,
+    }
+
+
+def calibration_coordinates(calibration: StaticCalibration) -> dict[str, NDArray[Any]]:
+    """The stored coordinates: places of the expected ground error; a given camera has none."""
+    known = calibration.report.ground_error
+    return {"ground_x": known.x, "ground_y": known.y}
+
+
+def calibration_attributes(camera_id: str, calibration: StaticCalibration | None) -> dict[str, Any]:
+    """The stored attributes of a camera; without a calibration it was given."""
+    if calibration is None:
+        lists = ("point", "marking", "free", "decisions", "reasons", "add_next")
+        nothing: dict[str, Any] = {name: [] for name in lists}
+        numbers = {"noise_scale": None, "condition": None}
+        return {"camera_id": camera_id, "origin": "given", **nothing, **numbers}
+    report = calibration.report
+    return {
+        "camera_id": camera_id,
+        "origin": report.stage,
+        "point": [point.name for point in report.points],
+        "marking": [marking.name for marking in report.drawn],
+        "free": list(report.free),
+        "decisions": list(report.decisions),
+        "reasons": list(report.reasons),
+        "add_next": list(report.add_next),
+        "noise_scale": report.noise_scale,
+        "condition": report.condition,
+    }

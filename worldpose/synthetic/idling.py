@@ -1,0 +1,73 @@
+"""When people who stand do what, and when a goalkeeper is ready."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.synthetic.motions import Action
+from worldpose.synthetic.paths import GroundPath
+from worldpose.synthetic.settings import ActionRates
+from worldpose.synthetic.standing import hands_on_hips, look_around, ready, shift_weight
+
+Floats = NDArray[np.float64]
+
+STANDING_SPEED: Final = 0.25
+"""Who is slower stands [m/s]."""
+SHORTEST: Final = 1.6
+"""Shortest rest in which people do something [s]."""
+LONGEST: Final = (3.0, 6.0)
+"""What they do takes at most between these [s]."""
+ALERT: Final = 35.0
+"""Ball's distance to the goal at which a goalkeeper gets ready [m]."""
+
+
+def stand_about(path: GroundPath, rates: ActionRates, rng: np.random.Generator) -> GroundPath:
+    """Return the path with what a person does who stands: shift weight, look, hands on hips."""
+    motions = (shift_weight, look_around, hands_on_hips)
+    actions = list(path.actions)
+    for begin, end in _rests(path):
+        while end - begin > SHORTEST:
+            duration = min(end - begin, rng.uniform(*LONGEST))
+            kind, left = rng.choice(len(motions), p=(0.5, 0.3, 0.2)), bool(rng.random() < 0.5)
+            if rng.random() < rates.standing_about:
+                actions.append(Action(begin, motions[kind](duration), left))
+            begin += duration
+    return replace(path, actions=_in_order(actions))
+
+
+def keep_ready(path: GroundPath, goal: Floats, ball: Floats) -> GroundPath:
+    """Return a goalkeeper's path on which he is ready while he stands and the ball is near.
+
+    Args:
+        path: of the goalkeeper.
+        goal: (2,) [m].
+        ball: (samples, 2) [m], at the path's times.
+    """
+    near = np.linalg.norm(ball - goal, axis=-1) < ALERT
+    actions = list(path.actions)
+    for begin, end in _rests(path, near):
+        if end - begin > SHORTEST:
+            actions.append(Action(begin, ready(end - begin)))
+    return replace(path, actions=_in_order(actions))
+
+
+def _rests(path: GroundPath, also: NDArray[np.bool_] | None = None) -> list[tuple[float, float]]:
+    """Begins and ends [s] of stretches in which a person stands and does nothing else."""
+    still = path.speed < STANDING_SPEED
+    turning = np.abs(np.gradient(path.heading, path.time))
+    still &= turning < 0.5 * STANDING_SPEED
+    if also is not None:
+        still &= also
+    for action in path.actions:
+        still &= (path.time < action.begin) | (path.time > action.end)
+    edges = np.diff(np.concatenate([[0], still.astype(np.int8), [0]]))
+    begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
+    return [(float(path.time[a]), float(path.time[b])) for a, b in zip(begins, ends, strict=True)]
+
+
+def _in_order(actions: list[Action]) -> tuple[Action, ...]:
+    return tuple(sorted(actions, key=lambda action: action.begin))

@@ -1,0 +1,225 @@
+"""Which fragment of a track goes on as which other, by motion and size, and how sure that is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from worldpose.tracking.limbs import limb_lengths
+from worldpose.tracking.settings import TrackingSettings
+
+TORSO = (5, 6, 11, 12)
+"""Shoulders and hips, whose mean is the place of a body."""
+PLACE_NOISE = 0.1
+"""Standard deviation of a place from few frames [m]."""
+VELOCITY_NOISE = 0.5
+"""Standard deviation of a velocity from few frames [m/s]."""
+TOP_SPEED = 9.5
+"""Nobody runs faster [m/s]."""
+
+
+@dataclass(frozen=True)
+class End:
+    """A track where it begins or stops.
+
+    Attributes:
+        number: of the track.
+        frame: first or last frame.
+        place: (2,) [m], on the ground.
+        velocity: (2,) [m/s]; NaN where not known.
+        limbs: (11,) lengths [m], over the whole track; NaN where not known.
+        limb_variance: (11,) of those lengths [m^2].
+    """
+
+    number: int
+    frame: int
+    place: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    limbs: NDArray[np.float64]
+    limb_variance: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A place in a clip where one track may go on as another.
+
+    Attributes:
+        before: number of the track that stops.
+        after: number of the track that begins.
+        last_frame: of the first.
+        first_frame: of the second.
+        cost: minus the logarithm of the odds that they are one person rather than two strangers.
+        margin: by how much every other way of joining the tracks is worse [nat].
+        decided: whether they were joined.
+    """
+
+    before: int
+    after: int
+    last_frame: int
+    first_frame: int
+    cost: float
+    margin: float
+    decided: bool
+
+
+def ends_of(
+    number: int,
+    frames: NDArray[np.int64],
+    joints: NDArray[np.float64],
+    fps: float,
+    settings: TrackingSettings,
+) -> tuple[End, End]:
+    """Return how a track begins and how it stops.
+
+    Args:
+        number: of the track.
+        frames: (n,) frames whose rays determined the place.
+        joints: (n, 17, 3) [m], world; NaN where not determined.
+        fps: frames per second [1/s].
+        settings: times.
+    """
+    torso, whole = _mean_known(joints[:, TORSO]), _mean_known(joints)
+    places = np.where(np.isfinite(torso), torso, whole)
+    limbs, variance = limb_lengths(joints, fps)
+    out = []
+    for edge in (0, -1):
+        near = np.abs(frames - frames[edge]) <= settings.end_time * fps
+        time = (frames[near] - frames[edge]) / fps
+        place, velocity = places[edge], np.full(2, np.nan)
+        if np.count_nonzero(near) >= 3:
+            slope = np.polynomial.polynomial.polyfit(time, places[near], 1)
+            place, velocity = slope[0], slope[1]
+        out.append(End(number, int(frames[edge]), place, velocity, limbs, variance))
+    return out[0], out[1]
+
+
+def _mean_known(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean place (n, 2) of the points known among (n, points, 3); NaN without any."""
+    known: NDArray[np.bool_] = np.isfinite(points[..., :1])
+    total = np.where(known, points[..., :2], 0.0).sum(axis=1)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(total / known.sum(axis=1))
+
+
+def join_costs(
+    before: list[End],
+    after: list[End],
+    fps: float,
+    area: float,
+    settings: TrackingSettings,
+) -> NDArray[np.float64]:
+    """Return the cost of every track that stops going on as every track that begins.
+
+    Between two sightings a person's velocity wanders at random: the place where the second track
+    begins is expected at the mean of both velocities, or at the first's where the second's is not
+    known yet, and the doubt grows with the gap. A stranger may appear anywhere on the area, at
+    any speed and of any size.
+
+    Args:
+        before: n tracks that stop.
+        after: m tracks that begin.
+        fps: frames per second [1/s].
+        area: ground on which people move [m^2].
+        settings: how people move and differ.
+
+    Returns:
+        (n, m) [nat], minus the log odds of one person; infinite where impossible.
+    """
+    costs = np.full((len(before), len(after)), np.inf)
+    for i, old in enumerate(before):
+        for j, new in enumerate(after):
+            gap = (new.frame - old.frame) / fps
+            if 0.0 < gap <= settings.max_gap:
+                costs[i, j] = _cost(old, new, gap, area, settings)
+    return costs
+
+
+def _cost(old: End, new: End, gap: float, area: float, settings: TrackingSettings) -> float:
+    """Return minus the log odds that two ends `gap` [s] apart are one person."""
+    offset = new.place - old.place
+    if np.linalg.norm(offset) > TOP_SPEED * gap + 3.0 * PLACE_NOISE:
+        return math.inf
+    first = np.nan_to_num(old.velocity)
+    both = bool(np.isfinite(new.velocity).all())
+    change = new.velocity - first
+    memory = settings.velocity_memory
+    short = min(gap, memory)
+    mean = 0.5 * (first + new.velocity) if both else first
+    offset = offset - mean * memory * (1.0 - math.exp(-gap / memory))
+    prior, likelihood = [], []
+    for share, pace in settings.paces:
+        agility, speed = pace * settings.agility, pace * settings.mean_speed
+        variance = PLACE_NOISE**2 + agility**2 * short**3 / (12.0 if both else 3.0)
+        variance += 2.0 * speed**2 * memory * (gap - short)
+        prior.append(math.log(share) + _log_normal(first, speed**2 + VELOCITY_NOISE**2))
+        likelihood.append(prior[-1] + _log_normal(offset, variance))
+        if both:
+            spread = VELOCITY_NOISE**2 + agility**2 * short
+            likelihood[-1] += _log_normal(change, spread)
+    cost = float(np.logaddexp.reduce(prior) - np.logaddexp.reduce(likelihood)) - math.log(area)
+    if both:
+        cost += _log_normal(change, VELOCITY_NOISE**2 + 2.0 * settings.mean_speed**2)
+    difference = new.limbs - old.limbs
+    known = np.isfinite(difference)
+    own = settings.limb_noise**2 + old.limb_variance[known] + new.limb_variance[known]
+    other = own + 2.0 * settings.limb_spread**2
+    evidence = 0.5 * difference[known] ** 2 * (1.0 / own - 1.0 / other) + 0.5 * np.log(own / other)
+    # Limbs of one person err and differ together: their mean is worth two of them.
+    return cost + (2.0 * float(evidence.mean()) if known.any() else 0.0)
+
+
+def _log_normal(offset: NDArray[np.float64], variance: float) -> float:
+    """Return the logarithm of the density of a normal distribution in the plane."""
+    return -0.5 * float(offset @ offset) / variance - math.log(2.0 * math.pi * variance)
+
+
+def decide(
+    before: list[End],
+    after: list[End],
+    costs: NDArray[np.float64],
+    newcomer_odds: NDArray[np.float64],
+    settings: TrackingSettings,
+) -> list[Candidate]:
+    """Return the joins of the likeliest way to go on, each with its margin, cheapest first.
+
+    A join is decided when its odds against every other way are at least `join_odds`; the others
+    are for a person to decide.
+
+    Args:
+        before: n tracks that stop.
+        after: m tracks that begin.
+        costs: (n, m) [nat].
+        newcomer_odds: (m,) odds beforehand that the track is somebody new, not somebody lost.
+        settings: odds that decide.
+    """
+    sure = math.log(settings.join_odds)
+    gain = np.minimum(costs + np.log(newcomer_odds), 0.0)
+    row, column = np.flatnonzero((gain < 0.0).any(1)), np.flatnonzero((gain < 0.0).any(0))
+    gain = gain[np.ix_(row, column)]
+    chosen, best = _cheapest(gain)
+    joins = []
+    for i, j in chosen:
+        kept = gain[i, j]
+        gain[i, j] = 0.0
+        margin = _cheapest(gain)[1] - best
+        gain[i, j] = kept
+        old, new = before[row[i]], after[column[j]]
+        cost = float(costs[row[i], column[j]])
+        joins.append(
+            Candidate(
+                old.number, new.number, old.frame, new.frame, cost, float(margin), margin >= sure
+            )
+        )
+    return sorted(joins, key=lambda join: (join.cost, join.before))
+
+
+def _cheapest(gain: NDArray[np.float64]) -> tuple[list[tuple[int, int]], float]:
+    """Return the pairs of the cheapest matching and its cost; no pair costs nothing."""
+    row, column = linear_sum_assignment(gain)
+    used = gain[row, column] < 0.0
+    pairs = list(zip(row[used].tolist(), column[used].tolist(), strict=True))
+    return pairs, float(gain[row, column].sum())

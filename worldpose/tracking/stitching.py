@@ -1,0 +1,36 @@
+"""The tracks of a whole clip joined into people, by what comes before and after every gap."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from worldpose.tracking.following import Follower
+from worldpose.tracking.joining import Candidate, decide, join_costs
+from worldpose.tracking.person import Person
+from worldpose.tracking.rosters import most_at_once
+
+
+def join_tracks(
+    tracks: list[Person], follower: Follower
+) -> tuple[list[Candidate], list[list[Person]]]:
+    """Return the joins of a clip's tracks, and the people as chains of tracks in time order."""
+    if not tracks:
+        return [], []
+    numbers = [person.number for person in tracks]
+    ends = [follower.end_of(person) for person in tracks]
+    starts, stops = [start for start, _ in ends], [stop for _, stop in ends]
+    settings = follower.settings
+    costs = join_costs(stops, starts, follower.fps, follower.area, settings)
+    odds = np.array([follower.newcomer_odds(most_at_once(tracks, start.frame)) for start in starts])
+    joins = decide(stops, starts, costs, odds, settings)
+    after = {join.before: join.after for join in joins if join.decided}
+    people = {person.number: person for person in tracks}
+    chains = []
+    for number in numbers:
+        if number in after.values():
+            continue
+        chain = [people[number]]
+        while chain[-1].number in after:
+            chain.append(people[after[chain[-1].number]])
+        chains.append(chain)
+    return joins, chains

@@ -1,0 +1,76 @@
+"""How far calibration is expected to misplace each person in each picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.cameras import Camera
+from worldpose.triangulation.settings import TriangulationSettings
+
+Floats = NDArray[np.float64]
+
+RADIAL = [0, 1, 4]
+"""k1, k2, k3 among the five coefficients."""
+
+
+@dataclass(frozen=True, eq=False)
+class StatedErrors:
+    """Variance of people's places in pictures that calibration causes.
+
+    Attributes:
+        variance: (frames, cameras, persons) per axis [px^2]; 0 where the person is not known.
+        scale: (frames, cameras, persons) pixels a metre there [px/m]; 0 where not known.
+    """
+
+    variance: Floats
+    scale: Floats
+
+    def misplacement(self, factor: float) -> tuple[float | None, ...]:
+        """Return what the variance times `factor` is at the median person [m]."""
+        figures: list[float | None] = []
+        for camera in range(self.variance.shape[1]):
+            there = self.variance[:, camera] > 0.0
+            squared = self.variance[:, camera][there] / self.scale[:, camera][there] ** 2
+            figures.append(float(np.sqrt(factor * np.median(squared))) if len(squared) else None)
+        return tuple(figures)
+
+
+def stated_errors(
+    cameras: Camera,
+    joints: Floats,
+    settings: TriangulationSettings,
+    camera_covariance: Floats | None,
+) -> StatedErrors:
+    """Return the variance of each person's place in each picture.
+
+    Args:
+        cameras: batch (cameras,).
+        joints: (frames, persons, joints, 3) [m], world; people are taken at their mean.
+        settings: `calibration_error` stands in for a covariance.
+        camera_covariance: (cameras, 12, 12) of steps in the order of `PARAMETERS`, or None.
+    """
+    found = np.isfinite(joints[..., 0])
+    number = np.maximum(found.sum(axis=-1), 1)[..., None]
+    places = np.where(found[..., None], joints, 0.0).sum(axis=-2) / number
+    known = found.any(axis=-1)
+    pose = cameras.cam_from_world
+    shape = (len(joints), len(cameras.focal), joints.shape[1])
+    variance, scale = np.zeros(shape), np.zeros(shape)
+    for camera in range(shape[1]):
+        depth = places @ pose.rotation[camera, 2] + pose.translation[camera, 2]
+        before = known & (depth > 0.0)
+        size = np.sqrt(cameras.focal[camera].prod()) / np.where(before, depth, 1.0)
+        scale[:, camera] = np.where(before, size, 0.0)
+        if camera_covariance is None:
+            variance[:, camera] = (settings.calibration_error * scale[:, camera]) ** 2
+            continue
+        seen = cameras[camera].project_with_jacobians(places[before])
+        by_focal = (seen.d_intrinsics[..., :2] * cameras.focal[camera]).sum(-1, keepdims=True)
+        steps = (seen.d_pose, by_focal, seen.d_intrinsics[..., 2:], seen.d_distortion[..., RADIAL])
+        jacobian = np.concatenate(steps, axis=-1)
+        spread = np.einsum("nap,pq,naq->n", jacobian, camera_covariance[camera], jacobian) / 2.0
+        variance[:, camera][before] = np.where(np.isfinite(spread), spread, 0.0)
+    return StatedErrors(variance, scale)

@@ -1,0 +1,244 @@
+"""Clocks of the cameras: by how many frames each is late, seen in how people's rays miss.
+
+A camera that is late by d frames shows in its frame t what happened at t + d: its rays miss a
+person by the person's way in d frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.records import Record
+from worldpose.cameras import Camera, projection
+from worldpose.triangulation.noise_model import NoiseModel
+from worldpose.triangulation.observations import Rig
+from worldpose.triangulation.settings import TriangulationSettings
+from worldpose.triangulation.solving import no_shift, solve
+
+Floats = NDArray[np.float64]
+Moved = tuple[Floats, Floats, NDArray[np.int16]]
+
+GATES: Final = (10.0, 10.0, 5.0, 3.5, 3.5, 3.5, 3.5)
+"""Deviations accepted in each round: clocks three frames apart put a runner's rays half a metre
+apart."""
+SETTLED: Final = 0.005
+"""Change that ends the rounds [frame]."""
+SAMPLE: Final = 3000
+"""Person-frames looked at."""
+WINDOW: Final = 1.0
+"""Length of a stretch of frames, whose errors count as one [s]."""
+VELOCITY_TIME: Final = 0.06
+"""Half the time over which velocity is taken [s]."""
+UNKNOWN: Final = 10.0
+"""Standard deviation of an offset of which nothing is known [frame]."""
+
+
+class ClockReport(Record):
+    """The same as figures, a value a camera."""
+
+    clock_late_frames: tuple[float | None, ...]
+    """None where too little moves."""
+    clock_error_frames: tuple[float | None, ...]
+    """Standard error."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraClocks:
+    """By how much cameras are late.
+
+    Attributes:
+        late: (cameras,) [frame]: frame t shows the time t + late of the cameras' mean clock; NaN
+            where `determined` is false.
+        standard_error: (cameras,) [frame]; several frames without motion.
+        determined: (cameras,) bool, known to better than the settings' `clock_error`.
+    """
+
+    late: Floats
+    standard_error: Floats
+    determined: NDArray[np.bool_]
+
+    @property
+    def report(self) -> ClockReport:
+        """The figures of the clocks."""
+        late = zip(self.late.tolist(), self.determined.tolist(), strict=True)
+        return ClockReport(
+            clock_late_frames=tuple(value if known else None for value, known in late),
+            clock_error_frames=tuple(self.standard_error.tolist()),
+        )
+
+
+def estimate_clocks(
+    cameras: Camera,
+    keypoints: NDArray[np.floating],
+    confidence: NDArray[np.floating],
+    detection_index: NDArray[np.int16],
+    fps: float,
+    settings: TriangulationSettings,
+) -> CameraClocks:
+    """Return by how much each camera's frames are late against the cameras' mean.
+
+    Round by round people are triangulated, each camera's misses are regressed on the people's
+    velocity in its picture, with the people free to follow, and its observations are moved in time
+    by what was found. At the end no miss goes with velocity, so that its noise does not matter.
+
+    Args:
+        cameras: batch (cameras,).
+        keypoints: (frames, cameras, detections, 17, 2) [px].
+        confidence: (frames, cameras, detections, 17).
+        detection_index: (frames, cameras, persons).
+        fps: frames per second [1/s].
+        settings: noise, and the standard error up to which a clock counts as known.
+    """
+    rig = Rig.of(cameras)
+    count = len(rig.cameras)
+    late, error = np.zeros(count), np.full(count, UNKNOWN)
+    parts = _stretches(detection_index, max(3, round(WINDOW * fps)))
+    for gate in GATES if parts else ():
+        loose = settings.model_copy(update={"max_deviation": gate})
+        arrays = [
+            (keypoints[part], confidence[part], detection_index[part], late) for part in parts
+        ]
+        sums = [_regression(rig, *each, fps, loose) for each in arrays]
+        information = np.concatenate([each[0] for each in sums])
+        score = np.concatenate([each[1] for each in sums])
+        # A common offset moves people along their way and shows in no miss.
+        inverse = np.linalg.inv(information.sum(axis=0) + np.eye(count) / UNKNOWN**2)
+        step = inverse @ score.sum(axis=0)
+        centered = np.eye(count) - 1.0 / count
+        # Stretches are independent, frames are not: what the scores of stretches scatter by.
+        left = (score - information @ step) @ inverse @ centered
+        stated = np.diag(centered @ inverse @ centered)
+        error = np.sqrt(np.maximum((left**2).sum(axis=0), stated))
+        known = error < settings.clock_error
+        late = np.where(known, late + step, 0.0)
+        if known.any():
+            late = np.where(known, late - late[known].mean(), 0.0)
+        if np.abs(step[known] - step[known].mean() if known.any() else 0.0).max() < SETTLED:
+            break
+    determined = error < settings.clock_error
+    return CameraClocks(np.where(determined, late, np.nan), error, determined)
+
+
+def moved_in_time(
+    keypoints: NDArray[np.floating],
+    confidence: NDArray[np.floating],
+    detection_index: NDArray[np.int16],
+    late: Floats,
+) -> Moved:
+    """Return the observations as cameras with the right clock would have made them.
+
+    Between two frames a keypoint is taken to move straight; it is missing unless both have it.
+
+    Args:
+        keypoints: (frames, cameras, detections, joints, 2) [px].
+        confidence: (frames, cameras, detections, joints).
+        detection_index: (frames, cameras, persons).
+        late: (cameras,) [frame]; NaN or 0 leaves a camera as it is.
+
+    Returns:
+        The same three by person: keypoints (frames, cameras, persons, joints, 2), confidence, and
+        an index that says so.
+    """
+    frames, _, persons = detection_index.shape
+    at = np.maximum(detection_index, 0).astype(np.int64)[..., None]
+    there = (detection_index >= 0)[..., None]
+    pixels = np.take_along_axis(keypoints, at[..., None], axis=2).astype(np.float64)
+    weights = np.take_along_axis(confidence, at, axis=2).astype(np.float64)
+    weights = np.where(there & np.isfinite(pixels).all(axis=-1), weights, np.nan)
+    for camera in np.flatnonzero(np.nan_to_num(late)):
+        time = np.arange(frames) - late[camera]
+        before = np.floor(time).astype(np.int64)
+        share = time - before
+        # A whole number of frames needs one frame only.
+        after = np.where(share > 0.0, before + 1, before)
+        outside = (before < 0) | (after >= frames)
+        before, after = np.clip(before, 0, frames - 1), np.clip(after, 0, frames - 1)
+        for array, spread in ((pixels, 3), (weights, 2)):
+            part = share.reshape(-1, *(1,) * spread)
+            of = array[:, camera]
+            moved = (1.0 - part) * of[before] + part * of[after]
+            moved[outside] = np.nan
+            array[:, camera] = moved
+    seen = np.isfinite(weights).any(axis=-1)
+    index = np.where(seen, np.arange(persons), -1).astype(np.int16)
+    return pixels, weights, index
+
+
+def _stretches(index: NDArray[np.int16], length: int) -> list[slice]:
+    """Return stretches of frames spread over the clip, with enough people together."""
+    frames, _, persons = index.shape
+    starts = np.arange(0, max(1, frames - length + 1), length)
+    wanted = max(1, SAMPLE // max(1, length * persons))
+    chosen = np.unique(np.linspace(0, len(starts) - 1, min(len(starts), wanted)).astype(int))
+    return [slice(int(starts[n]), int(starts[n]) + length) for n in chosen if persons]
+
+
+def _regression(
+    rig: Rig,
+    keypoints: NDArray[np.floating],
+    confidence: NDArray[np.floating],
+    detection_index: NDArray[np.int16],
+    late: Floats,
+    fps: float,
+    settings: TriangulationSettings,
+) -> tuple[Floats, Floats]:
+    """Return information (persons, cameras, cameras) and score (persons, cameras).
+
+    Of their sums, the solution is what has to be added to `late` [frame].
+    """
+    pixels, weights, index = moved_in_time(keypoints, confidence, detection_index, late)
+    precision = NoiseModel.stated(weights.shape[-1]).precision(weights)
+    joints = solve(rig, pixels, precision, index, no_shift(), settings).joints
+    half = max(1, round(VELOCITY_TIME * fps))
+    velocity = (joints[2 * half :] - joints[: -2 * half]) / (2.0 * half)
+    here = slice(half, len(joints) - half)
+    at = joints[here]
+    known = np.isfinite(at + velocity).all(axis=-1)
+    at, velocity = at[known], velocity[known]
+    person = np.nonzero(known)[1]
+    persons, count = index.shape[2], len(rig.cameras)
+    # By the point: matrix (n, 3, 3) and right side; by the clock, and by both.
+    matrix, right = np.zeros((len(at), 3, 3)), np.zeros((len(at), 3))
+    mixed = np.zeros((count, len(at), 3))
+    information, score = np.zeros((persons, count, count)), np.zeros((persons, count))
+    for camera in range(count):
+        image, jacobian = _seen(rig.cameras[camera], at)
+        miss = pixels[here, camera][known] - image
+        depth = at @ rig.depths[camera, :3] + rig.depths[camera, 3]
+        with np.errstate(divide="ignore"):
+            size = rig.cameras[camera, 0] / depth
+        variance = settings.pixel_noise**2 + (size * settings.joint_noise) ** 2
+        weight = precision[here, camera][known] / variance
+        squared = weight * (miss**2).sum(axis=-1)
+        weight = weight / (1.0 + squared / settings.max_deviation**2) ** 2
+        usable = np.isfinite(weight * squared)
+        weight = np.where(usable, weight, 0.0)
+        miss = np.where(usable[:, None], miss, 0.0)
+        jacobian = np.where(usable[:, None, None], jacobian, 0.0)
+        way = np.einsum("nak,nk->na", jacobian, velocity)
+        matrix += np.einsum("n,nai,naj->nij", weight, jacobian, jacobian)
+        right += np.einsum("n,nai,na->ni", weight, jacobian, miss)
+        mixed[camera] = np.einsum("n,nai,na->ni", weight, jacobian, way)
+        along = weight * (way**2).sum(axis=-1), weight * (way * miss).sum(axis=-1)
+        information[:, camera, camera] = np.bincount(person, along[0], persons)
+        score[:, camera] = np.bincount(person, along[1], persons)
+    inverse = np.linalg.inv(matrix + 1e-9 * np.eye(3))
+    for one in range(persons):
+        its = person == one
+        follows = np.einsum("cni,nij->cnj", mixed[:, its], inverse[its])
+        information[one] -= np.einsum("cnj,dnj->cd", follows, mixed[:, its])
+        score[one] -= np.einsum("cnj,nj->c", follows, right[its])
+    return information, score
+
+
+def _seen(camera: Floats, points: Floats) -> tuple[Floats, Floats]:
+    """Return pixels (n, 2) of points and their derivatives (n, 2, 3)."""
+    image, jacobian = np.empty((1, len(points), 2)), np.empty((1, len(points), 2, 18))
+    status = np.empty((1, len(points)), np.uint8)
+    given = np.ascontiguousarray(points[None])
+    projection.project_with_jacobians(camera[None], given, image, jacobian, status)
+    return image[0], jacobian[0, ..., :3]

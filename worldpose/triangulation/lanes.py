@@ -1,0 +1,281 @@
+"""Least squares on reprojection for 64 joints at a time, one vector lane a joint.
+
+A tile is one flat row of numbers for each camera: `ROWS` rows of `LANES` lanes. A lane's
+observation is linearised at itself: with X = (x, y, z, 1) and depth p X, its error is
+(a X, b X) / (p X) [px]. The state of a tile is one flat array of `STATE` rows.
+
+Loops run over lanes with constant bounds and offsets within one flat array, without branches:
+compilers then need no proof that rows do not overlap and use vector instructions.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.compiled import compiled
+
+Floats = NDArray[np.float64]
+
+LANES: Final = 64
+"""Joints a tile: 16 cameras of 64 lanes fit the second cache of a processor core."""
+
+# Rows of an observation.
+A: Final = 0
+B: Final = 4 * LANES
+SCALE: Final = 8 * LANES
+"""Square pixels for an area of one at depth one."""
+PRECISION: Final = 9 * LANES
+"""Inverse of the factor on the image noise's variance; 0 = no observation."""
+EXTRA: Final = 10 * LANES
+"""Variance besides the image noise [px^2]."""
+USED: Final = 11 * LANES
+"""1 = agrees or is taken to, 0 = left out."""
+SQUARED: Final = 12 * LANES
+"""Squared error in units of its variance, written by `accumulate`; infinite behind the camera."""
+LEVERAGE: Final = 13 * LANES
+"""Share of the observation in its own prediction, of two, written by `weigh`."""
+ROWS: Final = 14
+
+# Rows of a state.
+POINT: Final = 0
+LOSS: Final = 3 * LANES
+"""Scale of the Geman-McClure loss in units of variance; infinite = least squares."""
+MATRIX: Final = 4 * LANES
+"""Sums of xx xy xz yy yz zz."""
+RIGHT: Final = 10 * LANES
+STEP: Final = 13 * LANES
+"""Squared length of the last step [m^2]."""
+SEEN: Final = 14 * LANES
+"""Views there are, written by `survey`."""
+INSIDE: Final = 15 * LANES
+"""Views within the limit."""
+WORST: Final = 16 * LANES
+"""Largest finite squared error."""
+CHANGED: Final = 17 * LANES
+"""Views that changed sides, written by `select`."""
+STATE: Final = 18
+
+SINGULAR: Final = 1e-14
+"""Determinant over product of the diagonal below which rounding decides the answer [1]."""
+
+
+@compiled
+def clear(state: Floats) -> None:
+    """Set the sums of a state to zero."""
+    state[MATRIX : MATRIX + 9 * LANES] = 0.0
+
+
+@compiled
+def accumulate_linear(tile: Floats, state: Floats) -> None:
+    """Add one camera's equations a X = 0, b X = 0 to the sums."""
+    for j in range(LANES):
+        w = tile[USED + j] * tile[SCALE + j]
+        w = w if tile[PRECISION + j] > 0.0 else 0.0
+        for row in (A, B):
+            x, y = tile[row + j], tile[row + LANES + j]
+            z, r = tile[row + 2 * LANES + j], tile[row + 3 * LANES + j]
+            state[MATRIX + j] += w * x * x
+            state[MATRIX + LANES + j] += w * x * y
+            state[MATRIX + 2 * LANES + j] += w * x * z
+            state[MATRIX + 3 * LANES + j] += w * y * y
+            state[MATRIX + 4 * LANES + j] += w * y * z
+            state[MATRIX + 5 * LANES + j] += w * z * z
+            state[RIGHT + j] -= w * x * r
+            state[RIGHT + LANES + j] -= w * y * r
+            state[RIGHT + 2 * LANES + j] -= w * z * r
+
+
+@compiled
+def accumulate(tile: Floats, depth: Floats, noise: tuple[float, float], state: Floats) -> None:
+    """Add one camera's Gauss-Newton equations at the points to the sums.
+
+    Args:
+        tile: one camera's rows; writes `SQUARED`.
+        depth: (4,), p of the camera.
+        noise: standard deviation of the image noise [px], and of its part in metres [m].
+        state: points and loss scales; writes the sums.
+    """
+    p, q, r, s = depth[0], depth[1], depth[2], depth[3]
+    pixel, metric = noise[0] ** 2, noise[1] ** 2
+    for j in range(LANES):
+        x, y, z = state[POINT + j], state[POINT + LANES + j], state[POINT + 2 * LANES + j]
+        away = p * x + q * y + r * z + s
+        inverse = 1.0 / away
+        a0, a1, a2 = tile[A + j], tile[A + LANES + j], tile[A + 2 * LANES + j]
+        b0, b1, b2 = tile[B + j], tile[B + LANES + j], tile[B + 2 * LANES + j]
+        e = (a0 * x + a1 * y + a2 * z + tile[A + 3 * LANES + j]) * inverse
+        f = (b0 * x + b1 * y + b2 * z + tile[B + 3 * LANES + j]) * inverse
+        size = tile[SCALE + j] * inverse * inverse
+        g = tile[PRECISION + j]
+        weight = g / (pixel + size * metric + g * tile[EXTRA + j])
+        squared = (e * e + f * f) * weight
+        squared = squared if away > 0.0 else np.inf
+        tile[SQUARED + j] = squared
+        loss = state[LOSS + j]
+        down = 1.0 / (1.0 + squared / loss)
+        weight *= down * down * tile[USED + j]
+        weight = weight if away > 0.0 else 0.0
+        ax, ay, az = (a0 - e * p) * inverse, (a1 - e * q) * inverse, (a2 - e * r) * inverse
+        bx, by, bz = (b0 - f * p) * inverse, (b1 - f * q) * inverse, (b2 - f * r) * inverse
+        state[MATRIX + j] += weight * (ax * ax + bx * bx)
+        state[MATRIX + LANES + j] += weight * (ax * ay + bx * by)
+        state[MATRIX + 2 * LANES + j] += weight * (ax * az + bx * bz)
+        state[MATRIX + 3 * LANES + j] += weight * (ay * ay + by * by)
+        state[MATRIX + 4 * LANES + j] += weight * (ay * az + by * bz)
+        state[MATRIX + 5 * LANES + j] += weight * (az * az + bz * bz)
+        state[RIGHT + j] -= weight * (ax * e + bx * f)
+        state[RIGHT + LANES + j] -= weight * (ay * e + by * f)
+        state[RIGHT + 2 * LANES + j] -= weight * (az * e + bz * f)
+
+
+@compiled
+def invert(state: Floats) -> None:
+    """Replace the matrix by its inverse, NaN where it is singular to working precision."""
+    for j in range(LANES):
+        a, b, c = state[MATRIX + j], state[MATRIX + LANES + j], state[MATRIX + 2 * LANES + j]
+        d = state[MATRIX + 3 * LANES + j]
+        e, f = state[MATRIX + 4 * LANES + j], state[MATRIX + 5 * LANES + j]
+        p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
+        determinant = a * p + b * q + c * r
+        over = 1.0 / determinant if determinant > SINGULAR * a * d * f else np.nan
+        state[MATRIX + j] = p * over
+        state[MATRIX + LANES + j] = q * over
+        state[MATRIX + 2 * LANES + j] = r * over
+        state[MATRIX + 3 * LANES + j] = (a * f - c * c) * over
+        state[MATRIX + 4 * LANES + j] = (b * c - a * e) * over
+        state[MATRIX + 5 * LANES + j] = (a * d - b * b) * over
+
+
+@compiled
+def move(state: Floats) -> None:
+    """Add the solution of the sums to the points; the matrix becomes its inverse."""
+    invert(state)
+    for j in range(LANES):
+        a, b, c = state[MATRIX + j], state[MATRIX + LANES + j], state[MATRIX + 2 * LANES + j]
+        d = state[MATRIX + 3 * LANES + j]
+        e, f = state[MATRIX + 4 * LANES + j], state[MATRIX + 5 * LANES + j]
+        u, v, w = state[RIGHT + j], state[RIGHT + LANES + j], state[RIGHT + 2 * LANES + j]
+        x, y, z = a * u + b * v + c * w, b * u + d * v + e * w, c * u + e * v + f * w
+        state[POINT + j] += x
+        state[POINT + LANES + j] += y
+        state[POINT + 2 * LANES + j] += z
+        state[STEP + j] = x * x + y * y + z * z
+
+
+@compiled
+def start(tiles: Floats, state: Floats) -> None:
+    """Set the points to the linear least-squares ones (inhomogeneous DLT) of the used views."""
+    clear(state)
+    for camera in range(len(tiles)):
+        accumulate_linear(tiles[camera], state)
+    state[POINT : POINT + 3 * LANES] = 0.0
+    move(state)
+
+
+@compiled
+def step(tiles: Floats, depths: Floats, noise: tuple[float, float], state: Floats) -> None:
+    """Take one Gauss-Newton step; errors and the inverted matrix are those before it."""
+    clear(state)
+    for camera in range(len(tiles)):
+        accumulate(tiles[camera], depths[camera], noise, state)
+    move(state)
+
+
+@compiled
+def weigh(tile: Floats, depth: Floats, noise: tuple[float, float], state: Floats) -> None:
+    """Write how far one camera's observations determine the points; the matrix is inverted."""
+    pixel, metric = noise[0] ** 2, noise[1] ** 2
+    for j in range(LANES):
+        x, y, z = state[POINT + j], state[POINT + LANES + j], state[POINT + 2 * LANES + j]
+        inverse = 1.0 / (depth[0] * x + depth[1] * y + depth[2] * z + depth[3])
+        base = pixel + tile[SCALE + j] * inverse * inverse * metric
+        g = tile[PRECISION + j]
+        weight = tile[USED + j] * g / (base + g * tile[EXTRA + j]) * inverse * inverse
+        total = 0.0
+        for row in (A, B):
+            a, b, c = tile[row + j], tile[row + LANES + j], tile[row + 2 * LANES + j]
+            e = (a * x + b * y + c * z + tile[row + 3 * LANES + j]) * inverse
+            a, b, c = a - e * depth[0], b - e * depth[1], c - e * depth[2]
+            total += a * a * state[MATRIX + j] + b * b * state[MATRIX + 3 * LANES + j]
+            total += c * c * state[MATRIX + 5 * LANES + j]
+            total += 2.0 * a * b * state[MATRIX + LANES + j]
+            total += (
+                2.0 * c * (a * state[MATRIX + 2 * LANES + j] + b * state[MATRIX + 4 * LANES + j])
+            )
+        tile[LEVERAGE + j] = weight * total
+
+
+@compiled
+def survey(tiles: Floats, limit: float, state: Floats) -> None:
+    """Write how many views there are, how many are within the limit, and the worst error."""
+    state[SEEN : SEEN + 3 * LANES] = 0.0
+    for tile in tiles:
+        for j in range(LANES):
+            there = 1.0 if tile[PRECISION + j] > 0.0 else 0.0
+            squared = tile[SQUARED + j]
+            finite = there * squared if squared < np.inf else 0.0
+            state[SEEN + j] += there
+            state[INSIDE + j] += there if squared <= limit else 0.0
+            state[WORST + j] = finite if finite > state[WORST + j] else state[WORST + j]
+
+
+@compiled
+def select(tiles: Floats, limit: float, state: Floats) -> None:
+    """Use the views within the limit; write how many of them were not used or no longer are."""
+    state[CHANGED : CHANGED + LANES] = 0.0
+    for tile in tiles:
+        for j in range(LANES):
+            there = 1.0 if tile[PRECISION + j] > 0.0 else 0.0
+            used = there if tile[SQUARED + j] <= limit else 0.0
+            state[CHANGED + j] += abs(used - tile[USED + j])
+            tile[USED + j] = used
+
+
+@compiled
+def largest(state: Floats, row: int) -> float:
+    """Return the largest number of a row of a state, NaN aside."""
+    value = 0.0
+    for j in range(LANES):
+        value = state[row + j] if state[row + j] > value else value
+    return value
+
+
+@compiled
+def measure(tiles: Floats, depths: Floats, centers: Floats, state: Floats, rays: Floats) -> None:
+    """Write the sum of squared pixel errors of the used views, their number and spread.
+
+    They go to the first three rows of sums: `MATRIX`, and the two after it; the spread is the
+    largest squared sine of an angle between two rays.
+    """
+    sums, views, widest = MATRIX, MATRIX + LANES, MATRIX + 2 * LANES
+    state[sums : sums + 3 * LANES] = 0.0
+    for camera in range(len(tiles)):
+        tile, ray = tiles[camera], rays[camera]
+        p, q, r, s = depths[camera, 0], depths[camera, 1], depths[camera, 2], depths[camera, 3]
+        cx, cy, cz = centers[camera, 0], centers[camera, 1], centers[camera, 2]
+        for j in range(LANES):
+            x, y, z = state[POINT + j], state[POINT + LANES + j], state[POINT + 2 * LANES + j]
+            inverse = 1.0 / (p * x + q * y + r * z + s)
+            e = tile[A + j] * x + tile[A + LANES + j] * y + tile[A + 2 * LANES + j] * z
+            f = tile[B + j] * x + tile[B + LANES + j] * y + tile[B + 2 * LANES + j] * z
+            e = (e + tile[A + 3 * LANES + j]) * inverse
+            f = (f + tile[B + 3 * LANES + j]) * inverse
+            used = tile[USED + j]
+            state[sums + j] += (e * e + f * f) * used
+            state[views + j] += used
+            x, y, z = x - cx, y - cy, z - cz
+            length = used / np.sqrt(x * x + y * y + z * z)
+            ray[j], ray[LANES + j], ray[2 * LANES + j] = x * length, y * length, z * length
+    for camera in range(len(tiles)):
+        one = rays[camera]
+        for other in range(camera):
+            two = rays[other]
+            for j in range(LANES):
+                dot = one[j] * two[j]
+                dot += one[LANES + j] * two[LANES + j] + one[2 * LANES + j] * two[2 * LANES + j]
+                both = tiles[camera, USED + j] * tiles[other, USED + j]
+                square = (1.0 - dot * dot) * both
+                state[widest + j] = max(state[widest + j], square)

@@ -1,0 +1,134 @@
+"""How people's joints usually accelerate, and for how long a detector repeats its errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17
+from worldpose.cameras import projection
+from worldpose.triangulation.observations import Rig, person_observations
+from worldpose.triangulation.robust import Triangulation
+from worldpose.triangulation.settings import TriangulationSettings
+from worldpose.triangulation.track_solver import held_out_cost, prepare, solve_segment
+
+Floats = NDArray[np.float64]
+
+ACCELERATIONS: Final = (3.0, 6.0, 12.0, 25.0, 50.0, 100.0, 200.0)
+"""What is tried [m/s^2]: from a stroller's trunk to a kicking foot."""
+USUAL: Final = 25.0
+"""Taken where nothing can be learned [m/s^2]."""
+WINDOWS: Final = 12
+"""Stretches of tracks that are looked at."""
+WINDOW: Final = 2.0
+"""Their length [s]."""
+REPEAT: Final = 0.2
+"""Time over which errors may repeat themselves [s]: that over which smoothing averages."""
+
+
+@dataclass(frozen=True, eq=False)
+class MotionModel:
+    """What smoothing takes for usual.
+
+    Attributes:
+        acceleration: (joints,) standard deviation per axis [m/s^2].
+        repeated: frames whose errors count as one, at least 1.
+    """
+
+    acceleration: Floats
+    repeated: float
+
+
+def learn_motion(
+    rig: Rig,
+    arrays: tuple[NDArray[np.floating], Floats, NDArray[np.integer], Floats],
+    raw: Triangulation,
+    fps: float,
+    settings: TriangulationSettings,
+) -> MotionModel:
+    """Return the accelerations under which some cameras best foretell the others.
+
+    Joints are smoothed from every other camera and compared with what the cameras left out saw.
+    That punishes too much smoothing as well as too little, and errors that a detector repeats from
+    frame to frame do not pass for motion, for another camera has others. Left and right share one
+    value.
+
+    Args:
+        rig: the cameras.
+        arrays: keypoints, precision, detection_index and offsets as in `person_observations`.
+        raw: triangulated joints.
+        fps: frames per second [1/s].
+        settings: noise and agreement.
+    """
+    joints = raw.joints.shape[2]
+    names = [name.split("_")[-1] for name in COCO17]
+    kind = np.unique(names, return_inverse=True)[1] if joints == len(COCO17) else np.arange(joints)
+    limit, noise = settings.max_deviation**2, settings.noise
+    cost = np.zeros((len(ACCELERATIONS), joints))
+    lag = max(1, round(REPEAT * fps))
+    correlation, energy = np.zeros(lag + 1), 0.0
+    odd = np.arange(len(rig.cameras)) % 2 == 1
+    for person, part in _windows(raw.joints, round(WINDOW * fps)):
+        pixels, weights = person_observations(arrays, person, part)
+        for joint in range(joints):
+            given = raw.joints[part, person, joint]
+            if not np.isfinite(given).all():
+                continue
+            for left_out in (odd, ~odd):
+                seen = np.where(left_out[:, None], 0.0, weights[joint])
+                hidden = np.where(left_out[:, None], weights[joint], 0.0)
+                if ((seen > 0.0).sum(axis=0) < settings.min_views).any():
+                    continue
+                tiles = prepare(pixels[joint], hidden, rig.cameras)
+                for n, acceleration in enumerate(ACCELERATIONS):
+                    penalty = (fps**2 / acceleration) ** 2
+                    x, _ = solve_segment(pixels[joint], seen, given, rig, noise, limit, penalty)
+                    cost[n, joint] += held_out_cost(tiles, rig.depths, noise, limit, x)
+            error = _whitened(pixels[joint], weights[joint], given, rig, noise, limit)
+            energy += float(np.nansum(error * error))
+            for k in range(1, lag + 1):
+                correlation[k] += float(np.nansum(error[:, k:] * error[:, :-k]))
+    total = np.stack([np.bincount(kind, row) for row in cost])[:, kind]
+    best = np.array(ACCELERATIONS)[total.argmin(axis=0)]
+    best = np.where(total.max(axis=0) > 0.0, best, USUAL)
+    alike = np.maximum(correlation[1:] / energy, 0.0) if energy > 0.0 else np.zeros(lag)
+    return MotionModel(best, float(1.0 + 2.0 * alike.sum()))
+
+
+def _windows(joints: Floats, length: int) -> list[tuple[int, slice]]:
+    """Return people and stretches of frames, spread over the clip."""
+    frames, persons = joints.shape[:2]
+    starts = range(0, max(1, frames - length + 1), max(1, length))
+    there = np.isfinite(joints[..., 0]).mean(axis=-1)
+    every = [
+        (person, slice(start, start + length))
+        for start in starts
+        for person in range(persons)
+        if there[start : start + length, person].mean() > 0.5
+    ]
+    chosen = np.linspace(0, len(every) - 1, min(len(every), WINDOWS)).astype(int)
+    return [every[n] for n in np.unique(chosen)]
+
+
+def _whitened(
+    pixels: Floats,
+    weights: Floats,
+    points: Floats,
+    rig: Rig,
+    noise: tuple[float, float],
+    limit: float,
+) -> Floats:
+    """Return errors (cameras, frames, 2) in standard deviations; NaN where a view disagrees."""
+    image = np.empty(pixels.shape)
+    at = np.ascontiguousarray(np.broadcast_to(points, (*image.shape[:2], 3)))
+    projection.project(rig.cameras, at, image)
+    depth = at @ rig.depths[:, :3, None] + rig.depths[:, 3, None, None]
+    size = rig.cameras[:, 0, None, None] / depth
+    variance = noise[0] ** 2 + (size * noise[1]) ** 2
+    usable = weights > 0.0
+    error = (image - pixels) * np.sqrt(np.where(usable, weights, np.nan)[..., None] / variance)
+    squared = (error**2).sum(axis=-1, keepdims=True)
+    return np.where(squared <= limit, error, np.nan)

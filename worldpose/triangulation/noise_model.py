@@ -1,0 +1,180 @@
+"""How much a clip's detector errs, by joint and by confidence, from how its views disagree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.compiled import compiled
+from worldpose.triangulation.consensus import consensus
+from worldpose.triangulation.lanes import (
+    EXTRA,
+    LANES,
+    LEVERAGE,
+    PRECISION,
+    ROWS,
+    SCALE,
+    SQUARED,
+    STATE,
+    USED,
+    weigh,
+)
+from worldpose.triangulation.observations import Rig, gather, linearize
+
+Floats = NDArray[np.float64]
+
+BINS: Final = 8
+"""Classes of confidence with equally many observations."""
+SAMPLE: Final = 6000
+"""Joints that a round looks at: a class then has thousands of observations."""
+ROUNDS: Final = 4
+"""Weights, agreement and spreads settle after three."""
+PRIOR: Final = 60.0
+"""Degrees of freedom for which the stated noise counts: few observations change little."""
+LEAST: Final = 0.01
+"""Smallest factor on a variance: views that agree perfectly do not make certain."""
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseModel:
+    """Factors on the stated variance of an observation.
+
+    Attributes:
+        joint: (joints,) for each joint.
+        confidence: (BINS,) rising confidences.
+        factor: (BINS,) for each of them; between them its logarithm is linear.
+    """
+
+    joint: Floats
+    confidence: Floats
+    factor: Floats
+
+    @classmethod
+    def stated(cls, joints: int) -> NoiseModel:
+        """Return the model of the settings: variance as one over confidence."""
+        confidence = np.geomspace(1e-3, 1.0, BINS)
+        return cls(np.ones(joints), confidence, 1.0 / confidence)
+
+    def precision(self, confidence: NDArray[np.floating]) -> Floats:
+        """Return one over the factor (..., joints); NaN where there is no observation."""
+        given = np.asarray(confidence, dtype=np.float64)
+        usable = (given > 0.0) & np.isfinite(given)
+        at = np.log(np.where(usable, given, 1.0))
+        logarithm = np.interp(at, np.log(self.confidence), np.log(self.factor))
+        return np.where(usable, np.exp(-logarithm) / self.joint, np.nan)
+
+
+def learn_noise(
+    rig: Rig,
+    keypoints: NDArray[np.floating],
+    confidence: NDArray[np.floating],
+    index: NDArray[np.integer],
+    shift: Floats,
+    noise: tuple[float, float],
+    limit: float,
+) -> NoiseModel:
+    """Return the noise that a clip's residuals show.
+
+    A residual is smaller than the error behind it, for the point follows its observations: sums of
+    squares are divided by degrees of freedom, two an observation less its leverage.
+    """
+    frames, count, persons = index.shape
+    joints = confidence.shape[-1]
+    model = NoiseModel.stated(joints)
+    # Whole frames from all over the clip.
+    chosen = np.linspace(0, frames - 1, min(frames, 1 + SAMPLE // max(1, persons * joints)))
+    chosen = np.unique(chosen.astype(np.int64))
+    some, doubt, who = keypoints[chosen], confidence[chosen], index[chosen]
+    moved = shift[chosen] if len(shift) else shift
+    place = np.maximum(who, 0).astype(np.int64)[..., None]
+    certain = np.take_along_axis(np.asarray(doubt, np.float64), place, axis=2)
+    certain = np.where(who[..., None] >= 0, certain, np.nan).transpose(0, 2, 3, 1)
+    usable = (certain > 0.0) & np.isfinite(certain)
+    if not usable.any():
+        return model
+    edges = np.quantile(certain[usable], np.linspace(0.0, 1.0, BINS + 1))
+    logarithm = np.log(np.where(usable, certain, 1.0))
+    bin_of = np.clip(np.searchsorted(edges, certain, side="right") - 1, 0, BINS - 1)
+    sums: Floats = np.bincount(bin_of[usable], logarithm[usable], BINS)
+    members = np.bincount(bin_of[usable], minlength=BINS)
+    filled = members > 0
+    knots = sums[filled] / members[filled]
+    bin_of = (np.cumsum(filled) - 1)[bin_of]
+    model = NoiseModel(np.ones(joints), np.exp(knots), np.exp(-knots))
+    joint_of = np.broadcast_to(np.arange(joints)[:, None], certain.shape)
+    shape = certain.shape
+    squares, known, freedom = np.empty(shape), np.empty(shape), np.empty(shape)
+    for _ in range(ROUNDS):
+        precision = model.precision(doubt)
+        _residuals(
+            *(some, precision, who, moved, rig.cameras, rig.depths, noise, limit),
+            *(squares.reshape(-1, count), known.reshape(-1, count), freedom.reshape(-1, count)),
+        )
+        used = freedom > 0.0
+        joint, factor = model.joint, model.factor
+        by_bin, by_joint = bin_of[used], joint_of[used]
+        excess = np.maximum(squares[used] - known[used] * freedom[used], 0.0)
+        expected = (excess / factor[by_bin] / joint[by_joint], freedom[used])
+        factor = np.maximum(factor * _ratio(by_bin, len(factor), *expected), LEAST)
+        expected = (excess / factor[by_bin] / joint[by_joint], freedom[used])
+        joint = joint * _ratio(by_joint, joints, *expected)
+        # Less confident is not surer: rising factors are pooled.
+        model = NoiseModel(joint, model.confidence, np.minimum.accumulate(factor))
+    return model
+
+
+def _ratio(group: NDArray[np.int64], groups: int, squares: Floats, freedom: Floats) -> Floats:
+    """Variance over the assumed one, (groups,), drawn towards that of all together."""
+    overall = (squares.sum() + PRIOR) / (freedom.sum() + PRIOR)
+    total = np.bincount(group, squares, groups) + PRIOR * overall
+    ratio: Floats = total / (np.bincount(group, freedom, groups) + PRIOR)
+    return ratio
+
+
+@compiled
+def _residuals(
+    keypoints: NDArray[np.floating],
+    precision: NDArray[np.floating],
+    index: NDArray[np.integer],
+    shift: Floats,
+    cameras: Floats,
+    depths: Floats,
+    noise: tuple[float, float],
+    limit: float,
+    squares: Floats,
+    known: Floats,
+    freedom: Floats,
+) -> None:
+    """Write (points, cameras): squared errors, further variance, degrees of freedom.
+
+    The first two in units of the stated variance; 0 where a view does not take part.
+    """
+    tiles, state = np.empty((len(cameras), ROWS * LANES)), np.empty(STATE * LANES)
+    total = len(squares)
+    for first in range(0, total, LANES):
+        gather(keypoints, precision, index, shift, first, cameras, tiles)
+        for camera in range(len(cameras)):
+            linearize(tiles[camera], cameras[camera])
+        consensus(tiles, depths, noise, limit, state)
+        for camera in range(len(cameras)):
+            tile, depth = tiles[camera], depths[camera]
+            weigh(tile, depth, noise, state)
+            for j in range(min(LANES, total - first)):
+                free = 2.0 - tile[LEVERAGE + j]
+                if tile[USED + j] > 0.0 and free > 1e-6:
+                    z = depth[0] * state[j] + depth[1] * state[LANES + j]
+                    z += depth[2] * state[2 * LANES + j] + depth[3]
+                    base = noise[0] ** 2 + tile[SCALE + j] / (z * z) * noise[1] ** 2
+                    extra = tile[EXTRA + j] / base
+                    squares[first + j, camera] = tile[SQUARED + j] * (
+                        1.0 / tile[PRECISION + j] + extra
+                    )
+                    known[first + j, camera] = extra
+                    freedom[first + j, camera] = free
+                else:
+                    squares[first + j, camera] = 0.0
+                    known[first + j, camera] = 0.0
+                    freedom[first + j, camera] = 0.0

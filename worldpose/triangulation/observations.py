@@ -1,0 +1,184 @@
+"""Observations of a clip as tiles: gathered by person, undistorted, linearised."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.cameras import Camera, fold_radius, projection
+from worldpose.cameras.distortion import distort
+from worldpose.compiled import compiled
+from worldpose.triangulation.lanes import (
+    EXTRA,
+    LANES,
+    PRECISION,
+    SCALE,
+    SQUARED,
+    A,
+    B,
+)
+
+Floats = NDArray[np.float64]
+
+NEWTON_STEPS: Final = 3
+"""Steps that invert most lenses to rounding; the others are inverted one by one."""
+MISFIT: Final = 1e-13
+"""Largest accepted misfit of an inverse on the plane z = 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Cameras as the kernels read them.
+
+    Attributes:
+        cameras: (cameras, 22) as in `worldpose.cameras.projection`.
+        depths: (cameras, 4), depth of (x, y, z, 1) [m].
+        centers: (cameras, 3) [m], world.
+    """
+
+    cameras: Floats
+    depths: Floats
+    centers: Floats
+
+    @classmethod
+    def of(cls, cameras: Camera) -> Rig:
+        """Return the rig of a batch (cameras,)."""
+        pose = cameras.cam_from_world
+        parts = (
+            cameras.focal,
+            cameras.principal_point,
+            cameras.distortion,
+            pose.rotation.reshape(-1, 9),
+            pose.translation,
+            fold_radius(cameras.distortion)[:, None],
+        )
+        depths = np.concatenate([pose.rotation[:, 2], pose.translation[:, 2:]], axis=-1)
+        return cls(np.concatenate(parts, axis=-1), depths, np.ascontiguousarray(cameras.center))
+
+
+def person_observations(
+    arrays: tuple[NDArray[np.floating], Floats, NDArray[np.integer], Floats],
+    person: int,
+    frames: slice = slice(None),
+) -> tuple[Floats, Floats]:
+    """Return one person's pixels (joints, cameras, frames, 2) and precision without the last.
+
+    Args:
+        arrays: keypoints (frames, cameras, detections, joints, 2), precision (the same without
+            the last), index (frames, cameras, persons), offsets (frames, cameras, persons, 2).
+        person: which.
+        frames: when.
+    """
+    keypoints, precision = arrays[0][frames], arrays[1][frames]
+    index, offsets = arrays[2][frames], arrays[3][frames]
+    there = index[:, :, person] >= 0
+    at = np.maximum(index[:, :, person], 0).astype(np.int64)[:, :, None, None]
+    pixels = np.take_along_axis(keypoints, at[..., None], axis=2)[:, :, 0]
+    weights = np.take_along_axis(precision, at, axis=2)[:, :, 0]
+    pixels = pixels - offsets[:, :, person, None]
+    weights = np.where(there[..., None], weights, np.nan)
+    return (
+        np.ascontiguousarray(pixels.transpose(2, 1, 0, 3)),
+        np.ascontiguousarray(weights.transpose(2, 1, 0)),
+    )
+
+
+@compiled
+def gather(
+    keypoints: NDArray[np.floating],
+    precision: NDArray[np.floating],
+    index: NDArray[np.integer],
+    shift: Floats,
+    first: int,
+    cameras: Floats,
+    tiles: Floats,
+) -> None:
+    """Write pixels, precision and further variance of 64 joints.
+
+    Args:
+        keypoints: (frames, cameras, detections, joints, 2) [px].
+        precision: (frames, cameras, detections, joints), 0 or NaN = no observation.
+        index: (frames, cameras, persons), place among the detections; -1 = not seen.
+        shift: (frames, cameras, persons, 3), subtracted from pixels [px], and variance [px^2];
+            or of no frames for none.
+        first: the first joint, counted over frames, persons, joints.
+        cameras: (cameras, 22).
+        tiles: (cameras, ROWS x LANES); pixels go to the first rows of `A` and `B`.
+    """
+    frames, count, persons = index.shape
+    joints = precision.shape[3]
+    last = min(LANES, frames * persons * joints - first)
+    for camera in range(count):
+        tile = tiles[camera]
+        tile[A : A + LANES], tile[B : B + LANES] = cameras[camera, 2], cameras[camera, 3]
+        tile[PRECISION : PRECISION + 2 * LANES] = 0.0
+        joint = first % joints
+        person = (first // joints) % persons
+        frame = first // (joints * persons)
+        for j in range(last):
+            detection = index[frame, camera, person]
+            if detection >= 0:
+                u = float(keypoints[frame, camera, detection, joint, 0])
+                v = float(keypoints[frame, camera, detection, joint, 1])
+                g = float(precision[frame, camera, detection, joint])
+                if 0.0 < g < math.inf and abs(u) + abs(v) < math.inf:
+                    if len(shift):
+                        u -= shift[frame, camera, person, 0]
+                        v -= shift[frame, camera, person, 1]
+                        tile[EXTRA + j] = shift[frame, camera, person, 2]
+                    tile[A + j], tile[B + j], tile[PRECISION + j] = u, v, g
+            joint += 1
+            if joint == joints:
+                joint = 0
+                person += 1
+                if person == persons:
+                    person = 0
+                    frame += 1
+
+
+@compiled
+def linearize(tile: Floats, c: Floats) -> None:
+    """Turn one camera's pixels into equations; no observation where the lens has no inverse."""
+    for j in range(LANES):
+        xd, yd = (tile[A + j] - c[2]) / c[0], (tile[B + j] - c[3]) / c[1]
+        x, y = xd, yd
+        for _ in range(NEWTON_STEPS):
+            fx, fy, dxx, dxy, dyy = distort(x, y, c[4], c[5], c[6], c[7], c[8])
+            over = 1.0 / (dxx * dyy - dxy * dxy)
+            fx, fy = fx - xd, fy - yd
+            x -= (dyy * fx - dxy * fy) * over
+            y -= (dxx * fy - dxy * fx) * over
+        fx, fy, dxx, dxy, dyy = distort(x, y, c[4], c[5], c[6], c[7], c[8])
+        misfit = max(abs(fx - xd), abs(fy - yd))
+        inside = misfit <= MISFIT and x * x + y * y < c[21] * c[21]
+        # Lanes that need another way are marked here.
+        tile[SQUARED + j] = 0.0 if inside else 1.0
+        tile[A + LANES + j], tile[B + LANES + j] = x, y
+    for j in range(LANES):
+        if tile[SQUARED + j] > 0.0:
+            pixel, plane = np.empty((1, 1, 2)), np.empty((1, 1, 2))
+            pixel[0, 0, 0], pixel[0, 0, 1] = tile[A + j], tile[B + j]
+            projection.normalize(c.reshape(1, 22), pixel, plane, np.empty((1, 1), np.uint8))
+            if not math.isfinite(plane[0, 0, 0]):
+                plane[:] = 0.0
+                tile[PRECISION + j] = 0.0
+            tile[A + LANES + j], tile[B + LANES + j] = plane[0, 0, 0], plane[0, 0, 1]
+    for j in range(LANES):
+        x, y = tile[A + LANES + j], tile[B + LANES + j]
+        _, _, dxx, dxy, dyy = distort(x, y, c[4], c[5], c[6], c[7], c[8])
+        m00, m01, m10, m11 = c[0] * dxx, c[0] * dxy, c[1] * dxy, c[1] * dyy
+        tile[SCALE + j] = abs(m00 * m11 - m01 * m10)
+        there = 1.0 if tile[PRECISION + j] > 0.0 else 0.0
+        m00, m01, m10, m11 = there * m00, there * m01, there * m10, there * m11
+        for k in range(4):
+            # Row k of the rotation is at 9 + 3 k, the translation at 18.
+            p = c[9 + k] if k < 3 else c[18]
+            q = c[12 + k] if k < 3 else c[19]
+            r = c[15 + k] if k < 3 else c[20]
+            p, q = p - x * r, q - y * r
+            tile[A + k * LANES + j] = m00 * p + m01 * q
+            tile[B + k * LANES + j] = m10 * p + m11 * q

@@ -1,0 +1,63 @@
+"""The whole stage: clocks, joints of every frame, joints of every track."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.cameras import Camera
+from worldpose.triangulation.array_checks import check_arrays
+from worldpose.triangulation.clocks import CameraClocks, estimate_clocks, moved_in_time
+from worldpose.triangulation.robust import Triangulation, triangulate_joints
+from worldpose.triangulation.settings import TriangulationSettings
+from worldpose.triangulation.smoothing import Smoothing, smooth_joints
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What the stage finds in a clip.
+
+    Attributes:
+        triangulation: every frame by itself.
+        smoothing: whole tracks.
+        clocks: by how much cameras are late; taken into account when the settings ask for it.
+    """
+
+    triangulation: Triangulation
+    smoothing: Smoothing
+    clocks: CameraClocks
+
+
+def reconstruct_joints(
+    cameras: Camera,
+    keypoints: NDArray[np.floating],
+    confidence: NDArray[np.floating],
+    detection_index: NDArray[np.int16],
+    fps: float,
+    settings: TriangulationSettings,
+    camera_covariance: NDArray[np.float64] | None = None,
+) -> Reconstruction:
+    """Return a clip's joints, triangulated and smoothed, and its cameras' clocks.
+
+    Args:
+        cameras: batch (cameras,).
+        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
+        confidence: (frames, cameras, detections, 17) in (0, 1]; NaN, 0 or less leaves a keypoint
+            out.
+        detection_index: (frames, cameras, persons), place among the detections; -1 = not seen.
+        fps: frames per second [1/s].
+        settings: of the stage.
+        camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
+
+    Raises:
+        InputError: the shapes do not fit together.
+    """
+    check_arrays(cameras, keypoints, confidence, detection_index, camera_covariance)
+    arrays = (keypoints, confidence, detection_index)
+    clocks = estimate_clocks(cameras, *arrays, fps, settings)
+    if settings.correct_clocks:
+        arrays = moved_in_time(*arrays, clocks.late)
+    joints = triangulate_joints(cameras, *arrays, settings, camera_covariance)
+    return Reconstruction(joints, smooth_joints(cameras, *arrays, joints, fps, settings), clocks)

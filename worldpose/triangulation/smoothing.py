@@ -1,0 +1,133 @@
+"""Whole tracks: joints that fit all their observations and do not jerk, with short gaps filled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.records import Record
+from worldpose.cameras import Camera
+from worldpose.triangulation.motion_model import MotionModel, learn_motion
+from worldpose.triangulation.observations import Rig, person_observations
+from worldpose.triangulation.robust import Triangulation
+from worldpose.triangulation.settings import TriangulationSettings
+from worldpose.triangulation.track_solver import solve_segment
+
+Floats = NDArray[np.float64]
+
+
+class SmoothingReport(Record):
+    """What smoothing did to a clip."""
+
+    filled: int
+    """Joints filled in [1]."""
+    filled_share: float | None
+    """Share of them in all joints; None without any."""
+    acceleration_m_s2: float
+    """Median over joints of the acceleration that was taken for usual [m/s^2]."""
+    repeated: float
+    """Frames of observations whose errors count as one [1]: they are alike for a while."""
+    moved_m: float | None
+    """Median distance between smoothed and triangulated joints [m]."""
+
+
+@dataclass(frozen=True)
+class Smoothing:
+    """Joints of whole tracks.
+
+    Attributes:
+        joints: (frames, persons, 17, 3) [m], world; NaN outside tracks and in long gaps.
+        covariance: (frames, persons, 17, 3, 3) [m^2], growing into gaps.
+        filled: (frames, persons, 17) bool, not triangulated in this frame but between two that
+            are.
+        motion: what was taken for usual motion.
+        report: figures for the whole clip.
+    """
+
+    joints: Floats
+    covariance: Floats
+    filled: NDArray[np.bool_]
+    motion: MotionModel
+    report: SmoothingReport
+
+
+def smooth_joints(
+    cameras: Camera,
+    keypoints: NDArray[np.floating],
+    confidence: NDArray[np.floating],
+    detection_index: NDArray[np.int16],
+    raw: Triangulation,
+    fps: float,
+    settings: TriangulationSettings,
+) -> Smoothing:
+    """Return joints that fit the observations of their whole track with little acceleration.
+
+    It is the observations that are fitted, not the triangulated joints: a view that alone saw a
+    joint still says where it is not. How much acceleration is usual is learned (`learn_motion`).
+
+    Args:
+        cameras: batch (cameras,).
+        keypoints: (frames, cameras, detections, 17, 2) [px].
+        confidence: (frames, cameras, detections, 17).
+        detection_index: (frames, cameras, persons).
+        raw: of the same arrays; its noise and offsets are used.
+        fps: frames per second [1/s].
+        settings: noise and the longest gap.
+    """
+    rig = Rig.of(cameras)
+    precision = raw.noise.precision(confidence)
+    joints, covariance = np.full_like(raw.joints, np.nan), np.full_like(raw.covariance, np.nan)
+    arrays = (keypoints, precision, detection_index, raw.offsets)
+    motion = learn_motion(rig, arrays, raw, fps, settings)
+    penalty = (fps**2 / motion.acceleration) ** 2
+    gap = round(settings.max_gap * fps)
+    limit = settings.max_deviation**2
+    for person in range(raw.joints.shape[1]):
+        pixels, weights = person_observations(arrays, person)
+        weights = weights / motion.repeated
+        for joint in range(raw.joints.shape[2]):
+            given = raw.joints[:, person, joint]
+            for part in segments(np.isfinite(given[:, 0]), gap):
+                x, c = solve_segment(
+                    *(pixels[joint, :, part], weights[joint, :, part], given[part], rig),
+                    *(settings.noise, limit, float(penalty[joint])),
+                )
+                # One wild observation must not take a whole track with it.
+                good = np.isfinite(x).all() and np.isfinite(c).all()
+                joints[part, person, joint] = x if good else given[part]
+                covariance[part, person, joint] = (
+                    c + _nearest(raw.calibration_covariance[part, person, joint], given[part])
+                    if good
+                    else raw.covariance[part, person, joint]
+                )
+    there, triangulated = np.isfinite(joints[..., 0]), np.isfinite(raw.joints[..., 0])
+    filled = there & ~triangulated
+    moved = np.linalg.norm(joints - raw.joints, axis=-1)[there & triangulated]
+    report = SmoothingReport(
+        filled=int(filled.sum()),
+        filled_share=float(filled.sum() / there.sum()) if there.any() else None,
+        acceleration_m_s2=float(np.median(motion.acceleration)),
+        repeated=motion.repeated,
+        moved_m=float(np.median(moved)) if len(moved) else None,
+    )
+    return Smoothing(joints, covariance, filled, motion, report)
+
+
+def segments(there: NDArray[np.bool_], gap: int) -> list[slice]:
+    """Return the stretches of frames that begin and end with a joint and have no longer gap."""
+    frames = np.flatnonzero(there)
+    if not len(frames):
+        return []
+    breaks = np.flatnonzero(np.diff(frames) > gap + 1)
+    first = [frames[0], *frames[breaks + 1]]
+    last = [*frames[breaks], frames[-1]]
+    return [slice(int(a), int(b) + 1) for a, b in zip(first, last, strict=True)]
+
+
+def _nearest(matrices: Floats, given: Floats) -> Floats:
+    """Return the matrices (frames, 3, 3), those of frames without a joint from the one before."""
+    known = np.isfinite(given[:, 0])
+    last = np.maximum.accumulate(np.where(known, np.arange(len(given)), 0))
+    return matrices[last]

@@ -1,0 +1,157 @@
+"""Every joint of a clip from the observations that agree."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.compiled import compiled
+from worldpose.triangulation.consensus import consensus
+from worldpose.triangulation.lanes import (
+    LANES,
+    MATRIX,
+    POINT,
+    PRECISION,
+    ROWS,
+    STATE,
+    USED,
+    measure,
+)
+from worldpose.triangulation.observations import Rig, gather, linearize
+from worldpose.triangulation.settings import TriangulationSettings
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Joints with what is known about them; the arrays are those of `Triangulation`.
+
+    Attributes:
+        seen: (frames, cameras, persons, joints) bool, is there an observation.
+    """
+
+    joints: Floats
+    covariance: Floats
+    views: NDArray[np.uint8]
+    spread: NDArray[np.float32]
+    reprojection_error: NDArray[np.float32]
+    inliers: NDArray[np.bool_]
+    seen: NDArray[np.bool_]
+
+
+def no_shift() -> Floats:
+    """Return the shift that leaves every observation where it is."""
+    return np.zeros((0, 0, 0, 3))
+
+
+def solve(
+    rig: Rig,
+    keypoints: NDArray[np.floating],
+    precision: Floats,
+    index: NDArray[np.integer],
+    shift: Floats,
+    settings: TriangulationSettings,
+) -> Solution:
+    """Return the joints of a clip, covariance from `precision` and the stated noise.
+
+    Args:
+        rig: the cameras.
+        keypoints: (frames, cameras, detections, joints, 2) [px].
+        precision: (frames, cameras, detections, joints), inverse of the factor on the stated
+            variance; 0 or NaN = no observation.
+        index: (frames, cameras, persons), place among the detections; -1 = not seen.
+        shift: (frames, cameras, persons, 3), subtracted from pixels [px], and further variance
+            [px^2]; `no_shift()` for none.
+        settings: noise, agreement and least views.
+    """
+    frames, count, persons = index.shape
+    shape = (frames, persons, precision.shape[-1])
+    solution = Solution(
+        joints=np.full((*shape, 3), np.nan),
+        covariance=np.full((*shape, 3, 3), np.nan),
+        views=np.zeros(shape, np.uint8),
+        spread=np.full(shape, np.nan, np.float32),
+        reprojection_error=np.full(shape, np.nan, np.float32),
+        inliers=np.zeros((frames, count, *shape[1:]), np.bool_),
+        seen=np.zeros((frames, count, *shape[1:]), np.bool_),
+    )
+    _solve_all(
+        *(keypoints, precision, index, shift, rig.cameras, rig.depths, rig.centers),
+        settings.noise,
+        settings.max_deviation**2,
+        settings.min_views,
+        math.sin(settings.min_angle),
+        *(solution.joints, solution.covariance, solution.views, solution.spread),
+        *(solution.reprojection_error, solution.inliers, solution.seen),
+    )
+    return solution
+
+
+@compiled
+def _solve_all(
+    keypoints: NDArray[np.floating],
+    precision: NDArray[np.floating],
+    index: NDArray[np.integer],
+    shift: Floats,
+    cameras: Floats,
+    depths: Floats,
+    centers: Floats,
+    noise: tuple[float, float],
+    limit: float,
+    min_views: int,
+    min_sine: float,
+    joints: Floats,
+    covariance: Floats,
+    views: NDArray[np.uint8],
+    spread: NDArray[np.float32],
+    error: NDArray[np.float32],
+    inliers: NDArray[np.bool_],
+    seen: NDArray[np.bool_],
+) -> None:
+    """Solve tile after tile and write the last eight arguments."""
+    frames, count, persons = index.shape
+    joint_count = precision.shape[3]
+    tiles, rays = np.empty((count, ROWS * LANES)), np.empty((count, 3 * LANES))
+    state, sums = np.empty(STATE * LANES), np.empty(STATE * LANES)
+    found, place = np.empty(LANES, np.bool_), np.empty((LANES, 3), np.int64)
+    total = frames * persons * joint_count
+    for first in range(0, total, LANES):
+        gather(keypoints, precision, index, shift, first, cameras, tiles)
+        for camera in range(count):
+            linearize(tiles[camera], cameras[camera])
+        consensus(tiles, depths, noise, limit, state)
+        sums[:] = state
+        measure(tiles, depths, centers, sums, rays)
+        last = min(LANES, total - first)
+        for j in range(last):
+            at = first + j
+            t, n, joint = (
+                at // (joint_count * persons),
+                (at // joint_count) % persons,
+                at % joint_count,
+            )
+            place[j] = t, n, joint
+            x, y, z = state[POINT + j], state[POINT + LANES + j], state[POINT + 2 * LANES + j]
+            xx, xy, xz = state[MATRIX + j], state[MATRIX + LANES + j], state[MATRIX + 2 * LANES + j]
+            yy, yz = state[MATRIX + 3 * LANES + j], state[MATRIX + 4 * LANES + j]
+            zz = state[MATRIX + 5 * LANES + j]
+            agreed, widest = sums[MATRIX + LANES + j], math.sqrt(sums[MATRIX + 2 * LANES + j])
+            found[j] = math.isfinite(x + xx) and widest >= min_sine and agreed >= min_views
+            if found[j]:
+                joints[t, n, joint] = x, y, z
+                covariance[t, n, joint, 0] = xx, xy, xz
+                covariance[t, n, joint, 1] = xy, yy, yz
+                covariance[t, n, joint, 2] = xz, yz, zz
+                views[t, n, joint] = int(agreed)
+                spread[t, n, joint] = math.asin(min(1.0, widest))
+                error[t, n, joint] = math.sqrt(sums[MATRIX + j] / agreed)
+        for camera in range(count):
+            tile = tiles[camera]
+            for j in range(last):
+                t, n, joint = place[j]
+                seen[t, camera, n, joint] = tile[PRECISION + j] > 0.0
+                inliers[t, camera, n, joint] = found[j] and tile[USED + j] > 0.0
