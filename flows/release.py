@@ -33,7 +33,7 @@ def clips_of(record: RunRecord) -> tuple[str, ...]:
     clips = tuple(sorted({unit for stage, _, unit in units if stage in JOINT_STAGES}))
     if not clips:
         raise WorldposeError(
-            f"run {record.run_id} of {record.match_id}: expected results of {JOINT_STAGES[-1]}, "
+            f"run {record.run_id} of {record.match_id}: expected results of {JOINT_STAGES[0]}, "
             f"found {', '.join(record.results) or 'none'}. Run the match to the end first."
         )
     return clips

@@ -9,7 +9,8 @@ from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
 from data_contracts.pitch import PitchSpec
 from data_contracts.run import Work
 from tasks.clip_inputs import open_clip
-from tasks.unit import figures_of, open_input, unit_task
+from tasks.triangulation import reconstruction_arrays, reconstruction_figures
+from tasks.unit import open_input, unit_task
 from worldpose.bundle_adjustment import (
     BundleAdjustment,
     BundleAdjustmentSettings,
@@ -22,7 +23,7 @@ from worldpose.cameras import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import PARAMETERS
 from worldpose.store import Store
-from worldpose.triangulation import TriangulationSettings, triangulate_joints
+from worldpose.triangulation import TriangulationSettings, reconstruct_joints
 
 
 @unit_task
@@ -56,24 +57,18 @@ def bundle_adjustment(work: Work) -> str:
         )
         settings = BundleAdjustmentSettings.model_validate(work.recipe.settings)
         adjusted = adjust_cameras(clip, settings)
-        joints = triangulate_joints(
-            adjusted.cameras, opened.keypoints, opened.confidence, index, clip.triangulation
+        found = reconstruct_joints(
+            adjusted.cameras,
+            *(opened.keypoints, opened.confidence, index, opened.fps, clip.triangulation),
         )
-        arrays, attributes = adjustment_arrays(clip, adjusted, settings, tracks["person"].values)
+        arrays, attributes = adjustment_arrays(adjusted, settings, tracks["person"].values)
         result.write(
             BUNDLE_ADJUSTMENT,
-            arrays={
-                "joints": joints.joints,
-                "covariance": joints.covariance,
-                "views": joints.views,
-                "reprojection_error": joints.reprojection_error,
-                "inliers": joints.inliers,
-                **arrays,
-            },
+            arrays={**reconstruction_arrays(found), **arrays},
             coordinates={"frame": opened.frame, "person": tracks["person"].values},
             attributes={"camera": list(opened.camera_ids), **attributes},
         )
-        result.figures.update(figures_of(joints.report, opened.camera_ids))
+        result.figures.update(reconstruction_figures(found, opened.camera_ids))
         result.figures.update(_figures(adjusted))
     return work.key
 

@@ -21,6 +21,7 @@ class ClipInputs:
     Attributes:
         camera_ids: in the order of every camera dimension.
         cameras: (cameras,) batch.
+        camera_covariance: (cameras, 12, 12) of a step of each; None where not all are known.
         frame: (frames,) match frames.
         keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
         confidence: (frames, cameras, detections, 17); NaN where not found.
@@ -29,6 +30,7 @@ class ClipInputs:
 
     camera_ids: tuple[str, ...]
     cameras: Camera
+    camera_covariance: NDArray[np.float64] | None
     frame: NDArray[np.int64]
     keypoints: NDArray[np.float64]
     confidence: NDArray[np.float64]
@@ -51,9 +53,11 @@ def open_clip(store: Store, work: Work) -> ClipInputs:
         present = clip.sizes["detection"]
         keypoints[:, index, :present] = clip["keypoints"].values
         confidence[:, index, :present] = clip["confidence"].values
+    known = all("covariance" in camera for camera in cameras)  # a given camera tells none
     return ClipInputs(
         camera_ids=camera_ids,
         cameras=Camera.stack([camera_from_arrays(camera.data_vars) for camera in cameras]),
+        camera_covariance=np.stack([c["covariance"].values for c in cameras]) if known else None,
         frame=frame,
         keypoints=keypoints,
         confidence=confidence,

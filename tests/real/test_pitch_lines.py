@@ -6,6 +6,7 @@ WORLDPOSE_TEST_DATA names a folder with `wc14` (lines.json, homographies.json, c
 
 import importlib.util
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ def bench():
     path = Path(__file__).parents[2] / "benchmarks" / "pitch_lines.py"
     spec = importlib.util.spec_from_file_location("pitch_lines", path)
     module = importlib.util.module_from_spec(spec)
+    sys.modules["pitch_lines"] = module  # its dataclass looks its own module up
     spec.loader.exec_module(module)
     return module
 

@@ -12,7 +12,7 @@ from worldpose.bundle_adjustment.building import (
     markings_problem,
     players_problem,
 )
-from worldpose.bundle_adjustment.clip import Clip, Observed, observe
+from worldpose.bundle_adjustment.clip import Clip, Observed, observe, with_learned_noise
 from worldpose.bundle_adjustment.frames import propose_frames
 from worldpose.bundle_adjustment.guard import HeldOut, Verdict, held_out, verdict
 from worldpose.bundle_adjustment.noise import measured_noise
@@ -29,6 +29,7 @@ class BundleAdjustment:
     """Cameras of a clip after adjustment.
 
     Attributes:
+        clip: what was adjusted, with the noise of its detector in its confidences.
         cameras: (cameras,) batch; a camera whose change was refused is as it was.
         covariance: (cameras, 12, 12) of a step; as calibrated where the change was refused.
         accepted: (cameras,) bool.
@@ -44,6 +45,7 @@ class BundleAdjustment:
         observations: keypoints that cameras were adjusted to [1].
     """
 
+    clip: Clip
     cameras: Camera
     covariance: NDArray[np.float64]
     accepted: NDArray[np.bool_]
@@ -82,6 +84,7 @@ def adjust_cameras(
     used = used if settings.chosen_frames else proposed
     judged = propose_frames(clip, settings.frames, settings.frame_gap, settings.min_views, used)
     judged = judged if len(judged) else used
+    clip = with_learned_noise(clip, np.union1d(used, judged))
     adjuster = _Adjuster(clip, settings, used, judged)
     count = len(clip.clicks)
     everybody = adjuster.everybody
@@ -105,6 +108,7 @@ def adjust_cameras(
     blocks = last.camera_covariance.reshape(count, _SIZE, count, _SIZE)
     own = blocks[np.arange(count), :, np.arange(count)]
     return BundleAdjustment(
+        clip=clip,
         cameras=_where(~standing, last.cameras, clip.cameras),
         covariance=np.where(standing[:, None, None], clip.covariance, own),
         accepted=~standing,
@@ -217,6 +221,7 @@ def _nothing(
     count = len(clip.clicks)
     nan = np.full((count, 2), np.nan)
     return BundleAdjustment(
+        clip=clip,
         cameras=clip.cameras,
         covariance=clip.covariance,
         accepted=np.zeros(count, dtype=np.bool_),

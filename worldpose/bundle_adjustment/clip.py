@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.cameras import Camera
-from worldpose.triangulation import TriangulationSettings
+from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -53,7 +53,7 @@ class Clip:
         detection_index: (frames, cameras, persons); -1 = not seen.
         joints: (frames, persons, 17, 3) [m], world, as triangulated; NaN where not determined.
         views: (frames, persons, 17) agreeing cameras.
-        triangulation: settings that made the joints, with the noise of keypoints.
+        triangulation: settings that made the joints.
     """
 
     cameras: Camera
@@ -154,6 +154,36 @@ def observe(
     )
 
 
+def with_learned_noise(clip: Clip, frames: Integers) -> Clip:
+    """Return the clip with the noise of its detector in its confidences.
+
+    The variance of a keypoint is then the stated one over its confidence, and triangulation takes
+    cameras as they are: their errors are what adjustment is to see.
+
+    Args:
+        clip: the clip.
+        frames: (k,) indices of frames that the noise is learned from.
+    """
+    settings = clip.triangulation
+    if settings.learn_noise and len(frames):
+        seen = (clip.keypoints[frames], clip.confidence[frames])
+        index = clip.detection_index[frames].astype(np.int16)
+        noise = triangulate_joints(clip.cameras, *seen, index, settings).noise
+        precision = noise.precision(clip.confidence)
+    else:
+        precision = np.where(clip.confidence > 0.0, clip.confidence, 0.0)
+    most = max(float(precision.max(initial=0.0)), 1e-12)
+    exact = {
+        "learn_noise": False,
+        "offsets": "none",
+        "pixel_noise": settings.pixel_noise / np.sqrt(most),
+        "joint_noise": settings.joint_noise / np.sqrt(most),
+    }
+    return replace(
+        clip, confidence=precision / most, triangulation=settings.model_copy(update=exact)
+    )
+
+
 def predict(
     cameras: Camera,
     joints: NDArray[np.float64],
@@ -172,15 +202,16 @@ def predict(
         (frames, cameras, persons, 17, 2) and (frames, cameras, persons, 17); NaN and infinite
         where there is no image.
     """
-    shape = (joints.shape[0], *joints.shape[1:3])
+    count = len(cameras.focal)
+    shape = (count, *joints.shape[:3])
     flat = joints.reshape(-1, 3)
-    predicted = np.stack([cameras[c].project(flat) for c in range(len(cameras.focal))])
+    predicted = np.stack([cameras[c].project(flat) for c in range(count)])
     pose = cameras.cam_from_world
     depth = flat @ pose.rotation[:, 2].T + pose.translation[:, 2]
     with np.errstate(invalid="ignore", divide="ignore"):
         size = cameras.focal.mean(axis=-1)[:, None] / depth.T
-        size = size.reshape(-1, *shape).swapaxes(0, 1)
+        size = size.reshape(shape).swapaxes(0, 1)
         variance = settings.pixel_noise**2 + (settings.joint_noise * size) ** 2
         noise = np.sqrt(variance / confidence)
     noise[~np.isfinite(noise)] = np.inf
-    return predicted.reshape(-1, *shape, 2).swapaxes(0, 1), noise
+    return predicted.reshape(*shape, 2).swapaxes(0, 1), noise

@@ -17,7 +17,6 @@ from worldpose.cameras.stored import camera_arrays
 
 
 def adjustment_arrays(
-    clip: Clip,
     adjusted: BundleAdjustment,
     settings: BundleAdjustmentSettings,
     person: NDArray[np.integer[Any]],
@@ -25,7 +24,6 @@ def adjustment_arrays(
     """The stored arrays and attributes of adjusted cameras, without the people.
 
     Args:
-        clip: what was adjusted.
         adjusted: the adjustment.
         settings: of the adjustment.
         person: (persons,) ids.
@@ -33,6 +31,7 @@ def adjustment_arrays(
     Returns:
         Arrays by name, and attributes by name but for the camera ids.
     """
+    clip = adjusted.clip
     outliers = keypoint_outliers(
         clip, adjusted.cameras, adjusted.noise, settings.wrong_keypoint, settings.review
     )

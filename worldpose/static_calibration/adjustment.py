@@ -28,7 +28,7 @@ class Problem:
     Attributes:
         evidence: clicks and drawn markings.
         image_size: width, height [px].
-        prior: (15,), see `prior_residuals`.
+        prior: (18,), see `prior_residuals`.
         free: (12,) which parameters are solved for.
         click_noise: standard deviation of clicks [px].
         drawn_noise: standard deviation of drawn points [px].
@@ -91,6 +91,7 @@ def problem_of(
     prior += [known.k1_spread, known.k2_spread, known.k3_spread]
     prior += [np.log(known.height), known.height_spread]
     prior += [np.log(known.distance), known.distance_spread, known.roll_spread, _LEAST_HEIGHT]
+    prior += known.lens_spread
     return Problem(
         evidence=evidence,
         image_size=image_size,

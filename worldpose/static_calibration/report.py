@@ -60,7 +60,7 @@ class CalibrationReport:
         drawn: residuals of drawn markings, the worst first.
         wrong: names of clicks and drawn markings that the camera does not rest on, the most
             surprising first.
-        noise_scale: factor on the stated noise that the residuals ask for, at least 1 [1].
+        noise_scale: factor on the stated noise that the residuals ask for [1].
         condition: of the information about the free parameters, each in its prior's spreads [1].
         ground_error: the coverage map.
         weak: must a person look at this camera.

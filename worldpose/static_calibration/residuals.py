@@ -157,9 +157,9 @@ def prior_residuals(c: Floats, prior: Floats, residual: Floats, jacobian: Floats
 
     Args:
         c: (22,) camera.
-        prior: (15,) log focal, its spread; cx, cy, their spread; half diagonal [px]; spreads of
+        prior: (18,) log focal, its spread; cx, cy, their spread; half diagonal [px]; spreads of
             k1, k2, k3; log height, its spread; log distance, its spread; spread of the roll; the
-            least height [m] that counts.
+            least height [m] that counts; spreads of k1, k2, k3 as coefficients.
         residual: (9,), written.
         jacobian: (9, 12), written.
     """
@@ -175,9 +175,10 @@ def prior_residuals(c: Floats, prior: Floats, residual: Floats, jacobian: Floats
         power *= squared
         # The corner's displacement: the same lens bends a long picture's corner less.
         value = c[8] if k == 2 else c[4 + k]
-        residual[3 + k] = value * power / prior[6 + k]
-        jacobian[3 + k, 9 + k] = power / prior[6 + k]
-        jacobian[3 + k, 6] = -2.0 * (k + 1.0) * residual[3 + k]
+        spread = np.hypot(prior[6 + k], prior[15 + k] * power)
+        residual[3 + k] = value * power / spread
+        jacobian[3 + k, 9 + k] = power / spread
+        jacobian[3 + k, 6] = -2.0 * (k + 1.0) * residual[3 + k] * (prior[6 + k] / spread) ** 2
     # The center moves by -R^T d with the step's shift d, and not with its rotation.
     x = -(c[9] * c[18] + c[12] * c[19] + c[15] * c[20])
     y = -(c[10] * c[18] + c[13] * c[19] + c[16] * c[20])

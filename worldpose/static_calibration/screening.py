@@ -14,7 +14,7 @@ from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 _ROBUST: Final = 3.0
 """Cauchy scale of clicks [standard deviations] of the fit that the screening starts from."""
-_OWN_WORTH: Final = 10.0
+_OWN_WORTH: Final = 40.0
 """Residuals that the stated noise is worth when the noise is estimated [1]: a few clicks cannot
 overrule it."""
 
@@ -47,7 +47,7 @@ class Screened:
         inliers: (n,) bool.
         markings: (m,) bool, drawn markings that the camera rests on.
         surprise: (n,) residual in standard deviations of what the other evidence predicts.
-        noise_scale: factor on the stated noise, at least 1.
+        noise_scale: factor on the stated noise that the residuals ask for.
         misfit: mean loss of an observation in the stated noise [1]; about 1 for honest ones.
     """
 
@@ -190,7 +190,7 @@ def _covariance(problem: Problem, fit: Fits) -> tuple[NDArray[np.float64], float
     count = 2 * len(rows.click) + len(rows.drawn)
     spent = float(np.trace(np.linalg.solve(fit.information[0][free], observed[free])))
     squared_scale = (_OWN_WORTH + squared) / (_OWN_WORTH + max(count - spent, 0.0))
-    scale = float(np.sqrt(max(1.0, squared_scale)))
+    scale = float(np.sqrt(squared_scale))
     covariance = np.zeros_like(prior)
     total = observed[free] / scale**2 + prior[free]
     # Coefficients of the lens and meters differ by many powers of ten.

@@ -33,6 +33,9 @@ class CameraPrior(Record):
     the clicks: on drawn broadcast lines 0.005 predicts worse than 0.0015."""
     k3_spread: float = Field(default=0.005, gt=0)
     """As `k1_spread`, of k3 where it is solved for [1]."""
+    lens_spread: tuple[float, float, float] = (0.1, 0.02, 0.01)
+    """Of k1, k2, k3 themselves [1], added in squares to what the corner's displacement allows: wide
+    lenses bend their corners more (C5)."""
     height: float = Field(default=18.0, gt=0)
     """Above the pitch [m]: stands and roofs are 8 to 40 m up."""
     height_spread: float = Field(default=0.4, gt=0)

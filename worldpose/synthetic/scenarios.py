@@ -116,6 +116,8 @@ SCENARIOS: Final = {
             rig=_SPRAWL,
             broadcast=BroadcastSettings(),
             noise=_TRIAL,
+            # A line is 7 px wide here: its edge, taken for its middle, is 3.5 px off.
+            clicks=ClickSettings(clustered=1.0, clustered_points=(5, 5), noise=3.0),
         ),
         Scenario(
             name="crossing",

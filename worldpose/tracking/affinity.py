@@ -26,7 +26,8 @@ def ray_affinity(
         joints: (persons, joints, 3) [m], world; NaN where unknown.
         centers: (cameras, 3) [m], world, where the rays begin.
         directions: (cameras, detections, joints, 3) unit rays, world.
-        weights: (cameras, detections, joints), 0 or less where not seen; how much more says nothing.
+        weights: (cameras, detections, joints), 0 or less where not seen; else their size says
+            nothing.
         gates: (persons,) [m], distances beyond which a person's affinity is not needed.
         min_joints: least joints known on both sides.
 

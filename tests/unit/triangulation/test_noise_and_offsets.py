@@ -78,28 +78,30 @@ def misjudged(camera, seed, size):
 def shape_error(joints, truth):
     """Mean error [m] of joints about their mean: calibration errors move a person as a whole."""
     return np.linalg.norm(
-        (joints - joints.mean(axis=2, keepdims=True))
-        - (truth - truth.mean(axis=2, keepdims=True)),
+        (joints - joints.mean(axis=2, keepdims=True)) - (truth - truth.mean(axis=2, keepdims=True)),
         axis=-1,
     ).mean()
 
 
 @pytest.mark.parametrize("known", [True, False])
 def test_offsets_keep_calibration_errors_from_the_pose(ring, known):
-    truth, joints = ring(6), runner(40)
-    arrays = detections(truth, joints, 1.0)
+    truth, joints = ring(8), runner(40)
+    keypoints, confidence, index = detections(truth, joints, 1.0)
+    # Other cameras for every joint: with the same ones all joints err alike anyway.
+    confidence[np.random.default_rng(8).random(confidence.shape) < 0.25] = 0.0
+    arrays = keypoints, confidence, index
     given, covariance = misjudged(truth, 5, 2e-3)
     covariance = covariance if known else None
     errors = {}
     for offsets in ("none", "midhip", "body"):
-        # Views taken or left would show as shape; 2 mrad are 6 cm at 30 m.
+        # 2 mrad are 6 cm at 30 m.
         settings = SETTINGS.model_copy(update={"offsets": offsets})
         result = triangulate_joints(given, *arrays, settings, covariance)
         errors[offsets] = shape_error(result.joints, joints)
     exact = shape_error(triangulate_joints(truth, *arrays, SETTINGS).joints, joints)
-    assert errors["body"] < 1.1 * exact
+    assert errors["body"] < 1.15 * exact
     assert errors["body"] < errors["midhip"]
-    assert errors["body"] < errors["none"]
+    assert errors["body"] < 0.9 * errors["none"]
 
 
 def test_offsets_do_nothing_to_exact_cameras(ring):

@@ -57,7 +57,9 @@ def test_smoothing_is_nearer_and_steadier_than_single_frames(ring):
         np.linalg.inv(smooth.covariance),
         smooth.joints - joints,
     )
-    assert 0.9 < (squared < 7.815).mean() < 0.995
+    # Regions of 95 %; usual accelerations come in steps of two, which leaves them up to a third
+    # too wide.
+    assert (squared < 7.815).mean() > 0.93
 
 
 def test_short_gaps_are_filled_and_marked_and_long_ones_left(ring):
@@ -139,7 +141,7 @@ def test_whole_frames_are_moved_exactly_and_half_frames_lie_between(ring):
     keypoints, confidence, index = detections(ring(3), runner(10), 0.0)
     index[4, 1, 0] = -1
     late = np.array([0.0, 2.0, -0.5])
-    pixels, weights, moved = moved_in_time(keypoints, confidence, index, late)
+    pixels, _, moved = moved_in_time(keypoints, confidence, index, late)
     np.testing.assert_array_equal(pixels[:, 0], keypoints[:, 0])
     np.testing.assert_array_equal(pixels[2:, 1, 1], keypoints[:-2, 1, 1])
     assert (moved[:2, 1] == -1).all()

@@ -1,0 +1,210 @@
+"""Prints how fast and how well joints are triangulated, beside peers in the same run.
+
+    python benchmarks/triangulation.py [--frames 500] [--rounds 3]
+
+22 people of 17 joints before 16 cameras; noise of 1.5 px with a heavy spread, 20 % of keypoints
+missing, 5 % displaced by 15 to 150 px. All sides start from pixels and use one thread; they take
+turns and the best round counts, in processor time, so that other work on the machine matters
+little. "aniposelib-style" is that library's published algorithm written here (undistort with
+OpenCV, one SVD a point, a loop over points): the library is not needed. It and "EasyMocap-style"
+(one SVD call a person) run on a part, their time is scaled.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from worldpose.cameras import Camera, Rigid
+from worldpose.triangulation import TriangulationSettings, triangulate_joints
+
+CAMERAS, PEOPLE, JOINTS = 16, 22, 17
+PART = 17 * 60
+STATED = TriangulationSettings(learn_noise=False, offsets="none")
+
+
+def rig(rng: np.random.Generator) -> Camera:
+    """Cameras in the stands, each framing a part of the pitch."""
+    cameras = []
+    for n in range(CAMERAS):
+        angle = 2 * np.pi * (n + rng.uniform(-0.2, 0.2)) / CAMERAS
+        center = np.array([85 * np.cos(angle), 65 * np.sin(angle), rng.uniform(14, 28)])
+        forward = np.array([rng.uniform(-25, 25), rng.uniform(-15, 15), 0.0]) - center
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        cameras.append(
+            Camera(
+                focal=np.full(2, rng.uniform(1500, 2300)),
+                principal_point=np.array([960.0, 540.0]) + rng.normal(0, 8, 2),
+                distortion=np.array([rng.uniform(-0.12, 0.02), rng.uniform(-0.02, 0.04), 0, 0, 0]),
+                cam_from_world=Rigid(rotation, -rotation @ center),
+                image_size=np.array([1920, 1080]),
+            )
+        )
+    return Camera.stack(cameras)
+
+
+def workload(frames: int) -> tuple[Camera, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Cameras, joints (n, 3), pixels (cameras, n, 2), confidence (cameras, n), displaced."""
+    rng = np.random.default_rng(0)
+    cameras = rig(rng)
+    seconds = np.arange(frames)[:, None] / 50.0
+    start = rng.uniform([-40, -26], [40, 26], (PEOPLE, 2))
+    way = start + 2.0 * np.sin(rng.uniform(0.1, 0.5, (PEOPLE, 2)) * seconds[..., None])
+    body = rng.uniform([-0.3, -0.3, 0.0], [0.3, 0.3, 1.8], (PEOPLE, JOINTS, 3))
+    joints = np.broadcast_to(body, (frames, *body.shape)).copy()
+    joints[..., :2] += way[:, :, None]
+    points = joints.reshape(-1, 3)
+    pixels = cameras.project(points)
+    shape = pixels.shape[:2]
+    spread = 1.5 * rng.lognormal(0, 0.5, shape)
+    sure = np.clip(1.1 - 0.22 * spread / 1.5 + rng.normal(0, 0.08, shape), 0.05, 1.0)
+    inside = ((pixels > 0) & (pixels < [1920, 1080])).all(axis=-1) & (rng.random(shape) > 0.2)
+    displaced = rng.random(shape) < 0.05
+    angle, far = rng.uniform(0, 2 * np.pi, shape), rng.uniform(15, 150, shape)
+    pixels += spread[..., None] * rng.normal(size=pixels.shape)
+    away = far[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    pixels += np.where(displaced[..., None], away, 0.0)
+    return cameras, points, np.nan_to_num(pixels), np.where(inside, sure, 0.0), displaced
+
+
+def main() -> None:
+    """Print one line a method."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--frames", type=int, default=500)
+    parser.add_argument("--rounds", type=int, default=3)
+    options = parser.parse_args()
+    cv2.setNumThreads(1)
+    cameras, points, pixels, sure, displaced = workload(options.frames)
+    pose = cameras.cam_from_world
+    poses = np.concatenate([pose.rotation, pose.translation[..., None]], axis=-1)
+    many = len(points)
+    shape = (CAMERAS, options.frames, PEOPLE, JOINTS)
+
+    def by_frame(array: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(array.reshape(*shape, *array.shape[2:]).swapaxes(0, 1))
+
+    keypoints, index = by_frame(pixels), np.arange(PEOPLE, dtype=np.int16)
+    index = np.broadcast_to(index, (options.frames, CAMERAS, PEOPLE)).copy()
+
+    def ours(confidence: np.ndarray, settings: TriangulationSettings) -> np.ndarray:
+        result = triangulate_joints(cameras, keypoints, by_frame(confidence), index, settings)
+        return result.joints.reshape(-1, 3)
+
+    def undistorted(count: int) -> np.ndarray:
+        k, focal = cameras.distortion, cameras.focal[:, None]
+        start = (pixels[:, :count] - cameras.principal_point[:, None]) / focal
+        plane = start
+        for _ in range(6):
+            square = (plane**2).sum(-1, keepdims=True)
+            plane = start / (1 + square * (k[:, None, :1] + square * k[:, None, 1:2]))
+        return plane
+
+    def rows(count: int) -> tuple[np.ndarray, np.ndarray]:
+        plane, weight = undistorted(count), sure[:, :count, None]
+        a = weight * (plane[..., :1] * poses[:, None, 2] - poses[:, None, 0])
+        return a, weight * (plane[..., 1:] * poses[:, None, 2] - poses[:, None, 1])
+
+    def stacked(count: int) -> np.ndarray:
+        return np.concatenate(rows(count)).transpose(1, 0, 2)
+
+    def from_null(vectors: np.ndarray) -> np.ndarray:
+        return vectors[..., :3] / vectors[..., 3:]
+
+    def normal_equations() -> np.ndarray:
+        a, b = rows(many)
+        matrix = np.empty((many, 4, 4))
+        for i in range(4):
+            for j in range(i, 4):
+                value = (a[..., i] * a[..., j] + b[..., i] * b[..., j]).sum(0)
+                matrix[:, i, j] = matrix[:, j, i] = value
+        ridge = 1e-12 * np.eye(3)
+        return -np.linalg.solve(matrix[:, :3, :3] + ridge, matrix[:, :3, 3:])[..., 0]
+
+    def matmul_normal_equations() -> np.ndarray:
+        a = stacked(many)
+        matrix = a.transpose(0, 2, 1) @ a
+        ridge = 1e-12 * np.eye(3)
+        return -np.linalg.solve(matrix[:, :3, :3] + ridge, matrix[:, :3, 3:])[..., 0]
+
+    def batch_svd() -> np.ndarray:
+        return from_null(np.linalg.svd(stacked(many), full_matrices=False)[2][:, -1])
+
+    def easymocap_style() -> np.ndarray:
+        a = stacked(PART)
+        parts = [np.linalg.svd(a[n : n + 17])[2][:, -1] for n in range(0, PART, 17)]
+        return from_null(np.concatenate(parts))
+
+    def opencv_pairs() -> np.ndarray:
+        plane = undistorted(many)
+        pair = np.sort(np.argsort(-sure, axis=0)[:2], axis=0)
+        out = np.empty((many, 3))
+        for one, two in {tuple(column) for column in np.unique(pair, axis=1).T}:
+            at = (pair[0] == one) & (pair[1] == two)
+            views = [np.ascontiguousarray(plane[c, at].T) for c in (one, two)]
+            found = cv2.triangulatePoints(poses[one], poses[two], *views)
+            out[at] = (found[:3] / found[3]).T
+        return out
+
+    def aniposelib_style() -> np.ndarray:
+        plane = []
+        for c in range(CAMERAS):
+            matrix = np.diag([*cameras.focal[c], 1.0])
+            matrix[:2, 2] = cameras.principal_point[c]
+            given = np.ascontiguousarray(pixels[c, :PART])
+            plane.append(cv2.undistortPoints(given, matrix, np.array(cameras.distortion[c])))
+        flat = np.stack(plane).reshape(CAMERAS, PART, 2)
+        out = np.full((PART, 3), np.nan)
+        for n in range(PART):
+            good = np.flatnonzero(sure[:, n] > 0.3)
+            if len(good) < 2:
+                continue
+            equations = np.zeros((2 * len(good), 4))
+            for k, c in enumerate(good):
+                x, y = flat[c, n]
+                equations[2 * k] = x * poses[c, 2] - poses[c, 0]
+                equations[2 * k + 1] = y * poses[c, 2] - poses[c, 1]
+            vector = np.linalg.svd(equations, full_matrices=True)[2][-1]
+            out[n] = vector[:3] / vector[3]
+        return out
+
+    inliers = np.where(displaced, 0.0, sure)
+    sides: dict[str, Callable[[], np.ndarray]] = {
+        "ours, robust": lambda: ours(sure, STATED),
+        "ours, true inliers given": lambda: ours(inliers, STATED),
+        "ours, robust, noise learned": lambda: ours(
+            sure, STATED.model_copy(update={"learn_noise": True})
+        ),
+        "numpy normal equations": normal_equations,
+        "numpy normal equations, matmul": matmul_normal_equations,
+        "numpy batch SVD": batch_svd,
+        "cv2.triangulatePoints, best pair": opencv_pairs,
+        "EasyMocap-style batch DLT": easymocap_style,
+        "aniposelib-style loop": aniposelib_style,
+    }
+    best, found = dict.fromkeys(sides, np.inf), {name: side() for name, side in sides.items()}
+    for _ in range(options.rounds):
+        for name, side in sides.items():
+            start = time.process_time()
+            side()
+            seconds = (time.process_time() - start) * many / len(found[name])
+            best[name] = min(best[name], seconds)
+    enough = (sure > 0).sum(axis=0) >= 3
+    print(f"{many} joints, {CAMERAS} cameras, best of {options.rounds} rounds, one thread")
+    for name, joints in found.items():
+        counted = enough[: len(joints)]
+        error = np.linalg.norm(joints - points[: len(joints)], axis=-1)[counted]
+        print(
+            f"{name:34s} {best[name]:8.3f} s  {best[name] / best['ours, robust']:7.2f} times ours  "
+            f"mean {np.nanmean(error) * 1e3:8.1f} mm  median {np.nanmedian(error) * 1e3:6.1f} mm"
+        )
+
+
+if __name__ == "__main__":
+    main()

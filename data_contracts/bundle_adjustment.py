@@ -1,0 +1,156 @@
+"""Result of stage `bundle_adjustment`: cameras that agree with people, and people again (B1-B3)."""
+
+from __future__ import annotations
+
+from data_contracts.arrays import ArrayLayout, GroupLayout, Missing
+from data_contracts.cameras import CAMERA_ARRAYS, CAMERA_LABELS
+from data_contracts.conventions import COCO17
+from data_contracts.observations import FRAME
+from data_contracts.static_calibration import CAMERA_STEP
+from data_contracts.tracking import PERSON
+from data_contracts.triangulation import TRIANGULATION
+
+
+def _of_cameras(name: str, last: str, unit: str, missing: Missing, about: str) -> ArrayLayout:
+    return ArrayLayout(
+        name=name,
+        dims=("camera", last),
+        dtype="float64",
+        unit=unit,
+        missing=missing,
+        about=about,
+    )
+
+
+_CAMERAS = tuple(
+    array.model_copy(update={"dims": ("camera", *array.dims)}) for array in CAMERA_ARRAYS
+)
+_ACCEPTANCE = (
+    ArrayLayout(
+        name="camera_covariance",
+        dims=("camera", "parameter", "parameter_"),
+        dtype="float64",
+        unit="1",
+        missing="none",
+        about="covariance of a step of each camera, in the units of its parameters; all zero for "
+        "a given camera whose change was refused",
+    ),
+    ArrayLayout(
+        name="accepted",
+        dims=("camera",),
+        dtype="bool",
+        unit="1",
+        missing="none",
+        about="was the camera changed; else it is as `static_calibration` has it",
+    ),
+    ArrayLayout(
+        name="judges",
+        dims=("camera",),
+        dtype="int64",
+        unit="1",
+        missing="0",
+        about="keypoints of left-out people that judged the camera",
+    ),
+    _of_cameras("held_out_loss", "side", "1", "nan", "mean loss of these keypoints, which decides"),
+    _of_cameras("held_out_error", "side", "px", "nan", "median error of these keypoints"),
+    _of_cameras(
+        "marking_error",
+        "side",
+        "px",
+        "nan",
+        "root mean square error per axis of the clicked points that calibration rests on",
+    ),
+    _of_cameras(
+        "weak_step",
+        "parameter",
+        "1",
+        "none",
+        "one standard deviation along the direction in which the camera is known least",
+    ),
+)
+_REVIEW = (
+    *(
+        ArrayLayout(
+            name=f"outlier_{name}",
+            dims=("outlier",),
+            dtype="int64",
+            unit="frame" if name == "frame" else "1",
+            missing="-1" if name == "joint" else "none",
+            about=f"{about} of a keypoint that disagrees, the most surprising first",
+        )
+        for name, about in (
+            ("frame", "match frame"),
+            ("camera", "place among the cameras"),
+            ("person", "person id"),
+            ("joint", "joint, missing where most of the person in this picture is off,"),
+        )
+    ),
+    ArrayLayout(
+        name="outlier_surprise",
+        dims=("outlier",),
+        dtype="float64",
+        unit="1",
+        missing="none",
+        about="its distance to where the other cameras put it, in standard deviations",
+    ),
+    ArrayLayout(
+        name="click_camera",
+        dims=("click",),
+        dtype="int64",
+        unit="1",
+        missing="none",
+        about="place among the cameras of a clicked point, the most surprising first",
+    ),
+    ArrayLayout(
+        name="click_residual",
+        dims=("click", "axis"),
+        dtype="float64",
+        unit="px",
+        missing="none",
+        about="projected minus clicked, after adjustment",
+    ),
+    ArrayLayout(
+        name="click_surprise",
+        dims=("click",),
+        dtype="float64",
+        unit="1",
+        missing="none",
+        about="residual in standard deviations of what everything else predicts",
+    ),
+    ArrayLayout(
+        name="click_wrong",
+        dims=("click",),
+        dtype="bool",
+        unit="1",
+        missing="none",
+        about="is it proposed for removal; a person decides",
+    ),
+)
+
+BUNDLE_ADJUSTMENT = GroupLayout(
+    stage="bundle_adjustment",
+    about="Cameras of one clip adjusted to its people and markings, and the people triangulated "
+    "again with them.",
+    coordinates=(FRAME, PERSON),
+    arrays=(*TRIANGULATION.arrays, *_CAMERAS, *_ACCEPTANCE, *_REVIEW),
+    labels={
+        **CAMERA_LABELS,
+        "joint": COCO17,
+        "coordinate_": ("x", "y", "z"),
+        "parameter": CAMERA_STEP,
+        "parameter_": CAMERA_STEP,
+        "side": ("before", "after"),
+    },
+    attributes={
+        "camera": "camera ids in the order of the camera dimension",
+        "reasons": "why each camera was changed or not",
+        "weak": "parameters that make up each camera's weakest direction",
+        "proposed_frames": "match frames that suit adjustment best",
+        "used_frames": "match frames that people were taken from",
+        "judged_frames": "match frames in which left-out people judged",
+        "noise_scale": "factor on the stated noise of keypoints that they show",
+        "noise_correlation": "keypoints that are worth one independent one",
+        "outliers_found": "keypoints and people that disagree, also beyond the list",
+        "click": "names of the clicked points",
+    },
+)
