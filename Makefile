@@ -34,11 +34,14 @@ format: install
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+# Files, not tests, are handed to the processes: tests of a file share what they made.
+PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+
 test: install check
-	$(BIN)/pytest -m "not slow"
+	$(PYTEST) -m "not slow"
 
 test-all: install check
-	$(BIN)/pytest
+	$(PYTEST)
 
 schemas: install
 	$(BIN)/python -m data_contracts.schemas docs/schemas

@@ -25,7 +25,7 @@ class Answer:
         return json.loads(self.out)
 
 
-def worldpose(*arguments, timeout=240, environment=None, program=WORLDPOSE):
+def worldpose(*arguments, timeout=480, environment=None, program=WORLDPOSE):
     """Runs the command line in a process of its own."""
     done = subprocess.run(
         [*program, *map(str, arguments)],
