@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from data_contracts.arrays import ArrayLayout, GroupLayout
+from data_contracts.conventions import COCO17
 from data_contracts.observations import FRAME
 from data_contracts.tracking import PERSON
 
@@ -32,10 +33,58 @@ BODY_FITTING = GroupLayout(
             missing="nan",
             about="body shape; comparable only within one body model",
         ),
+        ArrayLayout(
+            name="betas_covariance",
+            dims=("person", "shape_component", "shape_component_"),
+            dtype="float64",
+            unit="1",
+            missing="nan",
+            about="covariance of `betas`",
+        ),
         _pose_array("global_orient", "rotation", "rad", "axis-angle of the pelvis, world"),
         _pose_array("body_pose", "rotation_23", "rad", "axis-angle of the 23 other joints"),
         _pose_array("transl", "coordinate", "m", "translation, world, added after rotation"),
+        ArrayLayout(
+            name="joints",
+            dims=("frame", "person", "joint", "coordinate"),
+            dtype="float64",
+            unit="m",
+            missing="nan",
+            about="keypoints of the bodies, world",
+            chunk_dim="frame",
+        ),
+        ArrayLayout(
+            name="covariance",
+            dims=("frame", "person", "joint", "coordinate", "coordinate_"),
+            dtype="float64",
+            unit="m^2",
+            missing="nan",
+            about="covariance of `joints`, shape and joint offsets taken as known",
+            chunk_dim="frame",
+        ),
+        ArrayLayout(
+            name="filled",
+            dims=("frame", "person"),
+            dtype="bool",
+            unit="1",
+            missing="none",
+            about="a body in a frame without any joint of the person: filled by motion",
+            chunk_dim="frame",
+        ),
+        ArrayLayout(
+            name="joint_offsets",
+            dims=("joint", "body_axis"),
+            dtype="float64",
+            unit="m",
+            missing="none",
+            about="from a joint to what the detector takes for it, the same for everybody",
+        ),
     ),
-    labels={"coordinate": ("x", "y", "z")},
-    attributes={"body_model": "name and version of the body model, such as open-neutral/1"},
+    labels={
+        "joint": COCO17,
+        "coordinate": ("x", "y", "z"),
+        "coordinate_": ("x", "y", "z"),
+        "body_axis": ("forward", "left", "up"),
+    },
+    attributes={"body_model": "name and version of the body model, such as open-neutral/2"},
 )

@@ -44,8 +44,8 @@ some of them wrong."""
 
 PAPER: Final = {
     "base": (83.5, 70.8),
-    "+ BA (S and P)": (86.2, 70.7),
-    "+ BA (S only), no guard": (548.4, 75.4),
+    "+ BA, S and P": (86.2, 70.7),
+    "+ BA, S, unguarded": (548.4, 75.4),
     "+ BA + SMPL": (80.0, 66.3),
 }
 """G-MPJPE and PA-MPJPE of the paper's table [mm]."""
@@ -107,9 +107,9 @@ def trial(seed: int, clicks: ClickSettings) -> dict[str, Score]:
     rows = {
         "true cameras": (true, ~everyone),
         "base": (clip.cameras, ~everyone),
-        "+ BA (S and P)": (both.cameras, both.accepted),
-        "+ BA (S only)": (markings.cameras, markings.accepted),
-        "+ BA (S only), no guard": (markings.refused, everyone),
+        "+ BA, S and P": (both.cameras, both.accepted),
+        "+ BA, S only": (markings.cameras, markings.accepted),
+        "+ BA, S, unguarded": (markings.refused, everyone),
     }
     return {
         name + how: _score(scene, clip, tuple(calibrations), *row, settings)

@@ -20,7 +20,7 @@ def print_ablation(seeds: int, *, as_json: bool) -> None:
         seeds: how many, from 0.
         as_json: every trial's figures instead of a table.
     """
-    from flows.ablation import PAPER, Score, ablation
+    from flows.ablation import PAPER, TRIANGULATIONS, Score, ablation
 
     trials = ablation(
         range(seeds), lambda clicks, seed: line(f"{clicks}: trial {seed} done", to=errors)
@@ -37,28 +37,42 @@ def print_ablation(seeds: int, *, as_json: bool) -> None:
             }
         )
         return
-    columns = ("", ">G-MPJPE mm", ">PA-MPJPE mm", ">ground m", ">clicks px", ">changed", ">paper")
+    columns = ("", ">G-MPJPE", ">PA-MPJPE", ">ground m", ">clicks px", ">paper G / PA")
     for clicks, found in trials.items():
-        rows = [_row(row, [trial[row] for trial in found], PAPER.get(row)) for row in found[0]]
-        rows += [_row(row, [], paper) for row, paper in PAPER.items() if row not in found[0]]
-        print_table(f"{clicks}, {seeds} trials, mean and spread", columns, rows)
+        for how in TRIANGULATIONS:
+            names = [row.removesuffix(how) for row in found[0] if _is_of(row, how)]
+            names += [row for row in PAPER if row not in names]
+            rows = [
+                _row(name, [t[name + how] for t in found if name + how in t], PAPER.get(name))
+                for name in names
+            ]
+            print_table(f"{clicks}{how}: {seeds} trials, mm, mean ± spread", columns, rows)
+
+
+def _is_of(row: str, how: str) -> bool:
+    """Whether a row is triangulated this way; the first way has no name."""
+    from flows.ablation import TRIANGULATIONS
+
+    return max((end for end in TRIANGULATIONS if row.endswith(end)), key=len) == how
 
 
 def _row(
     name: str, scores: list[Score], paper: tuple[float, float] | None
-) -> tuple[str, str, str, str, str, str, str]:
+) -> tuple[str, str, str, str, str, str]:
+    def values(figure: str) -> list[float]:
+        return [getattr(score, figure) for score in scores]
+
+    def mean(figure: str, digits: int) -> str:
+        return f"{np.mean(values(figure)):.{digits}f}" if scores else "-"
+
     def told(figure: str, digits: int) -> str:
-        values = np.array([getattr(score, figure) for score in scores])
-        if not len(values):
-            return "-"
-        return f"{values.mean():.{digits}f} ± {values.std():.{digits}f}"
+        return f"{mean(figure, digits)} ± {np.std(values(figure)):.{digits}f}" if scores else "-"
 
     return (
         name,
         told("g_mpjpe_mm", 1),
         told("pa_mpjpe_mm", 1),
-        told("ground_error_m", 3),
-        told("marking_error_px", 2),
-        f"{np.mean([score.changed for score in scores]):.0%}" if scores else "-",
+        mean("ground_error_m", 3),
+        mean("marking_error_px", 2),
         "-" if paper is None else f"{paper[0]:.1f} / {paper[1]:.1f}",
     )

@@ -26,6 +26,7 @@ STAGES_IN_WORLDPOSE = (
     "static_calibration",
     "tracking",
     "triangulation",
+    "bundle_adjustment",
     "release",
     "evaluation",
     "synthetic",

@@ -34,9 +34,9 @@ def bench():
     ("name", "least"),
     [
         # Seen on this half: 98.7, 98.9, 98.9.
-        ("wc14", (97.0, 98.0, 98.0)),
-        # Seen on this half: 94.8, 96.3, 96.5, all pictures kept.
-        ("sn22", (94.3, 95.8, 96.0)),
+        ("wc14", (98.4, 98.6, 98.6)),
+        # Seen on this half: 94.9, 96.3, 96.5, all pictures kept.
+        ("sn22", (94.6, 96.0, 96.2)),
     ],
 )
 def test_drawn_lines_give_cameras_that_hit_them(bench, name, least):
@@ -53,9 +53,9 @@ def test_the_camera_of_the_other_markings_predicts_one(bench):
     lines = bench.load_lines(DATA, "wc14", half=1, every=3)
     _, size = bench.SETS["wc14"]
     hits = bench.left_out(bench.load_scorer(DATA), lines, size, bench.BROADCAST)
-    # A third of the half, about 140 markings: 3 % either way of the half's 82.6 and 91.6.
-    assert hits[0] >= 76.0
-    assert hits[1] >= 87.0
+    # A third of the half, about 130 markings: two deviations of 3 % below the half's 84.1 and 92.6.
+    assert hits[0] >= 78.0
+    assert hits[1] >= 87.5
 
 
 def test_distortion_free_cameras_overlap_the_annotated_homographies(bench):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from worldpose.bundle_adjustment.building import (
     KeypointNoise,
     markings_problem,
+    measured_doubt,
     players_problem,
 )
 from worldpose.bundle_adjustment.clip import Clip, Observed, observe, with_learned_noise
@@ -21,7 +23,12 @@ from worldpose.bundle_adjustment.solving import Adjusted, solve
 from worldpose.cameras import Camera
 from worldpose.static_calibration import PARAMETERS
 
-_SIZE = len(PARAMETERS)
+_SIZE: Final = len(PARAMETERS)
+_ROUNDS: Final = 3
+"""Solutions from which noise and calibration's errors are learned; the third changes little."""
+_MOST: Final = 16.0
+"""Largest factor on calibration's variances [1]: nobody is four times less sure than he says, and
+it is calibration alone that holds the world in place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,16 +145,19 @@ class _Adjuster:
         self.clip, self.settings, self.used, self.judged = clip, settings, used, judged
         people = np.ones(clip.detection_index.shape[2], dtype=np.bool_)
         self.everybody = observe(clip, used, people, clip.cameras, settings.min_views)
-        self.noise = KeypointNoise()
+        self.noise, self.doubt = KeypointNoise(), np.ones(len(clip.clicks))
         if settings.evidence == "markings_and_players" and len(self.everybody.points):
             standing = np.zeros(len(clip.clicks), dtype=np.bool_)
-            rough = solve(
-                players_problem(clip, self.everybody, self.noise, standing, settings),
-                settings.solver,
-            )
-            self.noise = measured_noise(
-                rough.cameras, rough.points, self.everybody, settings.robust_scale
-            )
+            for _ in range(_ROUNDS):
+                problem = players_problem(
+                    clip, self.everybody, self.noise, standing, settings, self.doubt
+                )
+                rough = solve(problem, settings.solver)
+                self.noise = measured_noise(
+                    rough.cameras, rough.points, self.everybody, settings.robust_scale
+                )
+                # Nobody is surer than he says he is.
+                self.doubt = np.clip(self.doubt * measured_doubt(problem, rough), 1.0, _MOST)
 
     def solved(self, standing: NDArray[np.bool_], without: int | None = None) -> Adjusted:
         """The adjustment to everybody, or to everybody but one group."""
@@ -158,7 +168,9 @@ class _Adjuster:
             groups = self._groups(len(self.used))
             row = np.searchsorted(self.used, observed.frame_of)
             observed = _only(observed, groups[row, observed.person_of] != without)
-        problem = players_problem(self.clip, observed, self.noise, standing, self.settings)
+        problem = players_problem(
+            self.clip, observed, self.noise, standing, self.settings, self.doubt
+        )
         return solve(problem, self.settings.solver)
 
     def judgement(self, standing: NDArray[np.bool_] | None) -> HeldOut:

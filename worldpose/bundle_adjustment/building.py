@@ -7,15 +7,22 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from worldpose.bundle_adjustment.clip import Clip, Observed
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, GivenCameraPrior
-from worldpose.bundle_adjustment.solving import Problem
+from worldpose.bundle_adjustment.solving import Adjusted, Problem
+from worldpose.cameras import Camera
 from worldpose.static_calibration import PARAMETERS
 
 _SIZE: Final = len(PARAMETERS)
 _UNKNOWN: Final = np.array([1.0] * 3 + [100.0] * 3 + [1.0, 300.0, 300.0, 3.0, 30.0, 300.0])
 """Spreads that say nothing [rad, m, 1, px, 1]: what a few clicks leave open stays where it is."""
+
+
+_FAITH: Final = 10.0
+"""Directions for which calibration's own word counts, and that of the other cameras [1]: as many as
+one camera has."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +45,7 @@ def players_problem(
     noise: KeypointNoise,
     standing: NDArray[np.bool_],
     settings: BundleAdjustmentSettings,
+    doubt: NDArray[np.float64] | float = 1.0,
 ) -> Problem:
     """Return the adjustment of cameras to people, on top of what calibration knows.
 
@@ -51,8 +59,10 @@ def players_problem(
         noise: their scale and correlation.
         standing: (cameras,) bool, those that may not move.
         settings: robust scale, and the prior of given cameras.
+        doubt: (cameras,) factor on the variance that calibration states [1].
     """
     information, free = camera_knowledge(clip.covariance, settings.given)
+    information = information / np.reshape(doubt, (-1, 1, 1))
     variance = (observed.noise * noise.scale) ** 2 * noise.correlation
     scale = settings.robust_scale / np.sqrt(noise.correlation)
     return Problem(
@@ -66,6 +76,46 @@ def players_problem(
         image=observed.image,
         weight=1.0 / variance,
         scale=np.full(len(variance), scale),
+    )
+
+
+def measured_doubt(problem: Problem, adjusted: Adjusted) -> NDArray[np.float64]:
+    """Return the factor (cameras,) on calibration's variances that adjustment asks for.
+
+    People move a camera in the directions that they determine; where its step is longer than its
+    calibration allows, the calibration was too sure of itself. The squared step in stated standard
+    deviations is divided by the number of these directions (MacKay 1992), drawn towards the
+    median of all cameras.
+
+    Args:
+        problem: what was solved, with the variances that the factor is on.
+        adjusted: its solution.
+    """
+    count = len(problem.free)
+    step = step_between(problem.cameras, adjusted.cameras)
+    squared = np.einsum("ci,cij,cj->c", step, problem.camera_information, step)
+    blocks = adjusted.camera_covariance.reshape(count, _SIZE, count, _SIZE)
+    own = blocks[np.arange(count), :, np.arange(count)]
+    kept = np.einsum("cij,cji->c", problem.camera_information, own)
+    told = np.maximum(problem.free.sum(axis=1) - kept, 0.0)
+    # The median: a camera that shows somebody else must not free all the others.
+    overall = float(np.median((squared + 1.0) / (told + 1.0)))
+    return np.asarray((squared + _FAITH * overall) / (told + _FAITH))
+
+
+def step_between(start: Camera, end: Camera) -> NDArray[np.float64]:
+    """Return the step (cameras, 12) that takes cameras from start to end, to first order."""
+    turn = end.cam_from_world.rotation @ start.cam_from_world.rotation.swapaxes(-1, -2)
+    moved = np.einsum("cij,cj->ci", turn, start.cam_from_world.translation)
+    return np.concatenate(
+        [
+            Rotation.from_matrix(turn).as_rotvec(),
+            end.cam_from_world.translation - moved,
+            np.log(end.focal[:, :1] / start.focal[:, :1]),
+            end.principal_point - start.principal_point,
+            (end.distortion - start.distortion)[:, [0, 1, 4]],
+        ],
+        axis=1,
     )
 
 

@@ -58,5 +58,6 @@ class BundleAdjustmentSettings(Record):
     """Standard deviations from which a keypoint is on the review list [1]."""
     review: int = Field(default=1000, ge=0)
     """Longest review list of keypoints and people [1]; the worst come first."""
-    solver: SolverSettings = SolverSettings()
-    """When the solver stops."""
+    solver: SolverSettings = SolverSettings(cost_change=1e-6)
+    """When the solver stops: with a robust loss the last steps are small and many, and two more
+    digits of the cost move no joint."""

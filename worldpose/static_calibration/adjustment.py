@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -17,6 +17,8 @@ from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 _ITERATIONS: Final = 60
 """Enough from any start in the basin; most end after ten."""
+_LEAST_DEPTH: Final = 1.0
+"""Nearer points [m] are none that anybody clicks, and the camera is far from the answer."""
 _LEAST_HEIGHT: Final = 0.5
 """A camera below it is pushed up as if it were there [m]."""
 
@@ -28,9 +30,9 @@ class Problem:
     Attributes:
         evidence: clicks and drawn markings.
         image_size: width, height [px].
-        prior: (18,), see `prior_residuals`.
+        prior: (19,), see `prior_residuals`.
         free: (12,) which parameters are solved for.
-        click_noise: standard deviation of clicks [px].
+        click_noise: standard deviation of each click (n,), each axis [px].
         drawn_noise: standard deviation of drawn points [px].
         drawn_loss: Cauchy scale of drawn points [standard deviations].
     """
@@ -39,7 +41,7 @@ class Problem:
     image_size: tuple[int, int]
     prior: NDArray[np.float64]
     free: NDArray[np.bool_]
-    click_noise: float
+    click_noise: NDArray[np.float64]
     drawn_noise: float
     drawn_loss: float
 
@@ -47,6 +49,32 @@ class Problem:
     def reach(self) -> float:
         """Half the picture's diagonal [px]."""
         return 0.5 * float(np.hypot(*self.image_size))
+
+    def only(self, points: NDArray[np.bool_], markings: NDArray[np.bool_]) -> Problem:
+        """Return the problem of some clicked points (n,) and drawn markings (m,) only."""
+        return replace(
+            self,
+            evidence=self.evidence.only(points, markings),
+            click_noise=self.click_noise[points],
+        )
+
+    def surveyed_from(
+        self, row: NDArray[np.float64], settings: StaticCalibrationSettings
+    ) -> Problem:
+        """Return the problem with what the survey's error adds to clicks, as a camera sees it.
+
+        An error that is the same along all three axes covers as many pixels along both of the
+        picture's as the point's depth lets a meter cover.
+
+        Args:
+            row: (22,) camera near the answer.
+            settings: noise of clicks and survey.
+        """
+        depth = self.evidence.points_world @ row[15:18] + row[20]
+        meter = np.where(depth > _LEAST_DEPTH, row[0] / np.maximum(depth, _LEAST_DEPTH), 0.0)
+        return replace(
+            self, click_noise=np.hypot(settings.click_noise, settings.survey_error * meter)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,13 +119,13 @@ def problem_of(
     prior += [known.k1_spread, known.k2_spread, known.k3_spread]
     prior += [np.log(known.height), known.height_spread]
     prior += [np.log(known.distance), known.distance_spread, known.roll_spread, _LEAST_HEIGHT]
-    prior += known.lens_spread
+    prior += [*known.lens_spread, known.k1]
     return Problem(
         evidence=evidence,
         image_size=image_size,
         prior=np.array(prior),
         free=free,
-        click_noise=settings.click_noise,
+        click_noise=np.full(len(evidence.points), settings.click_noise),
         drawn_noise=settings.drawn_noise,
         drawn_loss=settings.drawn_loss,
     )
@@ -134,10 +162,10 @@ def adjust(
         evidence.drawn_marking,
         problem.prior,
         problem.free,
+        problem.click_noise,
         np.array(
             [
                 problem.reach,
-                problem.click_noise,
                 click_loss,
                 problem.drawn_noise,
                 problem.drawn_loss,

@@ -16,13 +16,13 @@ from worldpose.static_calibration.adjustment import (
     camera_of_row,
     problem_of,
 )
+from worldpose.static_calibration.agreement import refine_and_judge
 from worldpose.static_calibration.checks import (
     check_agreement,
     check_amount,
     check_determined,
 )
 from worldpose.static_calibration.evidence import gather
-from worldpose.static_calibration.line_refinement import refine_on_lines
 from worldpose.static_calibration.parameters import PARAMETERS, CameraEstimate
 from worldpose.static_calibration.report import StaticCalibration
 from worldpose.static_calibration.reporting import report_of
@@ -82,13 +82,14 @@ def calibrate(
     check_amount(evidence, pitch, where)
     problem = problem_of(evidence, image_size, settings)
     fit = screen(problem, _start(problem, settings), settings)
+    problem = problem.surveyed_from(fit.row, settings)
     check_agreement(problem, fit, settings, where)
     check_determined(problem, fit, pitch, settings, where)
     problem, fit, decisions = _with_k3(problem, fit, settings)
     estimate = CameraEstimate(camera_of_row(fit.row, image_size), fit.covariance)
     lines = None
     if picture is not None and settings.lines:
-        lines = refine_on_lines(estimate, pitch, picture, settings.line_refinement)
+        fit, lines = refine_and_judge(problem, fit, pitch, picture, settings)
         estimate = lines.estimate
     report = report_of(estimate, problem, fit, decisions, lines, pitch, settings)
     return StaticCalibration(estimate, report)

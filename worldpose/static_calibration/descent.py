@@ -33,6 +33,7 @@ def descend(
     marking: Integers,
     prior: Floats,
     free: NDArray[np.bool_],
+    spread: Floats,
     noise: Floats,
     iterations: int,
     cost: Floats,
@@ -64,6 +65,7 @@ def descend(
                 marking,
                 prior,
                 free,
+                spread,
                 noise,
                 new_information,
                 new_observed,
@@ -101,6 +103,7 @@ def _linearize(
     marking: Integers,
     prior: Floats,
     free: NDArray[np.bool_],
+    spread: Floats,
     noise: Floats,
     information: Floats,
     observed: Floats,
@@ -120,12 +123,12 @@ def _linearize(
     gradient[:] = 0.0
     observed[:] = 0.0
     for i in range(n):
-        weight = _weight((click[i, 0] ** 2 + click[i, 1] ** 2) / noise[1] ** 2, noise[2])
-        weight /= noise[1] ** 2
+        weight = _weight((click[i, 0] ** 2 + click[i, 1] ** 2) / spread[i] ** 2, noise[1])
+        weight /= spread[i] ** 2
         for k in range(2):
             _add(by_click[i, k], click[i, k], weight, observed, gradient)
     for i in range(d):
-        weight = _weight((off[i] / noise[3]) ** 2, noise[4]) / noise[3] ** 2
+        weight = _weight((off[i] / noise[2]) ** 2, noise[3]) / noise[2] ** 2
         _add(by_off[i], off[i], weight, observed, gradient)
     information[:] = observed
     for i in range(PRIORS):
@@ -135,7 +138,7 @@ def _linearize(
             information[j, :] = information[:, j] = 0.0
             observed[j, :] = observed[:, j] = 0.0
             gradient[j] = 0.0
-    return _cost(click, off, known, noise)
+    return _cost(click, off, known, spread, noise)
 
 
 @compiled
@@ -183,12 +186,12 @@ def _loss(squared: float, scale: float) -> float:
 
 
 @compiled
-def _cost(click: Floats, off: Floats, known: Floats, noise: Floats) -> float:
+def _cost(click: Floats, off: Floats, known: Floats, spread: Floats, noise: Floats) -> float:
     total = 0.0
     for i in range(len(click)):
-        total += _loss((click[i, 0] ** 2 + click[i, 1] ** 2) / noise[1] ** 2, noise[2])
+        total += _loss((click[i, 0] ** 2 + click[i, 1] ** 2) / spread[i] ** 2, noise[1])
     for i in range(len(off)):
-        total += _loss((off[i] / noise[3]) ** 2, noise[4])
+        total += _loss((off[i] / noise[2]) ** 2, noise[3])
     for i in range(len(known)):
         total += known[i] ** 2
     return 0.5 * total if total < np.inf else np.inf

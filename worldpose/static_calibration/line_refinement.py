@@ -30,6 +30,9 @@ from worldpose.static_calibration.parameters import CameraEstimate
 
 __all__ = ["LineRefinement", "LineRefinementSettings", "MarkingFit", "refine_on_lines"]
 
+SURVEY_ERROR: Final = 0.006
+"""Default of how far surveyed points are from the painted ones, each axis [m]."""
+
 
 @dataclass(frozen=True)
 class MarkingFit:
@@ -56,6 +59,7 @@ class LineRefinement:
         estimate: the refined camera; the start where it was kept.
         refined: whether the lines were used.
         reason: why not; empty if they were.
+        contradictory: were lines found that the start's covariance does not allow.
         markings: those in the picture.
         rms: of all samples found, measured minus projected across the line [px]; NaN without any.
         correlation: of neighbouring residuals along a marking [1].
@@ -65,6 +69,7 @@ class LineRefinement:
     estimate: CameraEstimate
     refined: bool
     reason: str
+    contradictory: bool
     markings: tuple[MarkingFit, ...]
     rms: float
     correlation: float
@@ -76,6 +81,9 @@ def refine_on_lines(
     pitch: PitchTemplate,
     picture: NDArray[np.uint8],
     settings: LineRefinementSettings | None = None,
+    *,
+    survey_error: float = SURVEY_ERROR,
+    begin: CameraEstimate | None = None,
 ) -> LineRefinement:
     """Return the camera that the painted lines and what was known before agree on.
 
@@ -88,6 +96,9 @@ def refine_on_lines(
         pitch: the template.
         picture: (height, width) or (height, width, 3) RGB.
         settings: the defaults if None.
+        survey_error: of the template's points from the painted ones, each axis, standard
+            deviation [m].
+        begin: where to look first, where more is known than the prior; the start if None.
 
     Raises:
         InputError: the picture is not one of the start's camera.
@@ -95,14 +106,15 @@ def refine_on_lines(
     settings = settings or LineRefinementSettings()
     grey = brightness(picture)
     _check_size(start.camera, grey)
-    search = LineSearch(start, grey, settings)
+    search = LineSearch(start, grey, survey_error, settings)
     everywhere = sample_markings(pitch, _WORLD_SPACING)
-    seen = search.look(start.camera, everywhere)
+    begin = begin or start
+    seen = search.look(begin.camera, everywhere)
     index = apart(everywhere, thinned(seen, everywhere, settings.spacing, settings.samples))
     if len(index) < settings.least_found or not search.free.any():
         return _kept(start, "no painted line is in the picture")
     samples = everywhere[index]
-    found = search.run(samples)
+    found = search.run(begin, samples)
     if found is None:
         return _kept(start, "too few painted lines were found")
     inliers = found.adjusted.weights > _INLIER
@@ -119,11 +131,13 @@ def refine_on_lines(
             start,
             "the lines contradict the clicks: the camera would move by "
             f"{distance:.1f} standard deviations",
+            contradictory=True,
         )
     return LineRefinement(
         estimate=CameraEstimate(found.camera, search.covariance_of(found)),
         refined=True,
         reason="",
+        contradictory=False,
         markings=_markings(samples, found, inliers),
         rms=float(np.sqrt(np.mean(found.adjusted.residuals[inliers] ** 2))),
         correlation=correlation,
@@ -172,6 +186,6 @@ def _markings(
     return tuple(fits)
 
 
-def _kept(start: CameraEstimate, reason: str) -> LineRefinement:
+def _kept(start: CameraEstimate, reason: str, contradictory: bool = False) -> LineRefinement:
     nan = float("nan")
-    return LineRefinement(start, False, reason, (), nan, nan, 0.0)
+    return LineRefinement(start, False, reason, contradictory, (), nan, nan, 0.0)

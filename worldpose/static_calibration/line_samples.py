@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from worldpose.cameras import Camera
 from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration.parameters import project_with_jacobian
+from worldpose.static_calibration.parameters import by_step
 
 Floats = NDArray[np.float64]
 
@@ -141,21 +141,20 @@ def see_lines(
         shift: of a whole marking in the picture, standard deviation [px].
     """
     points = samples.points_world
-    image, jacobian = project_with_jacobian(camera, points)
-    half = 0.5 * line_width * samples.across_world
-    forward = np.cross(samples.across_world, [0.0, 0.0, 0.05])
-    spread = camera.project(points + half) - camera.project(points - half)
-    ahead = camera.project(points + forward) - camera.project(points - forward)
-    up = np.array([0.0, 0.0, 0.05])
-    lift = camera.project(points + up) - camera.project(points - up)
+    projected = camera.project_with_jacobians(points)
+    image, jacobian = projected.points_image, by_step(camera, projected)
+    across = samples.across_world
+    along = np.stack([across[:, 1], -across[:, 0], np.zeros(len(across))], axis=-1)
+    spread = (projected.d_points * across[:, None, :]).sum(-1)
+    ahead = (projected.d_points * along[:, None, :]).sum(-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
         normals = np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1)
-        side = (spread * normals).sum(-1) / line_width
+        side = (spread * normals).sum(-1)
         widths = np.abs(side) * line_width
         inside = ((image > 0.0) & (image < camera.image_size - 1.0)).all(-1)
         visible = inside & (widths >= _NARROWEST) & np.isfinite(jacobian).all((1, 2))
-    rise = (lift * normals).sum(-1) / 0.1
+    rise = (projected.d_points[..., 2] * normals).sum(-1)
     by_paint = np.concatenate(
         [
             survey_error * side[:, None] * samples.sideways,

@@ -49,9 +49,6 @@ class LineRefinementSettings(Record):
 
     line_width: float = Field(default=0.12, gt=0)
     """Of the paint [m]: Law 1 allows no more, and most pitches have it."""
-    survey_error: float = Field(default=0.006, ge=0)
-    """Standard deviation of the template's ends of lines from the paint, each axis [m]: a laser
-    scan, and paint that wanders by a twentieth of its width."""
     line_shift: float = Field(default=0.05, ge=0)
     """Standard deviation of what moves a whole marking in the picture [px], such as sharpening or
     a rest of the lens that k1 and k2 leave."""
@@ -97,26 +94,31 @@ class LineSearch:
     """One camera's start, picture and settings."""
 
     def __init__(
-        self, start: CameraEstimate, grey: NDArray[np.uint8], settings: LineRefinementSettings
+        self,
+        start: CameraEstimate,
+        grey: NDArray[np.uint8],
+        survey_error: float,
+        settings: LineRefinementSettings,
     ) -> None:
         self.start, self.grey, self.settings = start, grey, settings
+        self.survey_error = survey_error
         spread = np.sqrt(np.diag(start.covariance))
         self.free = spread > 0.0
-        self.covariance = start.covariance[np.ix_(self.free, self.free)]
+        covariance = start.covariance[np.ix_(self.free, self.free)]
         scale = spread[self.free]
         # Scaled, since radians and pixels differ by a million in their squares.
-        shape = self.covariance / np.outer(scale, scale)
+        shape = covariance / np.outer(scale, scale)
         inverse: Floats = np.linalg.inv(shape + 1e-12 * np.eye(len(scale)))
         self.information = inverse / np.outer(scale, scale)
 
     def look(self, camera: Camera, samples: LineSamples) -> SeenLines:
         """Return the samples as a camera has them."""
         s = self.settings
-        return see_lines(camera, samples, s.line_width, s.survey_error, s.line_shift)
+        return see_lines(camera, samples, s.line_width, self.survey_error, s.line_shift)
 
-    def run(self, samples: LineSamples) -> Found | None:
+    def run(self, begin: CameraEstimate, samples: LineSamples) -> Found | None:
         """Return the camera found by looking closer and closer; None where there are no lines."""
-        camera, covariance = self.start.camera, self.covariance
+        camera, covariance = begin.camera, begin.covariance[np.ix_(self.free, self.free)]
         few = samples[np.arange(0, len(samples.marking), max(1, len(samples.marking) // _FEW))]
         found = None
         for left in reversed(range(_ROUNDS)):
@@ -236,11 +238,7 @@ class LineSearch:
     def _prior(self, camera: Camera) -> tuple[Floats, Floats]:
         """Return information and expected step of the free parameters, at a camera."""
         gone = difference(self.start.camera, camera)
-        # A further turn also turns the way gone so far.
-        chain = np.eye(len(gone))
-        x, y, z = gone[3:6]
-        chain[3:6, :3] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        chain = chain[np.ix_(self.free, self.free)]
+        chain = turned(gone)[np.ix_(self.free, self.free)]
         information: Floats = chain.T @ self.information @ chain
         expected = np.linalg.solve(chain, -gone[self.free])
         return information, np.asarray(expected, dtype=np.float64)
@@ -249,6 +247,15 @@ class LineSearch:
         whole = np.zeros(len(self.free))
         whole[self.free] = step
         return whole
+
+
+def turned(gone: Floats) -> Floats:
+    """Return how a step that was made (12,) changes with a further one (12, 12)."""
+    chain = np.eye(len(gone))
+    x, y, z = gone[3:6]
+    # A further turn also turns the way gone so far.
+    chain[3:6, :3] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return chain
 
 
 def difference(start: Camera, camera: Camera) -> Floats:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from data_contracts.static_calibration import CAMERA_STEP
-from worldpose.cameras import Camera
+from worldpose.cameras import Camera, Projection
 
 PARAMETERS: Final = CAMERA_STEP
 """Steps of a camera: rotation about its center [rad] and shift [m] in its own axes
@@ -62,6 +62,16 @@ def project_with_jacobian(
         NaN for points behind the camera, and where the lens model is not one to one.
     """
     seen = camera.project_with_jacobians(points_world)
+    return seen.points_image, by_step(camera, seen)
+
+
+def by_step(camera: Camera, seen: Projection) -> NDArray[np.float64]:
+    """Return derivatives (n, 2, 12) by a step out of those of a projection.
+
+    Args:
+        camera: a single camera with square pixels.
+        seen: what it has of n points.
+    """
     by_focal = (seen.d_intrinsics[..., :2] * camera.focal).sum(axis=-1, keepdims=True)
     parts = (
         seen.d_pose,
@@ -69,4 +79,4 @@ def project_with_jacobian(
         seen.d_intrinsics[..., 2:],
         seen.d_distortion[..., [0, 1, 4]],
     )
-    return seen.points_image, np.concatenate(parts, axis=-1)
+    return np.concatenate(parts, axis=-1)

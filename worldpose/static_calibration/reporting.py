@@ -18,6 +18,7 @@ from worldpose.static_calibration.report import (
     MarkingResidual,
     PointResidual,
 )
+from worldpose.static_calibration.residuals import SIZE, drawn_residuals
 from worldpose.static_calibration.screening import Screened, residual_rows
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
@@ -80,11 +81,15 @@ def report_of(
     if lines is not None:
         found = f"{lines.effective_samples:.0f} independent samples" if lines.refined else "none"
         decisions = (*decisions, f"painted lines: {lines.reason or found}")
+    misnamed = [
+        _true_name(int(index), estimate, problem, pitch, settings)
+        for index in np.flatnonzero(~fit.markings)
+    ]
     clicked = (*evidence.points, *evidence.markings)
     return CalibrationReport(
         stage="lines" if lines is not None and lines.refined else "points",
         free=tuple(name for name, free in zip(PARAMETERS, problem.free, strict=True) if free),
-        decisions=decisions,
+        decisions=(*decisions, *misnamed),
         points=points,
         drawn=tuple(sorted(drawn, key=lambda marking: -marking.rms)),
         wrong=(
@@ -104,6 +109,32 @@ def report_of(
 def _marking_residual(name: str, off: NDArray[np.float64], inlier: bool) -> MarkingResidual:
     rms, worst = float(np.sqrt(np.mean(off**2))), float(np.abs(off).max())
     return MarkingResidual(name, len(off), rms, worst, inlier)
+
+
+def _true_name(
+    index: int,
+    estimate: CameraEstimate,
+    problem: Problem,
+    pitch: PitchTemplate,
+    settings: StaticCalibrationSettings,
+) -> str:
+    """Return which marking the pixels of a wrong one lie on, in words."""
+    evidence = problem.evidence
+    pixels = evidence.drawn_image[evidence.drawn_marking == index]
+    every = np.zeros(len(pixels), dtype=np.int64)
+    off, by_step = np.empty(len(pixels)), np.empty((len(pixels), SIZE))
+    row = row_of(estimate.camera)
+    worst = {}
+    for name in pitch.marking_names:
+        samples = pitch.marking_points(name, settings.sample_spacing)
+        bounds = np.array([0, len(samples)])
+        drawn_residuals(row, problem.reach, samples, bounds, pixels, every, off, by_step)
+        worst[name] = float(np.abs(off).max())
+    nearest = min(worst, key=lambda name: worst[name])
+    drawn = f"{evidence.markings[index]} left out: its pixels lie"
+    if worst[nearest] > settings.wrong_marking * problem.drawn_noise:
+        return f"{drawn} on no marking"
+    return f"{drawn} on {nearest}, {worst[nearest]:.1f} px off at most"
 
 
 def _condition(covariance: NDArray[np.float64], free: NDArray[np.bool_]) -> float:

@@ -157,9 +157,9 @@ def prior_residuals(c: Floats, prior: Floats, residual: Floats, jacobian: Floats
 
     Args:
         c: (22,) camera.
-        prior: (18,) log focal, its spread; cx, cy, their spread; half diagonal [px]; spreads of
+        prior: (19,) log focal, its spread; cx, cy, their spread; half diagonal [px]; spreads of
             k1, k2, k3; log height, its spread; log distance, its spread; spread of the roll; the
-            least height [m] that counts; spreads of k1, k2, k3 as coefficients.
+            least height [m] that counts; spreads of k1, k2, k3 as coefficients; the middle of k1.
         residual: (9,), written.
         jacobian: (9, 12), written.
     """
@@ -176,9 +176,12 @@ def prior_residuals(c: Floats, prior: Floats, residual: Floats, jacobian: Floats
         # The corner's displacement: the same lens bends a long picture's corner less.
         value = c[8] if k == 2 else c[4 + k]
         spread = np.hypot(prior[6 + k], prior[15 + k] * power)
-        residual[3 + k] = value * power / spread
+        middle = prior[18] if k == 0 else 0.0
+        residual[3 + k] = (value * power - middle) / spread
         jacobian[3 + k, 9 + k] = power / spread
-        jacobian[3 + k, 6] = -2.0 * (k + 1.0) * residual[3 + k] * (prior[6 + k] / spread) ** 2
+        # The focal length is in the displacement and in the spread.
+        wide = (prior[15 + k] * power / spread) ** 2
+        jacobian[3 + k, 6] = -2.0 * (k + 1.0) * (value * power / spread - residual[3 + k] * wide)
     # The center moves by -R^T d with the step's shift d, and not with its rotation.
     x = -(c[9] * c[18] + c[12] * c[19] + c[15] * c[20])
     y = -(c[10] * c[18] + c[13] * c[19] + c[16] * c[20])

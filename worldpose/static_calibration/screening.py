@@ -8,7 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.static_calibration.adjustment import Fits, Problem, adjust
+from worldpose.static_calibration.adjustment import Fits, Problem, adjust, row_of
+from worldpose.static_calibration.bending import with_bends
+from worldpose.static_calibration.parameters import CameraEstimate
 from worldpose.static_calibration.residuals import drawn_residuals, point_residuals
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
@@ -42,7 +44,8 @@ class Screened:
 
     Attributes:
         row: (22,) camera.
-        covariance: (12, 12) of a step.
+        covariance: (12, 12) of a step, to the second order.
+        tangent_covariance: (12, 12) to the first.
         evidence_information: (12, 12) of the inliers, at the estimated noise.
         inliers: (n,) bool.
         markings: (m,) bool, drawn markings that the camera rests on.
@@ -53,6 +56,7 @@ class Screened:
 
     row: NDArray[np.float64]
     covariance: NDArray[np.float64]
+    tangent_covariance: NDArray[np.float64]
     evidence_information: NDArray[np.float64]
     inliers: NDArray[np.bool_]
     markings: NDArray[np.bool_]
@@ -101,13 +105,14 @@ def screen(
     count = len(problem.evidence.points)
     robust = adjust(problem, start[None], click_loss=_ROBUST)
     row = robust.rows[0]
-    length = np.linalg.norm(residual_rows(problem, row).click, axis=1)
-    inliers = length < limit * problem.click_noise * max(1.0, _spread(length, problem.click_noise))
+    problem = problem.surveyed_from(row, settings)
+    length = np.linalg.norm(residual_rows(problem, row).click, axis=1) / problem.click_noise
+    inliers = length < limit * max(1.0, _spread(length))
     markings = _right_markings(problem, row, settings)
     seen = set()
     while True:
         seen.add(inliers.tobytes() + markings.tobytes())
-        kept = replace(problem, evidence=problem.evidence.only(inliers, markings))
+        kept = problem.only(inliers, markings)
         fit = adjust(kept, row[None])
         row = fit.rows[0]
         covariance, scale = _covariance(kept, fit)
@@ -123,13 +128,41 @@ def screen(
         following_markings = _right_markings(problem, row, settings)
         if following.tobytes() + following_markings.tobytes() in seen:
             break
+        # Half of the clicks against the other half is no majority, whoever goes next.
+        if 2 * following.sum() < count:
+            break
         inliers, markings = following, following_markings
+    return rest_on(problem, row, inliers, markings)
+
+
+def rest_on(
+    problem: Problem,
+    row: NDArray[np.float64],
+    inliers: NDArray[np.bool_],
+    markings: NDArray[np.bool_],
+) -> Screened:
+    """Return the fit to some of the clicks, whatever the others say.
+
+    Args:
+        problem: what was clicked, and how well.
+        row: (22,) camera near the answer.
+        inliers: (n,) clicks to rest on.
+        markings: (m,) drawn markings to rest on.
+    """
+    kept = problem.only(inliers, markings)
+    fit = adjust(kept, row[None])
+    row = fit.rows[0]
+    covariance, scale = _covariance(kept, fit)
+    surprise = _surprise(
+        residual_rows(problem, row), covariance, scale * problem.click_noise, inliers
+    )
     own = residual_rows(kept, row)
     evidence_rows = 2 * len(own.click) + len(own.drawn)
-    squared = ((own.click / problem.click_noise) ** 2).sum() + _drawn_loss(problem, own)
+    squared = _click_loss(kept, own) + _drawn_loss(problem, own)
     return Screened(
         row=row,
-        covariance=covariance,
+        covariance=with_bends(kept, row, covariance, scale),
+        tangent_covariance=covariance,
         evidence_information=fit.evidence_information[0] / scale**2,
         inliers=inliers,
         markings=markings,
@@ -137,6 +170,29 @@ def screen(
         noise_scale=scale,
         misfit=float(squared / max(evidence_rows, 1)),
     )
+
+
+def noise_of(problem: Problem, row: NDArray[np.float64]) -> float:
+    """Return by what factor half of the clicks are farther off a camera than stated.
+
+    Args:
+        problem: what was clicked.
+        row: (22,) camera.
+    """
+    length = np.linalg.norm(residual_rows(problem, row).click, axis=1)
+    return _spread(length / problem.click_noise)
+
+
+def surprise_at(problem: Problem, estimate: CameraEstimate) -> NDArray[np.float64]:
+    """Return each click's residual (n,) in standard deviations of what a camera predicts.
+
+    Args:
+        problem: what was clicked.
+        estimate: camera that does not rest on these clicks.
+    """
+    rows = residual_rows(problem, row_of(estimate.camera))
+    nobody = np.zeros(len(rows.click), dtype=np.bool_)
+    return _surprise(rows, estimate.covariance, problem.click_noise, nobody)
 
 
 def held_out_error(problem: Problem, fit: Screened) -> float:
@@ -148,14 +204,15 @@ def held_out_error(problem: Problem, fit: Screened) -> float:
     evidence = problem.evidence
     rows = residual_rows(problem, fit.row)
     units = [
-        (rows.click[i], rows.by_click[i], problem.click_noise) for i in np.flatnonzero(fit.inliers)
+        (rows.click[i], rows.by_click[i], float(problem.click_noise[i]))
+        for i in np.flatnonzero(fit.inliers)
     ]
     for index in np.flatnonzero(fit.markings):
         on = evidence.drawn_marking == index
         units.append((rows.drawn[on], rows.by_drawn[on], problem.drawn_noise))
     total, count = 0.0, 0
     for residual, by_step, noise in units:
-        share = by_step @ fit.covariance @ by_step.T / (noise * fit.noise_scale) ** 2
+        share = by_step @ fit.tangent_covariance @ by_step.T / (noise * fit.noise_scale) ** 2
         predicted = np.linalg.lstsq(np.eye(len(residual)) - share, residual, rcond=1e-9)[0]
         total += float(predicted @ predicted)
         count += len(residual)
@@ -175,9 +232,9 @@ def _right_markings(
     return np.asarray(right if enough else np.ones(count, dtype=np.bool_))
 
 
-def _spread(length: NDArray[np.float64], noise: float) -> float:
+def _spread(length: NDArray[np.float64]) -> float:
     # 1.1774 is the median length of a standard Gaussian in two dimensions.
-    return float(np.median(length)) / (1.1774 * noise) if len(length) else 1.0
+    return float(np.median(length)) / 1.1774 if len(length) else 1.0
 
 
 def _covariance(problem: Problem, fit: Fits) -> tuple[NDArray[np.float64], float]:
@@ -186,7 +243,7 @@ def _covariance(problem: Problem, fit: Fits) -> tuple[NDArray[np.float64], float
     prior = fit.information[0] - observed
     free = np.ix_(problem.free, problem.free)
     rows = residual_rows(problem, fit.rows[0])
-    squared = ((rows.click / problem.click_noise) ** 2).sum() + _drawn_loss(problem, rows)
+    squared = _click_loss(problem, rows) + _drawn_loss(problem, rows)
     count = 2 * len(rows.click) + len(rows.drawn)
     spent = float(np.trace(np.linalg.solve(fit.information[0][free], observed[free])))
     squared_scale = (_OWN_WORTH + squared) / (_OWN_WORTH + max(count - spent, 0.0))
@@ -199,20 +256,28 @@ def _covariance(problem: Problem, fit: Fits) -> tuple[NDArray[np.float64], float
     return covariance, scale
 
 
+def _click_loss(problem: Problem, rows: Rows) -> float:
+    return float(((rows.click / problem.click_noise[:, None]) ** 2).sum())
+
+
 def _drawn_loss(problem: Problem, rows: Rows) -> float:
     limit = problem.drawn_loss**2
     return float(limit * np.log1p((rows.drawn / problem.drawn_noise) ** 2 / limit).sum())
 
 
 def _surprise(
-    rows: Rows, covariance: NDArray[np.float64], noise: float, inliers: NDArray[np.bool_]
+    rows: Rows,
+    covariance: NDArray[np.float64],
+    noise: NDArray[np.float64],
+    inliers: NDArray[np.bool_],
 ) -> NDArray[np.float64]:
     """Return each click's residual in standard deviations of its prediction without it."""
     spread = np.einsum("nij,jk,nlk->nil", rows.by_click, covariance, rows.by_click)
     # A click that the fit rests on has drawn the fit towards it.
     sign = np.where(inliers, -1.0, 1.0)[:, None, None]
-    total = noise**2 * np.eye(2) + sign * spread
+    variance = noise[:, None] ** 2
+    total = variance[..., None] * np.eye(2) + sign * spread
     values, vectors = np.linalg.eigh(total)
-    values = np.maximum(values, 1e-6 * noise**2)
+    values = np.maximum(values, 1e-6 * variance)
     along = np.einsum("nij,ni->nj", vectors, rows.click)
     return np.asarray(np.sqrt((along**2 / values).sum(axis=1)))

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from data_contracts.records import Record
-from worldpose.static_calibration.line_refinement import LineRefinementSettings
+from worldpose.static_calibration.line_refinement import SURVEY_ERROR, LineRefinementSettings
 
 
 class CameraPrior(Record):
@@ -25,6 +25,8 @@ class CameraPrior(Record):
     principal_point_spread: float = Field(default=0.004, gt=0)
     """About the picture's middle, each axis, in widths [1]: 8 px of 1920, a lens and a sensor
     mounted with ordinary care."""
+    k1: float = 0.0
+    """As `k1_spread`, its middle [1]: a lens that nobody named may bend either way."""
     k1_spread: float = Field(default=0.025, gt=0)
     """What k1 moves a pixel in the picture's corner by, in its distance from the middle [1]:
     2.5 % is a visibly bent touch line."""
@@ -56,6 +58,10 @@ class StaticCalibrationSettings(Record):
     click_noise: float = Field(default=1.0, gt=0)
     """Standard deviation of a clicked point, each axis [px]: a careful click in a zoomed view
     (C7)."""
+    survey_error: float = Field(default=SURVEY_ERROR, ge=0)
+    """Standard deviation of the template's points from the painted ones, each axis [m], in clicks
+    and in painted lines: a total station knows millimetres, and what is the middle of painted
+    corners that wander by a twentieth of their width does not."""
     drawn_noise: float = Field(default=1.5, gt=0)
     """Standard deviation of a point drawn along a marking, across it [px]: hand annotations of
     SoccerNet lie 1.2 px (median 0.8) off the best camera."""

@@ -1,5 +1,7 @@
 """What people and markings weigh in the adjustment."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,11 +10,14 @@ from worldpose.bundle_adjustment.building import (
     KeypointNoise,
     camera_knowledge,
     markings_problem,
+    measured_doubt,
     players_problem,
+    step_between,
 )
 from worldpose.bundle_adjustment.clip import observe
 from worldpose.bundle_adjustment.noise import measured_noise
-from worldpose.static_calibration import PARAMETERS
+from worldpose.bundle_adjustment.solving import solve
+from worldpose.static_calibration import PARAMETERS, stepped
 
 SETTINGS = BundleAdjustmentSettings()
 
@@ -95,3 +100,23 @@ def test_markings_alone_free_everything_where_there_are_clicks(clip):
     assert not problem.free[1].any()
     assert np.isinf(problem.point_information).all()
     assert len(problem.image) == 5 * 12
+
+
+def test_the_step_between_cameras_is_the_one_that_was_made(clip):
+    _, true, _ = clip()
+    step = 1e-3 * np.random.default_rng(3).standard_normal((5, 12))
+    found = step_between(true, stepped(true, step))
+    # To first order in a thousandth: the rest is under a millionth of the distance of 50 m.
+    np.testing.assert_allclose(found, step, atol=5e-5)
+
+
+@pytest.mark.parametrize("claimed", [1.0, 0.2])
+def test_calibration_that_claims_too_much_is_doubted_as_much(clip, claimed):
+    made, *_ = clip(persons=8, seed=6)
+    sure = replace(made, covariance=claimed**2 * made.covariance)
+    nobody = np.zeros(5, dtype=bool)
+    problem = players_problem(sure, everybody(made), KeypointNoise(), nobody, SETTINGS)
+    doubt = measured_doubt(problem, solve(problem))
+    # Some 40 directions of five cameras tell a variance to a factor of 1.25; and one's own word
+    # counts for another ten, which draws large factors down.
+    assert 0.4 / claimed**2 < doubt.mean() < 1.6 / claimed**2

@@ -10,7 +10,7 @@ from worldpose.cameras import Camera
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.line_adjustment import adjust
-from worldpose.static_calibration.line_refinement import LineRefinementSettings, refine_on_lines
+from worldpose.static_calibration.line_refinement import refine_on_lines
 from worldpose.static_calibration.line_samples import apart, sample_markings, see_lines
 from worldpose.static_calibration.line_search import difference
 from worldpose.static_calibration.parameters import CameraEstimate, stepped
@@ -18,7 +18,7 @@ from worldpose.synthetic.rendering import RenderingSettings, render_pitch
 from worldpose.synthetic.stadium import looking
 
 PITCH = PitchTemplate.standard()
-EXACT = LineRefinementSettings(survey_error=0.0)
+EXACT = 0.0
 SPREAD = np.array([2e-3, 2e-3, 2e-3, 0.15, 0.15, 0.15, 3e-3, 3.0, 3.0, 0.01, 0.01, 0.0])
 """Of a start from ordinary clicks: a few pixels at most places."""
 
@@ -72,7 +72,7 @@ def line_error(estimate, true=None):
 def test_start_pixels_off_comes_to_a_fraction_of_one(light):
     for seed in range(3):
         first = start(seed)
-        found = refine_on_lines(first, PITCH, picture(light=light), EXACT)
+        found = refine_on_lines(first, PITCH, picture(light=light), survey_error=EXACT)
         assert line_error(first) > 2.0
         assert found.refined
         # Along lines a picture of a few tells less than across: the bar is 0.25 px.
@@ -84,13 +84,15 @@ def test_start_tens_of_pixels_off_is_caught():
     for seed in range(3):
         first = start(seed, factor=5.0)
         assert line_error(first) > 10.0
-        assert line_error(refine_on_lines(first, PITCH, picture(), EXACT).estimate) < 0.25
+        assert (
+            line_error(refine_on_lines(first, PITCH, picture(), survey_error=EXACT).estimate) < 0.25
+        )
 
 
 def test_people_standing_on_a_line_move_nothing():
     first = start(5)
-    without = refine_on_lines(first, PITCH, picture(), EXACT)
-    among = refine_on_lines(first, PITCH, picture(people=14), EXACT)
+    without = refine_on_lines(first, PITCH, picture(), survey_error=EXACT)
+    among = refine_on_lines(first, PITCH, picture(people=14), survey_error=EXACT)
     assert line_error(among.estimate) < 0.25
     front = {fit.name: fit for fit in among.markings}["penalty_area_left_front"]
     clear = {fit.name: fit for fit in without.markings}["penalty_area_left_front"]
@@ -98,7 +100,7 @@ def test_people_standing_on_a_line_move_nothing():
 
 
 def test_stripes_without_paint_give_no_lines():
-    found = refine_on_lines(start(0), PITCH, picture(paint=0.0), EXACT)
+    found = refine_on_lines(start(0), PITCH, picture(paint=0.0), survey_error=EXACT)
     assert not found.refined
     assert "found" in found.reason
 
@@ -121,7 +123,7 @@ def test_view_without_markings_says_so():
 
 def test_lines_that_contradict_the_start_are_refused():
     sure = CameraEstimate(start(1).camera, np.diag((0.02 * SPREAD) ** 2))
-    found = refine_on_lines(sure, PITCH, picture(), EXACT)
+    found = refine_on_lines(sure, PITCH, picture(), survey_error=EXACT)
     assert not found.refined
     assert found.estimate is sure
 
@@ -135,7 +137,9 @@ def test_parameters_without_variance_stay_as_they_are():
     first = start(2)
     covariance = first.covariance.copy()
     covariance[7:9] = covariance[:, 7:9] = 0.0
-    found = refine_on_lines(CameraEstimate(first.camera, covariance), PITCH, picture(), EXACT)
+    found = refine_on_lines(
+        CameraEstimate(first.camera, covariance), PITCH, picture(), survey_error=EXACT
+    )
     assert (found.estimate.camera.principal_point == first.camera.principal_point).all()
     assert (found.estimate.covariance[7:9] == 0.0).all()
 
@@ -157,8 +161,8 @@ def test_covariance_holds_the_truth_and_says_more_than_the_start():
 
 
 def test_survey_that_is_off_is_told_by_its_setting():
-    rough = refine_on_lines(start(3), PITCH, picture(), LineRefinementSettings(survey_error=0.02))
-    exact = refine_on_lines(start(3), PITCH, picture(), EXACT)
+    rough = refine_on_lines(start(3), PITCH, picture(), survey_error=0.02)
+    exact = refine_on_lines(start(3), PITCH, picture(), survey_error=EXACT)
     ratio = np.diag(rough.estimate.covariance)[:11] / np.diag(exact.estimate.covariance)[:11]
     assert (ratio > 1.0).all()
 

@@ -2,6 +2,7 @@
 
 import clicking_people as people
 import numpy as np
+import pytest
 
 from worldpose.cameras import Camera
 from worldpose.static_calibration import stepped
@@ -93,12 +94,15 @@ def test_distances_of_drawn_pixels():
     np.testing.assert_allclose(sign * analytic / size, numeric / size, atol=0.01)
 
 
-def test_residuals_of_the_prior():
+@pytest.mark.parametrize("k1", [0.0, 0.03])
+def test_residuals_of_the_prior(k1):
     problem, camera = problem_and_row()
+    prior = problem.prior.copy()
+    prior[18] = k1
 
     def residual(at):
         out = np.empty(9), np.empty((9, 12))
-        prior_residuals(row_of(at), problem.prior, *out)
+        prior_residuals(row_of(at), prior, *out)
         return out
 
     numeric = differences(lambda at: residual(at)[0], camera)

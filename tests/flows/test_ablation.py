@@ -1,0 +1,48 @@
+"""The paper's ablation: what is printed, and what one trial shows."""
+
+import json
+
+import pytest
+
+from flows import ablation
+from flows.ablation import CLICKS, Score, trial
+from flows.cli.ablation import print_ablation
+
+
+@pytest.fixture
+def two_trials(monkeypatch):
+    scores = [
+        {"true cameras": Score(60.0, 50.0, 0.0, 1.0, 0.0), "base": Score(g, 60.0, 0.1, 0.5, 0.0)}
+        for g in (70.0, 74.0)
+    ]
+    monkeypatch.setattr(ablation, "ablation", lambda seeds, progress: {"few clicks": scores})
+
+
+def test_rows_have_mean_and_spread_and_the_paper_beside_them(two_trials, capsys):
+    print_ablation(2, as_json=False)
+    said = capsys.readouterr().out
+    base = next(line for line in said.splitlines() if line.startswith("base"))
+    assert "72.0 ± 2.0" in base
+    assert "83.5 / 70.8" in base
+    # A row that nothing computes yet stands with the paper's figures alone.
+    body = next(line for line in said.splitlines() if line.startswith("+ BA + SMPL"))
+    assert body.split()[-3:] == ["80.0", "/", "66.3"]
+
+
+def test_machines_get_every_trial(two_trials, capsys):
+    print_ablation(2, as_json=True)
+    told = json.loads(capsys.readouterr().out)
+    assert told["few clicks"]["base"]["g_mpjpe_mm"] == [70.0, 74.0]
+
+
+@pytest.mark.slow
+def test_people_and_markings_win_and_markings_alone_are_refused():
+    scores = trial(2, CLICKS["few clicks"])
+    true, both = scores["true cameras"], scores["+ BA, S and P"]
+    base, free = scores["base"], scores["+ BA, S, unguarded"]
+    assert both.g_mpjpe_mm < 1.02 * true.g_mpjpe_mm
+    assert both.ground_error_m < 0.5 * base.ground_error_m
+    # Lines fit better, people worse (trap 1); the guard sees it.
+    assert free.marking_error_px < 0.7 * base.marking_error_px
+    assert free.g_mpjpe_mm > 1.1 * base.g_mpjpe_mm
+    assert scores["+ BA, S only"].changed < 0.2

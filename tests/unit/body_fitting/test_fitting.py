@@ -1,0 +1,150 @@
+"""Fits of bodies whose truth is known, and of data at its worst."""
+
+import numpy as np
+import pytest
+from walking_bodies import KEYPOINTS, MODEL, seen, walker
+
+from worldpose.body import BodyParameters
+from worldpose.body_fitting import BodyFittingSettings, fit_bodies, report_fit
+from worldpose.body_fitting.shared_bias import MIRRORED_OFFSETS, body_axes
+from worldpose.errors import InputError
+
+SETTINGS = BodyFittingSettings()
+
+
+def height(betas):
+    return np.ptp(MODEL.template[:, 1] + MODEL.shape_directions[:, 1] @ betas)
+
+
+def human(joints):
+    """Whether every body stands within a box that a person fits in."""
+    extent = joints.max(axis=-2) - joints.min(axis=-2)
+    return np.isfinite(joints).all() and (extent < 2.5).all()
+
+
+@pytest.mark.parametrize("upside_down", [False, True], ids=["upright", "upside down"])
+def test_a_noisy_walker_comes_out_nearer_than_the_joints_that_were_seen(upside_down):
+    rng = np.random.default_rng(7)
+    truth = walker(60, rng, upside_down=upside_down)
+    joints, covariance = seen(truth, 0.03, rng)
+    fit = fit_bodies(MODEL, joints, covariance, 50.0, SETTINGS)
+    exact = KEYPOINTS(truth)[:, None]
+    before, after = (np.linalg.norm(x - exact, axis=-1).mean() for x in (joints, fit.joints))
+    assert after < 0.7 * before
+    # One person, 1.2 s, no ground: offsets and size are known to a few centimetres.
+    assert height(fit.betas[0]) == pytest.approx(height(truth.betas[0]), abs=0.06)
+    np.testing.assert_allclose(KEYPOINTS(fit.parameters), fit.joints, atol=1e-9)
+
+
+def test_bones_of_a_fit_never_change():
+    rng = np.random.default_rng(8)
+    joints, covariance = seen(walker(20, rng), 0.03, rng)
+    fit = fit_bodies(MODEL, joints, covariance, 50.0, SETTINGS)
+    for a, b in ((5, 7), (7, 9), (11, 13), (13, 15)):
+        length = np.linalg.norm(fit.joints[:, 0, a] - fit.joints[:, 0, b], axis=-1)
+        assert np.ptp(length) < 1e-9
+
+
+def test_what_a_detector_always_gets_wrong_is_found():
+    rng = np.random.default_rng(9)
+    unknowns = np.zeros(26)
+    unknowns[2] = 0.05  # of the eyes, forward
+    offsets = MIRRORED_OFFSETS @ unknowns
+    truths = [walker(60, rng) for _ in range(4)]
+    parts = [seen(truth, 0.01, rng) for truth in truths]
+    joints = np.concatenate([part[0] for part in parts], axis=1)
+    covariance = np.concatenate([part[1] for part in parts], axis=1)
+    joints = joints + np.einsum("fpab,jb->fpja", body_axes(joints), offsets)
+    fit = fit_bodies(MODEL, joints, covariance, 50.0, SETTINGS)
+    moved = np.abs(offsets).max(axis=-1) > 0.0
+    # A head is rigid, so that pose explains nothing of it, and shape and the prior but a part.
+    np.testing.assert_allclose(fit.offsets[moved], offsets[moved], atol=0.02)
+
+
+def test_gaps_are_filled_marked_and_less_sure():
+    rng = np.random.default_rng(10)
+    truth = walker(60, rng)
+    joints, covariance = seen(truth, 0.01, rng)
+    joints[25:35] = np.nan
+    fit = fit_bodies(MODEL, joints, covariance, 50.0, SETTINGS)
+    np.testing.assert_array_equal(np.flatnonzero(fit.filled[:, 0]), np.arange(25, 35))
+    variance = np.trace(fit.covariance[:, 0, 0], axis1=-2, axis2=-1)
+    assert variance[30] > 2.0 * variance[10]
+    error = np.linalg.norm(fit.joints - KEYPOINTS(truth)[:, None], axis=-1)
+    # 0.2 s of a stride, bridged by its ends.
+    assert error[25:35].mean() < 0.10
+
+
+def test_longer_gaps_than_the_longest_stay_empty():
+    rng = np.random.default_rng(11)
+    joints, covariance = seen(walker(60, rng), 0.01, rng)
+    joints[20:40] = np.nan
+    settings = BodyFittingSettings(longest_gap=0.3)
+    fit = fit_bodies(MODEL, joints, covariance, 50.0, settings)
+    assert np.isnan(fit.joints[20:40]).all() and np.isfinite(fit.joints[:20]).all()
+    assert not fit.filled.any()
+
+
+def test_arms_missing_for_a_second_do_not_explode():
+    rng = np.random.default_rng(12)
+    joints, covariance = seen(walker(75, rng), 0.02, rng)
+    joints[10:60, :, 7:11] = np.nan
+    assert human(fit_bodies(MODEL, joints, covariance, 50.0, SETTINGS).joints)
+
+
+def test_a_t_pose_is_fitted():
+    rest = BodyParameters(
+        np.zeros(10), np.tile([np.pi / 2, 0.0, 0.0], (5, 1)), np.zeros(69), np.zeros(3)
+    )
+    joints, covariance = seen(rest, 0.0, np.random.default_rng(0))
+    fit = fit_bodies(MODEL, joints, covariance, 50.0, SETTINGS)
+    # The prior, whose people let their arms hang, pulls by centimetres.
+    assert np.linalg.norm(fit.joints - joints, axis=-1).max() < 0.06
+
+
+@pytest.mark.parametrize("kept", [slice(0, 17), slice(0, 5), slice(9, 10), slice(13, 17)])
+def test_one_frame_and_few_joints_give_a_human_body(kept):
+    joints, covariance = seen(walker(1, np.random.default_rng(1)), 0.02, np.random.default_rng(2))
+    few = np.full_like(joints, np.nan)
+    few[:, :, kept] = joints[:, :, kept]
+    fit = fit_bodies(MODEL, few, covariance, 50.0, SETTINGS, lambda x, y: 0.0 * x)
+    assert human(fit.joints)
+    assert np.linalg.norm(fit.joints[few == few].mean() - few[few == few].mean()) < 0.5
+
+
+def test_people_without_any_joint_and_clips_without_people_are_missing():
+    nobody = np.full((4, 1, 17, 3), np.nan)
+    fit = fit_bodies(MODEL, nobody, np.full((4, 1, 17, 3, 3), np.nan), 50.0, SETTINGS)
+    assert np.isnan(fit.joints).all() and np.isnan(fit.betas).all() and not fit.filled.any()
+    report = report_fit(fit, nobody, 50.0)
+    assert report.bodies == 0 and report.residual_m == (None,)
+    none = fit_bodies(MODEL, nobody[:, :0], np.empty((4, 0, 17, 3, 3)), 50.0, SETTINGS)
+    assert none.joints.shape == (4, 0, 17, 3)
+
+
+def test_feet_stand_still_and_not_below_the_ground():
+    rng = np.random.default_rng(13)
+    stands = walker(1, rng)
+    stands = BodyParameters(
+        stands.betas, stands.global_orient, np.tile(stands.body_pose, (40, 1)), stands.transl
+    )
+    exact = KEYPOINTS(stands)
+    sole = exact[0, 15:, 2].min() - 0.08
+    joints, covariance = seen(stands, 0.02, rng)
+    fit = fit_bodies(MODEL, joints, covariance, 50.0, SETTINGS, lambda x, y: sole + 0.0 * x)
+    step = np.linalg.norm(np.diff(fit.joints[:, 0, 15:], axis=0), axis=-1)
+    assert np.median(step) < 0.004
+    report = report_fit(fit, joints, 50.0)
+    assert report.bodies == 40 and report.skating_m[0] < 0.004
+
+
+def test_the_same_joints_give_the_same_bits():
+    joints, covariance = seen(walker(15, np.random.default_rng(3)), 0.02, np.random.default_rng(4))
+    one, two = (fit_bodies(MODEL, joints, covariance, 50.0, SETTINGS) for _ in range(2))
+    np.testing.assert_array_equal(one.joints, two.joints)
+    np.testing.assert_array_equal(one.betas, two.betas)
+
+
+def test_arrays_that_do_not_fit_are_refused():
+    with pytest.raises(InputError, match="body fitting"):
+        fit_bodies(MODEL, np.zeros((3, 1, 14, 3)), np.zeros((3, 1, 14, 3, 3)), 50.0, SETTINGS)

@@ -1,0 +1,75 @@
+"""The gradient of the objective is that of its cost."""
+
+import numpy as np
+import pytest
+from walking_bodies import KEYPOINTS, MODEL, seen, walker
+
+from worldpose.body.jacobian import ChainedKeypoints
+from worldpose.body_fitting.evidence import Evidence
+from worldpose.body_fitting.feet import Contacts
+from worldpose.body_fitting.objective import Pose, Track
+from worldpose.body_fitting.pose_space import GATHER, load_pose_prior
+from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.body_fitting.shared_bias import MIRRORED_OFFSETS
+
+
+@pytest.fixture
+def track():
+    rng = np.random.default_rng(5)
+    truth = walker(5, rng)
+    joints, covariance = seen(truth, 0.02, rng)
+    joints[1, 0, 4] = np.nan
+    settings = BodyFittingSettings()
+    contacts = Contacts(np.ones((5, 2)), np.ones((4, 2)), np.full((5, 2), 0.07))
+    evidence = Evidence.of(joints[:, 0], covariance[:, 0], 50.0, settings)
+    chained = ChainedKeypoints.of(KEYPOINTS)
+    made = Track(chained, evidence, load_pose_prior(), settings, 50.0, 10.0, contacts)
+    angles = truth.body_pose @ GATHER.T + 0.1 * rng.standard_normal((5, 30))
+    pose = Pose(truth.transl + 0.01, truth.global_orient, angles, truth.betas[0])
+    return made, pose
+
+
+def test_gradient_by_frames_and_betas_agrees_with_finite_differences(track):
+    made, pose = track
+    rng = np.random.default_rng(1)
+    at = made.equations(pose, np.zeros((17, 3)), bordered=True)
+    small = 1e-6
+    for _ in range(5):
+        step, betas = rng.standard_normal((5, 36)), rng.standard_normal(MODEL.shapes)
+        costs = [
+            made.equations(
+                pose.moved(sign * small * step, sign * small * betas),
+                np.zeros((17, 3)),
+                bordered=True,
+            ).cost
+            for sign in (1.0, -1.0)
+        ]
+        slope = (costs[0] - costs[1]) / (2.0 * small)
+        expected = (at.gradient * step).sum() + at.border_gradient[: MODEL.shapes] @ betas
+        # Betas feel the smoothness only through the poses, so that it does not shorten limbs,
+        # and offsets turn with the pose: both are left out, a hundredth of the whole.
+        assert slope == pytest.approx(expected, rel=0.02, abs=0.02 * np.abs(at.gradient).sum())
+
+
+def test_gradient_by_offsets_agrees_with_finite_differences(track):
+    made, pose = track
+    at = made.equations(pose, np.zeros((17, 3)), bordered=True)
+    unknowns = np.random.default_rng(2).standard_normal(MIRRORED_OFFSETS.shape[-1])
+    costs = [
+        made.equations(pose, sign * 1e-6 * MIRRORED_OFFSETS @ unknowns, bordered=True).cost
+        for sign in (1.0, -1.0)
+    ]
+    slope = (costs[0] - costs[1]) / 2e-6
+    # Central differences of a cost of some thousands: rounding of 1e-12 over 1e-6.
+    assert at.border_gradient[MODEL.shapes :] @ unknowns == pytest.approx(slope, rel=1e-5)
+
+
+def test_the_gradient_by_frames_is_exact_without_offsets(track):
+    made, pose = track
+    at = made.equations(pose, np.zeros((17, 3)), bordered=False)
+    step = np.random.default_rng(3).standard_normal((5, 36))
+    costs = [
+        made.equations(pose.moved(sign * 1e-6 * step), np.zeros((17, 3)), bordered=False).cost
+        for sign in (1.0, -1.0)
+    ]
+    assert (at.gradient * step).sum() == pytest.approx((costs[0] - costs[1]) / 2e-6, rel=1e-5)

@@ -1,0 +1,40 @@
+"""Open bodies that walk, as truth for fits."""
+
+import numpy as np
+
+from data_contracts.conventions import COCO17
+from worldpose.body import BodyParameters, fold_keypoints, load_open_body
+from worldpose.body.parameters import BODY_POSE
+from worldpose.body_fitting.pose_space import SPREAD, load_pose_prior
+
+MODEL = load_open_body()
+KEYPOINTS = fold_keypoints(MODEL, COCO17)
+
+
+def walker(frames, rng, *, fps=50.0, upside_down=False):
+    """A body that swings arms and legs on its way along x."""
+    time = np.arange(frames) / fps
+    angles = np.tile(load_pose_prior().mean, (frames, 1))
+    swing = np.sin(2.0 * np.pi * 1.2 * time + rng.uniform(0.0, 6.0))
+    angles[:, 6] += 0.4 * swing
+    angles[:, 9] -= 0.4 * swing
+    angles[:, 19] += 0.4 * swing
+    angles[:, 22] -= 0.4 * swing
+    angles[:, 12] += 0.3 * swing
+    angles[:, 15] -= 0.3 * swing
+    # Upright, or on the head, and looking along x.
+    turn = np.array([np.pi / 2, 0.0, 0.0]) if not upside_down else np.array([-1.4, 0.0, 0.2])
+    return BodyParameters(
+        betas=np.r_[rng.normal(0.0, 0.7, 3), np.zeros(7)],
+        global_orient=np.broadcast_to(turn, (frames, 3)),
+        body_pose=(angles @ SPREAD.T).reshape(frames, BODY_POSE),
+        transl=np.stack([1.5 * time, 0.0 * time, np.full(frames, 0.95)], axis=-1),
+    )
+
+
+def seen(parameters, noise, rng):
+    """Joints (frames, 1, 17, 3) with noise, and their covariance."""
+    joints = KEYPOINTS(parameters)[:, None]
+    joints = joints + noise * rng.standard_normal(joints.shape)
+    spread = max(noise, 0.005) ** 2 * np.eye(3)
+    return joints, np.broadcast_to(spread, (*joints.shape, 3)).copy()

@@ -1,0 +1,104 @@
+"""Shape from bone lengths (S1).
+
+The paper adds lengths of shape directions; lengths do not add, so here a bone's length is that of
+the blended bone. A joint with error makes bones longer, by about its variance over the length; the
+mean square of a noisy bone is its squared length plus the trace of the error's covariance, exactly,
+so squares are averaged and the trace is taken off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17
+from worldpose.body import BodyModel
+from worldpose.body.skeletons import JOINT_OF_POINT
+
+Floats = NDArray[np.float64]
+
+BONES: Final = (
+    *((5, 7), (6, 8), (7, 9), (8, 10), (11, 13), (12, 14), (13, 15), (14, 16), (5, 6), (11, 12)),
+)
+"""Pairs of COCO-17 joints whose distance no pose changes."""
+DEFINITION: Final = 0.02
+"""How far a detector's idea of a joint is from the body model's [m]: no number of frames makes a
+bone's length surer than this times sqrt(2)."""
+
+
+@dataclass(frozen=True, eq=False)
+class BoneLengths:
+    """A person's bones, of `BONES`."""
+
+    length: Floats
+    """(bones,) [m]; NaN for bones that were never seen."""
+    variance: Floats
+    """(bones,) [m^2]"""
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """Betas and how sure they are."""
+
+    betas: Floats
+    """(shapes,)"""
+    covariance: Floats
+    """(shapes, shapes)"""
+
+
+def measure_bones(joints: Floats, covariance: Floats, witnesses: float) -> BoneLengths:
+    """Return lengths without what noise adds, robust over frames.
+
+    Args:
+        joints: (frames, 17, 3) [m].
+        covariance: (frames, 17, 3, 3) [m^2], true to the joints' errors.
+        witnesses: frames that err alike, so that they count as one.
+    """
+    lengths, variances = np.full(len(BONES), np.nan), np.full(len(BONES), np.inf)
+    for index, (a, b) in enumerate(BONES):
+        bone = joints[:, b] - joints[:, a]
+        error = covariance[:, a] + covariance[:, b]
+        seen = np.isfinite(bone).all(-1) & np.isfinite(error).all((-1, -2))
+        if not seen.any():
+            continue
+        bone, error = bone[seen], error[seen]
+        square = (bone**2).sum(-1) - np.trace(error, axis1=-2, axis2=-1)
+        # A normal vector's square varies by 4 d'Cd + 2 tr(C C).
+        spread = 4.0 * np.einsum("fa,fab,fb->f", bone, error, bone)
+        spread = spread + 2.0 * np.einsum("fab,fba->f", error, error) + 1e-12
+        # Three standard deviations of the middle half: gross errors, but no honest tail, go.
+        middle = np.median(square)
+        scale = max(1.4826 * float(np.median(np.abs(square - middle))), 1e-9)
+        kept = np.abs(square - middle) <= 4.0 * scale
+        mean = float(square[kept].mean())
+        lengths[index] = np.sqrt(max(mean, 1e-4))
+        count = max(kept.sum() / witnesses, 1.0)
+        variances[index] = max(spread[kept].mean(), scale**2) / count / (4.0 * max(mean, 1e-2))
+    return BoneLengths(lengths, variances)
+
+
+def fit_shape(model: BodyModel, bones: BoneLengths) -> Shape:
+    """Return the most probable betas for bones, with exact lengths of the blended bones (S1).
+
+    Betas of people have a normal distribution of variance 1; without bones they are 0 with
+    covariance 1.
+    """
+    ends = np.array([[JOINT_OF_POINT[COCO17[joint]] for joint in bone] for bone in BONES])
+    template = model.joint_template[ends[:, 1]] - model.joint_template[ends[:, 0]]
+    directions = model.joint_directions[ends[:, 1]] - model.joint_directions[ends[:, 0]]
+    seen = np.isfinite(bones.length)
+    weight = np.zeros(len(BONES))
+    weight[seen] = 1.0 / (bones.variance[seen] + 2.0 * DEFINITION**2)
+    betas, precision = np.zeros(model.shapes), np.eye(model.shapes)
+    # Lengths are all but linear in the betas: the third step changes nothing any more.
+    for _ in range(5):
+        blended = template + directions @ betas
+        length = np.linalg.norm(blended, axis=-1)
+        slope = np.einsum("bc,bcs->bs", blended / length[:, None], directions)
+        lacking = np.where(seen, bones.length - length, 0.0)
+        precision = np.eye(model.shapes) + slope.T @ (weight[:, None] * slope)
+        betas = betas + np.linalg.solve(precision, slope.T @ (weight * lacking) - betas)
+    return Shape(betas, np.linalg.inv(precision).astype(np.float64))

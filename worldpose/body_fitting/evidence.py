@@ -1,0 +1,48 @@
+"""What triangulation says of one person, as least squares takes it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17_SIGMAS
+from worldpose.body_fitting.settings import BodyFittingSettings
+
+Floats = NDArray[np.float64]
+
+DIFFICULTY: Final = np.array(COCO17_SIGMAS) / 0.08
+"""Spread of each joint relative to an average one: COCO's sigmas over their mean of 0.08."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Joints of one person and how sure they are."""
+
+    joints: Floats
+    """(frames, 17, 3) [m]; NaN where nothing is known."""
+    information: Floats
+    """(frames, 17, 3, 3) [1/m^2], inverse covariance; 0 where nothing is known."""
+
+    @classmethod
+    def of(
+        cls, joints: Floats, covariance: Floats, fps: float, settings: BodyFittingSettings
+    ) -> Evidence:
+        """Return what joints say whose errors last for `noise_time`.
+
+        Args:
+            joints: (frames, 17, 3) [m], world.
+            covariance: (frames, 17, 3, 3) [m^2], as triangulation states it.
+            fps: [1/s].
+            settings: how far to trust that.
+        """
+        seen = np.asarray(np.isfinite(joints).all(-1) & np.isfinite(covariance).all((-1, -2)))
+        stated = np.where(seen[..., None, None], covariance, np.eye(3))
+        spread = settings.noise_scale**2 * DIFFICULTY[:, None, None] ** 2 * stated
+        spread = spread + settings.joint_floor**2 * np.eye(3)
+        # So many frames are one witness.
+        spread *= 1.0 + settings.noise_time * fps
+        information: Floats = (np.linalg.inv(spread) * seen[..., None, None]).astype(np.float64)
+        return cls(np.where(seen[..., None], joints, np.nan), information)

@@ -1,0 +1,65 @@
+"""Settings of body fitting."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from data_contracts.records import Record
+
+
+class BodyFittingSettings(Record):
+    """What is expected of detectors, of bodies and of motion.
+
+    Every weight of the objective is one over the square of a spread that has a unit. The values
+    were chosen on simulated seeds 101 to 104, not on those that figures are taken from.
+    """
+
+    noise_scale: float = Field(default=1.3, gt=0)
+    """Standard deviation of the joints over what triangulation states [1]: it knows the noise of
+    a detector, not what a hidden joint or a wrong view adds."""
+    noise_time: float = Field(default=0.1, ge=0)
+    """Time in which a detector's error stays what it is [s]: so long its frames are one witness,
+    else a slow error would pass for motion."""
+    joint_floor: float = Field(default=0.008, ge=0)
+    """Least standard deviation of a joint [m]: calibration, and what the body model cannot do."""
+    tail: float = Field(default=2.5, gt=0)
+    """Deviation at which a joint has half its weight (Cauchy's loss) [standard deviations]."""
+    bias_spread: float = Field(default=0.02, gt=0)
+    """Expected offset of what a detector takes for a joint from the body's joint, along each axis
+    of the body [m]; the same for everybody and mirrored left to right. Both the offsets and, from
+    the middle of the steps on, this spread are estimated; held at 0.02, a detector of 0.008
+    makes everybody 35 mm too tall."""
+    shape_rate: float = Field(default=12.5, gt=0)
+    """Frames a second that shape and offsets are estimated from [1/s]: more add no witnesses."""
+    shape_acceleration: float = Field(default=50.0, gt=0)
+    """Standard deviation of the hips' acceleration per axis while shape is estimated [m/s^2].
+    Smoothing shortens swings, and shape would follow: with 6 the limbs come out 2 cm short."""
+    shape_weight: float = Field(default=1.0, gt=0)
+    """Weight of the betas' normal distribution [1]: 1 takes people to be as varied as the body
+    model's components say."""
+    acceleration: float = Field(default=20.0, gt=0)
+    """Standard deviation of the hips' acceleration per axis [m/s^2]; other joints have multiples
+    of it (`objective.LIVELINESS`). Players have 2 to 4 on average;
+    smoothing to that cuts swings short (G-MPJPE of a match 26 mm at 8, 23 mm at 12)."""
+    acceleration_tail: float = Field(default=6.0, gt=0)
+    """Deviation at which an acceleration has half its weight [standard deviations]: kicks. Jerk
+    where views change is 1.2 times the truth's at 3, 0.9 at 8."""
+    pose_weight: float = Field(default=0.03, gt=0)
+    """Weight of the pose prior in each frame [1]: neighbouring frames are one pose, not many.
+    At 0.1 heights are 25 instead of 17 mm off."""
+    limit_spread: float = Field(default=0.1, gt=0)
+    """How far angles go beyond the joint limits [rad]."""
+    contact_height: float = Field(default=0.04, gt=0)
+    """An ankle less than this above that of a flat foot may stand [m]."""
+    contact_speed: float = Field(default=0.5, gt=0)
+    """An ankle slower than this may stand [m/s]."""
+    contact_spread: float = Field(default=0.01, gt=0)
+    """How far a standing ankle is from the height of a flat foot's [m]."""
+    slip_spread: float = Field(default=0.001, gt=0)
+    """How far a standing ankle moves in a frame [m]."""
+    shape_steps: int = Field(default=7, ge=1)
+    """Gauss-Newton steps for shape, offsets and coarse poses together [1]."""
+    steps: int = Field(default=4, ge=1)
+    """Gauss-Newton steps for the poses of every frame [1]; feet stand from the third on."""
+    longest_gap: float = Field(default=1.0, ge=0)
+    """Gaps up to this are filled by motion [s]; in longer ones a person is missing."""
