@@ -25,10 +25,7 @@ from worldpose.static_calibration import PARAMETERS
 
 _SIZE: Final = len(PARAMETERS)
 _ROUNDS: Final = 3
-"""Solutions from which noise and calibration's errors are learned; the third changes little."""
-_MOST: Final = 16.0
-"""Largest factor on calibration's variances [1]: nobody is four times less sure than he says, and
-it is calibration alone that holds the world in place."""
+"""Solutions from which noise is learned; the third changes little."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,15 +146,14 @@ class _Adjuster:
         if settings.evidence == "markings_and_players" and len(self.everybody.points):
             standing = np.zeros(len(clip.clicks), dtype=np.bool_)
             for _ in range(_ROUNDS):
-                problem = players_problem(
-                    clip, self.everybody, self.noise, standing, settings, self.doubt
-                )
+                problem = players_problem(clip, self.everybody, self.noise, standing, settings)
                 rough = solve(problem, settings.solver)
                 self.noise = measured_noise(
                     rough.cameras, rough.points, self.everybody, settings.robust_scale
                 )
-                # Nobody is surer than he says he is.
-                self.doubt = np.clip(self.doubt * measured_doubt(problem, rough), 1.0, _MOST)
+            # Nobody is surer than he says he is. Once: repeated, one camera that shows somebody
+            # else would free all the others step by step.
+            self.doubt = np.maximum(measured_doubt(problem, rough), 1.0)
 
     def solved(self, standing: NDArray[np.bool_], without: int | None = None) -> Adjusted:
         """The adjustment to everybody, or to everybody but one group."""

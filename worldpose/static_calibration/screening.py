@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from worldpose.errors import InputError
 from worldpose.static_calibration.adjustment import Fits, Problem, adjust, row_of
 from worldpose.static_calibration.bending import with_bends
 from worldpose.static_calibration.parameters import CameraEstimate
@@ -16,6 +17,9 @@ from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 _ROBUST: Final = 3.0
 """Cauchy scale of clicks [standard deviations] of the fit that the screening starts from."""
+_SINGULAR: Final = 1e-14
+"""Least eigenvalue of the scaled information [1]: below it a point lies in the camera's center,
+and rounding decides."""
 _OWN_WORTH: Final = 40.0
 """Residuals that the stated noise is worth when the noise is estimated [1]: a few clicks cannot
 overrule it."""
@@ -100,6 +104,9 @@ def screen(
         problem: what was clicked.
         start: (22,) camera near the answer.
         settings: what is wrong.
+
+    Raises:
+        InputError: only a camera that cannot be explains the clicks.
     """
     limit = settings.wrong_click
     count = len(problem.evidence.points)
@@ -251,8 +258,16 @@ def _covariance(problem: Problem, fit: Fits) -> tuple[NDArray[np.float64], float
     covariance = np.zeros_like(prior)
     total = observed[free] / scale**2 + prior[free]
     # Coefficients of the lens and meters differ by many powers of ten.
-    size = np.sqrt(np.diag(total))
-    covariance[free] = np.linalg.inv(total / np.outer(size, size)) / np.outer(size, size)
+    size = np.sqrt(np.abs(np.diag(total)))
+    scaled = total / np.outer(size, size)
+    if not np.linalg.eigvalsh(scaled)[0] > _SINGULAR:
+        raise InputError(
+            "clicked markings",
+            expected="clicks that a camera beside or above the pitch can have made",
+            found=f"{count} pixel coordinates that bring the camera down to a clicked point",
+            todo="Check names and pixels of the clicks, and image_size.",
+        )
+    covariance[free] = np.linalg.inv(scaled) / np.outer(size, size)
     return covariance, scale
 
 
