@@ -45,7 +45,7 @@ def test_truth_scored_against_itself_is_perfect_and_a_shift_is_its_length(tiny, 
 def test_exported_joints_are_the_run_s_own(tiny_run, tmp_path):
     succeed(*("export", TINY, "--format", "joints", "--out", tmp_path, "--project", tiny_run))
     tracks = read_joints(tmp_path / "joints.npz")
-    result = open_run(tiny_run, TINY)["bundle_adjustment/clip"]
+    result = open_run(tiny_run, TINY)["triangulation/clip"]
     np.testing.assert_array_equal(tracks.joints, result.joints.values)
     np.testing.assert_array_equal(tracks.frames, np.arange(30))
     assert tracks.covariance.shape == (30, len(tracks.person_ids), 17, 3, 3)
