@@ -12,6 +12,11 @@ $(INSTALLED): pyproject.toml constraints.txt
 	  { echo "Python 3.11 or later is needed; name one with: make PYTHON=python3.12"; exit 2; }
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@echo "Compiling the kernels by reconstructing half a second: once, about a minute"
+	@rm -rf .venv/first
+	@$(BIN)/worldpose simulate --scenario tiny --duration 0.5 --out .venv/first/tiny
+	@$(BIN)/worldpose run .venv/first/tiny --project .venv/first/project
+	@rm -rf .venv/first
 	@touch $(INSTALLED)
 
 demo: install

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from people_samples import detections, runner
+from running_samples import detections, runner
 
 from worldpose.cameras import Camera
 from worldpose.static_calibration.parameters import project_with_jacobian, stepped

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from people_samples import FPS, detections, runner
+from running_samples import FPS, detections, runner
 
 from worldpose.triangulation import (
     TriangulationSettings,
