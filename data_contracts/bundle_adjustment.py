@@ -1,14 +1,10 @@
-"""Result of stage `bundle_adjustment`: cameras that agree with people, and people again (B1-B3)."""
+"""Result of stage `bundle_adjustment`: cameras that agree with markings and people (B1-B3)."""
 
 from __future__ import annotations
 
 from data_contracts.arrays import ArrayLayout, GroupLayout, Missing
 from data_contracts.cameras import CAMERA_ARRAYS, CAMERA_LABELS
-from data_contracts.conventions import COCO17
-from data_contracts.observations import FRAME
 from data_contracts.static_calibration import CAMERA_STEP
-from data_contracts.tracking import PERSON
-from data_contracts.triangulation import TRIANGULATION
 
 
 def _of_cameras(name: str, last: str, unit: str, missing: Missing, about: str) -> ArrayLayout:
@@ -129,14 +125,10 @@ _REVIEW = (
 
 BUNDLE_ADJUSTMENT = GroupLayout(
     stage="bundle_adjustment",
-    about="Cameras of one clip adjusted to its people and markings, and the people triangulated "
-    "again with them.",
-    coordinates=(FRAME, PERSON),
-    arrays=(*TRIANGULATION.arrays, *_CAMERAS, *_ACCEPTANCE, *_REVIEW),
+    about="All static cameras of a match, adjusted to its people and markings.",
+    arrays=(*_CAMERAS, *_ACCEPTANCE, *_REVIEW),
     labels={
         **CAMERA_LABELS,
-        "joint": COCO17,
-        "coordinate_": ("x", "y", "z"),
         "parameter": CAMERA_STEP,
         "parameter_": CAMERA_STEP,
         "side": ("before", "after"),

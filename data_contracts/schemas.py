@@ -17,6 +17,7 @@ from data_contracts.ingest import INGEST
 from data_contracts.match import MatchSpec, Registration
 from data_contracts.pitch import PitchSpec
 from data_contracts.records import Record
+from data_contracts.retriangulation import RETRIANGULATION
 from data_contracts.review import Correction, ReviewDecision, ReviewRequest
 from data_contracts.run import Project, Reservation, ResultManifest, RunRecord
 from data_contracts.static_calibration import STATIC_CALIBRATION, ClickedMarkings
@@ -49,6 +50,7 @@ LAYOUTS: tuple[GroupLayout, ...] = (
     TRACKING,
     TRIANGULATION,
     BUNDLE_ADJUSTMENT,
+    RETRIANGULATION,
     BODY_FITTING,
 )
 

@@ -135,7 +135,7 @@ def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str
             found=f"a match of {len(clips)} clips",
             todo="Export it and score clip by clip.",
         )
-    cameras = static_cameras(run, spec, clips[0], stage) if truth.cameras else {}
+    cameras = static_cameras(run, spec, stage) if truth.cameras else {}
     return Side(joint_tracks(run, clips[0], stage), cameras, match.folder)
 
 

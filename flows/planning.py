@@ -66,7 +66,8 @@ def plan_stage(
         overrides: settings that differ from their defaults.
         results: `stage/unit` to key of what earlier stages have, or will have, computed.
     """
-    settings = settings_of(stage, overrides).model_dump(mode="json")
+    settings = settings_of(stage, overrides)
+    outside = stage.outside(settings)
     units, blocked = [], []
     for unit in stage.units(match):
         inputs = stage.inputs(match, unit)
@@ -77,9 +78,9 @@ def plan_stage(
             match_id=match.match_id,
             stage=stage.name,
             unit=unit,
-            sources=stage.sources(match, unit),
+            sources=stage.sources(match, unit) | outside,
             inputs={name: results[name] for name in inputs},
-            settings=settings,
+            settings=settings.model_dump(mode="json"),
             code=code_version(f"tasks.{stage.name}"),
             libraries=libraries(),
         )

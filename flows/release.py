@@ -10,17 +10,22 @@ import numpy as np
 
 from data_contracts.match import MatchSpec
 from data_contracts.run import RunRecord
+from worldpose.body import BodyParameters
 from worldpose.cameras import Camera
 from worldpose.cameras.stored import camera_from_arrays
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.release import JointTracks, coco_dataset, write_coco, write_joints
+from worldpose.release.camera_file import write_static_camera
+from worldpose.release.pose_file import write_poses
 from worldpose.store import Run
 
 if TYPE_CHECKING:
     import xarray as xr
 
-JOINT_STAGES = ("triangulation", "bundle_adjustment")
+JOINT_STAGES = ("triangulation", "retriangulation", "body_fitting")
 """Stages that give 3D joints, the best last."""
+ADJUSTED = "bundle_adjustment/cameras"
+"""Where all static cameras are once people have adjusted them."""
 
 
 def clips_of(record: RunRecord) -> tuple[str, ...]:
@@ -45,52 +50,63 @@ def joint_tracks(run: Run, clip: str, stage: str | None = None) -> JointTracks:
     Raises:
         UsageError: the run has no such result.
     """
-    result = joint_result(run, clip, stage)
+    stages = [name for name in reversed(JOINT_STAGES) if f"{name}/{clip}" in run]
+    if stage in stages:
+        stages = stages[stages.index(stage) :]
+    elif stage is not None or not stages:
+        raise UsageError(
+            f"--stage {stage}" if stage else f"clip {clip}",
+            expected=f"a result with joints: {', '.join(JOINT_STAGES)}",
+            found=", ".join(run) or "an empty run",
+            todo="Run the match to the end first.",
+        )
+    result = run[f"{stages[0]}/{clip}"]
+    seen = placed_joints(run, clip) if stages[0] == "body_fitting" else result
     return JointTracks(
         frames=result["frame"].values,
         person_ids=result["person"].values.astype(np.int64),
         joints=result["joints"].values,
         covariance=result["covariance"].values,
-        views=result["views"].values.astype(np.int64),
+        views=seen["views"].values.astype(np.int64),
     )
 
 
-def joint_result(run: Run, clip: str, stage: str | None = None) -> xr.Dataset:
-    """The result with the joints of one clip, of the best stage or of the stage asked for.
+def placed_joints(run: Run, clip: str) -> xr.Dataset:
+    """The best triangulated joints of one clip, with the views that carry them.
 
     Raises:
-        UsageError: the run has no such result.
+        UsageError: the run has none.
     """
-    for name in (f"{name}/{clip}" for name in reversed(JOINT_STAGES) if stage in (None, name)):
-        if name in run:
-            return run[name]
+    for stage in ("retriangulation", "triangulation"):
+        if f"{stage}/{clip}" in run:
+            return run[f"{stage}/{clip}"]
     raise UsageError(
-        f"--stage {stage}" if stage else f"clip {clip}",
-        expected=f"a result with joints: {', '.join(JOINT_STAGES)}",
+        f"clip {clip}",
+        expected="triangulated joints",
         found=", ".join(run) or "an empty run",
         todo="Run the match to the end first.",
     )
 
 
-def export_joints(run: Run, spec: MatchSpec, out: Path) -> list[Path]:
+def export_joints(run: Run, spec: MatchSpec, out: Path, stage: str | None) -> list[Path]:
     """Writes `joints.npz`, or `<clip>.joints.npz` for each clip where there are several."""
     clips = clips_of(run.record)
     written = []
     for clip in clips:
         path = out / ("joints.npz" if len(clips) == 1 else f"{clip}.joints.npz")
-        write_joints(path, joint_tracks(run, clip))
+        write_joints(path, joint_tracks(run, clip, stage))
         written.append(path)
     return written
 
 
-def export_coco(run: Run, spec: MatchSpec, out: Path) -> list[Path]:
+def export_coco(run: Run, spec: MatchSpec, out: Path, stage: str | None) -> list[Path]:
     """Writes `<camera>.json` for each static camera, in `<clip>/` where there are several."""
     clips = clips_of(run.record)
     written = []
     for clip in clips:
-        tracks = joint_tracks(run, clip)
-        inliers = joint_result(run, clip)["inliers"]
-        for camera_id, camera in static_cameras(run, spec, clip).items():
+        tracks = joint_tracks(run, clip, stage)
+        inliers = placed_joints(run, clip)["inliers"]
+        for camera_id, camera in static_cameras(run, spec, stage).items():
             dataset = coco_dataset(
                 camera_id,
                 camera,
@@ -104,33 +120,54 @@ def export_coco(run: Run, spec: MatchSpec, out: Path) -> list[Path]:
     return written
 
 
-def static_cameras(
-    run: Run, spec: MatchSpec, clip: str | None = None, stage: str | None = None
-) -> dict[str, Camera]:
+def export_worldpose(run: Run, spec: MatchSpec, out: Path, stage: str | None) -> list[Path]:
+    """Writes `poses/<clip>.npz` and `cameras/<camera>.npz` in the layout of the release (X3)."""
+    written = []
+    for clip in clips_of(run.record):
+        if f"body_fitting/{clip}" not in run:
+            raise WorldposeError(
+                f"run {run.record.run_id} of {run.record.match_id}: expected results of "
+                "body_fitting, found none. Run the match to the end first."
+            )
+        fits = run[f"body_fitting/{clip}"]
+        poses = BodyParameters(
+            fits["betas"].values[:, None],
+            *(
+                fits[name].values.swapaxes(0, 1)
+                for name in ("global_orient", "body_pose", "transl")
+            ),
+        )
+        written.append(out / "poses" / f"{clip}.npz")
+        write_poses(written[-1], poses, fits.attrs["body_model"])
+    for name, camera in static_cameras(run, spec, stage).items():
+        written.append(out / "cameras" / f"{name}.npz")
+        write_static_camera(written[-1], camera.to_calibration(name))
+    return written
+
+
+def static_cameras(run: Run, spec: MatchSpec, stage: str | None = None) -> dict[str, Camera]:
     """The static cameras that a run has, by id; all of them where it has joints.
 
     Args:
         run: the run.
         spec: the match.
-        clip: as the joints of this clip were placed with them; None = as they were calibrated.
-        stage: as the joints of this stage were, instead of the best one's.
+        stage: as the joints of this stage were placed with them; None = the best there are.
     """
+    if ADJUSTED in run and stage != "triangulation":
+        adjusted = run[ADJUSTED]
+        cameras = camera_from_arrays(adjusted.data_vars)
+        return {str(name): cameras[c] for c, name in enumerate(adjusted["camera"].values)}
     units = {camera.id: f"static_calibration/{camera.id}" for camera in spec.static_cameras}
-    cameras = {
+    return {
         camera_id: camera_from_arrays(run[unit].data_vars)
         for camera_id, unit in units.items()
         if unit in run
     }
-    adjusted = f"bundle_adjustment/{clip}"
-    if adjusted in run and stage in (None, "bundle_adjustment"):
-        result = run[adjusted]
-        batch = camera_from_arrays(result.data_vars)
-        cameras |= {str(name): batch[k] for k, name in enumerate(result["camera"].values)}
-    return cameras
 
 
-EXPORTS: dict[str, Callable[[Run, MatchSpec, Path], list[Path]]] = {
+EXPORTS: dict[str, Callable[[Run, MatchSpec, Path, str | None], list[Path]]] = {
     "joints": export_joints,
     "coco": export_coco,
+    "worldpose": export_worldpose,
 }
-"""Formats by name."""
+"""Formats by name; each takes a run, its match, a folder, and whose joints are meant."""

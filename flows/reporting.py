@@ -10,10 +10,13 @@ import numpy as np
 from data_contracts.evaluation import Evaluation
 from flows.camera_reporting import camera_pictures, camera_summaries, still_of
 from flows.evaluation import load_reference, score
-from flows.release import clips_of, joint_result, joint_tracks, static_cameras
+from flows.people_reporting import adjustment_tables, body_tables
+from flows.release import clips_of, joint_tracks, placed_joints, static_cameras
 from flows.stage import Match
+from worldpose.body import BodyParameters, find_body
 from worldpose.cameras import Camera
 from worldpose.release import JointTracks, Picture, report_page, whole_file
+from worldpose.release.body_pictures import bodies_picture
 from worldpose.release.pictures import paths_picture, view_picture
 from worldpose.release.stadium_pictures import camera_picture, stadium_picture
 from worldpose.store import Run, Store, open_run
@@ -49,14 +52,11 @@ def write_report(
         seconds=seconds,
         scores=scores,
         pictures=[
-            picture
-            for clip in clips
-            for picture in _pictures(
-                run, match, clip, static_cameras(run, match.folder.spec, clip), truth
-            )
+            picture for clip in clips for picture in _pictures(run, match, clip, cameras, truth)
         ],
         cameras=camera_summaries(run, match.folder.spec),
         camera_pictures=camera_pictures(store, run, match, cameras),
+        tables=[*adjustment_tables(run), *body_tables(run, clips)],
     )
     with whole_file(out) as draft:
         draft.write_text(page, encoding="utf-8")
@@ -73,7 +73,7 @@ def _pictures(
     """The stadium from a camera and from above, people's ways, and the view with most people."""
     tracks = joint_tracks(run, clip)
     pitch = match.folder.pitch
-    seen = joint_result(run, clip)["inliers"].any("joint").sum("person").values
+    seen = placed_joints(run, clip)["inliers"].any("joint").sum("person").values
     pictures = []
     if len(tracks.frames):
         first = int(tracks.frames[0])
@@ -94,6 +94,8 @@ def _pictures(
                 stadium_picture(cameras, "", tracks, 0, pitch=pitch),
             ),
         ]
+        if f"body_fitting/{clip}" in run:
+            pictures.append(_bodies(run, match, clip, widest, cameras[widest]))
     above = paths_picture(tracks, truth=truth, cameras=cameras, pitch=pitch)
     pictures.append(Picture(f"Clip {clip}: everybody's way.", above))
     if not seen.any():
@@ -110,3 +112,28 @@ def _pictures(
         pitch=pitch,
     )
     return [*pictures, Picture(f"The view with most people: {camera_id}, frame {number}.", view)]
+
+
+def _bodies(run: Run, match: Match, clip: str, camera_id: str, camera: Camera) -> Picture:
+    """The bodies of a clip's first frame over a camera's still."""
+    fits = run[f"body_fitting/{clip}"]
+    model = find_body(fits.attrs["body_model"])
+    poses = BodyParameters(
+        fits["betas"].values,
+        *(fits[name].values[0] for name in ("global_orient", "body_pose", "transl")),
+    )
+    frame, still = int(fits["frame"].values[0]), still_of(match, camera_id)
+    png = bodies_picture(
+        camera,
+        f"camera {camera_id}, frame {frame}",
+        model.vertices(poses),
+        model.faces,
+        fits["person"].values,
+        still=still,
+        pitch=match.folder.pitch,
+    )
+    return Picture(
+        f"Clip {clip}, frame {frame}: fitted bodies ({model.name}) where camera {camera_id} shows "
+        f"most people{'' if still is None else ', over its still'}.",
+        png,
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from pydantic import JsonValue
 
@@ -25,6 +26,10 @@ class Match:
         return self.registration.spec.match_id
 
 
+def _nothing(settings: Record) -> dict[str, JsonValue]:
+    return {}
+
+
 @dataclass(frozen=True)
 class Stage:
     """One step of the method; its task is the function of the same name in `tasks`.
@@ -36,6 +41,7 @@ class Stage:
         units: names of the pieces that are computed, retried and stored on their own.
         inputs: for a unit, the `stage/unit` names of the results it is made from.
         sources: for a unit, everything the match folder contributes to its result.
+        outside: for its settings, what they name outside of the match: digests of those files.
     """
 
     name: str
@@ -44,3 +50,4 @@ class Stage:
     units: Callable[[Match], tuple[str, ...]]
     inputs: Callable[[Match, str], tuple[str, ...]]
     sources: Callable[[Match, str], dict[str, JsonValue]]
+    outside: Callable[[Any], dict[str, JsonValue]] = _nothing

@@ -18,5 +18,5 @@ STAGE = Stage(
     settings=TriangulationSettings,
     units=tracking.units,
     inputs=inputs,
-    sources=tracking.sources,
+    sources=tracking.clip_sources,
 )

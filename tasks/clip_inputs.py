@@ -1,10 +1,13 @@
-"""A clip as tracking and triangulation see it: all static cameras, one clock."""
+"""Frames of a match as all static cameras see them, on one clock."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from data_contracts.run import Work
@@ -12,11 +15,50 @@ from tasks.unit import open_input
 from worldpose.cameras import Camera
 from worldpose.cameras.stored import camera_from_arrays
 from worldpose.store import Store
+from worldpose.tracking.clip_arrays import ClipArray
+
+PAGE = 256
+"""Frames read at a time."""
+PAGES = 4
+"""Pages kept: a stretch with its margins lies in four."""
+
+
+class StoredClip:
+    """One array of every camera's detections, padded to the same number, read when it is used.
+
+    Attributes:
+        shape: (frames, cameras, detections, ...).
+    """
+
+    def __init__(self, clips: Sequence[xr.Dataset], name: str) -> None:
+        arrays = [clip[name] for clip in clips]
+        detections = max(1, *(array.sizes["detection"] for array in arrays))
+        frames, _, *rest = arrays[0].shape
+        self.shape: tuple[int, ...] = (frames, len(arrays), detections, *rest)
+        self._arrays = arrays
+        self._page = lru_cache(PAGES)(self._read)
+
+    def __getitem__(self, frames: slice) -> NDArray[np.float64]:
+        """A stretch of frames as float64; NaN where a camera has fewer detections."""
+        first, last, _ = frames.indices(self.shape[0])
+        out = np.empty((max(0, last - first), *self.shape[1:]))
+        for number in range(first // PAGE, -(-last // PAGE)):
+            start, stop = max(first, number * PAGE), min(last, (number + 1) * PAGE)
+            page = self._page(number)
+            out[start - first : stop - first] = page[start - number * PAGE : stop - number * PAGE]
+        return out
+
+    def _read(self, number: int) -> NDArray[np.float32]:
+        start, stop = number * PAGE, min((number + 1) * PAGE, self.shape[0])
+        page = np.full((stop - start, *self.shape[1:]), np.nan, dtype=np.float32)
+        for camera, array in enumerate(self._arrays):
+            page[:, camera, : array.sizes["detection"]] = array[start:stop].values
+        return page
 
 
 @dataclass(frozen=True)
 class ClipInputs:
-    """Observations of one clip.
+    """Observations of some frames.
 
     Attributes:
         camera_ids: in the order of every camera dimension.
@@ -32,34 +74,59 @@ class ClipInputs:
     cameras: Camera
     camera_covariance: NDArray[np.float64] | None
     frame: NDArray[np.int64]
-    keypoints: NDArray[np.float64]
-    confidence: NDArray[np.float64]
+    keypoints: ClipArray
+    confidence: ClipArray
     fps: float
 
 
+ADJUSTED = "bundle_adjustment/cameras"
+"""All static cameras, where they are adjusted to people."""
+
+
 def open_clip(store: Store, work: Work) -> ClipInputs:
-    """The clip of `work`, with every camera's detections padded to the same number."""
+    """The clip of `work`; its detections are read when they are used."""
+    first, count = work.recipe.sources["first_frame"], work.recipe.sources["frame_count"]
+    return _open(store, work, np.arange(first, first + count), slice(first, first + count - 1))
+
+
+def open_frames(store: Store, work: Work, frame: NDArray[np.int64]) -> ClipInputs:
+    """Match frames, with every camera's detections in memory."""
+    some = _open(store, work, frame, frame)
+    keypoints, confidence = some.keypoints[: len(frame)], some.confidence[: len(frame)]
+    return replace(some, keypoints=keypoints, confidence=confidence)
+
+
+def _open(
+    store: Store, work: Work, frame: NDArray[np.int64], where: slice | NDArray[np.int64]
+) -> ClipInputs:
+    """Match frames, which are `where` in what each camera brought in.
+
+    The cameras are the adjusted ones where `work` is made from them.
+    """
     sources = work.recipe.sources
     camera_ids = tuple(sources["cameras"])
-    first, count = sources["first_frame"], sources["frame_count"]
-    frame = np.arange(first, first + count)
-    clips = [open_input(store, work, f"ingest/{camera}").sel(frame=frame) for camera in camera_ids]
-    cameras = [open_input(store, work, f"static_calibration/{camera}") for camera in camera_ids]
-    detections = max(1, *(clip.sizes["detection"] for clip in clips))
-    shape = (count, len(camera_ids), detections, clips[0].sizes["joint"])
-    keypoints = np.full((*shape, 2), np.nan)
-    confidence = np.full(shape, np.nan)
-    for index, clip in enumerate(clips):
-        present = clip.sizes["detection"]
-        keypoints[:, index, :present] = clip["keypoints"].values
-        confidence[:, index, :present] = clip["confidence"].values
-    known = all("covariance" in camera for camera in cameras)  # a given camera tells none
+    seen = [open_input(store, work, f"ingest/{camera}").sel(frame=where) for camera in camera_ids]
+    cameras, covariance = _cameras(store, work, camera_ids)
     return ClipInputs(
         camera_ids=camera_ids,
-        cameras=Camera.stack([camera_from_arrays(camera.data_vars) for camera in cameras]),
-        camera_covariance=np.stack([c["covariance"].values for c in cameras]) if known else None,
+        cameras=cameras,
+        camera_covariance=covariance,
         frame=frame,
-        keypoints=keypoints,
-        confidence=confidence,
+        keypoints=StoredClip(seen, "keypoints"),
+        confidence=StoredClip(seen, "confidence"),
         fps=float(sources["fps"]),
     )
+
+
+def _cameras(
+    store: Store, work: Work, camera_ids: tuple[str, ...]
+) -> tuple[Camera, NDArray[np.float64] | None]:
+    """The cameras in order, and how well they are known, where all of them tell."""
+    if ADJUSTED in work.recipe.inputs:
+        adjusted = open_input(store, work, ADJUSTED)
+        return camera_from_arrays(adjusted.data_vars), adjusted["camera_covariance"].values
+    each = [open_input(store, work, f"static_calibration/{camera}") for camera in camera_ids]
+    cameras = Camera.stack([camera_from_arrays(camera.data_vars) for camera in each])
+    if all("covariance" in camera for camera in each):
+        return cameras, np.stack([camera["covariance"].values for camera in each])
+    return cameras, None  # a given camera tells none

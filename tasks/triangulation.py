@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import reduce
+from operator import add
 from typing import Any
 
 from numpy.typing import NDArray
 
+from data_contracts.arrays import GroupLayout
 from data_contracts.run import Work
 from data_contracts.triangulation import TRIANGULATION
 from tasks.clip_inputs import open_clip
+from tasks.spool import spooling
 from tasks.unit import figures_of, open_input, unit_task
-from worldpose.store import Store
-from worldpose.triangulation import Reconstruction, TriangulationSettings, reconstruct_joints
+from worldpose.store import ResultWriter, Store
+from worldpose.triangulation import (
+    CameraClocks,
+    ClipDetections,
+    Reconstruction,
+    Smoothing,
+    Triangulation,
+    TriangulationSettings,
+    learn_clip,
+    reconstruct_parts,
+)
 
 
 @unit_task
@@ -20,30 +32,59 @@ def triangulation(work: Work) -> str:
     """Publishes joints with covariance; returns the key."""
     store = Store.open(work.project)
     with store.publishing(work) as result:
-        clip = open_clip(store, work)
-        tracks = open_input(store, work, f"tracking/{work.recipe.unit}")
-        found = reconstruct_joints(
-            clip.cameras,
-            clip.keypoints,
-            clip.confidence,
-            tracks["detection_index"].values,
-            clip.fps,
-            TriangulationSettings.model_validate(work.recipe.settings),
-            clip.camera_covariance,
-        )
+        settings = TriangulationSettings.model_validate(work.recipe.settings)
+        place_joints(store, work, settings, result, TRIANGULATION)
+    return work.key
+
+
+def settings_before(store: Store, work: Work, clip: str) -> TriangulationSettings:
+    """The settings with which the joints of a clip were placed the first time."""
+    match_id, key = work.recipe.match_id, work.recipe.inputs[f"triangulation/{clip}"]
+    recipe = store.manifest(match_id, "triangulation", clip, key).recipe
+    return TriangulationSettings.model_validate(recipe.settings)
+
+
+def place_joints(
+    store: Store,
+    work: Work,
+    settings: TriangulationSettings,
+    result: ResultWriter,
+    layout: GroupLayout,
+) -> None:
+    """Writes the joints of the clip of `work` into its result, a stretch of frames at a time."""
+    clip = open_clip(store, work)
+    tracks = open_input(store, work, f"tracking/{work.recipe.unit}")
+    index = tracks["detection_index"].values
+    detections = ClipDetections(clip.keypoints, clip.confidence, index)
+    given = (clip.fps, settings, clip.camera_covariance)
+    model, detections = learn_clip(clip.cameras, detections, *given)
+    agreements, changes = [], []
+    with spooling(store) as spool:
+        for part in reconstruct_parts(clip.cameras, detections, model, *given):
+            spool.add(part_arrays(part.triangulation, part.smoothing))
+            agreements.append(part.triangulation.agreement)
+            changes.append(part.smoothing.changes)
         result.write(
-            TRIANGULATION,
-            arrays=reconstruction_arrays(found),
+            layout,
+            arrays=spool.arrays() | clock_arrays(model.clocks),
             coordinates={"frame": clip.frame, "person": tracks["person"].values},
             attributes={"camera": list(clip.camera_ids)},
         )
-        result.figures.update(reconstruction_figures(found, clip.camera_ids))
-    return work.key
+    for report in (
+        reduce(add, agreements).report(model.detector.noise[-1].factor),
+        reduce(add, changes).report(model.motion.acceleration, model.motion.repeated),
+        model.clocks.report,
+    ):
+        result.figures.update(figures_of(report, clip.camera_ids))
 
 
 def reconstruction_arrays(found: Reconstruction) -> dict[str, NDArray[Any]]:
     """The stored arrays of a clip's joints, by name."""
-    joints, smooth = found.triangulation, found.smoothing
+    return part_arrays(found.triangulation, found.smoothing) | clock_arrays(found.clocks)
+
+
+def part_arrays(joints: Triangulation, smooth: Smoothing) -> dict[str, NDArray[Any]]:
+    """The stored arrays that have frames."""
     return {
         "joints": joints.joints,
         "covariance": joints.covariance,
@@ -55,15 +96,9 @@ def reconstruction_arrays(found: Reconstruction) -> dict[str, NDArray[Any]]:
         "smoothed": smooth.joints,
         "smoothed_covariance": smooth.covariance,
         "filled": smooth.filled,
-        "clock_late": found.clocks.late,
-        "clock_error": found.clocks.standard_error,
     }
 
 
-def reconstruction_figures(found: Reconstruction, camera_ids: Sequence[str]) -> dict[str, float]:
-    """The figures of a clip's joints."""
-    reports = (found.triangulation.report, found.smoothing.report, found.clocks.report)
-    figures: dict[str, float] = {}
-    for report in reports:
-        figures |= figures_of(report, camera_ids)
-    return figures
+def clock_arrays(clocks: CameraClocks) -> dict[str, NDArray[Any]]:
+    """The stored arrays of the cameras' clocks."""
+    return {"clock_late": clocks.late, "clock_error": clocks.standard_error}

@@ -22,12 +22,17 @@ from flows.cli.console import (
 from worldpose.errors import UsageError
 from worldpose.store import Store, open_run
 
+StageOption = Annotated[
+    str | None, typer.Option("--stage", help="Take this stage's joints; the latest by default.")
+]
+
 
 def export(
     match: MatchArgument,
-    form: Annotated[str, typer.Option("--format", help="joints or coco.")],
+    form: Annotated[str, typer.Option("--format", help="joints, coco or worldpose.")],
     out: Annotated[Path, typer.Option("--out", help="Folder to write into.")],
     run: RunOption = "latest",
+    stage: StageOption = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -46,7 +51,7 @@ def export(
             todo="Choose one of these.",
         )
     spec = find_registration(Store.open(project), match).spec
-    written = EXPORTS[form](open_run(project, spec.match_id, run), spec, out)
+    written = EXPORTS[form](open_run(project, spec.match_id, run), spec, out, stage)
     if as_json:
         print_json({"match": spec.match_id, "files": [str(path) for path in written]})
     else:
@@ -69,9 +74,7 @@ def evaluate(
         ),
     ] = None,
     run: RunOption = "latest",
-    stage: Annotated[
-        str | None, typer.Option("--stage", help="Score this stage's joints; the best by default.")
-    ] = None,
+    stage: StageOption = None,
     match_in: Annotated[
         str | None,
         typer.Option(

@@ -27,6 +27,8 @@ STAGES_IN_WORLDPOSE = (
     "tracking",
     "triangulation",
     "bundle_adjustment",
+    "body",
+    "body_fitting",
     "release",
     "evaluation",
     "synthetic",

@@ -122,6 +122,12 @@ def test_a_damaged_input_fails_its_unit_and_repair_mends_it(server, tiny, tmp_pa
     lost = succeed("why", f"{TINY}/tracking/clip", "--project", project, "--json").json
     assert lost["state"] == "missing"
     status = succeed("status", "--project", project, "--json").json["matches"][0]["units"]
-    assert status["missing"] == ["tracking/clip", "triangulation/clip"]
+    assert status["missing"] == [
+        "tracking/clip",
+        "triangulation/clip",
+        "bundle_adjustment/cameras",
+        "retriangulation/clip",
+        "body_fitting/clip",
+    ]
     again = succeed("run", tiny, "--project", project, "--json").json
-    assert (again["executed"], again["failed"]) == (2, 0)
+    assert (again["executed"], again["failed"]) == (5, 0)

@@ -10,8 +10,11 @@ import pytest
 import yaml
 from command_line import TINY, succeed, worldpose
 
+from data_contracts.conventions import COCO17
 from worldpose import open_run
-from worldpose.release import read_joints
+from worldpose.body import fold_keypoints, load_open_body
+from worldpose.release import read_camera, read_joints
+from worldpose.release.pose_file import read_poses
 
 pytestmark = pytest.mark.usefixtures("server")
 
@@ -45,7 +48,7 @@ def test_truth_scored_against_itself_is_perfect_and_a_shift_is_its_length(tiny, 
 def test_exported_joints_are_the_run_s_own(tiny_run, tmp_path):
     succeed(*("export", TINY, "--format", "joints", "--out", tmp_path, "--project", tiny_run))
     tracks = read_joints(tmp_path / "joints.npz")
-    result = open_run(tiny_run, TINY)["triangulation/clip"]
+    result = open_run(tiny_run, TINY)["body_fitting/clip"]
     np.testing.assert_array_equal(tracks.joints, result.joints.values)
     np.testing.assert_array_equal(tracks.frames, np.arange(30))
     assert tracks.covariance.shape == (30, len(tracks.person_ids), 17, 3, 3)
@@ -98,6 +101,23 @@ class Outside(HTMLParser):
         ]
 
 
+def test_the_release_layout_holds_bodies_whose_keypoints_are_the_run_s_joints(tiny_run, tmp_path):
+    succeed(*("export", TINY, "--format", "worldpose", "--out", tmp_path, "--project", tiny_run))
+    run = open_run(tiny_run, TINY)
+    poses, body_model = read_poses(tmp_path / "poses" / "clip.npz")
+    assert body_model == run["body_fitting/clip"].attrs["body_model"]
+    keypoints = fold_keypoints(load_open_body(), COCO17)(poses).swapaxes(0, 1)
+    # Single precision: micrometres at the pitch's corners, and angles add a few along a limb.
+    np.testing.assert_allclose(keypoints, run["body_fitting/clip"].joints.values, atol=5e-5)
+    adjusted = run["bundle_adjustment/cameras"]
+    for index, name in enumerate(adjusted.camera.values):
+        camera = read_camera(tmp_path / "cameras" / f"{name}.npz")
+        np.testing.assert_array_equal(camera.focal, adjusted.focal.values[index])
+        np.testing.assert_array_equal(
+            camera.cam_from_world.translation, adjusted.translation.values[index]
+        )
+
+
 def test_report_is_one_page_that_asks_for_nothing(tiny, tiny_run, tmp_path):
     out = tmp_path / "report.html"
     succeed("report", tiny, "--out", out, "--project", tiny_run)
@@ -105,7 +125,7 @@ def test_report_is_one_page_that_asks_for_nothing(tiny, tiny_run, tmp_path):
     outside = Outside()
     outside.feed(page)
     assert outside.asked == []
-    assert page.count("data:image/png;base64,") == 6
+    assert page.count("data:image/png;base64,") == 7
     assert "Mean joint error" in page
     assert "expected ground error" in page
     assert "triangulation/clip" in page

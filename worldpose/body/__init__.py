@@ -6,7 +6,13 @@ same for gradients; only that file needs torch.
 """
 
 from worldpose.body.body_file import OPEN_BODY, load_body, load_open_body, save_body
-from worldpose.body.installing import BODY_FOLDER, body_path, find_body, install_body
+from worldpose.body.installing import (
+    BODY_FOLDER,
+    body_path,
+    digest_of_body,
+    find_body,
+    install_body,
+)
 from worldpose.body.keypoints import FoldedKeypoints, fold_keypoints, fold_regressor
 from worldpose.body.model import BodyModel
 from worldpose.body.parameters import BodyParameters
@@ -23,6 +29,7 @@ __all__ = [
     "BodyParameters",
     "FoldedKeypoints",
     "body_path",
+    "digest_of_body",
     "find_body",
     "fold_keypoints",
     "fold_regressor",

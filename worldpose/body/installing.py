@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 import zipfile
 from pathlib import Path
@@ -69,6 +70,15 @@ def body_path(name: str, folder: Path = BODY_FOLDER) -> Path:
     return folder.expanduser() / f"{name}.npz"
 
 
+def digest_of_body(name: str, folder: Path = BODY_FOLDER) -> str:
+    """Return the SHA-256 of an installed model's file.
+
+    Raises:
+        UsageError: no body of that name is installed.
+    """
+    return hashlib.sha256(_installed(name, folder).read_bytes()).hexdigest()
+
+
 def find_body(name: str = OPEN_BODY, folder: Path = BODY_FOLDER) -> BodyModel:
     """Return the open body or an installed one.
 
@@ -78,6 +88,10 @@ def find_body(name: str = OPEN_BODY, folder: Path = BODY_FOLDER) -> BodyModel:
     """
     if name == OPEN_BODY:
         return load_open_body()
+    return load_body(_installed(name, folder))
+
+
+def _installed(name: str, folder: Path) -> Path:
     path = body_path(name, folder)
     if not _NAME.fullmatch(name) or not path.is_file():
         installed = sorted(each.stem for each in folder.expanduser().glob("*.npz"))
@@ -87,4 +101,4 @@ def find_body(name: str = OPEN_BODY, folder: Path = BODY_FOLDER) -> BodyModel:
             found="none of that name",
             todo="Install one with worldpose body install FILE, or take the open body.",
         )
-    return load_body(path)
+    return path

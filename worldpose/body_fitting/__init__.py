@@ -4,19 +4,35 @@ Input: triangulated joints with covariance, a body model, and the ground where i
 body parameters, the bodies' keypoints with covariance, and what the detector always gets wrong.
 """
 
-from worldpose.body_fitting.bones import BoneLengths, Shape, fit_shape, measure_bones
+from worldpose.body_fitting.bones import (
+    BoneLengths,
+    Shape,
+    fit_shape,
+    measure_bones,
+    pool_shapes,
+)
 from worldpose.body_fitting.figures import BodyFittingReport, report_fit
 from worldpose.body_fitting.fitting import BodyFit, fit_bodies
+from worldpose.body_fitting.glimpses import Glimpses, place_glimpses
+from worldpose.body_fitting.monocular import MonocularEstimates, read_monocular
 from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.body_fitting.sightings import Sightings, find_sightings
 
 __all__ = [
     "BodyFit",
     "BodyFittingReport",
     "BodyFittingSettings",
     "BoneLengths",
+    "Glimpses",
+    "MonocularEstimates",
     "Shape",
+    "Sightings",
+    "find_sightings",
     "fit_bodies",
     "fit_shape",
     "measure_bones",
+    "place_glimpses",
+    "pool_shapes",
+    "read_monocular",
     "report_fit",
 ]

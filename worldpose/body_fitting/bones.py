@@ -8,6 +8,7 @@ so squares are averaged and the trace is taken off.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -24,6 +25,10 @@ BONES: Final = (
     *((5, 7), (6, 8), (7, 9), (8, 10), (11, 13), (12, 14), (13, 15), (14, 16), (5, 6), (11, 12)),
 )
 """Pairs of COCO-17 joints whose distance no pose changes."""
+LIMBS: Final = ((5, 7, 9), (6, 8, 10), (11, 13, 15), (12, 14, 16))
+"""Arms and legs of COCO-17, outward."""
+MOST_NOISE: Final = 0.15
+"""By which part of their length bones are shortened at most [1]: beyond it noise is not small."""
 DEFINITION: Final = 0.02
 """How far a detector's idea of a joint is from the body model's [m]: no number of frames makes a
 bone's length surer than this times sqrt(2)."""
@@ -80,6 +85,33 @@ def measure_bones(joints: Floats, covariance: Floats, witnesses: float) -> BoneL
     return BoneLengths(lengths, variances)
 
 
+def shorten_limbs(joints: Floats, covariance: Floats) -> Floats:
+    """Return joints (frames, 17, 3) [m] whose limbs are on average as long as the true ones.
+
+    Bodies turned after noisy joints point along the noisy bones, which are longer than the true
+    ones by half the variance across over the length.
+
+    Args:
+        joints: (frames, 17, 3) [m].
+        covariance: (frames, 17, 3, 3) [m^2], true to the joints' errors.
+    """
+    shortened = joints.copy()
+    for near, middle, far in LIMBS:
+        for a, b, moved in ((near, middle, (middle, far)), (middle, far, (far,))):
+            bone, error = joints[:, b] - joints[:, a], covariance[:, a] + covariance[:, b]
+            length = np.linalg.norm(bone, axis=-1)
+            along = bone / np.maximum(length, 1e-9)[:, None]
+            across = np.trace(error, axis1=-2, axis2=-1) - np.einsum(
+                "fa,fab,fb->f", along, error, along
+            )
+            longer = np.minimum(0.5 * across / np.maximum(length, 1e-9), MOST_NOISE * length)
+            longer = np.where(np.isfinite(longer), longer, 0.0)
+            along = np.where(np.isfinite(along), along, 0.0)
+            for joint in moved:
+                shortened[:, joint] -= longer[:, None] * along
+    return shortened
+
+
 def fit_shape(model: BodyModel, bones: BoneLengths) -> Shape:
     """Return the most probable betas for bones, with exact lengths of the blended bones (S1).
 
@@ -102,3 +134,20 @@ def fit_shape(model: BodyModel, bones: BoneLengths) -> Shape:
         precision = np.eye(model.shapes) + slope.T @ (weight[:, None] * slope)
         betas = betas + np.linalg.solve(precision, slope.T @ (weight * lacking) - betas)
     return Shape(betas, np.linalg.inv(precision).astype(np.float64))
+
+
+def pool_shapes(shapes: Sequence[Shape]) -> Shape:
+    """Return one person's shape from several clips: means weighted by what each of them says (S1).
+
+    Every covariance holds that betas of people are normal; that counts once. What the clips say is
+    taken as independent, which the detector's offsets are not: they are the same in all of them.
+
+    Args:
+        shapes: of one person and body model, at least one.
+    """
+    anybody = np.eye(len(shapes[0].betas))
+    precisions = [np.linalg.inv(shape.covariance) for shape in shapes]
+    precision = sum(precisions, start=-(len(shapes) - 1.0) * anybody)
+    pulls = [own @ shape.betas for own, shape in zip(precisions, shapes, strict=True)]
+    covariance = np.linalg.inv(precision).astype(np.float64)
+    return Shape(covariance @ np.sum(pulls, axis=0), covariance)

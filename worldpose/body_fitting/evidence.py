@@ -46,3 +46,22 @@ class Evidence:
         spread *= 1.0 + settings.noise_time * fps
         information: Floats = (np.linalg.inv(spread) * seen[..., None, None]).astype(np.float64)
         return cls(np.where(seen[..., None], joints, np.nan), information)
+
+    def with_lines(
+        self, points: Floats, across: Floats, fps: float, settings: BodyFittingSettings
+    ) -> Evidence:
+        """Return the evidence with lines of sight where nothing else is known.
+
+        Args:
+            points: (frames, 17, 3) [m], world, on the lines; NaN without.
+            across: (frames, 17, 3, 3) [1], projections across the lines.
+            fps: [1/s].
+            settings: how far a joint is from its line.
+        """
+        added = np.asarray(np.isfinite(points).all(-1) & np.isnan(self.joints).any(-1))
+        spread = (settings.sight_spread * DIFFICULTY) ** 2 + settings.joint_floor**2
+        spread *= 1.0 + settings.noise_time * fps
+        information = np.where(
+            added[..., None, None], across / spread[:, None, None], self.information
+        )
+        return Evidence(np.where(added[..., None], points, self.joints), information)

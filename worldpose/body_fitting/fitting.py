@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +18,24 @@ from worldpose.body_fitting.banded import BandedFactor
 from worldpose.body_fitting.bones import Shape
 from worldpose.body_fitting.evidence import Evidence
 from worldpose.body_fitting.feet import Ground
+from worldpose.body_fitting.glimpses import Glimpses
+from worldpose.body_fitting.guidance import Guidance, learn_precision
 from worldpose.body_fitting.objective import Pose
-from worldpose.body_fitting.pose_space import SPREAD, load_pose_prior
+from worldpose.body_fitting.pose_space import GATHER, SPREAD, load_pose_prior
 from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.body_fitting.shaping import Shapes, fit_shapes
+from worldpose.body_fitting.shared_bias import body_axes
+from worldpose.body_fitting.sightings import Sightings
 from worldpose.body_fitting.solving import Solver
 from worldpose.errors import InputError
 
 Floats = NDArray[np.float64]
+
+SURE: Final = 0.035
+"""Joints are well known where their median standard deviation per axis is below this [m]: 16
+cameras leave 0.02 to 0.03, two 0.04 to 0.1."""
+GLIMPSE_TIME: Final = 0.5
+"""Time in which an error of a monocular pose stays what it is [s]: pictures hardly change."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,9 +47,10 @@ class BodyFit:
         parameters: (frames, persons), NaN where a person is missing.
         betas_covariance: (persons, shapes, shapes).
         joints: (frames, persons, 17, 3) [m], world: COCO-17 keypoints of the bodies.
-        covariance: (frames, persons, 17, 3, 3) [m^2], of `joints` from the objective, betas and
-            offsets taken as known.
+        covariance: (frames, persons, 17, 3, 3) [m^2], of `joints`: poses by the objective, the
+            detector's offsets, and each person's own.
         filled: (frames, persons), bodies in frames without any joint of theirs.
+        guided: (frames, persons), bodies that a picture of one camera had a say in.
         offsets: (17, 3) [m] forward, left and up: from joints to what the detector takes for them.
     """
 
@@ -46,6 +60,7 @@ class BodyFit:
     joints: Floats
     covariance: Floats
     filled: NDArray[np.bool_]
+    guided: NDArray[np.bool_]
     offsets: Floats
 
 
@@ -56,6 +71,9 @@ def fit_bodies(
     fps: float,
     settings: BodyFittingSettings,
     ground: Ground | None = None,
+    known: Mapping[int, Shape] | None = None,
+    sightings: Sightings | None = None,
+    glimpses: Glimpses | None = None,
 ) -> BodyFit:
     """Return the bodies that explain everybody's triangulated joints (S1-S3).
 
@@ -70,6 +88,10 @@ def fit_bodies(
         fps: [1/s].
         settings: what is expected of detectors, bodies and motion.
         ground: height of the surface under the feet, in a world with z up; None where unknown.
+        known: shapes of people, by their place in `joints`, as other clips have them.
+        sightings: lines of sight of joints that are not triangulated, of the same frames and
+            persons; a person without joints is there as long as these last.
+        glimpses: of the same frames and persons, used where few joints are well known (S4).
 
     Raises:
         InputError: the shapes do not fit together.
@@ -96,21 +118,59 @@ def fit_bodies(
         person: Evidence.of(joints[span, person], covariance[span, person], fps, settings)
         for person, span in spans.items()
     }
-    shapes, offsets = solver.shape(
+    there = seen
+    if sightings is not None:
+        there = seen | sightings.seen
+        for person, span in spans.items():
+            lines = sightings.points[span, person], sightings.across[span, person]
+            evidence[person] = evidence[person].with_lines(*lines, fps, settings)
+    shapes = fit_shapes(
+        solver,
         {
             person: (joints[span, person], covariance[span, person])
             for person, span in spans.items()
         },
+        known or {},
         fps,
     )
     result = _Result.empty(model, frames, persons)
     for person, span in spans.items():
-        pose, factor = solver.poses(evidence[person], shapes[person], offsets, fps)
-        result.put(solver, person, span, pose, factor, shapes[person])
-        own = seen[span, person]
-        result.filled[span, person] = ~own
-        result.drop(person, span, _too_long(own, settings.longest_gap * fps))
-    return result.fit(offsets)
+        pose, factor = solver.poses(evidence[person], shapes.people[person], shapes.offsets, fps)
+        result.put(solver, person, span, pose, factor, shapes)
+    if glimpses is not None:
+        for person, guidance in _guide(result, covariance, glimpses, spans, fps).items():
+            shape = shapes.people[person]
+            pose, factor = solver.poses(evidence[person], shape, shapes.offsets, fps, guidance)
+            result.put(solver, person, spans[person], pose, factor, shapes)
+            result.guided[spans[person], person] = guidance.used
+    for person, span in spans.items():
+        result.filled[span, person] = ~seen[span, person]
+        gone = _too_long(there[span, person], settings.longest_gap * fps)
+        result.drop(person, span, gone)
+    return result.fit(shapes)
+
+
+def _guide(
+    result: _Result, covariance: Floats, glimpses: Glimpses, spans: Mapping[int, slice], fps: float
+) -> dict[int, Guidance]:
+    """Monocular poses of the persons who have some where few of their joints are well known."""
+    limbs = np.sqrt(np.trace(covariance[:, :, 5:], axis1=-2, axis2=-1) / 3.0)
+    sure = np.median(np.where(np.isfinite(limbs), limbs, np.inf), axis=-1) < SURE
+    witnesses = 1.0 + GLIMPSE_TIME * fps
+    angles = result.body_pose @ GATHER.T
+    precision = learn_precision(glimpses, result.orient, angles, sure, witnesses)
+    there = np.isfinite(glimpses.angles[..., 0]) & ~sure
+    return {
+        person: Guidance(
+            glimpses.orient[span, person],
+            glimpses.angles[span, person],
+            there[span, person],
+            precision,
+            witnesses,
+        )
+        for person, span in spans.items()
+        if there[span, person].any()
+    }
 
 
 def _too_long(seen: NDArray[np.bool_], most: float) -> NDArray[np.bool_]:
@@ -135,6 +195,7 @@ class _Result:
     joints: Floats
     covariance: Floats
     filled: NDArray[np.bool_]
+    guided: NDArray[np.bool_]
 
     @classmethod
     def empty(cls, model: BodyModel, frames: int, persons: int) -> _Result:
@@ -150,6 +211,7 @@ class _Result:
             nan(frames, persons, 17, 3),
             nan(frames, persons, 17, 3, 3),
             np.zeros((frames, persons), dtype=bool),
+            np.zeros((frames, persons), dtype=bool),
         )
 
     def put(
@@ -159,9 +221,10 @@ class _Result:
         span: slice,
         pose: Pose,
         factor: BandedFactor,
-        shape: Shape,
+        shapes: Shapes,
     ) -> None:
         """Write one person's part."""
+        shape = shapes.people[person]
         body = solver.chained.differentiate(pose.parameters())
         planted = solver.planted(pose)
         self.betas[person] = shape.betas
@@ -176,15 +239,21 @@ class _Result:
             axis=-1,
         )
         spread = factor.inverse_blocks()[:, None]
-        self.covariance[span, person] = by_frame @ spread @ by_frame.swapaxes(-1, -2)
+        axes = body_axes(body.keypoints)[:, None]
+        # A joint is what was seen less the offset: what is not known of it is not of the joint.
+        habits = axes @ shapes.offsets_covariance @ axes.swapaxes(-1, -2)
+        own = solver.settings.own_bias**2 * np.eye(3)
+        turned = by_frame.swapaxes(-1, -2)
+        self.covariance[span, person] = by_frame @ spread @ turned + habits + own
 
     def drop(self, person: int, span: slice, gone: NDArray[np.bool_]) -> None:
         """Take a person out of frames of a span."""
         for array in (self.orient, self.body_pose, self.transl, self.joints, self.covariance):
             array[span, person][gone] = np.nan
         self.filled[span, person] &= ~gone
+        self.guided[span, person] &= ~gone
 
-    def fit(self, offsets: Floats) -> BodyFit:
+    def fit(self, shapes: Shapes) -> BodyFit:
         """The whole."""
         betas = np.broadcast_to(self.betas, (*self.orient.shape[:2], self.betas.shape[-1]))
         parameters = BodyParameters(betas, self.orient, self.body_pose, self.transl)
@@ -195,5 +264,6 @@ class _Result:
             self.joints,
             self.covariance,
             self.filled,
-            offsets,
+            self.guided,
+            shapes.offsets,
         )

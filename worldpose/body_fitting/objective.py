@@ -1,9 +1,10 @@
 """The objective of one person's track, and its normal equations (S3).
 
 Terms: joints where triangulation puts them, less what the detector always gets wrong; small second
-differences of keypoints; angles as people hold them, within limits; betas near 0; ankles that
-stand, and none below the ground. A triangulated joint with its covariance carries what the agreeing
-views' reprojections say, to first order, so these are not counted a second time.
+differences of keypoints; angles as people hold them, within limits, and as pictures of one camera
+have them; ankles that stand, and none below the ground. A triangulated joint with its covariance
+carries what the agreeing views' reprojections say, to first order, so these are not counted a
+second time.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from worldpose.body import BodyParameters
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body_fitting.evidence import Evidence
 from worldpose.body_fitting.feet import ANKLES, Contacts
+from worldpose.body_fitting.guidance import Guidance
 from worldpose.body_fitting.pose_space import HIGHEST, LOWEST, SIZE, SPREAD, PosePrior
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shared_bias import MIRRORED_OFFSETS, body_axes
@@ -89,7 +91,10 @@ class Track:
     fps: float
     acceleration: float
     """Standard deviation of the hips' acceleration [m/s^2]."""
+    pose_weight: float
+    """Of the pose prior in each frame [1]."""
     contacts: Contacts | None = None
+    guidance: Guidance | None = None
 
     def equations(self, pose: Pose, offsets: Floats, *, bordered: bool) -> NormalEquations:
         """Return the normal equations at a pose.
@@ -131,6 +136,11 @@ class Track:
                 blocks[ahead, :-ahead] = turned[ahead:] @ scaled
         gradient = (turned @ (pulled + smooth_pull).reshape(frames, 51, 1))[..., 0]
         cost += smooth_cost + self._add_angles(pose.angles, blocks[0], gradient)
+        if self.guidance is not None:
+            matrix, pull, guided_cost = self.guidance.pull(pose.orient, pose.angles)
+            blocks[0][:, 3:, 3:] += matrix
+            gradient[:, 3:] += pull
+            cost += guided_cost
 
         width = shapes + MIRRORED_OFFSETS.shape[-1] if bordered else 0
         border, corner = np.zeros((frames, UNKNOWNS, width)), np.zeros((width, width))
@@ -144,9 +154,6 @@ class Track:
             border = turned @ held
             corner = np.einsum("fka,fkb->ab", columns, held, optimize=True)
             shared = np.einsum("fka,fk->a", columns, pulled.reshape(frames, 51))
-            corner[:shapes, :shapes] += settings.shape_weight * np.eye(shapes)
-            shared[:shapes] += settings.shape_weight * pose.betas
-            cost += 0.5 * settings.shape_weight * float(pose.betas @ pose.betas)
         equations = NormalEquations(blocks, gradient, border, corner, shared, cost)
         if self.contacts is None:
             return equations
@@ -188,7 +195,7 @@ class Track:
 
     def _add_angles(self, angles: Floats, blocks: Floats, gradient: Floats) -> float:
         """Add the pose prior and the joint limits; return their cost."""
-        prior = self.settings.pose_weight * self.prior.precision
+        prior = self.pose_weight * self.prior.precision
         away = angles - self.prior.mean
         beyond = np.maximum(angles - HIGHEST, 0.0) + np.minimum(angles - LOWEST, 0.0)
         stiff = 1.0 / self.settings.limit_spread**2

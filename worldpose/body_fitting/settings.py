@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from data_contracts.records import Record
+from worldpose.body.body_file import OPEN_BODY
 
 
 class BodyFittingSettings(Record):
@@ -14,6 +15,9 @@ class BodyFittingSettings(Record):
     were chosen on simulated seeds 101 to 104, not on those that figures are taken from.
     """
 
+    body_model: str = OPEN_BODY
+    """Whose shape and joints are fitted: the open body, or one that was brought with
+    `worldpose body install`."""
     noise_scale: float = Field(default=1.3, gt=0)
     """Standard deviation of the joints over what triangulation states [1]: it knows the noise of
     a detector, not what a hidden joint or a wrong view adds."""
@@ -22,6 +26,9 @@ class BodyFittingSettings(Record):
     else a slow error would pass for motion."""
     joint_floor: float = Field(default=0.008, ge=0)
     """Least standard deviation of a joint [m]: calibration, and what the body model cannot do."""
+    sight_spread: float = Field(default=0.04, gt=0)
+    """Distance of a joint that one camera sees from its line of sight, per axis [m]: 2 % of a
+    person's height, for a joint of average difficulty."""
     tail: float = Field(default=2.5, gt=0)
     """Deviation at which a joint has half its weight (Cauchy's loss) [standard deviations]."""
     bias_spread: float = Field(default=0.02, gt=0)
@@ -29,6 +36,11 @@ class BodyFittingSettings(Record):
     of the body [m]; the same for everybody and mirrored left to right. Both the offsets and, from
     the middle of the steps on, this spread are estimated; held at 0.02, a detector of 0.008
     makes everybody 35 mm too tall."""
+    bias_time: float = Field(default=40.0, gt=0)
+    """So many seconds of all people together make offsets as sure as they get [s]."""
+    own_bias: float = Field(default=0.006, ge=0)
+    """Further offset per axis of the body that each person has on his own [m]: clothes and build.
+    It is in the covariance only, for nothing tells it from the pose."""
     shape_rate: float = Field(default=12.5, gt=0)
     """Frames a second that shape and offsets are estimated from [1/s]: more add no witnesses."""
     shape_acceleration: float = Field(default=50.0, gt=0)
@@ -47,6 +59,13 @@ class BodyFittingSettings(Record):
     pose_weight: float = Field(default=0.03, gt=0)
     """Weight of the pose prior in each frame [1]: neighbouring frames are one pose, not many.
     At 0.1 heights are 25 instead of 17 mm off."""
+    shape_pose_weight: float = Field(default=0.003, gt=0)
+    """The same while shape is estimated [1]: it unbends limbs, and longer bones with offsets that
+    take it back would follow, the farther the longer a clip. At 0.03 exact joints of 10 s make
+    everybody 69 mm too tall."""
+    shape_time: float = Field(default=10.0, gt=0)
+    """So many seconds of a person are looked at for his shape [s], evenly spread: what a detector
+    gets wrong of him by view and pose does not average out over more."""
     limit_spread: float = Field(default=0.1, gt=0)
     """How far angles go beyond the joint limits [rad]."""
     contact_height: float = Field(default=0.04, gt=0)

@@ -10,20 +10,24 @@ from numpy.typing import NDArray
 
 from worldpose.bundle_adjustment.building import (
     KeypointNoise,
+    camera_knowledge,
     markings_problem,
     measured_doubt,
     players_problem,
 )
 from worldpose.bundle_adjustment.clip import Clip, Observed, observe, with_learned_noise
+from worldpose.bundle_adjustment.contradictions import Contradictions, find_contradictions
 from worldpose.bundle_adjustment.frames import propose_frames
 from worldpose.bundle_adjustment.guard import HeldOut, Verdict, held_out, verdict
 from worldpose.bundle_adjustment.noise import measured_noise
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.bundle_adjustment.solving import Adjusted, solve
+from worldpose.bundle_adjustment.survey import survey_response, with_shared_errors
 from worldpose.cameras import Camera
 from worldpose.static_calibration import PARAMETERS
 
 _SIZE: Final = len(PARAMETERS)
+_STRANGER: Final = "refused: it shows other people than the other cameras do under the same ids"
 _ROUNDS: Final = 3
 """Solutions from which noise is learned; the third changes little."""
 
@@ -74,7 +78,7 @@ def adjust_cameras(
     People are split into groups. For each, cameras are adjusted without it, and the group judges:
     its keypoints in a camera against its joints from the other cameras, in frames that had no part
     either. A camera on which the judges' loss rises stands as it was, and the others are adjusted
-    to it. At last the accepted ones are adjusted to everybody.
+    without it. At last the accepted ones are adjusted to everybody.
 
     Args:
         clip: calibrated cameras and triangulated people.
@@ -96,8 +100,8 @@ def adjust_cameras(
         return _nothing(clip, "nobody is seen by enough cameras", proposed, used, judged)
     if settings.evidence == "markings" and not any(c.inlier.any() for c in clip.clicks):
         return _nothing(clip, "nobody clicked a marking", proposed, used, judged)
-    before = adjuster.judgement(None)
-    standing = np.zeros(count, dtype=np.bool_)
+    before, stranger = adjuster.before, adjuster.stranger
+    standing = stranger.copy()
     first: Verdict | None = None
     while True:
         said = verdict(before, adjuster.judgement(standing))
@@ -107,16 +111,21 @@ def adjust_cameras(
         if (confirmed | standing).all():
             break
         standing |= ~confirmed
-    freely = adjuster.solved(np.zeros(count, dtype=np.bool_))
-    last = freely if not standing.any() else adjuster.solved(standing)
-    blocks = last.camera_covariance.reshape(count, _SIZE, count, _SIZE)
-    own = blocks[np.arange(count), :, np.arange(count)]
+        if (~standing).sum() < 2:
+            standing[:] = True
+            break
+    freely = adjuster.solved(stranger)
+    last = freely if standing.all() or (standing == stranger).all() else adjuster.solved(standing)
+    own = adjuster.uncertainty(last)
     return BundleAdjustment(
         clip=clip,
         cameras=_where(~standing, last.cameras, clip.cameras),
         covariance=np.where(standing[:, None, None], clip.covariance, own),
         accepted=~standing,
-        reasons=tuple(_reason(first, c, not standing[c], settings) for c in range(count)),
+        reasons=tuple(
+            _STRANGER if stranger[c] else _reason(first, c, not standing[c], settings)
+            for c in range(count)
+        ),
         proposed=clip.frame[proposed],
         used=clip.frame[used],
         judged=clip.frame[judged],
@@ -142,32 +151,58 @@ class _Adjuster:
         self.clip, self.settings, self.used, self.judged = clip, settings, used, judged
         people = np.ones(clip.detection_index.shape[2], dtype=np.bool_)
         self.everybody = observe(clip, used, people, clip.cameras, settings.min_views)
-        self.noise, self.doubt = KeypointNoise(), np.ones(len(clip.clicks))
+        self.noise = KeypointNoise()
+        self.before = self.judgement(None)
+        found = Contradictions.none(len(clip.clicks))
+        if settings.evidence == "markings_and_players":
+            found = find_contradictions(clip, judged, self.before, settings)
+        self.stranger, self.doubt, self.offset = found.stranger, found.doubt, found.offset
         if settings.evidence == "markings_and_players" and len(self.everybody.points):
-            standing = np.zeros(len(clip.clicks), dtype=np.bool_)
-            for _ in range(_ROUNDS):
-                problem = players_problem(clip, self.everybody, self.noise, standing, settings)
-                rough = solve(problem, settings.solver)
-                self.noise = measured_noise(
-                    rough.cameras, rough.points, self.everybody, settings.robust_scale
-                )
-            # Nobody is surer than he says he is. Once: repeated, one camera that shows somebody
-            # else would free all the others step by step.
-            self.doubt = np.maximum(measured_doubt(problem, rough), 1.0)
+            self._learn()
+
+    def _learn(self) -> None:
+        """Find out how far keypoints are off, and whether calibration is as good as it says."""
+        stranger, settings = self.stranger, self.settings
+        for _ in range(_ROUNDS):
+            observed = _only(self.everybody, ~stranger[self.everybody.camera_of])
+            problem = players_problem(
+                self.clip, observed, self.noise, stranger, settings, self.doubt
+            )
+            rough = solve(problem, settings.solver, self.offset)
+            # Where the next solution begins: two or three steps are left to it.
+            self.offset, self.everybody = rough.offset, observed._replace(points=rough.points)
+            self.noise = measured_noise(
+                rough.cameras, rough.points, self.everybody, settings.robust_scale
+            )
+        # Nobody is surer than he says he is. Once: repeated, one camera that shows somebody else
+        # would free all the others step by step.
+        self.doubt = self.doubt * np.maximum(measured_doubt(problem, rough), 1.0)
 
     def solved(self, standing: NDArray[np.bool_], without: int | None = None) -> Adjusted:
         """The adjustment to everybody, or to everybody but one group."""
         if self.settings.evidence == "markings":
             return solve(markings_problem(self.clip, standing, self.settings), self.settings.solver)
         observed = self.everybody
+        # A camera that stands as it was has no say: it would drag the others to its error.
+        kept = ~standing[observed.camera_of]
         if without is not None:
             groups = self._groups(len(self.used))
             row = np.searchsorted(self.used, observed.frame_of)
-            observed = _only(observed, groups[row, observed.person_of] != without)
+            kept &= groups[row, observed.person_of] != without
+        observed = _only(observed, kept)
         problem = players_problem(
             self.clip, observed, self.noise, standing, self.settings, self.doubt
         )
-        return solve(problem, self.settings.solver)
+        return solve(problem, self.settings.solver, self.offset, covariance=without is None)
+
+    def uncertainty(self, adjusted: Adjusted) -> NDArray[np.float64]:
+        """The covariance (cameras, 12, 12) of adjusted cameras."""
+        information, _ = camera_knowledge(self.clip.covariance, self.settings.given)
+        doubt = self.doubt[:, None, None]
+        response = survey_response(self.clip, self.settings.survey_error)
+        return with_shared_errors(
+            adjusted.camera_covariance, information / doubt, np.sqrt(doubt) * response
+        )
 
     def judgement(self, standing: NDArray[np.bool_] | None) -> HeldOut:
         """Every group's errors with cameras adjusted without it; None = cameras as they were."""
@@ -194,7 +229,13 @@ class _Adjuster:
 
 
 def _only(observed: Observed, kept: NDArray[np.bool_]) -> Observed:
-    """The observations (n,) that are kept, and their points numbered anew."""
+    """The observations (n,) that are kept, and their points numbered anew.
+
+    A point that is left with one of them tells nothing.
+    """
+    kept = kept & (
+        np.bincount(observed.point_of[kept], minlength=len(observed.points))[observed.point_of] > 1
+    )
     used, number = np.unique(observed.point_of[kept], return_inverse=True)
     rows = {name: getattr(observed, name)[kept] for name in Observed._fields if name != "points"}
     return Observed(points=observed.points[used], **(rows | {"point_of": number}))

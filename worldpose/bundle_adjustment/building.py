@@ -7,12 +7,10 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from worldpose.bundle_adjustment.clip import Clip, Observed
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, GivenCameraPrior
 from worldpose.bundle_adjustment.solving import Adjusted, Problem
-from worldpose.cameras import Camera
 from worldpose.static_calibration import PARAMETERS
 
 _SIZE: Final = len(PARAMETERS)
@@ -92,7 +90,7 @@ def measured_doubt(problem: Problem, adjusted: Adjusted) -> NDArray[np.float64]:
         adjusted: its solution.
     """
     count = len(problem.free)
-    step = step_between(problem.cameras, adjusted.cameras)
+    step = adjusted.offset
     squared = np.einsum("ci,cij,cj->c", step, problem.camera_information, step)
     blocks = adjusted.camera_covariance.reshape(count, _SIZE, count, _SIZE)
     own = blocks[np.arange(count), :, np.arange(count)]
@@ -101,22 +99,6 @@ def measured_doubt(problem: Problem, adjusted: Adjusted) -> NDArray[np.float64]:
     # The median: a camera that shows somebody else must not free all the others.
     overall = float(np.median((squared + 1.0) / (told + 1.0)))
     return np.asarray((squared + _FAITH * overall) / (told + _FAITH))
-
-
-def step_between(start: Camera, end: Camera) -> NDArray[np.float64]:
-    """Return the step (cameras, 12) that takes cameras from start to end, to first order."""
-    turn = end.cam_from_world.rotation @ start.cam_from_world.rotation.swapaxes(-1, -2)
-    moved = np.einsum("cij,cj->ci", turn, start.cam_from_world.translation)
-    return np.concatenate(
-        [
-            Rotation.from_matrix(turn).as_rotvec(),
-            end.cam_from_world.translation - moved,
-            np.log(end.focal[:, :1] / start.focal[:, :1]),
-            end.principal_point - start.principal_point,
-            (end.distortion - start.distortion)[:, [0, 1, 4]],
-        ],
-        axis=1,
-    )
 
 
 def markings_problem(
@@ -157,18 +139,29 @@ def camera_knowledge(
         covariance: (cameras, 12, 12); zero for what was not solved for, all zero where given.
         given: spreads of those cameras.
     """
-    spread = np.zeros(_SIZE)
-    spread[:7] = [given.rotation] * 3 + [given.center] * 3 + [given.focal]
-    information = np.zeros_like(covariance)
-    free = np.diagonal(covariance, axis1=1, axis2=2) > 0.0
-    for c, known in enumerate(covariance):
-        if not free[c].any():
-            free[c] = spread > 0.0
-            known = np.diag(spread**2)
+    known = known_covariance(covariance, given)
+    information = np.zeros_like(known)
+    free: NDArray[np.bool_] = np.diagonal(known, axis1=1, axis2=2) > 0.0
+    for c in range(len(known)):
         block = np.ix_(free[c], free[c])
         # Lens coefficients and meters differ by many powers of ten.
-        size = np.sqrt(np.diag(known[block]))
-        information[c][block] = np.linalg.inv(known[block] / np.outer(size, size)) / np.outer(
+        size = np.sqrt(np.diag(known[c][block]))
+        information[c][block] = np.linalg.inv(known[c][block] / np.outer(size, size)) / np.outer(
             size, size
         )
     return 0.5 * (information + information.swapaxes(1, 2)), free
+
+
+def known_covariance(
+    covariance: NDArray[np.float64], given: GivenCameraPrior
+) -> NDArray[np.float64]:
+    """Return the covariance (cameras, 12, 12) of a step, that of given cameras by their prior.
+
+    Args:
+        covariance: (cameras, 12, 12); all zero where given.
+        given: spreads of those cameras.
+    """
+    spread = np.zeros(_SIZE)
+    spread[:7] = [given.rotation] * 3 + [given.center] * 3 + [given.focal]
+    stated = covariance.any(axis=(1, 2), keepdims=True)
+    return np.where(stated, covariance, np.diag(spread**2))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.cameras import Camera
+from worldpose.pitch import PitchTemplate
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
 Floats = NDArray[np.float64]
@@ -54,6 +55,8 @@ class Clip:
         joints: (frames, persons, 17, 3) [m], world, as triangulated; NaN where not determined.
         views: (frames, persons, 17) agreeing cameras.
         triangulation: settings that made the joints.
+        pitch: as surveyed; None = not known.
+        on_lines: (cameras,) bool, was it calibrated on painted lines; None = nobody was.
     """
 
     cameras: Camera
@@ -67,6 +70,8 @@ class Clip:
     joints: NDArray[np.float64]
     views: NDArray[np.int64]
     triangulation: TriangulationSettings
+    pitch: PitchTemplate | None = None
+    on_lines: NDArray[np.bool_] | None = None
 
 
 class Observed(NamedTuple):

@@ -45,23 +45,50 @@ def held_out(
     """
     keypoints, confidence = clip.keypoints[frames], clip.confidence[frames]
     index = np.where(people[:, None], clip.detection_index[frames], -1).astype(np.int16)
+    loss = np.full((*index.shape, keypoints.shape[-2]), np.nan)
+    error = loss.copy()
+    judges = np.flatnonzero(people.any(axis=0))
+    index = index[:, :, judges]
     image, weight = keypoints_of(keypoints, confidence, index.astype(np.int64))
-    loss = np.full(weight.shape, np.nan)
-    error = np.full(weight.shape, np.nan)
     for c in range(len(cameras.focal)):
-        others = index.copy()
-        others[:, c] = -1
-        joints = triangulate_joints(
-            cameras, keypoints, confidence, others, clip.triangulation
-        ).joints
+        joints = _without(clip, cameras, c, keypoints, confidence, index)
         predicted, noise = predict(
             cameras[c : c + 1], joints, weight[:, c : c + 1], clip.triangulation
         )
-        error[:, c] = np.linalg.norm(predicted[:, 0] - image[:, c], axis=-1)
-        squared = (error[:, c] / noise[:, 0]) ** 2
-        loss[:, c] = robust_scale**2 * np.log1p(squared / robust_scale**2)
+        length = np.linalg.norm(predicted[:, 0] - image[:, c], axis=-1)
+        squared = (length / noise[:, 0]) ** 2
+        error[:, c, judges] = length
+        loss[:, c, judges] = robust_scale**2 * np.log1p(squared / robust_scale**2)
     loss[~np.isfinite(error)] = np.nan
     return HeldOut(loss, error)
+
+
+def joints_without(
+    clip: Clip, cameras: Camera, camera: int, frames: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return joints (k, persons, 17, 3) from all cameras but one [m], world.
+
+    Args:
+        clip: keypoints and who is who.
+        cameras: (cameras,) batch.
+        camera: the one that is left out.
+        frames: (k,) indices of frames.
+    """
+    index = clip.detection_index[frames].astype(np.int16)
+    return _without(clip, cameras, camera, clip.keypoints[frames], clip.confidence[frames], index)
+
+
+def _without(
+    clip: Clip,
+    cameras: Camera,
+    camera: int,
+    keypoints: NDArray[np.float64],
+    confidence: NDArray[np.float64],
+    index: NDArray[np.int16],
+) -> NDArray[np.float64]:
+    others = index.copy()
+    others[:, camera] = -1
+    return triangulate_joints(cameras, keypoints, confidence, others, clip.triangulation).joints
 
 
 @dataclass(frozen=True, eq=False)

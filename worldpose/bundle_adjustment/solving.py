@@ -72,16 +72,18 @@ class Adjusted:
 
     Attributes:
         cameras: (cameras,) batch.
+        offset: (cameras, 12) steps from the problem's cameras to these.
         points: (points, 3) [m], world.
         cost: robust sum of squares with priors.
         start_cost: the same before.
         iterations: steps that were tried.
         converged: the last step gained less than asked for.
         camera_covariance: (12 cameras, 12 cameras) of steps from the solution, the points being
-            free; zero for parameters that may not move.
+            free; zero for parameters that may not move, empty if nobody asked.
     """
 
     cameras: Camera
+    offset: NDArray[np.float64]
     points: NDArray[np.float64]
     cost: float
     start_cost: float
@@ -90,8 +92,20 @@ class Adjusted:
     camera_covariance: NDArray[np.float64]
 
 
-def solve(problem: Problem, settings: SolverSettings | None = None) -> Adjusted:
+def solve(
+    problem: Problem,
+    settings: SolverSettings | None = None,
+    offset: Floats | None = None,
+    covariance: bool = True,
+) -> Adjusted:
     """Return the cameras and points that explain all observations and priors best.
+
+    Args:
+        problem: what is known.
+        settings: when to stop.
+        offset: (cameras, 12) steps from the problem's cameras to where to begin, that of the
+            solution of a similar problem; None = none.
+        covariance: of the cameras is wanted; it takes as long as half a step.
 
     Raises:
         InputError: a free point has fewer than two cameras, a point lies behind a camera that sees
@@ -100,8 +114,9 @@ def solve(problem: Problem, settings: SolverSettings | None = None) -> Adjusted:
     settings = settings or SolverSettings()
     _require_two_views(problem)
     system = _System(problem)
-    cameras, points = problem.cameras, problem.points
-    offset = np.zeros(problem.free.shape)
+    points = problem.points
+    offset = np.zeros(problem.free.shape) if offset is None else np.where(problem.free, offset, 0.0)
+    cameras = stepped(problem.cameras, offset) if offset.any() else problem.cameras
     start_cost = system.cost(cameras, points, offset)
     if not np.isfinite(start_cost):
         raise InputError(
@@ -124,8 +139,8 @@ def solve(problem: Problem, settings: SolverSettings | None = None) -> Adjusted:
             damping = max(damping / 5.0, 1e-9)
         else:
             damping *= 8.0
-    covariance = system.covariance(cameras, points)
-    return Adjusted(cameras, points, reached, start_cost, iteration, converged, covariance)
+    spread = system.covariance(cameras, points) if covariance else np.empty((0, 0))
+    return Adjusted(cameras, offset, points, reached, start_cost, iteration, converged, spread)
 
 
 def _require_two_views(problem: Problem) -> None:

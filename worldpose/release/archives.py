@@ -20,6 +20,10 @@ ARRAY_BYTES: Final = 16 << 30
 """Most that the arrays of one file may fill [byte]: two hours of 25 people with covariance at
 50 frames/s are 13 GB."""
 
+_KINDS: Final = {"float": "f", "int": "iu", "text": "U"}
+_MEANINGS: Final = {"float": "float numbers", "int": "int numbers", "text": "text"}
+_READ_AS: Final[Mapping[str, type]] = {"float": np.float64, "int": np.int64, "text": np.str_}
+
 
 @dataclass(frozen=True)
 class Member:
@@ -27,8 +31,8 @@ class Member:
 
     dims: tuple[str | int, ...]
     """Lengths, or names of lengths that must agree between members."""
-    kind: Literal["float", "int"]
-    """Read as float64 or int64, whatever the width in the file."""
+    kind: Literal["float", "int", "text"]
+    """Read as float64, int64 or str, whatever the width in the file."""
     required: bool = True
 
 
@@ -50,7 +54,7 @@ def read_archive(path: Path, members: Mapping[str, Member]) -> dict[str, NDArray
         members: what it must hold; nothing else may be in it.
 
     Returns:
-        float64 and int64 arrays by name; optional members that are absent are left out.
+        float64, int64 and str arrays by name; optional members that are absent are left out.
 
     Raises:
         InputError: naming file and member: absent, truncated, no npz, members missing or unknown,
@@ -108,8 +112,8 @@ def _check_headers(
                 start = stream.tell()
         except Exception as error:  # a hostile header can raise nearly anything
             raise wrong(where, "an npy array", f"{error}" or type(error).__name__) from error
-        if dtype.kind not in ("f" if member.kind == "float" else "iu"):
-            raise wrong(where, f"{member.kind} numbers", dtype.str)
+        if dtype.kind not in _KINDS[member.kind]:
+            raise wrong(where, _MEANINGS[member.kind], dtype.str)
         fits = len(shape) == len(member.dims) and all(
             n == (sizes.setdefault(dim, n) if isinstance(dim, str) else dim)
             for n, dim in zip(shape, member.dims, strict=True)
@@ -130,4 +134,4 @@ def _array(
             stream.read()  # to the end, where the checksum is compared
     except Exception as error:  # see _check_headers
         raise wrong(f"{path}: {info.filename}", "a whole array", f"{error}") from error
-    return np.ascontiguousarray(array, np.float64 if member.kind == "float" else np.int64)
+    return np.ascontiguousarray(array, _READ_AS[member.kind])

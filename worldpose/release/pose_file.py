@@ -18,23 +18,25 @@ MEMBERS: Final = {
     "global_orient": Member(("persons", "frames", 3), "float"),
     "body_pose": Member(("persons", "frames", 69), "float"),
     "transl": Member(("persons", "frames", 3), "float"),
+    "body_model": Member((1,), "text", required=False),
 }
 """Arrays of a pose file; persons first, unlike everywhere else here."""
 PLURALS: Final = {"global_orients": "global_orient", "body_poses": "body_pose"}
 """Names in the release's own note, which are read as well."""
 
 
-def write_poses(path: Path, poses: BodyParameters) -> None:
+def write_poses(path: Path, poses: BodyParameters, body_model: str) -> None:
     """Write `poses/<clip>.npz`, whole or not at all; the same poses give the same bytes.
 
     Members in single precision, 4 um at most beside the poses on a pitch of 105 m: `betas`
     (persons, shapes), `global_orient` (persons, frames, 3) [rad], `body_pose` (persons, frames, 69)
-    [rad], `transl` (persons, frames, 3) [m, world]. NaN where a person is missing. The file does
-    not name its body model: the release knows one.
+    [rad], `transl` (persons, frames, 3) [m, world]. NaN where a person is missing. The release
+    knows one body model; here `body_model` (1,) names it, since betas of another mean nothing.
 
     Args:
         path: the file.
         poses: (persons, frames); each person's betas are those of the first frame.
+        body_model: name and version of the body model.
     """
     arrays: Mapping[str, NDArray[np.float64]] = {
         "betas": poses.betas[:, 0],
@@ -42,11 +44,15 @@ def write_poses(path: Path, poses: BodyParameters) -> None:
         "body_pose": poses.body_pose,
         "transl": poses.transl,
     }
-    write_archive(path, {name: array.astype(np.float32) for name, array in arrays.items()})
+    single = {name: array.astype(np.float32) for name, array in arrays.items()}
+    write_archive(path, {**single, "body_model": np.array([body_model])})
 
 
-def read_poses(path: Path) -> BodyParameters:
+def read_poses(path: Path) -> tuple[BodyParameters, str | None]:
     """The poses (persons, frames) of a pose file, with singular or plural names.
+
+    Returns:
+        The poses, and the name of their body model where the file tells it.
 
     Raises:
         InputError: naming file and member: absent, truncated, members missing or unknown, wrong
@@ -62,10 +68,11 @@ def read_poses(path: Path) -> BodyParameters:
             errors.append(error)
             continue
         named = {renamed.get(name, name): array for name, array in arrays.items()}
-        return BodyParameters(
+        poses = BodyParameters(
             betas=named["betas"][:, None],
             global_orient=named["global_orient"],
             body_pose=named["body_pose"],
             transl=named["transl"],
         )
+        return poses, str(named["body_model"][0]) if "body_model" in named else None
     raise errors[0]

@@ -73,6 +73,21 @@ class CameraSummary:
     weak: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class Table:
+    """A table with a heading.
+
+    Attributes:
+        heading: what it is about.
+        columns: their titles; ">" before one aligns numbers.
+        rows: of text.
+    """
+
+    heading: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
 class _Failure(str):
     """Text of a table's cell that is shown as a failure."""
 
@@ -86,6 +101,7 @@ def report_page(
     pictures: Sequence[Picture] = (),
     cameras: Sequence[CameraSummary] = (),
     camera_pictures: Sequence[Picture] = (),
+    tables: Sequence[Table] = (),
 ) -> str:
     """Return a whole HTML page that needs nothing beside itself and asks for nothing outside.
 
@@ -97,6 +113,7 @@ def report_page(
         pictures: shown in this order.
         cameras: the static cameras, in the order of the match.
         camera_pictures: shown below their table.
+        tables: shown below these.
     """
     sections = [
         f"<h1>{escape(title)}</h1>",
@@ -106,6 +123,14 @@ def report_page(
         *(_figure(picture) for picture in pictures),
         *_cameras(cameras),
         *(_figure(picture) for picture in camera_pictures),
+        *(
+            text
+            for table in tables
+            for text in (
+                f"<h2>{escape(table.heading)}</h2>",
+                _table(table.columns, table.rows),
+            )
+        ),
         "<h2>What was run</h2>",
         _table(("", ""), _about(run)),
         "<h2>Units of work</h2>",

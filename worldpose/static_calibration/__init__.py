@@ -4,6 +4,7 @@ Input: a pitch template and what a person clicked. Output: a camera with its unc
 """
 
 from worldpose.static_calibration.calibrate import calibrate
+from worldpose.static_calibration.clip_picture import median_picture
 from worldpose.static_calibration.ground_error import GroundErrorMap, ground_error_map
 from worldpose.static_calibration.parameters import (
     PARAMETERS,
@@ -39,6 +40,7 @@ __all__ = [
     "calibration_attributes",
     "calibration_coordinates",
     "ground_error_map",
+    "median_picture",
     "project_with_jacobian",
     "stepped",
 ]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.adjustment import Problem, camera_of_row, row_of
 from worldpose.static_calibration.bending import tangent_at
@@ -21,12 +24,11 @@ from worldpose.static_calibration.screening import (
     surprise_at,
 )
 from worldpose.static_calibration.settings import StaticCalibrationSettings
+from worldpose.static_calibration.valley import fit_and_bends
 
-_TRIES: Final = 3
-_WIDER: Final = 2.0
-"""Factor on the noise of clicks that the lines contradict, each time [1]."""
-_WIDEST: Final = 4.0
-"""No click is believed to be worse than this many times what is stated [1]."""
+_WIDER: Final = (2.0, 4.0)
+"""Factors on the noise of clicks that do not lead to the lines [1]; none is believed to be worse
+than the last."""
 _AS_STATED: Final = 1.5
 """Up to this factor the noise that the lines tell is the stated one [1]: half of few clicks are
 farther off by chance."""
@@ -42,9 +44,9 @@ def refine_and_judge(
     """Return stage 2 as the lines judge its clicks, and stage 3 from there.
 
     Few clicks close together do not tell their own noise, nor which of them is wrong. The lines
-    do: a camera that they hold shows how far every click is off. Where they contradict the clicks,
-    these are taken to be twice, then four times as far off as stated; more is a contradiction
-    that stands, and the camera is left to the clicks.
+    do: a camera that they hold shows how far every click is off. Where they are not found, or
+    contradict the clicks, these are taken to be twice, then four times as far off as stated, and
+    then one of them to be wrong; if that is not it either, the camera is left to the clicks.
 
     Args:
         problem: what was clicked.
@@ -53,35 +55,75 @@ def refine_and_judge(
         picture: of the camera.
         settings: noise, and what is wrong.
     """
-    first = fit, _refined(_estimate(problem, fit), pitch, picture, settings)
-    lines, factor = first[1], 1.0
-    for _ in range(_TRIES):
-        if lines.refined:
-            row = row_of(lines.estimate.camera)
-            told = noise_of(problem, row)
-            factor = 1.0 if told <= _AS_STATED else min(told, _WIDEST)
-            wider = _at_noise(problem, factor, settings)[0]
-            surprise = surprise_at(wider, lines.estimate)
-            inliers = surprise < settings.wrong_click
-            if len(inliers) and 1.0 - inliers.mean() > settings.max_wrong_share:
-                return first
-            fit = rest_on(wider, row, inliers, fit.markings)
-            # What was drawn along a line that was found tells of the same paint, only worse.
-            read = {each.name for each in lines.markings if each.found}
-            other = np.array([name not in read for name in problem.evidence.markings], dtype=bool)
-            rest = wider.only(inliers, fit.markings & other)
-            known = tangent_at(rest, row, fit.noise_scale)
-            fit = replace(fit, surprise=surprise, noise_scale=factor * fit.noise_scale)
-            again = _refined(known, pitch, picture, settings, begin=lines.estimate)
-            return (fit, again) if again.refined else first
-        if lines.contradictory and factor < _WIDEST:
-            factor *= _WIDER
-            wider, rough = _at_noise(problem, factor, settings)
-            fit = screen(wider, fit.row, rough)
-        else:
-            return first
-        lines = _refined(_estimate(problem, fit), pitch, picture, settings)
-    return first
+    first = _refined(_estimate(problem, fit), pitch, picture, settings)
+    tried = [(fit, first)]
+    for factor in _WIDER:
+        if tried[-1][1].refined:
+            break
+        wider, rough = _at_noise(problem, factor, settings)
+        other = screen(wider, fit.row, rough)
+        tried.append((other, _refined(_estimate(wider, other), pitch, picture, settings)))
+    if not tried[-1][1].refined:
+        tried += sorted(
+            (
+                (other, _refined(_estimate(problem, other), pitch, picture, settings))
+                for other in _without_one(problem, fit, settings)
+            ),
+            key=lambda one: -one[1].effective_samples,
+        )
+    for other, lines in tried:
+        judged = _judged(problem, other, lines, pitch, picture, settings)
+        if judged is not None:
+            return judged
+    return fit, first
+
+
+def _without_one(
+    problem: Problem, fit: Screened, settings: StaticCalibrationSettings
+) -> Iterator[Screened]:
+    """Yield the fits, at the widest noise, to all clicks but one."""
+    wider, _ = _at_noise(problem, _WIDER[-1], settings)
+    for index in range(len(problem.evidence.points)):
+        inliers = np.arange(len(problem.evidence.points)) != index
+        with suppress(InputError):
+            yield rest_on(wider, fit.row, inliers, fit.markings)
+
+
+def _judged(
+    problem: Problem,
+    fit: Screened,
+    lines: LineRefinement,
+    pitch: PitchTemplate,
+    picture: NDArray[np.uint8],
+    settings: StaticCalibrationSettings,
+) -> tuple[Screened, LineRefinement] | None:
+    """Return the fit to the clicks that a camera from its lines confirms, and stage 3 from there.
+
+    None where there is no such camera, or it confirms too few of them.
+    """
+    if not lines.refined:
+        return None
+    row = row_of(lines.estimate.camera)
+    told = noise_of(problem, row)
+    factor = 1.0 if told <= _AS_STATED else min(told, _WIDER[-1])
+    wider = _at_noise(problem, factor, settings)[0]
+    surprise = surprise_at(wider, lines.estimate)
+    inliers = surprise < settings.wrong_click
+    if len(inliers) and 1.0 - inliers.mean() > settings.max_wrong_share:
+        return None
+    fit = rest_on(wider, row, inliers, fit.markings)
+    # What was drawn along a line that was found tells of the same paint, only worse.
+    read = {each.name for each in lines.markings if each.found}
+    other = np.array([name not in read for name in problem.evidence.markings], dtype=bool)
+    rest = wider.only(inliers, fit.markings & other)
+    scale = fit.noise_scale
+    known = tangent_at(rest, row, scale)
+    again = _refined(known, pitch, picture, settings, begin=lines.estimate)
+    if again.bars is None:
+        return None
+    best = fit_and_bends(rest, again.estimate.camera, again.bars, scale)
+    fit = replace(fit, surprise=surprise, noise_scale=factor * scale)
+    return fit, replace(again, estimate=best)
 
 
 def _at_noise(

@@ -26,7 +26,7 @@ from worldpose.static_calibration.residuals import (
 
 Floats = NDArray[np.float64]
 
-_POSE_SPREAD: Final = np.array([0.1] * 3 + [10.0] * 3 + [np.inf] * 6)
+_POSE_SPREAD: Final = np.array([1.0] * 3 + [100.0] * 3 + [np.inf] * 6)
 """Of a camera that the painted lines have found [rad, m]: far wider than they leave it, and clicks
 that tell nothing of some direction have a Gaussian still."""
 
@@ -80,15 +80,10 @@ def tangent_at(problem: Problem, row: Floats, scale: float) -> CameraEstimate:
         row: (22,) camera near the truth.
         scale: factor on the stated noise of the evidence.
     """
-    residuals, jacobian = whitened(problem, row, np.zeros(SIZE), scale)
-    drawn = slice(2 * len(problem.evidence.points), len(residuals) - PRIORS)
-    weights = np.ones(len(residuals))
-    weights[drawn] = 1.0 / (1.0 + (scale * residuals[drawn] / problem.drawn_loss) ** 2)
+    residuals, rows = weighted(problem, row, scale)
     free = problem.free
-    rows = np.concatenate([np.sqrt(weights)[:, None] * jacobian, np.diag(1.0 / _POSE_SPREAD)])[
-        :, free
-    ]
-    residuals = np.concatenate([np.sqrt(weights) * residuals, np.zeros(SIZE)])
+    rows = np.concatenate([rows, np.diag(1.0 / _POSE_SPREAD)])[:, free]
+    residuals = np.concatenate([residuals, np.zeros(SIZE)])
     size = np.linalg.norm(rows, axis=0)
     shape: Floats = np.linalg.inv((rows / size).T @ (rows / size)) / np.outer(size, size)
     step, covariance = np.zeros(SIZE), np.zeros((SIZE, SIZE))
@@ -98,6 +93,21 @@ def tangent_at(problem: Problem, row: Floats, scale: float) -> CameraEstimate:
     start = stepped(camera, step)
     turn = turned(difference(start, camera))
     return CameraEstimate(start, turn @ covariance @ turn.T)
+
+
+def weighted(problem: Problem, row: Floats, scale: float) -> tuple[Floats, Floats]:
+    """Return residuals (m,) of a camera and derivatives (m, 12), times the roots of their weights.
+
+    Args:
+        problem: what was clicked.
+        row: (22,) camera.
+        scale: factor on the stated noise of the evidence.
+    """
+    residuals, rows = whitened(problem, row, np.zeros(SIZE), scale)
+    drawn = slice(2 * len(problem.evidence.points), len(residuals) - PRIORS)
+    root = np.ones(len(residuals))
+    root[drawn] = 1.0 / np.hypot(1.0, scale * residuals[drawn] / problem.drawn_loss)
+    return root * residuals, root[:, None] * rows
 
 
 def whitened(problem: Problem, row: Floats, step: Floats, scale: float) -> tuple[Floats, Floats]:

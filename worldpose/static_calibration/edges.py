@@ -1,15 +1,12 @@
-"""Where painted lines lie in a picture, measured across them with sub-pixel accuracy (C4).
+"""Where painted lines lie in a picture, found across them (C4).
 
 A painted line has two edges, and an edge detector finds either: half a width beside the template's
-line. Here brightness is read across the projected line, and a bar as wide as the projected paint
-between two levels of grass is fitted to it. The edge of a mown stripe or of a shadow is bright on
-one side only and is no bar; a line along such an edge keeps its centre, as the levels are separate.
+line. Here brightness is read across the projected line, where paint is a bar as wide as the paint
+is projected. The edge of a mown stripe or of a shadow is bright on one side only and is no bar.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from typing import Final
 
 import cv2
@@ -21,42 +18,19 @@ from worldpose.errors import InputError
 
 Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
-Integers = NDArray[np.int64]
 
 CANDIDATES: Final = 4
 """Bars that are kept across one place [1]."""
 _STEP: Final = 0.5
 """Between readings across a line [px]."""
-_ALONG: Final = 2
-"""Readings are means over this many pixels to either side along the line."""
+ALONG: Final = 2
+"""Pixels to either side along the line that a bar is found and fitted in."""
 _FLANK: Final = 3.0
 """Grass that is looked at on either side of a bar [px]."""
 _GAP: Final = 1.0
 """Blurred rim of a bar, neither paint nor grass [px]."""
-_SOFT: Final = 0.45
-"""Scale of the logistic edge that stands for blur: as a Gaussian of 0.75 px."""
-_SHARED: Final = 1.3
-"""Variance of a fit for that of independent readings [1]: those half a pixel apart share pixels;
-measured with white noise."""
-_FITTINGS: Final = 5
-"""Gauss-Newton steps of a bar; it is found to a half pixel before."""
-
-
-def median_picture(pictures: Sequence[Picture]) -> Picture:
-    """Return the median of pictures of one camera: without the people who move.
-
-    Raises:
-        InputError: there are none, or their sizes differ.
-    """
-    sizes = {picture.shape for picture in pictures}
-    if len(sizes) != 1:
-        raise InputError(
-            "median_picture",
-            expected="one or more pictures of one size",
-            found=f"sizes {sorted(sizes)}",
-            todo="Give frames of one camera's clip.",
-        )
-    return np.asarray(np.median(np.stack(list(pictures)), axis=0).astype(np.uint8))
+BESIDE: Final = _GAP + _FLANK
+"""Beside a bar there must be nothing else for this far [px]."""
 
 
 def brightness(picture: Picture) -> Picture:
@@ -87,6 +61,7 @@ def find_bars(
     places: Floats,
     normals: Floats,
     widths: Floats,
+    curvatures: Floats,
     reaches: Floats,
     contrast: float,
     offsets: Floats,
@@ -99,6 +74,7 @@ def find_bars(
         places: (n, 2) [px].
         normals: (n, 2) unit vectors across the line.
         widths: (n,) of the bar [px].
+        curvatures: (n,) of the line, positive where it turns towards its normal [1/px].
         reaches: (n,) how far to look to either side [px]; negative = not at all.
         contrast: least brightness above both sides [levels of 255].
         offsets: (n, CANDIDATES) along the normal [px], written; NaN where there are no more.
@@ -113,7 +89,7 @@ def find_bars(
             continue
         count = 2 * int(np.ceil((reaches[i] + rim) / _STEP)) + 1
         profile = np.empty(count)
-        _read(grey, places[i], normals[i], profile)
+        _read(grey, places[i], normals[i], curvatures[i], profile)
         sums = np.zeros(count + 1)
         begin, end = count, 0
         for j in range(count):
@@ -154,62 +130,20 @@ def find_bars(
 
 
 @compiled
-def fit_bars(
-    grey: Picture,
-    places: Floats,
-    normals: Floats,
-    widths: Floats,
-    starts: Floats,
-    contrast: float,
-    offsets: Floats,
-    variances: Floats,
-) -> None:
-    """Write the exact place of bars, and how well the picture tells it.
+def _read(grey: Picture, place: Floats, normal: Floats, curvature: float, profile: Floats) -> None:
+    """Write brightness across a line, its middle entry at `place`; NaN outside the picture.
 
-    Args:
-        grey: (height, width).
-        places: (n, 2) [px].
-        normals: (n, 2) unit vectors across the line.
-        widths: (n,) of the bar [px].
-        starts: (n,) along the normal [px], right to about a pixel; NaN = none.
-        contrast: least brightness above both sides [levels of 255].
-        offsets: (n,) along the normal [px], written; NaN where no bar fits.
-        variances: (n,) [px^2], written.
+    Readings are means along the line and follow its curve: at the ends of a flat ellipse, the
+    tangent leaves the paint within few pixels.
     """
-    for i in range(len(places)):
-        offsets[i] = np.nan
-        variances[i] = np.inf
-        if np.isnan(starts[i]):
-            continue
-        half = max(0.5 * widths[i], 0.25)
-        count = 2 * int(np.ceil((half + _GAP + _FLANK) / _STEP)) + 1
-        profile = np.empty(count)
-        middle = places[i] + starts[i] * normals[i]
-        _read(grey, middle, normals[i], profile)
-        # Both ends in the picture: all of a line across it is.
-        if np.isnan(profile[0]) or np.isnan(profile[-1]):
-            continue
-        shift, contrast_left, contrast_right, variance = _fit_bar(profile, half)
-        if (
-            abs(shift) < 2.0
-            and contrast_left > contrast
-            and contrast_right > contrast
-            and variance < np.inf
-        ):
-            offsets[i] = starts[i] + shift
-            variances[i] = variance
-
-
-@compiled
-def _read(grey: Picture, place: Floats, normal: Floats, profile: Floats) -> None:
-    """Write brightness across a line, its middle entry at `place`; NaN outside the picture."""
     height, width = grey.shape
     for j in range(len(profile)):
         t = (j - len(profile) // 2) * _STEP
         total = 0.0
-        for k in range(-_ALONG, _ALONG + 1):
-            x = place[0] + t * normal[0] - k * normal[1]
-            y = place[1] + t * normal[1] + k * normal[0]
+        for k in range(-ALONG, ALONG + 1):
+            across = t + 0.5 * curvature * k * k
+            x = place[0] + across * normal[0] - k * normal[1]
+            y = place[1] + across * normal[1] + k * normal[0]
             if not (0.0 <= x < width - 1.0 and 0.0 <= y < height - 1.0):
                 total = np.nan
                 break
@@ -217,75 +151,4 @@ def _read(grey: Picture, place: Floats, normal: Floats, profile: Floats) -> None
             fx, fy = x - u, y - v
             total += (1.0 - fy) * ((1.0 - fx) * grey[v, u] + fx * grey[v, u + 1])
             total += fy * ((1.0 - fx) * grey[v + 1, u] + fx * grey[v + 1, u + 1])
-        profile[j] = total / (2 * _ALONG + 1)
-
-
-@compiled
-def _fit_bar(profile: Floats, half: float) -> tuple[float, float, float, float]:
-    """Return a bar's offset [px], its height above either side, and the offset's variance.
-
-    The variance is infinite where nothing fits.
-    """
-    count = len(profile)
-    shift = 0.0
-    level = np.zeros(4)  # grass, paint, grass; the last entry is not used
-    normal, right = np.empty((4, 4)), np.empty(4)
-    row = np.empty(4)
-    variance = np.inf
-    for fitting in range(_FITTINGS):
-        normal[:] = 0.0
-        right[:] = 0.0
-        squares = 0.0
-        for j in range(count):
-            t = (j - count // 2) * _STEP - shift
-            rise = 1.0 / (1.0 + math.exp(-(t + half) / _SOFT))
-            fall = 1.0 / (1.0 + math.exp(-(t - half) / _SOFT))
-            row[0], row[1], row[2] = 1.0 - rise, rise - fall, fall
-            # The levels come with the first step, the place from the second on.
-            up, down = level[1] - level[0], level[1] - level[2]
-            row[3] = (down * fall * (1.0 - fall) - up * rise * (1.0 - rise)) / _SOFT
-            rest = profile[j] - level[0] * row[0] - level[1] * row[1] - level[2] * row[2]
-            squares += rest * rest
-            for a in range(4):
-                right[a] += row[a] * rest
-                for b in range(a + 1):
-                    normal[a, b] += row[a] * row[b]
-        if fitting == 0:
-            normal[3, 3] = 1.0
-        pivot = _solve(normal, right)
-        if not pivot > 0.0:
-            return shift, 0.0, 0.0, np.inf
-        level += right
-        if fitting > 0:
-            shift += min(max(right[3], -1.0), 1.0)
-            variance = max(squares / (count - 4), 0.25) / pivot
-        if not abs(shift) < 3.0 or (fitting > 0 and abs(right[3]) < 0.01):
-            break
-    return shift, level[1] - level[0], level[1] - level[2], _SHARED * variance
-
-
-@compiled
-def _solve(normal: Floats, right: Floats) -> float:
-    """Replace `right` by the solution; return the last unknown's information, 0 if singular.
-
-    Args:
-        normal: (n, n) positive definite, its lower half is used and lost.
-        right: (n,).
-    """
-    size = len(right)
-    for a in range(size):
-        for b in range(a):
-            for c in range(b):
-                normal[a, b] -= normal[a, c] * normal[b, c] * normal[c, c]
-            normal[a, b] /= normal[b, b]
-        for c in range(a):
-            normal[a, a] -= normal[a, c] ** 2 * normal[c, c]
-        if not normal[a, a] > 1e-9:
-            return 0.0
-        for b in range(a):
-            right[a] -= normal[a, b] * right[b]
-    for a in range(size - 1, -1, -1):
-        right[a] /= normal[a, a]
-        for b in range(a + 1, size):
-            right[a] -= normal[b, a] * right[b]
-    return float(normal[size - 1, size - 1])
+        profile[j] = total / (2 * ALONG + 1)

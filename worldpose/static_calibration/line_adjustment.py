@@ -19,9 +19,8 @@ class Adjusted:
 
     Attributes:
         step: (f,).
-        information: (f, f) inverse of the step's covariance, the markings' own unknowns accounted
-            for.
-        residuals: (n,) with the markings' unknowns taken off [px].
+        information: (f, f) inverse of the step's covariance, the paint's unknowns accounted for.
+        residuals: (n,) with the paint's unknowns taken off [px].
         weights: (n,) of the robust loss [1].
     """
 
@@ -36,31 +35,30 @@ def adjust(
     variances: Floats,
     by_camera: Floats,
     by_paint: Floats,
-    marking: Integers,
+    unknowns: Integers,
     prior: tuple[Floats, Floats],
     scales: tuple[float, ...],
 ) -> Adjusted:
     """Return the step that moves projected markings onto measured ones.
 
-    Iteratively reweighted least squares with the loss of Geman and McClure. Every marking has
-    unknowns of its own with unit Gaussian priors: a thousand samples of one line tell where it is
-    painted, and no more about the camera than the survey of its ends allows.
+    Iteratively reweighted least squares with the loss of Geman and McClure. What is not known of
+    the paint has unit Gaussian priors: a thousand samples of one line tell where it is painted, and
+    no more about the camera than the survey of its ends allows.
 
     Args:
         offsets: (n,) measured minus projected, along the normal [px]; NaN = nothing found.
         variances: (n,) [px^2].
         by_camera: (n, f) how the projection moves with a step of the free parameters.
-        by_paint: (n, k) how it moves with the marking's own unknowns.
-        marking: (n,) rising.
+        by_paint: (n, k) how it moves with unknowns of the paint.
+        unknowns: (n, k) which ones.
         prior: information (f, f), and the step (f,) that it expects.
         scales: of the loss [standard deviations], one for each solution.
     """
     known = np.isfinite(offsets)
     weights = known.astype(np.float64)
-    _, group = np.unique(marking, return_inverse=True)
-    groups, paints = (int(group[-1]) + 1 if len(group) else 0), by_paint.shape[1]
+    numbers, index = np.unique(unknowns, return_inverse=True)
     free = by_camera.shape[1]
-    size = free + groups * paints
+    size = free + len(numbers)
     shift = np.where(known, offsets, 0.0)
     solution = np.zeros(size)
     normal = np.empty((size, size))
@@ -71,14 +69,13 @@ def adjust(
             weights = np.where(known, 1.0 / (1.0 + squared) ** 2, 0.0)
         normal[:] = 0.0
         right = np.zeros(size)
-        _accumulate(shift, weights / variances, by_camera, by_paint, group, normal, right)
+        _accumulate(shift, weights / variances, by_camera, by_paint, index, normal, right)
         normal[:free, :free] += prior[0]
         right[:free] += prior[0] @ prior[1]
         normal[np.arange(free, size), np.arange(free, size)] += 1.0
         solution = np.linalg.solve(normal, right)
-        paint = solution[free:].reshape(groups, paints)
         residuals = shift - by_camera @ solution[:free]
-        residuals -= np.einsum("nk,nk->n", by_paint, paint[group])
+        residuals -= (by_paint * solution[free:][index]).sum(axis=1)
     corner = normal[:free, free:]
     information = normal[:free, :free] - corner @ np.linalg.solve(normal[free:, free:], corner.T)
     return Adjusted(solution[:free], 0.5 * (information + information.T), residuals, weights)
@@ -90,27 +87,26 @@ def _accumulate(
     weights: Floats,
     by_camera: Floats,
     by_paint: Floats,
-    group: Integers,
+    index: Integers,
     normal: Floats,
     right: Floats,
 ) -> None:
-    """Add the samples to the normal equations: the camera first, then each marking's unknowns."""
+    """Add the samples to the normal equations: the camera first, then the paint's unknowns."""
     free, paints = by_camera.shape[1], by_paint.shape[1]
     for i in range(len(shift)):
         w = weights[i]
         if w == 0.0:
             continue
-        base = free + group[i] * paints
         for a in range(free):
             left = w * by_camera[i, a]
             right[a] += left * shift[i]
             for b in range(free):
                 normal[a, b] += left * by_camera[i, b]
             for b in range(paints):
-                normal[a, base + b] += left * by_paint[i, b]
-                normal[base + b, a] += left * by_paint[i, b]
+                normal[a, free + index[i, b]] += left * by_paint[i, b]
+                normal[free + index[i, b], a] += left * by_paint[i, b]
         for a in range(paints):
             left = w * by_paint[i, a]
-            right[base + a] += left * shift[i]
+            right[free + index[i, a]] += left * shift[i]
             for b in range(paints):
-                normal[base + a, base + b] += left * by_paint[i, b]
+                normal[free + index[i, a], free + index[i, b]] += left * by_paint[i, b]

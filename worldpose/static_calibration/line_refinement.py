@@ -18,20 +18,17 @@ from scipy.stats import chi2
 from worldpose.cameras import Camera
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration.bars import Bars
 from worldpose.static_calibration.edges import brightness
 from worldpose.static_calibration.line_samples import (
-    LineSamples,
-    apart,
     sample_markings,
     thinned,
 )
-from worldpose.static_calibration.line_search import Found, LineRefinementSettings, LineSearch
+from worldpose.static_calibration.line_search import Found, LineSearch
+from worldpose.static_calibration.line_settings import SURVEY_ERROR, LineRefinementSettings
 from worldpose.static_calibration.parameters import CameraEstimate
 
-__all__ = ["LineRefinement", "LineRefinementSettings", "MarkingFit", "refine_on_lines"]
-
-SURVEY_ERROR: Final = 0.006
-"""Default of how far surveyed points are from the painted ones, each axis [m]."""
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -59,21 +56,21 @@ class LineRefinement:
         estimate: the refined camera; the start where it was kept.
         refined: whether the lines were used.
         reason: why not; empty if they were.
-        contradictory: were lines found that the start's covariance does not allow.
         markings: those in the picture.
         rms: of all samples found, measured minus projected across the line [px]; NaN without any.
-        correlation: of neighbouring residuals along a marking [1].
+        correlation: of neighbouring residuals along a marking, mean over the samples [1].
         effective_samples: independent ones that those found are worth [1].
+        bars: what the camera rests on; None where the start was kept.
     """
 
     estimate: CameraEstimate
     refined: bool
     reason: str
-    contradictory: bool
     markings: tuple[MarkingFit, ...]
     rms: float
     correlation: float
     effective_samples: float
+    bars: Bars | None
 
 
 def refine_on_lines(
@@ -106,42 +103,42 @@ def refine_on_lines(
     settings = settings or LineRefinementSettings()
     grey = brightness(picture)
     _check_size(start.camera, grey)
-    search = LineSearch(start, grey, survey_error, settings)
+    search = LineSearch(start, pitch, grey, survey_error, settings)
     everywhere = sample_markings(pitch, _WORLD_SPACING)
     begin = begin or start
     seen = search.look(begin.camera, everywhere)
-    index = apart(everywhere, thinned(seen, everywhere, settings.spacing, settings.samples))
+    index = thinned(seen, everywhere, settings.spacing, settings.samples)
+    index = index[search.clear(begin.camera, everywhere[index], seen[index])]
     if len(index) < settings.least_found or not search.free.any():
         return _kept(start, "no painted line is in the picture")
-    samples = everywhere[index]
-    found = search.run(begin, samples)
+    found = search.run(begin, everywhere[index])
     if found is None:
         return _kept(start, "too few painted lines were found")
     inliers = found.adjusted.weights > _INLIER
+    inliers &= _there(found, inliers, settings.least_share)
     count, visible = int(inliers.sum()), int(found.seen.visible.sum())
     if count < max(settings.least_found, settings.least_share * visible):
         return _kept(start, f"only {count} of {visible} samples of lines were found")
-    correlation, excess = _noise(found, samples, inliers)
+    correlation, excess = _noise(found, inliers)
     independent = (1.0 - correlation) / (1.0 + correlation)
     # Neighbours tell partly the same: their variances grow until together they tell what they do.
-    found = search.reweighed(found, samples, excess / independent)
+    found = search.reweighed(found, inliers, excess / independent)
     distance = search.distance(found.camera)
     if chi2.sf(distance**2, search.free.sum()) < settings.contradiction:
         return _kept(
             start,
             "the lines contradict the clicks: the camera would move by "
             f"{distance:.1f} standard deviations",
-            contradictory=True,
         )
     return LineRefinement(
         estimate=CameraEstimate(found.camera, search.covariance_of(found)),
         refined=True,
         reason="",
-        contradictory=False,
-        markings=_markings(samples, found, inliers),
+        markings=_markings(found, inliers),
         rms=float(np.sqrt(np.mean(found.adjusted.residuals[inliers] ** 2))),
-        correlation=correlation,
-        effective_samples=count * independent,
+        correlation=float(correlation[inliers].mean()),
+        effective_samples=float(independent[inliers].sum()),
+        bars=search.bars_of(found),
     )
 
 
@@ -150,6 +147,8 @@ _WORLD_SPACING: Final = 0.2
 _INLIER: Final = 0.25
 """Weight above which a sample counts as found: within one scale of the loss [1]."""
 _MOST_CORRELATED: Final = 0.95
+_POOLED: Final = 20.0
+"""Samples that all markings together are worth where one's noise is told [1]."""
 
 
 def _check_size(camera: Camera, grey: NDArray[np.uint8]) -> None:
@@ -163,20 +162,43 @@ def _check_size(camera: Camera, grey: NDArray[np.uint8]) -> None:
         )
 
 
-def _noise(found: Found, samples: LineSamples, inliers: NDArray[np.bool_]) -> tuple[float, float]:
-    """Return how neighbouring residuals correlate, and how much larger than expected they are."""
+def _there(found: Found, inliers: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:
+    """Return which samples (n,) are of markings of which enough was found.
+
+    Of a marking that is not there, something else is found here or there, and moves the camera.
+    """
+    marking, count = found.samples.marking, len(found.samples.names)
+    seen = np.bincount(marking, found.seen.visible, count)
+    there = np.bincount(marking, inliers, count)
+    return np.asarray((there >= least * seen)[marking])
+
+
+def _noise(found: Found, inliers: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    """Return how neighbouring residuals correlate, and how much larger than expected they are.
+
+    Both for every sample (n,), from all of its marking: grass is rougher about a far line that is
+    as wide as a pixel than about a near one, and neighbours there share it.
+    """
+    marking = found.samples.marking
     scaled = np.where(inliers, found.adjusted.residuals / np.sqrt(found.measured.variances), 0.0)
-    excess = float(np.mean(scaled[inliers] ** 2))
-    pairs = inliers[1:] & inliers[:-1] & (np.diff(samples.marking) == 0)
-    products = float(np.mean((scaled[1:] * scaled[:-1])[pairs])) if pairs.any() else 0.0
-    return float(np.clip(products / excess, 0.0, _MOST_CORRELATED)), max(excess, 1.0)
+    pairs = inliers[1:] & inliers[:-1] & (np.diff(marking) == 0)
+
+    def shared(mine: Floats, values: Floats, labels: NDArray[np.int64]) -> Floats:
+        """The mean of each marking's values, drawn to that of all by a few of these."""
+        count = np.bincount(labels, mine, len(found.samples.names))
+        total = np.bincount(labels, mine * values, len(found.samples.names))
+        everywhere = total.sum() / max(count.sum(), 1.0)
+        return np.asarray((total + _POOLED * everywhere) / (count + _POOLED))
+
+    squares = shared(inliers.astype(np.float64), scaled**2, marking)
+    products = shared(pairs.astype(np.float64), scaled[1:] * scaled[:-1], marking[1:])
+    correlation = np.clip(products / squares, 0.0, _MOST_CORRELATED)
+    return correlation[marking], squares[marking]
 
 
-def _markings(
-    samples: LineSamples, found: Found, inliers: NDArray[np.bool_]
-) -> tuple[MarkingFit, ...]:
+def _markings(found: Found, inliers: NDArray[np.bool_]) -> tuple[MarkingFit, ...]:
     """Return how each marking in the picture was found."""
-    fits = []
+    samples, fits = found.samples, []
     visible, residuals = found.seen.visible, found.adjusted.residuals
     for index in np.unique(samples.marking[visible]):
         mine = visible & (samples.marking == index)
@@ -186,6 +208,6 @@ def _markings(
     return tuple(fits)
 
 
-def _kept(start: CameraEstimate, reason: str, contradictory: bool = False) -> LineRefinement:
+def _kept(start: CameraEstimate, reason: str) -> LineRefinement:
     nan = float("nan")
-    return LineRefinement(start, False, reason, contradictory, (), nan, nan, 0.0)
+    return LineRefinement(start, False, reason, (), nan, nan, 0.0, None)

@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from worldpose.cameras import Camera
 from worldpose.pitch import PitchTemplate
@@ -15,13 +14,8 @@ from worldpose.static_calibration.parameters import by_step
 
 Floats = NDArray[np.float64]
 
-OFFSETS: Final = 5
-"""Unknowns of one marking: how far the paint lies from the template sideways and upwards, at both
-ends of a line or along x and y for an arc, and a constant shift in the picture."""
-_CLEARANCE: Final = 0.4
-"""Between a sample and other markings [m]: three widths of paint."""
-_NEIGHBOURS: Final = 10
-"""More samples than a marking has within `_CLEARANCE` at 0.2 m, and one of another [1]."""
+_STRIDE: Final = 0.1
+"""Along an arc, its curvature is told from [m]."""
 _NARROWEST: Final = 0.5
 """Paint that is narrower in the picture is not looked for [px]."""
 
@@ -33,26 +27,39 @@ class LineSamples:
     Attributes:
         points_world: (n, 3) [m], world.
         across_world: (n, 3) unit vectors on the surface, across the marking.
-        sideways: (n, 2) how far a sample moves across, when either end of its line does, or the
-            arc's center along x or y [m/m].
-        upwards: (n, 2) how far it moves up, when either end does, or the arc [m/m].
+        bend_world: (n, 3) how the marking turns, its second derivative along itself [1/m].
+        ends: (n, 2) indices of the template's points that a sample hangs on: the ends of its line,
+            or its arc's center twice.
+        shares: (n, 2) how far it moves when these do [m/m].
         marking: (n,) indices into `names`, rising.
         names: the markings.
     """
 
     points_world: Floats
     across_world: Floats
-    sideways: Floats
-    upwards: Floats
+    bend_world: Floats
+    ends: NDArray[np.int64]
+    shares: Floats
     marking: NDArray[np.int64]
     names: tuple[str, ...]
+
+    @property
+    def along_world(self) -> Floats:
+        """(n, 3) unit vectors on the surface, along the marking."""
+        across = self.across_world
+        return np.stack([across[:, 1], -across[:, 0], np.zeros(len(across))], axis=-1)
+
+    def beside(self, way: float) -> Floats:
+        """Return places (n, 3) [m], world, some way [m] along the marking from the samples."""
+        return self.points_world + way * self.along_world + 0.5 * way**2 * self.bend_world
 
     def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> LineSamples:
         return LineSamples(
             self.points_world[index],
             self.across_world[index],
-            self.sideways[index],
-            self.upwards[index],
+            self.bend_world[index],
+            self.ends[index],
+            self.shares[index],
             self.marking[index],
             self.names,
         )
@@ -66,18 +73,34 @@ class SeenLines:
         places: (n, 2) [px].
         normals: (n, 2) unit vectors across the projected marking.
         widths: (n,) of the paint across it [px].
+        curvatures: (n,) of the projected marking, positive where it turns to its normal [1/px].
         by_camera: (n, 12) how a place moves along its normal with a step of `PARAMETERS`.
-        by_paint: (n, OFFSETS) how it moves with the marking's unknowns, these being one standard
-            deviation large.
+        by_paint: (n, 7) how it moves with what is not known of the paint, each one standard
+            deviation large: both ends along x, y, z, and a shift of the marking in the picture.
+        unknowns: (n, 7) numbers of these; markings that share a point share its error.
         visible: (n,) whether it is in the picture and wide enough.
     """
 
     places: Floats
     normals: Floats
     widths: Floats
+    curvatures: Floats
     by_camera: Floats
     by_paint: Floats
+    unknowns: NDArray[np.int64]
     visible: NDArray[np.bool_]
+
+    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> SeenLines:
+        return SeenLines(
+            self.places[index],
+            self.normals[index],
+            self.widths[index],
+            self.curvatures[index],
+            self.by_camera[index],
+            self.by_paint[index],
+            self.unknowns[index],
+            self.visible[index],
+        )
 
 
 def sample_markings(pitch: PitchTemplate, spacing: float) -> LineSamples:
@@ -94,38 +117,27 @@ def sample_markings(pitch: PitchTemplate, spacing: float) -> LineSamples:
         mine = np.flatnonzero(marking == index)
         along[mine] = np.gradient(points[mine], axis=0)
         share[mine] = np.linspace(0.0, 1.0, len(mine))
+    bend = np.zeros_like(points)
     for name, arc in pitch.arcs.items():
+        mine = np.flatnonzero(marking == samples.names.index(name))
+        bend[mine, :2] = (pitch.points[arc.center] - points[mine])[:, :2] / arc.radius**2
         if np.isclose(arc.end_angle - arc.start_angle, 2.0 * np.pi):
-            mine = np.flatnonzero(marking == samples.names.index(name))
             along[mine] = np.roll(points[mine], -1, axis=0) - np.roll(points[mine], 1, axis=0)
     across = np.cross(along, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across, axis=-1, keepdims=True)
-    ends = np.stack([1.0 - share, share], axis=-1)
+    names = {name: index for index, name in enumerate(pitch.points)}
+    ends = [(names[line.start], names[line.end]) for line in pitch.lines.values()]
+    ends += [(names[arc.center], names[arc.center]) for arc in pitch.arcs.values()]
     curved = (marking >= len(pitch.lines))[:, None]
     return LineSamples(
         points,
         across,
-        np.where(curved, across[:, :2], ends),
-        np.where(curved, [1.0, 0.0], ends),
+        bend,
+        np.array(ends)[marking],
+        np.where(curved, [1.0, 0.0], np.stack([1.0 - share, share], axis=-1)),
         marking,
         samples.names,
     )
-
-
-def apart(samples: LineSamples, index: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return those of some samples that no other marking comes near: bars cross there.
-
-    Args:
-        samples: all of them.
-        index: which to look at.
-    """
-    tree = cKDTree(samples.points_world)
-    points = samples.points_world[index]
-    _, near = tree.query(points, k=_NEIGHBOURS, distance_upper_bound=_CLEARANCE)
-    # Beyond the last sample stand neighbours that are not there.
-    neighbour = np.append(samples.marking, -1)[near]
-    own = (neighbour == samples.marking[index][:, None]) | (neighbour == -1)
-    return np.asarray(index[own.all(axis=1)])
 
 
 def see_lines(
@@ -137,14 +149,14 @@ def see_lines(
         camera: a single camera.
         samples: of `sample_markings`.
         line_width: of the paint [m].
-        survey_error: of the ends of a marking, each axis, standard deviation [m].
+        survey_error: of the points that markings hang on, each axis, standard deviation [m].
         shift: of a whole marking in the picture, standard deviation [px].
     """
     points = samples.points_world
     projected = camera.project_with_jacobians(points)
     image, jacobian = projected.points_image, by_step(camera, projected)
     across = samples.across_world
-    along = np.stack([across[:, 1], -across[:, 0], np.zeros(len(across))], axis=-1)
+    along = samples.along_world
     spread = (projected.d_points * across[:, None, :]).sum(-1)
     ahead = (projected.d_points * along[:, None, :]).sum(-1)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -154,18 +166,35 @@ def see_lines(
         widths = np.abs(side) * line_width
         inside = ((image > 0.0) & (image < camera.image_size - 1.0)).all(-1)
         visible = inside & (widths >= _NARROWEST) & np.isfinite(jacobian).all((1, 2))
-    rise = (projected.d_points[..., 2] * normals).sum(-1)
-    by_paint = np.concatenate(
-        [
-            survey_error * side[:, None] * samples.sideways,
-            survey_error * rise[:, None] * samples.upwards,
-            np.full((len(points), 1), shift),
-        ],
-        axis=1,
-    )
+    curvatures = _curvatures(camera, samples, normals)
+    by_point = survey_error * np.einsum("nij,ni->nj", projected.d_points, normals)
+    moved = (samples.shares[:, :, None] * by_point[:, None]).reshape(len(points), 6)
+    axes = (3 * samples.ends[:, :, None] + np.arange(3)).reshape(len(points), 6)
+    # Below zero, what is no point's.
+    own = -1 - samples.marking[:, None]
     return SeenLines(
-        image, normals, widths, np.einsum("ni,nij->nj", normals, jacobian), by_paint, visible
+        image,
+        normals,
+        widths,
+        curvatures,
+        np.einsum("ni,nij->nj", normals, jacobian),
+        np.concatenate([moved, np.full((len(points), 1), shift)], axis=1),
+        np.concatenate([axes, own], axis=1),
+        visible,
     )
+
+
+def _curvatures(camera: Camera, samples: LineSamples, normals: Floats) -> Floats:
+    """Return how projected markings turn towards normals (n, 2) at the samples (n,) [1/px]."""
+    curvatures = np.zeros(len(normals))
+    arcs = np.flatnonzero(samples.bend_world.any(axis=1))
+    before, middle, after = (
+        camera.project(samples[arcs].beside(s)) for s in (-_STRIDE, 0.0, _STRIDE)
+    )
+    turned = ((before + after - 2.0 * middle) * normals[arcs]).sum(-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        curvatures[arcs] = 4.0 * turned / ((after - before) ** 2).sum(-1)
+    return curvatures
 
 
 def thinned(seen: SeenLines, samples: LineSamples, spacing: float, most: int) -> NDArray[np.int64]:

@@ -7,13 +7,16 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
-from data_contracts.records import Record
 from worldpose.cameras import Camera
-from worldpose.static_calibration.edges import CANDIDATES, find_bars, fit_bars
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration.bar_fits import fit_bars
+from worldpose.static_calibration.bars import Bars
+from worldpose.static_calibration.clearance import clear, whites_of
+from worldpose.static_calibration.edges import BESIDE, CANDIDATES, find_bars
 from worldpose.static_calibration.line_adjustment import Adjusted, adjust
 from worldpose.static_calibration.line_samples import LineSamples, SeenLines, see_lines
+from worldpose.static_calibration.line_settings import LineRefinementSettings
 from worldpose.static_calibration.parameters import CameraEstimate, stepped
 
 Floats = NDArray[np.float64]
@@ -36,40 +39,14 @@ _TURNS: Final = 4
 """Times that exact bars are fitted to, each time from where the camera has come to."""
 _SETTLED: Final = 0.02
 """Largest move of a sample in the last of them [px]."""
+_NO_WEIGHT: Final = 1e-3
+"""Of a sample that the fit does not rest on [1]."""
 _READING: Final = 0.05
 """What a fitted bar is off by at least [px]."""
 _COARSE_SCALES: Final = (np.inf, 12.0, 6.0, 4.0, 3.0, 3.0)
 _FINE_SCALES: Final = (12.0, 6.0)
 """Scales of the loss while it tightens [standard deviations]: outliers lose their pull one by
 one, and the fit does not fall into the nearest minimum."""
-
-
-class LineRefinementSettings(Record):
-    """What is looked for, how far off, and what is believed."""
-
-    line_width: float = Field(default=0.12, gt=0)
-    """Of the paint [m]: Law 1 allows no more, and most pitches have it."""
-    line_shift: float = Field(default=0.05, ge=0)
-    """Standard deviation of what moves a whole marking in the picture [px], such as sharpening or
-    a rest of the lens that k1 and k2 leave."""
-    samples: int = Field(default=2000, ge=100)
-    """Samples in the picture at most, about [1]."""
-    spacing: float = Field(default=4.0, gt=0)
-    """Between neighbouring samples in the picture [px]."""
-    reach: float = Field(default=40.0, gt=0)
-    """A sample is looked for where its projection is known to within this [px], three standard
-    deviations; others wait until nearer ones have been found."""
-    contrast: float = Field(default=6.0, gt=0)
-    """Least brightness of paint above the grass on either side [levels of 255]."""
-    loss: float = Field(default=3.0, gt=0)
-    """Scale of the robust loss in the end [standard deviations]."""
-    least_found: int = Field(default=30, ge=1)
-    """Fewer samples found make no line [1]."""
-    least_share: float = Field(default=0.25, ge=0, le=1)
-    """Least share of the samples in the picture that is found where the fit puts it [1]; people
-    hide some, and worn paint."""
-    contradiction: float = Field(default=1e-6, gt=0, lt=1)
-    """A fit that the start and its covariance give less than this probability is refused [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +59,10 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A camera, the samples as it has them, the bars measured there, and the last fit."""
+    """A camera, samples, how it has them, the bars measured there, and the last fit."""
 
     camera: Camera
+    samples: LineSamples
     seen: SeenLines
     measured: Measured
     adjusted: Adjusted
@@ -96,12 +74,14 @@ class LineSearch:
     def __init__(
         self,
         start: CameraEstimate,
+        pitch: PitchTemplate,
         grey: NDArray[np.uint8],
         survey_error: float,
         settings: LineRefinementSettings,
     ) -> None:
         self.start, self.grey, self.settings = start, grey, settings
         self.survey_error = survey_error
+        self.whites = whites_of(pitch)
         spread = np.sqrt(np.diag(start.covariance))
         self.free = spread > 0.0
         covariance = start.covariance[np.ix_(self.free, self.free)]
@@ -116,6 +96,11 @@ class LineSearch:
         s = self.settings
         return see_lines(camera, samples, s.line_width, self.survey_error, s.line_shift)
 
+    def clear(self, camera: Camera, samples: LineSamples, seen: SeenLines) -> NDArray[np.bool_]:
+        """Return which samples (n,) have grass on both sides in the picture."""
+        room, half = 0.5 * seen.widths + BESIDE, 0.5 * self.settings.line_width
+        return clear(camera, self.whites, half, seen.places, room, samples.marking)
+
     def run(self, begin: CameraEstimate, samples: LineSamples) -> Found | None:
         """Return the camera found by looking closer and closer; None where there are no lines."""
         camera, covariance = begin.camera, begin.covariance[np.ix_(self.free, self.free)]
@@ -129,7 +114,9 @@ class LineSearch:
             reach = self._reach(seen, covariance)
             fine = left == 0 or bool((reach <= _FINE)[seen.visible].mean() >= _MOSTLY)
             if fine:
-                chosen, seen = samples, self.look(camera, samples)
+                seen = self.look(camera, samples)
+                alone = self.clear(camera, samples, seen)
+                chosen, seen = samples[alone], seen[alone]
                 reach = self._reach(seen, covariance)
             measured = self._measure(seen, reach, fine)
             least = self.settings.least_found * len(chosen.marking) / len(samples.marking)
@@ -142,13 +129,15 @@ class LineSearch:
             covariance = np.asarray(np.linalg.inv(found.adjusted.information))
         return found
 
-    def reweighed(self, found: Found, samples: LineSamples, inflation: float) -> Found:
-        """Return the fit with the variances of all samples multiplied."""
-        measured = replace(found.measured, variances=found.measured.variances * inflation)
+    def reweighed(self, found: Found, used: NDArray[np.bool_], inflation: Floats) -> Found:
+        """Return the fit to some samples (n,), their variances multiplied (n,)."""
+        measured = Measured(
+            np.where(used, found.measured.offsets, np.nan), found.measured.variances * inflation
+        )
         scales = (2.0 * self.settings.loss, *(self.settings.loss,) * 2)
-        adjusted = self._adjust(found.camera, samples, found.seen, measured, scales)
+        adjusted = self._adjust(found.camera, found.seen, measured, scales)
         camera = stepped(found.camera, self._whole(adjusted.step))
-        return Found(camera, found.seen, measured, adjusted)
+        return replace(found, camera=camera, measured=measured, adjusted=adjusted)
 
     def distance(self, camera: Camera) -> float:
         """Return how far a camera is from the start [standard deviations]."""
@@ -160,6 +149,20 @@ class LineSearch:
         whole = np.zeros_like(self.start.covariance)
         whole[np.ix_(self.free, self.free)] = np.linalg.inv(found.adjusted.information)
         return np.asarray(0.5 * (whole + whole.T))
+
+    def bars_of(self, found: Found) -> Bars:
+        """Return the bars that a fit rests on."""
+        seen, weights = found.seen, found.adjusted.weights
+        used = weights > _NO_WEIGHT
+        pixels = seen.places + found.measured.offsets[:, None] * seen.normals
+        variances = found.measured.variances[used] / weights[used]
+        return Bars(
+            found.samples[used],
+            pixels[used],
+            np.sqrt(variances),
+            seen.by_paint[used],
+            seen.unknowns[used],
+        )
 
     def _settle(
         self,
@@ -174,7 +177,7 @@ class LineSearch:
         final = (self.settings.loss,) * 3
         scales: tuple[float, ...] = (*_FINE_SCALES, *final) if fine else _COARSE_SCALES
         for _ in range(_TURNS if fine else 1):
-            adjusted = self._adjust(camera, samples, seen, measured, scales)
+            adjusted = self._adjust(camera, seen, measured, scales)
             scales = (2.0 * self.settings.loss, self.settings.loss, self.settings.loss)
             camera = stepped(camera, self._whole(adjusted.step))
             moved = np.abs(seen.by_camera[:, self.free] @ adjusted.step)[seen.visible]
@@ -182,7 +185,7 @@ class LineSearch:
             measured = replace(measured, offsets=((bars - seen.places) * seen.normals).sum(-1))
             if moved.max() < _SETTLED:
                 break
-        return Found(camera, seen, measured, adjusted)
+        return Found(camera, samples, seen, measured, adjusted)
 
     def _reach(self, seen: SeenLines, covariance: Floats) -> Floats:
         """Return how far samples are looked for along their normals [px]."""
@@ -198,7 +201,7 @@ class LineSearch:
         limit = max(s.reach, float(np.quantile(reach[seen.visible], _BEST)))
         usable = seen.visible & (reach <= limit)
         offsets, strengths = np.empty((count, CANDIDATES)), np.empty((count, CANDIDATES))
-        across = seen.places, seen.normals, seen.widths
+        across = seen.places, seen.normals, seen.widths, seen.curvatures
         looked = np.where(usable, reach, -1.0)
         find_bars(self.grey, *across, looked, s.contrast, offsets, strengths)
         # The likelier is the nearer, in standard deviations, and the stronger.
@@ -215,7 +218,6 @@ class LineSearch:
     def _adjust(
         self,
         camera: Camera,
-        samples: LineSamples,
         seen: SeenLines,
         measured: Measured,
         scales: tuple[float, ...],
@@ -227,7 +229,7 @@ class LineSearch:
             measured.variances[known],
             np.ascontiguousarray(seen.by_camera[np.ix_(known, np.flatnonzero(self.free))]),
             np.ascontiguousarray(seen.by_paint[known]),
-            samples.marking[known],
+            seen.unknowns[known],
             self._prior(camera),
             scales,
         )

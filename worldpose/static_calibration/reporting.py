@@ -78,6 +78,8 @@ def report_of(
         reasons.append(
             f"residuals {np.sqrt(fit.misfit):.1f} times the stated noise: a name may be wrong"
         )
+    if lines is not None and not lines.refined:
+        reasons.append(f"no painted lines to confirm it: {lines.reason}")
     if lines is not None:
         found = f"{lines.effective_samples:.0f} independent samples" if lines.refined else "none"
         decisions = (*decisions, f"painted lines: {lines.reason or found}")

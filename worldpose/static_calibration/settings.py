@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from data_contracts.records import Record
-from worldpose.static_calibration.line_refinement import SURVEY_ERROR, LineRefinementSettings
+from worldpose.static_calibration.line_settings import SURVEY_ERROR, LineRefinementSettings
 
 
 class CameraPrior(Record):

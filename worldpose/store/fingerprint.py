@@ -29,7 +29,8 @@ def code_version(root_module: str, roots: tuple[Path, ...] = _HOME) -> dict[str,
 
     Follows imports, those inside functions too, into `tasks`, `worldpose` (not its store) and
     `data_contracts`. A package's `__init__` counts where an import takes a name from it, not
-    merely because a module inside it is imported. Comments, docstrings and formatting are left
+    merely because a module inside it is imported. A data file beside a module counts where the
+    module names it. Comments, docstrings and formatting are left
     out, so that editing them recomputes nothing. Only literal import statements are seen. Read
     once per process: a process keeps the code it started with.
 
@@ -53,7 +54,9 @@ def code_version(root_module: str, roots: tuple[Path, ...] = _HOME) -> dict[str,
             tree = ast.parse(path.read_bytes())
         except (OSError, SyntaxError, ValueError) as error:
             raise StoreError(f"{path}: cannot read module {name}: {error}") from error
-        versions[name] = digest(ast.unparse(_WithoutText().visit(tree)).encode())
+        code = _WithoutText().visit(tree)
+        versions[name] = digest(ast.unparse(code).encode())
+        versions |= {f"{name}:{data.name}": digest(data.read_bytes()) for data in _data(code, path)}
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
         waiting.extend(found for found in _imported(tree, package, roots) if _is_followed(found))
     return dict(sorted(versions.items()))
@@ -86,6 +89,16 @@ def _source(name: str, roots: tuple[Path, ...]) -> Path | None:
             if path.is_file():
                 return path
     return None
+
+
+def _data(code: ast.AST, path: Path) -> Iterator[Path]:
+    """Files beside a module that a text in it names."""
+    texts = {node.value for node in ast.walk(code) if isinstance(node, ast.Constant)}
+    yield from (
+        file
+        for file in sorted(path.parent.iterdir())
+        if file.suffix == ".npz" and file.name in texts
+    )
 
 
 def _imported(tree: ast.AST, package: str, roots: tuple[Path, ...]) -> Iterator[str]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from worldpose.body import OPEN_BODY, BodyParameters
+from worldpose.body import OPEN_BODY
 from worldpose.ingest import write_calibration_toml, write_match
 from worldpose.pitch import PitchTemplate
 from worldpose.release import (
@@ -18,6 +18,7 @@ from worldpose.release import (
     write_moving_camera,
     write_static_camera,
 )
+from worldpose.release.pose_file import write_poses
 from worldpose.synthetic.clips import read_clip
 from worldpose.synthetic.rendering import render_pitch
 from worldpose.synthetic.scene import Scene, simulate_scene
@@ -149,7 +150,7 @@ def simulate_match(
 def write_references(folder: Path, scenario: Scenario, scene: Scene) -> None:
     """Write the truth of a scene: joints, cameras, clocks, pitch and who every detection is."""
     write_joints(folder / "joints.npz", scene.truth)
-    _write_poses(folder / "poses" / f"{CLIP_ID}.npz", scene.poses)
+    write_poses(folder / "poses" / f"{CLIP_ID}.npz", scene.poses, OPEN_BODY)
     for name, camera in scene.cameras.items():
         write_static_camera(folder / "cameras" / f"{name}.npz", camera.to_calibration(name))
     if scene.broadcast is not None:
@@ -180,15 +181,3 @@ def write_references(folder: Path, scenario: Scenario, scene: Scene) -> None:
 
 def _write_json(path: Path, content: object) -> None:
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-
-
-def _write_poses(path: Path, poses: BodyParameters) -> None:
-    """Write bodies (N, T), 4 um at most beside the truth: float32 on a pitch of 105 m."""
-    arrays = {
-        "betas": poses.betas[:, 0],
-        "global_orient": poses.global_orient,
-        "body_pose": poses.body_pose,
-        "transl": poses.transl,
-    }
-    single = {name: array.astype(np.float32) for name, array in arrays.items()}
-    write_archive(path, {**single, "body_model": np.array([OPEN_BODY])})

@@ -14,6 +14,7 @@ from data_contracts.records import Record
 from data_contracts.tracking import Join, Track
 from worldpose.cameras import Camera
 from worldpose.errors import InputError
+from worldpose.tracking.clip_arrays import ClipArray
 from worldpose.tracking.following import Follower
 from worldpose.tracking.joining import Candidate
 from worldpose.tracking.person import Person
@@ -78,8 +79,8 @@ class Tracking:
 
 def track_people(
     cameras: Camera,
-    keypoints: NDArray[np.floating],
-    confidence: NDArray[np.floating],
+    keypoints: ClipArray,
+    confidence: ClipArray,
     fps: float,
     settings: TrackingSettings,
     progress: Callable[[int, int], None] | None = None,
@@ -97,7 +98,7 @@ def track_people(
     Args:
         cameras: batch (cameras,).
         keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found. Read in blocks
-            of frames: anything that slices like an array will do.
+            of frames.
         confidence: (frames, cameras, detections, 17) in (0, 1]; NaN, 0 or less leaves a keypoint
             out.
         fps: frames per second [1/s].
@@ -122,7 +123,7 @@ def track_people(
         )
     centers = np.ascontiguousarray(cameras.center)
     follower = Follower(centers, fps, ground, people, settings)
-    frames = len(keypoints)
+    frames = confidence.shape[0]
     for start in range(0, frames, BLOCK):
         image = np.asarray(keypoints[start : start + BLOCK], dtype=np.float64)
         weights = np.array(confidence[start : start + BLOCK], dtype=np.float64, order="C")

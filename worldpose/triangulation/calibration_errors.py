@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.cameras import Camera
+from worldpose.triangulation.reports import Histogram
 from worldpose.triangulation.settings import TriangulationSettings
 
 Floats = NDArray[np.float64]
@@ -28,14 +29,12 @@ class StatedErrors:
     variance: Floats
     scale: Floats
 
-    def misplacement(self, factor: float) -> tuple[float | None, ...]:
-        """Return what the variance times `factor` is at the median person [m]."""
-        figures: list[float | None] = []
-        for camera in range(self.variance.shape[1]):
-            there = self.variance[:, camera] > 0.0
-            squared = self.variance[:, camera][there] / self.scale[:, camera][there] ** 2
-            figures.append(float(np.sqrt(factor * np.median(squared))) if len(squared) else None)
-        return tuple(figures)
+    def misplaced(self, factor: float) -> tuple[Histogram, ...]:
+        """Return what the variance times `factor` is at people [m], by camera."""
+        there = self.variance > 0.0
+        variance = np.where(there, self.variance, 0.0) / np.where(there, self.scale, 1.0) ** 2
+        root = np.sqrt(factor * variance)
+        return tuple(Histogram.of(root[:, c][there[:, c]]) for c in range(there.shape[1]))
 
 
 def stated_errors(

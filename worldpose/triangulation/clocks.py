@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from data_contracts.records import Record
 from worldpose.cameras import Camera, projection
+from worldpose.tracking.clip_arrays import ClipArray
 from worldpose.triangulation.noise_model import NoiseModel
 from worldpose.triangulation.observations import Rig
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.solving import no_shift, solve
 
 Floats = NDArray[np.float64]
-Moved = tuple[Floats, Floats, NDArray[np.int16]]
+Moved = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.int16]]
 
 GATES: Final = (10.0, 10.0, 5.0, 3.5, 3.5, 3.5, 3.5)
 """Deviations accepted in each round: clocks three frames apart put a runner's rays half a metre
@@ -73,9 +74,9 @@ class CameraClocks:
 
 def estimate_clocks(
     cameras: Camera,
-    keypoints: NDArray[np.floating],
-    confidence: NDArray[np.floating],
-    detection_index: NDArray[np.int16],
+    keypoints: ClipArray,
+    confidence: ClipArray,
+    detection_index: ClipArray,
     fps: float,
     settings: TriangulationSettings,
 ) -> CameraClocks:
@@ -96,7 +97,7 @@ def estimate_clocks(
     rig = Rig.of(cameras)
     count = len(rig.cameras)
     late, error = np.zeros(count), np.full(count, UNKNOWN)
-    parts = _stretches(detection_index, max(3, round(WINDOW * fps)))
+    parts = _stretches(detection_index.shape, max(3, round(WINDOW * fps)))
     for gate in GATES if parts else ():
         loose = settings.model_copy(update={"max_deviation": gate})
         arrays = [
@@ -168,9 +169,9 @@ def moved_in_time(
     return pixels, weights, index
 
 
-def _stretches(index: NDArray[np.int16], length: int) -> list[slice]:
+def _stretches(shape: tuple[int, ...], length: int) -> list[slice]:
     """Return stretches of frames spread over the clip, with enough people together."""
-    frames, _, persons = index.shape
+    frames, _, persons = shape
     starts = np.arange(0, max(1, frames - length + 1), length)
     wanted = max(1, SAMPLE // max(1, length * persons))
     chosen = np.unique(np.linspace(0, len(starts) - 1, min(len(starts), wanted)).astype(int))

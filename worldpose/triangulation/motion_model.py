@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -10,8 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17
 from worldpose.cameras import projection
-from worldpose.triangulation.observations import Rig, person_observations
-from worldpose.triangulation.robust import Triangulation
+from worldpose.triangulation.observations import Rig
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.track_solver import held_out_cost, prepare, solve_segment
 
@@ -44,8 +44,8 @@ class MotionModel:
 
 def learn_motion(
     rig: Rig,
-    arrays: tuple[NDArray[np.floating], Floats, NDArray[np.integer], Floats],
-    raw: Triangulation,
+    stretches: Iterable[tuple[Floats, Floats, Floats]],
+    joints: int,
     fps: float,
     settings: TriangulationSettings,
 ) -> MotionModel:
@@ -58,23 +58,22 @@ def learn_motion(
 
     Args:
         rig: the cameras.
-        arrays: keypoints, precision, detection_index and offsets as in `person_observations`.
-        raw: triangulated joints.
+        stretches: of one person each, pixels (17, cameras, frames, 2) and precision as in
+            `person_observations`, and triangulated joints (frames, 17, 3) [m].
+        joints: how many there are of a person.
         fps: frames per second [1/s].
         settings: noise and agreement.
     """
-    joints = raw.joints.shape[2]
     names = [name.split("_")[-1] for name in COCO17]
-    kind = np.unique(names, return_inverse=True)[1] if joints == len(COCO17) else np.arange(joints)
     limit, noise = settings.max_deviation**2, settings.noise
+    kind = np.unique(names, return_inverse=True)[1] if joints == len(COCO17) else np.arange(joints)
     cost = np.zeros((len(ACCELERATIONS), joints))
     lag = max(1, round(REPEAT * fps))
     correlation, energy = np.zeros(lag + 1), 0.0
     odd = np.arange(len(rig.cameras)) % 2 == 1
-    for person, part in _windows(raw.joints, round(WINDOW * fps)):
-        pixels, weights = person_observations(arrays, person, part)
+    for pixels, weights, points in stretches:
         for joint in range(joints):
-            given = raw.joints[part, person, joint]
+            given = np.ascontiguousarray(points[:, joint])
             if not np.isfinite(given).all():
                 continue
             for left_out in (odd, ~odd):
@@ -98,16 +97,20 @@ def learn_motion(
     return MotionModel(best, float(1.0 + 2.0 * alike.sum()))
 
 
-def _windows(joints: Floats, length: int) -> list[tuple[int, slice]]:
-    """Return people and stretches of frames, spread over the clip."""
-    frames, persons = joints.shape[:2]
-    starts = range(0, max(1, frames - length + 1), max(1, length))
-    there = np.isfinite(joints[..., 0]).mean(axis=-1)
+def choose_stretches(there: NDArray[np.bool_], fps: float) -> list[tuple[int, slice]]:
+    """Return people and stretches of frames to learn from, spread over the clip.
+
+    Args:
+        there: (frames, persons), can the person be triangulated.
+        fps: frames per second [1/s].
+    """
+    frames, persons = there.shape
+    length = max(1, min(frames, round(WINDOW * fps)))
     every = [
         (person, slice(start, start + length))
-        for start in starts
+        for start in range(0, max(1, frames - length + 1), length)
         for person in range(persons)
-        if there[start : start + length, person].mean() > 0.5
+        if 2 * there[start : start + length, person].sum() > length
     ]
     chosen = np.linspace(0, len(every) - 1, min(len(every), WINDOWS)).astype(int)
     return [every[n] for n in np.unique(chosen)]

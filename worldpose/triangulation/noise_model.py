@@ -28,8 +28,6 @@ Floats = NDArray[np.float64]
 
 BINS: Final = 8
 """Classes of confidence with equally many observations."""
-SAMPLE: Final = 6000
-"""Joints that a round looks at: a class then has thousands of observations."""
 ROUNDS: Final = 4
 """Weights, agreement and spreads settle after three."""
 PRIOR: Final = 60.0
@@ -57,6 +55,11 @@ class NoiseModel:
         """Return the model of the settings: variance as one over confidence."""
         return cls(np.ones(joints), np.array([0.0, 1.0]), np.array([0.0, 1.0]))
 
+    @property
+    def factor(self) -> float:
+        """Median over joints of a confident keypoint's noise over the stated one [1]."""
+        return float(np.median(np.sqrt(self.joint / self.precision_at[-1])))
+
     def precision(self, confidence: NDArray[np.floating]) -> Floats:
         """Return one over the factor (..., joints); 0 where there is no observation."""
         precision = np.empty(confidence.shape)
@@ -75,22 +78,16 @@ def learn_noise(
     noise: tuple[float, float],
     limit: float,
 ) -> NoiseModel:
-    """Return the noise that a clip's residuals show.
+    """Return the noise that the residuals of a sample of frames show.
 
     A residual is smaller than the error behind it, for the point follows its observations: sums of
     squares are divided by degrees of freedom, two an observation less its leverage.
     """
-    frames, count, persons = index.shape
-    joints = confidence.shape[-1]
+    count, joints = index.shape[1], confidence.shape[-1]
     model = NoiseModel.stated(joints)
-    # Whole frames from all over the clip.
-    chosen = np.linspace(0, frames - 1, min(frames, 1 + SAMPLE // max(1, persons * joints)))
-    chosen = np.unique(chosen.astype(np.int64))
-    some, doubt, who = keypoints[chosen], confidence[chosen], index[chosen]
-    moved = shift[chosen] if len(shift) else shift
-    place = np.maximum(who, 0).astype(np.int64)[..., None]
-    certain = np.take_along_axis(np.asarray(doubt, np.float64), place, axis=2)
-    certain = np.where(who[..., None] >= 0, certain, np.nan).transpose(0, 2, 3, 1)
+    place = np.maximum(index, 0).astype(np.int64)[..., None]
+    certain = np.take_along_axis(np.asarray(confidence, np.float64), place, axis=2)
+    certain = np.where(index[..., None] >= 0, certain, np.nan).transpose(0, 2, 3, 1)
     usable = (certain > 0.0) & np.isfinite(certain)
     if not usable.any():
         return model
@@ -108,9 +105,9 @@ def learn_noise(
     shape = certain.shape
     squares, known, freedom = np.empty(shape), np.empty(shape), np.empty(shape)
     for _ in range(ROUNDS):
-        precision = model.precision(doubt)
+        precision = model.precision(confidence)
         _residuals(
-            *(some, precision, who, moved, rig.cameras, rig.depths, noise, limit),
+            *(keypoints, precision, index, shift, rig.cameras, rig.depths, noise, limit),
             *(squares.reshape(-1, count), known.reshape(-1, count), freedom.reshape(-1, count)),
         )
         used = freedom > 0.0

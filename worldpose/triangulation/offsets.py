@@ -38,8 +38,6 @@ Floats = NDArray[np.float64]
 
 ROUNDS: Final = 6
 """Updates of the cameras' variances; the last changes them by a few percent."""
-SAMPLE: Final = 400
-"""Person-frames that they are learned from: one a second of each person in a long clip."""
 DAMPING: Final = 4.0
 """Degrees of freedom for which the variance before an update counts."""
 LEAST: Final = 1e-3
@@ -52,13 +50,41 @@ class Offsets:
 
     Attributes:
         shift: (frames, cameras, persons, 3), the offsets [px] and a zero.
-        factor: on the variance that was stated.
         covariance: (frames, persons, joints, 3, 3) [m^2] that they add to the joints'.
     """
 
     shift: Floats
-    factor: float
     covariance: Floats
+
+
+def learn_factor(
+    rig: Rig,
+    keypoints: NDArray[np.floating],
+    precision: Floats,
+    index: NDArray[np.integer],
+    noise: tuple[float, float],
+    first: Solution,
+    stated: Floats,
+) -> float:
+    """Return the factor on the stated variance that a sample of frames makes most probable.
+
+    It is the same for all cameras: each camera's own error is drawn once, and cannot tell how
+    large it might have been. Arguments are those of `estimate_offsets`.
+    """
+    factor, known = 1.0, first.inliers.any(axis=-1) & (stated > 0.0)
+    scale = np.where(known, stated, 1.0)
+    for _ in range(ROUNDS if known.any() else 0):
+        offsets, variance = np.zeros((*stated.shape, 2)), np.zeros(stated.shape)
+        _body_offsets(
+            *(keypoints, precision, index, rig.cameras, rig.depths, noise),
+            *(first.joints, first.inliers, factor * stated),
+            *(offsets, variance, np.empty((0, 0, 0, 3, 3))),
+        )
+        squares = np.where(known, (offsets**2).sum(axis=-1) / scale, 0.0).sum()
+        # Degrees of freedom that the observations determine (MacKay 1992).
+        freedom = np.where(known, 2.0 * (1.0 - variance / (factor * scale)), 0.0).sum()
+        factor = max(LEAST, float((squares + DAMPING * factor) / (freedom + DAMPING)))
+    return factor
 
 
 def estimate_offsets(
@@ -68,8 +94,7 @@ def estimate_offsets(
     index: NDArray[np.integer],
     noise: tuple[float, float],
     first: Solution,
-    stated: Floats,
-    learn: bool,
+    variance: Floats,
 ) -> Offsets:
     """Return the most probable offsets with the joints free to follow.
 
@@ -84,36 +109,15 @@ def estimate_offsets(
         index: (frames, cameras, persons).
         noise: [px], [m].
         first: the joints without offsets.
-        stated: (frames, cameras, persons) variance per axis that calibration has [px^2].
-        learn: whether it is right only up to a factor, the same for all cameras: each camera's own
-            error is drawn once, and cannot tell how large it might have been.
+        variance: (frames, cameras, persons) per axis that calibration has [px^2].
     """
-    frames, _, persons = index.shape
-    chosen = np.linspace(0, frames - 1, min(frames, 1 + SAMPLE // max(1, persons)))
-    chosen = np.unique(chosen.astype(np.int64))
-    some = (keypoints[chosen], precision[chosen], index[chosen])
-    at = (rig.cameras, rig.depths, noise)
-    joints, inliers, expected = first.joints[chosen], first.inliers[chosen], stated[chosen]
-    factor, known = 1.0, inliers.any(axis=-1) & (expected > 0.0)
-    for _ in range(ROUNDS if learn and known.any() else 0):
-        prior = factor * expected
-        offsets, variance = np.zeros((*prior.shape, 2)), np.zeros(prior.shape)
-        _body_offsets(
-            *some, *at, joints, inliers, prior, offsets, variance, np.empty((0, 0, 0, 3, 3))
-        )
-        scale = np.where(known, expected, 1.0)
-        squares = np.where(known, (offsets**2).sum(axis=-1) / scale, 0.0).sum()
-        # Degrees of freedom that the observations determine (MacKay 1992).
-        freedom = np.where(known, 2.0 * (1.0 - variance / (factor * scale)), 0.0).sum()
-        factor = max(LEAST, float((squares + DAMPING * factor) / (freedom + DAMPING)))
-    offsets, variance = np.zeros((*stated.shape, 2)), np.zeros(stated.shape)
+    offsets, unknown = np.zeros((*variance.shape, 2)), np.zeros(variance.shape)
     further = np.zeros((*first.joints.shape, 3))
-    prior = factor * stated
     _body_offsets(
-        *(keypoints, precision, index, *at, first.joints, first.inliers, prior),
-        *(offsets, variance, further),
+        *(keypoints, precision, index, rig.cameras, rig.depths, noise),
+        *(first.joints, first.inliers, variance, offsets, unknown, further),
     )
-    return Offsets(np.concatenate([offsets, np.zeros((*stated.shape, 1))], -1), factor, further)
+    return Offsets(np.concatenate([offsets, np.zeros((*variance.shape, 1))], axis=-1), further)
 
 
 @compiled

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from worldpose.cameras import Camera
 from worldpose.triangulation.array_checks import check_arrays
-from worldpose.triangulation.clocks import CameraClocks, estimate_clocks, moved_in_time
-from worldpose.triangulation.robust import Triangulation, triangulate_joints
+from worldpose.triangulation.clocks import CameraClocks
+from worldpose.triangulation.robust import Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.smoothing import Smoothing, smooth_joints
+from worldpose.triangulation.smoothing import Smoothing
+from worldpose.triangulation.windows import ClipDetections, learn_clip, reconstruct_parts
 
 
 @dataclass(frozen=True)
@@ -55,9 +56,9 @@ def reconstruct_joints(
         InputError: the shapes do not fit together.
     """
     check_arrays(cameras, keypoints, confidence, detection_index, camera_covariance)
-    arrays = (keypoints, confidence, detection_index)
-    clocks = estimate_clocks(cameras, *arrays, fps, settings)
-    if settings.correct_clocks:
-        arrays = moved_in_time(*arrays, clocks.late)
-    joints = triangulate_joints(cameras, *arrays, settings, camera_covariance)
-    return Reconstruction(joints, smooth_joints(cameras, *arrays, joints, fps, settings), clocks)
+    detections = ClipDetections(keypoints, confidence, detection_index)
+    model, detections = learn_clip(cameras, detections, fps, settings, camera_covariance)
+    (whole,) = reconstruct_parts(
+        *(cameras, detections, model, fps, settings, camera_covariance, len(keypoints))
+    )
+    return Reconstruction(whole.triangulation, whole.smoothing, model.clocks)

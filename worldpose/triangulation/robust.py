@@ -3,46 +3,42 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.records import Record
 from worldpose.cameras import Camera
 from worldpose.triangulation.array_checks import check_arrays
 from worldpose.triangulation.calibration_errors import stated_errors
 from worldpose.triangulation.midhip import midhip_shift
 from worldpose.triangulation.noise_model import NoiseModel, learn_noise
 from worldpose.triangulation.observations import Rig
-from worldpose.triangulation.offsets import estimate_offsets
+from worldpose.triangulation.offsets import estimate_offsets, learn_factor
+from worldpose.triangulation.reports import Agreement, Histogram, TriangulationReport
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.solving import Solution, no_shift, solve
 
 Floats = NDArray[np.float64]
 
 
-class TriangulationReport(Record):
-    """How well the views of a clip agree."""
+SAMPLE: Final = 6000
+"""Joints that a clip's detector and calibration are judged by: a class of confidence then has
+thousands of observations."""
 
-    joints: int
-    """Joints found [1]."""
-    undetermined: int
-    """Joints that some camera saw and that are missing all the same [1]."""
-    observations: int
-    """Keypoints of tracked people [1]."""
-    rejected_share: tuple[float | None, ...]
-    """Share of each camera's keypoints, among joints found, that disagree; None without any."""
-    mean_views: float | None
-    """Mean number of agreeing views of the joints found."""
-    reprojection_error_px: float | None
-    """Median over joints [px]."""
-    standard_deviation_m: float | None
-    """Median over joints of the root of the covariance's trace [m]."""
-    noise_factor: float
-    """Median over joints of the learned noise of a confident keypoint over the stated one [1]."""
-    misplacement_m: tuple[float | None, ...]
-    """By how much each camera misplaces people, root mean square per axis at the median person
-    [m]; None where it sees nobody or offsets are off."""
+
+@dataclass(frozen=True, eq=False)
+class DetectorModel:
+    """What a clip shows of its detector and its calibration.
+
+    Attributes:
+        noise: what the detector's errors are taken to be in each pass: without calibration's
+            share, with it, and without the offsets.
+        factor: on the variance that calibration is stated to have.
+    """
+
+    noise: tuple[NoiseModel, ...]
+    factor: float
 
 
 @dataclass(frozen=True)
@@ -64,7 +60,7 @@ class Triangulation:
         calibration_covariance: (frames, persons, 17, 3, 3) [m^2], the part of `covariance` that
             observations of more frames do not lessen: offsets and the shared bias.
         noise: what the detector's errors were taken to be.
-        report: figures for the whole clip.
+        agreement: what `report` is made of.
     """
 
     joints: Floats
@@ -76,7 +72,12 @@ class Triangulation:
     offsets: Floats
     calibration_covariance: Floats
     noise: NoiseModel
-    report: TriangulationReport
+    agreement: Agreement
+
+    @property
+    def report(self) -> TriangulationReport:
+        """The figures of these frames."""
+        return self.agreement.report(self.noise.factor)
 
 
 def triangulate_joints(
@@ -86,11 +87,13 @@ def triangulate_joints(
     detection_index: NDArray[np.int16],
     settings: TriangulationSettings,
     camera_covariance: Floats | None = None,
+    model: DetectorModel | None = None,
 ) -> Triangulation:
     """Return every joint of every tracked person where the views that agree put it.
 
     Each joint is the weighted least-squares point on reprojection over the cameras that agree
-    (`consensus`). Nothing is filled in.
+    (`consensus`). Nothing is filled in, and no frame has a say in another's joints but by the
+    model, which is learned from frames all over the clip.
 
     Args:
         cameras: batch (cameras,).
@@ -101,6 +104,8 @@ def triangulate_joints(
         settings: noise, agreement and least views.
         camera_covariance: (cameras, 12, 12) of steps in the order of
             `static_calibration.parameters.PARAMETERS`; None = not known.
+        model: what `learn_detector` found in the clip that these frames are of; None = these
+            frames are the clip.
 
     Raises:
         InputError: the shapes do not fit together.
@@ -110,42 +115,15 @@ def triangulate_joints(
         observation, exact enough for any residual that can agree.
     """
     check_arrays(cameras, keypoints, confidence, detection_index, camera_covariance)
-    rig, limit = Rig.of(cameras), settings.max_deviation**2
-
-    def modelled(shift: Floats) -> NoiseModel:
-        if not settings.learn_noise:
-            return NoiseModel.stated(confidence.shape[-1])
-        at = (rig, keypoints, confidence, detection_index, shift)
-        return learn_noise(*at, settings.noise, limit)
-
-    def solved(shift: Floats) -> tuple[NoiseModel, Solution]:
-        model = modelled(shift)
-        precision = model.precision(confidence)
-        return model, solve(rig, keypoints, precision, detection_index, shift, settings)
-
-    shift = no_shift()
-    if settings.offsets == "midhip":
-        shift = midhip_shift(rig, keypoints, confidence, detection_index, settings)
-    model, solution = solved(shift)
-    further: Floats | float = 0.0
-    misplaced: tuple[float | None, ...] = (None,) * len(rig.cameras)
-    if camera_covariance is not None and settings.offsets != "midhip":
-        stated = stated_errors(cameras, solution.joints, settings, camera_covariance)
-        # What calibration explains is not the detector's noise, nor a reason to reject a view.
-        shift = np.zeros((*stated.variance.shape, 3))
-        shift[..., 2] = stated.variance
-        model, solution = solved(shift)
-    if settings.offsets == "body":
-        stated = stated_errors(cameras, solution.joints, settings, camera_covariance)
-        at = (rig, keypoints, model.precision(confidence), detection_index)
-        learn = camera_covariance is None
-        found = estimate_offsets(*at, settings.noise, solution, stated.variance, learn)
-        shift, further = found.shift, found.covariance
-        misplaced = stated.misplacement(found.factor)
-        model, solution = solved(shift)
-    offsets = shift[..., :2] if len(shift) else np.zeros((*detection_index.shape, 2))
+    arrays = (keypoints, confidence, detection_index)
+    if model is None and (settings.learn_noise or settings.offsets == "body"):
+        chosen = sample_frames(detection_index.shape, confidence.shape[-1])
+        some = (keypoints[chosen], confidence[chosen], detection_index[chosen])
+        model = learn_detector(cameras, *some, settings, camera_covariance)
+    passes = _passes(cameras, arrays, settings, camera_covariance, model)
+    solution, shift, noise = passes.solution, passes.shift, passes.model.noise[-1]
     lasting = np.broadcast_to(
-        further + settings.common_bias**2 * np.eye(3), solution.covariance.shape
+        passes.further + settings.common_bias**2 * np.eye(3), solution.covariance.shape
     )
     covariance = solution.covariance + lasting
     return Triangulation(
@@ -155,38 +133,109 @@ def triangulate_joints(
         spread=solution.spread,
         reprojection_error=solution.reprojection_error,
         inliers=solution.inliers,
-        offsets=offsets,
+        offsets=shift[..., :2] if len(shift) else np.zeros((*detection_index.shape, 2)),
         calibration_covariance=lasting,
-        noise=model,
-        report=_report(solution, covariance, model, misplaced),
+        noise=noise,
+        agreement=_agreement(solution, covariance, passes.misplaced),
     )
 
 
-def _report(
-    solution: Solution,
-    covariance: Floats,
-    model: NoiseModel,
-    misplaced: tuple[float | None, ...],
-) -> TriangulationReport:
-    """Return the clip's figures from its arrays."""
+def sample_frames(shape: tuple[int, ...], joints: int) -> NDArray[np.int64]:
+    """Return frames all over a clip of `shape` (frames, cameras, persons) to learn from."""
+    frames, _, persons = shape
+    number = min(frames, 1 + SAMPLE // max(1, persons * joints))
+    return np.unique(np.linspace(0, frames - 1, number).astype(np.int64))
+
+
+def learn_detector(
+    cameras: Camera,
+    keypoints: NDArray[np.floating],
+    confidence: NDArray[np.floating],
+    detection_index: NDArray[np.int16],
+    settings: TriangulationSettings,
+    camera_covariance: Floats | None = None,
+) -> DetectorModel:
+    """Return what a sample of a clip's frames shows; arguments as in `triangulate_joints`."""
+    arrays = (keypoints, confidence, detection_index)
+    return _passes(cameras, arrays, settings, camera_covariance, None).model
+
+
+@dataclass(frozen=True, eq=False)
+class _Passes:
+    """The last solution and what led to it."""
+
+    solution: Solution
+    shift: Floats
+    further: Floats | float
+    model: DetectorModel
+    misplaced: tuple[Histogram, ...]
+
+
+def _passes(
+    cameras: Camera,
+    arrays: tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.int16]],
+    settings: TriangulationSettings,
+    camera_covariance: Floats | None,
+    known: DetectorModel | None,
+) -> _Passes:
+    """Solve, and solve again with what that tells of calibration and of offsets."""
+    keypoints, confidence, index = arrays
+    rig, limit = Rig.of(cameras), settings.max_deviation**2
+    models: list[NoiseModel] = []
+
+    def solved(shift: Floats) -> Solution:
+        if known is not None:
+            models.append(known.noise[len(models)])
+        elif settings.learn_noise:
+            at = (rig, keypoints, confidence, index, shift)
+            models.append(learn_noise(*at, settings.noise, limit))
+        else:
+            models.append(NoiseModel.stated(confidence.shape[-1]))
+        precision = models[-1].precision(confidence)
+        return solve(rig, keypoints, precision, index, shift, settings)
+
+    shift = no_shift()
+    if settings.offsets == "midhip":
+        shift = midhip_shift(rig, keypoints, confidence, index, settings)
+    solution = solved(shift)
+    further: Floats | float = 0.0
+    misplaced = (Histogram.of(np.empty(0)),) * len(rig.cameras)
+    factor = 1.0 if known is None else known.factor
+    if camera_covariance is not None and settings.offsets != "midhip":
+        stated = stated_errors(cameras, solution.joints, settings, camera_covariance)
+        # What calibration explains is not the detector's noise, nor a reason to reject a view.
+        shift = np.zeros((*stated.variance.shape, 3))
+        shift[..., 2] = stated.variance
+        solution = solved(shift)
+    if settings.offsets == "body":
+        stated = stated_errors(cameras, solution.joints, settings, camera_covariance)
+        at = (rig, keypoints, models[-1].precision(confidence), index, settings.noise, solution)
+        if known is None and camera_covariance is None:
+            factor = learn_factor(*at, stated.variance)
+        found = estimate_offsets(*at, factor * stated.variance)
+        shift, further = found.shift, found.covariance
+        misplaced = stated.misplaced(factor)
+        solution = solved(shift)
+    model = DetectorModel(tuple(models), factor)
+    return _Passes(solution, shift, further, model, misplaced)
+
+
+def _agreement(
+    solution: Solution, covariance: Floats, misplaced: tuple[Histogram, ...]
+) -> Agreement:
+    """Return how well the views of some frames agree."""
     views, seen = solution.views, solution.seen
     found = views > 0
     used = seen & found[:, None]
-    observations = used.sum(axis=(0, 2, 3)).tolist()
-    agreed = solution.inliers.sum(axis=(0, 2, 3)).tolist()
     trace = np.trace(covariance[found], axis1=-2, axis2=-1)
-    some = bool(found.any())
-    error = solution.reprojection_error[found]
-    return TriangulationReport(
-        joints=int(found.sum()),
+    return Agreement(
+        found=int(found.sum()),
         undetermined=int((seen.any(axis=1) & ~found).sum()),
-        observations=int(seen.sum()),
-        rejected_share=tuple(
-            1.0 - a / n if n else None for a, n in zip(agreed, observations, strict=True)
-        ),
-        mean_views=float(views[found].mean()) if some else None,
-        reprojection_error_px=float(np.median(error)) if some else None,
-        standard_deviation_m=float(np.median(np.sqrt(trace))) if some else None,
-        noise_factor=float(np.median(np.sqrt(model.joint / model.precision_at[-1]))),
-        misplacement_m=misplaced,
+        seen=int(seen.sum()),
+        views=int(views[found].sum(dtype=np.int64)),
+        used=used.sum(axis=(0, 2, 3)),
+        agreed=solution.inliers.sum(axis=(0, 2, 3)),
+        error=Histogram.of(solution.reprojection_error[found]),
+        deviation=Histogram.of(np.sqrt(trace)),
+        misplaced=misplaced,
     )

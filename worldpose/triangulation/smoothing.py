@@ -7,30 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.records import Record
 from worldpose.cameras import Camera
-from worldpose.triangulation.motion_model import MotionModel, learn_motion
+from worldpose.triangulation.motion_model import MotionModel, choose_stretches, learn_motion
 from worldpose.triangulation.observations import Rig, person_observations
+from worldpose.triangulation.reports import Changes, Histogram, SmoothingReport
 from worldpose.triangulation.robust import Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.track_solver import solve_segment
 
 Floats = NDArray[np.float64]
-
-
-class SmoothingReport(Record):
-    """What smoothing did to a clip."""
-
-    filled: int
-    """Joints filled in [1]."""
-    filled_share: float | None
-    """Share of them in all joints; None without any."""
-    acceleration_m_s2: float
-    """Median over joints of the acceleration that was taken for usual [m/s^2]."""
-    repeated: float
-    """Frames of observations whose errors count as one [1]: they are alike for a while."""
-    moved_m: float | None
-    """Median distance between smoothed and triangulated joints [m]."""
 
 
 @dataclass(frozen=True)
@@ -43,14 +28,19 @@ class Smoothing:
         filled: (frames, persons, 17) bool, not triangulated in this frame but between two that
             are.
         motion: what was taken for usual motion.
-        report: figures for the whole clip.
+        changes: what `report` is made of.
     """
 
     joints: Floats
     covariance: Floats
     filled: NDArray[np.bool_]
     motion: MotionModel
-    report: SmoothingReport
+    changes: Changes
+
+    @property
+    def report(self) -> SmoothingReport:
+        """The figures of these frames."""
+        return self.changes.report(self.motion.acceleration, self.motion.repeated)
 
 
 def smooth_joints(
@@ -61,6 +51,8 @@ def smooth_joints(
     raw: Triangulation,
     fps: float,
     settings: TriangulationSettings,
+    motion: MotionModel | None = None,
+    core: slice = slice(None),
 ) -> Smoothing:
     """Return joints that fit the observations of their whole track with little acceleration.
 
@@ -75,12 +67,20 @@ def smooth_joints(
         raw: of the same arrays; its noise and offsets are used.
         fps: frames per second [1/s].
         settings: noise and the longest gap.
+        motion: what is usual in the clip that these frames are of; None = they are the clip.
+        core: frames to return; the others only lend them support.
     """
     rig = Rig.of(cameras)
     precision = raw.noise.precision(confidence)
     joints, covariance = np.full_like(raw.joints, np.nan), np.full_like(raw.covariance, np.nan)
     arrays = (keypoints, precision, detection_index, raw.offsets)
-    motion = learn_motion(rig, arrays, raw, fps, settings)
+    if motion is None:
+        chosen = choose_stretches(np.asarray(raw.views.any(axis=-1)), fps)
+        stretches = (
+            (*person_observations(arrays, person, part), raw.joints[part, person])
+            for person, part in chosen
+        )
+        motion = learn_motion(rig, stretches, raw.joints.shape[2], fps, settings)
     penalty = (fps**2 / motion.acceleration) ** 2
     gap = round(settings.max_gap * fps)
     limit = settings.max_deviation**2
@@ -102,17 +102,12 @@ def smooth_joints(
                     if good
                     else raw.covariance[part, person, joint]
                 )
-    there, triangulated = np.isfinite(joints[..., 0]), np.isfinite(raw.joints[..., 0])
+    joints, covariance, given = joints[core], covariance[core], raw.joints[core]
+    there, triangulated = np.isfinite(joints[..., 0]), np.isfinite(given[..., 0])
     filled = there & ~triangulated
-    moved = np.linalg.norm(joints - raw.joints, axis=-1)[there & triangulated]
-    report = SmoothingReport(
-        filled=int(filled.sum()),
-        filled_share=float(filled.sum() / there.sum()) if there.any() else None,
-        acceleration_m_s2=float(np.median(motion.acceleration)),
-        repeated=motion.repeated,
-        moved_m=float(np.median(moved)) if len(moved) else None,
-    )
-    return Smoothing(joints, covariance, filled, motion, report)
+    moved = np.linalg.norm(joints - given, axis=-1)[there & triangulated]
+    changes = Changes(int(there.sum()), int(filled.sum()), Histogram.of(moved))
+    return Smoothing(joints, covariance, filled, motion, changes)
 
 
 def segments(there: NDArray[np.bool_], gap: int) -> list[slice]:

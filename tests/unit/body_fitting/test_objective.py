@@ -23,7 +23,7 @@ def track():
     contacts = Contacts(np.ones((5, 2)), np.ones((4, 2)), np.full((5, 2), 0.07))
     evidence = Evidence.of(joints[:, 0], covariance[:, 0], 50.0, settings)
     chained = ChainedKeypoints.of(KEYPOINTS)
-    made = Track(chained, evidence, load_pose_prior(), settings, 50.0, 10.0, contacts)
+    made = Track(chained, evidence, load_pose_prior(), settings, 50.0, 10.0, 0.03, contacts)
     angles = truth.body_pose @ GATHER.T + 0.1 * rng.standard_normal((5, 30))
     pose = Pose(truth.transl + 0.01, truth.global_orient, angles, truth.betas[0])
     return made, pose

@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
+from worldpose.static_calibration.bar_fits import fit_bars
 from worldpose.static_calibration.edges import (
     CANDIDATES,
     brightness,
     find_bars,
-    fit_bars,
-    median_picture,
 )
 
 
@@ -28,18 +27,16 @@ def bars(middle, width, *, left=80.0, right=80.0, paint=200.0, shape=(40, 80)):
 def found(picture, x, width, reach=10.0, contrast=6.0):
     offsets, strengths = np.empty((1, CANDIDATES)), np.empty((1, CANDIDATES))
     place, normal = np.array([[x, 20.0]]), np.array([[1.0, 0.0]])
-    find_bars(
-        picture, place, normal, np.array([width]), np.array([reach]), contrast, offsets, strengths
-    )
+    bar = np.array([width]), np.zeros(1)
+    find_bars(picture, place, normal, *bar, np.array([reach]), contrast, offsets, strengths)
     return offsets[0]
 
 
-def fitted(picture, x, width, start, contrast=6.0):
+def fitted(picture, x, width, start, contrast=6.0, curvature=0.0):
     offset, variance = np.empty(1), np.empty(1)
     place, normal = np.array([[x, 20.0]]), np.array([[1.0, 0.0]])
-    fit_bars(
-        picture, place, normal, np.array([width]), np.array([start]), contrast, offset, variance
-    )
+    bar = np.array([width]), np.array([curvature])
+    fit_bars(picture, place, normal, *bar, np.array([start]), contrast, offset, variance)
     return offset[0], variance[0]
 
 
@@ -60,6 +57,21 @@ def test_middle_of_a_bar_is_found_whatever_its_width(width, middle):
 def test_width_that_is_wrong_moves_no_middle(slip):
     offset, _ = fitted(bars(40.3, 3.0), 39.0, 3.0 + slip, 1.0)
     assert abs(39.0 + offset - 40.3) < 0.05  # as with the right width
+
+
+def test_middle_of_a_curved_bar_is_found():
+    # A ring of radius 8 around (32, 20), drawn eight times as large and averaged.
+    y, x = np.mgrid[0:320, 0:640] / 8.0 - 0.4375
+    far = np.abs(np.hypot(x - 32.0, y - 20.0) - 8.0)
+    fine = (80.0 + 120.0 * (far < 1.0)).astype(np.float32)
+    ring = cv2.resize(fine, (80, 40), interpolation=cv2.INTER_AREA)
+    ring = np.rint(cv2.GaussianBlur(ring, (0, 0), 0.7)).astype(np.uint8)
+    straight, _ = fitted(ring, 40.0, 2.0, 0.0)
+    along, _ = fitted(ring, 40.0, 2.0, 0.0, curvature=-1.0 / 8.0)
+    # Two pixels to either side the ring is a quarter of a pixel inside its tangent, and blur draws
+    # it 0.035 px inwards; of the third order 0.02 px are left.
+    assert straight < -0.12
+    assert abs(along) < 0.04
 
 
 def test_grass_of_two_shades_moves_no_middle():
@@ -124,20 +136,6 @@ def test_variance_is_that_of_the_offsets():
     )
     # 300 draws give a variance to 8 %, and the fit's rest holds the lens's misfit besides noise.
     assert 0.6 < fits[:, 0].var() / fits[:, 1].mean() < 1.5
-
-
-def test_median_of_pictures_is_without_who_passes():
-    grass = np.full((20, 30, 3), 90, dtype=np.uint8)
-    pictures = [grass.copy() for _ in range(5)]
-    for index, picture in enumerate(pictures):
-        picture[5:15, 5 * index : 5 * index + 5] = 200
-    assert (median_picture(pictures) == grass).all()
-
-
-def test_median_of_nothing_or_of_two_sizes_is_refused():
-    for pictures in ([], [np.zeros((4, 4), np.uint8), np.zeros((4, 5), np.uint8)]):
-        with pytest.raises(InputError, match="one size"):
-            median_picture(pictures)
 
 
 def test_brightness_is_luma_of_rgb():

@@ -6,12 +6,14 @@ from functools import cache
 import numpy as np
 import pytest
 
+from data_contracts.pitch import PitchSpec
 from worldpose.cameras import Camera
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration.clearance import clear, whites_of
 from worldpose.static_calibration.line_adjustment import adjust
 from worldpose.static_calibration.line_refinement import refine_on_lines
-from worldpose.static_calibration.line_samples import apart, sample_markings, see_lines
+from worldpose.static_calibration.line_samples import sample_markings, see_lines
 from worldpose.static_calibration.line_search import difference
 from worldpose.static_calibration.parameters import CameraEstimate, stepped
 from worldpose.synthetic.rendering import RenderingSettings, render_pitch
@@ -183,30 +185,69 @@ def test_derivatives_of_samples_are_those_of_projection():
         assert seen.by_camera[here, parameter] == pytest.approx(slope[here], rel=1e-4, abs=1e-3)
 
 
-def test_paint_unknowns_move_samples_as_surveyed_points_do():
-    view = camera()
+def test_paint_moves_as_its_surveyed_points_do():
+    spec, view = PitchSpec(), camera()
     samples = sample_markings(PITCH, 1.0)
     seen = see_lines(view, samples, 0.12, 1.0, 1.0)
-    mine = seen.visible & (samples.marking == samples.names.index("penalty_area_left_front"))
-    share = np.linspace(0.0, 1.0, int((samples.marking == samples.marking[mine][0]).sum()))
-    share = share[mine[samples.marking == samples.marking[mine][0]]]
-    # The line runs along y: its start moved by 1 mm along x, across it.
-    shift = np.zeros((int(mine.sum()), 3))
-    shift[:, 0] = 1e-3 * (1.0 - share)
-    points = samples.points_world[mine]
-    moved = ((view.project(points + shift) - view.project(points)) * seen.normals[mine]).sum(-1)
-    sign = np.sign(samples.across_world[mine][0, 0])
-    # The width of 0.12 m stands for the slope: the second order is a part in ten thousand.
-    assert 1e-3 * sign * seen.by_paint[mine, 0] == pytest.approx(moved, rel=2e-3, abs=1e-5)
+    names = list(PITCH.points)
+    # A corner holds one end of two lines, the centre mark an arc.
+    for point in ("penalty_area_left_near_front", "penalty_mark_left"):
+        for axis in range(3):
+            place = PITCH.points[point].copy()
+            place[axis] += 1e-3
+            points = {point: tuple(float(value) for value in place)}
+            other = PitchTemplate.from_spec(spec.model_copy(update={"points": points}))
+            moved = view.project(other.sample_lines(1.0).points_world) - seen.places
+            moved = (moved * seen.normals).sum(-1)[seen.visible]
+            mine = seen.unknowns == 3 * names.index(point) + axis
+            told = 1e-3 * np.where(mine, seen.by_paint, 0.0).sum(axis=1)[seen.visible]
+            assert np.abs(moved).max() > 1e-4
+            # A moved line also follows the crown: 3 cm in a metre of the far ends, of a millimetre.
+            assert told == pytest.approx(moved, rel=2e-3, abs=5e-5)
 
 
-def test_samples_near_other_markings_are_left_out():
+def test_curvature_is_that_of_the_projected_arc():
+    view = camera()
+    samples = sample_markings(PITCH, 0.1)
+    seen = see_lines(view, samples, 0.12, 0.0, 0.0)
+    arc = seen.visible & (samples.marking == samples.names.index("penalty_arc_left"))
+    index = np.flatnonzero(arc)[5:-5:20]
+    assert len(index) > 3
+    for i in index:
+        before, here, after = seen.places[i - 4], seen.places[i], seen.places[i + 4]
+        sides = np.linalg.norm([after - here, here - before, after - before], axis=1)
+        # The circle through three points: four times the area over the product of the sides.
+        area = np.linalg.det(np.stack([after - here, before - here])) / 2.0
+        radius = sides.prod() / (4.0 * abs(area))
+        assert abs(seen.curvatures[i]) == pytest.approx(1.0 / radius, rel=0.02)
+        inwards = (before + after - 2.0 * here) @ seen.normals[i]
+        assert np.sign(seen.curvatures[i]) == np.sign(inwards)
+    straight = samples.marking < len(PITCH.lines)
+    assert (seen.curvatures[straight] == 0.0).all()
+
+
+def test_samples_near_other_markings_and_the_goal_are_left_out():
+    # From behind the goal the crossbar crosses the goal area's front in the picture only.
+    view = replace(
+        camera(),
+        cam_from_world=looking(np.array([-68.0, 3.0, 9.28]), np.array([-44.0, 0.0, 0.0]), 0.0),
+    )
     samples = sample_markings(PITCH, 0.2)
-    clear = apart(samples, np.arange(len(samples.points_world)))
-    left = samples.points_world[clear]
-    for name in ("corner_left_near", "penalty_area_left_near_front", "penalty_arc_left_far"):
-        assert np.linalg.norm(left - PITCH.points[name], axis=-1).min() > 0.25
-    assert len(clear) > 0.9 * len(samples.points_world)
+    seen = see_lines(view, samples, 0.12, 0.0, 0.0)
+    alone = clear(
+        view, whites_of(PITCH), 0.06, seen.places, 0.5 * seen.widths + 4.0, samples.marking
+    )
+    bar = view.project(PITCH.marking_points("crossbar_left", 0.02))
+    visible = np.flatnonzero(seen.visible)
+    near = np.array([np.linalg.norm(bar - seen.places[i], axis=1).min() < 4.0 for i in visible])
+    assert near.sum() >= 2
+    assert not alone[visible[near]].any()
+    corner = view.project(PITCH.positions(["penalty_area_left_near_front"]))
+    away = np.linalg.norm(seen.places - corner, axis=1)
+    assert not alone[away < 4.0].any()
+    front = seen.visible & (samples.marking == samples.names.index("penalty_area_left_front"))
+    # All but where the penalty arc ends and at the corners.
+    assert alone[front].mean() > 0.9
 
 
 def test_thousand_samples_of_one_line_tell_no_more_than_its_survey():
@@ -217,7 +258,7 @@ def test_thousand_samples_of_one_line_tell_no_more_than_its_survey():
         np.full(count, 0.01),
         rows,
         paint,
-        np.zeros(count, np.int64),
+        np.zeros((count, 1), np.int64),
         (np.array([[1e-9]]), np.zeros(1)),
         (np.inf,),
     )
@@ -233,7 +274,7 @@ def test_outliers_lose_their_pull():
         np.full(85, 0.01),
         np.ones((85, 1)),
         np.zeros((85, 1)),
-        np.zeros(85, np.int64),
+        np.zeros((85, 1), np.int64),
         (np.array([[1e-9]]), np.zeros(1)),
         (np.inf, 50.0, 20.0, 8.0, 3.0, 3.0),
     )

@@ -121,6 +121,19 @@ def test_text_that_is_a_value_counts(tree: Path) -> None:
     assert edited(tree, "worldpose/late.py", "one", "two") == {"worldpose.late"}
 
 
+def test_a_data_file_that_a_module_names_counts(tree: Path) -> None:
+    (tree / "worldpose/late.py").write_text("PRIOR = 'prior.npz'")
+    (tree / "worldpose/prior.npz").write_bytes(b"one")
+    (tree / "worldpose/unnamed.npz").write_bytes(b"one")
+    before = version_of(tree)
+    assert "worldpose.late:prior.npz" in before
+    (tree / "worldpose/unnamed.npz").write_bytes(b"two")
+    assert version_of(tree) == before
+    (tree / "worldpose/prior.npz").write_bytes(b"two")
+    after = version_of(tree)
+    assert {name for name in after if after[name] != before[name]} == {"worldpose.late:prior.npz"}
+
+
 def test_version_is_read_once_per_process(tree: Path) -> None:
     before = version_of(tree)
     (tree / "worldpose/late.py").write_text("changed = True")

@@ -1,0 +1,145 @@
+"""What people click in a clip's key frames, and the result of stage `broadcast_calibration`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from data_contracts.arrays import ArrayLayout, GroupLayout
+from data_contracts.cameras import CAMERA_LABELS
+from data_contracts.observations import FRAME
+from data_contracts.records import CONTRACT_VERSION, Record
+from data_contracts.static_calibration import ClickedMarkings
+
+
+class KeyFrame(Record):
+    """One picked frame of a clip."""
+
+    frame: int = Field(ge=0)
+    """Number in the video, from 0."""
+    markings: ClickedMarkings
+    """Points and drawn markings of its picture."""
+
+
+class KeyFrames(Record):
+    """annotations/broadcast_calibration/<clip>.json: everything clicked in one clip (M2)."""
+
+    contract: Literal[1] = CONTRACT_VERSION
+    key_frames: tuple[KeyFrame, ...] = Field(min_length=1)
+    """In rising order, each frame once."""
+
+
+FRAME_STEP = ("rx", "ry", "rz", "log_focal", "k1", "k2", "k3")
+"""A small change of one frame's camera: rotation about its center in its own axes [rad], the
+logarithm of the focal length, radial distortion [1]."""
+
+CLIP_STEP = ("x", "y", "z", "cx", "cy")
+"""A small change of what all frames share: center, world [m], and principal point [px]."""
+
+FRAME_STATUS = ("missing", "bridged", "followed", "players", "lines", "key_frame")
+"""What a frame's camera rests on, the best of it: nothing, and there is no camera; neighbouring
+frames alone; motion of the background; players; painted lines found in the picture; clicks."""
+
+
+def _by_frame(
+    name: str, dims: tuple[str, ...], unit: str, about: str, missing: Literal["nan"] = "nan"
+) -> ArrayLayout:
+    return ArrayLayout(
+        name=name,
+        dims=("frame", *dims),
+        dtype="float64",
+        unit=unit,
+        missing=missing,
+        about=about,
+        chunk_dim="frame",
+    )
+
+
+def _counted(name: str, about: str) -> ArrayLayout:
+    return ArrayLayout(
+        name=name, dims=("frame",), dtype="int32", unit="1", missing="0", about=about
+    )
+
+
+BROADCAST_CALIBRATION = GroupLayout(
+    stage="broadcast_calibration",
+    about="The broadcast camera in every frame of a clip, how well it is known and why.",
+    coordinates=(FRAME,),
+    arrays=(
+        _by_frame("focal", ("axis",), "px", "focal lengths fx, fy"),
+        _by_frame("principal_point", ("axis",), "px", "principal point, one for the clip"),
+        _by_frame("distortion", ("coefficient",), "1", "k1, k2, p1, p2, k3 in OpenCV's order"),
+        _by_frame("rotation", ("cam_coordinate", "coordinate"), "1", "R in x_cam = R x_world + t"),
+        _by_frame("translation", ("cam_coordinate",), "m", "t in x_cam = R x_world + t"),
+        ArrayLayout(
+            name="image_size",
+            dims=("axis",),
+            dtype="int64",
+            unit="px",
+            missing="none",
+            about="width, height",
+        ),
+        ArrayLayout(
+            name="center",
+            dims=("coordinate",),
+            dtype="float64",
+            unit="m",
+            missing="none",
+            about="the camera's place, world, one for the clip",
+        ),
+        _by_frame(
+            "covariance",
+            ("parameter", "parameter_"),
+            "1",
+            "covariance of a step of the frame's camera, in the units of its parameters; zero for "
+            "parameters that were not solved for",
+        ),
+        ArrayLayout(
+            name="clip_covariance",
+            dims=("clip_parameter", "clip_parameter_"),
+            dtype="float64",
+            unit="1",
+            missing="none",
+            about="covariance of what all frames share",
+        ),
+        ArrayLayout(
+            name="status",
+            dims=("frame",),
+            dtype="uint8",
+            unit="1",
+            missing="0",
+            about="what the frame's camera rests on, a number of the attribute `status_names`",
+        ),
+        _by_frame(
+            "reprojection_error",
+            (),
+            "px",
+            "expected error of where a player stands in the picture, root mean square over the "
+            "seen pitch",
+        ),
+        _by_frame("marking_rms", (), "px", "of painted lines found, across them"),
+        _by_frame("player_rms", (), "px", "of the keypoints of matched players"),
+        _counted("marking_count", "samples of painted lines that the frame rests on"),
+        _counted("player_count", "players matched with people of the static cameras"),
+        _counted("flow_count", "points followed from this frame to the next"),
+    ),
+    labels={
+        **CAMERA_LABELS,
+        "parameter": FRAME_STEP,
+        "parameter_": FRAME_STEP,
+        "clip_parameter": CLIP_STEP,
+        "clip_parameter_": CLIP_STEP,
+    },
+    attributes={
+        "clip_id": "clip of the match",
+        "status_names": "meanings of `status`",
+        "key_frames": "frames that were clicked and used",
+        "refused_key_frames": "frames that were clicked and could not be used, and why",
+        "weights": "weights and noise of the terms, and the rule that each follows",
+        "drift": "by how much tracking from one key frame missed the next [px], by gap",
+        "pick_next": "frames whose clicks would help most, the best first",
+        "decisions": "what was chosen, and the figures that decided",
+        "reasons": "why a person must look at it; empty where nobody must",
+    },
+)

@@ -1,0 +1,12 @@
+"""Result of stage `retriangulation`: the arrays of `triangulation`, from adjusted cameras."""
+
+from __future__ import annotations
+
+from data_contracts.triangulation import TRIANGULATION
+
+RETRIANGULATION = TRIANGULATION.model_copy(
+    update={
+        "stage": "retriangulation",
+        "about": "3D joints of every person placed again with the adjusted cameras.",
+    }
+)

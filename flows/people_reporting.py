@@ -1,0 +1,116 @@
+"""What the page about a run says of adjusted cameras and of fitted bodies."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from data_contracts.conventions import COCO17
+from flows.release import ADJUSTED
+from worldpose.release.meanings import shown_number
+from worldpose.release.report import Table
+from worldpose.store import Run
+
+MOST = 20
+"""Rows of the lists of what disagrees: the worst."""
+
+
+def adjustment_tables(run: Run) -> list[Table]:
+    """Markings and people side by side, camera by camera, and what disagrees after adjustment."""
+    if ADJUSTED not in run:
+        return []
+    result = run[ADJUSTED]
+    names = [str(name) for name in result["camera"].values]
+    rows = []
+    for c, name in enumerate(names):
+        marking, people = result["marking_error"].values[c], result["held_out_error"].values[c]
+        rows.append(
+            (
+                name,
+                *(_number(value) for value in (*marking, *people)),
+                str(int(result["judges"].values[c])),
+                str(result.attrs["reasons"][c]),
+                str(result.attrs["weak"][c]),
+            )
+        )
+    cameras = Table(
+        "Bundle adjustment: clicked markings and left-out people",
+        (
+            "camera",
+            ">markings before px",
+            ">after px",
+            ">people before px",
+            ">after px",
+            ">judging keypoints",
+            "changed?",
+            "known least",
+        ),
+        tuple(rows),
+    )
+    return [table for table in (cameras, _clicks(result, names), _people(result, names)) if table]
+
+
+def _clicks(result: xr.Dataset, names: list[str]) -> Table | None:
+    rows = [
+        (
+            names[int(result["click_camera"].values[k])],
+            str(result["click"].values[k]),
+            _number(float(np.linalg.norm(result["click_residual"].values[k]))),
+            _number(float(result["click_surprise"].values[k])),
+        )
+        for k in np.flatnonzero(result["click_wrong"].values)[:MOST]
+    ]
+    if not rows:
+        return None
+    columns = ("camera", "marking", ">off px", ">standard deviations")
+    return Table("Clicks to look at: proposed for removal", columns, tuple(rows))
+
+
+def _people(result: xr.Dataset, names: list[str]) -> Table | None:
+    count = int(result.attrs["outliers_found"])
+    frame, camera, person, joint, surprise = (
+        result[f"outlier_{name}"].values[:MOST]
+        for name in ("frame", "camera", "person", "joint", "surprise")
+    )
+    if not len(frame):
+        return None
+    rows = tuple(
+        (
+            str(int(frame[k])),
+            names[int(camera[k])],
+            str(int(person[k])),
+            "most of the person" if joint[k] < 0 else COCO17[int(joint[k])].replace("_", " "),
+            _number(float(surprise[k])),
+        )
+        for k in range(len(frame))
+    )
+    columns = (">frame", "camera", ">person", "joint", ">standard deviations")
+    return Table(f"Keypoints that disagree: the first of {count}", columns, rows)
+
+
+def body_tables(run: Run, clips: tuple[str, ...]) -> list[Table]:
+    """Figures of every fitted person, clip by clip."""
+    tables = []
+    for clip in clips:
+        unit = f"body_fitting/{clip}"
+        if unit not in run:
+            continue
+        figures = run.record.figures.get(unit, {})
+        persons = [int(person) for person in run[unit]["person"].values]
+        columns = dict.fromkeys(
+            name.rpartition(".person")[0] for name in figures if ".person" in name
+        )
+        rows = tuple(
+            (
+                str(person),
+                *(_number(figures.get(f"{name}.person{person}", np.nan)) for name in columns),
+            )
+            for person in persons
+        )
+        titles = (f">{name.replace('_', ' ')}" for name in columns)
+        tables.append(Table(f"Bodies of clip {clip}", (">person", *titles), rows))
+    return tables
+
+
+def _number(value: float) -> str:
+    return shown_number(value) if np.isfinite(value) else "-"

@@ -1,0 +1,167 @@
+"""Task of stage `bundle_adjustment`: all static cameras of a match adjusted together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
+from data_contracts.pitch import PitchSpec
+from data_contracts.run import Work
+from tasks.clip_inputs import open_frames
+from tasks.triangulation import settings_before
+from tasks.unit import open_input, unit_task
+from worldpose.bundle_adjustment import (
+    BundleAdjustment,
+    BundleAdjustmentSettings,
+    Clicks,
+    Clip,
+    adjust_cameras,
+    adjustment_arrays,
+)
+from worldpose.cameras import Camera
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration import PARAMETERS
+from worldpose.store import Store
+
+
+@unit_task
+def bundle_adjustment(work: Work) -> str:
+    """Publishes the cameras and what disagrees with them; returns the key."""
+    store = Store.open(work.project)
+    settings = BundleAdjustmentSettings.model_validate(work.recipe.settings)
+    with store.publishing(work) as result:
+        people = _open_people(store, work, settings)
+        adjusted = adjust_cameras(_open_clip(store, work, people), settings)
+        arrays, attributes = adjustment_arrays(adjusted, settings, people.person)
+        camera_ids = list(work.recipe.sources["cameras"])
+        result.write(
+            BUNDLE_ADJUSTMENT, arrays=arrays, attributes={"camera": camera_ids, **attributes}
+        )
+        result.figures.update(_figures(adjusted))
+    return work.key
+
+
+@dataclass(frozen=True)
+class _People:
+    """Everybody in some frames of all clips.
+
+    Attributes:
+        frame: (frames,) match frames, clip by clip.
+        fps: of them a second.
+        person: (persons,) ids; one id in two clips need not be one person, and nothing here takes
+            them for one.
+        detection_index: (frames, cameras, persons).
+        joints: (frames, persons, 17, 3) [m], world.
+        views: (frames, persons, 17).
+    """
+
+    frame: NDArray[np.int64]
+    fps: float
+    person: NDArray[np.int64]
+    detection_index: NDArray[np.int64]
+    joints: NDArray[np.float64]
+    views: NDArray[np.int64]
+
+
+def _open_people(store: Store, work: Work, settings: BundleAdjustmentSettings) -> _People:
+    """Tracked and placed people in evenly spread frames, and in those a person chose."""
+    sources = work.recipe.sources
+    whole = {
+        clip: np.arange(first, first + count) for clip, (first, count) in sources["clips"].items()
+    }
+    stride = -(-sum(map(len, whole.values())) // settings.candidates)
+    frames = {
+        clip: every[(np.arange(len(every)) % stride == 0) | np.isin(every, settings.chosen_frames)]
+        for clip, every in sorted(whole.items(), key=lambda item: item[1][0])
+    }
+    tracked = [
+        open_input(store, work, f"tracking/{clip}").sel(frame=frame)
+        for clip, frame in frames.items()
+    ]
+    placed = [
+        open_input(store, work, f"triangulation/{clip}").sel(frame=frame)
+        for clip, frame in frames.items()
+    ]
+    person = np.unique(np.concatenate([tracks["person"].values for tracks in tracked]))
+    frame = np.concatenate(list(frames.values()))
+    count = len(sources["cameras"])
+    people = _People(
+        frame=frame,
+        fps=float(sources["fps"]) / stride,
+        person=person,
+        detection_index=np.full((len(frame), count, len(person)), -1),
+        joints=np.full((len(frame), len(person), 17, 3), np.nan),
+        views=np.zeros((len(frame), len(person), 17), dtype=np.int64),
+    )
+    last = 0
+    for tracks, joints in zip(tracked, placed, strict=True):
+        rows = np.arange(last, last := last + tracks.sizes["frame"])[:, None]
+        columns = np.searchsorted(person, tracks["person"].values)
+        people.detection_index[rows, :, columns] = (
+            tracks["detection_index"].transpose("frame", "person", "camera").values
+        )
+        people.joints[rows, columns] = joints["joints"].values
+        people.views[rows, columns] = joints["views"].values
+    return people
+
+
+def _open_clip(store: Store, work: Work, people: _People) -> Clip:
+    """The cameras as calibrated, what was clicked in them, and what they saw of `people`."""
+    sources = work.recipe.sources
+    opened = open_frames(store, work, people.frame)
+    pitch = sources["pitch"]
+    template = None if pitch is None else PitchTemplate.from_spec(PitchSpec.model_validate(pitch))
+    known = [
+        open_input(store, work, f"static_calibration/{camera}") for camera in opened.camera_ids
+    ]
+    return Clip(
+        cameras=opened.cameras,
+        covariance=np.stack([_covariance(camera) for camera in known]),
+        clicks=tuple(
+            _clicks(camera, opened.cameras[c], template) for c, camera in enumerate(known)
+        ),
+        frame=people.frame,
+        fps=people.fps,
+        keypoints=opened.keypoints,
+        confidence=opened.confidence,
+        detection_index=people.detection_index,
+        joints=people.joints,
+        views=people.views,
+        triangulation=settings_before(store, work, next(iter(sources["clips"]))),
+    )
+
+
+def _covariance(known: xr.Dataset) -> NDArray[np.float64]:
+    """The covariance of a calibrated camera; zero of a given one."""
+    if "covariance" not in known:
+        return np.zeros((len(PARAMETERS), len(PARAMETERS)))
+    return np.asarray(known["covariance"].values)
+
+
+def _clicks(known: xr.Dataset, camera: Camera, pitch: PitchTemplate | None) -> Clicks:
+    """What was clicked, from where the camera projects it and how far off that is."""
+    if pitch is None or "point_residual" not in known:
+        return Clicks.none()
+    names = tuple(str(name) for name in known["point"].values)
+    places = pitch.positions(names)
+    pixels = camera.project(places) - known["point_residual"].values
+    return Clicks(names, places, pixels, known["point_inlier"].values)
+
+
+def _figures(adjusted: BundleAdjustment) -> dict[str, float]:
+    """Figures of the adjustment."""
+    figures = {
+        "cameras_changed": float(adjusted.accepted.sum()),
+        "cameras_refused": float((~adjusted.accepted).sum()),
+        "noise_scale": adjusted.noise.scale,
+        "noise_correlation": adjusted.noise.correlation,
+    }
+    error = adjusted.verdict.error
+    if np.isfinite(error).any():
+        figures["held_out_error_before_px"] = float(np.nanmedian(error[:, 0]))
+        figures["held_out_error_after_px"] = float(np.nanmedian(error[:, 1]))
+    return figures

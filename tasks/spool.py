@@ -1,0 +1,49 @@
+"""Arrays too long for memory, laid down on disk a stretch of frames at a time."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.store import Store
+
+
+class Spool:
+    """Arrays by name in a scratch folder, each longer by every stretch that is added."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._form: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
+
+    def add(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Append a stretch; frames are the first dimension."""
+        for name, values in arrays.items():
+            frames = self._form[name][1][0] if name in self._form else 0
+            with (self._folder / name).open("ab") as file:
+                np.ascontiguousarray(values).tofile(file)
+            self._form[name] = (values.dtype, (frames + len(values), *values.shape[1:]))
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All that was added, read from disk when it is used."""
+        return {
+            name: np.memmap(self._folder / name, dtype, "r", shape=shape)
+            if np.prod(shape)
+            else np.empty(shape, dtype)
+            for name, (dtype, shape) in self._form.items()
+        }
+
+
+@contextmanager
+def spooling(store: Store) -> Iterator[Spool]:
+    """A spool beside the results under way, where there is room for them; gone afterwards."""
+    folder = store.blobs.staging()
+    try:
+        yield Spool(folder)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,76 @@
+"""Shape and the detector's offsets: neither drifts for the length of a clip."""
+
+import numpy as np
+import pytest
+from walking_bodies import KEYPOINTS, MODEL, seen, walker
+
+from worldpose.body.jacobian import ChainedKeypoints
+from worldpose.body_fitting.bones import Shape
+from worldpose.body_fitting.pose_space import load_pose_prior
+from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.body_fitting.shaping import fit_shapes
+from worldpose.body_fitting.solving import Solver
+
+SETTINGS = BodyFittingSettings()
+SOLVER = Solver(ChainedKeypoints.of(KEYPOINTS), load_pose_prior(), SETTINGS, None)
+
+
+def height(betas):
+    return np.ptp(MODEL.template[:, 1] + MODEL.shape_directions[:, 1] @ betas)
+
+
+def people(count, frames, noise, seed=5):
+    """Walkers, and their joints and covariance by person."""
+    rng = np.random.default_rng(seed)
+    truths = [walker(frames, rng) for _ in range(count)]
+    parts = [seen(truth, noise, rng) for truth in truths]
+    return truths, {p: (part[0][:, 0], part[1][:, 0]) for p, part in enumerate(parts)}
+
+
+@pytest.mark.parametrize("frames", [100, 500, 1500])
+def test_neither_people_nor_offsets_grow_with_the_length_of_a_clip(frames):
+    truths, joints = people(3, frames, 0.02)
+    shapes = fit_shapes(SOLVER, joints, {}, 50.0)
+    off = [height(shapes.people[p].betas) - height(t.betas[0]) for p, t in enumerate(truths)]
+    # Nobody stands on a ground and the detector has no offsets. Noise leaves 10 mm and 3 mm; with
+    # the poses' own weight of the prior and all frames, 1500 of them make it 128 mm and 24 mm.
+    assert np.abs(off).max() < 0.02
+    assert np.sqrt((shapes.offsets**2).mean()) < 0.005
+
+
+def test_a_clip_is_looked_at_for_no_longer_than_is_asked():
+    _, joints = people(1, 1000, 0.02)
+    broken = {p: (j.copy(), c) for p, (j, c) in joints.items()}
+    # Between the two parts of a second each, at both ends, nothing is looked at.
+    broken[0][0][60:940] += 100.0
+    settings = SETTINGS.model_copy(update={"shape_time": 2.0})
+    solver = Solver(SOLVER.chained, SOLVER.prior, settings, None)
+    one = fit_shapes(solver, joints, {}, 50.0)
+    two = fit_shapes(solver, broken, {}, 50.0)
+    # All the frames are in the bone lengths that the search starts from, and bones are as long.
+    np.testing.assert_allclose(one.people[0].betas, two.people[0].betas, atol=0.01)
+
+
+def test_what_other_clips_know_of_a_person_counts():
+    truths, joints = people(1, 50, 0.04)
+    true = truths[0].betas[0]
+    sure = Shape(true, 1e-4 * np.eye(MODEL.shapes))
+    alone = fit_shapes(SOLVER, joints, {}, 50.0).people[0]
+    known = fit_shapes(SOLVER, joints, {0: sure}, 50.0).people[0]
+    assert np.linalg.norm(known.betas - true) < 0.1 < np.linalg.norm(alone.betas - true)
+    assert np.trace(known.covariance) < 1e-2 * np.trace(alone.covariance)
+
+
+def test_offsets_are_the_less_sure_the_fewer_frames_tell_them():
+    spreads = []
+    for frames in (25, 400):
+        _, joints = people(2, frames, 0.02)
+        shapes = fit_shapes(SOLVER, joints, {}, 50.0)
+        spreads.append(np.trace(shapes.offsets_covariance, axis1=-2, axis2=-1))
+    assert (spreads[1] <= spreads[0]).all() and (spreads[1] > 0.0).all()
+
+
+def test_without_people_there_are_no_offsets():
+    shapes = fit_shapes(SOLVER, {}, {}, 50.0)
+    assert shapes.people == {}
+    np.testing.assert_array_equal(shapes.offsets, 0.0)

@@ -1,0 +1,132 @@
+"""Projection, derivatives and normal equations of the moving camera against differences."""
+
+import numpy as np
+import pytest
+import turning_clip as clip
+
+from worldpose.broadcast_calibration.evidence import PAINT, FlowEvidence, PointEvidence
+from worldpose.broadcast_calibration.flow_equations import flow_row, undistorted
+from worldpose.broadcast_calibration.normal_equations import point_row
+from worldpose.broadcast_calibration.priors import prior_of
+from worldpose.broadcast_calibration.settings import BroadcastPrior
+from worldpose.broadcast_calibration.solving import Problem, equations_at
+
+POINT = np.array([6.0, -9.0, 1.2])
+
+
+def pixel_and_rows(camera, point=POINT):
+    image, rows = np.empty(2), np.empty((2, 12))
+    lens = camera.focal[0], camera.distortion[0]
+    assert point_row(
+        camera.rotation[0], camera.center, camera.principal_point, *lens, point, image, rows
+    )
+    return image, rows
+
+
+def test_a_point_is_where_the_camera_projects_it():
+    camera = clip.moving(2)
+    # Both are double precision on numbers of a thousand.
+    np.testing.assert_allclose(
+        pixel_and_rows(camera)[0], camera.camera[0].project(POINT[None])[0], atol=1e-9
+    )
+
+
+def test_a_point_behind_the_camera_has_no_pixel():
+    camera = clip.moving(2)
+    image, rows = np.empty(2), np.empty((2, 12))
+    behind = camera.center - camera.rotation[0, 2]
+    lens = camera.focal[0], camera.distortion[0]
+    assert not point_row(
+        camera.rotation[0], camera.center, camera.principal_point, *lens, behind, image, rows
+    )
+
+
+@pytest.mark.parametrize("number", range(12))
+def test_a_pixel_moves_with_the_step_as_derived(number):
+    camera = clip.moving(2)
+    _, rows = pixel_and_rows(camera)
+    size = 1e-6 if number < 7 else 1e-4
+
+    def moved(by):
+        frame, shared = np.zeros((2, 7)), np.zeros(5)
+        if number < 7:
+            frame[0, number] = by
+        else:
+            shared[number - 7] = by
+        return pixel_and_rows(camera.stepped(frame, shared))[0]
+
+    numeric = (moved(size) - moved(-size)) / (2.0 * size)
+    # Central differences of pixels known to 1e-12 with steps of 1e-6.
+    np.testing.assert_allclose(rows[:, number], numeric, rtol=1e-6, atol=1e-4)
+
+
+@pytest.mark.parametrize("number", range(16))
+def test_a_followed_point_moves_with_both_frames_as_derived(number):
+    camera, start = clip.moving(2, pan=(0.0, 1.0)), np.array([200.0, 410.0])
+
+    def predicted(by):
+        frame, shared = np.zeros((2, 7)), np.zeros(5)
+        if number < 14:
+            frame[number // 7, number % 7] = by
+        else:
+            shared[number - 11] = by
+        moved = camera.stepped(frame, shared)
+        image, rows = np.empty(2), np.empty((2, 16))
+        lens = moved.principal_point, moved.focal, moved.rotation, moved.distortion
+        assert flow_row(*lens, start, image, rows)
+        return image, rows
+
+    size = 1e-6 if number < 14 else 1e-4
+    numeric = (predicted(size)[0] - predicted(-size)[0]) / (2.0 * size)
+    # As above.
+    np.testing.assert_allclose(predicted(0.0)[1][:, number], numeric, rtol=1e-6, atol=1e-4)
+
+
+def test_the_lens_is_inverted_exactly():
+    k = np.array([0.4, 1.5, -0.2])
+    for x, y in ((0.0, 0.0), (0.2, -0.1), (-0.05, 0.13)):
+        s = x * x + y * y
+        radial = 1.0 + s * (k[0] + s * (k[1] + s * k[2]))
+        # Newton ends at rounding.
+        assert undistorted(x * radial, y * radial, k)[:2] == pytest.approx((x, y), abs=1e-14)
+
+
+def test_the_gradient_is_the_slope_of_the_cost():
+    rng = np.random.default_rng(4)
+    true = clip.moving(6)
+    points, flow = clip.ground_points(true, rng, each=8), clip.followed_points(true, rng, each=8)
+    painted = rng.standard_normal((len(points), PAINT, 3)) * 0.01
+    robust = PointEvidence(
+        **{**vars(points), "loss": np.full(len(points), 3.0), "paint": painted}
+    )
+    problem = Problem(
+        robust,
+        flow,
+        prior_of(BroadcastPrior(), true.focal, true.image_size),
+        np.array([np.inf] * 3 + [1e-3, 1e-2, 1e-2, 1e-2]),
+        0.7,
+        2.0,
+    )
+    camera = true.stepped(1e-4 * rng.standard_normal((6, 7)), [0.02, -0.01, 0.03, 0.5, -0.4])
+    beside = 0.3 * rng.standard_normal((1, PAINT))
+    here = equations_at(camera, beside, problem)
+    step, shared = rng.standard_normal((6, 7)), rng.standard_normal(5)
+    paint = rng.standard_normal((1, PAINT))
+    size = 1e-8
+    ahead, behind = (
+        equations_at(camera.stepped(by * step, by * shared), beside + by * paint, problem).cost
+        for by in (size, -size)
+    )
+    slope = float((here.right * step).sum() + here.right_corner @ [*shared, *paint.ravel()])
+    # Differences of a cost of 1e3 known to 1e-13, over 2e-8; the slope is 1e5.
+    assert (ahead - behind) / (2.0 * size) == pytest.approx(slope, rel=1e-5)
+
+
+def test_evidence_of_nothing_costs_nothing():
+    camera = clip.moving(3)
+    prior = prior_of(BroadcastPrior(), camera.focal, camera.image_size)
+    problem = Problem(PointEvidence.none(), FlowEvidence.none(), prior)
+    bare = equations_at(camera, np.zeros((0, PAINT)), problem)
+    # What is left is the prior's: 5 numbers of the clip, 4 of each frame.
+    assert np.count_nonzero(bare.blocks[0].diagonal(axis1=1, axis2=2)) == 3 * 4
+    assert not bare.border.any()

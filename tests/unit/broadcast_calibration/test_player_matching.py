@@ -1,0 +1,108 @@
+"""Matching of projected and detected people, and the noise that residuals show."""
+
+import numpy as np
+import pytest
+import turning_clip as clip
+
+from worldpose.broadcast_calibration.players import (
+    BONES,
+    People,
+    boxes_of,
+    match,
+    player_evidence,
+    similarity,
+)
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
+from worldpose.errors import InputError
+from worldpose.synthetic.reference_poses import standing_joints
+
+
+def figure(x=0.0, y=0.0, scale=1.0):
+    """Seventeen points on two lines, 10 wide and 40 high."""
+    points = np.zeros((17, 2))
+    points[:, 0] = np.where(np.arange(17) % 2 == 1, 0.0, 10.0)
+    points[:, 1] = np.linspace(0.0, 40.0, 17)
+    return scale * points + [x, y]
+
+
+def test_bones_are_a_tree_over_all_joints():
+    assert len(BONES) == 16
+    reached = {5}
+    for _ in range(16):
+        for a, b in BONES:
+            if a in reached or b in reached:
+                reached |= {int(a), int(b)}
+    assert reached == set(range(17))
+
+
+def test_the_same_person_is_alike_by_one():
+    assert similarity(figure()[None], figure()[None]) == pytest.approx(np.ones((1, 1)))
+
+
+def test_half_overlap_counts_a_third_and_bones_are_unchanged():
+    # Boxes 10 wide, 5 apart: 5 shared of 15.
+    assert similarity(figure()[None], figure(x=5.0)[None])[0, 0] == pytest.approx(1.0 / 3.0)
+
+
+def test_a_person_upside_down_is_minus_alike():
+    turned = figure()
+    turned = turned.max(axis=0) + turned.min(axis=0) - turned
+    assert similarity(figure()[None], turned[None])[0, 0] == pytest.approx(-1.0)
+
+
+def test_boxes_apart_are_not_alike():
+    assert similarity(figure()[None], figure(x=11.0)[None])[0, 0] == 0.0
+
+
+def test_too_few_common_joints_are_not_alike():
+    few = figure()
+    few[5:] = np.nan
+    assert similarity(figure()[None], few[None])[0, 0] == 0.0
+
+
+def test_boxes_of_nobody_are_missing():
+    assert np.isnan(boxes_of(np.full((1, 17, 2), np.nan))).all()
+
+
+def crowd(frames, rng, noise):
+    """People standing on the pitch, seen by a moving camera in another order."""
+    camera = clip.moving(frames)
+    places = [(-3.0, -6.0), (2.0, 4.0), (6.0, -3.0), (-8.0, 8.0)]
+    joints = np.stack([standing_joints() + [x, y, 0.0] for x, y in places])
+    joints = np.broadcast_to(joints, (frames, *joints.shape))
+    pixels = camera.camera.project(joints.reshape(frames, -1, 3)).reshape(frames, 4, 17, 2)
+    seen = pixels[:, [2, 0, 3, 1]]
+    return camera, People(joints, seen + noise * rng.standard_normal(seen.shape), 50.0)
+
+
+def test_people_are_found_whatever_their_order():
+    camera, people = crowd(5, np.random.default_rng(1), 0.5)
+    pairs = match(camera, people)
+    assert len(pairs.frame) == 20
+    assert (np.array([2, 0, 3, 1])[pairs.detection] == pairs.person).all()
+
+
+def test_noise_is_learned_as_a_share_of_height():
+    camera, people = crowd(60, np.random.default_rng(2), 1.0)
+    pairs = match(camera, people)
+    evidence, noise = player_evidence(camera, people, pairs, BroadcastCalibrationSettings())
+    tall = np.nanmean(people.boxes[..., 3] - people.boxes[..., 1])
+    # 8,000 residuals; the height itself has the noise.
+    assert noise.share == pytest.approx(1.0 / tall, rel=0.1)
+    assert noise.frames == pytest.approx(1.0, abs=0.2)
+    assert len(evidence) == 60 * 4 * 17
+
+
+def test_errors_that_last_are_noticed():
+    rng = np.random.default_rng(3)
+    camera, people = crowd(100, rng, 0.0)
+    slow = np.repeat(rng.standard_normal((10, 4, 17, 2)), 10, axis=0)
+    people = People(people.joints, people.keypoints + slow, 50.0)
+    _, noise = player_evidence(camera, people, match(camera, people), BroadcastCalibrationSettings())
+    # Steps of ten frames: the triangle of their autocorrelation has an area of ten.
+    assert noise.frames == pytest.approx(10.0, rel=0.2)
+
+
+def test_joints_and_keypoints_of_other_frames_are_refused():
+    with pytest.raises(InputError, match="same frames"):
+        People(np.zeros((3, 1, 17, 3)), np.zeros((2, 1, 17, 2)), 50.0)

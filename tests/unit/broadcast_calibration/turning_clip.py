@@ -1,0 +1,70 @@
+"""A small clip for tests: a camera that pans and zooms over the pitch, with evidence and pictures."""
+
+import numpy as np
+
+from worldpose.broadcast_calibration.evidence import MARKING, FlowEvidence, PointEvidence
+from worldpose.broadcast_calibration.moving_camera import MovingCamera
+from worldpose.pitch import PitchTemplate
+from worldpose.synthetic.stadium import looking
+
+PITCH = PitchTemplate.standard()
+SIZE = (960, 540)
+CENTER = np.array([0.5, -74.0, 16.0])
+
+
+def moving(frames=40, pan=(-3.0, 4.0), zoom=(1900.0, 2100.0), size=SIZE):
+    """A camera that aims along x from one place to another while it zooms."""
+    share = 0.5 - 0.5 * np.cos(np.pi * np.linspace(0.0, 1.0, frames))
+    aims = pan[0] + (pan[1] - pan[0]) * share
+    focal = zoom[0] + (zoom[1] - zoom[0]) * share
+    grown = focal / 2100.0
+    return MovingCamera(
+        center=CENTER,
+        principal_point=np.array([0.5 * size[0] - 2.0, 0.5 * size[1] - 14.0]),
+        rotation=np.stack([looking(CENTER, np.array([x, -2.0, 0.0]), 0.002).rotation for x in aims]),
+        focal=focal,
+        distortion=np.stack([0.4 * grown**1.6, 1.5 * grown, 0.0 * grown], axis=-1),
+        image_size=np.array(size),
+    )
+
+
+def ground_points(camera, rng, each=40, noise=0.3):
+    """Places on the pitch as points across random directions, `each` a frame."""
+    frames = len(camera)
+    x, y = rng.uniform(-30.0, 30.0, 4000), rng.uniform(-30.0, 30.0, 4000)
+    places = np.stack([x, y, PITCH.height(x, y)], axis=-1)
+    seen = camera.camera.project(places)
+    frame, which, image = [], [], []
+    for t in range(frames):
+        inside = np.flatnonzero(((seen[t] > 0) & (seen[t] < camera.image_size - 1)).all(-1))
+        chosen = rng.choice(inside, each)
+        frame.append(np.full(each, t))
+        which.append(chosen)
+        image.append(seen[t, chosen])
+    frame, which, image = (np.concatenate(part) for part in (frame, which, image))
+    turn = rng.uniform(0.0, np.pi, len(frame))
+    return PointEvidence.across_lines(
+        frame,
+        places[which],
+        image + noise * rng.standard_normal(image.shape),
+        np.stack([np.cos(turn), np.sin(turn)], axis=-1),
+        np.full(len(frame), noise),
+        np.inf,
+        MARKING,
+        np.zeros(len(frame), dtype=np.int64),
+    )
+
+
+def followed_points(camera, rng, each=60, noise=0.1):
+    """Directions seen in neighbouring frames."""
+    frames = len(camera) - 1
+    start = rng.uniform([0.0, 0.0], camera.image_size - 1.0, (frames, each, 2))
+    rays = camera.camera[:-1].unproject(start)
+    end = camera.camera[1:].project(rays.origins + 100.0 * rays.directions)
+    end = end + noise * rng.standard_normal(end.shape)
+    return FlowEvidence(
+        np.repeat(np.arange(frames), each),
+        start.reshape(-1, 2),
+        end.reshape(-1, 2),
+        np.full(frames * each, noise),
+    )

@@ -1,0 +1,135 @@
+"""Bodies that methods of one picture saw, read from files as those methods write them (S4).
+
+4DHumans (HMR2) and HybrIK find a body in each crop of a picture: turns of joints that are much
+better than nothing, at a depth and size that are guesses. Only the turns and the place in the
+picture are taken. Every file is an npz of arrays; names as the methods have them are known.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.body.model import JOINTS
+from worldpose.cameras import Rigid
+from worldpose.errors import InputError
+
+Floats = NDArray[np.float64]
+
+WHOLE: Final = ("pred_thetas", "pred_theta_mats", "poses", "pose", "thetas")
+"""Names of all 24 turns in one array."""
+ROOT: Final = ("global_orient", "pred_global_orient")
+REST: Final = ("body_pose", "pred_body_pose")
+"""Names of the pelvis' turn and of the 23 others."""
+CROPS: Final = ("box_center", "bbox", "bboxes")
+"""Names of crops: middles, or x0 y0 x1 y1. Bodies of crops face the crop's middle."""
+PLACES: Final = ("transl", "pred_cam_t_full", "cam_t", "trans")
+"""Names of places in front of a whole picture [m], of full perspective."""
+
+
+@dataclass(frozen=True, eq=False)
+class MonocularEstimates:
+    """Bodies in the pictures of one camera, a row each."""
+
+    frame: NDArray[np.int64]
+    """(rows,)"""
+    rotations: Floats
+    """(rows, 24, 3, 3): of the pelvis, from the body to a camera (x right, y down, z forward) that
+    looks at `center` where `cropped`, else along the picture's axis; of the others, relative to
+    the parent."""
+    center: Floats
+    """(rows, 2) [px], the middle of the body's box, or its place in the picture."""
+    cropped: bool
+
+
+def read_monocular(path: Path) -> MonocularEstimates:
+    """Return the bodies of an npz file of 4DHumans, HybrIK, or anything that estimates SMPL.
+
+    Turns are axis-angle vectors or matrices, in one array (`pred_thetas`, `poses`, ...) or two
+    (`global_orient` and `body_pose`). Where a body is comes from its crop (`box_center`, `bbox`:
+    weak perspective, whose scale and offset are not needed) or from its place before the picture
+    (`transl` with `focal_length` and `img_size`: full perspective). `frame` counts the rows'
+    frames; without it each row is a frame of its own.
+
+    Args:
+        path: written by `numpy.savez`; of a pickle, save its arrays so.
+
+    Raises:
+        InputError: unreadable, or lacking turns or places.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: np.asarray(file[name]) for name in file.files}
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise _wrong(path, "an npz file of plain arrays", f"{error}") from error
+    return monocular_of(arrays, path)
+
+
+def monocular_of(arrays: Mapping[str, NDArray[Any]], where: Path) -> MonocularEstimates:
+    """Return the bodies of arrays as such a file holds them.
+
+    Raises:
+        InputError: naming `where`.
+    """
+    whole = _first(arrays, WHOLE)
+    if whole is None:
+        root, rest = _first(arrays, ROOT), _first(arrays, REST)
+        if root is None or rest is None:
+            expected = f"{' or '.join(WHOLE)}; or {ROOT[0]} and {REST[0]}"
+            raise _wrong(where, expected, ", ".join(arrays) or "nothing")
+        parts = [_turns(root, where, ROOT[0], 1), _turns(rest, where, REST[0], JOINTS - 1)]
+        if len(parts[0]) != len(parts[1]):
+            raise _wrong(where, "as many pelves as bodies", f"{len(parts[0])} and {len(parts[1])}")
+        rotations = np.concatenate(parts, axis=1)
+    else:
+        rotations = _turns(whole, where, "turns", JOINTS)
+    rows = len(rotations)
+    frame = np.asarray(arrays.get("frame", arrays.get("frames", np.arange(rows)))).ravel()
+    crop, place = _first(arrays, CROPS), _first(arrays, PLACES)
+    if crop is not None:
+        crop = np.asarray(crop, dtype=np.float64).reshape(rows, -1)
+        center = crop if crop.shape[1] == 2 else 0.5 * (crop[:, :2] + crop[:, 2:4])
+    elif place is not None and "focal_length" in arrays and "img_size" in arrays:
+        focal = np.broadcast_to(np.asarray(arrays["focal_length"]).reshape(-1, 1), (rows, 1))
+        size = np.broadcast_to(np.asarray(arrays["img_size"]).reshape(-1, 2), (rows, 2))
+        place = np.asarray(place, dtype=np.float64).reshape(rows, 3)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            center = focal * place[:, :2] / place[:, 2:] + 0.5 * (size - 1.0)
+    else:
+        expected = "a crop (box_center or bbox), or transl with focal_length and img_size"
+        raise _wrong(where, expected, ", ".join(arrays))
+    if len(frame) != rows or center.shape != (rows, 2):
+        raise _wrong(where, f"{rows} frames and places", f"{len(frame)} and {center.shape}")
+    return MonocularEstimates(frame.astype(np.int64), rotations, center, crop is not None)
+
+
+def _first(arrays: Mapping[str, NDArray[Any]], names: tuple[str, ...]) -> NDArray[Any] | None:
+    return next((arrays[name] for name in names if name in arrays), None)
+
+
+def _turns(given: NDArray[Any], where: Path, name: str, joints: int) -> Floats:
+    """Matrices (rows, joints, 3, 3) of axis-angle vectors or matrices of whatever shape."""
+    values = np.asarray(given, dtype=np.float64)
+    flat = values.reshape(len(values), -1) if values.ndim > 1 else values.reshape(1, -1)
+    if flat.shape[1] == 9 * joints:
+        matrices: Floats = flat.reshape(-1, joints, 3, 3)
+        return matrices
+    if flat.shape[1] == 3 * joints:
+        return Rigid.from_rotvec(flat.reshape(-1, joints, 3), np.zeros(3)).rotation
+    expected = f"{name} of {joints} joints, axis-angle vectors or matrices, for each row"
+    raise _wrong(where, expected, f"shape {values.shape}")
+
+
+def _wrong(where: Path, expected: str, found: str) -> InputError:
+    return InputError(
+        str(where),
+        expected=expected,
+        found=found,
+        todo="Save the method's arrays with numpy.savez, one row for each body and picture.",
+    )

@@ -1,0 +1,35 @@
+"""Broadcast calibration: a clip's moving camera from a few picked frames (M1-M6).
+
+Input: clicks in key frames, the clip's pictures, people of the static cameras. Output: a camera a
+frame with one center, its uncertainty, and a report.
+"""
+
+from worldpose.broadcast_calibration.calibrating import (
+    BroadcastCalibration,
+    calibrate_broadcast,
+)
+from worldpose.broadcast_calibration.feed_offset import FeedOffset, estimate_feed_offset
+from worldpose.broadcast_calibration.given_lens import follow_given_lens
+from worldpose.broadcast_calibration.moving_camera import MovingCamera
+from worldpose.broadcast_calibration.players import People
+from worldpose.broadcast_calibration.report import BroadcastReport
+from worldpose.broadcast_calibration.settings import (
+    BroadcastCalibrationSettings,
+    BroadcastPrior,
+)
+from worldpose.broadcast_calibration.stored import broadcast_arrays, broadcast_attributes
+
+__all__ = [
+    "BroadcastCalibration",
+    "BroadcastCalibrationSettings",
+    "BroadcastPrior",
+    "BroadcastReport",
+    "FeedOffset",
+    "MovingCamera",
+    "People",
+    "broadcast_arrays",
+    "broadcast_attributes",
+    "calibrate_broadcast",
+    "estimate_feed_offset",
+    "follow_given_lens",
+]

@@ -1,0 +1,251 @@
+"""A broadcast clip's camera in every frame, from a few picked ones (M1 to M6)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.broadcast_calibration import KeyFrame
+from worldpose.broadcast_calibration.adam import descend
+from worldpose.broadcast_calibration.chain import Chain, chain
+from worldpose.broadcast_calibration.cuts import require_one_shot
+from worldpose.broadcast_calibration.evidence import (
+    FlowEvidence,
+    PointEvidence,
+    together,
+)
+from worldpose.broadcast_calibration.key_frames import Keys, calibrate_keys
+from worldpose.broadcast_calibration.line_evidence import FieldSamples, follow_lines
+from worldpose.broadcast_calibration.moving_camera import MovingCamera
+from worldpose.broadcast_calibration.optical_flow import Followed, follow
+from worldpose.broadcast_calibration.players import (
+    People,
+    PlayerNoise,
+    match,
+    player_evidence,
+)
+from worldpose.broadcast_calibration.priors import prior_of
+from worldpose.broadcast_calibration.report import BroadcastReport, report_of
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
+from worldpose.broadcast_calibration.solving import Problem, Solution, solve
+from worldpose.broadcast_calibration.uncertainty import Uncertainty, uncertainty_of
+from worldpose.broadcast_calibration.weights import Weights, flow_share_of, smoothness_of
+from worldpose.errors import InputError
+from worldpose.pitch import PitchTemplate
+
+Floats = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+Pictures = Callable[[], Iterator[Picture]]
+"""A new pass over all pictures of a clip, grey (height, width), in order."""
+
+
+@dataclass(frozen=True, eq=False)
+class BroadcastCalibration:
+    """A moving camera, how well it is known, and why.
+
+    Attributes:
+        camera: all frames.
+        uncertainty: its covariance.
+        report: residuals, drift, frames to pick next.
+        tracked: what came from key frames and followed points alone, before any refinement.
+    """
+
+    camera: MovingCamera
+    uncertainty: Uncertainty
+    report: BroadcastReport
+    tracked: MovingCamera
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """A clip before refinement: its key frames, and the chain of cameras between them.
+
+    Attributes:
+        keys: calibrated key frames.
+        chain: a first camera for every frame.
+        flow: followed points that move with it.
+    """
+
+    keys: Keys
+    chain: Chain
+    flow: FlowEvidence
+
+
+def calibrate_broadcast(
+    pitch: PitchTemplate,
+    key_frames: Sequence[KeyFrame],
+    pictures: Pictures,
+    fps: float,
+    *,
+    people: People | None = None,
+    boxes: Floats | None = None,
+    settings: BroadcastCalibrationSettings = BroadcastCalibrationSettings(),  # noqa: B008
+    where: str = "broadcast clip",
+) -> BroadcastCalibration:
+    """Return the camera of every frame of a clip.
+
+    Key frames give cameras of one place; points that stand still are followed from each to the
+    next; painted lines are looked for in every frame; players of the static cameras are matched
+    with those in the pictures; then all frames are fitted at once.
+
+    Args:
+        pitch: the stadium's template.
+        key_frames: what was clicked, in one frame or more.
+        pictures: makes a new pass over the clip's grey pictures; it is gone through once to track,
+            and once in each round.
+        fps: frames a second.
+        people: those of the static cameras, and those seen in the clip; None = markings alone.
+        boxes: (frames, detections, 4) x0 y0 x1 y1 [px] of who moves in the pictures; those of
+            `people` if None.
+        settings: weights, noise and gates.
+        where: clip or file, for messages.
+
+    Raises:
+        InputError: the clip has cuts, or no key frame can be used.
+        DegenerateError: a frame is not determined.
+
+    Note:
+        M1 to M6; paper section "Broadcasting Camera Calibration" and its supplement.
+    """
+    if boxes is None and people is not None:
+        boxes = people.boxes
+    tracked = track(pitch, key_frames, pictures, boxes, settings, where)
+    return refine(pitch, tracked, pictures, fps, people, boxes, settings)
+
+
+def track(
+    pitch: PitchTemplate,
+    key_frames: Sequence[KeyFrame],
+    pictures: Pictures,
+    boxes: Floats | None,
+    settings: BroadcastCalibrationSettings,
+    where: str,
+) -> Tracked:
+    """Return a clip's cameras from its key frames and followed points (M2); as above."""
+    wanted = {key.frame for key in key_frames}
+    kept: dict[int, Picture] = {}
+    followed = follow(_keeping(pictures(), wanted, kept), boxes, settings.flow_points)
+    missing = sorted(wanted - set(kept))
+    if missing:
+        raise InputError(
+            where,
+            expected=f"key frames from 0 to {len(followed)}",
+            found=f"{missing}",
+            todo="Number frames from 0, as the video has them.",
+        )
+    require_one_shot(followed, settings.cut_share, where)
+    height, width = next(iter(kept.values())).shape
+    keys = calibrate_keys(pitch, key_frames, (width, height), kept, settings, where)
+    links = chain([int(n) for n in keys.frames], keys.camera, followed, settings.flow_outlier)
+    return Tracked(keys, links, _flow(followed, links, settings))
+
+
+def refine(
+    pitch: PitchTemplate,
+    tracked: Tracked,
+    pictures: Pictures,
+    fps: float,
+    people: People | None,
+    boxes: Floats | None,
+    settings: BroadcastCalibrationSettings,
+) -> BroadcastCalibration:
+    """Return the fit of all frames at once (M3 to M6); as `calibrate_broadcast`."""
+    samples = FieldSamples.of(pitch)
+    camera = tracked.chain.camera
+    spread = smoothness_of(camera, fps) if settings.smooth else np.full(7, np.inf)
+    if not settings.smooth:
+        # Frames without evidence are bridged all the same.
+        spread[:3] = smoothness_of(camera, fps)[:3]
+    clicks = replace(tracked.keys.clicks, frame=tracked.keys.frames[tracked.keys.clicks.frame])
+    deviation = float(tracked.flow.deviation[0]) if len(tracked.flow) else 0.0
+    share = flow_share_of(tracked.chain, tracked.keys.frames, deviation, settings.flow_drift)
+    noise, matches = PlayerNoise(0.0, 0.0), None
+    solution: Solution | None = None
+    points = clicks
+    for _ in range(settings.rounds):
+        lines = follow_lines(camera, samples, pictures(), boxes, settings)
+        parts = [clicks, lines.evidence]
+        if people is not None and settings.player_weight > 0.0:
+            matches = match(lines.camera, people)
+            players, noise = player_evidence(lines.camera, people, matches, settings)
+            parts.append(players)
+        points = together(parts)
+        problem = _problem(points, tracked.flow, share, lines.camera, spread, settings)
+        solution = solve(lines.camera, problem, settings.iterations)
+        camera = solution.camera
+    assert solution is not None  # settings have one round or more
+    if settings.solver == "adam":
+        solution = descend(tracked.chain.camera, problem, settings.adam_iterations)
+    uncertainty = uncertainty_of(solution, problem)
+    weights = Weights(
+        flow_deviation_px=deviation,
+        flow_share=share,
+        smooth_log_focal=_number(spread[3]),
+        smooth_k1=_number(spread[4]),
+        smooth_k2=_number(spread[5]),
+        player_share=noise.share,
+        player_frames=noise.frames,
+    )
+    report = report_of(
+        solution.camera, uncertainty, points, tracked.flow, tracked.keys, tracked.chain, matches,
+        weights, pitch, settings,
+    )  # fmt: skip
+    return BroadcastCalibration(solution.camera, uncertainty, report, tracked.chain.camera)
+
+
+def _problem(
+    points: PointEvidence,
+    flow: FlowEvidence,
+    share: float,
+    camera: MovingCamera,
+    spread: Floats,
+    settings: BroadcastCalibrationSettings,
+) -> Problem:
+    return Problem(
+        points=points,
+        flow=flow,
+        prior=prior_of(settings.prior, camera.focal, camera.image_size),
+        smoothness=spread,
+        flow_weight=share * settings.flow_weight,
+        flow_loss=settings.loss,
+    )
+
+
+def _flow(
+    followed: Sequence[Followed], links: Chain, settings: BroadcastCalibrationSettings
+) -> FlowEvidence:
+    """Return the points that move with the camera, with the deviation that they show."""
+    kept = links.kept
+    counts = [int(mine.sum()) for mine in kept]
+    residual = np.concatenate(
+        [np.empty((0, 2)), *(r[mine] for r, mine in zip(links.residual, kept, strict=True))]
+    )
+    seen = 1.4826 * float(np.median(np.abs(residual))) if len(residual) else 0.0
+    return FlowEvidence(
+        frame=np.repeat(np.arange(len(followed)), counts),
+        start=_stacked([p.start[mine] for p, mine in zip(followed, kept, strict=True)]),
+        end=_stacked([p.end[mine] for p, mine in zip(followed, kept, strict=True)]),
+        deviation=np.full(sum(counts), max(seen, settings.flow_noise)),
+    )
+
+
+def _stacked(parts: Sequence[Floats]) -> Floats:
+    return np.concatenate([np.empty((0, 2)), *parts])
+
+
+def _keeping(
+    pictures: Iterator[Picture], wanted: set[int], kept: dict[int, Picture]
+) -> Iterator[Picture]:
+    """Pass pictures on, and keep those of the wanted frames."""
+    for number, picture in enumerate(pictures):
+        if number in wanted:
+            kept[number] = picture
+        yield picture
+
+
+def _number(value: float) -> float:
+    """Return a spread for a record, which has no infinity: 0 stands for none."""
+    return float(value) if np.isfinite(value) else 0.0

@@ -1,0 +1,187 @@
+"""What a moving camera is fitted to: places of known points in pictures, and followed points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+PAINT = 4
+"""Ways in which a marking may lie beside the template: sideways and upwards at either end of a
+line, or along x, y and z for an arc, the last twice."""
+CLICK, MARKING, PLAYER = 0, 1, 2
+"""Kinds of `PointEvidence`: clicked points and drawn markings, painted lines, players' joints."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointEvidence:
+    """Pixels of known world points, frame by frame.
+
+    Attributes:
+        frame: (n,) index of the frame, rising.
+        world: (n, 3) [m], world.
+        image: (n, 2) [px].
+        whitening: (n, 2, 2) [1/px] takes a pixel error to standard deviations; a place along a
+            line has one row, the other is zero.
+        weight: (n,) factor on the loss [1].
+        loss: (n,) scale of the Geman-McClure loss [standard deviations]; infinite = squares.
+        kind: (n,) CLICK, MARKING or PLAYER.
+        source: (n,) which marking or person, -1 for clicks.
+        paint: (n, PAINT, 3) [m] how the place moves when its marking is painted one standard
+            deviation beside the template in each of the ways that it can be; 0 for others.
+    """
+
+    frame: Integers
+    world: Floats
+    image: Floats
+    whitening: Floats
+    weight: Floats
+    loss: Floats
+    kind: Integers
+    source: Integers
+    paint: Floats
+
+    @classmethod
+    def none(cls) -> PointEvidence:
+        """Return no evidence."""
+        empty, index = np.empty(0), np.empty(0, dtype=np.int64)
+        return cls(
+            index,
+            np.empty((0, 3)),
+            np.empty((0, 2)),
+            np.empty((0, 2, 2)),
+            empty,
+            empty,
+            index,
+            index,
+            np.empty((0, PAINT, 3)),
+        )
+
+    @classmethod
+    def across_lines(
+        cls,
+        frame: Integers,
+        world: Floats,
+        image: Floats,
+        normals: Floats,
+        deviation: Floats,
+        loss: float,
+        kind: int,
+        source: Integers,
+        paint: Floats | None = None,
+    ) -> PointEvidence:
+        """Return places that are known across a line only.
+
+        Args:
+            frame: (n,), rising.
+            world: (n, 3) [m], world.
+            image: (n, 2) [px].
+            normals: (n, 2) unit vectors across the line.
+            deviation: (n,) standard deviation [px].
+            loss: scale of the loss [standard deviations].
+            kind: CLICK or MARKING.
+            source: (n,) which marking.
+            paint: (n, PAINT, 3) [m]; None where the template is exact.
+        """
+        whitening = np.zeros((len(frame), 2, 2))
+        whitening[:, 0] = normals / deviation[:, None]
+        ones = np.ones(len(frame))
+        kinds = np.full(len(frame), kind)
+        if paint is None:
+            paint = np.zeros((len(frame), PAINT, 3))
+        return cls(frame, world, image, whitening, ones, loss * ones, kinds, source, paint)
+
+    @classmethod
+    def at_points(
+        cls,
+        frame: Integers,
+        world: Floats,
+        image: Floats,
+        deviation: Floats,
+        weight: float,
+        loss: float,
+        kind: int,
+        source: Integers,
+    ) -> PointEvidence:
+        """Return places that are known alike in both directions.
+
+        Args:
+            frame: (n,), rising.
+            world: (n, 3) [m], world.
+            image: (n, 2) [px].
+            deviation: (n,) standard deviation, each axis [px].
+            weight: factor on the loss [1].
+            loss: scale of the loss [standard deviations].
+            kind: CLICK, MARKING or PLAYER.
+            source: (n,) which person.
+        """
+        ones = np.ones(len(frame))
+        whitening = np.eye(2) / deviation[:, None, None]
+        kinds = np.full(len(frame), kind)
+        paint = np.zeros((len(frame), PAINT, 3))
+        return cls(frame, world, image, whitening, weight * ones, loss * ones, kinds, source, paint)
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def __getitem__(self, index: Integers | NDArray[np.bool_]) -> PointEvidence:
+        return PointEvidence(*(getattr(self, name)[index] for name in _POINT_PARTS))
+
+    def in_frame(self, frame: int) -> PointEvidence:
+        """Return evidence of a single frame as that of the frame with another index."""
+        return replace(self, frame=np.full(len(self), frame))
+
+
+@dataclass(frozen=True, eq=False)
+class FlowEvidence:
+    """Points of what does not move, followed from one frame to the next (M6).
+
+    Attributes:
+        frame: (n,) index of the first frame, rising.
+        start: (n, 2) [px] there.
+        end: (n, 2) [px] in the next frame.
+        deviation: (n,) standard deviation of their difference, each axis [px].
+    """
+
+    frame: Integers
+    start: Floats
+    end: Floats
+    deviation: Floats
+
+    @classmethod
+    def none(cls) -> FlowEvidence:
+        """Return no evidence."""
+        pixels = np.empty((0, 2))
+        return cls(np.empty(0, dtype=np.int64), pixels, pixels, np.empty(0))
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def __getitem__(self, index: Integers | NDArray[np.bool_]) -> FlowEvidence:
+        return FlowEvidence(*(getattr(self, name)[index] for name in _FLOW_PARTS))
+
+
+_POINT_PARTS = (
+    *("frame", "world", "image", "whitening", "weight", "loss", "kind", "source", "paint"),
+)
+_FLOW_PARTS = ("frame", "start", "end", "deviation")
+
+
+def together(parts: Sequence[PointEvidence]) -> PointEvidence:
+    """Return all of several pieces of evidence, by frame."""
+    arrays = {
+        name: np.concatenate([getattr(part, name) for part in [PointEvidence.none(), *parts]])
+        for name in _POINT_PARTS
+    }
+    order = np.argsort(arrays["frame"], kind="stable")
+    return PointEvidence(**{name: array[order] for name, array in arrays.items()})
+
+
+def bounds(frame: Integers, frames: int) -> Integers:
+    """Return where each frame's entries begin, and where the last one's end (frames + 1,)."""
+    return np.searchsorted(frame, np.arange(frames + 1)).astype(np.int64)

@@ -1,0 +1,239 @@
+"""Picked frames: each by itself, then all with one center and principal point (M1, M2)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.broadcast_calibration import KeyFrame
+from worldpose.broadcast_calibration.evidence import (
+    CLICK,
+    FlowEvidence,
+    PointEvidence,
+    together,
+)
+from worldpose.broadcast_calibration.line_evidence import FieldSamples, find_lines
+from worldpose.broadcast_calibration.moving_camera import MovingCamera, joined
+from worldpose.broadcast_calibration.priors import prior_of
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
+from worldpose.broadcast_calibration.solving import Problem, solve
+from worldpose.errors import InputError, WorldposeError
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration import CameraEstimate, StaticCalibration, calibrate
+from worldpose.static_calibration.residuals import nearest_on_markings
+
+Floats = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+_ROUNDS = 3
+"""Times that drawn markings and painted lines are met anew [1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Keys:
+    """Key frames with one center.
+
+    Attributes:
+        frames: (k,) their numbers, rising.
+        camera: theirs (k,).
+        clicks: evidence of points and drawn markings; `frame` counts key frames.
+        refused: frames that could not be used, and why.
+        wrong: names of clicks and markings that a frame does not rest on, by frame.
+    """
+
+    frames: NDArray[np.int64]
+    camera: MovingCamera
+    clicks: PointEvidence
+    refused: Mapping[int, str]
+    wrong: Mapping[int, tuple[str, ...]]
+
+
+def calibrate_keys(
+    pitch: PitchTemplate,
+    key_frames: Sequence[KeyFrame],
+    image_size: tuple[int, int],
+    pictures: Mapping[int, Picture],
+    settings: BroadcastCalibrationSettings,
+    where: str,
+) -> Keys:
+    """Return the key frames' cameras, of one place.
+
+    Args:
+        pitch: the stadium's template.
+        key_frames: what was clicked.
+        image_size: width, height [px].
+        pictures: grey (height, width) of the key frames, by number; frames without one rest on
+            their clicks alone.
+        settings: noise, prior.
+        where: clip or file, for messages.
+
+    Raises:
+        InputError: no key frame can be used; the message has each one's reason.
+    """
+    found: dict[int, StaticCalibration] = {}
+    refused: dict[int, str] = {}
+    for key in sorted(key_frames, key=lambda each: each.frame):
+        place = f"{where}: frame {key.frame}"
+        try:
+            found[key.frame] = calibrate(
+                pitch,
+                key.markings,
+                image_size,
+                picture=pictures.get(key.frame),
+                settings=settings.key_frame,
+                where=place,
+            )
+        except WorldposeError as error:
+            refused[key.frame] = f"{error}"
+    if not found:
+        raise InputError(
+            where,
+            expected="a key frame that determines a camera",
+            found="; ".join(refused.values()) or "no key frame",
+            todo="Click points in frames that show an area's corners or the centre circle.",
+        )
+    clicked = {key.frame: key for key in key_frames}
+    wrong = {frame: each.report.wrong for frame, each in found.items() if each.report.wrong}
+    estimates = [each.estimate for each in found.values()]
+    camera = _of_one_place(estimates)
+    samples = FieldSamples.of(pitch)
+    clicks = PointEvidence.none()
+    for _ in range(_ROUNDS):
+        parts, lines = [], []
+        for index, frame in enumerate(found):
+            single = camera.frames(slice(index, index + 1))
+            parts.append(
+                _clicks(pitch, clicked[frame], index, single, found[frame].report.wrong, settings)
+            )
+            if frame in pictures:
+                seen, _ = find_lines(single, samples, pictures[frame], None, settings)
+                lines.append(seen.in_frame(index))
+        clicks = together(parts)
+        problem = Problem(
+            points=together([clicks, *lines]),
+            flow=FlowEvidence.none(),
+            prior=prior_of(settings.prior, camera.focal, camera.image_size),
+        )
+        camera = solve(camera, problem, settings.iterations).camera
+    return Keys(np.array(list(found)), camera, clicks, refused, wrong)
+
+
+def _of_one_place(estimates: Sequence[CameraEstimate]) -> MovingCamera:
+    """Return cameras with the center and principal point that their covariances agree on."""
+    information, right = np.zeros((5, 5)), np.zeros(5)
+    for estimate in estimates:
+        camera = estimate.camera
+        rotation = camera.cam_from_world.rotation
+        # The center moves by -R^T d with a step's shift d.
+        by_step = np.zeros((5, 12))
+        by_step[:3, 3:6] = -rotation.T
+        by_step[3:, 7:9] = np.eye(2)
+        own = np.linalg.inv(by_step @ estimate.covariance @ by_step.T)
+        information += own
+        right += own @ np.concatenate([camera.center, camera.principal_point])
+    shared = np.linalg.solve(information, right)
+    parts = []
+    for estimate in estimates:
+        camera = estimate.camera
+        batch = type(camera).stack([camera])
+        single = MovingCamera.of(batch, shared[:3], shared[3:])
+        parts.append(_kept_aim(single, camera.center, camera.principal_point))
+    return joined(parts)
+
+
+def _kept_aim(camera: MovingCamera, center: Floats, principal_point: Floats) -> MovingCamera:
+    """Return a single frame turned and zoomed so that its picture shows the same ground.
+
+    Args:
+        camera: with the rotation and focal length that it had from another place.
+        center: that place (3,) [m].
+        principal_point: that it had (2,) [px].
+    """
+    before = camera.rotation[0]
+    ray = np.append((camera.image_size - 1.0 - 2.0 * principal_point) / 2.0 / camera.focal[0], 1.0)
+    down = before.T @ ray
+    # A camera that does not look down shows nothing of the ground; it looks far ahead.
+    reach = -center[2] / down[2] if down[2] < -0.02 else 100.0
+    aim = center + reach * down
+    old, new = aim - center, aim - camera.center
+    off = np.append(
+        (camera.image_size - 1.0 - 2.0 * camera.principal_point) / 2.0 / camera.focal[0], 1.0
+    )
+    turned = _between(before.T @ off, new)
+    zoom = np.linalg.norm(new) / np.linalg.norm(old)
+    return MovingCamera(
+        camera.center,
+        camera.principal_point,
+        (before @ turned.T)[None],
+        camera.focal * zoom,
+        camera.distortion,
+        camera.image_size,
+    )
+
+
+def _between(one: Floats, other: Floats) -> Floats:
+    """Return the shortest rotation (3, 3) from one direction to another."""
+    a, b = one / np.linalg.norm(one), other / np.linalg.norm(other)
+    axis, cos = np.cross(a, b), float(a @ b)
+    cross = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + cos))
+
+
+def _clicks(
+    pitch: PitchTemplate,
+    key: KeyFrame,
+    index: int,
+    camera: MovingCamera,
+    wrong: Sequence[str],
+    settings: BroadcastCalibrationSettings,
+) -> PointEvidence:
+    """Return one key frame's clicks, the wrong ones left out."""
+    points = [point for point in key.markings.points if point.name not in wrong]
+    drawn = [marking for marking in key.markings.drawn if marking.name not in wrong]
+    world = pitch.positions([point.name for point in points])
+    depth = (world - camera.center) @ camera.rotation[0, 2]
+    meter = camera.focal[0] / np.maximum(depth, 1.0)
+    parts = [
+        PointEvidence.at_points(
+            np.full(len(points), index),
+            world,
+            np.array([point.xy for point in points]).reshape(-1, 2),
+            np.hypot(settings.click_noise, settings.survey_error * meter),
+            settings.field_weight,
+            settings.loss,
+            CLICK,
+            np.full(len(points), -1),
+        )
+    ]
+    numbers = camera.camera[0].numbers
+    for marking in drawn:
+        pixels = np.array(marking.xy).reshape(-1, 2)
+        samples = pitch.marking_points(marking.name, settings.key_frame.sample_spacing)
+        place, normal = np.empty((len(pixels), 3)), np.empty((len(pixels), 2))
+        nearest_on_markings(
+            numbers,
+            0.5 * float(np.hypot(*camera.image_size)),
+            samples,
+            np.array([0, len(samples)]),
+            pixels,
+            np.zeros(len(pixels), dtype=np.int64),
+            place,
+            normal,
+        )
+        known = np.isfinite(place).all(axis=-1)
+        parts.append(
+            PointEvidence.across_lines(
+                np.full(int(known.sum()), index),
+                place[known],
+                pixels[known],
+                normal[known],
+                np.full(int(known.sum()), settings.key_frame.drawn_noise),
+                settings.loss,
+                CLICK,
+                np.full(int(known.sum()), -1),
+            )
+        )
+    return together(parts)

@@ -1,0 +1,269 @@
+"""Painted lines of every frame, looked for across the template's projection (M2, M3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.broadcast_calibration.evidence import (
+    MARKING,
+    PAINT,
+    PointEvidence,
+    bounds,
+    together,
+)
+from worldpose.broadcast_calibration.moving_camera import MovingCamera, joined
+from worldpose.broadcast_calibration.normal_equations import add_points
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration.edges import CANDIDATES, find_bars, fit_bars
+from worldpose.static_calibration.line_samples import (
+    LineSamples,
+    apart,
+    sample_markings,
+    see_lines,
+    thinned,
+)
+
+Floats = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+_SPACING: Final = 0.25
+"""Between samples in the world [m]."""
+_LINE_WIDTH: Final = 0.12
+"""Of the paint [m]; Law 1 allows no more, and most pitches have it."""
+_CONTRAST: Final = 6.0
+"""Least brightness of paint above the grass on either side [levels of 255]."""
+_FEW: Final = 15
+"""Fewer samples of lines correct nothing [1]."""
+_FINE: Final = 3.0
+"""Reach of the second look, after the first has corrected the camera [px]."""
+_SCALES: Final = (12.0, 6.0, 3.0, 1.5, 1.0)
+"""Of the loss while the correction tightens [px]."""
+_HOLD: Final = np.array([3e-3, 3e-3, 1.5e-3, 4e-3])
+"""How far a frame's turn [rad] and log focal may be corrected, standard deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class FieldSamples:
+    """The template's markings as samples that lines are looked for at.
+
+    Attributes:
+        lines: samples away from other markings.
+    """
+
+    lines: LineSamples
+
+    @classmethod
+    def of(cls, pitch: PitchTemplate) -> FieldSamples:
+        """Return the samples of a pitch."""
+        everywhere = sample_markings(pitch, _SPACING)
+        return cls(everywhere[apart(everywhere, np.arange(len(everywhere.marking)))])
+
+
+def find_lines(
+    camera: MovingCamera,
+    samples: FieldSamples,
+    picture: Picture,
+    people: Floats | None,
+    settings: BroadcastCalibrationSettings,
+) -> tuple[PointEvidence, MovingCamera]:
+    """Return one frame's painted lines, and its camera corrected by them.
+
+    A first look reaches far and corrects turn and zoom; a second near the corrected lines says
+    where they are.
+
+    Args:
+        camera: a single frame, about right.
+        samples: of the pitch.
+        picture: grey (height, width).
+        people: boxes (detections, 4) [px] that hide lines; None = nobody.
+        settings: reach, noise, number of samples.
+    """
+    first = _look(camera, samples, picture, people, settings, settings.line_reach)
+    if len(first) < _FEW:
+        return PointEvidence.none(), camera
+    corrected = _corrected(camera, first)
+    return _look(corrected, samples, picture, people, settings, _FINE), corrected
+
+
+def _look(
+    camera: MovingCamera,
+    samples: FieldSamples,
+    picture: Picture,
+    people: Floats | None,
+    settings: BroadcastCalibrationSettings,
+    reach: float,
+) -> PointEvidence:
+    """Return bars of paint within reach of one frame's projected lines."""
+    lines = _near(camera, samples.lines)
+    seen = see_lines(camera.camera[0], lines, _LINE_WIDTH, 0.0, 0.0)
+    index = thinned(seen, lines, 4.0, settings.line_samples)
+    if people is not None and len(index):
+        index = index[~_hidden(seen.places[index], people, reach)]
+    if not len(index):
+        return PointEvidence.none()
+    places, normals = seen.places[index], seen.normals[index]
+    widths, count = seen.widths[index], len(index)
+    offsets, strengths = np.empty((count, CANDIDATES)), np.empty((count, CANDIDATES))
+    find_bars(
+        picture,
+        places,
+        normals,
+        widths,
+        np.full(count, reach),
+        _CONTRAST,
+        offsets,
+        strengths,
+    )
+    with np.errstate(divide="ignore"):
+        merit = np.log(strengths) - 0.5 * (2.0 * offsets / reach) ** 2
+    best = np.where(np.isnan(offsets), -np.inf, merit).argmax(axis=1)
+    exact, variances = np.empty(count), np.empty(count)
+    fit_bars(
+        picture,
+        places,
+        normals,
+        widths,
+        offsets[np.arange(count), best],
+        _CONTRAST,
+        exact,
+        variances,
+    )
+    found = np.isfinite(exact)
+    deviation = np.sqrt(variances[found] + settings.line_noise**2)
+    return PointEvidence.across_lines(
+        np.zeros(int(found.sum()), dtype=np.int64),
+        lines.points_world[index][found],
+        (places + exact[:, None] * normals)[found],
+        normals[found],
+        deviation,
+        settings.loss,
+        MARKING,
+        lines.marking[index][found],
+        settings.survey_error * _paint(lines[index[found]]),
+    )
+
+
+def _paint(lines: LineSamples) -> Floats:
+    """Return how samples move with their markings (n, PAINT, 3) [m/m]."""
+    paint = np.zeros((len(lines.marking), PAINT, 3))
+    paint[:, :2] = lines.sideways[:, :, None] * lines.across_world[:, None, :]
+    paint[:, 2:, 2] = lines.upwards
+    return paint
+
+
+def _near(camera: MovingCamera, lines: LineSamples) -> LineSamples:
+    """Return the samples that a pinhole without distortion has in or near the picture."""
+    gone = (lines.points_world - camera.center) @ camera.rotation[0].T
+    ahead = gone[:, 2] > 1.0
+    place = gone[:, :2] / np.where(ahead, gone[:, 2], 1.0)[:, None]
+    half = 0.6 * camera.image_size / camera.focal[0]
+    off = (camera.principal_point - 0.5 * camera.image_size) / camera.focal[0]
+    return lines[ahead & (np.abs(place + off) < half).all(axis=-1)]
+
+
+def _hidden(places: Floats, people: Floats, reach: float) -> NDArray[np.bool_]:
+    """Return which places (n,) lie in or near a person's box."""
+    x, y = places[:, 0, None], places[:, 1, None]
+    x0, y0, x1, y1 = people.T
+    with np.errstate(invalid="ignore"):
+        across = (x > x0 - reach) & (x < x1 + reach)
+        return np.asarray((across & (y > y0 - reach) & (y < y1 + reach)).any(axis=1))
+
+
+def _corrected(camera: MovingCamera, lines: PointEvidence) -> MovingCamera:
+    """Return a single frame turned and zoomed onto its lines."""
+    begin, edges = camera, bounds(lines.frame, 1)
+    gone = np.zeros(4)
+    across = lines.whitening / np.linalg.norm(lines.whitening, axis=(1, 2))[:, None, None]
+    for scale in _SCALES:
+        blocks, right = np.zeros((3, 1, 7, 7)), np.zeros((1, 7))
+        border, corner, rest = np.zeros((1, 7, 5)), np.zeros((5, 5)), np.zeros(5)
+        add_points(
+            camera.center,
+            camera.principal_point,
+            camera.focal,
+            camera.rotation,
+            camera.distortion,
+            edges,
+            lines.world,
+            lines.image,
+            across / scale,
+            lines.weight,
+            np.ones(len(lines)),
+            np.full(len(lines), -1),
+            lines.paint,
+            np.zeros((0, PAINT)),
+            blocks,
+            border,
+            corner,
+            right,
+            rest,
+        )
+        normal = blocks[0, 0, :4, :4] + np.diag(1.0 / _HOLD**2)
+        gone = gone - np.linalg.solve(normal, right[0, :4] + gone / _HOLD**2)
+        camera = begin.stepped(np.append(gone, np.zeros(3))[None], np.zeros(5))
+    return camera
+
+
+def carried(camera: MovingCamera, begin: MovingCamera, corrected: MovingCamera) -> MovingCamera:
+    """Return a frame's camera with the correction that another frame's has had.
+
+    Args:
+        camera: a single frame.
+        begin: another before its correction.
+        corrected: the same after it.
+    """
+    turn = corrected.rotation @ np.swapaxes(begin.rotation, -1, -2)
+    return replace(
+        camera,
+        rotation=turn @ camera.rotation,
+        focal=camera.focal * corrected.focal / begin.focal,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class FollowedLines:
+    """Painted lines of a clip.
+
+    Attributes:
+        evidence: of all frames.
+        camera: the clip's cameras, turned and zoomed onto their lines.
+    """
+
+    evidence: PointEvidence
+    camera: MovingCamera
+
+
+def follow_lines(
+    camera: MovingCamera,
+    samples: FieldSamples,
+    pictures: Iterable[Picture],
+    boxes: Floats | None,
+    settings: BroadcastCalibrationSettings,
+) -> FollowedLines:
+    """Return the painted lines of all frames; what one frame corrects, the next begins with.
+
+    Args:
+        camera: all frames, as tracked.
+        samples: of the pitch.
+        pictures: grey (height, width), in order.
+        boxes: (frames, detections, 4) [px] of people, who hide lines; None = nobody.
+        settings: reach, noise, number of samples.
+    """
+    parts, cameras = [], []
+    before = after = camera.frames(slice(0, 1))
+    for frame, picture in enumerate(pictures):
+        single = camera.frames(slice(frame, frame + 1))
+        begin = carried(single, before, after)
+        people = None if boxes is None else boxes[frame]
+        found, corrected = find_lines(begin, samples, picture, people, settings)
+        parts.append(found.in_frame(frame))
+        cameras.append(corrected)
+        before, after = single, corrected
+    return FollowedLines(together(parts), joined(cameras))

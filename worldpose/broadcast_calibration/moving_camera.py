@@ -1,0 +1,130 @@
+"""The moving camera: one center and principal point, and a rotation and a lens a frame (M1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldpose.cameras import Camera, Rigid
+
+Floats = NDArray[np.float64]
+
+FRAME_SIZE = 7
+"""Numbers of a frame's step: rotation [rad] in the camera's axes, log focal, k1, k2, k3."""
+CLIP_SIZE = 5
+"""Numbers of the clip's step: center [m], world, and principal point [px]."""
+
+
+@dataclass(frozen=True, eq=False)
+class MovingCamera:
+    """A camera that turns and zooms about a fixed center.
+
+    Attributes:
+        center: (3,) [m], world.
+        principal_point: (2,) [px].
+        rotation: (frames, 3, 3) of x_cam = R (x_world - center).
+        focal: (frames,) [px]; square pixels.
+        distortion: (frames, 3) k1, k2, k3.
+        image_size: (2,) width, height [px].
+    """
+
+    center: Floats
+    principal_point: Floats
+    rotation: Floats
+    focal: Floats
+    distortion: Floats
+    image_size: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, camera: Camera, center: ArrayLike, principal_point: ArrayLike) -> MovingCamera:
+        """Return cameras (frames,) with a center and a principal point in common.
+
+        Args:
+            camera: their rotations, focal lengths and distortion are kept.
+            center: (3,) [m], world.
+            principal_point: (2,) [px].
+        """
+        return cls(
+            center=np.asarray(center, dtype=np.float64),
+            principal_point=np.asarray(principal_point, dtype=np.float64),
+            rotation=np.ascontiguousarray(camera.cam_from_world.rotation),
+            focal=np.ascontiguousarray(camera.focal.mean(axis=-1)),
+            distortion=np.ascontiguousarray(camera.distortion[:, [0, 1, 4]]),
+            image_size=camera.image_size[0],
+        )
+
+    def __len__(self) -> int:
+        return len(self.focal)
+
+    @property
+    def camera(self) -> Camera:
+        """The same as a batch (frames,)."""
+        distortion = np.zeros((len(self), 5))
+        distortion[:, [0, 1, 4]] = self.distortion
+        return Camera(
+            focal=np.repeat(self.focal[:, None], 2, axis=1),
+            principal_point=np.broadcast_to(self.principal_point, (len(self), 2)),
+            distortion=distortion,
+            cam_from_world=Rigid(self.rotation, -self.rotation @ self.center),
+            image_size=self.image_size,
+        )
+
+    def frames(self, index: NDArray[np.int64] | slice) -> MovingCamera:
+        """Return some of the frames."""
+        return replace(
+            self,
+            rotation=np.ascontiguousarray(self.rotation[index]),
+            focal=np.ascontiguousarray(self.focal[index]),
+            distortion=np.ascontiguousarray(self.distortion[index]),
+        )
+
+    def stepped(self, frame_step: ArrayLike, clip_step: ArrayLike) -> MovingCamera:
+        """Return the camera after a step.
+
+        Args:
+            frame_step: (frames, 7).
+            clip_step: (5,).
+        """
+        step = np.asarray(frame_step, dtype=np.float64)
+        shared = np.asarray(clip_step, dtype=np.float64)
+        turn = Rigid.from_rotvec(step[:, :3], np.zeros(3)).rotation
+        return replace(
+            self,
+            center=self.center + shared[:3],
+            principal_point=self.principal_point + shared[3:],
+            rotation=turn @ self.rotation,
+            focal=self.focal * np.exp(step[:, 3]),
+            distortion=self.distortion + step[:, 4:],
+        )
+
+    def between(self, start: int, stop: int, frames: ArrayLike) -> MovingCamera:
+        """Return cameras at frame numbers between two given ones, turned and zoomed evenly.
+
+        Args:
+            start: index of the first.
+            stop: index of the second.
+            frames: (n,) shares of the way, 0 at the first and 1 at the second.
+        """
+        share = np.asarray(frames, dtype=np.float64)[:, None]
+        way = Rigid(self.rotation[stop] @ self.rotation[start].T, np.zeros(3)).rotvec
+        turn = Rigid.from_rotvec(share * way, np.zeros(3)).rotation
+        ends = np.log(self.focal[[start, stop]])
+        lens = self.distortion[[start, stop]]
+        return replace(
+            self,
+            rotation=turn @ self.rotation[start],
+            focal=np.exp((1.0 - share[:, 0]) * ends[0] + share[:, 0] * ends[1]),
+            distortion=(1.0 - share) * lens[0] + share * lens[1],
+        )
+
+
+def joined(parts: list[MovingCamera]) -> MovingCamera:
+    """Return the frames of several parts one after another; what is shared is the first's."""
+    return replace(
+        parts[0],
+        rotation=np.concatenate([part.rotation for part in parts]),
+        focal=np.concatenate([part.focal for part in parts]),
+        distortion=np.concatenate([part.distortion for part in parts]),
+    )

@@ -1,0 +1,221 @@
+"""Players of the static cameras matched with those detected in the broadcast pictures (M4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from worldpose.broadcast_calibration.evidence import PLAYER, PointEvidence
+from worldpose.broadcast_calibration.moving_camera import MovingCamera
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
+from worldpose.errors import InputError
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+BONES: Final = np.array(
+    [
+        *((5, 6), (5, 7), (7, 9), (6, 8), (8, 10), (5, 11), (6, 12), (11, 13)),
+        *((13, 15), (12, 14), (14, 16), (0, 1), (0, 2), (1, 3), (2, 4), (0, 5)),
+    ]
+)
+"""A tree over the 17 joints of COCO: J - 1 bones."""
+_LEAST: Final = 0.05
+"""Pairs less alike are no pairs [1]: a twentieth of shared area, or bones at random."""
+_JOINTS: Final = 6
+"""Fewer joints seen on both sides make no pair [1]."""
+_START: Final = 0.05
+"""Deviation of a keypoint before the clip has told it, of the person's height in the picture."""
+_LAG: Final = 1.0
+"""Errors are taken as independent beyond this [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class People:
+    """People in space and in the picture, frame by frame.
+
+    Attributes:
+        joints: (frames, persons, 17, 3) [m], world; NaN where missing.
+        keypoints: (frames, detections, 17, 2) [px]; NaN where missing.
+        fps: frames a second.
+
+    Raises:
+        InputError: the frames differ.
+    """
+
+    joints: Floats
+    keypoints: Floats
+    fps: float
+
+    def __post_init__(self) -> None:
+        if len(self.joints) != len(self.keypoints):
+            raise InputError(
+                "broadcast calibration: people",
+                expected="joints and keypoints of the same frames",
+                found=f"{len(self.joints)} and {len(self.keypoints)}",
+                todo="Give both for every frame of the clip, missing ones as NaN.",
+            )
+
+    @property
+    def boxes(self) -> Floats:
+        """Boxes (frames, detections, 4) about the keypoints [px]; NaN without any."""
+        return boxes_of(self.keypoints)
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Who is who.
+
+    Attributes:
+        frame: (n,) rising.
+        person: (n,).
+        detection: (n,).
+        similarity: (n,).
+    """
+
+    frame: Integers
+    person: Integers
+    detection: Integers
+    similarity: Floats
+
+
+@dataclass(frozen=True)
+class PlayerNoise:
+    """What the residuals of matched players say of the detector.
+
+    Attributes:
+        share: standard deviation of a keypoint, of the person's height in the picture [1].
+        frames: of how many frames in a row the errors are worth one frame's [frame].
+    """
+
+    share: float
+    frames: float
+
+
+def boxes_of(keypoints: Floats) -> Floats:
+    """Return boxes (..., 4) x0 y0 x1 y1 about keypoints (..., 17, 2); NaN without any."""
+    known = np.isfinite(keypoints)
+    low = np.where(known, keypoints, np.inf).min(axis=-2)
+    high = np.where(known, keypoints, -np.inf).max(axis=-2)
+    boxes = np.concatenate([low, high], axis=-1)
+    return np.where(np.isfinite(boxes), boxes, np.nan)
+
+
+def similarity(projected: Floats, detected: Floats) -> Floats:
+    """Return how alike projected and detected people are (persons, detections) [-1..1] (M4).
+
+    Intersection over union of the boxes about all keypoints, times the mean cosine between
+    corresponding bones; the mean over those that both have. 0 where too little is seen.
+
+    Args:
+        projected: (persons, 17, 2) [px].
+        detected: (detections, 17, 2) [px].
+    """
+    one, two = boxes_of(projected)[:, None], boxes_of(detected)[None]
+    sides = np.minimum(one[..., 2:], two[..., 2:]) - np.maximum(one[..., :2], two[..., :2])
+    shared = np.maximum(sides, 0.0).prod(axis=-1)
+    union = (one[..., 2:] - one[..., :2]).prod(-1) + (two[..., 2:] - two[..., :2]).prod(-1)
+    union = union - shared
+    with np.errstate(invalid="ignore", divide="ignore"):
+        overlap = np.where(union > 0.0, shared / union, 0.0)
+        bones = [each[:, BONES[:, 1]] - each[:, BONES[:, 0]] for each in (projected, detected)]
+        unit = [bone / np.linalg.norm(bone, axis=-1, keepdims=True) for bone in bones]
+        cosine = np.einsum("ibk,jbk->ijb", *unit)
+        known = np.isfinite(cosine)
+        mean = np.where(known, cosine, 0.0).sum(-1) / np.maximum(known.sum(-1), 1)
+    one_seen, two_seen = (np.asarray(np.isfinite(p).all(-1)) for p in (projected, detected))
+    both = one_seen[:, None] & two_seen[None]
+    alike = np.where(both.sum(-1) >= _JOINTS, overlap * mean, 0.0)
+    return np.where(np.isfinite(alike), alike, 0.0)
+
+
+def match(camera: MovingCamera, people: People) -> Matches:
+    """Return the best pairs of every frame, by weighted bipartite matching."""
+    frames, persons = people.joints.shape[:2]
+    projected = camera.camera.project(people.joints.reshape(frames, -1, 3))
+    projected = projected.reshape(frames, persons, -1, 2)
+    rows: list[tuple[int, int, int, float]] = []
+    for frame in range(frames):
+        alike = similarity(projected[frame], people.keypoints[frame])
+        for person, detection in zip(*linear_sum_assignment(-alike), strict=True):
+            if alike[person, detection] > _LEAST:
+                value = float(alike[person, detection])
+                rows.append((frame, int(person), int(detection), value))
+    table = np.array(rows, dtype=np.float64).reshape(-1, 4)
+    frame, person, detection = table[:, :3].T.astype(np.int64)
+    return Matches(frame, person, detection, table[:, 3])
+
+
+def player_evidence(
+    camera: MovingCamera,
+    people: People,
+    matches: Matches,
+    settings: BroadcastCalibrationSettings,
+) -> tuple[PointEvidence, PlayerNoise]:
+    """Return matched keypoints as evidence, and the noise that it is weighed with.
+
+    A keypoint's deviation is a share of the person's height in the picture, and its weight falls
+    with the number of frames over which errors last; the clip's own residuals tell both.
+
+    Args:
+        camera: all frames, about right.
+        people: joints and keypoints.
+        matches: who is who.
+        settings: weight and loss.
+    """
+    world = people.joints[matches.frame, matches.person]
+    image = people.keypoints[matches.frame, matches.detection]
+    tall = np.ptp(np.nan_to_num(boxes_of(image)).reshape(-1, 2, 2)[..., 1], axis=-1)
+    projected = np.full(image.shape, np.nan)
+    for frame in np.unique(matches.frame):
+        mine = matches.frame == frame
+        single = camera.frames(slice(int(frame), int(frame) + 1)).camera[0]
+        projected[mine] = single.project(world[mine].reshape(-1, 3)).reshape(-1, *image.shape[1:])
+    scaled = (projected - image) / np.maximum(tall, 1.0)[:, None, None]
+    noise = _noise(scaled, matches, people.fps)
+    known = np.isfinite(scaled).all(axis=-1)
+    frame = np.repeat(matches.frame[:, None], image.shape[1], axis=1)[known]
+    deviation = noise.share * np.repeat(tall[:, None], image.shape[1], axis=1)[known]
+    evidence = PointEvidence.at_points(
+        frame,
+        world[known],
+        image[known],
+        np.maximum(deviation, 0.5),
+        settings.player_weight / noise.frames,
+        settings.loss,
+        PLAYER,
+        np.repeat(matches.person[:, None], image.shape[1], axis=1)[known],
+    )
+    return evidence, noise
+
+
+def _noise(scaled: Floats, matches: Matches, fps: float) -> PlayerNoise:
+    """Return spread and persistence of residuals (n, 17, 2) over heights."""
+    known = scaled[np.isfinite(scaled)]
+    if len(known) < 100:
+        return PlayerNoise(_START, 1.0)
+    share = max(1.4826 * float(np.median(np.abs(known))), 1e-3)
+    bounded = np.clip(scaled, -3.0 * share, 3.0 * share)
+    persons = int(matches.person.max()) + 1
+    where = {
+        int(key): number for number, key in enumerate(matches.frame * persons + matches.person)
+    }
+    power = float(np.nanmean(bounded**2))
+    total = 1.0
+    for lag in range(1, max(1, round(_LAG * fps)) + 1):
+        later = np.array(
+            [where.get(int(key), -1) for key in (matches.frame + lag) * persons + matches.person]
+        )
+        there = later >= 0
+        products = bounded[there] * bounded[later[there]]
+        if not np.isfinite(products).any():
+            break
+        correlation = float(np.nanmean(products)) / power
+        if correlation < 0.05:
+            break
+        total += 2.0 * correlation
+    return PlayerNoise(share, total)

@@ -1,0 +1,117 @@
+"""Settings of broadcast calibration."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from data_contracts.records import Record
+from worldpose.static_calibration import CameraPrior, StaticCalibrationSettings
+
+
+class BroadcastPrior(Record):
+    """What is known of a main camera before anything is clicked: middles and spreads.
+
+    Of 20 released clips of the 2022 World Cup (K, k, R, t of WorldPose), widened where one
+    broadcaster's lenses and stadiums need not be everybody's.
+    """
+
+    principal_point: tuple[float, float] = (0.0, -0.018)
+    """From the picture's middle, in widths of the picture [1]; 2022: 0, and -35 px of 1920."""
+    principal_point_spread: tuple[float, float] = (0.01, 0.012)
+    """In widths [1]; 2022: 19 and 23 px of 1920."""
+    focal: float = Field(default=2.1, gt=0)
+    """In widths of the picture [1]; 2022: 1.25 to 3.7."""
+    focal_spread: float = Field(default=0.4, gt=0)
+    """Of the focal length's logarithm [1]."""
+    k1: float = 0.4
+    """At a focal length of 2.19 widths [1]; it grows with the focal length to the power 1.6."""
+    k1_spread: float = Field(default=0.25, gt=0)
+    """As `k1`, growing alike [1]; 2022: 0.08. Wide enough for a lens without distortion."""
+    k2: float = 1.5
+    """At a focal length of 2.19 widths [1]; it grows with the focal length."""
+    k2_spread: float = Field(default=0.8, gt=0)
+    """As `k2`, growing alike [1]; 2022: 0.5 to 0.8."""
+    k3_spread: float = Field(default=0.5, gt=0)
+    """As `k2_spread`, about zero [1]: the released cameras have none (trap 3)."""
+    center: tuple[float, float, float] = (0.0, -75.0, 17.0)
+    """World [m]: on the main stand, at the halfway line."""
+    center_spread: tuple[float, float, float] = (15.0, 20.0, 8.0)
+    """[m]; 2022: 0.1, 6 and 2 m, of cameras at the halfway line in large stadiums."""
+
+
+class BroadcastCalibrationSettings(Record):
+    """Weights, noise and gates of the moving camera."""
+
+    prior: BroadcastPrior = BroadcastPrior()
+    """What the clip cannot tell."""
+    click_noise: float = Field(default=1.0, gt=0)
+    """Standard deviation of a clicked point, each axis [px]."""
+    survey_error: float = Field(default=0.006, ge=0)
+    """Of the template's markings from the painted ones, each axis, standard deviation [m]."""
+    field_weight: float = Field(default=1.0, gt=0)
+    """Factor on the loss of markings (M3; the paper's 1)."""
+    player_weight: float = Field(default=0.5, ge=0)
+    """Factor on the loss of players' keypoints (M4; the paper's 0.5): with residuals in standard
+    deviations, two keypoints of a person are worth one; a detector errs alike for many at once."""
+    loss: float = Field(default=3.0, gt=0)
+    """Scale of the Geman-McClure losses [standard deviations]; the paper gives none."""
+    line_noise: float = Field(default=0.3, gt=0)
+    """Least standard deviation of a painted line's sample across it [px]: the survey's error and
+    the paint's edge, which the picture's noise does not show."""
+    line_samples: int = Field(default=240, ge=20)
+    """Samples of painted lines in one frame, at most, about [1]."""
+    line_reach: float = Field(default=12.0, gt=0)
+    """Lines are looked for this far from their projection at most [px]."""
+    flow_points: int = Field(default=400, ge=30)
+    """Points followed from frame to frame, about [1]."""
+    flow_noise: float = Field(default=0.1, gt=0)
+    """Least standard deviation of a followed point's motion [px]; what the clip shows is taken
+    where that is more."""
+    flow_outlier: float = Field(default=3.5, gt=0)
+    """Largest modified z-score of a followed point (M6; Iglewicz and Hoaglin's cut)."""
+    flow_weight: float = Field(default=1.0, ge=0)
+    """Factor on the loss of followed points (M6); 0 = without."""
+    flow_drift: float = Field(default=0.15, gt=0)
+    """What tracking misses by after one frame, growing with the square root of the frames [px];
+    where two key frames or more tell it, that is taken."""
+    smooth: bool = True
+    """Let focal length and distortion change evenly, as far as the clip itself does (M6)."""
+    rounds: int = Field(default=2, ge=1)
+    """Times that players are matched and lines are looked for anew [1]."""
+    iterations: int = Field(default=30, ge=1)
+    """Of the solver in each round, at most [1]."""
+    solver: Literal["levenberg_marquardt", "adam"] = "levenberg_marquardt"
+    """How the last fit is done; Adam is the paper's (M5)."""
+    adam_iterations: int = Field(default=2000, ge=1)
+    """Of Adam, where it is chosen [1]."""
+    cut_share: float = Field(default=0.25, gt=0, lt=1)
+    """Between two frames of one shot at least this share of the followed points moves as a turning
+    and zooming camera moves them [1]."""
+    weak_error: float = Field(default=3.0, gt=0)
+    """A clip is weak where more than a twentieth of its frames expect a larger error of players'
+    places in the picture [px]."""
+
+    @property
+    def key_frame(self) -> StaticCalibrationSettings:
+        """How a single key frame is calibrated."""
+        prior = self.prior
+        # In the terms of static cameras: what k1 and k2 move the picture's corner by, in its
+        # distance from the middle, at a focal length of 2.19 widths.
+        corner = (0.574 / 2.19) ** 2
+        camera = CameraPrior(
+            focal=prior.focal,
+            focal_spread=prior.focal_spread,
+            principal_point_spread=0.02,
+            k1=prior.k1 * corner,
+            k1_spread=1.5 * prior.k1_spread * corner,
+            k2_spread=2.0 * prior.k2 * corner**2,
+            height=prior.center[2],
+            height_spread=0.35,
+            distance=-prior.center[1],
+            distance_spread=0.25,
+        )
+        return StaticCalibrationSettings(
+            prior=camera, click_noise=self.click_noise, survey_error=self.survey_error
+        )

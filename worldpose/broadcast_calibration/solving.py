@@ -1,0 +1,301 @@
+"""All frames at once: Levenberg-Marquardt on an arrow-shaped, banded system (M3 to M6)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.body_fitting.banded import BandedFactor
+from worldpose.broadcast_calibration.evidence import (
+    MARKING,
+    PAINT,
+    FlowEvidence,
+    PointEvidence,
+    bounds,
+)
+from worldpose.broadcast_calibration.flow_equations import add_flow
+from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
+from worldpose.broadcast_calibration.normal_equations import add_points
+from worldpose.broadcast_calibration.smoothness import add_smoothness
+from worldpose.errors import DegenerateError
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_START_DAMPING: Final = 1e-4
+_MOST_DAMPING: Final = 1e9
+_SETTLED: Final = 1e-7
+"""Relative fall of the cost that ends the iterations."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known without any evidence, Gaussian.
+
+    Attributes:
+        center: (3,) [m], world.
+        center_information: (3, 3) [1/m^2].
+        principal_point: (2,) [px].
+        principal_spread: (2,) [px].
+        log_focal: (frames,); with `focal_spread`.
+        focal_spread: standard deviation of the logarithm.
+        distortion: (frames, 3).
+        distortion_spread: (frames, 3).
+    """
+
+    center: Floats
+    center_information: Floats
+    principal_point: Floats
+    principal_spread: Floats
+    log_focal: Floats
+    focal_spread: float
+    distortion: Floats
+    distortion_spread: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Everything that the frames of a clip are fitted to.
+
+    Attributes:
+        points: clicks, lines and players.
+        flow: followed points.
+        prior: of places and lenses.
+        smoothness: (7,) standard deviation of second differences of a frame's numbers; infinite
+            = free.
+        flow_weight: factor on the loss of followed points [1].
+        flow_loss: scale of it [standard deviations].
+        free_frame: (7,) which of a frame's numbers are solved for.
+        free_clip: (5,) which of the clip's.
+        known: (frames, 7) numbers that are known beforehand in single frames, such as the first
+            frame's rotation.
+    """
+
+    points: PointEvidence
+    flow: FlowEvidence
+    prior: Prior
+    smoothness: Floats = field(default_factory=lambda: np.full(FRAME_SIZE, np.inf))
+    flow_weight: float = 1.0
+    flow_loss: float = np.inf
+    free_frame: NDArray[np.bool_] = field(default_factory=lambda: np.ones(FRAME_SIZE, np.bool_))
+    free_clip: NDArray[np.bool_] = field(default_factory=lambda: np.ones(CLIP_SIZE, np.bool_))
+    known: NDArray[np.bool_] | None = None
+
+    @property
+    def markings(self) -> Integers:
+        """Numbers of the markings whose place is solved for, rising (m,)."""
+        painted = self.points.source[self.points.kind == MARKING]
+        return np.asarray(np.unique(painted))
+
+    @property
+    def group(self) -> Integers:
+        """Which of `markings` each point lies on (n,); -1 = none."""
+        group = np.searchsorted(self.markings, self.points.source)
+        return np.asarray(np.where(self.points.kind == MARKING, group, -1))
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """Cost, gradient and Gauss-Newton matrix at a camera.
+
+    Attributes:
+        cost: half the sum of losses and squares.
+        blocks: (3, frames, 7, 7) band, see `BandedFactor`.
+        border: (frames, 7, 5 + 4 markings).
+        corner: (5 + 4 markings, the same).
+        right: (frames, 7) gradient by the frames' steps.
+        right_corner: (5 + 4 markings,) gradient by the clip's step and the markings' places.
+    """
+
+    cost: float
+    blocks: Floats
+    border: Floats
+    corner: Floats
+    right: Floats
+    right_corner: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The camera that costs least, and how the search went.
+
+    Attributes:
+        camera: the answer.
+        beside: (markings, 4) where its markings lie beside the template [standard deviations].
+        cost: at it.
+        costs: after every iteration.
+        equations: at it.
+    """
+
+    camera: MovingCamera
+    beside: Floats
+    cost: float
+    costs: tuple[float, ...]
+    equations: Equations
+
+
+def equations_at(camera: MovingCamera, beside: Floats, problem: Problem) -> Equations:
+    """Return cost, gradient and matrix of a problem at a camera.
+
+    Args:
+        camera: all frames.
+        beside: (markings, 4) where the problem's markings lie [standard deviations].
+        problem: evidence, smoothness and priors.
+    """
+    frames = len(camera)
+    shared = CLIP_SIZE + beside.size
+    blocks = np.zeros((3, frames, FRAME_SIZE, FRAME_SIZE))
+    border = np.zeros((frames, FRAME_SIZE, shared))
+    # Their own prior, in standard deviations.
+    corner = np.diag(np.append(np.zeros(CLIP_SIZE), np.ones(beside.size)))
+    right = np.zeros((frames, FRAME_SIZE))
+    right_corner = np.append(np.zeros(CLIP_SIZE), beside.ravel())
+    points, group = problem.points, problem.group
+    system = (blocks, border, corner, right, right_corner)
+    flow = problem.flow
+    lens = (camera.principal_point, camera.focal, camera.rotation, camera.distortion)
+    cost = add_points(
+        camera.center,
+        *lens,
+        bounds(points.frame, frames),
+        points.world,
+        points.image,
+        points.whitening,
+        points.weight,
+        points.loss,
+        group,
+        points.paint,
+        beside,
+        *system,
+    )
+    if len(flow) and problem.flow_weight > 0.0:
+        cost += add_flow(
+            *lens,
+            bounds(flow.frame, frames),
+            flow.start,
+            flow.end,
+            flow.deviation,
+            problem.flow_weight,
+            problem.flow_loss,
+            *system,
+        )
+    cost += 0.5 * float((beside**2).sum())
+    cost += add_smoothness(camera, problem.smoothness, blocks, right)
+    cost += _add_prior(camera, problem.prior, *system)
+    _fix(problem, blocks, border, corner, right, right_corner)
+    return Equations(float(cost), blocks, border, corner, right, right_corner)
+
+
+def solve(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
+    """Return the camera of least cost near a start.
+
+    Args:
+        camera: the start.
+        problem: evidence, smoothness and priors.
+        iterations: at most.
+
+    Raises:
+        DegenerateError: the matrix is singular: some number has neither evidence nor prior.
+    """
+    beside = np.zeros((len(problem.markings), PAINT))
+    here = equations_at(camera, beside, problem)
+    damping, costs = _START_DAMPING, [here.cost]
+    for _ in range(iterations):
+        frame, clip = _step(here, damping)
+        trial = camera.stepped(frame, clip[:CLIP_SIZE])
+        moved = beside + clip[CLIP_SIZE:].reshape(beside.shape)
+        there = equations_at(trial, moved, problem)
+        if there.cost < here.cost:
+            fall = here.cost - there.cost
+            camera, beside, here = trial, moved, there
+            damping = max(damping / 6.0, 1e-10)
+            costs.append(here.cost)
+            if fall < _SETTLED * here.cost:
+                break
+        else:
+            damping *= 8.0
+            if damping > _MOST_DAMPING:
+                break
+    return Solution(camera, beside, here.cost, tuple(costs), here)
+
+
+def _step(system: Equations, damping: float) -> tuple[Floats, Floats]:
+    """Return the damped Gauss-Newton step of the frames (frames, 7) and of what they share."""
+    blocks = system.blocks.copy()
+    diagonal = np.arange(FRAME_SIZE)
+    blocks[0][:, diagonal, diagonal] *= 1.0 + damping
+    factor = BandedFactor.of(blocks)
+    if not factor.determined:
+        raise DegenerateError(
+            "broadcast camera: a frame's numbers have neither evidence nor prior. Pick a key frame "
+            "near the frames without lines, or give priors."
+        )
+    columns = np.concatenate([-system.right[..., None], system.border], axis=-1)
+    solved = factor.solve(columns)
+    corner = system.corner * (1.0 + damping * np.eye(len(system.corner)))
+    flat = system.border.reshape(-1, len(corner))
+    product = flat.T @ solved.reshape(len(flat), -1)
+    reduced = corner - product[:, 1:]
+    rest = -system.right_corner - product[:, 0]
+    clip = np.linalg.solve(reduced, rest)
+    return solved[..., 0] - solved[..., 1:] @ clip, np.asarray(clip)
+
+
+def _add_prior(
+    camera: MovingCamera,
+    prior: Prior,
+    blocks: Floats,
+    border: Floats,
+    corner: Floats,
+    right: Floats,
+    right_corner: Floats,
+) -> float:
+    """Add the priors and return their cost."""
+    off = camera.center - prior.center
+    corner[:3, :3] += prior.center_information
+    right_corner[:3] += prior.center_information @ off
+    cost = 0.5 * float(off @ prior.center_information @ off)
+    moved = (camera.principal_point - prior.principal_point) / prior.principal_spread
+    corner[[3, 4], [3, 4]] += 1.0 / prior.principal_spread**2
+    right_corner[3:CLIP_SIZE] += moved / prior.principal_spread
+    cost += 0.5 * float(moved @ moved)
+    lens = np.concatenate([np.log(camera.focal)[:, None], camera.distortion], axis=1)
+    middle = np.concatenate([prior.log_focal[:, None], prior.distortion], axis=1)
+    width = np.full((len(lens), 1), prior.focal_spread)
+    spread = np.concatenate([width, prior.distortion_spread], axis=1)
+    gone = (lens - middle) / spread
+    diagonal = np.arange(3, FRAME_SIZE)
+    blocks[0][:, diagonal, diagonal] += 1.0 / spread**2
+    right[:, 3:] += gone / spread
+    return cost + 0.5 * float((gone**2).sum())
+
+
+def _fix(
+    problem: Problem,
+    blocks: Floats,
+    border: Floats,
+    corner: Floats,
+    right: Floats,
+    right_corner: Floats,
+) -> None:
+    """Take what is not solved for out of the system, in place."""
+    frames = len(right)
+    fixed = np.broadcast_to(~problem.free_frame, (frames, FRAME_SIZE))
+    if problem.known is not None:
+        fixed = fixed | problem.known
+    if fixed.any():
+        for below in range(3):
+            rows = np.concatenate([fixed[below:], np.zeros((below, FRAME_SIZE), np.bool_)])
+            blocks[below][rows[:, :, None] | fixed[:, None, :]] = 0.0
+        border[fixed] = 0.0
+        right[fixed] = 0.0
+        frame, number = np.nonzero(fixed)
+        blocks[0, frame, number, number] = 1.0
+    held = np.flatnonzero(~problem.free_clip)
+    border[:, :, held] = 0.0
+    corner[held, :] = corner[:, held] = 0.0
+    corner[held, held] = 1.0
+    right_corner[held] = 0.0

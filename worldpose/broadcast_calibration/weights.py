@@ -1,0 +1,100 @@
+"""Weights of smoothness and flow by what the clip itself shows (M6)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.records import Record
+from worldpose.broadcast_calibration.chain import Chain
+from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE, MovingCamera
+from worldpose.broadcast_calibration.smoothness import second_differences
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_HAND: Final = 2e-3
+"""Largest plausible second difference of the rotation at 50 frames a second [rad]: it bridges
+frames without evidence and binds nothing else."""
+_LEAST: Final = np.array([1e-5, 1e-5, 1e-4, 1e-4])
+"""Least deviation of a second difference of log focal, k1, k2, k3."""
+_LENS: Final = np.array([1.6, 1.0, 1.0])
+"""Powers of the focal length that k1, k2, k3 grow with."""
+_WINDOW: Final = 0.2
+"""Tracked focal lengths are evened over this time before their differences are taken [s]."""
+
+
+class Weights(Record):
+    """What the terms are weighed with, and the rule behind each number."""
+
+    flow_deviation_px: float
+    """Of a followed point's motion: 1.4826 times the median absolute residual along an axis of the
+    points that move with the camera, and at least the setting."""
+    flow_share: float
+    """Of its loss that a followed point counts: the drift from key frame to key frame that
+    independent points would leave over the drift found, squared; points of a frame err together."""
+    smooth_log_focal: float
+    """Deviation of second differences: their root mean square in the tracked focal lengths, evened
+    over 0.2 s."""
+    smooth_k1: float
+    """As the focal length's, times 1.6 and k1: a zoom lens bends as it zooms."""
+    smooth_k2: float
+    """As the focal length's, times k2."""
+    player_share: float
+    """Deviation of a keypoint over the person's height: 1.4826 times the median absolute
+    residual."""
+    player_frames: float
+    """Over how many frames a person's errors last: the sum of their autocorrelation."""
+
+
+def smoothness_of(camera: MovingCamera, fps: float) -> Floats:
+    """Return the deviation (7,) of second differences that a tracked clip shows.
+
+    Args:
+        camera: all frames, as tracked.
+        fps: frames a second.
+    """
+    spread = np.full(FRAME_SIZE, np.inf)
+    spread[:3] = _HAND * (50.0 / fps) ** 2
+    width = max(1, round(_WINDOW * fps))
+    if len(camera) < 3 * width:
+        spread[3:] = 1.0
+        return spread
+    window = np.hanning(width + 2)[1:-1]
+    window /= window.sum()
+    padded = np.pad(np.log(camera.focal), width, mode="reflect", reflect_type="odd")
+    even = np.convolve(padded, window, mode="same")[width:-width]
+    change = float(np.sqrt(np.mean(np.diff(even, n=2) ** 2)))
+    lens = np.median(np.abs(camera.distortion), axis=0)
+    # k3 is that of k2, which it stands beside.
+    lens[2] = max(lens[2], lens[1])
+    spread[3:] = np.maximum(np.concatenate([[change], change * _LENS * lens]), _LEAST)
+    return spread
+
+
+def flow_share_of(links: Chain, key_frames: Integers, deviation: float, drift: float) -> float:
+    """Return which share of its loss a followed point counts [0..1].
+
+    Args:
+        links: a tracked clip; without a gap between key frames, `drift` is taken.
+        key_frames: their numbers, rising.
+        deviation: of a followed point's motion [px].
+        drift: what tracking misses by after one frame, growing with the square root of frames [px].
+    """
+    points = np.array([kept.sum() for kept in links.kept])
+    if not len(points) or points.max() == 0:
+        return 1.0
+    # Four numbers a pair out of twice as many coordinates as points.
+    independent = deviation * np.sqrt(4.0 / np.median(points[points > 0]))
+    found = links.drift[np.isfinite(links.drift)]
+    if len(found):
+        gaps = np.diff(key_frames)[np.isfinite(links.drift)]
+        drift = float(np.sqrt(np.mean(found**2 / gaps)))
+    return float(min(1.0, (independent / max(drift, 1e-6)) ** 2))
+
+
+def roughness(camera: MovingCamera) -> Floats:
+    """Return root mean square second differences (7,) of a solution."""
+    return np.asarray(np.sqrt((second_differences(camera) ** 2).mean(axis=0)))

@@ -1,0 +1,169 @@
+"""Fitted bodies over what a camera saw."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import cv2
+import numpy as np
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from data_contracts.pitch import PitchSpec
+from worldpose.cameras import Camera
+from worldpose.release.drawing import INK, draw_label, markings, person_color, png, style
+
+Floats = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+WIDTH: Final = 1540
+"""Of the picture [px]."""
+SHARE: Final = 0.3
+"""Part of the camera's picture that is shown: players of 80 px are 210 px tall then."""
+_GROUND: Final = (206, 217, 202)
+_SUN: Final = np.array([0.35, -0.45, 0.82])
+"""Where light comes from, world: high, from the main camera's side."""
+_SUBPIXEL: Final = 4
+"""Bits of a corner's place below the pixel."""
+
+
+def bodies_picture(
+    camera: Camera,
+    title: str,
+    surfaces: Floats,
+    faces: NDArray[np.int64],
+    person_ids: Sequence[int] | NDArray[np.int64],
+    *,
+    still: Picture | None = None,
+    pitch: PitchSpec | None = None,
+) -> bytes:
+    """Return a PNG of everybody's body as one camera sees it: the part with most of them.
+
+    Args:
+        camera: a single camera.
+        title: says which camera, frame and body model.
+        surfaces: (persons, vertices, 3) [m], world; NaN for a person who is missing.
+        faces: (triangles, 3), counter-clockwise seen from outside.
+        person_ids: (persons,).
+        still: the camera's picture (height, width, 3), RGB, beneath; None = plain ground.
+        pitch: its markings are drawn where there is no still; None where there is no pitch.
+    """
+    present = np.isfinite(surfaces[:, 0, 0])
+    ids = np.asarray(person_ids)[present]
+    bodies = surfaces[present]
+    corner, side = crowded_part(camera, bodies)
+    scale = WIDTH / side[0]
+    near = zoomed(camera, corner, scale, (WIDTH, round(side[1] * scale)))
+    canvas = _background(near, corner, scale, still, pitch)
+    colors = np.array([to_rgb(person_color(int(person))) for person in ids]).reshape(-1, 3)
+    paint_bodies(canvas, near, bodies, faces, colors)
+
+    height, width = canvas.shape[:2]
+    figure = Figure(figsize=(14.0, 14.0 * height / width + 0.4), dpi=110, facecolor="white")
+    figure.set_layout_engine("constrained")
+    axes = figure.subplots()
+    axes.imshow(canvas)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
+    style(axes)
+    for person, body in zip(ids, bodies, strict=True):
+        ((u, v),) = near.project(body[np.argmax(body[:, 2])][None]).tolist()
+        if 0.0 <= u < width and 0.0 <= v < height:
+            draw_label(axes, f"{person}", (u, v), (0, 8), person_color(int(person)))
+    axes.set_title(title, color=INK, loc="left", fontsize=12)
+    return png(figure)
+
+
+def crowded_part(camera: Camera, bodies: Floats) -> tuple[Floats, Floats]:
+    """Return corner and side lengths [px] of the part of a picture that shows most people.
+
+    Args:
+        camera: a single camera.
+        bodies: (persons, points, 3) [m], world.
+    """
+    size = np.asarray(camera.image_size, dtype=np.float64)
+    side = SHARE * size
+    middles = camera.project(bodies.mean(axis=1))
+    inside = np.all((middles >= 0.0) & (middles < size), axis=-1)
+    if not inside.any():
+        return np.full(2, -0.5), size
+    middles = middles[inside]
+    together = (np.abs(middles[:, None] - middles) < 0.45 * side).all(axis=-1)
+    around = middles[together[np.argmax(together.sum(axis=1))]].mean(axis=0)
+    return np.clip(around - 0.5 * side, -0.5, size - 0.5 - side), side
+
+
+def zoomed(camera: Camera, corner: Floats, scale: float, size: tuple[int, int]) -> Camera:
+    """Return the camera whose picture is a part of another's, enlarged.
+
+    Args:
+        camera: the other.
+        corner: top left of the part [px]; (-0.5, -0.5) is that of the picture.
+        scale: enlargement [1].
+        size: width and height of the new picture [px].
+    """
+    return replace(
+        camera,
+        focal=camera.focal * scale,
+        principal_point=(camera.principal_point - corner) * scale - 0.5,
+        image_size=np.array(size),
+    )
+
+
+def paint_bodies(
+    canvas: Picture, camera: Camera, bodies: Floats, faces: NDArray[np.int64], colors: Floats
+) -> None:
+    """Paint bodies over a picture, the farthest triangles first.
+
+    Args:
+        canvas: (height, width, 3), RGB, painted over.
+        camera: a single camera whose picture it is.
+        bodies: (persons, vertices, 3) [m], world, finite.
+        faces: (triangles, 3), counter-clockwise seen from outside.
+        colors: (persons, 3) in 0..1.
+    """
+    corners = bodies[:, faces]
+    normals = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    toward = camera.center - corners.mean(axis=2)
+    pixels = camera.project(bodies)[:, faces]
+    size = np.asarray(camera.image_size)
+    shown = (normals * toward).sum(axis=-1) > 0.0
+    shown &= np.isfinite(pixels).all(axis=(-1, -2))
+    shown &= ((pixels > -1.0) & (pixels < size)).all(axis=-1).any(axis=-1)
+    person, _ = np.nonzero(shown)
+    sun = np.clip(normals[shown] @ (_SUN / np.linalg.norm(_SUN)), 0.0, 1.0)
+    facing = (normals * toward).sum(axis=-1)[shown] / np.linalg.norm(toward[shown], axis=-1)
+    light = 0.45 + 0.3 * sun + 0.25 * facing
+    shades = np.rint(255.0 * light[:, None] * (0.35 + 0.65 * colors[person])).astype(int).tolist()
+    places = np.rint(pixels[shown] * 2**_SUBPIXEL).astype(np.int32)
+    for triangle in np.argsort(-np.linalg.norm(toward[shown], axis=-1), kind="stable").tolist():
+        cv2.fillConvexPoly(
+            canvas, places[triangle], shades[triangle], lineType=cv2.LINE_AA, shift=_SUBPIXEL
+        )
+
+
+def _background(
+    camera: Camera, corner: Floats, scale: float, still: Picture | None, pitch: PitchSpec | None
+) -> Picture:
+    width, height = (int(n) for n in camera.image_size)
+    if still is not None:
+        # Pixel (x, y) of the part shows place (x + 0.5) / scale + corner of the still.
+        offset = 0.5 / scale + corner
+        part = np.array([[1.0 / scale, 0.0, offset[0]], [0.0, 1.0 / scale, offset[1]]])
+        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        edge = cv2.BORDER_REPLICATE
+        return np.asarray(
+            cv2.warpAffine(still, part, (width, height), flags=flags, borderMode=edge), np.uint8
+        )
+    canvas: Picture = np.full((height, width, 3), _GROUND, dtype=np.uint8)
+    for line in markings(pitch) if pitch is not None else ():
+        pixels = camera.project(line)
+        # What is far outside has no place in 32 bits, and none in the picture.
+        near = (np.abs(pixels) < 1e4).all(axis=-1)
+        for start in np.flatnonzero(near[:-1] & near[1:]):
+            ends = np.rint(pixels[start : start + 2] * 2**_SUBPIXEL).astype(int).tolist()
+            cv2.line(canvas, *ends, (255, 255, 255), 3, cv2.LINE_AA, _SUBPIXEL)
+    return canvas

@@ -1,0 +1,185 @@
+"""Where the middle of a painted line is, fitted to the pixels across it (C4).
+
+A bar as wide as the projected paint stands between two levels of grass, its edges blurred. A line
+along the edge of a mown stripe or of a shadow keeps its middle, as the levels are separate.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from worldpose.compiled import compiled
+from worldpose.static_calibration.edges import ALONG, BESIDE, Floats, Picture
+
+_BLUR: Final = 0.75
+"""Standard deviation of a bar's edges [px]: of a sharp lens, 0.7, and of a pixel's own size."""
+_ROOT_2, _ROOT_2PI = math.sqrt(2.0), math.sqrt(2.0 * math.pi)
+_MOST: Final = 1000
+"""Pixels of a bar that is fitted, at most [1]: none is 190 px wide."""
+_FITTINGS: Final = 5
+"""Gauss-Newton steps of a bar; it is found to a half pixel before."""
+
+
+@compiled
+def fit_bars(
+    grey: Picture,
+    places: Floats,
+    normals: Floats,
+    widths: Floats,
+    curvatures: Floats,
+    starts: Floats,
+    contrast: float,
+    offsets: Floats,
+    variances: Floats,
+) -> None:
+    """Write the exact place of bars, and how well the picture tells it.
+
+    Args:
+        grey: (height, width).
+        places: (n, 2) [px].
+        normals: (n, 2) unit vectors across the line.
+        widths: (n,) of the bar [px].
+        curvatures: (n,) of the line, positive where it turns towards its normal [1/px].
+        starts: (n,) along the normal [px], right to about a pixel; NaN = none.
+        contrast: least brightness above both sides [levels of 255].
+        offsets: (n,) along the normal [px], written; NaN where no bar fits.
+        variances: (n,) [px^2], written.
+    """
+    across, values = np.empty(_MOST), np.empty(_MOST)
+    for i in range(len(places)):
+        offsets[i] = np.nan
+        variances[i] = np.inf
+        if np.isnan(starts[i]):
+            continue
+        half = max(0.5 * widths[i], 0.25)
+        middle = places[i] + starts[i] * normals[i]
+        count = _gather(grey, middle, normals[i], curvatures[i], half + BESIDE, across, values)
+        if count == 0:
+            continue
+        shift, contrast_left, contrast_right, variance = _fit_bar(
+            across[:count], values[:count], half
+        )
+        if (
+            abs(shift) < 2.0
+            and contrast_left > contrast
+            and contrast_right > contrast
+            and variance < np.inf
+        ):
+            # Blur draws a curved bar inwards.
+            offsets[i] = starts[i] + shift - 0.5 * curvatures[i] * _BLUR**2
+            variances[i] = variance
+
+
+@compiled
+def _gather(
+    grey: Picture,
+    place: Floats,
+    normal: Floats,
+    curvature: float,
+    reach: float,
+    across: Floats,
+    values: Floats,
+) -> int:
+    """Write pixels about a place on a line, how far across they lie and how bright they are.
+
+    Pixels themselves and not readings between them: what is interpolated between two pixels of a
+    line narrower than they are depends on where in the pixel it lies.
+
+    Returns:
+        How many; 0 if some lie outside the picture, or they are too many.
+    """
+    height, width = grey.shape
+    wide = abs(normal[0]) * reach + abs(normal[1]) * ALONG
+    tall = abs(normal[1]) * reach + abs(normal[0]) * ALONG
+    left, right = math.ceil(place[0] - wide), math.floor(place[0] + wide)
+    top, bottom = math.ceil(place[1] - tall), math.floor(place[1] + tall)
+    if left < 0 or top < 0 or right >= width or bottom >= height:
+        return 0
+    count = 0
+    for v in range(top, bottom + 1):
+        for u in range(left, right + 1):
+            x, y = u - place[0], v - place[1]
+            along = y * normal[0] - x * normal[1]
+            t = x * normal[0] + y * normal[1] - 0.5 * curvature * along * along
+            if abs(along) <= ALONG and abs(t) <= reach:
+                if count == len(across):
+                    return 0
+                across[count] = t
+                values[count] = grey[v, u]
+                count += 1
+    return count
+
+
+@compiled
+def _fit_bar(across: Floats, values: Floats, half: float) -> tuple[float, float, float, float]:
+    """Return a bar's offset [px], its height above either side, and the offset's variance.
+
+    The variance is infinite where nothing fits.
+    """
+    count = len(across)
+    shift = 0.0
+    level = np.zeros(4)  # grass, paint, grass; the last entry is not used
+    normal, right = np.empty((4, 4)), np.empty(4)
+    row = np.empty(4)
+    variance = np.inf
+    for fitting in range(_FITTINGS):
+        normal[:] = 0.0
+        right[:] = 0.0
+        squares = 0.0
+        for j in range(count):
+            low, high = (across[j] - shift + half) / _BLUR, (across[j] - shift - half) / _BLUR
+            rise = 0.5 + 0.5 * math.erf(low / _ROOT_2)
+            fall = 0.5 + 0.5 * math.erf(high / _ROOT_2)
+            row[0], row[1], row[2] = 1.0 - rise, rise - fall, fall
+            # The levels come with the first step, the place from the second on.
+            up, down = level[1] - level[0], level[1] - level[2]
+            row[3] = down * math.exp(-0.5 * high * high) - up * math.exp(-0.5 * low * low)
+            row[3] /= _BLUR * _ROOT_2PI
+            rest = values[j] - level[0] * row[0] - level[1] * row[1] - level[2] * row[2]
+            squares += rest * rest
+            for a in range(4):
+                right[a] += row[a] * rest
+                for b in range(a + 1):
+                    normal[a, b] += row[a] * row[b]
+        if fitting == 0:
+            normal[3, 3] = 1.0
+        pivot = _solve(normal, right)
+        if not pivot > 0.0:
+            return shift, 0.0, 0.0, np.inf
+        level += right
+        if fitting > 0:
+            shift += min(max(right[3], -1.0), 1.0)
+            variance = max(squares / (count - 4), 0.25) / pivot
+        if not abs(shift) < 3.0 or (fitting > 0 and abs(right[3]) < 0.01):
+            break
+    return shift, level[1] - level[0], level[1] - level[2], variance
+
+
+@compiled
+def _solve(normal: Floats, right: Floats) -> float:
+    """Replace `right` by the solution; return the last unknown's information, 0 if singular.
+
+    Args:
+        normal: (n, n) positive definite, its lower half is used and lost.
+        right: (n,).
+    """
+    size = len(right)
+    for a in range(size):
+        for b in range(a):
+            for c in range(b):
+                normal[a, b] -= normal[a, c] * normal[b, c] * normal[c, c]
+            normal[a, b] /= normal[b, b]
+        for c in range(a):
+            normal[a, a] -= normal[a, c] ** 2 * normal[c, c]
+        if not normal[a, a] > 1e-9:
+            return 0.0
+        for b in range(a):
+            right[a] -= normal[a, b] * right[b]
+    for a in range(size - 1, -1, -1):
+        right[a] /= normal[a, a]
+        for b in range(a + 1, size):
+            right[a] -= normal[b, a] * right[b]
+    return float(normal[size - 1, size - 1])

@@ -1,0 +1,101 @@
+"""Which samples of markings nothing else that is white comes near, as a picture has them.
+
+Across such a sample there is one bar and grass on both sides. A crossbar, and the other side of a
+far circle, lie beside a sample in the picture only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.cameras import Camera
+from worldpose.compiled import compiled
+from worldpose.pitch import PitchTemplate
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_STEP: Final = 0.5
+"""Between corners of the polylines that stand for what is white [m]: a corner arc is then 3 cm
+off, a quarter of its width."""
+
+
+@dataclass(frozen=True, eq=False)
+class Whites:
+    """All that is white about a pitch, as polylines one after another.
+
+    Attributes:
+        points_world: (n, 3) corners [m], world.
+        label: (n,) which one; markings have the indices of `PitchTemplate.sample_lines`, goals'
+            posts and crossbars higher ones.
+    """
+
+    points_world: Floats
+    label: Integers
+
+
+def whites_of(pitch: PitchTemplate) -> Whites:
+    """Return markings and goals of a template."""
+    parts = [pitch.marking_points(name, _STEP) for name in pitch.marking_names]
+    return Whites(
+        np.concatenate(parts), np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    )
+
+
+def clear(
+    camera: Camera,
+    whites: Whites,
+    half_width: float,
+    places: Floats,
+    room: Floats,
+    marking: Integers,
+) -> NDArray[np.bool_]:
+    """Return which places (n,) have only their own marking within a distance.
+
+    Args:
+        camera: a single camera.
+        whites: of the template.
+        half_width: of paint and posts [m].
+        places: (n, 2) of samples [px].
+        room: (n,) that nothing else may come into [px].
+        marking: (n,) the samples' own labels.
+    """
+    depth = camera.cam_from_world.apply(whites.points_world)[:, 2]
+    corners = camera.project(whites.points_world)
+    with np.errstate(divide="ignore"):
+        radius = np.where(depth > 0.0, half_width * camera.focal[0] / depth, 0.0)
+    result = np.empty(len(places), dtype=np.bool_)
+    _clear(corners, radius, whites.label, places, room, marking, result)
+    return result
+
+
+@compiled
+def _clear(
+    corners: Floats,
+    radius: Floats,
+    label: Integers,
+    places: Floats,
+    room: Floats,
+    marking: Integers,
+    result: NDArray[np.bool_],
+) -> None:
+    for i in range(len(places)):
+        x, y = places[i, 0], places[i, 1]
+        result[i] = True
+        for j in range(len(corners) - 1):
+            if label[j] == marking[i] or label[j] != label[j + 1]:
+                continue
+            ax, ay = corners[j, 0] - x, corners[j, 1] - y
+            dx, dy = corners[j + 1, 0] - corners[j, 0], corners[j + 1, 1] - corners[j, 1]
+            share = -(ax * dx + ay * dy) / max(dx * dx + dy * dy, 1e-18)
+            share = min(max(share, 0.0), 1.0)
+            ax, ay = ax + share * dx, ay + share * dy
+            limit = room[i] + max(radius[j], radius[j + 1])
+            # What is behind the camera is NaN, and compares false.
+            if ax * ax + ay * ay < limit * limit:
+                result[i] = False
+                break

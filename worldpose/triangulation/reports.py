@@ -1,0 +1,174 @@
+"""Figures of a clip, added up over its parts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.records import Record
+
+Floats = NDArray[np.float64]
+
+LEAST: Final = 1e-7
+WIDTH: Final = 0.005
+"""Of a class, relative: as exact as a median is given."""
+CLASSES: Final = 5000
+"""From `LEAST` to 7000."""
+
+
+class TriangulationReport(Record):
+    """How well the views of a clip agree."""
+
+    joints: int
+    """Joints found [1]."""
+    undetermined: int
+    """Joints that some camera saw and that are missing all the same [1]."""
+    observations: int
+    """Keypoints of tracked people [1]."""
+    rejected_share: tuple[float | None, ...]
+    """Share of each camera's keypoints, among joints found, that disagree; None without any."""
+    mean_views: float | None
+    """Mean number of agreeing views of the joints found."""
+    reprojection_error_px: float | None
+    """Median over joints [px]."""
+    standard_deviation_m: float | None
+    """Median over joints of the root of the covariance's trace [m]."""
+    noise_factor: float
+    """Median over joints of the learned noise of a confident keypoint over the stated one [1]."""
+    misplacement_m: tuple[float | None, ...]
+    """By how much each camera misplaces people, root mean square per axis at the median person
+    [m]; None where it sees nobody or offsets are off."""
+
+
+class SmoothingReport(Record):
+    """What smoothing did to a clip."""
+
+    filled: int
+    """Joints filled in [1]."""
+    filled_share: float | None
+    """Share of them in all joints; None without any."""
+    acceleration_m_s2: float
+    """Median over joints of the acceleration that was taken for usual [m/s^2]."""
+    repeated: float
+    """Frames of observations whose errors count as one [1]: they are alike for a while."""
+    moved_m: float | None
+    """Median distance between smoothed and triangulated joints [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Histogram:
+    """Numbers from 0 counted in classes half a percent wide, so that parts of a clip add up.
+
+    Attributes:
+        counts: (CLASSES,) int64; what is below `LEAST` is in the first.
+    """
+
+    counts: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, values: NDArray[np.floating]) -> Self:
+        """Return the counts of values of any shape, without NaN."""
+        place = np.log(np.maximum(values, LEAST) / LEAST) / math.log1p(WIDTH)
+        place = np.clip(place, 0, CLASSES - 1).astype(np.int64)
+        return cls(np.bincount(place.ravel(), minlength=CLASSES))
+
+    def __add__(self, other: Self) -> Self:
+        return type(self)(self.counts + other.counts)
+
+    @property
+    def median(self) -> float | None:
+        """The middle of the median's class; None of nothing, 0 below `LEAST`."""
+        below = self.counts.cumsum()
+        if not below[-1]:
+            return None
+        place = int(np.searchsorted(below, 0.5 * below[-1]))
+        return LEAST * math.exp((place + 0.5) * math.log1p(WIDTH)) if place else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """What a report of triangulation is made of.
+
+    Attributes:
+        found: joints.
+        undetermined: joints seen and not found.
+        seen: observations.
+        views: agreeing views, over all joints.
+        used: (cameras,) observations of joints found.
+        agreed: (cameras,) of these, agreeing.
+        error: reprojection errors [px].
+        deviation: roots of traces [m].
+        misplaced: misplacements that calibration makes probable, by camera [m].
+    """
+
+    found: int
+    undetermined: int
+    seen: int
+    views: int
+    used: NDArray[np.int64]
+    agreed: NDArray[np.int64]
+    error: Histogram
+    deviation: Histogram
+    misplaced: tuple[Histogram, ...]
+
+    def __add__(self, other: Self) -> Self:
+        return type(self)(
+            self.found + other.found,
+            self.undetermined + other.undetermined,
+            self.seen + other.seen,
+            self.views + other.views,
+            self.used + other.used,
+            self.agreed + other.agreed,
+            self.error + other.error,
+            self.deviation + other.deviation,
+            tuple(a + b for a, b in zip(self.misplaced, other.misplaced, strict=True)),
+        )
+
+    def report(self, noise_factor: float) -> TriangulationReport:
+        """Return the figures."""
+        shares = zip(self.agreed.tolist(), self.used.tolist(), strict=True)
+        return TriangulationReport(
+            joints=self.found,
+            undetermined=self.undetermined,
+            observations=self.seen,
+            rejected_share=tuple(1.0 - a / n if n else None for a, n in shares),
+            mean_views=self.views / self.found if self.found else None,
+            reprojection_error_px=self.error.median,
+            standard_deviation_m=self.deviation.median,
+            noise_factor=noise_factor,
+            misplacement_m=tuple(each.median for each in self.misplaced),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Changes:
+    """What a report of smoothing is made of.
+
+    Attributes:
+        there: joints after smoothing.
+        filled: of these, filled in.
+        moved: distances from the triangulated ones [m].
+    """
+
+    there: int
+    filled: int
+    moved: Histogram
+
+    def __add__(self, other: Self) -> Self:
+        return type(self)(
+            self.there + other.there, self.filled + other.filled, self.moved + other.moved
+        )
+
+    def report(self, acceleration: Floats, repeated: float) -> SmoothingReport:
+        """Return the figures under a motion model."""
+        return SmoothingReport(
+            filled=self.filled,
+            filled_share=self.filled / self.there if self.there else None,
+            acceleration_m_s2=float(np.median(acceleration)),
+            repeated=repeated,
+            moved_m=self.moved.median,
+        )

@@ -1,0 +1,71 @@
+"""Video files from pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+from av.video.stream import VideoStream
+from numpy.typing import NDArray
+
+from worldpose.errors import InputError
+
+
+def write_video(
+    path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float, *, quality: int = 20
+) -> int:
+    """Write a file of pictures and return how many; the same pictures give the same bytes.
+
+    H.264 with a key frame a second where the installed FFmpeg can write it, else MPEG-4 part 2.
+
+    Args:
+        path: .mp4, written as pictures come.
+        pictures: (height, width, 3) RGB, or (height, width) grey, all of one even size.
+        fps: frames a second.
+        quality: 0 is without loss, 51 the worst (H.264's constant rate factor).
+
+    Raises:
+        InputError: no picture, or one of another or an odd size.
+    """
+    rate = Fraction(fps).limit_denominator(1001)
+    codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"
+    count = 0
+    size: tuple[int, int] | None = None
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=rate)
+        assert isinstance(stream, VideoStream)  # both codecs are of video
+        stream.pix_fmt = "yuv420p"
+        # One thread: more make the bytes depend on the machine.
+        stream.codec_context.thread_count = 1
+        stream.gop_size = max(1, round(fps))
+        if codec == "libx264":
+            stream.options = {"crf": str(quality), "preset": "veryfast"}
+        else:
+            stream.codec_context.qmax = max(1, quality // 2)
+        for picture in pictures:
+            if size is None:
+                size = picture.shape[0], picture.shape[1]
+                stream.height, stream.width = size
+            if picture.shape[:2] != size or size[0] % 2 or size[1] % 2:
+                raise InputError(
+                    f"{path}: picture {count}",
+                    expected="pictures of one size, width and height even",
+                    found=f"{picture.shape[1]} x {picture.shape[0]}",
+                    todo="Cut or scale the pictures.",
+                )
+            frame = av.VideoFrame.from_ndarray(
+                np.ascontiguousarray(picture), format="rgb24" if picture.ndim == 3 else "gray"
+            )
+            for packet in stream.encode(frame):
+                container.mux(packet)
+            count += 1
+        if size is None:
+            raise InputError(
+                str(path), expected="one picture or more", found="none", todo="Give some."
+            )
+        for packet in stream.encode(None):
+            container.mux(packet)
+    return count
