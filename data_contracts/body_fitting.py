@@ -59,7 +59,7 @@ BODY_FITTING = GroupLayout(
             dtype="float64",
             unit="m^2",
             missing="nan",
-            about="covariance of `joints`, shape and joint offsets taken as known",
+            about="covariance of `joints`: poses, the detector's offsets, and each person's own",
             chunk_dim="frame",
         ),
         ArrayLayout(
@@ -69,6 +69,15 @@ BODY_FITTING = GroupLayout(
             unit="1",
             missing="none",
             about="a body in a frame without any joint of the person: filled by motion",
+            chunk_dim="frame",
+        ),
+        ArrayLayout(
+            name="guided",
+            dims=("frame", "person"),
+            dtype="bool",
+            unit="1",
+            missing="none",
+            about="a body that pictures of one camera had a say in",
             chunk_dim="frame",
         ),
         ArrayLayout(

@@ -7,12 +7,18 @@ from typing import Annotated, Literal
 
 from pydantic import Field, JsonValue
 
-from data_contracts.records import CONTRACT_VERSION, Key, Name, Record
+from data_contracts.records import CONTRACT_VERSION, Digest, Key, Name, Record
+from data_contracts.static_calibration import Pixel
+
+Origin = Literal["automatic", "corrected", "filled", "rejected"]
+"""Where a value comes from: computed from what was seen, from what a person corrected, from motion
+alone, or computed and refused by a person."""
 
 
 class ReviewRequest(Record):
-    """What a person is asked to look at, and the figures that asked for it."""
+    """What a person is asked to look at, and why."""
 
+    kind: Literal["request"] = "request"
     contract: Literal[1] = CONTRACT_VERSION
     id: Name
     match_id: Name
@@ -21,8 +27,12 @@ class ReviewRequest(Record):
     """The stage whose result waits."""
     keys: dict[str, Key]
     """Results under review: `stage/unit` to key."""
+    contents: dict[str, Digest]
+    """The same results' contents: a verdict holds for the bytes, whatever key gives them again."""
+    reasons: tuple[str, ...]
+    """One line each: figures beyond their limits, or that every result is asked about."""
     figures: dict[str, float]
-    """The figures that were outside their thresholds, with the unit in the name."""
+    """All figures of the results, with the unit in the name."""
     pictures: tuple[str, ...] = ()
     """Paths in the store."""
     created_at: datetime
@@ -31,6 +41,7 @@ class ReviewRequest(Record):
 class ReviewDecision(Record):
     """A person's verdict. It has no default: an empty answer never approves."""
 
+    kind: Literal["decision"] = "decision"
     contract: Literal[1] = CONTRACT_VERSION
     match_id: Name
     request: Name
@@ -44,16 +55,35 @@ class ReviewDecision(Record):
 
 
 class MovedPoint(Record):
-    """A clicked pitch point put elsewhere in a camera's picture."""
+    """A clicked pitch point put elsewhere in a camera's picture, added or removed."""
 
     kind: Literal["moved_point"] = "moved_point"
     camera: Name
+    """A static camera, or the clip of a moving one."""
     marking: Name
     """Name of the point in the pitch template."""
     frame: int | None = None
-    """Match frame of a moving camera's picture; None for a static camera."""
-    xy: tuple[float, float]
-    """[px]"""
+    """Frame of the clip's video; None for a static camera."""
+    was: Pixel | None = None
+    """Where it was when the person moved it [px]; None where it was not clicked."""
+    xy: Pixel | None
+    """[px]; None removes it."""
+
+
+class RedrawnMarking(Record):
+    """A line or arc drawn anew in a camera's picture, added or removed."""
+
+    kind: Literal["redrawn_marking"] = "redrawn_marking"
+    camera: Name
+    """A static camera, or the clip of a moving one."""
+    marking: Name
+    """Name of the line or arc in the pitch template."""
+    frame: int | None = None
+    """Frame of the clip's video; None for a static camera."""
+    was: tuple[Pixel, ...] = ()
+    """How it was drawn when the person drew it anew [px]; empty where it was not."""
+    xy: tuple[Pixel, ...]
+    """[px]; empty removes it."""
 
 
 class DeletedDetection(Record):
@@ -122,6 +152,7 @@ class SplitTrack(Record):
 
 Edit = Annotated[
     MovedPoint
+    | RedrawnMarking
     | DeletedDetection
     | AddedDetection
     | MovedKeypoint
@@ -135,6 +166,7 @@ Edit = Annotated[
 class Correction(Record):
     """One edit, replayed over untouched automatic output; never applied in place."""
 
+    kind: Literal["correction"] = "correction"
     contract: Literal[1] = CONTRACT_VERSION
     id: Name
     match_id: Name
@@ -144,3 +176,33 @@ class Correction(Record):
     based_on: dict[str, Key]
     """The results the person looked at: `stage/unit` to key."""
     note: JsonValue = None
+
+
+class Withdrawal(Record):
+    """A correction taken back."""
+
+    kind: Literal["withdrawal"] = "withdrawal"
+    contract: Literal[1] = CONTRACT_VERSION
+    match_id: Name
+    correction: Name
+    """Id of the `Correction`."""
+    who: str = Field(min_length=1)
+    why: str = ""
+    withdrawn_at: datetime
+
+
+ReviewRecord = Annotated[
+    ReviewRequest | ReviewDecision | Correction | Withdrawal, Field(discriminator="kind")
+]
+
+
+class JournalEntry(Record):
+    """reviews/<match>/<number>.json: what was said at once; entries are added, never changed."""
+
+    contract: Literal[1] = CONTRACT_VERSION
+    match_id: Name
+    number: int = Field(ge=1)
+    """Its place in the journal."""
+    previous: Digest | None
+    """Checksum of the entry before it, None for the first: a lost or changed one is seen."""
+    records: tuple[ReviewRecord, ...] = Field(min_length=1)

@@ -108,7 +108,23 @@ class Reservation(Record):
     """Its process there."""
 
 
-RunState = Literal["complete", "partial", "failed"]
+class WaitingUnit(Record):
+    """A unit whose result is there, and may not be built upon before a person approves it."""
+
+    unit: str
+    """Stage and unit: `tracking/clip`."""
+    request: Name
+    """Id of its `ReviewRequest`."""
+    reasons: tuple[str, ...]
+    """Why a person is asked."""
+    rejected: bool = False
+    """A person refused it: it waits for a correction."""
+
+
+GatePolicy = Literal["auto", "always", "never"]
+"""When a person is asked: where figures are beyond their limits, for every result, not at all."""
+
+RunState = Literal["complete", "waiting", "partial", "failed"]
 
 
 class RunRecord(Record):
@@ -121,7 +137,8 @@ class RunRecord(Record):
     parent: Name | None
     """The run before this one."""
     state: RunState
-    """partial: some units failed, but units of the last stage asked for have results."""
+    """waiting: nothing failed, but a person has to approve results; partial: some units failed, but
+    units of the last stage asked for have results."""
     results: dict[str, Key]
     """Unit, as `stage/unit`, to key."""
     settings: dict[str, dict[str, JsonValue]]
@@ -135,7 +152,11 @@ class RunRecord(Record):
     failed: tuple[UnitFailure, ...]
     """Units that have no result because their task failed."""
     blocked: tuple[str, ...]
-    """Units that have no result because one that they are made from has none."""
+    """Units that have no result because one that they are made from has none, or waits."""
+    gates: GatePolicy = "never"
+    """When a person was to be asked."""
+    waiting: tuple[WaitingUnit, ...] = ()
+    """Units that wait for review."""
     figures: dict[str, dict[str, float]]
     """Unit, as `stage/unit`, to quality figures."""
     versions: dict[str, str]

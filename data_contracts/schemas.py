@@ -18,7 +18,7 @@ from data_contracts.match import MatchSpec, Registration
 from data_contracts.pitch import PitchSpec
 from data_contracts.records import Record
 from data_contracts.retriangulation import RETRIANGULATION
-from data_contracts.review import Correction, ReviewDecision, ReviewRequest
+from data_contracts.review import Correction, JournalEntry, ReviewDecision, ReviewRequest
 from data_contracts.run import Project, Reservation, ResultManifest, RunRecord
 from data_contracts.static_calibration import STATIC_CALIBRATION, ClickedMarkings
 from data_contracts.tracking import TRACKING, Join, Track
@@ -35,6 +35,7 @@ RECORDS: dict[str, type[Record]] = {
     "review_request": ReviewRequest,
     "review_decision": ReviewDecision,
     "correction": Correction,
+    "journal_entry": JournalEntry,
     "project": Project,
     "reservation": Reservation,
     "result_manifest": ResultManifest,

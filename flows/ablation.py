@@ -9,6 +9,8 @@ from typing import Final
 import numpy as np
 
 from data_contracts.static_calibration import ClickedPoint
+from worldpose.body import find_body
+from worldpose.body_fitting import BodyFittingSettings, fit_bodies
 from worldpose.bundle_adjustment import (
     BundleAdjustmentSettings,
     Clicks,
@@ -51,15 +53,14 @@ PAPER: Final = {
 """G-MPJPE and PA-MPJPE of the paper's table [mm]."""
 
 _OURS: Final = TriangulationSettings()
+_STATED: Final = {"offsets": "none", "learn_noise": False}
 TRIANGULATIONS: Final = {
     "": _OURS,
-    ", no offsets": _OURS.model_copy(update={"offsets": "none"}),
-    ", plain least squares": _OURS.model_copy(
-        update={"offsets": "none", "learn_noise": False, "max_deviation": 1e6}
-    ),
+    ", stated noise": _OURS.model_copy(update=_STATED),
+    ", plain least squares": _OURS.model_copy(update=_STATED | {"max_deviation": 1e6}),
 }
-"""Ours; without taking calibration's errors off people's pictures; and every view at its stated
-weight, however far off."""
+"""Ours; views that agree, at their stated weight, calibration's errors not taken off; and every
+view so, however far off."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,8 @@ def trial(seed: int, clicks: ClickSettings) -> dict[str, Score]:
 
     Base is calibration from clicks alone, without painted lines, as the paper's was. `S only`
     frees the whole lens and forgets what is known of cameras, as people do it; its rows without
-    guard are what the guard is for. Every row is triangulated from the same tracks.
+    guard are what the guard is for. Every row is triangulated from the same tracks; the last one
+    fits bodies to our triangulation after adjustment.
 
     Args:
         seed: of the trial.
@@ -111,11 +113,16 @@ def trial(seed: int, clicks: ClickSettings) -> dict[str, Score]:
         "+ BA, S only": (markings.cameras, markings.accepted),
         "+ BA, S, unguarded": (markings.refused, everyone),
     }
-    return {
-        name + how: _score(scene, clip, tuple(calibrations), *row, settings)
+    names = tuple(calibrations)
+    scores = {
+        name + how: _score(scene, clip, names, *row, settings)
         for how, settings in TRIANGULATIONS.items()
         for name, row in rows.items()
     }
+    scores["+ BA + SMPL"] = _score(
+        scene, clip, names, both.cameras, both.accepted, _OURS, both.covariance, bodies=True
+    )
+    return scores
 
 
 def ablation(
@@ -204,10 +211,19 @@ def _score(
     cameras: Camera,
     changed: np.ndarray,
     settings: TriangulationSettings,
+    covariance: np.ndarray | None = None,
+    bodies: bool = False,
 ) -> Score:
-    """The score of cameras and of the joints that they give."""
+    """The score of cameras and of the joints that they give, or of bodies fitted to these."""
     index = clip.detection_index.astype(np.int16)
-    joints = triangulate_joints(cameras, clip.keypoints, clip.confidence, index, settings).joints
+    seen = (cameras, clip.keypoints, clip.confidence, index)
+    placed = triangulate_joints(*seen, settings, covariance)
+    joints = placed.joints
+    if bodies:
+        how = BodyFittingSettings()
+        floor = PitchTemplate.from_spec(scene.surveyed).height
+        model = find_body(how.body_model)
+        joints = fit_bodies(model, joints, placed.covariance, clip.fps, how, floor).joints
     people = np.arange(index.shape[2])
     found, _ = evaluate_joints(JointTracks(clip.frame, people, joints), scene.truth, fps=clip.fps)
     estimated = {name: cameras[c] for c, name in enumerate(names)}

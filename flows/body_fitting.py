@@ -11,14 +11,18 @@ from worldpose.body_fitting import BodyFittingSettings
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Where everybody's joints are."""
-    return (f"retriangulation/{unit}",)
+    """Where everybody's joints are, and what each camera saw of whom."""
+    cameras = [f"ingest/{camera.id}" for camera in match.folder.spec.static_cameras]
+    return (*cameras, "bundle_adjustment/cameras", f"tracking/{unit}", f"retriangulation/{unit}")
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The clock, and the pitch under the feet."""
-    spec, pitch = match.folder.spec, match.folder.pitch
-    return {"fps": spec.fps, "pitch": None if pitch is None else pitch.model_dump(mode="json")}
+    """The clip, the clock, the order of the cameras, and the pitch under the feet."""
+    pitch = match.folder.pitch
+    return {
+        **tracking.clip_sources(match, unit),
+        "pitch": None if pitch is None else pitch.model_dump(mode="json"),
+    }
 
 
 def outside(settings: BodyFittingSettings) -> dict[str, JsonValue]:

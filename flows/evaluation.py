@@ -9,7 +9,13 @@ from pathlib import Path
 from data_contracts.evaluation import Evaluation
 from data_contracts.match import MatchSpec
 from flows.registering import find_match
-from flows.release import JOINT_STAGES, clips_of, joint_tracks, static_cameras
+from flows.release import (
+    JOINT_STAGES,
+    broadcast_cameras,
+    clips_of,
+    joint_tracks,
+    static_cameras,
+)
 from worldpose.cameras import Camera
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation import CameraScore, PersonScore, evaluate_cameras, evaluate_joints
@@ -135,7 +141,7 @@ def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str
             found=f"a match of {len(clips)} clips",
             todo="Export it and score clip by clip.",
         )
-    cameras = static_cameras(run, spec, stage) if truth.cameras else {}
+    cameras = static_cameras(run, spec, stage) | broadcast_cameras(run) if truth.cameras else {}
     return Side(joint_tracks(run, clips[0], stage), cameras, match.folder)
 
 

@@ -15,22 +15,29 @@ from prefect import Task, flow
 from prefect.futures import as_completed
 from pydantic import JsonValue
 
+from data_contracts.run import GatePolicy, RunRecord
+from flows.gatekeeping import Gatekeeper, undecided
+from flows.outlook import look_ahead
 from flows.planning import PlannedUnit, plan_stage
 from flows.progress import reporter
 from flows.registering import open_match
-from flows.run_record import RunLog
-from flows.settings import selected_stages
+from flows.run_record import RunLog, latest_run, standing_results
+from flows.settings import Overrides, selected_stages
 from flows.stage import Match, Stage
+from flows.suspension import is_deployed, take_verdict
 from worldpose.errors import WorldposeError
 from worldpose.store import Store
 
 
 class IncompleteRunError(WorldposeError):
-    """A run is recorded, but some of its units have no result."""
+    """A run is recorded, but some of its units have no result, or wait for a person."""
 
-    def __init__(self, match_id: str, run_id: str, failed: int) -> None:
-        self.match_id, self.run_id = match_id, run_id
-        super().__init__(f"run {run_id} of {match_id}: {failed} units failed")
+    def __init__(self, record: RunRecord) -> None:
+        self.run_id = record.run_id
+        super().__init__(
+            f"run {record.run_id} of {record.match_id}: {len(record.failed)} units failed, "
+            f"{len(record.waiting)} wait for review"
+        )
 
 
 @flow(name="match", flow_run_name="{match_id}", validate_parameters=False)
@@ -40,8 +47,12 @@ def process_match(
     settings: dict[str, dict[str, JsonValue]],
     from_stage: str | None = None,
     until_stage: str | None = None,
+    gates: GatePolicy | None = None,
 ) -> str:
     """Runs the method on one match, records the run and returns its number.
+
+    A run of a deployment that has to wait for people is suspended until they have decided, and then
+    goes on; any other ends, and the next one goes on.
 
     Args:
         project: folder or URL of the store.
@@ -49,16 +60,47 @@ def process_match(
         settings: stage to the settings that differ from their defaults.
         from_stage: first stage to run; earlier ones are taken from the latest run as they stand.
         until_stage: last stage to run.
+        gates: when results wait for a person; None is `auto` for a deployment, else `never`.
 
     Raises:
-        IncompleteRunError: some units failed; the others have their results.
+        IncompleteRunError: some units failed or wait; the others have their results.
     """
     logging.getLogger("worldpose").setLevel(logging.INFO)
     store = Store.open(project)
-    match = open_match(store, match_id)
-    log = RunLog.begin(store, match, selected_stages(from_stage, until_stage), settings)
-    for stage in log.stages:
-        plan = plan_stage(store, match, stage, settings, log.results)
+    stages = selected_stages(from_stage, until_stage)
+    policy: GatePolicy = gates or ("auto" if is_deployed() else "never")
+    while True:
+        match = open_match(store, match_id)
+        if is_deployed():
+            latest = latest_run(store, match_id)
+            outlook = look_ahead(
+                Gatekeeper(store, match, policy),
+                settings,
+                stages,
+                standing_results(latest, stages),
+            )
+            open_questions = undecided(outlook.waiting)
+            if open_questions and outlook.is_recorded_by(latest):
+                take_verdict(store, match_id, open_questions)
+                continue
+        record = _run_stages(store, match, stages, settings, policy)
+        if record.failed or not (is_deployed() and undecided(record.waiting)):
+            break
+    if record.failed or record.waiting:
+        raise IncompleteRunError(record)
+    return record.run_id
+
+
+def _run_stages(
+    store: Store,
+    match: Match,
+    stages: tuple[Stage, ...],
+    settings: Overrides,
+    policy: GatePolicy,
+) -> RunRecord:
+    log = RunLog.begin(store, match, stages, settings, policy)
+    for stage in stages:
+        plan = plan_stage(store, match, stage, settings, log.passed)
         missing = [unit for unit in plan.units if not unit.published]
         log.blocked += plan.blocked
         log.reuse(unit for unit in plan.units if unit.published)
@@ -67,10 +109,8 @@ def process_match(
         )
         for unit, failure in _compute(store, match, stage, missing, log.run_id):
             log.finished(unit, failure)
-    record = log.close()
-    if record.failed:
-        raise IncompleteRunError(match_id, record.run_id, len(record.failed))
-    return record.run_id
+        log.hold(stage)
+    return log.close()
 
 
 def _compute(

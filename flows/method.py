@@ -8,24 +8,37 @@ from __future__ import annotations
 
 from flows import (
     body_fitting,
+    broadcast_calibration,
     bundle_adjustment,
+    gates,
     ingest,
     retriangulation,
     static_calibration,
     tracking,
     triangulation,
 )
+from flows.gates import Gate
 from flows.stage import Stage
 
 METHOD: tuple[Stage, ...] = (
     ingest.STAGE,  # [camera]
-    static_calibration.STAGE,  # [camera]  C1-C5; then a gate, C7
+    static_calibration.STAGE,  # [camera]  C1-C5; then gate CAMERAS, C7
     # detection [camera, chunk]         people and keypoints from pixels, D1-D5; then a gate, D6
-    tracking.STAGE,  # [clip]           T1, T2
-    triangulation.STAGE,  # [clip]      T3, T4; then a gate
-    bundle_adjustment.STAGE,  #         B1-B3; then a gate
+    tracking.STAGE,  # [clip]           T1, T2; then gate IDENTITIES
+    triangulation.STAGE,  # [clip]      T3, T4; then gate JOINTS
+    bundle_adjustment.STAGE,  #         B1-B3; then gate ADJUSTMENT
     retriangulation.STAGE,  # [clip]    B2
-    body_fitting.STAGE,  # [clip]       S1-S3
-    # broadcast_calibration [clip]      M1-M6; then a gate
-    # release, evaluation               X1-X3, E1-E6; clip acceptance is the last gate
+    body_fitting.STAGE,  # [clip]       S1-S3; then gate ACCEPTANCE of the clip
+    broadcast_calibration.STAGE,  # [clip]  M1-M6; then a gate
+    # release, evaluation               X1-X3, E1-E6
 )
+
+GATES: tuple[Gate, ...] = (
+    gates.CAMERAS,
+    gates.IDENTITIES,
+    gates.JOINTS,
+    gates.ADJUSTMENT,
+    gates.ACCEPTANCE,
+)
+"""Where people are asked, with `--gates auto` or `always`; each stands behind the stage it names.
+"""

@@ -38,6 +38,11 @@ UNLESS_GIVEN = {
 }
 
 
+def has_server() -> bool:
+    """Is a Prefect server named: only such a one outlives its runs."""
+    return bool(os.environ.get("PREFECT_API_URL"))
+
+
 @contextmanager
 def prefect_server(project: str) -> Iterator[Callable[[], None]]:
     """Environment and server for Prefect; gives a function that returns when its API answers.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 
@@ -27,6 +27,10 @@ class Reporter:
     def unit_done(self, unit: str, seconds: float, figures: Mapping[str, float]) -> None:
         """A unit has been computed and published."""
         logger.info("%s: done in %.2f s (%s)", unit, seconds, in_short(figures))
+
+    def unit_waits(self, unit: str, reasons: Sequence[str]) -> None:
+        """A unit's result waits for a person."""
+        logger.warning("%s: waits for review: %s", unit, "; ".join(reasons))
 
     def unit_failed(self, unit: str, message: str) -> None:
         """A unit has no result."""

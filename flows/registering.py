@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from data_contracts.match import Registration, SourceFile
+from flows.corrections import corrected_match
 from flows.stage import Match
 from worldpose.errors import InputError
 from worldpose.ingest import (
@@ -32,7 +33,7 @@ def register(store: Store, folder: Path) -> tuple[Match, bool]:
     match_id = match_folder.spec.match_id
     previous = store.registration(match_id)
     registration = register_match(match_folder, previous)
-    match = Match(match_folder, registration)
+    match = corrected_match(store, match_folder, registration)
     if previous is not None:
         if previous.identity != registration.identity:
             raise InputError(

@@ -1,22 +1,17 @@
-"""Results of a run in the forms that other tools read."""
+"""What of a run is given out: clips, the best joints, the best static cameras."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from data_contracts.match import MatchSpec
 from data_contracts.run import RunRecord
-from worldpose.body import BodyParameters
 from worldpose.cameras import Camera
 from worldpose.cameras.stored import camera_from_arrays
 from worldpose.errors import UsageError, WorldposeError
-from worldpose.release import JointTracks, coco_dataset, write_coco, write_joints
-from worldpose.release.camera_file import write_static_camera
-from worldpose.release.pose_file import write_poses
+from worldpose.release import JointTracks
 from worldpose.store import Run
 
 if TYPE_CHECKING:
@@ -88,63 +83,6 @@ def placed_joints(run: Run, clip: str) -> xr.Dataset:
     )
 
 
-def export_joints(run: Run, spec: MatchSpec, out: Path, stage: str | None) -> list[Path]:
-    """Writes `joints.npz`, or `<clip>.joints.npz` for each clip where there are several."""
-    clips = clips_of(run.record)
-    written = []
-    for clip in clips:
-        path = out / ("joints.npz" if len(clips) == 1 else f"{clip}.joints.npz")
-        write_joints(path, joint_tracks(run, clip, stage))
-        written.append(path)
-    return written
-
-
-def export_coco(run: Run, spec: MatchSpec, out: Path, stage: str | None) -> list[Path]:
-    """Writes `<camera>.json` for each static camera, in `<clip>/` where there are several."""
-    clips = clips_of(run.record)
-    written = []
-    for clip in clips:
-        tracks = joint_tracks(run, clip, stage)
-        inliers = placed_joints(run, clip)["inliers"]
-        for camera_id, camera in static_cameras(run, spec, stage).items():
-            dataset = coco_dataset(
-                camera_id,
-                camera,
-                tracks,
-                inliers.sel(camera=camera_id).values,
-                offset_frames=int(spec.camera(camera_id).offset_frames),
-            )
-            path = (out if len(clips) == 1 else out / clip) / f"{camera_id}.json"
-            write_coco(path, dataset)
-            written.append(path)
-    return written
-
-
-def export_worldpose(run: Run, spec: MatchSpec, out: Path, stage: str | None) -> list[Path]:
-    """Writes `poses/<clip>.npz` and `cameras/<camera>.npz` in the layout of the release (X3)."""
-    written = []
-    for clip in clips_of(run.record):
-        if f"body_fitting/{clip}" not in run:
-            raise WorldposeError(
-                f"run {run.record.run_id} of {run.record.match_id}: expected results of "
-                "body_fitting, found none. Run the match to the end first."
-            )
-        fits = run[f"body_fitting/{clip}"]
-        poses = BodyParameters(
-            fits["betas"].values[:, None],
-            *(
-                fits[name].values.swapaxes(0, 1)
-                for name in ("global_orient", "body_pose", "transl")
-            ),
-        )
-        written.append(out / "poses" / f"{clip}.npz")
-        write_poses(written[-1], poses, fits.attrs["body_model"])
-    for name, camera in static_cameras(run, spec, stage).items():
-        written.append(out / "cameras" / f"{name}.npz")
-        write_static_camera(written[-1], camera.to_calibration(name))
-    return written
-
-
 def static_cameras(run: Run, spec: MatchSpec, stage: str | None = None) -> dict[str, Camera]:
     """The static cameras that a run has, by id; all of them where it has joints.
 
@@ -165,9 +103,11 @@ def static_cameras(run: Run, spec: MatchSpec, stage: str | None = None) -> dict[
     }
 
 
-EXPORTS: dict[str, Callable[[Run, MatchSpec, Path, str | None], list[Path]]] = {
-    "joints": export_joints,
-    "coco": export_coco,
-    "worldpose": export_worldpose,
-}
-"""Formats by name; each takes a run, its match, a folder, and whose joints are meant."""
+def broadcast_cameras(run: Run) -> dict[str, Camera]:
+    """The broadcast camera of every calibrated clip, a batch (frames,), by clip."""
+    units = (name.partition("/") for name in run)
+    return {
+        clip: camera_from_arrays(run[f"{stage}/{clip}"].data_vars)
+        for stage, _, clip in units
+        if stage == "broadcast_calibration"
+    }

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Self
 
-from data_contracts.run import RunRecord, RunState, UnitFailure
+from data_contracts.run import GatePolicy, RunRecord, RunState, UnitFailure, WaitingUnit
+from flows.gatekeeping import Gatekeeper, passed
 from flows.method import METHOD
 from flows.planning import PlannedUnit, plan_stage
 from flows.progress import reporter
@@ -43,22 +44,48 @@ class RunLog:
     run_id: str
     latest: RunRecord | None
     results: dict[str, str]
+    gatekeeper: Gatekeeper
     started_at: datetime = field(default_factory=lambda: datetime.now(UTC))
     started: float = field(default_factory=time.monotonic)
     executed: list[str] = field(default_factory=list)
     reused: list[str] = field(default_factory=list)
     failed: list[UnitFailure] = field(default_factory=list)
     blocked: list[str] = field(default_factory=list)
+    waiting: list[WaitingUnit] = field(default_factory=list)
 
     @classmethod
     def begin(
-        cls, store: Store, match: Match, stages: tuple[Stage, ...], overrides: Overrides
+        cls,
+        store: Store,
+        match: Match,
+        stages: tuple[Stage, ...],
+        overrides: Overrides,
+        gates: GatePolicy = "never",
     ) -> Self:
         """A new run with its number reserved; earlier stages stand as the latest run has them."""
         latest = latest_run(store, match.match_id)
         standing = standing_results(latest, stages)
         run_id = store.reserve_run(match.match_id)
-        return cls(store, match, stages, overrides, run_id, latest, standing, reused=list(standing))
+        gatekeeper = Gatekeeper(store, match, gates)
+        log = cls(
+            *(store, match, stages, overrides, run_id, latest, standing, gatekeeper),
+            reused=list(standing),
+        )
+        for stage in METHOD[: METHOD.index(stages[0])]:
+            log.hold(stage)
+        return log
+
+    @property
+    def passed(self) -> dict[str, str]:
+        """The results that later stages may be made from."""
+        return passed(self.results, self.waiting)
+
+    def hold(self, stage: Stage) -> None:
+        """Keep back what waits for a person behind a stage that has run."""
+        held = self.gatekeeper.held(stage.name, self.results)
+        self.waiting += held
+        for unit in held:
+            reporter().unit_waits(unit.unit, unit.reasons)
 
     def reuse(self, units: Iterable[PlannedUnit]) -> None:
         """Take over results that the store already holds."""
@@ -81,7 +108,7 @@ class RunLog:
             reporter().unit_failed(unit.name, str(failure))
 
     def close(self) -> RunRecord:
-        """Store the record: from here on the run counts."""
+        """Store the record: from here on the run counts, and people are asked what it waits for."""
         self._carry_over()
         figures = {}
         for name, key in sorted(self.results.items()):
@@ -100,20 +127,26 @@ class RunLog:
             reused=tuple(sorted(self.reused)),
             failed=tuple(sorted(self.failed, key=lambda failure: failure.unit)),
             blocked=tuple(sorted(self.blocked)),
+            gates=self.gatekeeper.policy,
+            waiting=tuple(self.waiting),
             figures=figures,
             versions=libraries(),
             started_at=self.started_at,
             finished_at=datetime.now(UTC),
             seconds=round(time.monotonic() - self.started, 3),
         )
+        self.gatekeeper.ask(self.run_id, self.waiting, self.results)
         self.store.finish_run(record)
         return record
 
     def _carry_over(self) -> None:
-        """Keep results of later stages that are current all the same."""
+        """Keep results of later stages that are current all the same, and wait for nobody."""
         for stage in METHOD[METHOD.index(self.stages[-1]) + 1 :]:
-            plan = plan_stage(self.store, self.match, stage, self.overrides, self.results)
-            self.reuse(unit for unit in plan.units if unit.published)
+            plan = plan_stage(self.store, self.match, stage, self.overrides, self.passed)
+            current = {unit.name: unit for unit in plan.units if unit.published}
+            keys = {name: unit.key for name, unit in current.items()}
+            let_pass = passed(keys, self.gatekeeper.held(stage.name, keys))
+            self.reuse(current[name] for name in let_pass)
 
     def _settings(self) -> tuple[dict[str, dict[str, object]], dict[str, dict[str, object]]]:
         """All settings and the asked-for ones, by stage; a standing stage keeps its own."""
@@ -132,6 +165,6 @@ class RunLog:
 
     def _state(self) -> RunState:
         if not self.failed:
-            return "complete"
+            return "waiting" if self.waiting else "complete"
         last = f"{self.stages[-1].name}/"
         return "partial" if any(name.startswith(last) for name in self.results) else "failed"

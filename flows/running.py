@@ -11,8 +11,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
 
-from data_contracts.run import RunRecord
-from flows.planning import PlannedUnit, plan_run
+from data_contracts.run import GatePolicy, RunRecord
+from flows.gatekeeping import Gatekeeper
+from flows.outlook import look_ahead
+from flows.planning import PlannedUnit, plan_stage
 from flows.prefect_environment import prefect_server
 from flows.progress import reporter
 from flows.run_record import RunLog, latest_run, standing_results
@@ -36,6 +38,7 @@ class RunRequest:
         dask: address of a running Dask scheduler; None starts workers on this machine.
         workers: number of worker processes on this machine; None = one a core, as far as there
             is work for them.
+        gates: when results wait for a person.
     """
 
     settings: Overrides
@@ -43,12 +46,14 @@ class RunRequest:
     until_stage: str | None = None
     dask: str | None = None
     workers: int | None = None
+    gates: GatePolicy = "never"
 
 
 def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
     """The record of a run that makes the match's results current.
 
-    When nothing is stale this is the latest run's own record, and neither Prefect nor Dask starts.
+    When nothing is stale this is the latest run's own record, and neither Prefect nor Dask starts;
+    the same where all that could run waits for people.
 
     Raises:
         UsageError: no such stage, or no results to start `from_stage` from.
@@ -57,27 +62,34 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
     stages = selected_stages(request.from_stage, request.until_stage)
     latest = latest_run(store, match.match_id)
     standing = standing_results(latest, stages)
-    planned = plan_run(store, match, request.settings, stages, standing)
-    missing = [unit for unit in planned if not unit.published]
-    if missing:
-        return _with_prefect(store, match, request, missing)
-    results = standing | {unit.name: unit.key for unit in planned}
-    is_current = latest is not None and latest.state == "complete"
-    if is_current and results.items() <= latest.results.items():
-        return latest.model_copy(update={"executed": (), "reused": tuple(sorted(results))})
-    return _without_work(store, match, stages, request.settings, planned)
+    gatekeeper = Gatekeeper(store, match, request.gates)
+    outlook = look_ahead(gatekeeper, request.settings, stages, standing)
+    if outlook.missing:
+        return _with_prefect(store, match, request, outlook.missing)
+    if latest is not None and outlook.is_recorded_by(latest):
+        reused = tuple(sorted(outlook.results))
+        return latest.model_copy(
+            update={
+                "executed": (),
+                "reused": reused,
+                "gates": request.gates,
+                "waiting": outlook.waiting,
+            }
+        )
+    return _without_work(gatekeeper, stages, request.settings)
 
 
 def _without_work(
-    store: Store,
-    match: Match,
-    stages: tuple[Stage, ...],
-    overrides: Overrides,
-    planned: list[PlannedUnit],
+    gatekeeper: Gatekeeper, stages: tuple[Stage, ...], overrides: Overrides
 ) -> RunRecord:
-    """A new record of results that are all there, as after going back to an earlier setting."""
-    log = RunLog.begin(store, match, stages, overrides)
-    log.reuse(planned)
+    """A new record of results that are all there: an earlier setting, or a verdict since."""
+    store, match, policy = gatekeeper.store, gatekeeper.match, gatekeeper.policy
+    log = RunLog.begin(store, match, stages, overrides, policy)
+    for stage in stages:
+        plan = plan_stage(store, match, stage, overrides, log.passed)
+        log.blocked += plan.blocked
+        log.reuse(plan.units)
+        log.hold(stage)
     return log.close()
 
 
@@ -101,6 +113,7 @@ def _with_prefect(
                 settings=request.settings,
                 from_stage=request.from_stage,
                 until_stage=request.until_stage,
+                gates=request.gates,
             )
         except IncompleteRunError as failure:
             run_id = failure.run_id

@@ -10,15 +10,28 @@ from pydantic import JsonValue
 
 from data_contracts.match import Registration
 from data_contracts.records import Record
+from data_contracts.review import Correction
 from worldpose.ingest import MatchFolder
+from worldpose.review import Journal
 
 
 @dataclass(frozen=True)
 class Match:
-    """A registered match: its folder as validated, and the digests of its files."""
+    """A registered match: its folder as validated and corrected, and the digests of its files.
+
+    Attributes:
+        folder: what it holds, with people's corrections.
+        registration: what the project knows of it.
+        journal: what people said of it.
+        corrections: those that are in `folder`.
+        stale: those that no longer apply, each with the reason.
+    """
 
     folder: MatchFolder
     registration: Registration
+    journal: Journal
+    corrections: tuple[Correction, ...] = ()
+    stale: tuple[tuple[Correction, str], ...] = ()
 
     @property
     def match_id(self) -> str:

@@ -7,9 +7,16 @@ from typing import Any
 from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.pitch import PitchSpec
 from data_contracts.run import Work
+from tasks.clip_inputs import open_clip
 from tasks.unit import figures_of, open_input, unit_task
 from worldpose.body import BodyModel, digest_of_body, find_body
-from worldpose.body_fitting import BodyFittingSettings, fit_bodies, report_fit
+from worldpose.body_fitting import (
+    BodyFittingSettings,
+    Pictures,
+    find_sightings,
+    fit_bodies,
+    report_fit,
+)
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.store import Store
@@ -27,9 +34,20 @@ def body_fitting(work: Work) -> str:
     settings = BodyFittingSettings.model_validate(work.recipe.settings)
     model = _body(settings.body_model, sources["body_model_sha256"])
     with store.publishing(work) as result:
-        seen = open_input(store, work, f"retriangulation/{work.recipe.unit}")
-        joints, fps = seen["joints"].values, float(sources["fps"])
-        fit = fit_bodies(model, joints, seen["covariance"].values, fps, settings, ground)
+        clip = open_clip(store, work)
+        keypoints = clip.keypoints[:]
+        index = open_input(store, work, f"tracking/{work.recipe.unit}")["detection_index"].values
+        placed = open_input(store, work, f"retriangulation/{work.recipe.unit}")
+        joints = placed["joints"].values
+        fit = fit_bodies(
+            model,
+            joints,
+            placed["covariance"].values,
+            clip.fps,
+            settings,
+            ground,
+            sightings=find_sightings(clip.cameras, keypoints, index, joints),
+        )
         result.write(
             BODY_FITTING,
             arrays={
@@ -41,13 +59,15 @@ def body_fitting(work: Work) -> str:
                 "joints": fit.joints,
                 "covariance": fit.covariance,
                 "filled": fit.filled,
+                "guided": fit.guided,
                 "joint_offsets": fit.offsets,
             },
-            coordinates={"frame": seen["frame"].values, "person": seen["person"].values},
+            coordinates={"frame": clip.frame, "person": placed["person"].values},
             attributes={"body_model": model.name},
         )
-        persons = [f"person{person}" for person in seen["person"].values]
-        result.figures.update(figures_of(report_fit(fit, joints, fps), persons))
+        persons = [f"person{person}" for person in placed["person"].values]
+        report = report_fit(fit, joints, clip.fps, Pictures(clip.cameras, keypoints, index))
+        result.figures.update(figures_of(report, persons))
     return work.key
 
 

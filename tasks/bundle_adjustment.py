@@ -132,6 +132,8 @@ def _open_clip(store: Store, work: Work, people: _People) -> Clip:
         joints=people.joints,
         views=people.views,
         triangulation=settings_before(store, work, next(iter(sources["clips"]))),
+        pitch=template,
+        on_lines=np.array([camera.attrs["origin"] == "lines" for camera in known]),
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,7 @@ import numpy as np
 
 from data_contracts.ingest import INGEST
 from data_contracts.run import Work
-from tasks.unit import unit_task
-from worldpose.errors import InputError
+from tasks.unit import require_registered, unit_task
 from worldpose.ingest import Observations, read_observations
 from worldpose.store import Store
 
@@ -43,11 +41,5 @@ def _observations(work: Work) -> Observations:
     path = Path(work.folder) / sources["detections"]
     first = sources["first_frame"] + sources["offset_frames"]
     observations = read_observations(path, first, sources["frame_count"])
-    if hashlib.sha256(path.read_bytes()).hexdigest() != sources["detections_sha256"]:
-        raise InputError(
-            str(path),
-            expected="the file that was registered when the run began",
-            found="other content",
-            todo="Run again when nothing writes to the match folder.",
-        )
+    require_registered(path, sources["detections_sha256"])
     return replace(observations, frame=observations.frame - sources["offset_frames"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,9 @@ from data_contracts.static_calibration import (
     ClickedPoint,
     DrawnMarking,
 )
-from tasks.unit import unit_task
+from tasks.unit import require_registered, unit_task
 from worldpose.cameras import Camera
 from worldpose.cameras.stored import camera_arrays
-from worldpose.errors import InputError
 from worldpose.ingest.stills import read_still
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import (
@@ -53,7 +51,7 @@ def static_calibration(work: Work) -> str:
         width, height = sources["image_size"]
         calibration = calibrate(
             PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"])),
-            _clicked_markings(clicked),
+            clicked_markings(clicked),
             (width, height),
             picture=_still(work),
             settings=StaticCalibrationSettings.model_validate(work.recipe.settings),
@@ -69,7 +67,7 @@ def static_calibration(work: Work) -> str:
     return work.key
 
 
-def _clicked_markings(listed: Mapping[str, Any]) -> ClickedMarkings:
+def clicked_markings(listed: Mapping[str, Any]) -> ClickedMarkings:
     """The clicks of a recipe, by name: their order in the file decides nothing."""
     points, drawn = listed["points"], listed["drawn"]
     return ClickedMarkings(
@@ -90,13 +88,7 @@ def _still(work: Work) -> NDArray[np.uint8] | None:
     path = Path(work.folder) / sources["still"]
     width, height = sources["image_size"]
     picture = read_still(path, (width, height))
-    if hashlib.sha256(path.read_bytes()).hexdigest() != sources["still_sha256"]:
-        raise InputError(
-            str(path),
-            expected="the file that was registered when the run began",
-            found="other content",
-            todo="Run again when nothing writes to the match folder.",
-        )
+    require_registered(path, sources["still_sha256"])
     return picture
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import platform
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import xarray as xr
@@ -66,6 +68,25 @@ def open_input(store: Store, work: Work, name: str) -> xr.Dataset:
     """
     stage, _, unit = name.partition("/")
     return store.open_result(work.recipe.match_id, stage, unit, work.recipe.inputs[name])
+
+
+def require_registered(path: Path, sha256: str) -> None:
+    """Refuse what was read of a file of the match folder if it is not what the key stands for.
+
+    Call it after reading: what is changed meanwhile is then seen.
+
+    Raises:
+        InputError: the file is not, or no longer, the one that was registered.
+    """
+    with path.open("rb") as file:
+        found = hashlib.file_digest(file, "sha256").hexdigest()
+    if found != sha256:
+        raise InputError(
+            str(path),
+            expected="the file that was registered when the run began",
+            found="other content",
+            todo="Run again when nothing writes to the match folder.",
+        )
 
 
 def figures_of(report: Record, camera_ids: Sequence[str]) -> dict[str, float]:

@@ -92,6 +92,11 @@ class ConsoleReporter(Reporter):
             f"  {escape(unit)}  {seconds:.2f} s  [dim]{in_short(figures)}[/]  ({self._left} left)"
         )
 
+    def unit_waits(self, unit: str, reasons: Sequence[str]) -> None:
+        """Names the unit and why a person is asked."""
+        super().unit_waits(unit, reasons)
+        self.say(f"  [bold]{escape(unit)} waits for review[/]: {escape('; '.join(reasons))}")
+
     def unit_failed(self, unit: str, message: str) -> None:
         """Names the unit and why it failed."""
         super().unit_failed(unit, message)

@@ -44,6 +44,10 @@ def simulate(
     stills: Annotated[
         bool, typer.Option(help="Draw one picture of every static camera, about 1 s each.")
     ] = True,
+    video: Annotated[
+        bool,
+        typer.Option(help="Film the broadcast camera where the scenario says so: 0.1 s a frame."),
+    ] = True,
     as_json: JsonOption = False,
 ) -> None:
     """Make a synthetic match folder with known truth.
@@ -81,6 +85,7 @@ def simulate(
         mocap=mocap,
         calibrated=calibrated,
         stills=stills,
+        video=video,
     )
     if as_json:
         print_json({"match": spec.match_id, "folder": str(out)})

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from data_contracts.run import WaitingUnit
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -20,6 +21,7 @@ from flows.cli.console import (
 from flows.lineage import unit_state
 from flows.planning import plan_run
 from flows.registering import find_registration, open_match
+from flows.review import still_waiting
 from flows.run_record import latest_run
 from worldpose.errors import WorldposeError
 from worldpose.store import Store, collect, plan_gc, repair
@@ -65,6 +67,7 @@ def status(
         "state",
         *(f">{state}" for state in STATES),
         ">failed",
+        ">waiting",
         "next",
     )
     shown = []
@@ -78,11 +81,14 @@ def status(
                 row["state"],
                 *counts,
                 str(len(row["failed"])),
+                str(len(row["waiting"])),
                 row["problem"] or ", ".join(unsettled[:3]) + (" ..." * (len(unsettled) > 3)),
             )
         )
     print_table("matches", columns, shown)
     for row in rows:
+        if row["waiting"]:
+            line(f"{row['match']}: what waits: worldpose review list {row['match']}")
         if row["settings"]:
             line(f"{row['match']}: judged with the settings of run {row['run']}: {row['settings']}")
 
@@ -96,11 +102,13 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
     latest = latest_run(store, match_id)
     units: dict[str, list[str]] = {state: [] for state in STATES}
     problem = None
+    waiting: list[WaitingUnit] = []
     try:
         match = open_match(store, match_id)
     except WorldposeError as failure:
         problem = str(failure)
     else:
+        waiting = still_waiting(match, latest)
         for unit in plan_run(store, match, {} if latest is None else latest.overrides):
             units[unit_state(unit, latest)].append(unit.name)
     return {
@@ -109,6 +117,7 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
         "state": "not run" if latest is None else latest.state,
         "units": units,
         "failed": [] if latest is None else [failure.unit for failure in latest.failed],
+        "waiting": [unit.unit for unit in waiting],
         "settings": {} if latest is None else latest.overrides,
         "unfinished_runs": [run.run_id for run in store.unfinished_runs(match_id)],
         "problem": problem,

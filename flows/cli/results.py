@@ -29,10 +29,25 @@ StageOption = Annotated[
 
 def export(
     match: MatchArgument,
-    form: Annotated[str, typer.Option("--format", help="joints, coco or worldpose.")],
+    forms: Annotated[
+        list[str],
+        typer.Option(
+            "--format",
+            help="joints, coco, worldpose, trc, bvh, challenge or challenge-2025 "
+            "(docs/formats.md); more than one may be given.",
+        ),
+    ],
     out: Annotated[Path, typer.Option("--out", help="Folder to write into.")],
     run: RunOption = "latest",
     stage: StageOption = None,
+    release: Annotated[
+        str | None,
+        typer.Option("--release", metavar="NAME", help="Freeze the run under a name: manifest."),
+    ] = None,
+    licence: Annotated[
+        Path | None,
+        typer.Option("--licence", help="Text under which a release's data may be used."),
+    ] = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -40,20 +55,28 @@ def export(
 
     Example: worldpose export tiny --format joints --out exported
     """
+    from flows.formats import Origin
     from flows.registering import find_registration
-    from flows.release import EXPORTS
+    from flows.releasing import export as export_formats
+    from flows.releasing import release as write_release
 
-    if form not in EXPORTS:
+    if (release is None) != (licence is None):
         raise UsageError(
-            f"--format {form}",
-            expected=f"one of {', '.join(EXPORTS)}",
-            found=repr(form),
-            todo="Choose one of these.",
+            "worldpose export",
+            expected="both --release NAME and --licence FILE, or neither",
+            found="one of them",
+            todo="A release says under which licence its data may be used.",
         )
-    spec = find_registration(Store.open(project), match).spec
-    written = EXPORTS[form](open_run(project, spec.match_id, run), spec, out, stage)
+    registration = find_registration(Store.open(project), match)
+    origin = Origin(open_run(project, registration.spec.match_id, run), registration, stage)
+    if release is None or licence is None:
+        written = export_formats(origin, forms, out)
+    else:
+        text = licence.read_text(encoding="utf-8").strip()
+        written = write_release(origin, forms, out, release, text)
     if as_json:
-        print_json({"match": spec.match_id, "files": [str(path) for path in written]})
+        files = [str(path) for path in written]
+        print_json({"match": registration.spec.match_id, "files": files})
     else:
         for path in written:
             line(f"wrote {path}")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import time
-from typing import Annotated
+from typing import Annotated, get_args
 
 import typer
 
-from data_contracts.run import RunRecord
+from data_contracts.run import GatePolicy, RunRecord
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -24,9 +24,12 @@ from flows.method import METHOD
 from flows.registering import find_match
 from flows.running import RunRequest, run_match
 from flows.settings import parse_overrides, selected_stages
+from worldpose.errors import UsageError
 from worldpose.store import Store
 
-EXIT_CODES = {"complete": 0, "failed": 1, "partial": 4}
+EXIT_CODES = {"complete": 0, "failed": 1, "waiting": 3, "partial": 4}
+SHOWN = 5
+"""Waiting units that are named one by one."""
 
 
 def run(
@@ -50,6 +53,13 @@ def run(
     workers: Annotated[
         int | None, typer.Option(min=1, help="Worker processes on this machine; one a core.")
     ] = None,
+    gates: Annotated[
+        str,
+        typer.Option(
+            metavar="POLICY",
+            help="When results wait for a person: never, auto (figures beyond limits), always.",
+        ),
+    ] = "never",
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -63,7 +73,8 @@ def run(
         return
     overrides = parse_overrides(assignments or [], selected_stages(from_stage, until_stage))
     store = Store.open_or_new(project)
-    request = RunRequest(overrides, from_stage, until_stage, dask, workers)
+    policy = _policy(gates)
+    request = RunRequest(overrides, from_stage, until_stage, dask, workers, policy)
     with progress():
         record = run_match(store, find_match(store, match), request)
     seconds = time.monotonic() - started
@@ -74,15 +85,30 @@ def run(
                 "executed": len(record.executed),
                 "reused": len(record.reused),
                 "failed": len(record.failed),
-                "waiting": 0,
+                "waiting": len(record.waiting),
                 "seconds": round(seconds, 3),
                 "blocked": len(record.blocked),
                 "failures": [failure.model_dump() for failure in record.failed],
+                "gates": record.gates,
+                "reviews": [unit.model_dump() for unit in record.waiting],
             }
         )
     else:
         _print(record, store.url, seconds)
     raise typer.Exit(EXIT_CODES[record.state])
+
+
+def _policy(gates: str) -> GatePolicy:
+    policies: tuple[GatePolicy, ...] = get_args(GatePolicy)
+    for policy in policies:
+        if gates == policy:
+            return policy
+    raise UsageError(
+        f"--gates {gates}",
+        expected="never, auto or always",
+        found=repr(gates),
+        todo="See worldpose run --help.",
+    )
 
 
 def _print_settings(as_json: bool) -> None:
@@ -111,9 +137,10 @@ def _print(record: RunRecord, project: str, seconds: float) -> None:
     line(
         f"run {record.run_id} of {record.match_id} is {record.state}: "
         f"{len(record.executed)} computed, {len(record.reused)} reused, "
-        f"{len(record.failed)} failed{blocked}, {seconds:.1f} s"
+        f"{len(record.failed)} failed{blocked}, gates {record.gates}, {seconds:.1f} s"
     )
-    if not (record.executed or record.failed):
+    _print_waiting(record)
+    if not (record.executed or record.failed or record.waiting):
         line("nothing to do: every result is current")
     for name, figures in record.figures.items():
         if figures.get("joints") == 0:
@@ -123,6 +150,24 @@ def _print(record: RunRecord, project: str, seconds: float) -> None:
                 to=errors,
             )
     line(f"results: {project}/results/{record.match_id}")
+
+
+def _print_waiting(record: RunRecord) -> None:
+    """What waits, and what to do about it."""
+    if not record.waiting:
+        return
+    undecided = sum(not unit.rejected for unit in record.waiting)
+    rejected = len(record.waiting) - undecided
+    also = f", {rejected} rejected and to be corrected" if rejected else ""
+    line(f"{undecided} {'review' if undecided == 1 else 'reviews'} pending{also}:")
+    for unit in record.waiting[:SHOWN]:
+        line(f"  {unit.request}: {'; '.join(unit.reasons)}")
+    if len(record.waiting) > SHOWN:
+        line(f"  and {len(record.waiting) - SHOWN} more")
+    line(
+        f"next: worldpose review list {record.match_id}, then approve or reject what it lists, "
+        "and give this command again"
+    )
 
 
 def add_to(app: typer.Typer) -> None:

@@ -11,7 +11,7 @@ from worldpose.body_fitting.bones import (
     measure_bones,
     pool_shapes,
 )
-from worldpose.body_fitting.figures import BodyFittingReport, report_fit
+from worldpose.body_fitting.figures import BodyFittingReport, Pictures, report_fit
 from worldpose.body_fitting.fitting import BodyFit, fit_bodies
 from worldpose.body_fitting.glimpses import Glimpses, place_glimpses
 from worldpose.body_fitting.monocular import MonocularEstimates, read_monocular
@@ -25,6 +25,7 @@ __all__ = [
     "BoneLengths",
     "Glimpses",
     "MonocularEstimates",
+    "Pictures",
     "Shape",
     "Sightings",
     "find_sightings",

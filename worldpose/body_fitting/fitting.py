@@ -107,7 +107,7 @@ def fit_bodies(
     solver = Solver(
         ChainedKeypoints.of(fold_keypoints(model, COCO17)), load_pose_prior(), settings, ground
     )
-    joint_seen = np.isfinite(joints).all(-1) & np.isfinite(covariance).all((-1, -2))
+    joint_seen = np.asarray(np.isfinite(joints).all(-1) & np.isfinite(covariance).all((-1, -2)))
     seen = np.asarray(joint_seen.any(-1))
     spans = {
         person: slice(int(here[0]), int(here[-1]) + 1)
@@ -138,7 +138,9 @@ def fit_bodies(
         pose, factor = solver.poses(evidence[person], shapes.people[person], shapes.offsets, fps)
         result.put(solver, person, span, pose, factor, shapes)
     if glimpses is not None:
-        for person, guidance in _guide(result, covariance, glimpses, spans, fps).items():
+        for person, guidance in _guide(
+            result, joint_seen, covariance, glimpses, spans, fps
+        ).items():
             shape = shapes.people[person]
             pose, factor = solver.poses(evidence[person], shape, shapes.offsets, fps, guidance)
             result.put(solver, person, spans[person], pose, factor, shapes)
@@ -151,11 +153,16 @@ def fit_bodies(
 
 
 def _guide(
-    result: _Result, covariance: Floats, glimpses: Glimpses, spans: Mapping[int, slice], fps: float
+    result: _Result,
+    joint_seen: NDArray[np.bool_],
+    covariance: Floats,
+    glimpses: Glimpses,
+    spans: Mapping[int, slice],
+    fps: float,
 ) -> dict[int, Guidance]:
     """Monocular poses of the persons who have some where few of their joints are well known."""
-    limbs = np.sqrt(np.trace(covariance[:, :, 5:], axis1=-2, axis2=-1) / 3.0)
-    sure = np.median(np.where(np.isfinite(limbs), limbs, np.inf), axis=-1) < SURE
+    variance = np.trace(covariance[:, :, 5:], axis1=-2, axis2=-1) / 3.0
+    sure = np.median(np.where(joint_seen[:, :, 5:], variance, np.inf), axis=-1) < SURE**2
     witnesses = 1.0 + GLIMPSE_TIME * fps
     angles = result.body_pose @ GATHER.T
     precision = learn_precision(glimpses, result.orient, angles, sure, witnesses)

@@ -49,6 +49,8 @@ def place_glimpses(
     frames, persons = joints.shape[:2]
     orient = np.full((frames, persons, 3, 3), np.nan)
     angles = np.full((frames, persons, GATHER.shape[0]), np.nan)
+    if not persons:
+        return Glimpses(orient, angles)
     full = np.stack([bridged(joints[:, person]) for person in range(persons)], axis=1)
     image = camera.project(full.reshape(frames, -1, 3)).reshape(frames, persons, -1, 2)
     known = np.isfinite(image)
@@ -70,7 +72,7 @@ def place_glimpses(
             turned = _towards(at.normalize(estimates.center[row])) @ turned
         orient[place, person] = at.cam_from_world.rotation.T @ turned
         turns = Rigid(estimates.rotations[row, 1:], np.zeros(3)).rotvec
-        angles[place, person] = turns.reshape(len(row), -1) @ GATHER.T
+        angles[place, person] = turns.reshape(len(row), GATHER.shape[1]) @ GATHER.T
     bad = ~(np.isfinite(orient).all((-1, -2)) & np.isfinite(angles).all(-1))
     orient[bad], angles[bad] = np.nan, np.nan
     return Glimpses(orient, angles)

@@ -93,8 +93,8 @@ def monocular_of(arrays: Mapping[str, NDArray[Any]], where: Path) -> MonocularEs
     frame = np.asarray(arrays.get("frame", arrays.get("frames", np.arange(rows)))).ravel()
     crop, place = _first(arrays, CROPS), _first(arrays, PLACES)
     if crop is not None:
-        crop = np.asarray(crop, dtype=np.float64).reshape(rows, -1)
-        center = crop if crop.shape[1] == 2 else 0.5 * (crop[:, :2] + crop[:, 2:4])
+        crop = np.asarray(crop, dtype=np.float64)
+        center = crop if crop.shape[1:] == (2,) else 0.5 * (crop[..., :2] + crop[..., 2:4])
     elif place is not None and "focal_length" in arrays and "img_size" in arrays:
         focal = np.broadcast_to(np.asarray(arrays["focal_length"]).reshape(-1, 1), (rows, 1))
         size = np.broadcast_to(np.asarray(arrays["img_size"]).reshape(-1, 2), (rows, 2))
@@ -116,12 +116,12 @@ def _first(arrays: Mapping[str, NDArray[Any]], names: tuple[str, ...]) -> NDArra
 def _turns(given: NDArray[Any], where: Path, name: str, joints: int) -> Floats:
     """Matrices (rows, joints, 3, 3) of axis-angle vectors or matrices of whatever shape."""
     values = np.asarray(given, dtype=np.float64)
-    flat = values.reshape(len(values), -1) if values.ndim > 1 else values.reshape(1, -1)
-    if flat.shape[1] == 9 * joints:
-        matrices: Floats = flat.reshape(-1, joints, 3, 3)
+    rows, numbers = values.shape[:1], int(np.prod(values.shape[1:]))
+    if values.ndim > 1 and numbers == 9 * joints:
+        matrices: Floats = values.reshape(*rows, joints, 3, 3)
         return matrices
-    if flat.shape[1] == 3 * joints:
-        return Rigid.from_rotvec(flat.reshape(-1, joints, 3), np.zeros(3)).rotation
+    if values.ndim > 1 and numbers == 3 * joints:
+        return Rigid.from_rotvec(values.reshape(*rows, joints, 3), np.zeros(3)).rotation
     expected = f"{name} of {joints} joints, axis-angle vectors or matrices, for each row"
     raise _wrong(where, expected, f"shape {values.shape}")
 

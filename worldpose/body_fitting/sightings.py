@@ -1,4 +1,9 @@
-"""Joints that one camera alone sees: somewhere on a line, which is much better than nowhere."""
+"""Joints that one camera alone sees: somewhere on a line, which is much better than nowhere.
+
+All lines of a person in a frame are taken for parallel: how far away he is would follow from how
+large he looks, and a hundredth of that, less than any detector's bias, is 0.7 m at 70 m. Motion and
+feet on the ground know it better.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +26,7 @@ class Sightings:
     """(frames, persons, 17, 3) [m], world: of the line, the point nearest to where the track puts
     the joint; NaN where there is no line or more than one."""
     across: Floats
-    """(frames, persons, 17, 3, 3) [1], what takes the part along the line from a vector."""
+    """(frames, persons, 17, 3, 3) [1], what takes the part along his lines from a vector."""
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -48,7 +53,7 @@ def find_sightings(
     """
     frames, count, persons = detection_index.shape
     points = np.full(joints.shape, np.nan)
-    across = np.zeros((*joints.shape, 3))
+    ahead = np.full(joints.shape, np.nan)
     frame, camera, person = np.nonzero(detection_index >= 0)
     own = np.full((frames, count, persons, 17, 2), np.nan)
     own[frame, camera, person] = keypoints[frame, camera, detection_index[frame, camera, person]]
@@ -63,13 +68,16 @@ def find_sightings(
             continue
         at = frame[mine], person[mine], joint[mine]
         rays = cameras[each].unproject(own[at[0], each, at[1], at[2]])
-        ahead = rays.directions / np.linalg.norm(rays.directions, axis=-1, keepdims=True)
-        far = np.maximum(((expected[at] - rays.origins) * ahead).sum(-1, keepdims=True), 0.0)
-        points[at] = rays.origins + far * ahead
-        across[at] = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
+        along = rays.directions / np.linalg.norm(rays.directions, axis=-1, keepdims=True)
+        far = np.maximum(((expected[at] - rays.origins) * along).sum(-1, keepdims=True), 0.0)
+        points[at], ahead[at] = rays.origins + far * along, along
     lost = ~np.isfinite(points).all(-1)
-    points[lost], across[lost] = np.nan, 0.0
-    return Sightings(points, across)
+    points[lost], ahead[lost] = np.nan, 0.0
+    mean = ahead.sum(axis=2, keepdims=True)
+    length = np.linalg.norm(mean, axis=-1, keepdims=True)
+    mean = mean / np.maximum(length, 1e-9)
+    across = np.eye(3) - mean[..., :, None] * mean[..., None, :]
+    return Sightings(points, np.where(lost[..., None, None], 0.0, across))
 
 
 def _expected(joints: Floats) -> Floats:

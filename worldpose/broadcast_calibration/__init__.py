@@ -12,6 +12,7 @@ from worldpose.broadcast_calibration.feed_offset import FeedOffset, estimate_fee
 from worldpose.broadcast_calibration.given_lens import follow_given_lens
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.players import People
+from worldpose.broadcast_calibration.pooling import PooledCenter, pool_centers
 from worldpose.broadcast_calibration.report import BroadcastReport
 from worldpose.broadcast_calibration.settings import (
     BroadcastCalibrationSettings,
@@ -27,9 +28,11 @@ __all__ = [
     "FeedOffset",
     "MovingCamera",
     "People",
+    "PooledCenter",
     "broadcast_arrays",
     "broadcast_attributes",
     "calibrate_broadcast",
     "estimate_feed_offset",
     "follow_given_lens",
+    "pool_centers",
 ]

@@ -126,6 +126,13 @@ def track(
 ) -> Tracked:
     """Return a clip's cameras from its key frames and followed points (M2); as above."""
     wanted = {key.frame for key in key_frames}
+    if len(wanted) < len(key_frames):
+        raise InputError(
+            where,
+            expected="every key frame once",
+            found=f"{sorted(key.frame for key in key_frames)}",
+            todo="Put all clicks of a frame into one entry.",
+        )
     kept: dict[int, Picture] = {}
     followed = follow(_keeping(pictures(), wanted, kept), boxes, settings.flow_points)
     missing = sorted(wanted - set(kept))
@@ -155,10 +162,10 @@ def refine(
     """Return the fit of all frames at once (M3 to M6); as `calibrate_broadcast`."""
     samples = FieldSamples.of(pitch)
     camera = tracked.chain.camera
-    spread = smoothness_of(camera, fps) if settings.smooth else np.full(7, np.inf)
+    spread = smoothness_of(camera, fps)
     if not settings.smooth:
-        # Frames without evidence are bridged all the same.
-        spread[:3] = smoothness_of(camera, fps)[:3]
+        # The rotation of frames without evidence is bridged all the same.
+        spread[3:] = np.inf
     clicks = replace(tracked.keys.clicks, frame=tracked.keys.frames[tracked.keys.clicks.frame])
     deviation = float(tracked.flow.deviation[0]) if len(tracked.flow) else 0.0
     share = flow_share_of(tracked.chain, tracked.keys.frames, deviation, settings.flow_drift)

@@ -13,7 +13,7 @@ Integers = NDArray[np.int64]
 
 PAINT = 4
 """Ways in which a marking may lie beside the template: sideways and upwards at either end of a
-line, or along x, y and z for an arc, the last twice."""
+line, or along x, y and z for an arc."""
 CLICK, MARKING, PLAYER = 0, 1, 2
 """Kinds of `PointEvidence`: clicked points and drawn markings, painted lines, players' joints."""
 

@@ -15,8 +15,6 @@ Floats = NDArray[np.float64]
 
 _COARSE: Final = 25.0
 """Whole frames up to here are tried [frame]."""
-_FINE: Final = 0.25
-"""Between offsets tried about the best whole frame [frame]."""
 _STRIDE: Final = 5
 """Every so many frames are looked at while whole frames are tried [1]."""
 _SHARE: Final = 0.03
@@ -53,9 +51,9 @@ def estimate_feed_offset(
 ) -> FeedOffset:
     """Return how the feed's frames lie beside those of the static cameras.
 
-    Joints are taken between frames; for every offset tried, people are matched anew and what their
-    keypoints miss is weighed. The camera must not rest on these players, or it has absorbed what
-    is looked for: give one of markings alone.
+    For every whole offset people are matched anew and what their keypoints miss is weighed; between
+    the best and its neighbours the answer is where a parabola is lowest. The camera must not rest
+    on these players, or it has absorbed what is looked for: give one of markings alone.
 
     Args:
         camera: all frames of the clip, from markings and followed points.
@@ -70,19 +68,19 @@ def estimate_feed_offset(
         return FeedOffset(np.nan, np.inf, False, whole, coarse, 0)
     best = float(whole[int(np.nanargmin(coarse))])
     every = np.arange(len(camera))
-    near = best + np.arange(-1.0, 1.0 + 1e-9, _FINE)
+    # Between whole frames joints would be means of two, with less noise: a parabola through whole
+    # ones favours none.
+    near = best + np.arange(-2.0, 3.0)
     results = [_cost(camera, people, offset, every) for offset in near]
     fine = np.array([cost for cost, _ in results])
-    middle = int(np.nanargmin(fine))
-    inside = 0 < middle < len(near) - 1 and abs(best) < np.floor(reach)
+    middle = int(np.nanargmin(fine)) if np.isfinite(fine).any() else 0
     pairs = results[middle][1]
-    if not inside or pairs == 0:
-        return FeedOffset(np.nan, np.inf, False, near, fine, pairs)
-    left, here, right = fine[middle - 1 : middle + 2]
-    bend = (left - 2.0 * here + right) / _FINE**2
+    inside = 0 < middle < len(near) - 1 and abs(near[middle]) < np.floor(reach)
+    left, here, right = fine[middle - 1 : middle + 2] if inside else (np.nan,) * 3
+    bend = left - 2.0 * here + right
     if not bend > 0.0:
         return FeedOffset(np.nan, np.inf, False, near, fine, pairs)
-    offset = float(near[middle] + 0.5 * (left - right) / (left - 2.0 * here + right) * _FINE)
+    offset = float(near[middle] + 0.5 * (left - right) / bend)
     # Half a loss of one unit is one standard deviation; a person counts once in a while.
     independent = pairs / max(1.0, _LASTS * people.fps)
     error = float(np.sqrt(1.0 / (0.5 * bend * independent)))
@@ -94,14 +92,11 @@ def _cost(
     camera: MovingCamera, people: People, offset: float, frames: NDArray[np.int64]
 ) -> tuple[float, int]:
     """Return the mean loss of a keypoint at an offset, and the pairs."""
-    at = frames + offset
-    inside = (at >= 0.0) & (at <= len(people.joints) - 1.0)
-    frames, at = frames[inside], at[inside]
+    at = frames + int(offset)
+    inside = (at >= 0) & (at < len(people.joints))
+    frames, joints = frames[inside], people.joints[at[inside]]
     if not len(frames):
         return np.nan, 0
-    low = np.minimum(np.floor(at).astype(np.int64), len(people.joints) - 2)
-    share = (at - low)[:, None, None, None]
-    joints = (1.0 - share) * people.joints[low] + share * people.joints[low + 1]
     some = People(joints, people.keypoints[frames], people.fps)
     seen = camera.frames(frames)
     pairs = match(seen, some)

@@ -78,13 +78,9 @@ def calibrate_keys(
     for key in sorted(key_frames, key=lambda each: each.frame):
         place = f"{where}: frame {key.frame}"
         try:
+            # Painted lines come in below, for all key frames at once.
             found[key.frame] = calibrate(
-                pitch,
-                key.markings,
-                image_size,
-                picture=pictures.get(key.frame),
-                settings=settings.key_frame,
-                where=place,
+                pitch, key.markings, image_size, settings=settings.key_frame, where=place
             )
         except WorldposeError as error:
             refused[key.frame] = f"{error}"

@@ -20,10 +20,11 @@ from worldpose.broadcast_calibration.moving_camera import MovingCamera, joined
 from worldpose.broadcast_calibration.normal_equations import add_points
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration.edges import CANDIDATES, find_bars, fit_bars
+from worldpose.static_calibration.bar_fits import fit_bars
+from worldpose.static_calibration.clearance import Whites, clear, whites_of
+from worldpose.static_calibration.edges import BESIDE, CANDIDATES, find_bars
 from worldpose.static_calibration.line_samples import (
     LineSamples,
-    apart,
     sample_markings,
     see_lines,
     thinned,
@@ -53,16 +54,17 @@ class FieldSamples:
     """The template's markings as samples that lines are looked for at.
 
     Attributes:
-        lines: samples away from other markings.
+        lines: samples of the painted markings.
+        whites: all that is white, which bars must keep clear of.
     """
 
     lines: LineSamples
+    whites: Whites
 
     @classmethod
     def of(cls, pitch: PitchTemplate) -> FieldSamples:
         """Return the samples of a pitch."""
-        everywhere = sample_markings(pitch, _SPACING)
-        return cls(everywhere[apart(everywhere, np.arange(len(everywhere.marking)))])
+        return cls(sample_markings(pitch, _SPACING), whites_of(pitch))
 
 
 def find_lines(
@@ -105,16 +107,28 @@ def _look(
     index = thinned(seen, lines, 4.0, settings.line_samples)
     if people is not None and len(index):
         index = index[~_hidden(seen.places[index], people, reach)]
+    room = 0.5 * seen.widths[index] + BESIDE
+    index = index[
+        clear(
+            camera.camera[0],
+            samples.whites,
+            0.5 * _LINE_WIDTH,
+            seen.places[index],
+            room,
+            lines.marking[index],
+        )
+    ]
     if not len(index):
         return PointEvidence.none()
     places, normals = seen.places[index], seen.normals[index]
-    widths, count = seen.widths[index], len(index)
+    widths, curvatures, count = seen.widths[index], seen.curvatures[index], len(index)
     offsets, strengths = np.empty((count, CANDIDATES)), np.empty((count, CANDIDATES))
     find_bars(
         picture,
         places,
         normals,
         widths,
+        curvatures,
         np.full(count, reach),
         _CONTRAST,
         offsets,
@@ -129,6 +143,7 @@ def _look(
         places,
         normals,
         widths,
+        curvatures,
         offsets[np.arange(count), best],
         _CONTRAST,
         exact,
@@ -152,8 +167,11 @@ def _look(
 def _paint(lines: LineSamples) -> Floats:
     """Return how samples move with their markings (n, PAINT, 3) [m/m]."""
     paint = np.zeros((len(lines.marking), PAINT, 3))
-    paint[:, :2] = lines.sideways[:, :, None] * lines.across_world[:, None, :]
-    paint[:, 2:, 2] = lines.upwards
+    paint[:, :2] = lines.shares[:, :, None] * lines.across_world[:, None, :]
+    paint[:, 2:, 2] = lines.shares
+    arcs = lines.bend_world.any(axis=1)
+    # An arc moves with its center.
+    paint[arcs, 0], paint[arcs, 1] = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
     return paint
 
 

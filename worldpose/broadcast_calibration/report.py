@@ -33,8 +33,6 @@ _FEW_LINES: Final = 30
 """Fewer samples of lines do not hold a camera by themselves [1]."""
 _FEW_PLAYERS: Final = 3
 """Fewer players do not [1]."""
-_PICKED_APART: Final = 1.0
-"""Frames to pick next are at least this many seconds' worth of frames apart, of 50 [s]."""
 _PICKS: Final = 5
 """Frames to pick next that are named."""
 _GRID: Final = 4.0
@@ -216,7 +214,7 @@ def _rms(off: Floats, points: PointEvidence, chosen: NDArray[np.bool_], frames: 
 def _picks(expected: Floats) -> tuple[int, ...]:
     """Return the frames that are known worst, apart from one another."""
     left = np.where(np.isfinite(expected), expected, -1.0)
-    apart = max(1, round(50.0 * _PICKED_APART))
+    apart = max(1, len(expected) // (2 * _PICKS))
     picks: list[int] = []
     while len(picks) < _PICKS and left.max() > 0.0:
         best = int(left.argmax())

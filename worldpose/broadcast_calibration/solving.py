@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -84,13 +85,13 @@ class Problem:
     free_clip: NDArray[np.bool_] = field(default_factory=lambda: np.ones(CLIP_SIZE, np.bool_))
     known: NDArray[np.bool_] | None = None
 
-    @property
+    @cached_property
     def markings(self) -> Integers:
         """Numbers of the markings whose place is solved for, rising (m,)."""
         painted = self.points.source[self.points.kind == MARKING]
         return np.asarray(np.unique(painted))
 
-    @property
+    @cached_property
     def group(self) -> Integers:
         """Which of `markings` each point lies on (n,); -1 = none."""
         group = np.searchsorted(self.markings, self.points.source)
@@ -225,8 +226,7 @@ def solve(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
 def _step(system: Equations, damping: float) -> tuple[Floats, Floats]:
     """Return the damped Gauss-Newton step of the frames (frames, 7) and of what they share."""
     blocks = system.blocks.copy()
-    diagonal = np.arange(FRAME_SIZE)
-    blocks[0][:, diagonal, diagonal] *= 1.0 + damping
+    blocks[0][:, range(FRAME_SIZE), range(FRAME_SIZE)] *= 1.0 + damping
     factor = BandedFactor.of(blocks)
     if not factor.determined:
         raise DegenerateError(
@@ -236,8 +236,7 @@ def _step(system: Equations, damping: float) -> tuple[Floats, Floats]:
     columns = np.concatenate([-system.right[..., None], system.border], axis=-1)
     solved = factor.solve(columns)
     corner = system.corner * (1.0 + damping * np.eye(len(system.corner)))
-    flat = system.border.reshape(-1, len(corner))
-    product = flat.T @ solved.reshape(len(flat), -1)
+    product = system.border.reshape(-1, len(corner)).T @ solved.reshape(-1, 1 + len(corner))
     reduced = corner - product[:, 1:]
     rest = -system.right_corner - product[:, 0]
     clip = np.linalg.solve(reduced, rest)
@@ -267,8 +266,7 @@ def _add_prior(
     width = np.full((len(lens), 1), prior.focal_spread)
     spread = np.concatenate([width, prior.distortion_spread], axis=1)
     gone = (lens - middle) / spread
-    diagonal = np.arange(3, FRAME_SIZE)
-    blocks[0][:, diagonal, diagonal] += 1.0 / spread**2
+    blocks[0][:, range(3, FRAME_SIZE), range(3, FRAME_SIZE)] += 1.0 / spread**2
     right[:, 3:] += gone / spread
     return cost + 0.5 * float((gone**2).sum())
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.bundle_adjustment.building import (
+    MARKINGS_SOLVER,
     KeypointNoise,
     camera_knowledge,
     markings_problem,
@@ -181,7 +182,7 @@ class _Adjuster:
     def solved(self, standing: NDArray[np.bool_], without: int | None = None) -> Adjusted:
         """The adjustment to everybody, or to everybody but one group."""
         if self.settings.evidence == "markings":
-            return solve(markings_problem(self.clip, standing, self.settings), self.settings.solver)
+            return solve(markings_problem(self.clip, standing, self.settings), MARKINGS_SOLVER)
         observed = self.everybody
         # A camera that stands as it was has no say: it would drag the others to its error.
         kept = ~standing[observed.camera_of]

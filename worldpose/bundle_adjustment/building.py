@@ -10,12 +10,15 @@ from numpy.typing import NDArray
 
 from worldpose.bundle_adjustment.clip import Clip, Observed
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, GivenCameraPrior
-from worldpose.bundle_adjustment.solving import Adjusted, Problem
+from worldpose.bundle_adjustment.solving import Adjusted, Problem, SolverSettings
 from worldpose.static_calibration import PARAMETERS
 
 _SIZE: Final = len(PARAMETERS)
-_UNKNOWN: Final = np.array([1.0] * 3 + [100.0] * 3 + [1.0, 300.0, 300.0, 3.0, 30.0, 300.0])
-"""Spreads that say nothing [rad, m, 1, px, 1]: what a few clicks leave open stays where it is."""
+_UNKNOWN: Final = 100.0 * np.array([1.0] * 3 + [100.0] * 3 + [1.0, 300.0, 300.0, 3.0, 30.0, 300.0])
+"""Spreads that say nothing [rad, m, 1, px, 1]; they only keep the system regular. A hundredth of
+them would already hold the lens."""
+MARKINGS_SOLVER: Final = SolverSettings(iterations=500, cost_change=1e-6)
+"""For a valley as long and flat as a lens that six clicks determine."""
 
 
 _FAITH: Final = 10.0

@@ -17,7 +17,8 @@ from worldpose.bundle_adjustment.building import camera_knowledge, known_covaria
 from worldpose.bundle_adjustment.clip import Clip, keypoints_of, predict
 from worldpose.bundle_adjustment.guard import HeldOut, joints_without
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
-from worldpose.bundle_adjustment.solving import Problem, solve
+from worldpose.bundle_adjustment.solving import Adjusted, Problem, solve
+from worldpose.errors import InputError
 from worldpose.static_calibration import PARAMETERS
 from worldpose.triangulation.calibration_errors import StatedErrors, stated_errors
 
@@ -27,13 +28,15 @@ Booleans = NDArray[np.bool_]
 _SIZE: Final = len(PARAMETERS)
 _MEDIAN: Final = 2.0 * np.log(2.0)
 """Median squared length of a standard Gaussian in two dimensions [1]."""
-_LIMIT: Final = 16.0
-"""Median squared error, over what noise and calibration state, from which a camera contradicts the
-others [1]: four times as far off as it says, one honest camera in 60,000 (chi-square, two degrees
-of freedom)."""
-_DISBELIEF: Final = 1e4
-"""Factor on the variances of a contradicting camera while it is placed by the others' people
-[1]."""
+_LIMIT: Final = 4.0
+"""Median squared error, over what noise and calibration state, from which a camera is placed by the
+others' people [1]: twice as far off as it says, as one honest camera in thirty is."""
+_CONTRADICTS: Final = 9.0
+"""Squared step to there in stated standard deviations, per parameter, from which its calibration is
+not believed [1]: three of them in every direction."""
+_DISBELIEF: Final = 16.0
+"""Factor on the variances of a camera while it is placed so [1]: what people tell exceeds it, what
+they do not tell stays."""
 _SCALES: Final = (30.0, 3.0)
 """Of the loss, one after the other [standard deviations]: first it must get there."""
 _SEEN: Final = 20
@@ -93,7 +96,11 @@ def find_contradictions(
         points = joints_without(clip, clip.cameras, c, frames)
         used = np.isfinite(points[..., 0]) & (weight[:, c] > 0.0)
         used &= np.isfinite(place[:, c])
+        used &= np.isfinite(clip.cameras[c].project(points)).all(axis=-1)
         number = int(used.sum())
+        if number < _SEEN:
+            found.stranger[c] = True
+            continue
         problem = Problem(
             cameras=clip.cameras[c : c + 1],
             free=free[c : c + 1],
@@ -106,20 +113,33 @@ def find_contradictions(
             weight=1.0 / place[:, c][used],
             scale=np.full(number, np.inf),
         )
-        offset = None
-        for scale in _SCALES:
-            loss = np.full(number, scale)
-            placed = solve(replace(problem, scale=loss), settings.solver, offset, covariance=False)
-            offset = placed.offset
+        placed = _placed(problem, settings)
+        if placed is None:
+            found.stranger[c] = True
+            continue
         off = placed.cameras[0].project(problem.points) - problem.image
         left = float(np.median((off**2).sum(axis=1) * problem.weight))
         if left > _LIMIT * _MEDIAN:
             found.stranger[c] = True
             continue
-        found.offset[c] = placed.offset[0]
-        chi = float(placed.offset[0] @ information[c] @ placed.offset[0])
-        found.doubt[c] = max(1.0, chi / int(free[c].sum()))
+        step = placed.offset[0]
+        squared_step = float(step @ information[c] @ step) / int(free[c].sum())
+        if squared_step > _CONTRADICTS:
+            found.offset[c], found.doubt[c] = step, squared_step
     return found
+
+
+def _placed(problem: Problem, settings: BundleAdjustmentSettings) -> Adjusted | None:
+    """The camera where these points put it; None where none has them all in its picture."""
+    offset = None
+    for scale in _SCALES:
+        loss = np.full(len(problem.points), scale)
+        try:
+            placed = solve(replace(problem, scale=loss), settings.solver, offset, covariance=False)
+        except InputError:
+            return None
+        offset = placed.offset
+    return placed
 
 
 def _joint_variance(stated: StatedErrors) -> Floats:

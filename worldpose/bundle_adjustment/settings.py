@@ -8,7 +8,7 @@ from pydantic import Field
 
 from data_contracts.records import Record
 from worldpose.bundle_adjustment.solving import SolverSettings
-from worldpose.static_calibration.line_refinement import SURVEY_ERROR
+from worldpose.static_calibration.line_settings import SURVEY_ERROR
 
 
 class GivenCameraPrior(Record):

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.bundle_adjustment.clip import Clip
-from worldpose.static_calibration.line_refinement import LineRefinementSettings
 from worldpose.static_calibration.line_samples import sample_markings, see_lines, thinned
+from worldpose.static_calibration.line_settings import LineRefinementSettings
 
 Floats = NDArray[np.float64]
 

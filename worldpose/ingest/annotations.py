@@ -1,4 +1,4 @@
-"""Clicked markings of static cameras: one JSON file a camera, checked against the match's pitch."""
+"""Clicked markings, of static cameras and of key frames, checked against the match's pitch."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Final
 
+from data_contracts.broadcast_calibration import KeyFrames
 from data_contracts.match import CameraSpec, MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, Pixel
@@ -19,10 +20,18 @@ from worldpose.pitch import PitchTemplate
 CLICKED_FOLDER: Final = "annotations/static_calibration"
 """Where a match folder keeps `<camera>.json`, relative to it."""
 
+KEY_FRAMES_FOLDER: Final = "annotations/broadcast_calibration"
+"""Where a match folder keeps `<clip>.json`, relative to it."""
+
 
 def clicked_file(camera_id: str) -> str:
     """Path of a camera's clicked markings, relative to the match folder."""
     return f"{CLICKED_FOLDER}/{camera_id}.json"
+
+
+def key_frames_file(clip_id: str) -> str:
+    """Path of a clip's clicked key frames, relative to the match folder."""
+    return f"{KEY_FRAMES_FOLDER}/{clip_id}.json"
 
 
 def read_clicked(
@@ -68,6 +77,62 @@ def read_clicked_markings(
         InputError: naming file and entry: not JSON, an unknown key or name, no number, a name given
             twice, a place outside the picture, nothing clicked, or a match without a pitch.
     """
+    template = _template(file, pitch)
+    clicked = validate_record(ClickedMarkings, read_json(file), str(file))
+    _require_markings(str(file), "", clicked, camera, template)
+    return clicked
+
+
+def read_key_frames(folder: Path, spec: MatchSpec, pitch: PitchSpec | None) -> dict[str, KeyFrames]:
+    """What was clicked in key frames of the broadcast camera, by clip, in the order of the clips.
+
+    Args:
+        folder: the match folder.
+        spec: its match.yaml.
+        pitch: its pitch; None where it has none.
+
+    Raises:
+        InputError: a file of no clip with a broadcast camera, or one that is not as it must be.
+    """
+    clips = {clip.id: clip for clip in spec.clips if clip.broadcast is not None}
+    picked = {}
+    names = sorted(path.name for path in (folder / KEY_FRAMES_FOLDER).glob("[!.]*"))
+    for name in names:
+        file = existing_file(folder, f"{KEY_FRAMES_FOLDER}/{name}", str(folder))
+        if file.suffix != ".json" or file.stem not in clips:
+            raise InputError(
+                str(file),
+                expected=f"<clip>.json of a clip with a broadcast camera: {', '.join(clips)}",
+                found=repr(name),
+                todo="Rename or remove the file, or name the clip's camera in match.yaml.",
+            )
+        camera = spec.camera(str(clips[file.stem].broadcast))
+        template = _template(file, pitch)
+        key_frames = validate_record(KeyFrames, read_json(file), str(file))
+        numbers = [key_frame.frame for key_frame in key_frames.key_frames]
+        if numbers != sorted(set(numbers)):
+            raise InputError(
+                f"{file}: key_frames",
+                expected="every frame once, in rising order",
+                found=f"{numbers}",
+                todo="Sort them, and put all clicks of one frame into one entry.",
+            )
+        for n, key_frame in enumerate(key_frames.key_frames):
+            inside = f"key_frames[{n}].markings"
+            _require_markings(str(file), inside, key_frame.markings, camera, template)
+        picked[file.stem] = key_frames
+    return {name: picked[name] for name in clips if name in picked}
+
+
+def write_key_frames(folder: Path, key_frames: Mapping[str, KeyFrames]) -> None:
+    """Write each clip's file into a match folder."""
+    for clip_id, picked in key_frames.items():
+        file = folder / key_frames_file(clip_id)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(picked.model_dump_json(indent=2) + "\n", encoding="utf-8")
+
+
+def _template(file: Path, pitch: PitchSpec | None) -> PitchTemplate:
     if pitch is None:
         raise InputError(
             str(file),
@@ -75,14 +140,27 @@ def read_clicked_markings(
             found="a file of them",
             todo="Remove it, or take `pitch: none` out of match.yaml.",
         )
-    clicked = validate_record(ClickedMarkings, read_json(file), str(file))
+    return PitchTemplate.from_spec(pitch)
+
+
+def _require_markings(
+    file: str, within: str, clicked: ClickedMarkings, camera: CameraSpec, template: PitchTemplate
+) -> None:
+    """Refuse markings that the pitch does not have, or that lie outside of the picture."""
     if not (clicked.points or clicked.drawn):
         raise InputError(
-            str(file), expected="points or drawn markings", found="none", todo="Click some."
+            f"{file}: {within}" if within else file,
+            expected="points or drawn markings",
+            found="none",
+            todo="Click some.",
         )
-    template = PitchTemplate.from_spec(pitch)
-    points = [(f"points[{n}]", point.name, (point.xy,)) for n, point in enumerate(clicked.points)]
-    drawn = [(f"drawn[{n}]", marking.name, marking.xy) for n, marking in enumerate(clicked.drawn)]
+    dot = f"{within}." if within else ""
+    points = [
+        (f"{dot}points[{n}]", point.name, (point.xy,)) for n, point in enumerate(clicked.points)
+    ]
+    drawn = [
+        (f"{dot}drawn[{n}]", marking.name, marking.xy) for n, marking in enumerate(clicked.drawn)
+    ]
     _require_known(file, points, "a point", template.points)
     _require_known(file, drawn, "a marking", template.marking_names)
     for place, _, (pixel,) in points:
@@ -90,7 +168,6 @@ def read_clicked_markings(
     for place, _, along in drawn:
         for number, pixel in enumerate(along):
             _require_inside(f"{file}: {place}.xy[{number}]", pixel, camera)
-    return clicked
 
 
 def write_clicked_markings(folder: Path, clicked: Mapping[str, ClickedMarkings]) -> None:
@@ -102,7 +179,7 @@ def write_clicked_markings(folder: Path, clicked: Mapping[str, ClickedMarkings])
 
 
 def _require_known(
-    file: Path,
+    file: str,
     entries: Sequence[tuple[str, str, Sequence[Pixel]]],
     kind: str,
     known: Collection[str],
@@ -129,8 +206,9 @@ def _require_known(
 
 
 def _require_inside(where: str, pixel: Pixel, camera: CameraSpec) -> None:
+    # A pixel more than the picture: tools that count from 1, and clicks on its very border.
     inside = all(
-        -0.5 <= value <= size - 0.5
+        -1.0 <= value <= size
         for value, size in zip(pixel, (camera.width, camera.height), strict=True)
     )
     if not inside:

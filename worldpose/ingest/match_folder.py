@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from data_contracts.broadcast_calibration import KeyFrames
 from data_contracts.cameras import CameraCalibration
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
-from worldpose.ingest.annotations import clicked_file, read_clicked
+from worldpose.ingest.annotations import clicked_file, read_clicked, read_key_frames
 from worldpose.ingest.calibration_files import read_calibration
 from worldpose.ingest.places import existing_file
 from worldpose.ingest.text_files import read_json, read_yaml
@@ -38,6 +39,8 @@ class MatchFolder:
         videos: video file or folder of images, by id of a static camera or of a clip.
         clicked: what people clicked, by id of a static camera; may lack some.
         stills: one picture, by id of a static camera; may lack some.
+        key_frames: what people clicked in the broadcast camera's picture, by id of a clip; may
+            lack some.
     """
 
     folder: Path
@@ -48,6 +51,7 @@ class MatchFolder:
     videos: Mapping[str, Path]
     clicked: Mapping[str, ClickedMarkings]
     stills: Mapping[str, Path]
+    key_frames: Mapping[str, KeyFrames]
 
 
 def read_match(folder: Path) -> MatchFolder:
@@ -82,6 +86,7 @@ def read_match(folder: Path) -> MatchFolder:
         videos=videos,
         clicked=read_clicked(folder, spec, pitch),
         stills=_stills(folder, spec),
+        key_frames=read_key_frames(folder, spec, pitch),
     )
 
 

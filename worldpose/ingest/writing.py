@@ -12,12 +12,13 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from data_contracts.broadcast_calibration import KeyFrames
 from data_contracts.cameras import CameraCalibration
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
-from worldpose.ingest.annotations import write_clicked_markings
+from worldpose.ingest.annotations import write_clicked_markings, write_key_frames
 from worldpose.ingest.calibration_files import write_calibration_toml
 from worldpose.ingest.keypoint_arrays import read_keypoint_arrays, write_keypoint_arrays
 from worldpose.ingest.match_folder import NO_PITCH, read_match
@@ -35,7 +36,8 @@ def write_match(
     pitch: PitchSpec | None = None,
     clicked: Mapping[str, ClickedMarkings] = MappingProxyType({}),
     stills: Mapping[str, NDArray[np.uint8]] = MappingProxyType({}),
-    references: Callable[[Path], None] | None = None,
+    key_frames: Mapping[str, KeyFrames] = MappingProxyType({}),
+    further: Callable[[Path], None] | None = None,
 ) -> None:
     """Write a match folder that `read_match` accepts, all or nothing.
 
@@ -51,12 +53,13 @@ def write_match(
         clicked: what was clicked in static cameras, by id.
         stills: pictures (height, width, 3), RGB, by camera id; written to the file that the
             camera's `still` names, else to stills/<camera>.png.
-        references: called with the match folder under construction, to add `reference/`.
+        key_frames: what was clicked in key frames of the broadcast camera, by clip.
+        further: called with the match folder under construction, to add videos and `reference/`.
 
     Raises:
         InputError: the folder is there and not empty, or what is given contradicts itself.
     """
-    _require_known(spec, [*calibrations, *observations, *clicked, *stills])
+    _require_known(spec, [*calibrations, *observations, *clicked, *stills, *key_frames])
     require_local(spec.pitch or "pitch.json", "match.yaml: pitch")
     for camera_id in stills:
         require_local(_still_name(spec, camera_id), f"match.yaml: camera {camera_id}: still")
@@ -76,10 +79,11 @@ def write_match(
         if pitch is not None:
             _write_pitch(building, spec, pitch)
         write_clicked_markings(building, clicked)
+        write_key_frames(building, key_frames)
         for camera_id, picture in stills.items():
             write_still(building / _still_name(spec, camera_id), picture)
-        if references is not None:
-            references(building)
+        if further is not None:
+            further(building)
         read_match(building)
         _sync(building)
         try:

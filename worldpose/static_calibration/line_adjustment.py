@@ -22,12 +22,14 @@ class Adjusted:
         information: (f, f) inverse of the step's covariance, the paint's unknowns accounted for.
         residuals: (n,) with the paint's unknowns taken off [px].
         weights: (n,) of the robust loss [1].
+        spent: samples that the unknowns are worth which the priors do not tell [1].
     """
 
     step: Floats
     information: Floats
     residuals: Floats
     weights: Floats
+    spent: float
 
 
 def adjust(
@@ -62,6 +64,7 @@ def adjust(
     shift = np.where(known, offsets, 0.0)
     solution = np.zeros(size)
     normal = np.empty((size, size))
+    told = np.empty((size, size))
     residuals = shift
     for scale in scales:
         if scale < np.inf:
@@ -70,6 +73,7 @@ def adjust(
         normal[:] = 0.0
         right = np.zeros(size)
         _accumulate(shift, weights / variances, by_camera, by_paint, index, normal, right)
+        told[:] = normal
         normal[:free, :free] += prior[0]
         right[:free] += prior[0] @ prior[1]
         normal[np.arange(free, size), np.arange(free, size)] += 1.0
@@ -78,7 +82,8 @@ def adjust(
         residuals -= (by_paint * solution[free:][index]).sum(axis=1)
     corner = normal[:free, free:]
     information = normal[:free, :free] - corner @ np.linalg.solve(normal[free:, free:], corner.T)
-    return Adjusted(solution[:free], 0.5 * (information + information.T), residuals, weights)
+    spent = float(np.trace(np.linalg.solve(normal, told)))
+    return Adjusted(solution[:free], 0.5 * (information + information.T), residuals, weights, spent)
 
 
 @compiled

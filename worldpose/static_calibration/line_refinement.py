@@ -147,8 +147,10 @@ _WORLD_SPACING: Final = 0.2
 _INLIER: Final = 0.25
 """Weight above which a sample counts as found: within one scale of the loss [1]."""
 _MOST_CORRELATED: Final = 0.95
-_POOLED: Final = 20.0
-"""Samples that all markings together are worth where one's noise is told [1]."""
+_OWN_WORTH: Final = 20.0
+"""Residuals of a marking that the expected noise is worth when its noise is told [1]."""
+_LEAST_KEPT: Final = 0.5
+"""Share of the samples that a fit leaves to tell the noise, at least [1]."""
 
 
 def _check_size(camera: Camera, grey: NDArray[np.uint8]) -> None:
@@ -183,17 +185,19 @@ def _noise(found: Found, inliers: NDArray[np.bool_]) -> tuple[Floats, Floats]:
     scaled = np.where(inliers, found.adjusted.residuals / np.sqrt(found.measured.variances), 0.0)
     pairs = inliers[1:] & inliers[:-1] & (np.diff(marking) == 0)
 
-    def shared(mine: Floats, values: Floats, labels: NDArray[np.int64]) -> Floats:
-        """The mean of each marking's values, drawn to that of all by a few of these."""
-        count = np.bincount(labels, mine, len(found.samples.names))
-        total = np.bincount(labels, mine * values, len(found.samples.names))
-        everywhere = total.sum() / max(count.sum(), 1.0)
-        return np.asarray((total + _POOLED * everywhere) / (count + _POOLED))
+    def total(values: Floats, labels: NDArray[np.int64]) -> Floats:
+        return np.bincount(labels, values, len(found.samples.names)).astype(np.float64)
 
-    squares = shared(inliers.astype(np.float64), scaled**2, marking)
-    products = shared(pairs.astype(np.float64), scaled[1:] * scaled[:-1], marking[1:])
-    correlation = np.clip(products / squares, 0.0, _MOST_CORRELATED)
-    return correlation[marking], squares[marking]
+    # What the fit has spent on itself is missing from its residuals.
+    used = float(inliers.sum())
+    kept = max(1.0 - found.adjusted.spent / used, _LEAST_KEPT)
+    squares = total(scaled**2, marking) / kept
+    products = total(np.where(pairs, scaled[1:] * scaled[:-1], 0.0), marking[1:])
+    # Of few samples the mean square of all is more than their own.
+    mean = squares.sum() / used + np.finfo(np.float64).tiny
+    correlation = products / np.maximum(squares, _OWN_WORTH * mean)
+    excess = (squares + _OWN_WORTH) / (total(inliers.astype(np.float64), marking) + _OWN_WORTH)
+    return np.clip(correlation, 0.0, _MOST_CORRELATED)[marking], excess[marking]
 
 
 def _markings(found: Found, inliers: NDArray[np.bool_]) -> tuple[MarkingFit, ...]:

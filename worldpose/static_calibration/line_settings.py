@@ -33,8 +33,9 @@ class LineRefinementSettings(Record):
     """Scale of the robust loss in the end [standard deviations]."""
     least_found: int = Field(default=30, ge=1)
     """Fewer samples found make no line [1]."""
-    least_share: float = Field(default=0.25, ge=0, le=1)
-    """Least share of the samples in the picture that is found where the fit puts it [1]; people
-    hide some, and worn paint."""
+    least_share: float = Field(default=0.4, ge=0, le=1)
+    """Least share of the samples in the picture, and of a marking's, that is found where the fit
+    puts it [1]: people hide some, and worn paint. A wrong camera may find a third, on
+    markings that it takes for others."""
     contradiction: float = Field(default=1e-6, gt=0, lt=1)
     """A fit that the start and its covariance give less than this probability is refused [1]."""

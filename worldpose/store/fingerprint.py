@@ -18,7 +18,7 @@ NOT_FOLLOWED = "worldpose.store"
 """How results are kept decides none of their numbers; `STORE_FORMAT` decides their bytes."""
 STORE_FORMAT = "1"
 """Raised when the same arrays are written as other bytes."""
-NUMERIC_LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "zarr", "numcodecs")
+NUMERIC_LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "av", "zarr", "numcodecs")
 
 _HOME = (Path(__file__).resolve().parents[2],)
 

@@ -15,7 +15,13 @@ from zarr.storage import LocalStore
 
 from data_contracts.arrays import ArrayLayout, GroupLayout
 from data_contracts.conventions import CONVENTIONS
-from worldpose.store.layout_checks import Arrays, checked_arrays, checked_attributes
+from worldpose.store.layout_checks import (
+    Arrays,
+    array_parts,
+    checked_arrays,
+    checked_attributes,
+    with_one_nan,
+)
 
 
 def write_group(
@@ -67,8 +73,8 @@ def write_group(
             attributes=array.attributes(),
             config={"write_empty_chunks": True},
         )
-        if values.size:
-            stored[...] = values
+        for part in array_parts(array, values.shape):
+            stored[part] = with_one_nan(values[part])
 
 
 def read_group(files: Store) -> xr.Dataset:

@@ -15,11 +15,14 @@ from worldpose.store.canonical import canonical_json
 
 Arrays = Mapping[str, NDArray[Any]]
 
+PART_CHUNKS = 16
+"""Chunks of an array that are in memory at once: enough for every core to compress one."""
+
 
 def checked_arrays(
     layout: GroupLayout, arrays: Arrays, coordinates: Arrays
 ) -> dict[str, NDArray[Any]]:
-    """All arrays by name in the layout's order, with one bit pattern for every NaN.
+    """All arrays by name in the layout's order, as they were given.
 
     Raises:
         InputError: an array is unknown, absent, of another dtype or dimension, disagrees with
@@ -45,8 +48,37 @@ def checked_arrays(
                     found=f"size {size}, shape {values.shape}",
                     todo="Give every array of the group the same dimension sizes.",
                 )
-        checked[array.name] = _checked_values(where, array, values)
+        _check_values(where, array, values)
+        checked[array.name] = values
     return checked
+
+
+def array_parts(array: ArrayLayout, shape: tuple[int, ...]) -> list[tuple[slice, ...]]:
+    """Where the parts of an array of `shape` lie: a few whole chunks each, all of it in turn.
+
+    An array may be longer than memory; what is done to it is done to a part at a time.
+    """
+    if 0 in shape:
+        return []
+    whole = tuple(slice(0, size) for size in shape)
+    if array.chunk_dim is None:
+        return [whole]
+    axis = array.dims.index(array.chunk_dim)
+    size, length = shape[axis], PART_CHUNKS * array.chunks(shape)[axis]
+    return [
+        (*whole[:axis], slice(first, min(first + length, size)), *whole[axis + 1 :])
+        for first in range(0, size, length)
+    ]
+
+
+def with_one_nan(values: NDArray[Any]) -> NDArray[Any]:
+    """The values with one bit pattern for every NaN.
+
+    NaNs come with a sign and a payload that depend on the processor's path.
+    """
+    if values.dtype.kind != "f":
+        return values
+    return np.where(np.isnan(values), values.dtype.type(np.nan), values)
 
 
 def checked_attributes(
@@ -110,22 +142,28 @@ def _check_form(where: str, array: ArrayLayout, values: NDArray[Any]) -> None:
         )
 
 
-def _checked_values(where: str, array: ArrayLayout, values: NDArray[Any]) -> NDArray[Any]:
-    if values.dtype.kind == "f":
-        absent = np.isnan(values)
-        wrong = np.isinf(values) if array.missing == "nan" else ~np.isfinite(values)
-        if absent.any() and array.missing == "nan":
-            # NaNs come with a sign and a payload that depend on the processor's path.
-            values = np.where(absent, values.dtype.type(np.nan), values)
-    else:
-        wrong = values < -1 if array.missing == "-1" else np.zeros((), dtype=np.bool_)
-    if wrong.any():
-        place = tuple(int(index) for index in np.argwhere(wrong)[0])
+def _check_values(where: str, array: ArrayLayout, values: NDArray[Any]) -> None:
+    number, first, value = 0, (), None
+    for part in array_parts(array, values.shape):
+        wrong = _wrong_values(array, values[part])
+        if not wrong.any():
+            continue
+        if not number:
+            inside = np.argwhere(wrong)[0]
+            first = tuple(int(i) + at.start for i, at in zip(inside, part, strict=True))
+            value = values[first]
+        number += int(wrong.sum())
+    if number:
         allowed = {"nan": "finite numbers or NaN", "-1": "indices from 0, or -1 for missing"}
         raise InputError(
-            f"{where}{list(place)}",
+            f"{where}{list(first)}",
             expected=allowed.get(array.missing, "finite numbers only"),
-            found=f"{values[place]}, and {int(wrong.sum())} such in all",
+            found=f"{value}, and {number} such in all",
             todo="Mark what is missing as the layout says, or find out why it is not finite.",
         )
-    return values
+
+
+def _wrong_values(array: ArrayLayout, values: NDArray[Any]) -> NDArray[np.bool_]:
+    if values.dtype.kind == "f":
+        return np.isinf(values) if array.missing == "nan" else ~np.isfinite(values)
+    return values < -1 if array.missing == "-1" else np.zeros((), dtype=np.bool_)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from data_contracts.broadcast_calibration import KeyFrames
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from worldpose.body import OPEN_BODY
 from worldpose.ingest import write_calibration_toml, write_match
@@ -19,11 +20,14 @@ from worldpose.release import (
     write_static_camera,
 )
 from worldpose.release.pose_file import write_poses
+from worldpose.synthetic.broadcast_rendering import render_broadcast
 from worldpose.synthetic.clips import read_clip
+from worldpose.synthetic.key_frames import click_key_frames
 from worldpose.synthetic.rendering import render_pitch
 from worldpose.synthetic.scene import Scene, simulate_scene
 from worldpose.synthetic.settings import CalibrationErrors, Scenario
 from worldpose.synthetic.trajectories import read_trajectories
+from worldpose.video import write_video
 
 CLIP_ID = "clip"
 BROADCAST_ID = "broadcast"
@@ -41,6 +45,7 @@ def simulate_match(
     mocap: Path | None = None,
     calibrated: bool = False,
     stills: bool = True,
+    video: bool = True,
 ) -> MatchSpec:
     """Write a synthetic match folder with its truth; the same arguments give the same bytes.
 
@@ -73,6 +78,8 @@ def simulate_match(
         calibrated: give the true static cameras, as calibration.toml; else there is such a file
             only where the scenario misjudges cameras.
         stills: add one picture of every static camera, about a second each.
+        video: add the broadcast camera's video, about 0.1 s a frame, and clicked key frames, where
+            the scenario has some.
         mocap: motion capture (`worldpose.synthetic.clips.read_clip`) that one person plays.
 
     Returns:
@@ -142,9 +149,35 @@ def simulate_match(
         pitch=scene.surveyed,
         clicked={name: clicks.markings for name, clicks in scene.clicks.items()},
         stills=pictures,
-        references=lambda folder: write_references(folder / "reference", scenario, scene),
+        key_frames=_key_frames(scenario, scene, seed) if video else {},
+        further=lambda folder: _write_further(folder, scenario, scene, seed, video=video),
     )
     return spec
+
+
+def _key_frames(scenario: Scenario, scene: Scene, seed: int) -> dict[str, KeyFrames]:
+    """What was clicked in the broadcast camera's video, where the scenario has any."""
+    if scene.broadcast is None or not scenario.key_frames:
+        return {}
+    painted = PitchTemplate.from_spec(scenario.pitch)
+    people, rng = scene.truth.joints, np.random.default_rng([seed, 4])
+    clicked = click_key_frames(
+        scene.broadcast, painted, people, scenario.clicks, scenario.key_frames, rng
+    )
+    return {CLIP_ID: clicked}
+
+
+def _write_further(
+    folder: Path, scenario: Scenario, scene: Scene, seed: int, *, video: bool
+) -> None:
+    """Write the truth, and the broadcast camera's video where the scenario has one."""
+    write_references(folder / "reference", scenario, scene)
+    if scene.broadcast is not None and scenario.key_frames and video:
+        file = folder / "broadcast" / f"{CLIP_ID}.mp4"
+        file.parent.mkdir()
+        painted = PitchTemplate.from_spec(scenario.pitch)
+        pictures = render_broadcast(scene.broadcast, painted, scene.truth.joints, seed)
+        write_video(file, pictures, scenario.fps)
 
 
 def write_references(folder: Path, scenario: Scenario, scene: Scene) -> None:

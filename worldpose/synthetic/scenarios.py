@@ -181,6 +181,7 @@ SCENARIOS: Final = {
             _MATCH,
             duration=20.0,
             broadcast=BroadcastSettings(sweep=22.0, focal=(3300.0, 4200.0)),
+            key_frames=4,
         ),
         _variant(
             "broadcast-zoom",
@@ -188,6 +189,7 @@ SCENARIOS: Final = {
             _MATCH,
             duration=20.0,
             broadcast=BroadcastSettings(focal=(2500.0, 7000.0), zoom_period=(14.0, 20.0)),
+            key_frames=4,
         ),
     )
 }

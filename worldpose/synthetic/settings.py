@@ -187,6 +187,8 @@ class Scenario(Record):
     rig: RigSettings = RigSettings()
     broadcast: BroadcastSettings | None = None
     """None = no moving camera."""
+    key_frames: int = Field(default=0, ge=0)
+    """Frames of the broadcast camera that are clicked [1]; with some, its video is written."""
     calibration: CalibrationErrors = CalibrationErrors()
     noise: ObservationNoise = ObservationNoise()
     clicks: ClickSettings = ClickSettings()

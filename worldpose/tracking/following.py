@@ -160,15 +160,8 @@ class Follower:
             ends_of(place, now, group.joints[None], self.fps, self.settings)[0]
             for place, group in enumerate(groups)
         ]
-        known = len(self.lost) + sum(map(self._confirmed, self.active))
-        odds = np.full(len(groups), self.newcomer_odds(known))
         costs = join_costs(before, after, self.fps, self.area, self.settings)
-        return decide(before, after, costs, odds, self.settings)
-
-    def newcomer_odds(self, known: int) -> float:
-        """Return the odds that who appears is new, when so many people are known."""
-        full = self.people is not None and known >= self.people
-        return self.settings.roster_odds if full else self.settings.newcomer_odds
+        return decide(before, after, costs, self.settings)
 
     def end_of(self, person: Person) -> tuple[End, End]:
         """Return how a person's track begins and stops."""

@@ -181,7 +181,6 @@ def decide(
     before: list[End],
     after: list[End],
     costs: NDArray[np.float64],
-    newcomer_odds: NDArray[np.float64],
     settings: TrackingSettings,
 ) -> list[Candidate]:
     """Return the joins of the likeliest way to go on, each with its margin, cheapest first.
@@ -193,11 +192,10 @@ def decide(
         before: n tracks that stop.
         after: m tracks that begin.
         costs: (n, m) [nat].
-        newcomer_odds: (m,) odds beforehand that the track is somebody new, not somebody lost.
         settings: odds that decide.
     """
     sure = math.log(settings.join_odds)
-    gain = np.minimum(costs + np.log(newcomer_odds), 0.0)
+    gain = np.minimum(costs + math.log(settings.newcomer_odds), 0.0)
     row, column = np.flatnonzero((gain < 0.0).any(1)), np.flatnonzero((gain < 0.0).any(0))
     gain = gain[np.ix_(row, column)]
     chosen, best = _cheapest(gain)

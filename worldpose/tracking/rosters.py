@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-import numpy as np
-
 from data_contracts.match import PlayerSpec
 from worldpose.tracking.person import Person
 
@@ -41,12 +39,6 @@ def within_limit(people: list[Person], limit: int | None) -> list[Person]:
         for person in still[limit:]:
             kept.remove(person)
     return kept
-
-
-def most_at_once(people: list[Person], frame: int) -> int:
-    """Return the largest number of people at once before `frame`."""
-    counts = [len(together) for birth, together in alive(people).items() if birth < frame]
-    return int(np.max(counts, initial=0))
 
 
 def people_allowed(roster: Sequence[PlayerSpec]) -> int | None:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from worldpose.tracking.following import Follower
 from worldpose.tracking.joining import Candidate, decide, join_costs
 from worldpose.tracking.person import Person
-from worldpose.tracking.rosters import most_at_once
 
 
 def join_tracks(
@@ -21,8 +18,7 @@ def join_tracks(
     starts, stops = [start for start, _ in ends], [stop for _, stop in ends]
     settings = follower.settings
     costs = join_costs(stops, starts, follower.fps, follower.area, settings)
-    odds = np.array([follower.newcomer_odds(most_at_once(tracks, start.frame)) for start in starts])
-    joins = decide(stops, starts, costs, odds, settings)
+    joins = decide(stops, starts, costs, settings)
     after = {join.before: join.after for join in joins if join.decided}
     people = {person.number: person for person in tracks}
     chains = []

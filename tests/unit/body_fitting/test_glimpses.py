@@ -87,8 +87,10 @@ def test_people_whom_nobody_estimated_and_estimates_of_nobody_are_left_out():
     joints = KEYPOINTS(bodies)
     found = place_glimpses(estimates(bodies, camera), camera, np.arange(4), joints[:, :1])
     assert np.isfinite(found.angles).all()
-    later = place_glimpses(estimates(bodies, camera), camera, np.arange(2, 6), joints)
+    later = place_glimpses(estimates(bodies, camera), camera, np.array([0, 1, 7, 8]), joints)
     assert np.isfinite(later.angles[:2]).all() and np.isnan(later.angles[2:]).all()
+    nobody = place_glimpses(estimates(bodies, camera), camera, np.arange(4), joints[:, :0])
+    assert nobody.angles.shape == (4, 0, 30)
     nowhere = place_glimpses(estimates(bodies, camera), camera, np.arange(4), joints + 50.0)
     assert np.isnan(nowhere.angles).all() and np.isnan(nowhere.orient).all()
 

@@ -96,9 +96,7 @@ def test_the_gradient_is_the_slope_of_the_cost():
     true = clip.moving(6)
     points, flow = clip.ground_points(true, rng, each=8), clip.followed_points(true, rng, each=8)
     painted = rng.standard_normal((len(points), PAINT, 3)) * 0.01
-    robust = PointEvidence(
-        **{**vars(points), "loss": np.full(len(points), 3.0), "paint": painted}
-    )
+    robust = PointEvidence(**{**vars(points), "loss": np.full(len(points), 3.0), "paint": painted})
     problem = Problem(
         robust,
         flow,

@@ -94,12 +94,11 @@ def test_frames_without_points_are_carried_by_followed_ones():
     rng = np.random.default_rng(5)
     true = clip.moving(40)
     problem = problem_of(true, rng, frames=np.r_[0:5, 35:40])
-    problem = replace(problem, free_clip=np.zeros(5, dtype=np.bool_))
-    found = solve(off(true, rng).stepped(np.zeros((40, 7)), [-0.4, 0.5, -0.3, -3.0, -2.0]), problem, 60)
-    spread = uncertainty_of(found, problem).frame[:, 3, 3]
+    start = off(true, rng)
+    found = solve(start, problem, 60).camera
     # 60 points of 0.1 px a pair: a thousandth of a degree a frame, twenty from either end.
-    assert np.median(bearing_error(found.camera, true)[5:35]) < 0.02
-    assert spread[20] > spread[2]
+    assert np.median(bearing_error(start, true)[5:35]) > 0.05
+    assert np.median(bearing_error(found, true)[5:35]) < 0.02
 
 
 def test_smoothness_makes_focal_lengths_even_at_the_same_residuals():

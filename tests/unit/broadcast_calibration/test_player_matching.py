@@ -14,7 +14,6 @@ from worldpose.broadcast_calibration.players import (
 )
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.errors import InputError
-from worldpose.synthetic.reference_poses import standing_joints
 
 
 def figure(x=0.0, y=0.0, scale=1.0):
@@ -64,11 +63,22 @@ def test_boxes_of_nobody_are_missing():
     assert np.isnan(boxes_of(np.full((1, 17, 2), np.nan))).all()
 
 
+def standing():
+    """Joints of somebody upright, arms a little off: nearly what COCO's points are [m]."""
+    sides = np.array(
+        [[0.0, 0.03, -0.03, 0.07, -0.07, 0.2, -0.2, 0.3, -0.3, 0.32, -0.32, 0.12, -0.12]]
+    )
+    across = np.append(sides, [0.13, -0.13, 0.15, -0.15])
+    height = [1.65, 1.7, 1.7, 1.68, 1.68, 1.45, 1.45, 1.15, 1.15, 0.9, 0.9, 0.95, 0.95]
+    height += [0.5, 0.5, 0.08, 0.08]
+    return np.stack([across, 0.1 * np.sin(np.arange(17.0)), height], axis=-1)
+
+
 def crowd(frames, rng, noise):
     """People standing on the pitch, seen by a moving camera in another order."""
     camera = clip.moving(frames)
     places = [(-3.0, -6.0), (2.0, 4.0), (6.0, -3.0), (-8.0, 8.0)]
-    joints = np.stack([standing_joints() + [x, y, 0.0] for x, y in places])
+    joints = np.stack([standing() + [x, y, 0.0] for x, y in places])
     joints = np.broadcast_to(joints, (frames, *joints.shape))
     pixels = camera.camera.project(joints.reshape(frames, -1, 3)).reshape(frames, 4, 17, 2)
     seen = pixels[:, [2, 0, 3, 1]]
@@ -98,7 +108,9 @@ def test_errors_that_last_are_noticed():
     camera, people = crowd(100, rng, 0.0)
     slow = np.repeat(rng.standard_normal((10, 4, 17, 2)), 10, axis=0)
     people = People(people.joints, people.keypoints + slow, 50.0)
-    _, noise = player_evidence(camera, people, match(camera, people), BroadcastCalibrationSettings())
+    _, noise = player_evidence(
+        camera, people, match(camera, people), BroadcastCalibrationSettings()
+    )
     # Steps of ten frames: the triangle of their autocorrelation has an area of ten.
     assert noise.frames == pytest.approx(10.0, rel=0.2)
 

@@ -1,4 +1,4 @@
-"""A small clip for tests: a camera that pans and zooms over the pitch, with evidence and pictures."""
+"""A small clip for tests: a camera that pans and zooms over the pitch, and what is seen."""
 
 import numpy as np
 
@@ -18,10 +18,11 @@ def moving(frames=40, pan=(-3.0, 4.0), zoom=(1900.0, 2100.0), size=SIZE):
     aims = pan[0] + (pan[1] - pan[0]) * share
     focal = zoom[0] + (zoom[1] - zoom[0]) * share
     grown = focal / 2100.0
+    poses = [looking(CENTER, np.array([x, -2.0, 0.0]), 0.002) for x in aims]
     return MovingCamera(
         center=CENTER,
         principal_point=np.array([0.5 * size[0] - 2.0, 0.5 * size[1] - 14.0]),
-        rotation=np.stack([looking(CENTER, np.array([x, -2.0, 0.0]), 0.002).rotation for x in aims]),
+        rotation=np.stack([pose.rotation for pose in poses]),
         focal=focal,
         distortion=np.stack([0.4 * grown**1.6, 1.5 * grown, 0.0 * grown], axis=-1),
         image_size=np.array(size),

@@ -135,6 +135,25 @@ def test_what_tells_nothing_leaves_cameras_as_they_were_and_says_why(clip, case)
     assert all(reason in said for said in adjusted.reasons)
 
 
+def test_clicks_on_one_line_are_refused(clip):
+    made, true, _ = clip(seed=2)
+    rng = np.random.default_rng(3)
+    along = np.linspace(-1.0, 1.0, 12)[:, None] * [18.0, 6.0, 0.0]
+    clicks = tuple(
+        replace(
+            clicks,
+            points_world=along,
+            points_image=true[c].project(along) + rng.standard_normal((12, 2)),
+        )
+        for c, clicks in enumerate(made.clicks)
+    )
+    settings = QUICK.model_copy(update={"evidence": "markings"})
+    adjusted = adjust_cameras(replace(made, clicks=clicks), settings)
+    assert not adjusted.accepted.any()
+    np.testing.assert_array_equal(adjusted.cameras.numbers, made.cameras.numbers)
+    assert all(reason.startswith("refused") for reason in adjusted.reasons)
+
+
 def test_too_few_judges_refuse(clip):
     made, *_ = clip()
     adjusted = adjust_cameras(made, QUICK.model_copy(update={"min_judges": 10**6}))

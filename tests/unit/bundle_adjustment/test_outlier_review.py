@@ -44,6 +44,22 @@ def test_a_person_taken_for_another_is_one_entry(clip):
     assert listed.surprise[0] > 10.0
 
 
+def test_planted_exchanges_of_people_head_the_list_at_the_length_of_what_was_planted(clip):
+    made, true, _ = clip(cameras=8, frames=20, noise=0.9)
+    rng = np.random.default_rng(9)
+    index, planted = made.detection_index.copy(), set()
+    for number in rng.permutation(20 * 8)[:24]:
+        frame, camera = divmod(int(number), 8)
+        pair = rng.permutation(6)[:2]
+        index[frame, camera, pair] = index[frame, camera, pair[::-1]]
+        planted |= {(frame, camera, int(person), -1) for person in pair}
+    listed = found(replace(made, detection_index=index), true)
+    entries = list(zip(listed.frame, listed.camera, listed.person, listed.joint, strict=True))
+    first = set(entries[: len(planted)])
+    # At the planted length precision and recall are one figure.
+    assert len(first & planted) >= 0.95 * len(planted)
+
+
 def test_the_list_ends_where_it_is_told_and_still_counts(clip):
     made, true, _ = clip(noise=1.5)
     everything = found(made, true, limit=1.0)
@@ -73,6 +89,26 @@ def test_a_wrong_click_is_more_surprising_than_honest_ones(clip, rests):
     # 15 px in standard deviations of 1 px, give or take the click's own noise of up to three.
     assert review.surprise[0] == pytest.approx(15.0, abs=3.0)
     assert review.surprise[1] < 4.2
+
+
+def test_planted_wrong_clicks_head_the_list_at_the_length_of_what_was_planted(clip):
+    hits = number = 0
+    for seed in range(4):
+        made, true, _ = clip(cameras=8, seed=seed)
+        rng = np.random.default_rng(seed)
+        planted, changed = set(), []
+        for c, clicks in enumerate(made.clicks):
+            image = clicks.points_image.copy()
+            wrong = rng.permutation(12)[:2]
+            angle, length = rng.uniform(0.0, 2.0 * np.pi, 2), rng.uniform(6.0, 30.0, 2)
+            image[wrong] += length[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            planted |= {(c, f"point_{k}") for k in wrong}
+            changed.append(replace(clicks, points_image=image))
+        review = review_clicks(tuple(changed), true, 0.0 * made.covariance, click_noise=1.0)
+        first = list(zip(review.camera, review.name, strict=True))[: len(planted)]
+        hits, number = hits + len(planted & set(first)), number + len(planted)
+    # Errors of 6 to 30 standard deviations, give or take the click's own, among 320 honest ones.
+    assert hits >= 0.95 * number
 
 
 def test_cameras_without_clicks_have_nothing_to_review(clip):

@@ -95,7 +95,7 @@ def entries(**changes):
         (entries(points=[{"name": "corner_left_nea", "xy": [1, 2]}]), "points[0].name", "near"),
         (entries(drawn=[{"name": "halfway", "xy": [[1, 2]]}]), "drawn[0].name", "halfway_line"),
         (entries(drawn=[{"name": "center_mark", "xy": [[1, 2]]}]), "drawn[0].name", "a marking"),
-        (entries(points=[{"name": "center_mark", "xy": [1920, 2]}]), "points[0].xy", "1920 x 1080"),
+        (entries(points=[{"name": "center_mark", "xy": [1921, 2]}]), "points[0].xy", "1920 x 1080"),
         (
             entries(drawn=[{"name": "center_circle", "xy": [[1, 2], [3, -0.6]]}]),
             "drawn[0].xy[1]",

@@ -86,7 +86,7 @@ def test_references_go_into_the_match_before_it_appears(tmp_path, one, make_peop
         one,
         calibrations={},
         observations={"cam1": make_people()},
-        references=write_truth,
+        further=write_truth,
     )
     assert (tmp_path / "m" / "reference" / "joints.npz").read_bytes() == b"truth"
 
@@ -140,7 +140,7 @@ def test_a_folder_filled_meanwhile_is_left_as_it_was(tmp_path, one, make_people)
             one,
             calibrations={},
             observations={"cam1": make_people()},
-            references=interfere,
+            further=interfere,
         )
     assert files(tmp_path) == {"m/mine": b"precious"}
 
@@ -155,7 +155,7 @@ def test_a_failure_on_the_way_leaves_nothing(tmp_path, one, make_people):
             one,
             calibrations={},
             observations={"cam1": make_people()},
-            references=fail,
+            further=fail,
         )
     assert list(tmp_path.iterdir()) == []
 

@@ -79,10 +79,10 @@ def test_other_limbs_are_another_person():
 def decided(costs, odds=1.0):
     before = [end(n, 0, (0, 0)) for n in range(len(costs))]
     after = [end(10 + n, 50, (0, 0)) for n in range(len(costs[0]))]
-    newcomers = np.full(len(after), odds)
+    chosen = SETTINGS.model_copy(update={"newcomer_odds": odds})
     return [
         (join.before, join.after, join.decided, join.margin)
-        for join in decide(before, after, np.array(costs), newcomers, SETTINGS)
+        for join in decide(before, after, np.array(costs), chosen)
     ]
 
 
@@ -96,7 +96,7 @@ def test_even_chances_decide_nothing():
     assert [(join[2], join[3]) for join in joins] == [(False, 0.0)] * 2
 
 
-def test_newcomer_is_nobody_who_was_lost_unless_the_roster_is_full():
+def test_odds_beforehand_tell_newcomers_from_who_was_lost():
     assert decided([[4.0]], odds=0.05) == []
     (join,) = decided([[4.0]], odds=0.001)
     assert join[:3] == (0, 10, True)
@@ -105,5 +105,5 @@ def test_newcomer_is_nobody_who_was_lost_unless_the_roster_is_full():
 
 
 def test_nobody_to_join_is_no_join():
-    assert decide([], [], np.empty((0, 0)), np.empty(0), SETTINGS) == []
+    assert decide([], [], np.empty((0, 0)), SETTINGS) == []
     assert decided([[np.inf]]) == []

@@ -3,7 +3,7 @@ import pytest
 
 from data_contracts.match import PlayerSpec
 from worldpose.tracking.person import Person, Sighting
-from worldpose.tracking.rosters import most_at_once, people_allowed, within_limit
+from worldpose.tracking.rosters import people_allowed, within_limit
 
 
 def roster(red, blue, officials):
@@ -40,8 +40,3 @@ def test_weakest_of_too_many_at_once_goes():
     assert [each.number for each in kept] == [0, 2]
     assert within_limit(people, None) == people
     assert within_limit([], 2) == []
-
-
-def test_most_at_once_counts_who_was_there_before():
-    people = [person(0, 0, 9, 9.0), person(1, 0, 4, 4.0), person(2, 6, 9, 5.0)]
-    assert [most_at_once(people, frame) for frame in (0, 5, 9)] == [0, 2, 2]

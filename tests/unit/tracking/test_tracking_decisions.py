@@ -112,3 +112,35 @@ def test_both_matchings_keep_people_apart(ring, people, seen, hungarian):
     matching = SETTINGS.model_copy(update={"hungarian": hungarian})
     result = track_people(ring(5), *seen(ring(5), still(people)), FPS, matching)
     assert sorted(owners(result)) == [0, 1, 2, 3]
+
+
+def test_one_camera_alone_invents_nobody(ring, people, seen):
+    keypoints, confidence = seen(ring(1), still(people, 40))
+    result = track_people(ring(1), keypoints, confidence, FPS, SETTINGS, ground=True)
+    assert result.detection_index.shape == (40, 1, 0)
+    assert result.report.births == 0
+    assert result.report.unmatched_share == 1.0
+
+
+def test_every_detection_twice_makes_nobody_twice(ring, people, seen):
+    keypoints, confidence = seen(ring(5), still(people, 40))
+    keypoints = np.concatenate([keypoints, keypoints], axis=2)
+    confidence = np.concatenate([confidence, confidence], axis=2)
+    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS, ground=True)
+    assert len(result.tracks) == 4
+    assert ((result.detection_index >= 0).sum(axis=2) == 4).all()
+
+
+def test_two_seconds_without_anybody_hold_nobody(ring, people, seen):
+    # Runners at 3 m/s: afterwards they are elsewhere, in between they are nowhere.
+    time = np.arange(0, 4.0, 1 / FPS)[:, None, None]
+    way = np.array([[3.0, 0.0], [-3.0, 0.5], [0.0, 3.0], [1.0, -3.0]])
+    keypoints, confidence = seen(ring(6), people(PLACES + (time - 2.0) * way))
+    keypoints[50:150] = np.nan
+    for causal in (False, True):
+        chosen = SETTINGS.model_copy(update={"causal": causal})
+        result = track_people(ring(6), keypoints, confidence, FPS, chosen, ground=True)
+        assert (result.detection_index[50:150] == -1).all()
+        assert np.isnan(result.joints[50:150]).all()
+        for frame in (20, 180):
+            assert (result.detection_index[frame] >= 0).any(axis=0).sum() == 4

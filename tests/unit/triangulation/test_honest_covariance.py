@@ -4,7 +4,7 @@ import pytest
 from worldpose.cameras import Camera
 from worldpose.static_calibration.parameters import stepped
 from worldpose.synthetic import SCENARIOS, simulate_scene
-from worldpose.triangulation import TriangulationSettings, triangulate_joints
+from worldpose.triangulation import TriangulationSettings, estimate_clocks, triangulate_joints
 
 # Standard deviations of steps in the order of PARAMETERS; together some 9 cm at a player.
 CALIBRATION = np.array([3e-4] * 3 + [0.05] * 3 + [7e-4, 2.0, 2.0, 0.0, 0.0, 0.0])
@@ -17,7 +17,11 @@ def simulated(seed, people=8):
     scenario = SCENARIOS["match"]
     crowd = scenario.crowd.model_copy(update={"people": people})
     changes = {"duration": 0.8, "crowd": crowd, "broadcast": None}
-    scene = simulate_scene(scenario.model_copy(update=changes), seed)
+    return arrays_of(simulate_scene(scenario.model_copy(update=changes), seed), people)
+
+
+def arrays_of(scene, people):
+    """Cameras, arrays as the tracker would match them, and the truth."""
     truth = scene.truth.joints
     seen = [(scene.observations[name], scene.identities[name].person) for name in scene.cameras]
     most = max(found.keypoints.shape[1] for found, _ in seen)
@@ -90,3 +94,24 @@ def test_regions_hold_the_truth_of_one_clip():
     # 136 joints, not independent: five standard errors below and everything above.
     assert number > 100
     assert share > 0.86
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["match", "penalty-box", "corner-kick"])
+def test_95_percent_of_clocks_lie_within_two_standard_errors(name):
+    scenario, settings = SCENARIOS[name], TriangulationSettings()
+    rig = scenario.rig.model_copy(update={"clock_spread": 0.7})
+    scenario = scenario.model_copy(update={"duration": 3.0, "broadcast": None, "rig": rig})
+    deviations = []
+    for seed in range(20, 30):
+        scene = simulate_scene(scenario, seed)
+        cameras, arrays, _ = arrays_of(scene, scenario.crowd.people)
+        found = estimate_clocks(cameras, *arrays, scenario.fps, settings)
+        true = np.array(list(scene.clocks.values()))[found.determined]
+        error = found.late[found.determined] - true + true.mean()
+        deviations.append(error / found.standard_error[found.determined])
+    deviations = np.concatenate(deviations)
+    # Cameras of a clip share its people: some 30 independent ones, sampling error 4 %.
+    assert len(deviations) > 60
+    assert 0.87 <= (np.abs(deviations) < 1.96).mean() <= 1.0
+    assert np.sqrt((deviations**2).mean()) < 1.3

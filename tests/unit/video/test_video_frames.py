@@ -64,12 +64,13 @@ def test_times_and_rate_follow_from_the_stamps(clip):
 def test_a_clip_with_uneven_times_keeps_its_numbers(tmp_path):
     path = tmp_path / "uneven.mkv"
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg4", rate=25)
+        stream = container.add_stream("libx264", rate=25, options={"crf": "5"})
         stream.height, stream.width, stream.pix_fmt = *SIZE, "yuv420p"
         stream.codec_context.time_base = Fraction(1, 1000)
         for number, picture in enumerate(numbered(12)):
             frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-            frame.pts, frame.time_base = 500 + 40 * number + (17 if number > 5 else 0), Fraction(1, 1000)
+            late = 17 if number > 5 else 0
+            frame.pts, frame.time_base = 500 + 40 * number + late, Fraction(1, 1000)
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
     with VideoReader(path) as video:

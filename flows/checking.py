@@ -1,0 +1,62 @@
+"""Checking an exported data set, clip by clip."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from worldpose.body import OPEN_BODY, find_body
+from worldpose.release.check import CheckReport, check_clip
+from worldpose.release.check_reading import clips_in, read_clip
+from worldpose.release.check_settings import CheckSettings
+from worldpose.release.manifest import changed_files, read_manifest
+from worldpose.release.shipped import Finding
+
+USUAL_FPS = 50.0
+"""Frames in a second where neither a manifest nor a person says it: the released clips'."""
+
+
+def check(
+    folder: Path,
+    *,
+    fps: float | None = None,
+    body: str | None = None,
+    settings: CheckSettings | None = None,
+) -> CheckReport:
+    """What is wrong with a data set, and what was measured; one clip is in memory at a time.
+
+    Args:
+        folder: what `worldpose export` wrote, or another of the same layout.
+        fps: frames in a second; None = the manifest's, or 50.
+        body: body model of pose files that name none; None = the open body.
+        settings: what counts as wrong.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    settings = settings or CheckSettings()
+    manifest = read_manifest(folder)
+    findings = []
+    if manifest is not None and (changed := changed_files(folder, manifest)):
+        findings.append(
+            Finding(
+                fault="changed_files",
+                kind="damage",
+                where=tuple(changed),
+                says=f"files of release {manifest.release} are gone or have other bytes",
+            )
+        )
+    rate = fps or (USUAL_FPS if manifest is None else manifest.fps)
+    clips = clips_in(folder)
+    figures = {}
+    for name in clips:
+        shipped = read_clip(
+            folder,
+            name,
+            clips,
+            lambda model: find_body(model or body or OPEN_BODY),
+            manifest,
+            rate,
+        )
+        figures[name], found = check_clip(shipped, settings)
+        findings += found
+    return CheckReport(clips=figures, findings=tuple(findings))

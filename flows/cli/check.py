@@ -1,0 +1,68 @@
+"""The command that checks an exported data set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flows.cli.console import JsonOption, line, print_json, print_table
+
+FAULTY = 1
+"""Exit code where something is wrong with the data set."""
+
+
+def check(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="An exported data set, of any of the layouts.")
+    ],
+    fps: Annotated[
+        float | None,
+        typer.Option("--fps", min=0.001, help="Frames in a second; the manifest's, or 50."),
+    ] = None,
+    body: Annotated[
+        str | None,
+        typer.Option("--body", help="Body model of pose files that name none; the open body."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Tell whether a data set explains itself, and which convention is broken where not.
+
+    Example: worldpose check exported
+    """
+    from flows.checking import check as check_data_set
+
+    report = check_data_set(folder, fps=fps, body=body)
+    if as_json:
+        print_json({**report.model_dump(mode="json"), "passed": not report.findings})
+    else:
+        rows = [
+            (
+                name,
+                f"{figures.frames}",
+                f"{figures.persons}",
+                f"{figures.cameras}",
+                f"{figures.compared}",
+                _shown(figures.reprojection_median_px),
+                _shown(figures.plausible_share),
+            )
+            for name, figures in report.clips.items()
+        ]
+        titles = ("frames", "people", "cameras", "compared", "reprojection px", "plausible")
+        print_table("", ("clip", *(f">{title}" for title in titles)), rows)
+        for finding in report.findings:
+            figures = ", ".join(f"{name} {value:.4g}" for name, value in finding.figures.items())
+            line(f"{finding.fault}: {finding.says} [{', '.join(finding.where)}] {figures}".rstrip())
+        line(f"{len(report.findings)} findings" if report.findings else "nothing is wrong")
+    if report.findings:
+        raise typer.Exit(FAULTY)
+
+
+def _shown(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register this command."""
+    app.command()(check)

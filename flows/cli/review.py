@@ -1,0 +1,340 @@
+"""Commands of people in the loop: review list, show, approve, reject, correct, withdraw, resume."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from pydantic import TypeAdapter, ValidationError
+
+from data_contracts.review import Correction, Edit, MovedPoint, RedrawnMarking
+from flows import review
+from flows.cli.console import (
+    DEFAULT_PROJECT,
+    JsonOption,
+    ProjectOption,
+    errors,
+    line,
+    print_json,
+    print_table,
+)
+from flows.prefect_environment import has_server
+from flows.registering import find_registration, open_match
+from flows.review import Review, reviews_of
+from flows.run_record import latest_run
+from flows.stage import Match
+from worldpose.errors import InputError
+from worldpose.store import Store
+
+commands = typer.Typer(
+    name="review",
+    help="See what waits for a person, decide on it, correct it.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+MatchId = Annotated[str, typer.Argument(metavar="MATCH", help="Id of a registered match.")]
+Requests = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="[REVIEW...]", help="Ids as `list` shows them; all that wait."),
+]
+Who = Annotated[
+    str, typer.Option("--who", envvar="WORLDPOSE_REVIEWER", help="Your name; kept with it.")
+]
+Why = Annotated[str, typer.Option("--why", help="In your words; kept with it.")]
+Edits = Annotated[
+    Path | None,
+    typer.Option("--edits", help="JSON list of corrections, as docs/review.md shows them."),
+]
+EditsFile = Annotated[
+    Path, typer.Option("--edits", help="JSON list of corrections, as docs/review.md shows them.")
+]
+
+
+@commands.command("list")
+def list_reviews(
+    match: Annotated[str | None, typer.Argument(metavar="[MATCH]")] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Also what is decided or superseded.")
+    ] = False,
+    project: ProjectOption = DEFAULT_PROJECT,
+    as_json: JsonOption = False,
+) -> None:
+    """List what waits for a person, in one match or in all.
+
+    Example: worldpose review list tiny-1
+    """
+    store = Store.open(project)
+    names = [find_registration(store, match).spec.match_id] if match else store.matches()
+    found: list[Review] = []
+    for name in names:
+        opened = open_match(store, name)
+        _tell_damage(opened)
+        found += reviews_of(opened, latest_run(store, name))
+    shown = [each for each in found if everything or each.state == "waits"]
+    if as_json:
+        print_json({"reviews": [_as_json(each) for each in shown]})
+        return
+    if not shown:
+        line("nothing waits for review")
+        return
+    for each in shown:
+        request = each.request
+        line(f"{request.id}  {each.state}, {request.match_id}, {_when(request.created_at)}")
+        for reason in request.reasons:
+            line(f"  {reason}")
+
+
+@commands.command()
+def show(
+    match: MatchId,
+    request: Annotated[str | None, typer.Argument(metavar="[REVIEW]")] = None,
+    project: ProjectOption = DEFAULT_PROJECT,
+    as_json: JsonOption = False,
+) -> None:
+    """Show one review with all its figures, or a match's corrections and where results come from.
+
+    Example: worldpose review show tiny-1 static_calibration.cam03.1f2e3d4c5b6a
+    """
+    store = Store.open(project)
+    opened = open_match(store, match)
+    _tell_damage(opened)
+    latest = latest_run(store, match)
+    if request is not None:
+        known = {each.request.id: each for each in reviews_of(opened, latest)}
+        if request not in known:
+            raise InputError(
+                f"review {request}",
+                expected=f"one of {', '.join(known) or '(none)'}",
+                found="no such review",
+                todo=f"List them: worldpose review list {match} --all.",
+            )
+        _show(known[request], as_json)
+        return
+    origins = review.origins_of(store, opened, latest) if latest else {}
+    marked = {name: origin for name, origin in origins.items() if origin != "automatic"}
+    if as_json:
+        print_json(
+            {
+                "match": match,
+                "corrections": [_correction(each) for each in opened.corrections],
+                "stale": [_correction(each) | {"reason": why} for each, why in opened.stale],
+                "origins": origins,
+                "damage": list(opened.journal.damage),
+            }
+        )
+        return
+    states = [*((each, "applied") for each in opened.corrections), *opened.stale]
+    for correction, state in states:
+        line(f"{correction.id}  {correction.who}, {_when(correction.made_at)}")
+        line(f"  {_in_words(correction)}")
+        line(f"  {state if state == 'applied' else f'no longer applies: {state}'}")
+    if not states:
+        line("no corrections")
+    for name, origin in marked.items():
+        line(f"{name}: {origin}")
+
+
+@commands.command()
+def approve(
+    match: MatchId,
+    who: Who,
+    requests: Requests = None,
+    why: Why = "",
+    project: ProjectOption = DEFAULT_PROJECT,
+    as_json: JsonOption = False,
+) -> None:
+    """Let results pass; a verdict holds for their bytes, whatever run gives them again.
+
+    Example: worldpose review approve tiny-1 --who Ada --why "checked every overlay"
+    """
+    _decide("approve", match, requests, who, why, None, project, as_json)
+
+
+@commands.command()
+def reject(
+    match: MatchId,
+    who: Who,
+    why: Why,
+    requests: Requests = None,
+    edits: Edits = None,
+    project: ProjectOption = DEFAULT_PROJECT,
+    as_json: JsonOption = False,
+) -> None:
+    """Refuse results, with the corrections that would mend them; nothing is built upon them.
+
+    Example: worldpose review reject tiny-1 --who Ada --why "wrong corner" --edits edits.json
+    """
+    _decide("reject", match, requests, who, why, edits, project, as_json)
+
+
+@commands.command()
+def correct(
+    match: MatchId,
+    who: Who,
+    edits: EditsFile,
+    why: Why = "",
+    project: ProjectOption = DEFAULT_PROJECT,
+    as_json: JsonOption = False,
+) -> None:
+    """Correct what people clicked; the next run computes what depends on it, and nothing else.
+
+    Example: worldpose review correct tiny-1 --who Ada --edits edits.json
+    """
+    store = Store.open(project)
+    said = review.correct(store, open_match(store, match), _read_edits(edits), who=who, why=why)
+    if as_json:
+        print_json({"corrections": [_correction(each) for each in said]})
+        return
+    for each in said:
+        line(f"corrected: {_in_words(each)} ({each.id})")
+    _say_next(match)
+
+
+@commands.command()
+def withdraw(
+    match: MatchId,
+    correction: Annotated[str, typer.Argument(metavar="CORRECTION", help="As `show` lists it.")],
+    who: Who,
+    why: Why = "",
+    project: ProjectOption = DEFAULT_PROJECT,
+    as_json: JsonOption = False,
+) -> None:
+    """Take a correction back; the journal keeps both.
+
+    Example: worldpose review withdraw tiny-1 moved_point.0a1b2c3d4e5f --who Ada
+    """
+    store = Store.open(project)
+    review.withdraw(store, open_match(store, match), correction, who=who, why=why)
+    if as_json:
+        print_json({"withdrawn": correction})
+        return
+    line(f"withdrawn: {correction}")
+    _say_next(match)
+
+
+@commands.command()
+def resume(
+    match: MatchId, project: ProjectOption = DEFAULT_PROJECT, as_json: JsonOption = False
+) -> None:
+    """Let the suspended runs of a deployment go on, once everything is decided.
+
+    Example: worldpose review resume tiny-1
+    """
+    store = Store.open(project)
+    resumed = review.resume(store, open_match(store, match))
+    if as_json:
+        print_json({"resumed": resumed})
+        return
+    line(f"resumed {len(resumed)} runs of {match}; a serving process takes them up")
+
+
+def _decide(
+    verdict: Literal["approve", "reject"],
+    match: str,
+    requests: list[str] | None,
+    who: str,
+    why: str,
+    edits: Path | None,
+    project: str,
+    as_json: bool,
+) -> None:
+    store = Store.open(project)
+    ids, corrections = review.decide(
+        store,
+        open_match(store, match),
+        requests or (),
+        verdict,
+        who=who,
+        why=why,
+        edits=_read_edits(edits) if edits else (),
+    )
+    if as_json:
+        said = [_correction(each) for each in corrections]
+        print_json({"verdict": verdict, "reviews": ids, "corrections": said})
+        return
+    for name in ids:
+        line(f"{verdict}: {name}")
+    for each in corrections:
+        line(f"corrected: {_in_words(each)} ({each.id})")
+    _say_next(match)
+
+
+def _read_edits(file: Path) -> list[Edit]:
+    try:
+        return TypeAdapter(list[Edit]).validate_json(file.read_bytes())
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise InputError(
+            f"{file}: {place}" if place else str(file),
+            expected="a JSON list of corrections",
+            found=first["msg"],
+            todo="docs/review.md shows them; docs/schemas/correction.schema.json has all.",
+        ) from None
+
+
+def _show(shown: Review, as_json: bool) -> None:
+    if as_json:
+        print_json(_as_json(shown))
+        return
+    request, decision = shown.request, shown.decision
+    line(f"{request.id}: {shown.state}")
+    line(f"  {shown.question}")
+    for reason in request.reasons:
+        line(f"  because {reason}")
+    if decision is not None:
+        line(f"  {decision.verdict} by {decision.who}, {_when(decision.decided_at)}")
+        line(f"  {decision.why or '(no reason given)'}")
+    for unit, key in request.keys.items():
+        line(f"  {unit} {key}, run {request.run_id}")
+    print_table("figures", ("figure", ">value"), _figures(shown))
+
+
+def _figures(shown: Review) -> list[tuple[str, str]]:
+    return [(name, f"{value:.4g}") for name, value in sorted(shown.request.figures.items())]
+
+
+def _as_json(shown: Review) -> dict[str, Any]:
+    decision = shown.decision
+    return {
+        **shown.request.model_dump(mode="json"),
+        "state": shown.state,
+        "question": shown.question,
+        "decision": None if decision is None else decision.model_dump(mode="json"),
+    }
+
+
+def _correction(correction: Correction) -> dict[str, Any]:
+    return correction.model_dump(mode="json")
+
+
+def _in_words(correction: Correction) -> str:
+    edit = correction.edit
+    if isinstance(edit, MovedPoint | RedrawnMarking):
+        place = edit.camera if edit.frame is None else f"{edit.camera} frame {edit.frame}"
+        was, xy = (json.dumps(it) if it else "nothing" for it in (edit.was, edit.xy))
+        return f"{edit.marking} in {place}: {was} -> {xy}"
+    return f"{edit.kind} {edit.model_dump_json(exclude={'kind'})}"
+
+
+def _when(moment: datetime) -> str:
+    return f"{moment:%Y-%m-%d %H:%M} UTC"
+
+
+def _say_next(match: str) -> None:
+    resumes = f"; a suspended run: worldpose review resume {match}" if has_server() else ""
+    line(f"next: worldpose run {match}, with the same --gates{resumes}")
+
+
+def _tell_damage(match: Match) -> None:
+    for text in match.journal.damage:
+        line(f"warning: {text}", to=errors)
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register these commands."""
+    app.add_typer(commands)

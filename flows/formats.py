@@ -1,0 +1,208 @@
+"""The forms that a run's results can be written in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.match import MatchSpec, Registration
+from flows.release import clips_of, joint_tracks, placed_joints, static_cameras
+from worldpose.body import BodyModel, BodyParameters, find_body
+from worldpose.cameras import Camera
+from worldpose.cameras.stored import camera_from_arrays
+from worldpose.errors import WorldposeError
+from worldpose.ingest import read_match
+from worldpose.pitch import PitchTemplate
+from worldpose.release import coco_dataset, write_coco, write_joints
+from worldpose.release.camera_file import write_moving_camera, write_static_camera
+from worldpose.release.challenge import ChallengeTruth, challenge_truth
+from worldpose.release.challenge_files import (
+    Edition,
+    write_challenge,
+    write_challenge_camera,
+    write_pitch_points,
+    write_submission,
+)
+from worldpose.release.marker_file import write_markers
+from worldpose.release.motion_file import stretches, write_motion
+from worldpose.release.pose_file import write_poses
+from worldpose.store import Run
+
+PITCH_SPACING = 0.5
+"""Between points of pitch_points.txt [m]."""
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What an export is made from."""
+
+    run: Run
+    registration: Registration
+    stage: str | None = None
+    """Whose joints are meant; None = the best there are."""
+
+    @property
+    def spec(self) -> MatchSpec:
+        """The match."""
+        return self.registration.spec
+
+    @property
+    def clips(self) -> tuple[str, ...]:
+        """The clips that have joints."""
+        return clips_of(self.run.record)
+
+
+def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArray[np.int32]]:
+    """The body model of a clip's fits, the poses (persons, frames) and the person ids.
+
+    Raises:
+        WorldposeError: the run has no fitted bodies.
+    """
+    fits = run[_needed(run, f"body_fitting/{clip}", "Run the match to the end first.")]
+    poses = BodyParameters(
+        fits["betas"].values[:, None],
+        *(fits[name].values.swapaxes(0, 1) for name in ("global_orient", "body_pose", "transl")),
+    )
+    return find_body(fits.attrs["body_model"]), poses, fits["person"].values
+
+
+def broadcast_camera(run: Run, clip: str) -> Camera:
+    """The moving camera of a clip in the frames of its fitted bodies, (frames,).
+
+    Raises:
+        WorldposeError: the run has none.
+    """
+    todo = (
+        "This format is about the broadcast camera's picture: calibrate that camera first, or "
+        "choose another format."
+    )
+    found = run[_needed(run, f"broadcast_calibration/{clip}", todo)]
+    by_frame = found[["focal", "principal_point", "distortion", "rotation", "translation"]]
+    frames = run[f"body_fitting/{clip}"]["frame"].values
+    arrays = by_frame.reindex(frame=frames).data_vars
+    return camera_from_arrays({**arrays, "image_size": found["image_size"]})
+
+
+def _needed(run: Run, unit: str, todo: str) -> str:
+    if unit not in run:
+        raise WorldposeError(
+            f"run {run.record.run_id} of {run.record.match_id}: expected results of {unit}, "
+            f"found {', '.join(sorted({name.partition('/')[0] for name in run})) or 'none'}. {todo}"
+        )
+    return unit
+
+
+def export_joints(origin: Origin, out: Path) -> list[Path]:
+    """Writes `joints.npz`, or `<clip>.joints.npz` for each clip where there are several."""
+    written = []
+    for clip in origin.clips:
+        path = out / ("joints.npz" if len(origin.clips) == 1 else f"{clip}.joints.npz")
+        write_joints(path, joint_tracks(origin.run, clip, origin.stage))
+        written.append(path)
+    return written
+
+
+def export_coco(origin: Origin, out: Path) -> list[Path]:
+    """Writes `<camera>.json` for each static camera, in `<clip>/` where there are several."""
+    written = []
+    for clip in origin.clips:
+        tracks = joint_tracks(origin.run, clip, origin.stage)
+        inliers = placed_joints(origin.run, clip)["inliers"]
+        cameras = static_cameras(origin.run, origin.spec, origin.stage)
+        for camera_id, camera in cameras.items():
+            dataset = coco_dataset(
+                camera_id,
+                camera,
+                tracks,
+                inliers.sel(camera=camera_id).values,
+                offset_frames=int(origin.spec.camera(camera_id).offset_frames),
+            )
+            path = (out if len(origin.clips) == 1 else out / clip) / f"{camera_id}.json"
+            write_coco(path, dataset)
+            written.append(path)
+    return written
+
+
+def export_worldpose(origin: Origin, out: Path) -> list[Path]:
+    """Writes `poses/<clip>.npz` and `cameras/<clip or static camera>.npz` (X3)."""
+    written = []
+    for clip in origin.clips:
+        model, poses, _ = fitted_bodies(origin.run, clip)
+        written.append(out / "poses" / f"{clip}.npz")
+        write_poses(written[-1], poses, model.name)
+        if f"broadcast_calibration/{clip}" in origin.run:
+            written.append(out / "cameras" / f"{clip}.npz")
+            write_moving_camera(written[-1], broadcast_camera(origin.run, clip))
+    for name, camera in static_cameras(origin.run, origin.spec, origin.stage).items():
+        written.append(out / "cameras" / f"{name}.npz")
+        write_static_camera(written[-1], camera.to_calibration(name))
+    return written
+
+
+def export_markers(origin: Origin, out: Path) -> list[Path]:
+    """Writes `markers/<clip>/person_<id>.trc` for everybody who has a joint."""
+    written = []
+    for clip in origin.clips:
+        tracks = joint_tracks(origin.run, clip, origin.stage)
+        for person, person_id in enumerate(tracks.person_ids):
+            if np.isfinite(tracks.joints[:, person]).any():
+                written.append(out / "markers" / clip / f"person_{person_id:03d}.trc")
+                write_markers(written[-1], tracks, person, origin.spec.fps)
+    return written
+
+
+def export_motion(origin: Origin, out: Path) -> list[Path]:
+    """Writes `motion/<clip>/person_<id>_frame_<first>.bvh` for every uninterrupted stretch."""
+    written = []
+    for clip in origin.clips:
+        model, poses, persons = fitted_bodies(origin.run, clip)
+        frames = origin.run[f"body_fitting/{clip}"]["frame"].values
+        for person, person_id in enumerate(persons):
+            for part in stretches(poses[person]):
+                name = f"person_{person_id:03d}_frame_{frames[part.start]:06d}.bvh"
+                written.append(out / "motion" / clip / name)
+                write_motion(written[-1], model, poses[person, part], origin.spec.fps)
+    return written
+
+
+def export_challenge(origin: Origin, out: Path, edition: Edition = 2026) -> list[Path]:
+    """Writes cameras, boxes, skeletons, the pitch's points and what to submit."""
+    truths: dict[str, ChallengeTruth] = {}
+    fits = {clip: fitted_bodies(origin.run, clip) for clip in origin.clips}
+    cameras = {clip: broadcast_camera(origin.run, clip) for clip in origin.clips}
+    written = []
+    for clip, camera in cameras.items():
+        model, poses, _ = fits[clip]
+        truths[clip] = challenge_truth(model, poses, camera)
+        written.append(out / "cameras" / f"{clip}.npz")
+        write_challenge_camera(written[-1], camera, edition)
+    written += write_challenge(out, {clip: t.clip for clip, t in truths.items()}, edition)
+    pitch = read_match(Path(origin.registration.folder)).pitch
+    if pitch is not None:
+        written.append(out / "pitch_points.txt")
+        samples = PitchTemplate.from_spec(pitch).sample_lines(PITCH_SPACING)
+        write_pitch_points(written[-1], samples.points_world)
+    written.append(out / "submission.zip")
+    write_submission(written[-1], {clip: truth.submission for clip, truth in truths.items()})
+    return written
+
+
+def export_challenge_2025(origin: Origin, out: Path) -> list[Path]:
+    """Writes what `export_challenge` writes, in the layout of the edition of 2025."""
+    return export_challenge(origin, out, 2025)
+
+
+EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
+    "joints": export_joints,
+    "coco": export_coco,
+    "worldpose": export_worldpose,
+    "trc": export_markers,
+    "bvh": export_motion,
+    "challenge": export_challenge,
+    "challenge-2025": export_challenge_2025,
+}
+"""Formats by name; each takes what it is made from and a folder, and returns the files."""

@@ -1,0 +1,107 @@
+"""Which results of a run wait for a person, by what the journal says and the figures show."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from data_contracts.review import ReviewRequest
+from data_contracts.run import GatePolicy, ResultManifest, WaitingUnit
+from flows.method import GATES
+from flows.stage import Match
+from worldpose.review import Journal, decision_on, requests_by_id, say
+from worldpose.store import Store
+
+ALWAYS = "every result is asked about"
+
+
+@dataclass(frozen=True)
+class Gatekeeper:
+    """Lets results pass or holds them.
+
+    Attributes:
+        store: where results lie.
+        match: the match, with its journal as it was when the run began.
+        policy: when a person is asked.
+    """
+
+    store: Store
+    match: Match
+    policy: GatePolicy
+
+    def held(self, stage: str, results: Mapping[str, str]) -> tuple[WaitingUnit, ...]:
+        """The units of `stage` in `results` that may not be built upon yet.
+
+        A verdict holds for a result's bytes, and goes before its figures: what somebody rejected
+        waits for a correction, however good it looks.
+        """
+        gate = {each.stage: each for each in GATES}.get(stage)
+        if self.policy == "never" or gate is None:
+            return ()
+        waiting = []
+        for name, key in results.items():
+            if name.partition("/")[0] != stage:
+                continue
+            manifest = self._manifest(name, key)
+            decision = decision_on(self.match.journal.records, name, manifest.content)
+            if decision is None:
+                asked = (ALWAYS,) if self.policy == "always" else ()
+                reasons = (*asked, *gate.objections(manifest.figures))
+                if reasons:
+                    request = request_id(name, key)
+                    waiting.append(WaitingUnit(unit=name, request=request, reasons=reasons))
+            elif decision.verdict == "reject":
+                said = f"{decision.who} rejected it" + (f": {decision.why}" * bool(decision.why))
+                waiting.append(
+                    WaitingUnit(unit=name, request=decision.request, reasons=(said,), rejected=True)
+                )
+        return tuple(waiting)
+
+    def ask(self, run_id: str, waiting: Sequence[WaitingUnit], results: Mapping[str, str]) -> None:
+        """Put what waits into the journal, once for each result."""
+        requests = [
+            self._request(unit, results[unit.unit], run_id) for unit in waiting if not unit.rejected
+        ]
+
+        def unasked(journal: Journal) -> list[ReviewRequest]:
+            known = requests_by_id(journal.records)
+            return [request for request in requests if request.id not in known]
+
+        if requests:
+            say(self.store, self.match.match_id, unasked)
+
+    def _request(self, unit: WaitingUnit, key: str, run_id: str) -> ReviewRequest:
+        manifest = self._manifest(unit.unit, key)
+        return ReviewRequest(
+            id=unit.request,
+            match_id=self.match.match_id,
+            run_id=run_id,
+            gate=unit.unit.partition("/")[0],
+            keys={unit.unit: key},
+            contents={unit.unit: manifest.content},
+            reasons=unit.reasons,
+            figures=manifest.figures,
+            created_at=datetime.now(UTC),
+        )
+
+    def _manifest(self, name: str, key: str) -> ResultManifest:
+        stage, _, unit = name.partition("/")
+        return self.store.manifest(self.match.match_id, stage, unit, key)
+
+
+def request_id(unit: str, key: str) -> str:
+    """The id of the question about one result: `static_calibration.cam03.1f2e3d4c5b6a`."""
+    stage, _, name = unit.partition("/")
+    return f"{stage[:24]}.{name[:24]}.{key[:12]}"
+
+
+def passed(results: Mapping[str, str], waiting: Iterable[WaitingUnit]) -> dict[str, str]:
+    """The results that may be built upon."""
+    held = {unit.unit for unit in waiting}
+    return {name: key for name, key in results.items() if name not in held}
+
+
+def undecided(waiting: Iterable[WaitingUnit]) -> list[WaitingUnit]:
+    """What nobody has said anything about yet; the rest waits for corrections."""
+    return [unit for unit in waiting if not unit.rejected]

@@ -1,0 +1,143 @@
+"""Gates: where a person is asked before a run goes on, and which figures ask for it.
+
+A gate stands behind a stage and looks at each of its results on its own; `GATES`, beside
+`METHOD`, names them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from pydantic import Field
+
+from data_contracts.records import Record
+
+Figures = Mapping[str, float]
+
+
+def _as_they_are(figures: Figures) -> Figures:
+    return figures
+
+
+@dataclass(frozen=True)
+class Gate:
+    """Where a person is asked.
+
+    Attributes:
+        stage: the stage behind which it stands, which also names it.
+        question: what a person is to decide.
+        limits: a record of the largest figures with which `auto` lets a result pass.
+        judged: the figures that are held against the limits, from a result's.
+    """
+
+    stage: str
+    question: str
+    limits: Record
+    judged: Callable[[Figures], Figures] = _as_they_are
+
+    def objections(self, figures: Figures) -> tuple[str, ...]:
+        """A line for each figure beyond its limit; none where `auto` lets the result pass.
+
+        A result without any figure, such as a camera that was given, was somebody's to judge
+        before. A figure that could not be computed is beyond every limit.
+        """
+        if not figures:
+            return ()
+        judged = self.judged(figures)
+        lines = []
+        for name, limit in self.limits:
+            if name not in judged:
+                lines.append(f"{name} could not be computed")
+            elif judged[name] > limit:
+                lines.append(f"{name} is {judged[name]:.4g}, at most {limit:.4g} passes")
+        return tuple(lines)
+
+
+class CameraLimits(Record):
+    """What a calibrated static camera may show."""
+
+    expected_ground_error_median_m: float = Field(default=0.03, ge=0)
+    """Expected error on the pitch, median over what the camera sees [m]. Half of the 6 cm that a
+    joint is to be known to; cameras of eight good clicks reach 0.01 to 0.02."""
+    expected_ground_error_p95_m: float = Field(default=0.10, ge=0)
+    """The same at its 95th percentile [m]: the far side, where a pixel is 5 to 20 cm."""
+    clicks_wrong: float = Field(default=0, ge=0)
+    """Clicks that the others contradict [1]. One click at the wrong marking looks like this, and
+    whoever made it knows in a glance which of the two is right."""
+    weak: float = Field(default=0, ge=0)
+    """1 where the clicks leave a direction of the camera open [1]."""
+
+
+class IdentityLimits(Record):
+    """What the tracks of a clip may show."""
+
+    undecided: float = Field(default=0, ge=0)
+    """Joins of two tracks for and against which the evidence is too even [1]: a person sees at once
+    what a wrong guess would spoil for good."""
+    unmatched_share: float = Field(default=0.15, ge=0)
+    """Detections that belong to nobody [1]: staff and crowd are some, a camera out of step or place
+    makes many."""
+    mean_ray_distance_m: float = Field(default=0.15, ge=0)
+    """How far the rays of matched detections pass each other [m]: beyond a shoulder's width of
+    0.4 m people are mixed up, and a third of it says that cameras disagree."""
+
+
+class JointLimits(Record):
+    """What the triangulated joints of a clip may show."""
+
+    standard_deviation_m: float = Field(default=0.10, ge=0)
+    """Of a joint along an axis, median over joints [m]; 0.03 with five views."""
+    filled_share: float = Field(default=0.05, ge=0)
+    """Joints that are there by motion alone [1]."""
+
+
+class AdjustmentLimits(Record):
+    """What adjusted cameras may show.
+
+    How many changes left-out people refused is no limit: cameras that were good already need none.
+    """
+
+    held_out_error_after_px: float = Field(default=5.0, ge=0)
+    """Median distance of left-out people's keypoints to where the adjusted cameras put them [px];
+    1.5 to 2.5 where detection is the only error."""
+    held_out_growth: float = Field(default=1.0, ge=0)
+    """The same over what it was before adjustment [1]: above 1 it did harm."""
+
+
+class ClipLimits(Record):
+    """What the bodies of a clip may show before it is released."""
+
+    offset_rms_m: float = Field(default=0.03, ge=0)
+    """What the detector takes for a joint against the body's, along an axis [m]; 0.005 to 0.015
+    where the body fits."""
+    filled_share: float = Field(default=0.05, ge=0)
+    """Bodies in frames without any joint of the person [1]."""
+
+
+def _of_adjustment(figures: Figures) -> Figures:
+    after, before = (figures.get(f"held_out_error_{side}_px") for side in ("after", "before"))
+    if after is None or not before:
+        return figures
+    return {**figures, "held_out_growth": after / before}
+
+
+def _of_bodies(figures: Figures) -> Figures:
+    share = figures["filled"] / figures["bodies"] if figures["bodies"] else 0.0
+    return {**figures, "filled_share": share}
+
+
+CAMERAS = Gate(
+    "static_calibration", "Do the markings lie on the picture's, all over it?", CameraLimits()
+)
+IDENTITIES = Gate("tracking", "Is every person one track, from end to end?", IdentityLimits())
+JOINTS = Gate("triangulation", "Are the joints where the pictures show them?", JointLimits())
+ADJUSTMENT = Gate(
+    "bundle_adjustment",
+    "Did adjustment mend the cameras, and are its outliers outliers?",
+    AdjustmentLimits(),
+    _of_adjustment,
+)
+ACCEPTANCE = Gate(
+    "body_fitting", "Is the clip good enough to be released?", ClipLimits(), _of_bodies
+)

@@ -1,0 +1,108 @@
+"""A release: the files of a run under a name, frozen, with a manifest that proves them."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from flows.formats import EXPORTS, Origin
+from flows.release import joint_tracks, static_cameras
+from worldpose.errors import UsageError
+from worldpose.release.manifest import (
+    ReleasedClip,
+    ReleaseManifest,
+    read_manifest,
+    released_files,
+    write_manifest,
+)
+from worldpose.release.origins import ORIGINS, origins_of, write_origins
+
+CLASHING = {"worldpose", "challenge", "challenge-2025"}
+"""Formats that want the same file names; a folder holds one of them."""
+
+
+def export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
+    """Writes a run in several formats into one folder; returns the files.
+
+    Raises:
+        UsageError: an unknown format, or two that want the same files.
+    """
+    for form in forms:
+        if form not in EXPORTS:
+            raise UsageError(
+                f"--format {form}",
+                expected=f"one of {', '.join(EXPORTS)}",
+                found=repr(form),
+                todo="Choose one of these.",
+            )
+    if len(clashing := CLASHING & set(forms)) > 1:
+        raise UsageError(
+            f"--format {' --format '.join(sorted(clashing))}",
+            expected="formats that do not write the same files",
+            found="each has its own cameras/<clip>.npz",
+            todo="Export them into different folders.",
+        )
+    return [path for form in dict.fromkeys(forms) for path in EXPORTS[form](origin, out)]
+
+
+def release(origin: Origin, forms: list[str], out: Path, name: str, licence: str) -> list[Path]:
+    """Writes a release: the formats, origins/<clip>.npz and manifest.json; returns the files.
+
+    A release is frozen: its folder takes the same release again, and no other.
+
+    Raises:
+        UsageError: the folder holds another release.
+    """
+    record, spec = origin.run.record, origin.spec
+    frozen = read_manifest(out)
+    ours = {
+        "release": name,
+        "match_id": spec.match_id,
+        "run_id": record.run_id,
+        "formats": tuple(dict.fromkeys(forms)),
+        "stage": origin.stage,
+        "licence": licence,
+        "results": record.results,
+    }
+    if frozen is not None and any(getattr(frozen, key) != value for key, value in ours.items()):
+        raise UsageError(
+            f"--out {out}",
+            expected=f"a new folder, or release {name} of run {record.run_id} in the same formats",
+            found=f"release {frozen.release} of run {frozen.run_id} of {frozen.match_id}",
+            todo="A release is never overwritten: name another folder.",
+        )
+    written = export(origin, forms, out)
+    clips = {}
+    for clip in origin.clips:
+        tracks = joint_tracks(origin.run, clip, origin.stage)
+        origins = origins_of(tracks)
+        written.append(out / "origins" / f"{clip}.npz")
+        write_origins(written[-1], tracks, origins)
+        counts = np.bincount(origins.ravel(), minlength=len(ORIGINS))
+        clips[clip] = ReleasedClip(
+            first_frame=int(tracks.frames[0]) if len(tracks.frames) else 0,
+            frame_count=len(tracks.frames),
+            person_ids=tuple(tracks.person_ids.tolist()),
+            origins=dict(zip(ORIGINS, counts.tolist(), strict=True)),
+        )
+    bodies = [f"body_fitting/{clip}" for clip in origin.clips]
+    models = {origin.run[unit].attrs["body_model"] for unit in bodies if unit in origin.run}
+    cameras = static_cameras(origin.run, spec, origin.stage)
+    pictures = {camera.id: (camera.width, camera.height) for camera in spec.cameras}
+    manifest = ReleaseManifest(
+        **ours,
+        fps=spec.fps,
+        clips=clips,
+        pictures={
+            **{camera: pictures[camera] for camera in cameras},
+            **{c.id: pictures[c.broadcast] for c in spec.clips if c.broadcast and c.id in clips},
+        },
+        body_model=models.pop() if len(models) == 1 else None,
+        worldpose=version("worldpose"),
+        versions=record.versions,
+        settings=record.settings,
+        files=released_files(out, written),
+    )
+    return [*written, write_manifest(out, manifest)]

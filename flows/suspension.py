@@ -1,0 +1,131 @@
+"""How a deployment's run waits for people: Prefect suspends it, its process ends.
+
+The store's journal is the truth; Prefect only keeps the run until somebody resumes it, from the
+command line or in Prefect's own form. A resumed run begins anew and finds all its results.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from typing import Final, Literal
+
+from prefect.client.orchestration import get_client
+from prefect.client.schemas.filters import (
+    FlowRunFilter,
+    FlowRunFilterState,
+    FlowRunFilterStateType,
+)
+from prefect.client.schemas.objects import StateType
+from prefect.context import FlowRunContext
+from prefect.flow_runs import resume_flow_run, suspend_flow_run
+from prefect.input import RunInput
+from pydantic import Field
+
+from data_contracts.review import ReviewDecision
+from data_contracts.run import WaitingUnit
+from worldpose.errors import WorldposeError
+from worldpose.review import Journal, say
+from worldpose.store import Store
+from worldpose.store.blobs import open_blobs
+from worldpose.store.canonical import canonical_json, digest
+
+PATIENCE: Final = timedelta(days=90)
+"""Prefect cannot resume a run that has been suspended for longer; a new run goes on as well."""
+
+
+class Verdict(RunInput):
+    """What resumes a run. The verdict has no default, so that an empty answer is refused."""
+
+    verdict: Literal["approve", "reject", "recorded"]
+    """On all that waits; `recorded`: it has been decided one by one, as `worldpose review` does."""
+    who: str = Field(min_length=1)
+    """Name of the person."""
+    why: str = ""
+    """In the person's words."""
+
+
+def is_deployed() -> bool:
+    """Is this flow run one of a deployment: nothing else can be suspended."""
+    context = FlowRunContext.get()
+    run = None if context is None else context.flow_run
+    return run is not None and run.deployment_id is not None
+
+
+def take_verdict(store: Store, match_id: str, waiting: Sequence[WaitingUnit]) -> None:
+    """Suspend this flow run, or take in the verdict that it was resumed with.
+
+    Prefect knows the question by a key that the waiting results decide: asked again after a
+    resume it gives the answer, and other results are another question.
+
+    Args:
+        store: where the verdict is kept.
+        match_id: the match.
+        waiting: what nobody has decided on, and is in the journal already.
+
+    Raises:
+        WorldposeError: resumed with `recorded` though nothing was decided.
+        prefect.exceptions.Pause: not answered yet; this ends the process.
+    """
+    lines = [f"- `{unit.request}`: {'; '.join(unit.reasons)}" for unit in waiting]
+    text = "\n".join([f"{len(waiting)} results of {match_id} wait for review:", *lines])
+    answer = suspend_flow_run(
+        wait_for_input=Verdict.with_initial_data(description=text),
+        key=question_key(waiting),
+        timeout=int(PATIENCE.total_seconds()),
+    )
+    if answer.verdict == "recorded":
+        raise WorldposeError(
+            f"{match_id} was resumed with the verdict `recorded`, but {len(waiting)} results have "
+            f"none: {waiting[0].request} and others. Decide with `worldpose review approve` or "
+            "`reject`, and run again."
+        )
+    verdict: Literal["approve", "reject"] = answer.verdict
+
+    def decisions(journal: Journal) -> list[ReviewDecision]:
+        # Somebody may have decided with the command line between the resume and now.
+        decided = {
+            record.request for record in journal.records if isinstance(record, ReviewDecision)
+        }
+        return [
+            ReviewDecision(
+                match_id=match_id,
+                request=unit.request,
+                verdict=verdict,
+                who=answer.who,
+                why=answer.why,
+                decided_at=datetime.now(UTC),
+            )
+            for unit in waiting
+            if unit.request not in decided
+        ]
+
+    say(store, match_id, decisions)
+
+
+def resume_suspended(project: str, match_id: str) -> list[str]:
+    """Resume the suspended runs of a match, whose reviews are decided; gives their names.
+
+    Args:
+        project: folder or URL of the store.
+        match_id: the match.
+    """
+    paused = FlowRunFilter(
+        state=FlowRunFilterState(type=FlowRunFilterStateType(any_=[StateType.PAUSED]))
+    )
+    with get_client(sync_client=True) as client:
+        runs = [
+            run
+            for run in client.read_flow_runs(flow_run_filter=paused)
+            if run.parameters.get("match_id") == match_id
+            and open_blobs(str(run.parameters.get("project"))).url == project
+        ]
+    for run in runs:
+        resume_flow_run(run.id, run_input={"verdict": "recorded", "who": "worldpose review"})
+    return [run.name for run in runs]
+
+
+def question_key(waiting: Sequence[WaitingUnit]) -> str:
+    """The fixed key of a question: the same for the same waiting results."""
+    asked = sorted(unit.request for unit in waiting)
+    return f"review-{digest(canonical_json(asked))[:16]}"

@@ -1,0 +1,276 @@
+"""A run waits where people are asked, goes on when they approve, and forgets nothing they said."""
+
+import json
+import shutil
+
+import pytest
+from command_line import TINY, succeed, worldpose
+
+from data_contracts.review import MovedPoint, ReviewDecision
+from flows.gatekeeping import Gatekeeper
+from flows.gates import ACCEPTANCE, ADJUSTMENT, CAMERAS
+from flows.method import GATES, METHOD
+from flows.planning import plan_run
+from flows.registering import open_match
+from flows.review import correct, decide, origins_of, resume, reviews_of, still_waiting, withdraw
+from flows.run_record import latest_run
+from flows.running import RunRequest, run_match
+from worldpose.errors import InputError
+from worldpose.store import Store, verify
+
+WRONG = "static_calibration/cam03"
+"""The camera of `tiny` with a click that the others contradict."""
+
+
+@pytest.fixture
+def store(project_copy):
+    """A project whose every result is there: deciding and waiting needs no orchestrator."""
+    return Store.open(str(project_copy))
+
+
+def run(store, gates, **keywords):
+    return run_match(store, open_match(store, TINY), RunRequest({}, gates=gates, **keywords))
+
+
+def approve(store, *requests, verdict="approve", edits=()):
+    ids, _ = decide(
+        store, open_match(store, TINY), requests, verdict, who="Ada", why="looked", edits=edits
+    )
+    return ids
+
+
+def units(waiting):
+    return [unit.unit for unit in waiting]
+
+
+def wrong_click(match):
+    """An edit that removes a click of the camera that has a wrong one."""
+    name = match.folder.clicked["cam03"].points[0].name
+    return MovedPoint(camera="cam03", marking=name, xy=None)
+
+
+def test_gates_stand_behind_stages_of_the_method():
+    stages = [stage.name for stage in METHOD]
+    places = [stages.index(gate.stage) for gate in GATES]
+    assert places == sorted(set(places))
+
+
+GOOD_CAMERA = {
+    "expected_ground_error_median_m": 0.01,
+    "expected_ground_error_p95_m": 0.04,
+    "clicks_wrong": 0.0,
+    "weak": 0.0,
+}
+
+
+@pytest.mark.parametrize(
+    ("gate", "figures", "objected"),
+    [
+        (CAMERAS, GOOD_CAMERA, []),
+        (CAMERAS, {}, []),  # a given one was judged by who gave it
+        (CAMERAS, GOOD_CAMERA | {"clicks_wrong": 1.0}, ["clicks_wrong is 1, at most 0 passes"]),
+        (CAMERAS, {"clicks_wrong": 0.0, "weak": 0.0}, ["expected_ground", "expected_ground"]),
+        (ADJUSTMENT, {"held_out_error_before_px": 2.0, "held_out_error_after_px": 1.9}, []),
+        (
+            ADJUSTMENT,
+            {"held_out_error_before_px": 2.0, "held_out_error_after_px": 2.1},
+            ["held_out_growth is 1.05, at most 1 passes"],
+        ),
+        (ADJUSTMENT, {"cameras_changed": 0.0}, ["held_out_error_after_px", "held_out_growth"]),
+        (ACCEPTANCE, {"bodies": 100.0, "filled": 4.0, "offset_rms_m": 0.01}, []),
+        (ACCEPTANCE, {"bodies": 100.0, "filled": 6.0, "offset_rms_m": 0.01}, ["filled_share"]),
+        (ACCEPTANCE, {"bodies": 0.0, "filled": 0.0, "offset_rms_m": 0.01}, []),
+    ],
+)
+def test_auto_objects_to_figures_beyond_their_limits(gate, figures, objected):
+    lines = gate.objections(figures)
+    assert len(lines) == len(objected)
+    assert all(line.startswith(start) for line, start in zip(lines, objected, strict=True))
+
+
+def test_without_gates_nothing_waits_and_nothing_is_asked(store):
+    record = run(store, "never")
+    assert (record.run_id, record.gates, record.waiting) == ("0001", "never", ())
+    assert store.blobs.entries("reviews") == []
+
+
+def test_auto_waits_for_the_results_beyond_a_limit_and_goes_on_when_they_are_approved(store):
+    record = run(store, "auto")
+    assert (record.run_id, record.state, record.gates) == ("0002", "waiting", "auto")
+    reasons = {unit.unit: unit.reasons for unit in record.waiting}
+    assert "clicks_wrong is 1, at most 0 passes" in reasons[WRONG]
+    assert all("expected_ground_error_median_m is" in lines[0] for lines in reasons.values())
+    # Everything behind them has a result from before, and may not be built upon.
+    assert {name.partition("/")[0] for name in record.results} == {"ingest", "static_calibration"}
+    assert {name.partition("/")[0] for name in record.blocked} >= {"tracking", "body_fitting"}
+    reviews = {each.request.id: each for each in reviews_of(open_match(store, TINY), record)}
+    assert set(reviews) == {unit.request for unit in record.waiting}
+    assert {(each.state, each.request.run_id) for each in reviews.values()} == {("waits", "0002")}
+    assert verify(store) == ()
+    # Asked again, it waits for the same, and neither a run nor a question is added.
+    assert run(store, "auto").run_id == "0002"
+    assert len(store.blobs.entries("reviews")) == 1
+    first, *others = reviews
+    approve(store, first)
+    assert units(still_waiting(open_match(store, TINY), latest_run(store, TINY))) == [
+        unit.unit for unit in record.waiting if unit.request != first
+    ]
+    assert len(run(store, "auto").waiting) == len(others)
+    approve(store, *others)
+    record = run(store, "auto")
+    assert (record.run_id, record.state, record.executed) == ("0004", "complete", ())
+    assert record.results == store.run(TINY, "0001").results
+
+
+def test_always_asks_behind_every_gate_in_turn(store):
+    asked = []
+    for _ in GATES:
+        record = run(store, "always")
+        assert record.state == "waiting"
+        (stage,) = {unit.partition("/")[0] for unit in units(record.waiting)}
+        asked.append(stage)
+        assert len(approve(store)) == len(record.waiting)  # all that wait
+    assert asked == [gate.stage for gate in GATES]
+    assert run(store, "always").state == "complete"
+    assert run(store, "always").run_id == latest_run(store, TINY).run_id
+
+
+def test_a_stage_left_standing_does_not_get_around_its_gate(store):
+    record = run(store, "auto", from_stage="triangulation")
+    assert WRONG in units(record.waiting)
+    assert not any(name.startswith("triangulation") for name in record.results)
+
+
+def test_later_results_that_nobody_approved_are_not_carried_over(store):
+    run(store, "always")
+    approve(store)
+    record = run(store, "always", until_stage="static_calibration")
+    assert record.state == "complete"
+    assert not any(name.startswith("tracking") for name in record.results)
+
+
+def test_a_verdict_holds_for_the_bytes_whatever_key_gives_them(store):
+    """A setting that changes nothing of a camera changes its key; its approval stands."""
+    run(store, "auto")
+    approve(store)
+    match = open_match(store, TINY)
+    results = store.run(TINY, "0001").results
+    manifest = store.manifest(TINY, "static_calibration", "cam03", results[WRONG])
+
+    class Twin:
+        """The store, with the same result under another key."""
+
+        def manifest(self, *place):
+            return manifest
+
+    gatekeeper = Gatekeeper(Twin(), match, "auto")
+    assert gatekeeper.held("static_calibration", {WRONG: "f" * 32}) == ()
+    changed = manifest.model_copy(update={"content": "0" * 64})
+    Twin.manifest = lambda self, *place: changed
+    assert units(gatekeeper.held("static_calibration", {WRONG: "f" * 32})) == [WRONG]
+
+
+def test_a_rejected_result_waits_for_its_correction_which_reaches_nothing_else(store):
+    waiting = {unit.unit: unit.request for unit in run(store, "auto").waiting}
+    wrong = waiting.pop(WRONG)
+    approve(store, *waiting.values())
+    opened = open_match(store, TINY)
+    before = {unit.name: unit.key for unit in plan_run(store, opened, {})}
+    files = sorted(opened.folder.folder.rglob("*.json"))
+    contents = [file.read_bytes() for file in files]
+    edit = wrong_click(opened)
+    approve(store, wrong, verdict="reject", edits=[edit])
+
+    match = open_match(store, TINY)
+    assert [file.read_bytes() for file in files] == contents
+    after = {unit.name: unit for unit in plan_run(store, match, {})}
+    changed = {name for name, unit in after.items() if unit.key != before[name]}
+    early = {name for name in changed if name.startswith(("ingest/", "static_calibration/"))}
+    assert early == {WRONG}
+    (clicked,) = after[WRONG].recipe.sources["clicked"].values()
+    assert edit.marking not in clicked["points"]
+    origins = origins_of(store, match, latest_run(store, TINY))
+    assert origins[WRONG] == "rejected"
+    assert origins["static_calibration/cam00"] == "automatic"
+    # Taken back, everything is as it was; the refusal stands until somebody approves.
+    withdraw(store, match, match.corrections[0].id, who="Bob", why="it was right")
+    again = open_match(store, TINY)
+    assert {unit.name: unit.key for unit in plan_run(store, again, {})} == before
+    record = run(store, "auto")
+    assert [(unit.unit, unit.rejected) for unit in record.waiting] == [(WRONG, True)]
+    assert record.waiting[0].reasons == ("Ada rejected it: looked",)
+    with pytest.raises(InputError, match="nothing that waits"):
+        approve(store)
+    approve(store, wrong)
+    assert run(store, "auto").state == "complete"
+
+
+def test_a_correction_on_what_somebody_else_changed_is_refused(store):
+    run(store, "auto")
+    match = open_match(store, TINY)
+    correct(store, match, [wrong_click(match)], who="Ada", why="")
+    with pytest.raises(InputError, match="made in between"):
+        correct(store, match, [wrong_click(match)], who="Bob", why="")
+    fresh = open_match(store, TINY)
+    gone = match.folder.clicked["cam03"].points[0].name
+    twice = MovedPoint(camera="cam03", marking=gone, was=(1.0, 1.0), xy=(2.0, 2.0))
+    with pytest.raises(InputError, match=r"edit 1 of 1.*not there now"):
+        correct(store, fresh, [twice], who="Bob", why="")
+    assert len(open_match(store, TINY).corrections) == 1
+
+
+def test_a_correction_that_no_longer_applies_is_listed(store, tmp_path):
+    folder = shutil.copytree(open_match(store, TINY).folder.folder, tmp_path / "match")
+    record = store.registration(TINY).model_copy(update={"folder": str(folder)})
+    store.register(record)
+    match = open_match(store, TINY)
+    correct(store, match, [wrong_click(match)], who="Ada", why="")
+    file = folder / "annotations" / "static_calibration" / "cam03.json"
+    content = json.loads(file.read_text())
+    content["points"][0]["xy"][0] += 1.0
+    file.write_text(json.dumps(content))
+    match = open_match(store, TINY)
+    ((stale, reason),) = match.stale
+    assert (match.corrections, stale.who) == ((), "Ada")
+    assert "when it was corrected" in reason
+
+
+def test_an_unknown_or_superseded_review_is_refused(store):
+    with pytest.raises(InputError, match="nothing that waits"):
+        approve(store)
+    request = run(store, "auto").waiting[0].request
+    with pytest.raises(InputError, match="no such question"):
+        approve(store, request, "static_calibration.cam00.000000000000")
+    assert not any(
+        isinstance(record, ReviewDecision) for record in open_match(store, TINY).journal.records
+    )
+
+
+def test_without_a_server_there_is_nothing_to_resume(store, monkeypatch):
+    monkeypatch.delenv("PREFECT_API_URL", raising=False)
+    with pytest.raises(InputError, match="worldpose run"):
+        resume(store, open_match(store, TINY))
+
+
+def test_people_are_asked_and_answer_on_the_command_line(tiny, project_copy, tmp_path):
+    at = ("--project", project_copy)
+    answer = worldpose("run", tiny, "--gates", "auto", *at)
+    assert answer.code == 3
+    assert "6 reviews pending:" in answer.out
+    assert f"next: worldpose review list {TINY}" in answer.out
+    reviews = succeed("review", "list", *at, "--json").json["reviews"]
+    assert {(each["state"], each["match_id"]) for each in reviews} == {("waits", TINY)}
+    status = succeed("status", *at, "--json").json["matches"][0]
+    assert (status["state"], len(status["waiting"])) == ("waiting", 6)
+    assert worldpose("review", "approve", TINY, *at).code == 2  # who
+    edits = tmp_path / "edits.json"
+    edits.write_text('[{"kind": "moved_point", "camera": "cam03", "marking": "corner", "xy": []}]')
+    rejection = ("review", "reject", TINY, "--who", "Ada", "--why", "x", "--edits", edits, *at)
+    assert "edits.json: 0.moved_point.xy" in worldpose(*rejection).err
+    wrong = next(each["id"] for each in reviews if WRONG in each["keys"])
+    assert "clicks_wrong is 1" in succeed("review", "show", TINY, wrong, *at).out
+    done = succeed("review", "approve", TINY, "--who", "Ada", *at, "--json").json
+    assert set(done["reviews"]) == {each["id"] for each in reviews}
+    again = succeed("run", tiny, "--gates", "auto", *at, "--json").json
+    assert (again["waiting"], again["executed"], again["gates"]) == (0, 0, "auto")
+    assert worldpose("run", tiny, "--gates", "sometimes", *at).code == 2

@@ -1,0 +1,39 @@
+"""Figures of a fit without the truth."""
+
+import numpy as np
+import pytest
+from test_glimpses import broadcast
+from walking_bodies import KEYPOINTS, MODEL, seen, walker
+
+from worldpose.body_fitting import BodyFittingSettings, Pictures, fit_bodies, report_fit
+
+
+def test_figures_of_every_person_are_those_of_his_joints():
+    rng = np.random.default_rng(3)
+    truth = walker(30, rng)
+    joints, covariance = seen(truth, 0.01, rng)
+    joints[10:12] = np.nan
+    fit = fit_bodies(MODEL, joints, covariance, 50.0, BodyFittingSettings())
+    camera = broadcast(1)
+    exact = KEYPOINTS(truth)
+    keypoints = (camera.project(exact[:, None]) + [3.0, 4.0])[:, :, None]
+    keypoints[20:, 0, 0, 5] = np.nan
+    index = np.zeros((30, 1, 1), dtype=np.int64)
+    index[25:] = -1
+    report = report_fit(fit, joints, 50.0, Pictures(camera, keypoints, index))
+    assert report.bodies == 30 and report.filled == 2 and report.guided == 0
+    # Pixels are 5 px off by design; 1 cm at 70 m and 4000 px of focal length is 0.6 px.
+    assert report.reprojection_px[0] == pytest.approx(5.0, abs=1.0)
+    # 1 cm in each of three axes: a median of 15 mm, less what the body takes up.
+    assert report.residual_m[0] == pytest.approx(0.014, abs=0.004)
+    # Two joints of 1 cm along a limb.
+    assert report.bone_spread_m[0] == pytest.approx(0.0141, abs=0.004)
+    # A centimetre of noise, new in every frame, alone: sqrt(20 x 3) x 1 cm x 50^3.
+    assert report.jerk_m_s3[0] < 0.1 * np.sqrt(60.0) * 0.01 * 50.0**3
+
+
+def test_without_pictures_there_is_no_reprojection():
+    rng = np.random.default_rng(3)
+    joints, covariance = seen(walker(5, rng), 0.01, rng)
+    fit = fit_bodies(MODEL, joints, covariance, 50.0, BodyFittingSettings())
+    assert report_fit(fit, joints, 50.0).reprojection_px == (None,)

@@ -1,0 +1,243 @@
+"""Whole clips of rendered pictures: every frame's camera against the true one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import turning_clip as clip
+
+from data_contracts.broadcast_calibration import (
+    BROADCAST_CALIBRATION,
+    FRAME_STATUS,
+    KeyFrame,
+)
+from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
+from worldpose.broadcast_calibration import (
+    BroadcastCalibrationSettings,
+    People,
+    broadcast_arrays,
+    broadcast_attributes,
+    calibrate_broadcast,
+    follow_given_lens,
+)
+from worldpose.errors import InputError
+from worldpose.synthetic.broadcast_rendering import render_broadcast
+from worldpose.synthetic.rendering import RenderingSettings
+
+FRAMES, FPS = 16, 25.0
+LOOK = RenderingSettings(light="floodlights", stand_shadow=0.0)
+SETTINGS = BroadcastCalibrationSettings(flow_points=250, rounds=1)
+
+
+def grey(picture):
+    return np.ascontiguousarray(picture[..., 1])
+
+
+@pytest.fixture(scope="module")
+def true():
+    return clip.moving(FRAMES, pan=(-2.0, 6.0))
+
+
+@pytest.fixture(scope="module")
+def pictures(true):
+    return [grey(p) for p in render_broadcast(true.camera, clip.PITCH, None, 5, LOOK)]
+
+
+@pytest.fixture(scope="module")
+def bare(true):
+    """The same without any paint."""
+    unpainted = LOOK.model_copy(update={"paint": 0.0})
+    return [grey(p) for p in render_broadcast(true.camera, clip.PITCH, None, 5, unpainted)]
+
+
+def clicks(true, frame, noise=1.0, renamed=None):
+    names = [*("center_mark", "center_circle_near", "center_circle_far", "halfway_far")]
+    rng = np.random.default_rng(frame)
+    points = []
+    for name in names:
+        pixel = true.camera[frame].project(clip.PITCH.points[name][None])[0]
+        if ((pixel > 3.0) & (pixel < true.image_size - 4.0)).all():
+            x, y = (float(v) for v in pixel + noise * rng.standard_normal(2))
+            points.append(ClickedPoint(name=renamed or name, xy=(x, y)))
+            renamed = None
+    drawn = []
+    for name in ("center_circle", "halfway_line", "touch_line_far"):
+        pixels = true.camera[frame].project(clip.PITCH.marking_points(name, 0.5))
+        inside = pixels[((pixels > 3.0) & (pixels < true.image_size - 4.0)).all(axis=-1)]
+        some = inside[np.linspace(0, len(inside) - 1, 9).astype(int)]
+        some = some + noise * rng.standard_normal(some.shape)
+        drawn.append({"name": name, "xy": [(float(x), float(y)) for x, y in some]})
+    markings = ClickedMarkings.model_validate(
+        {"points": [p.model_dump() for p in points], "drawn": drawn}
+    )
+    return KeyFrame(frame=frame, markings=markings)
+
+
+def place_errors(camera, true):
+    """Distances in the picture of places on the pitch that the true camera sees [px]."""
+    x, y = np.meshgrid(np.linspace(-25.0, 25.0, 11), np.linspace(-20.0, 20.0, 9))
+    places = np.stack([x.ravel(), y.ravel(), clip.PITCH.height(x.ravel(), y.ravel())], axis=-1)
+    seen, found = true.camera.project(places), camera.camera.project(places)
+    inside = ((seen > 0.0) & (seen < true.image_size - 1.0)).all(axis=-1)
+    return np.linalg.norm(found - seen, axis=-1)[inside]
+
+
+@pytest.fixture(scope="module")
+def calibrated(true, pictures):
+    keys = [clicks(true, 3), clicks(true, 12)]
+    return calibrate_broadcast(clip.PITCH, keys, lambda: iter(pictures), FPS, settings=SETTINGS)
+
+
+def test_two_key_frames_give_every_frame(calibrated, true):
+    # Two frames of clicks at 1 px, and lines in every frame.
+    errors = place_errors(calibrated.camera, true)
+    assert np.median(errors) < 0.5
+    assert np.percentile(errors, 95.0) < 1.5
+
+
+def test_lines_better_what_was_tracked(calibrated, true):
+    tracked = place_errors(calibrated.tracked, true)
+    assert np.median(place_errors(calibrated.camera, true)) < np.median(tracked)
+
+
+def test_the_report_says_what_frames_rest_on(calibrated):
+    report = calibrated.report
+    names = [FRAME_STATUS[status] for status in report.status]
+    assert names[3] == names[12] == "key_frame"
+    assert set(names) == {"key_frame", "lines"}
+    assert len(report.drift) == 1 and report.drift[0] < 5.0
+    assert report.reasons == ()
+
+
+def test_the_stored_form_is_the_contract_s(calibrated):
+    arrays = broadcast_arrays(calibrated)
+    attributes = broadcast_attributes("clip", calibrated)
+    assert set(arrays) == {layout.name for layout in BROADCAST_CALIBRATION.arrays}
+    assert set(attributes) == set(BROADCAST_CALIBRATION.attributes)
+    for name, array in arrays.items():
+        layout = BROADCAST_CALIBRATION.layout(name)
+        assert array.dtype == layout.dtype, name
+        assert array.ndim == len(layout.dims), name
+
+
+def test_one_key_frame_is_still_usable(true, pictures):
+    found = calibrate_broadcast(
+        clip.PITCH, [clicks(true, 8)], lambda: iter(pictures), FPS, settings=SETTINGS
+    )
+    assert np.median(place_errors(found.camera, true)) < 1.0
+
+
+def test_frames_without_lines_are_carried_by_what_stands_still(true, pictures, bare):
+    mixed = [*pictures[:5], *bare[5:12], *pictures[12:]]
+    keys = [clicks(true, 3), clicks(true, 13)]
+    found = calibrate_broadcast(clip.PITCH, keys, lambda: iter(mixed), FPS, settings=SETTINGS)
+    names = {FRAME_STATUS[status] for status in found.report.status[6:11]}
+    assert names == {"followed"}
+    assert np.percentile(place_errors(found.camera, true), 95.0) < 3.0
+    # They are known less well, and the report knows.
+    expected = found.report.reprojection_error
+    assert expected[8] > expected[3]
+    assert any(5 <= frame < 12 for frame in found.report.pick_next)
+
+
+def test_a_point_under_a_wrong_name_is_left_out_and_named(true, pictures):
+    keys = [clicks(true, 3, renamed="penalty_mark_left"), clicks(true, 12)]
+    found = calibrate_broadcast(clip.PITCH, keys, lambda: iter(pictures), FPS, settings=SETTINGS)
+    assert "penalty_mark_left" in found.report.wrong[3]
+    assert any("penalty_mark_left" in reason for reason in found.report.reasons)
+    assert np.median(place_errors(found.camera, true)) < 0.5
+
+
+def test_a_key_frame_that_tells_nothing_is_refused_and_the_others_do(true, pictures):
+    empty = KeyFrame(
+        frame=2,
+        markings=ClickedMarkings(points=(ClickedPoint(name="center_mark", xy=(400.0, 300.0)),)),
+    )
+    keys = [empty, clicks(true, 8)]
+    found = calibrate_broadcast(clip.PITCH, keys, lambda: iter(pictures), FPS, settings=SETTINGS)
+    assert list(found.report.refused) == [2]
+    assert np.median(place_errors(found.camera, true)) < 1.0
+
+
+def test_no_usable_key_frame_is_an_error_with_each_reason(pictures):
+    empty = KeyFrame(
+        frame=2,
+        markings=ClickedMarkings(points=(ClickedPoint(name="center_mark", xy=(400.0, 300.0)),)),
+    )
+    with pytest.raises(InputError, match="frame 2"):
+        calibrate_broadcast(clip.PITCH, [empty], lambda: iter(pictures), FPS, settings=SETTINGS)
+
+
+def test_the_same_key_frame_twice_is_refused(true, pictures):
+    twice = [clicks(true, 8), clicks(true, 8)]
+    with pytest.raises(InputError, match="every key frame once"):
+        calibrate_broadcast(clip.PITCH, twice, lambda: iter(pictures), FPS, settings=SETTINGS)
+
+
+def test_without_any_paint_players_hold_the_camera(true, bare):
+    rng = np.random.default_rng(8)
+    x, y = np.meshgrid([-8.0, -2.0, 4.0, 10.0], [-9.0, 0.0, 9.0])
+    shape = np.stack([np.tile([-0.2, 0.2], 9)[:17], 0.0 * np.arange(17), np.linspace(0.1, 1.8, 17)])
+    places = np.stack([x.ravel(), y.ravel(), 0.0 * x.ravel()], axis=-1)
+    joints = np.broadcast_to(places[:, None] + shape.T, (FRAMES, 12, 17, 3))
+    seen = true.camera.project(joints.reshape(FRAMES, -1, 3)).reshape(FRAMES, 12, 17, 2)
+    seen = seen + 1.5 * rng.standard_normal(seen.shape)
+    away = ((seen < 0.0) | (seen > true.image_size - 1.0)).any(axis=-1, keepdims=True)
+    people = People(joints, np.where(away, np.nan, seen), FPS)
+    keys = [clicks(true, 3), clicks(true, 12)]
+    alone, held = (
+        calibrate_broadcast(
+            clip.PITCH, keys, lambda: iter(bare), FPS, people=who, settings=SETTINGS
+        )
+        for who in (None, people)
+    )
+    assert FRAME_STATUS[held.report.status[8]] == "players"
+    assert np.median(place_errors(held.camera, true)) < 0.5
+    # Clicks alone do not tell the place as well.
+    assert np.median(place_errors(held.camera, true)) < np.median(place_errors(alone.camera, true))
+
+
+def test_adam_can_be_chosen_and_is_no_better(true, pictures, calibrated):
+    slow = SETTINGS.model_copy(update={"solver": "adam", "adam_iterations": 30})
+    keys = [clicks(true, 3), clicks(true, 12)]
+    found = calibrate_broadcast(clip.PITCH, keys, lambda: iter(pictures), FPS, settings=slow)
+    best = np.median(place_errors(calibrated.camera, true))
+    assert np.median(place_errors(found.camera, true)) > best
+
+
+def test_a_key_frame_beyond_the_clip_is_refused(true, pictures):
+    late = clicks(true, 8).model_copy(update={"frame": 400})
+    with pytest.raises(InputError, match="key frames from 0 to 15"):
+        calibrate_broadcast(clip.PITCH, [late], lambda: iter(pictures), FPS, settings=SETTINGS)
+
+
+def test_a_cut_is_found_and_refused(true, pictures):
+    elsewhere = clip.moving(3, pan=(40.0, 40.0), zoom=(2600.0, 2600.0))
+    other = [grey(p) for p in render_broadcast(elsewhere.camera, clip.PITCH, None, 5, LOOK)]
+    cut = [*pictures[:8], *other, *pictures[8:12]]
+    with pytest.raises(InputError, match=r"cuts before frame 8, 11 of 15"):
+        calibrate_broadcast(
+            clip.PITCH, [clicks(true, 2)], lambda: iter(cut), FPS, settings=SETTINGS
+        )
+
+
+@pytest.mark.parametrize("lines", [False, True])
+def test_a_known_lens_needs_one_rotation(true, pictures, lines):
+    start = replace(true, rotation=np.repeat(true.rotation[:1], FRAMES, axis=0))
+    found, uncertainty = follow_given_lens(
+        start,
+        lambda: iter(pictures),
+        pitch=clip.PITCH if lines else None,
+        settings=SETTINGS,
+    )
+    np.testing.assert_array_equal(found.focal, true.focal)
+    np.testing.assert_allclose(found.rotation[0], true.rotation[0], atol=1e-12)
+    # 15 steps of hundredths of a pixel; with lines no steps add up.
+    assert np.percentile(place_errors(found, true), 95.0) < (0.3 if lines else 1.5)
+    spread = np.sqrt(np.trace(uncertainty.frame[:, :3, :3], axis1=1, axis2=2))
+    assert spread[1] > 0.0 and np.isfinite(spread).all()
+
+
+def test_a_lens_of_other_frames_is_refused(true, pictures):
+    with pytest.raises(InputError, match="16 frames"):
+        follow_given_lens(true, lambda: iter(pictures[:9]), settings=SETTINGS)

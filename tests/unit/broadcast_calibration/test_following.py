@@ -1,0 +1,113 @@
+"""Followed points, what they say of the camera, and which are no part of the picture."""
+
+import numpy as np
+import pytest
+import turning_clip as clip
+
+from worldpose.broadcast_calibration.chain import chain
+from worldpose.broadcast_calibration.cuts import find_cuts
+from worldpose.broadcast_calibration.optical_flow import Followed, follow
+from worldpose.broadcast_calibration.turning import modified_z_scores, turn
+
+SHIFT = np.array([3.0, -2.0])
+
+
+def textured(rng):
+    """A picture with structure at the size of a tracking window."""
+    coarse = rng.uniform(0.0, 255.0, (40, 60))
+    return np.kron(coarse, np.ones((8, 8))).astype(np.uint8)
+
+
+def test_a_shifted_picture_is_followed_by_its_shift():
+    picture = textured(np.random.default_rng(1))
+    moved = np.roll(picture, (int(SHIFT[1]), int(SHIFT[0])), axis=(0, 1))
+    (pair,) = follow([picture, moved], None, 200)
+    assert len(pair.start) > 60
+    # Whole pixels: what is left is the tracker's tolerance.
+    assert np.abs(pair.end - pair.start - SHIFT).max() < 0.05
+    assert pair.together > 0.9
+
+
+def test_people_are_not_followed():
+    picture = textured(np.random.default_rng(2))
+    box = np.array([[[100.0, 60.0, 240.0, 200.0]]])
+    (pair,) = follow([picture, picture], np.repeat(box, 2, axis=0), 400)
+    x, y = pair.start.T
+    assert len(x) > 50
+    assert not ((x > 100) & (x < 240) & (y > 60) & (y < 200)).any()
+
+
+def test_a_grey_picture_has_nothing_to_follow_and_is_no_cut():
+    grey = np.full((100, 160), 90, dtype=np.uint8)
+    pairs = follow([grey, grey], None, 100)
+    assert len(pairs[0].start) == 0
+    assert find_cuts(pairs, 0.25) == []
+
+
+def test_another_picture_is_a_cut():
+    rng = np.random.default_rng(3)
+    one, two = textured(rng), textured(rng)
+    assert find_cuts(follow([one, one, two, two], None, 200), 0.25) == [2]
+
+
+def test_modified_z_scores_are_those_of_the_definition():
+    residual = np.zeros((5, 2))
+    residual[:, 0] = [-2.0, -1.0, 0.0, 1.0, 10.0]
+    # The median is 0 and that of the distances 1, so 10 scores 0.6745 times 10.
+    assert modified_z_scores(residual)[4] == pytest.approx(6.745)
+
+
+def pairs_of(camera, rng, noise=0.05, each=80):
+    flow = clip.followed_points(camera, rng, each=each, noise=noise)
+    return [
+        Followed(flow.start[flow.frame == t], flow.end[flow.frame == t], 1.0)
+        for t in range(len(camera) - 1)
+    ]
+
+
+def test_a_turn_and_a_zoom_are_found_among_movers():
+    rng = np.random.default_rng(4)
+    true = clip.moving(2, pan=(0.0, 0.6), zoom=(2000.0, 2020.0))
+    (pair,) = pairs_of(true, rng)
+    # A third of the points move on their own.
+    end = pair.end.copy()
+    end[:25] += rng.uniform(-15.0, 15.0, (25, 2))
+    found = turn(true.frames(slice(0, 1)), Followed(pair.start, end, 1.0))
+    assert found.determined
+    pixels = np.array([[100.0, 100.0], [800.0, 450.0]])
+    one, two = (each.camera[1].unproject(pixels).directions for each in (found.camera, true))
+    # 55 points of 0.05 px: a hundredth of a pixel, of 2000 px.
+    assert np.abs(one - two).max() < 2e-5
+    assert (modified_z_scores(found.residual)[:25] > 3.5).mean() > 0.9
+
+
+def test_too_few_points_leave_the_camera_where_it_was():
+    camera = clip.moving(1)
+    found = turn(camera, Followed(np.zeros((3, 2)), np.zeros((3, 2)), np.nan))
+    assert not found.determined
+    np.testing.assert_array_equal(found.camera.rotation[1], camera.rotation[0])
+
+
+def test_a_chain_meets_its_key_frames_and_says_what_it_missed():
+    rng = np.random.default_rng(5)
+    true = clip.moving(30)
+    keys = true.frames(np.array([3, 24]))
+    links = chain([3, 24], keys, pairs_of(true, rng), 3.5)
+    for index, frame in enumerate((3, 24)):
+        np.testing.assert_allclose(links.camera.rotation[frame], keys.rotation[index], atol=1e-12)
+    assert links.determined.all()
+    # 21 steps of about a hundredth of a pixel.
+    assert 0.0 < links.drift[0] < 0.3
+
+
+def test_drift_is_spread_evenly_between_key_frames():
+    rng = np.random.default_rng(6)
+    true = clip.moving(21)
+    step = np.zeros((2, 7))
+    step[1, 1] = 1e-3
+    wrong = true.frames(np.array([0, 20])).stepped(step, np.zeros(5))
+    links = chain([0, 20], wrong, pairs_of(true, rng, noise=1e-3), 3.5)
+    turned = links.camera.rotation[10] @ true.rotation[10].T
+    # Half of a milliradian about y in the middle; 2 px of 2,000 at the end.
+    assert turned[0, 2] == pytest.approx(5e-4, rel=0.05)
+    assert links.drift[0] == pytest.approx(2.0, rel=0.2)

@@ -1,0 +1,57 @@
+"""What all cameras share of a survey's errors, and how sure it leaves them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from worldpose.bundle_adjustment.survey import survey_response, with_shared_errors
+from worldpose.pitch import PitchTemplate
+
+SURVEY_ERROR = 0.006
+
+
+@pytest.fixture
+def lined(clip):
+    """A clip of four cameras above the centre circle, the first three calibrated on its lines."""
+    made, *_ = clip(cameras=4)
+    on_lines = np.array([True, True, True, False])
+    return replace(made, pitch=PitchTemplate.standard(), on_lines=on_lines)
+
+
+def test_cameras_that_do_not_rest_on_lines_share_nothing(lined):
+    response = survey_response(lined, SURVEY_ERROR)
+    assert response[:3].any(axis=(1, 2)).all()
+    assert not response[3].any()
+    assert survey_response(replace(lined, pitch=None), SURVEY_ERROR).size == 0
+    assert survey_response(replace(lined, on_lines=None), SURVEY_ERROR).size == 0
+
+
+def test_what_cameras_share_is_never_more_than_they_state(lined):
+    response = survey_response(lined, SURVEY_ERROR)
+    for known, moved in zip(lined.covariance[:3], response[:3], strict=True):
+        free = np.diag(known) > 0.0
+        size = np.sqrt(np.diag(known)[free])
+        left = (known - moved @ moved.T)[np.ix_(free, free)] / np.outer(size, size)
+        # Rounding of numbers of size one.
+        assert np.linalg.eigvalsh(left).min() > -1e-9
+
+
+def test_lines_that_are_off_together_move_the_camera_with_them():
+    # One parameter that two cameras measure with unit variance: half of it is theirs alone, half
+    # shared. The mean of both errs by a quarter for the one and a half for the other.
+    information = np.ones((2, 1, 1))
+    pull_apart = 1e6  # what people tell: both are the same
+    matrix = np.diag([1.0, 1.0]) + pull_apart * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    response = np.full((2, 1, 1), np.sqrt(0.5))
+    found = with_shared_errors(np.linalg.inv(matrix), information, response)
+    # Of the mean of independent ones it would be a half; people's millionth is left.
+    np.testing.assert_allclose(found[:, 0, 0], 0.75, rtol=1e-5)
+
+
+def test_cameras_that_share_nothing_stay_as_sure(lined):
+    rng = np.random.default_rng(1)
+    root = rng.standard_normal((24, 24))
+    found = with_shared_errors(root @ root.T, np.tile(np.eye(12), (2, 1, 1)), np.zeros((2, 12, 0)))
+    blocks = (root @ root.T).reshape(2, 12, 2, 12)
+    np.testing.assert_allclose(found, blocks[[0, 1], :, [0, 1]])

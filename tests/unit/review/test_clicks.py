@@ -1,0 +1,293 @@
+"""Corrections lie over what was clicked; what no longer applies is said, and nothing is lost."""
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given as given_that
+from hypothesis import strategies as st
+
+from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
+from data_contracts.cameras import CameraCalibration
+from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from data_contracts.pitch import PitchSpec
+from data_contracts.review import (
+    Correction,
+    DeletedDetection,
+    MovedPoint,
+    RedrawnMarking,
+)
+from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
+from worldpose.ingest import MatchFolder
+from worldpose.review import (
+    append,
+    read_journal,
+    replay_corrections,
+    standing_corrections,
+    with_was,
+)
+from worldpose.store import Store
+from worldpose.store.blobs import Entry
+
+CORNER, MARK, LINE = "corner_left_near", "penalty_mark_left", "touch_line_near"
+
+
+def clicks(*points, drawn=()):
+    return ClickedMarkings(
+        points=tuple(ClickedPoint(name=name, xy=xy) for name, xy in points),
+        drawn=tuple(DrawnMarking(name=name, xy=xy) for name, xy in drawn),
+    )
+
+
+@pytest.fixture(scope="module")
+def folder():
+    cameras = [CameraSpec(id=name, width=100, height=50) for name in ("a", "b")]
+    cameras.append(CameraSpec(id="tv", kind="broadcast", width=200, height=100))
+    return MatchFolder(
+        folder=Path("m"),
+        spec=MatchSpec(
+            match_id="m",
+            fps=25,
+            cameras=tuple(cameras),
+            clips=(ClipSpec(id="clip", frame_count=9, broadcast="tv"),),
+        ),
+        calibrations={},
+        detections={},
+        pitch=PitchSpec(),
+        videos={},
+        clicked={
+            "a": clicks((CORNER, (1.0, 2.0)), (MARK, (3.0, 4.0)), drawn=[(LINE, ((5.0, 6.0),))]),
+            "b": clicks((CORNER, (7.0, 8.0))),
+        },
+        stills={},
+        key_frames={
+            "clip": KeyFrames(
+                key_frames=(KeyFrame(frame=3, markings=clicks((CORNER, (150.0, 60.0)))),)
+            )
+        },
+    )
+
+
+def made(*edits):
+    return [
+        Correction(
+            id=f"c{number}",
+            match_id="m",
+            edit=edit,
+            who="Ada",
+            made_at=datetime(2026, 1, 2, tzinfo=UTC),
+            based_on={},
+        )
+        for number, edit in enumerate(edits)
+    ]
+
+
+def moved(xy, was, camera="a", marking=CORNER, frame=None):
+    return MovedPoint(camera=camera, marking=marking, frame=frame, was=was, xy=xy)
+
+
+def points(clicked):
+    return {point.name: point.xy for point in clicked.points}
+
+
+def test_without_corrections_the_folder_is_the_very_same(folder):
+    replay = replay_corrections(folder, [])
+    assert replay.folder is folder
+    assert (replay.applied, replay.stale) == ((), ())
+
+
+def test_a_moved_point_moves_in_its_camera_alone(folder):
+    corrections = made(moved((9.0, 9.0), (1.0, 2.0)))
+    replay = replay_corrections(folder, corrections)
+    assert points(replay.folder.clicked["a"]) == {CORNER: (9.0, 9.0), MARK: (3.0, 4.0)}
+    assert replay.folder.clicked["b"] == folder.clicked["b"]
+    assert replay.folder.clicked["a"].drawn == folder.clicked["a"].drawn
+    assert list(replay.folder.clicked) == ["a", "b"]
+    assert replay.folder.key_frames == folder.key_frames
+    assert replay.applied == tuple(corrections)
+    assert points(folder.clicked["a"])[CORNER] == (1.0, 2.0), "the folder itself was changed"
+
+
+def test_a_point_is_removed_and_added(folder):
+    replay = replay_corrections(
+        folder,
+        made(moved(None, (1.0, 2.0)), moved((4.0, 4.0), None, marking="corner_left_far")),
+    )
+    assert points(replay.folder.clicked["a"]) == {MARK: (3.0, 4.0), "corner_left_far": (4.0, 4.0)}
+
+
+def test_a_marking_is_drawn_anew_removed_and_added(folder):
+    new = ((1.0, 1.0), (2.0, 2.0))
+    again = RedrawnMarking(camera="a", marking=LINE, was=((5.0, 6.0),), xy=new)
+    added = RedrawnMarking(camera="b", marking=LINE, was=(), xy=new)
+    removed = RedrawnMarking(camera="a", marking=LINE, was=new, xy=())
+    drawn = replay_corrections(folder, made(again, added)).folder.clicked
+    assert [marking.xy for marking in drawn["a"].drawn] == [new]
+    assert [marking.xy for marking in drawn["b"].drawn] == [new]
+    assert replay_corrections(folder, made(again, removed)).folder.clicked["a"].drawn == ()
+
+
+def test_corrections_build_on_each_other(folder):
+    replay = replay_corrections(
+        folder, made(moved((9.0, 9.0), (1.0, 2.0)), moved((8.0, 8.0), (9.0, 9.0)))
+    )
+    assert points(replay.folder.clicked["a"])[CORNER] == (8.0, 8.0)
+    assert replay.stale == ()
+
+
+def test_a_point_clicked_anew_in_the_folder_is_not_moved_back(folder):
+    """And what was built on that correction does not apply either."""
+    corrections = made(moved((9.0, 9.0), (1.0, 2.0)), moved((8.0, 8.0), (9.0, 9.0)))
+    clicked = {**folder.clicked, "a": clicks((CORNER, (2.0, 2.0)))}
+    replay = replay_corrections(replace(folder, clicked=clicked), corrections)
+    assert points(replay.folder.clicked["a"]) == {CORNER: (2.0, 2.0)}
+    assert [correction.id for correction, _ in replay.stale] == ["c0", "c1"]
+    assert "was (1.0, 2.0) when it was corrected, and is (2.0, 2.0) now" in replay.stale[0][1]
+
+
+@pytest.mark.parametrize(
+    ("edit", "reason"),
+    [
+        (moved((9.0, 9.0), (1.0, 2.0), camera="z"), "no picture z"),
+        (moved((9.0, 9.0), (1.0, 2.0), camera="tv"), "no picture tv"),
+        (moved((9.0, 9.0), (1.0, 2.0), frame=3), "no picture a frame 3"),
+        (moved((9.0, 9.0), None, camera="clip"), "no picture clip"),
+        (moved((9.0, 9.0), None, marking="corner"), "no point corner"),
+        (moved((9.0, 9.0), None, marking=LINE), f"no point {LINE}"),
+        (RedrawnMarking(camera="a", marking=CORNER, xy=((1.0, 1.0),)), f"no marking {CORNER}"),
+        (moved((99.6, 9.0), (1.0, 2.0)), "outside of the picture a"),
+        (moved((9.0, -0.6), (1.0, 2.0)), "outside of the picture a"),
+        (moved(None, None, marking="corner_left_far"), None),
+        (moved((9.0, 9.0), (3.0, 4.0)), "was (3.0, 4.0) when"),
+        (moved((9.0, 9.0), (1.0, 2.0), marking="corner_left_far"), "is not there now"),
+        (moved((9.0, 9.0), None), "was not there when"),
+        (DeletedDetection(camera="a", frame=0, detection=0), "nothing takes in"),
+    ],
+)
+def test_what_does_not_apply_says_why_and_changes_nothing(folder, edit, reason):
+    replay = replay_corrections(folder, made(edit))
+    if reason is None:
+        assert replay.stale == ()
+        return
+    ((correction, said),) = replay.stale
+    assert correction.edit == edit
+    assert reason in said
+    assert replay.folder is folder
+
+
+def test_clicks_of_a_given_camera_decide_nothing(folder):
+    given = CameraCalibration(
+        id="a",
+        image_size=(100, 50),
+        focal_px=(100.0, 100.0),
+        principal_point_px=(50.0, 25.0),
+        rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        translation=(0.0, 0.0, 1.0),
+    )
+    replay = replay_corrections(
+        replace(folder, calibrations={"a": given}), made(moved((9.0, 9.0), (1.0, 2.0)))
+    )
+    assert "is given" in replay.stale[0][1]
+
+
+def test_without_a_pitch_there_is_nothing_to_click(folder):
+    bare = replace(folder, pitch=None)
+    assert "no pitch" in replay_corrections(bare, made(moved((9.0, 9.0), None))).stale[0][1]
+
+
+def test_key_frames_of_a_clip_are_corrected_picked_and_dropped(folder):
+    at_3 = moved((190.0, 90.0), (150.0, 60.0), camera="clip", frame=3)
+    at_1 = moved((10.0, 9.0), None, camera="clip", frame=1)
+    picked = replay_corrections(folder, made(at_3, at_1)).folder.key_frames["clip"].key_frames
+    assert [each.frame for each in picked] == [1, 3]
+    assert points(picked[1].markings) == {CORNER: (190.0, 90.0)}
+    gone = moved(None, (150.0, 60.0), camera="clip", frame=3)
+    assert replay_corrections(folder, made(gone)).folder.key_frames == {}
+
+
+def test_what_a_person_does_not_say_is_taken_from_what_they_see(folder):
+    edit = MovedPoint(camera="a", marking=CORNER, xy=(9.0, 9.0))
+    assert with_was(folder, edit).was == (1.0, 2.0)
+    drawn = RedrawnMarking(camera="a", marking=LINE, xy=())
+    assert with_was(folder, drawn).was == ((5.0, 6.0),)
+    # What is said stays: two people may look at different states.
+    assert with_was(folder, moved((9.0, 9.0), None)).was is None
+
+
+places = st.tuples(st.integers(0, 99), st.integers(0, 49)).map(lambda xy: tuple(map(float, xy)))
+
+
+@given_that(st.lists(st.tuples(st.sampled_from(["a", "b"]), st.none() | places), max_size=12))
+def test_edits_of_one_who_sees_the_present_all_apply(folder, moves):
+    """Against a plain model: the last move of a point is where it is."""
+    state, corrections = folder, []
+    model = {name: points(folder.clicked[name]) for name in "ab"}
+    for camera, xy in moves:
+        edit = with_was(state, MovedPoint(camera=camera, marking=CORNER, xy=xy))
+        corrections += made(edit)
+        state = replay_corrections(folder, corrections).folder
+        model[camera].pop(CORNER, None)
+        if xy is not None:
+            model[camera][CORNER] = xy
+    assert replay_corrections(folder, corrections).stale == ()
+    assert {name: points(state.clicked[name]) for name in "ab"} == model
+
+
+class MemoryBlobs:
+    """What the journal asks of a medium, in memory."""
+
+    url = "memory"
+
+    def __init__(self):
+        self.files = {}
+
+    def entries(self, prefix):
+        paths = sorted(path for path in self.files if path.startswith(f"{prefix}/"))
+        return [Entry(path, len(self.files[path]), datetime.now(UTC)) for path in paths]
+
+    def read(self, path):
+        return self.files.get(path)
+
+    def put_new(self, path, data):
+        return self.files.setdefault(path, data) is data
+
+
+def interleave(folder, rng):
+    """Two editors of one point, in any order of looking and saving; what each was told."""
+    store = Store(MemoryBlobs())
+    seen, wanted = {}, {}
+    acknowledged, count = [], 0
+    for editor in rng.integers(0, 2, 10).tolist():
+        if editor not in seen:
+            journal = read_journal(store, "m")
+            state = replay_corrections(folder, standing_corrections(journal.records)).folder
+            seen[editor] = journal
+            wanted[editor] = MovedPoint(
+                camera="a",
+                marking=CORNER,
+                was=points(state.clicked["a"])[CORNER],
+                xy=(float(count), 1.0),
+            )
+            count += 1
+        else:
+            correction = made(wanted[editor])[0].model_copy(update={"id": f"c{count}"})
+            count += 1
+            if append(store, seen.pop(editor), [correction]) is not None:
+                acknowledged.append(correction)
+    kept = standing_corrections(read_journal(store, "m").records)
+    replay = replay_corrections(folder, kept)
+    assert list(kept) == acknowledged, "an acknowledged edit is lost or doubled"
+    assert replay.stale == (), "somebody's edit was written over unseen"
+    last = acknowledged[-1].edit.xy if acknowledged else (1.0, 2.0)
+    assert points(replay.folder.clicked["a"])[CORNER] == last
+    return len(acknowledged), count
+
+
+@pytest.mark.parametrize("orders", [200, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_two_editors_at_once_lose_and_overwrite_nothing(folder, orders):
+    rng = np.random.default_rng(5)
+    saved = np.array([interleave(folder, rng) for _ in range(orders)])
+    # Both outcomes have to come about for the test to say anything.
+    assert saved[:, 0].min() < saved[:, 0].max() <= 5

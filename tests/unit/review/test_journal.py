@@ -1,0 +1,254 @@
+"""What was said is kept whole, in order, whatever is killed, cut short or raced."""
+
+import threading
+import uuid
+from datetime import UTC, datetime
+
+import pytest
+
+from data_contracts.review import Correction, MovedPoint, ReviewDecision, ReviewRequest, Withdrawal
+from worldpose.errors import CorruptionError, InputError, StoreError
+from worldpose.review import (
+    append,
+    decision_on,
+    read_journal,
+    requests_by_id,
+    say,
+    standing_corrections,
+)
+from worldpose.store import Store, verify
+
+NOW = datetime(2026, 1, 2, tzinfo=UTC)
+
+
+def correction(name, x=1.0):
+    return Correction(
+        id=name,
+        match_id="m",
+        edit=MovedPoint(camera="cam00", marking="corner_left_near", was=(0.0, 0.0), xy=(x, 2.0)),
+        who="Ada",
+        made_at=NOW,
+        based_on={},
+    )
+
+
+def request(name, content):
+    return ReviewRequest(
+        id=name,
+        match_id="m",
+        run_id="0001",
+        gate="tracking",
+        keys={"tracking/clip": "0" * 32},
+        contents={"tracking/clip": content},
+        reasons=("undecided is 1, at most 0 passes",),
+        figures={"undecided": 1.0},
+        created_at=NOW,
+    )
+
+
+def decision(name, verdict):
+    return ReviewDecision(match_id="m", request=name, verdict=verdict, who="Ada", decided_at=NOW)
+
+
+@pytest.fixture
+def store(tmp_path):
+    return Store.create(tmp_path / "project")
+
+
+def files(store):
+    return [store.blobs.root / entry.path for entry in store.blobs.entries("reviews/m")]
+
+
+def said(journal):
+    return [record.id for record in journal.records]
+
+
+def test_an_empty_journal_says_nothing(store):
+    journal = read_journal(store, "m")
+    assert (journal.entries, journal.last, journal.damage) == ((), 0, ())
+    assert list(journal.records) == []
+
+
+def test_what_was_said_at_once_is_read_back_in_order(store):
+    for names in (["a"], ["b", "c"], ["d"]):
+        say(store, "m", lambda _, names=names: [correction(name) for name in names])
+    journal = read_journal(store, "m")
+    assert said(journal) == ["a", "b", "c", "d"]
+    assert [entry.number for entry in journal.entries] == [1, 2, 3]
+    assert journal.entries[0].previous is None
+    assert len({entry.previous for entry in journal.entries}) == 3
+    assert verify(store) == ()
+
+
+def test_nothing_to_say_writes_nothing(store):
+    say(store, "m", lambda _: [])
+    assert files(store) == []
+
+
+def test_a_last_entry_cut_short_at_any_byte_is_told_and_ignored(store):
+    say(store, "m", lambda _: [correction("a")])
+    say(store, "m", lambda _: [correction("b"), correction("c")])
+    last = files(store)[-1]
+    whole = last.read_bytes()
+    for size in range(len(whole)):
+        last.write_bytes(whole[:size])
+        journal = read_journal(store, "m")
+        assert said(journal) == ["a"], size
+        (told,) = journal.damage
+        assert str(last) in told
+        assert "must be said again" in told
+    last.write_bytes(whole)
+    assert said(read_journal(store, "m")) == ["a", "b", "c"]
+
+
+def test_a_last_entry_changed_in_any_byte_is_never_half_believed(store):
+    say(store, "m", lambda _: [correction("a")])
+    say(store, "m", lambda _: [correction("b")])
+    last = files(store)[-1]
+    whole = last.read_bytes()
+    for place in range(len(whole)):
+        changed = bytearray(whole)
+        changed[place] ^= 1
+        last.write_bytes(changed)
+        journal = read_journal(store, "m")
+        assert said(journal) == ["a"], place
+        assert len(journal.damage) == 1
+
+
+def test_the_journal_goes_on_after_an_entry_cut_short(store):
+    say(store, "m", lambda _: [correction("a")])
+    say(store, "m", lambda _: [correction("b")])
+    last = files(store)[-1]
+    last.write_bytes(last.read_bytes()[:-10])
+    say(store, "m", lambda _: [correction("c")])
+    journal = read_journal(store, "m")
+    assert said(journal) == ["a", "c"]
+    assert [entry.number for entry in journal.entries] == [1, 3]
+    assert len(journal.damage) == 1
+
+
+@pytest.mark.parametrize("harm", ["cut", "gone"])
+def test_an_entry_that_later_ones_build_on_is_missed(store, harm):
+    for name in "abc":
+        say(store, "m", lambda _, name=name: [correction(name)])
+    second = files(store)[1]
+    if harm == "cut":
+        second.write_bytes(second.read_bytes()[:-10])
+    else:
+        second.unlink()
+    with pytest.raises(CorruptionError, match="000003"):
+        read_journal(store, "m")
+
+
+def test_an_entry_of_another_place_is_refused(store):
+    say(store, "m", lambda _: [correction("a")])
+    first = files(store)[0]
+    first.rename(first.with_name("000002.json"))
+    with pytest.raises(CorruptionError, match="is entry 1"):
+        read_journal(store, "m")
+
+
+def test_a_writer_that_was_overtaken_writes_nothing(store):
+    stale = read_journal(store, "m")
+    assert append(store, stale, [correction("a")]) is not None
+    assert append(store, stale, [correction("b")]) is None
+    assert said(read_journal(store, "m")) == ["a"]
+
+
+def test_many_writers_at_once_lose_and_double_nothing(store):
+    """Each says its ten things one by one, deciding anew when another was quicker."""
+    writers = [
+        threading.Thread(
+            target=lambda writer: [
+                say(store, "m", lambda _, n=n: [correction(f"{writer}.{n}")]) for n in range(10)
+            ],
+            args=(writer,),
+        )
+        for writer in range(4)
+    ]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    found = said(read_journal(store, "m"))
+    assert sorted(found) == sorted(f"{writer}.{n}" for writer in range(4) for n in range(10))
+    for writer in range(4):
+        own = [name for name in found if name.startswith(f"{writer}.")]
+        assert own == [f"{writer}.{n}" for n in range(10)]
+
+
+def test_a_refusal_while_deciding_writes_nothing(store):
+    def refuse(_):
+        raise InputError("x", expected="a", found="b", todo="c")
+
+    with pytest.raises(InputError):
+        say(store, "m", refuse)
+    assert files(store) == []
+
+
+def test_a_full_disk_is_told_and_leaves_the_journal_as_it_was(store, monkeypatch):
+    say(store, "m", lambda _: [correction("a")])
+
+    def fail(_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("worldpose.store.folder.os.fsync", fail)
+        with pytest.raises(StoreError, match="No space left"):
+            say(store, "m", lambda _: [correction("b")])
+    assert said(read_journal(store, "m")) == ["a"]
+
+
+def test_an_entry_is_on_the_disk_before_it_is_acknowledged(store, monkeypatch):
+    """Its bytes and its name: the file is synced, then linked, then its folder is synced."""
+    import os
+
+    steps = []
+    sync, link = os.fsync, os.link
+    monkeypatch.setattr(
+        "worldpose.store.folder.os.fsync", lambda f: (steps.append("sync"), sync(f))
+    )
+    monkeypatch.setattr(
+        "worldpose.store.folder.os.link", lambda a, b: (steps.append("link"), link(a, b))
+    )
+    say(store, "m", lambda _: [correction("a")])
+    assert "sync" in steps[: steps.index("link")]
+    assert steps[-1] == "sync"
+
+
+def test_the_journal_is_the_same_in_object_storage(bucket):
+    store = Store.create(f"{bucket}/{uuid.uuid4().hex}")
+    say(store, "m", lambda _: [correction("a")])
+    stale = read_journal(store, "m")
+    say(store, "m", lambda _: [correction("b"), correction("c")])
+    assert append(store, stale, [correction("d")]) is None
+    assert said(read_journal(store, "m")) == ["a", "b", "c"]
+    last = store.blobs.entries("reviews/m")[-1].path
+    store.blobs.put(last, store.blobs.read(last)[:-10])
+    journal = read_journal(store, "m")
+    assert said(journal) == ["a"]
+    assert last in journal.damage[0]
+    assert [finding.path for finding in verify(store)] == [last]
+
+
+def test_the_last_verdict_on_the_same_bytes_counts(store):
+    one, other = "1" * 64, "2" * 64
+    say(store, "m", lambda _: [request("q1", one)])
+    say(store, "m", lambda _: [decision("q1", "reject")])
+    records = tuple(read_journal(store, "m").records)
+    assert decision_on(records, "tracking/clip", one).verdict == "reject"
+    assert decision_on(records, "tracking/clip", other) is None
+    assert decision_on(records, "tracking/other", one) is None
+    # The same bytes under another key are another question, and the later verdict is the one.
+    say(store, "m", lambda _: [request("q2", one), decision("q2", "approve")])
+    records = tuple(read_journal(store, "m").records)
+    assert decision_on(records, "tracking/clip", one).verdict == "approve"
+    assert list(requests_by_id(records)) == ["q1", "q2"]
+
+
+def test_a_correction_that_was_taken_back_stands_no_more(store):
+    say(store, "m", lambda _: [correction("a"), correction("b")])
+    back = Withdrawal(match_id="m", correction="a", who="Ada", withdrawn_at=NOW)
+    say(store, "m", lambda _: [back])
+    standing = standing_corrections(read_journal(store, "m").records)
+    assert [each.id for each in standing] == ["b"]

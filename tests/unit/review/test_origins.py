@@ -1,0 +1,68 @@
+"""Every value says where it comes from."""
+
+from datetime import UTC, datetime
+
+import numpy as np
+
+from data_contracts.review import Correction, MovedPoint
+from worldpose.review import ORIGINS, joint_origins, unit_origins
+
+MADE_FROM = {
+    "static_calibration/a": (),
+    "static_calibration/b": (),
+    "tracking/one": ("static_calibration/a", "static_calibration/b"),
+    "tracking/two": ("static_calibration/a", "static_calibration/b"),
+    "body_fitting/one": ("tracking/one",),
+    "body_fitting/two": ("tracking/two",),
+}
+
+
+def moved(camera, frame=None):
+    return Correction(
+        id=f"{camera}.{frame}",
+        match_id="m",
+        edit=MovedPoint(camera=camera, marking="corner_left_near", frame=frame, xy=(1.0, 1.0)),
+        who="Ada",
+        made_at=datetime(2026, 1, 2, tzinfo=UTC),
+        based_on={},
+    )
+
+
+def test_a_correction_marks_what_it_corrects_alone():
+    origins = unit_origins(MADE_FROM, [moved("a")], ())
+    assert origins == dict.fromkeys(MADE_FROM, "automatic") | {"static_calibration/a": "corrected"}
+
+
+def test_a_key_frame_s_correction_marks_the_clip_s_moving_camera():
+    origins = unit_origins({"broadcast_calibration/one": ()}, [moved("one", 3)], ())
+    assert origins == {"broadcast_calibration/one": "corrected"}
+
+
+def test_a_refusal_reaches_all_that_is_made_from_it():
+    origins = unit_origins(MADE_FROM, [], ["tracking/one"])
+    refused = {unit for unit, origin in origins.items() if origin == "rejected"}
+    assert refused == {"tracking/one", "body_fitting/one"}
+    everything = unit_origins(MADE_FROM, [moved("a")], ["static_calibration/a"])
+    assert {u for u, o in everything.items() if o == "automatic"} == {"static_calibration/b"}
+
+
+def test_joints_are_automatic_filled_or_missing():
+    joints = np.zeros((2, 1, 3, 3))
+    joints[0, 0, 2, 1] = np.nan
+    filled = np.array([[[False, True, False]], [[False, False, True]]])
+    codes = joint_origins(joints, filled, "automatic")
+    automatic, fill = ORIGINS.index("automatic"), ORIGINS.index("filled")
+    assert codes[:, 0].tolist() == [[automatic, fill, -1], [automatic, automatic, fill]]
+    assert codes.dtype == np.int8
+
+
+def test_bodies_are_filled_as_a_whole():
+    codes = joint_origins(np.zeros((2, 1, 3, 3)), np.array([[True], [False]]), "corrected")
+    assert codes[:, 0].tolist() == [[2, 2, 2], [1, 1, 1]]
+
+
+def test_a_refused_result_has_refused_joints_only():
+    joints = np.full((1, 1, 2, 3), np.nan)
+    joints[0, 0, 0] = 1.0
+    codes = joint_origins(joints, np.ones((1, 1, 2), dtype=bool), "rejected")
+    assert codes[0, 0].tolist() == [ORIGINS.index("rejected"), -1]

@@ -1,0 +1,51 @@
+"""One place for several clips of a match, where they agree (M1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+Floats = NDArray[np.float64]
+
+_UNLIKELY = 1e-3
+"""Clips whose places differ by more than all but this share of honest ones are not pooled [1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class PooledCenter:
+    """The place of a camera in several clips.
+
+    Attributes:
+        center: (3,) [m], world; NaN where the clips do not agree.
+        covariance: (3, 3) [m^2].
+        agree: whether one place explains all clips.
+        distance: (clips,) how far each is from the common place [standard deviations].
+    """
+
+    center: Floats
+    covariance: Floats
+    agree: bool
+    distance: Floats
+
+
+def pool_centers(centers: Sequence[Floats], covariances: Sequence[Floats]) -> PooledCenter:
+    """Return the place that several clips' centers have in common.
+
+    Args:
+        centers: (3,) each [m], world.
+        covariances: (3, 3) each [m^2].
+    """
+    information = [np.linalg.inv(covariance) for covariance in covariances]
+    whole = np.linalg.inv(np.sum(information, axis=0))
+    middle = whole @ np.sum([i @ c for i, c in zip(information, centers, strict=True)], axis=0)
+    squared = np.array(
+        [(c - middle) @ i @ (c - middle) for c, i in zip(centers, information, strict=True)]
+    )
+    freedom = 3 * (len(centers) - 1)
+    agree = freedom == 0 or bool(squared.sum() < chi2.isf(_UNLIKELY, freedom))
+    nothing = np.full(3, np.nan)
+    return PooledCenter(middle if agree else nothing, np.asarray(whole), agree, np.sqrt(squared))

@@ -1,0 +1,191 @@
+"""Folders of the FIFA skeletal tracking challenge, written and read, in both editions (X3).
+
+The 2026 edition has a file a clip: cameras/<clip>.npz, boxes/<clip>.npy, skel_2d/<clip>.npy,
+skel_3d/<clip>.npy. The 2025 edition has boxes.npz, skel_2d.npz and skel_3d.npz with an array a
+clip, and repeats the camera's pose as Rt. A submission is a zip with one member, submission.npz.
+"""
+
+from __future__ import annotations
+
+import io
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from worldpose.cameras import Camera
+from worldpose.errors import InputError
+from worldpose.release.archives import Member, read_archive, write_archive, wrong
+from worldpose.release.challenge import ChallengeClip
+from worldpose.release.files import whole_file
+
+Floats = NDArray[np.float64]
+Edition = Literal[2025, 2026]
+
+SUBMISSION: Final = "submission.npz"
+"""Member of a submission's zip."""
+KINDS: Final = {"boxes": (4,), "skel_2d": ("points", 2), "skel_3d": ("points", 3)}
+"""Arrays of a clip, and their dimensions after frames and persons."""
+
+
+def write_challenge_camera(path: Path, camera: Camera, edition: Edition) -> None:
+    """Write cameras/<clip>.npz: every frame's K and k, and R and t of the first frame alone.
+
+    Args:
+        path: the file.
+        camera: (frames,).
+        edition: 2025 repeats R and t as Rt.
+
+    Raises:
+        InputError: the first frame has no camera.
+    """
+    pose = camera.cam_from_world[:1]
+    if np.isnan(camera.numbers[0]).any():
+        raise wrong(
+            str(path),
+            "a camera in the clip's first frame, whose pose the layout gives",
+            "none",
+            "Calibrate the first frame, or export another format.",
+        )
+    intrinsics = np.zeros((len(camera.focal), 3, 3))
+    intrinsics[:, (0, 1), (0, 1)] = camera.focal
+    intrinsics[:, :2, 2] = camera.principal_point
+    intrinsics[:, 2, 2] = 1.0
+    arrays = {
+        "K": intrinsics,
+        "k": np.array(camera.distortion),
+        "R": np.array(pose.rotation),
+        "t": np.array(pose.translation),
+    }
+    if edition == 2025:
+        arrays["Rt"] = np.concatenate([pose.rotation, pose.translation[..., None]], axis=-1)
+    write_archive(path, arrays)
+
+
+def write_challenge(
+    folder: Path, clips: Mapping[str, ChallengeClip], edition: Edition
+) -> list[Path]:
+    """Write boxes and skeletons of clips; returns the files."""
+    written = []
+    for kind in KINDS:
+        arrays = {clip: getattr(data, kind).astype(np.float64) for clip, data in clips.items()}
+        if edition == 2025:
+            written.append(folder / f"{kind}.npz")
+            write_archive(written[-1], arrays)
+            continue
+        for clip, array in arrays.items():
+            written.append(folder / kind / f"{clip}.npy")
+            with whole_file(written[-1]) as draft, draft.open("wb") as file:
+                npy.write_array(file, np.ascontiguousarray(array, "<f8"), version=(1, 0))
+    return written
+
+
+def write_submission(path: Path, joints: Mapping[str, Floats]) -> None:
+    """Write a submission: (persons, frames, 15, 3) [m, world] by clip, in single precision."""
+    single = {clip: array.astype(np.float32) for clip, array in joints.items()}
+    with tempfile.TemporaryDirectory() as workshop:
+        inner = Path(workshop) / SUBMISSION
+        write_archive(inner, single)
+        with whole_file(path) as draft, zipfile.ZipFile(draft, "w") as file:
+            file.writestr(zipfile.ZipInfo(SUBMISSION), inner.read_bytes(), zipfile.ZIP_DEFLATED)
+
+
+def write_pitch_points(path: Path, points: Floats) -> None:
+    """Write points (n, 3) [m, world] along the markings, one a line."""
+    with whole_file(path) as draft:
+        np.savetxt(draft, points, fmt="%.4f")
+
+
+def read_challenge(folder: Path) -> dict[str, ChallengeClip]:
+    """The clips of a challenge folder of either edition, by name.
+
+    Raises:
+        InputError: naming file and place: absent, wrong types or shapes, kinds that disagree.
+    """
+    kinds: dict[str, dict[str, Floats]] = {}
+    for kind in KINDS:
+        together = folder / f"{kind}.npz"
+        files = sorted((folder / kind).glob("*.npy"))
+        if together.is_file():
+            dims = ("frames", "persons", *KINDS[kind])
+            kinds[kind] = _by_clip(together, dims)
+        elif files:
+            kinds[kind] = {file.stem: _read_npy(file, kind) for file in files}
+        else:
+            raise wrong(
+                str(folder), f"{kind}/<clip>.npy or {kind}.npz", "neither", "Check the path."
+            )
+    clips = {}
+    for clip, boxes in kinds["boxes"].items():
+        arrays = {"boxes": boxes}
+        for kind in ("skel_2d", "skel_3d"):
+            array = kinds[kind].get(clip)
+            if array is None or array.shape[:2] != boxes.shape[:2]:
+                raise wrong(
+                    f"{folder}: {kind} of {clip}",
+                    f"shape {boxes.shape[:2]} of frames and persons, as the boxes have",
+                    "nothing" if array is None else f"{array.shape[:2]}",
+                )
+            arrays[kind] = array
+        clips[clip] = ChallengeClip(**arrays)
+    return clips
+
+
+def read_submission(path: Path) -> dict[str, Floats]:
+    """The joints (persons, frames, 15, 3) [m, world] of a submission by clip, zipped or bare.
+
+    Raises:
+        InputError: no such file, no submission in it, or arrays of another type or shape.
+    """
+    dims = ("persons", "frames", 15, 3)
+    if not path.is_file():
+        raise wrong(str(path), "a submission", "nothing", "Check the path.")
+    try:
+        with zipfile.ZipFile(path) as file:
+            if SUBMISSION not in file.namelist():
+                return _by_clip(path, dims)
+            with tempfile.TemporaryDirectory() as workshop:
+                return _by_clip(Path(file.extract(SUBMISSION, workshop)), dims)
+    except (zipfile.BadZipFile, OSError, RuntimeError) as error:
+        raise wrong(str(path), f"a zip with {SUBMISSION}", f"{error}") from error
+
+
+def _by_clip(path: Path, dims: tuple[str | int, ...]) -> dict[str, Floats]:
+    """Arrays of an npz file by clip; lengths that are named may differ between clips."""
+    try:
+        with zipfile.ZipFile(path) as file:
+            names = [name.removesuffix(".npy") for name in file.namelist()]
+    except zipfile.BadZipFile as error:
+        raise wrong(str(path), "a whole npz file", f"{error}") from error
+    members = {
+        name: Member(tuple(f"{d} of {name}" if isinstance(d, str) else d for d in dims), "float")
+        for name in names
+    }
+    found: dict[str, Any] = read_archive(path, members)
+    return found
+
+
+def _read_npy(path: Path, kind: str) -> Floats:
+    """A clip's array of one kind, checked."""
+    try:
+        array = npy.read_array(io.BytesIO(path.read_bytes()), allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise wrong(str(path), "an npy array", f"{error}") from error
+    tail = KINDS[kind]
+    fits = array.ndim == 2 + len(tail) and array.dtype.kind == "f"
+    fits = fits and all(
+        isinstance(d, str) or n == d for n, d in zip(array.shape[2:], tail, strict=True)
+    )
+    if not fits:
+        raise InputError(
+            str(path),
+            expected=f"float numbers of shape (frames, persons, {', '.join(map(str, tail))})",
+            found=f"{array.dtype} of shape {array.shape}",
+            todo="Write the file anew.",
+        )
+    return array.astype(np.float64)

@@ -1,0 +1,173 @@
+"""Corrections of clicks, replayed over what the match folder holds (B3, C7)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
+from data_contracts.review import Correction, Edit, MovedPoint, RedrawnMarking
+from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking, Pixel
+from worldpose.ingest import MatchFolder
+from worldpose.pitch import PitchTemplate
+
+Picture = tuple[str, int | None]
+"""A static camera and None, or a clip and a frame of its video."""
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A match folder as people have corrected it; its files are as they were.
+
+    Attributes:
+        folder: with the corrected clicks.
+        applied: the corrections that are in it, in the order they were made.
+        stale: those that no longer apply, each with the reason.
+    """
+
+    folder: MatchFolder
+    applied: tuple[Correction, ...] = ()
+    stale: tuple[tuple[Correction, str], ...] = ()
+
+
+def replay_corrections(folder: MatchFolder, corrections: Iterable[Correction]) -> Replay:
+    """The match folder with corrections applied one after the other; none is ever dropped.
+
+    A correction applies while what it changes is as the person saw it: a point that was clicked
+    anew in the match folder, or moved by somebody in between, is not moved back.
+
+    Args:
+        folder: as it was read.
+        corrections: in the order they were made.
+    """
+    pictures = _pictures(folder)
+    template = None if folder.pitch is None else PitchTemplate.from_spec(folder.pitch)
+    applied, stale = [], []
+    for correction in corrections:
+        edit = correction.edit
+        if not isinstance(edit, MovedPoint | RedrawnMarking):
+            stale.append((correction, f"nothing takes in a {edit.kind} yet"))
+            continue
+        reason = _objection(folder, template, pictures, edit)
+        if reason is None:
+            picture = (edit.camera, edit.frame)
+            pictures[picture] = _edited(pictures.get(picture, ClickedMarkings()), edit)
+            applied.append(correction)
+        else:
+            stale.append((correction, reason))
+    if not applied:
+        return Replay(folder, (), tuple(stale))
+    corrected = replace(folder, clicked=_clicked(folder, pictures), key_frames=_picked(pictures))
+    return Replay(corrected, tuple(applied), tuple(stale))
+
+
+def with_was(folder: MatchFolder, edit: Edit) -> Edit:
+    """The edit with what it changes as it is now, unless it says that itself.
+
+    Args:
+        folder: with the corrections so far.
+        edit: as a person gave it.
+    """
+    if not isinstance(edit, MovedPoint | RedrawnMarking) or "was" in edit.model_fields_set:
+        return edit
+    return edit.model_copy(update={"was": _now(_pictures(folder), edit)})
+
+
+def _pictures(folder: MatchFolder) -> dict[Picture, ClickedMarkings]:
+    pictures: dict[Picture, ClickedMarkings] = {
+        (camera, None): clicked for camera, clicked in folder.clicked.items()
+    }
+    for clip, picked in folder.key_frames.items():
+        pictures |= {(clip, each.frame): each.markings for each in picked.key_frames}
+    return pictures
+
+
+def _objection(
+    folder: MatchFolder,
+    template: PitchTemplate | None,
+    pictures: dict[Picture, ClickedMarkings],
+    edit: MovedPoint | RedrawnMarking,
+) -> str | None:
+    """Why an edit does not apply; None where it does."""
+    place = edit.camera if edit.frame is None else f"{edit.camera} frame {edit.frame}"
+    if template is None:
+        return "the match has no pitch"
+    size = _picture_size(folder, edit)
+    if size is None:
+        return f"there is no picture {place}"
+    if edit.frame is None and edit.camera in folder.calibrations:
+        return f"camera {edit.camera} is given, so that its clicks decide nothing"
+    is_point = isinstance(edit, MovedPoint)
+    if edit.marking not in (template.points if is_point else template.marking_names):
+        return f"the pitch has no {'point' if is_point else 'marking'} {edit.marking}"
+    for pixel in _pixels(edit.xy):
+        if not all(-0.5 <= value <= side - 0.5 for value, side in zip(pixel, size, strict=True)):
+            return f"{list(pixel)} is outside of the picture {place}"
+    now = _now(pictures, edit)
+    if now != edit.was:
+        was, found = (", ".join(map(str, _pixels(it))) or "not there" for it in (edit.was, now))
+        return f"{edit.marking} in {place} was {was} when it was corrected, and is {found} now"
+    return None
+
+
+def _picture_size(folder: MatchFolder, edit: MovedPoint | RedrawnMarking) -> tuple[int, int] | None:
+    """Size of the picture that an edit is in [px], None where the match has no such picture."""
+    spec = folder.spec
+    owners = {camera.id: camera.id for camera in spec.static_cameras if edit.frame is None}
+    if edit.frame is not None:
+        owners = {clip.id: clip.broadcast for clip in spec.clips if clip.broadcast is not None}
+    if edit.camera not in owners:
+        return None
+    camera = spec.camera(owners[edit.camera])
+    return camera.width, camera.height
+
+
+def _pixels(xy: Pixel | tuple[Pixel, ...] | None) -> tuple[Pixel, ...]:
+    """A point's place, or those along a marking, as a list of pixels."""
+    if not xy:
+        return ()
+    return (xy,) if isinstance(xy[0], float | int) else xy
+
+
+def _now(
+    pictures: dict[Picture, ClickedMarkings], edit: MovedPoint | RedrawnMarking
+) -> Pixel | tuple[Pixel, ...] | None:
+    """What an edit changes, as it is."""
+    clicked = pictures.get((edit.camera, edit.frame), ClickedMarkings())
+    if isinstance(edit, MovedPoint):
+        return {point.name: point.xy for point in clicked.points}.get(edit.marking)
+    return {marking.name: marking.xy for marking in clicked.drawn}.get(edit.marking, ())
+
+
+def _edited(clicked: ClickedMarkings, edit: MovedPoint | RedrawnMarking) -> ClickedMarkings:
+    if isinstance(edit, MovedPoint):
+        points = {point.name: point for point in clicked.points}
+        points.pop(edit.marking, None)
+        if edit.xy is not None:
+            points[edit.marking] = ClickedPoint(name=edit.marking, xy=edit.xy)
+        return clicked.model_copy(update={"points": tuple(points.values())})
+    drawn = {marking.name: marking for marking in clicked.drawn}
+    drawn.pop(edit.marking, None)
+    if edit.xy:
+        drawn[edit.marking] = DrawnMarking(name=edit.marking, xy=edit.xy)
+    return clicked.model_copy(update={"drawn": tuple(drawn.values())})
+
+
+def _clicked(
+    folder: MatchFolder, pictures: dict[Picture, ClickedMarkings]
+) -> dict[str, ClickedMarkings]:
+    """Of the static cameras, in their order."""
+    cameras = (camera.id for camera in folder.spec.static_cameras)
+    return {camera: pictures[camera, None] for camera in cameras if (camera, None) in pictures}
+
+
+def _picked(pictures: dict[Picture, ClickedMarkings]) -> dict[str, KeyFrames]:
+    """Of the clips; a frame without a click is no key frame any more."""
+    picked: dict[str, list[KeyFrame]] = {}
+    for (clip, frame), markings in pictures.items():
+        if frame is not None and (markings.points or markings.drawn):
+            picked.setdefault(clip, []).append(KeyFrame(frame=frame, markings=markings))
+    return {
+        clip: KeyFrames(key_frames=tuple(sorted(frames, key=lambda each: each.frame)))
+        for clip, frames in picked.items()
+    }
