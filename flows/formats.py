@@ -174,6 +174,7 @@ def export_challenge(origin: Origin, out: Path, edition: Edition = 2026) -> list
     truths: dict[str, ChallengeTruth] = {}
     fits = {clip: fitted_bodies(origin.run, clip) for clip in origin.clips}
     cameras = {clip: broadcast_camera(origin.run, clip) for clip in origin.clips}
+    pitch = read_match(Path(origin.registration.folder)).pitch
     written = []
     for clip, camera in cameras.items():
         model, poses, _ = fits[clip]
@@ -181,7 +182,6 @@ def export_challenge(origin: Origin, out: Path, edition: Edition = 2026) -> list
         written.append(out / "cameras" / f"{clip}.npz")
         write_challenge_camera(written[-1], camera, edition)
     written += write_challenge(out, {clip: t.clip for clip, t in truths.items()}, edition)
-    pitch = read_match(Path(origin.registration.folder)).pitch
     if pitch is not None:
         written.append(out / "pitch_points.txt")
         samples = PitchTemplate.from_spec(pitch).sample_lines(PITCH_SPACING)

@@ -6,8 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-from data_contracts.review import ReviewRequest
+from data_contracts.review import ReviewDecision, ReviewRequest
 from data_contracts.run import GatePolicy, ResultManifest, WaitingUnit
+from flows.gates import Gate
 from flows.method import GATES
 from flows.stage import Match
 from worldpose.review import Journal, decision_on, requests_by_id, say
@@ -33,11 +34,11 @@ class Gatekeeper:
     def held(self, stage: str, results: Mapping[str, str]) -> tuple[WaitingUnit, ...]:
         """The units of `stage` in `results` that may not be built upon yet.
 
-        A verdict holds for a result's bytes, and goes before its figures: what somebody rejected
-        waits for a correction, however good it looks.
+        A verdict holds for a result's bytes, and goes before figures and policy: what somebody
+        rejected waits for a correction, however good it looks.
         """
         gate = {each.stage: each for each in GATES}.get(stage)
-        if self.policy == "never" or gate is None:
+        if gate is None or (self.policy == "never" and not self._has_refusals()):
             return ()
         waiting = []
         for name, key in results.items():
@@ -46,8 +47,7 @@ class Gatekeeper:
             manifest = self._manifest(name, key)
             decision = decision_on(self.match.journal.records, name, manifest.content)
             if decision is None:
-                asked = (ALWAYS,) if self.policy == "always" else ()
-                reasons = (*asked, *gate.objections(manifest.figures))
+                reasons = self._reasons(gate, manifest)
                 if reasons:
                     request = request_id(name, key)
                     waiting.append(WaitingUnit(unit=name, request=request, reasons=reasons))
@@ -70,6 +70,19 @@ class Gatekeeper:
 
         if requests:
             say(self.store, self.match.match_id, unasked)
+
+    def _reasons(self, gate: Gate, manifest: ResultManifest) -> tuple[str, ...]:
+        """Why a person is asked about a result that nobody has decided on."""
+        if self.policy == "never":
+            return ()
+        asked = (ALWAYS,) if self.policy == "always" else ()
+        return (*asked, *gate.objections(manifest.figures))
+
+    def _has_refusals(self) -> bool:
+        return any(
+            isinstance(record, ReviewDecision) and record.verdict == "reject"
+            for record in self.match.journal.records
+        )
 
     def _request(self, unit: WaitingUnit, key: str, run_id: str) -> ReviewRequest:
         manifest = self._manifest(unit.unit, key)

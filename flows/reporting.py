@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from data_contracts.evaluation import Evaluation
+from flows.broadcast_reporting import broadcast_pictures, broadcast_tables
 from flows.camera_reporting import camera_pictures, camera_summaries, still_of
 from flows.evaluation import load_reference, score
 from flows.people_reporting import adjustment_tables, body_tables
@@ -52,11 +53,12 @@ def write_report(
         seconds=seconds,
         scores=scores,
         pictures=[
-            picture for clip in clips for picture in _pictures(run, match, clip, cameras, truth)
+            *(picture for clip in clips for picture in _pictures(run, match, clip, cameras, truth)),
+            *broadcast_pictures(run, match),
         ],
         cameras=camera_summaries(run, match.folder.spec),
         camera_pictures=camera_pictures(store, run, match, cameras),
-        tables=[*adjustment_tables(run), *body_tables(run, clips)],
+        tables=[*adjustment_tables(run), *body_tables(run, clips), *broadcast_tables(run)],
     )
     with whole_file(out) as draft:
         draft.write_text(page, encoding="utf-8")

@@ -70,6 +70,17 @@ def _reviews(journal: Journal, latest: RunRecord | None) -> list[Review]:
     return found
 
 
+def warnings_of(match: Match) -> list[str]:
+    """What people said that cannot be heeded: damaged entries, corrections that do not apply."""
+    return [
+        *match.journal.damage,
+        *(
+            f"correction {correction.id} no longer applies: {reason}"
+            for correction, reason in match.stale
+        ),
+    ]
+
+
 def still_waiting(match: Match, latest: RunRecord | None) -> list[WaitingUnit]:
     """What the latest run waits for, without what was approved since."""
     records = match.journal.records

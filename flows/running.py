@@ -8,7 +8,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import FrameType
 
 from data_contracts.run import GatePolicy, RunRecord
@@ -38,7 +38,8 @@ class RunRequest:
         dask: address of a running Dask scheduler; None starts workers on this machine.
         workers: number of worker processes on this machine; None = one a core, as far as there
             is work for them.
-        gates: when results wait for a person.
+        gates: when results wait for a person; None = as in the latest run while that waits, else
+            never.
     """
 
     settings: Overrides
@@ -46,7 +47,7 @@ class RunRequest:
     until_stage: str | None = None
     dask: str | None = None
     workers: int | None = None
-    gates: GatePolicy = "never"
+    gates: GatePolicy | None = None
 
 
 def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
@@ -62,17 +63,20 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
     stages = selected_stages(request.from_stage, request.until_stage)
     latest = latest_run(store, match.match_id)
     standing = standing_results(latest, stages)
-    gatekeeper = Gatekeeper(store, match, request.gates)
+    policy: GatePolicy = request.gates or "never"
+    if request.gates is None and latest is not None and latest.state == "waiting":
+        policy = latest.gates
+    gatekeeper = Gatekeeper(store, match, policy)
     outlook = look_ahead(gatekeeper, request.settings, stages, standing)
     if outlook.missing:
-        return _with_prefect(store, match, request, outlook.missing)
+        return _with_prefect(store, match, replace(request, gates=policy), outlook.missing)
     if latest is not None and outlook.is_recorded_by(latest):
         reused = tuple(sorted(outlook.results))
         return latest.model_copy(
             update={
                 "executed": (),
                 "reused": reused,
-                "gates": request.gates,
+                "gates": policy,
                 "waiting": outlook.waiting,
             }
         )

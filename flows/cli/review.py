@@ -327,7 +327,7 @@ def _when(moment: datetime) -> str:
 
 def _say_next(match: str) -> None:
     resumes = f"; a suspended run: worldpose review resume {match}" if has_server() else ""
-    line(f"next: worldpose run {match}, with the same --gates{resumes}")
+    line(f"next: worldpose run {match}{resumes}")
 
 
 def _tell_damage(match: Match) -> None:

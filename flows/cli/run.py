@@ -22,6 +22,7 @@ from flows.cli.console import (
 )
 from flows.method import METHOD
 from flows.registering import find_match
+from flows.review import warnings_of
 from flows.running import RunRequest, run_match
 from flows.settings import parse_overrides, selected_stages
 from worldpose.errors import UsageError
@@ -54,12 +55,13 @@ def run(
         int | None, typer.Option(min=1, help="Worker processes on this machine; one a core.")
     ] = None,
     gates: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="POLICY",
-            help="When results wait for a person: never, auto (figures beyond limits), always.",
+            help="When results wait for a person: never (default), auto (figures beyond limits) "
+            "or always; while the latest run waits, as in that.",
         ),
-    ] = "never",
+    ] = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -73,10 +75,13 @@ def run(
         return
     overrides = parse_overrides(assignments or [], selected_stages(from_stage, until_stage))
     store = Store.open_or_new(project)
-    policy = _policy(gates)
+    policy = None if gates is None else _policy(gates)
     request = RunRequest(overrides, from_stage, until_stage, dask, workers, policy)
     with progress():
-        record = run_match(store, find_match(store, match), request)
+        opened = find_match(store, match)
+        for text in warnings_of(opened):
+            line(f"warning: {text}", to=errors)
+        record = run_match(store, opened, request)
     seconds = time.monotonic() - started
     if as_json:
         print_json(

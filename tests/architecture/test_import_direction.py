@@ -29,6 +29,7 @@ STAGES_IN_WORLDPOSE = (
     "bundle_adjustment",
     "body",
     "body_fitting",
+    "broadcast_calibration",
     "release",
     "evaluation",
     "synthetic",

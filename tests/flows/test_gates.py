@@ -12,7 +12,16 @@ from flows.gates import ACCEPTANCE, ADJUSTMENT, CAMERAS
 from flows.method import GATES, METHOD
 from flows.planning import plan_run
 from flows.registering import open_match
-from flows.review import correct, decide, origins_of, resume, reviews_of, still_waiting, withdraw
+from flows.review import (
+    correct,
+    decide,
+    origins_of,
+    resume,
+    reviews_of,
+    still_waiting,
+    warnings_of,
+    withdraw,
+)
 from flows.run_record import latest_run
 from flows.running import RunRequest, run_match
 from worldpose.errors import InputError
@@ -192,6 +201,10 @@ def test_a_rejected_result_waits_for_its_correction_which_reaches_nothing_else(s
     origins = origins_of(store, match, latest_run(store, TINY))
     assert origins[WRONG] == "rejected"
     assert origins["static_calibration/cam00"] == "automatic"
+    # No policy builds upon what somebody refused.
+    refused = Gatekeeper(store, match, "never")
+    latest = latest_run(store, TINY).results
+    assert units(refused.held("static_calibration", latest)) == [WRONG]
     # Taken back, everything is as it was; the refusal stands until somebody approves.
     withdraw(store, match, match.corrections[0].id, who="Bob", why="it was right")
     again = open_match(store, TINY)
@@ -231,6 +244,7 @@ def test_a_correction_that_no_longer_applies_is_listed(store, tmp_path):
     file.write_text(json.dumps(content))
     match = open_match(store, TINY)
     ((stale, reason),) = match.stale
+    assert warnings_of(match) == [f"correction {stale.id} no longer applies: {reason}"]
     assert (match.corrections, stale.who) == ((), "Ada")
     assert "when it was corrected" in reason
 
@@ -271,6 +285,7 @@ def test_people_are_asked_and_answer_on_the_command_line(tiny, project_copy, tmp
     assert "clicks_wrong is 1" in succeed("review", "show", TINY, wrong, *at).out
     done = succeed("review", "approve", TINY, "--who", "Ada", *at, "--json").json
     assert set(done["reviews"]) == {each["id"] for each in reviews}
-    again = succeed("run", tiny, "--gates", "auto", *at, "--json").json
+    # The latest run waits: the next one goes on with its policy.
+    again = succeed("run", tiny, *at, "--json").json
     assert (again["waiting"], again["executed"], again["gates"]) == (0, 0, "auto")
     assert worldpose("run", tiny, "--gates", "sometimes", *at).code == 2

@@ -164,6 +164,6 @@ def _background(
         # What is far outside has no place in 32 bits, and none in the picture.
         near = (np.abs(pixels) < 1e4).all(axis=-1)
         for start in np.flatnonzero(near[:-1] & near[1:]):
-            ends = np.rint(pixels[start : start + 2] * 2**_SUBPIXEL).astype(int).tolist()
-            cv2.line(canvas, *ends, (255, 255, 255), 3, cv2.LINE_AA, _SUBPIXEL)
+            a, b = np.rint(pixels[start : start + 2] * 2**_SUBPIXEL).astype(int).tolist()
+            cv2.line(canvas, a, b, (255, 255, 255), 3, cv2.LINE_AA, _SUBPIXEL)
     return canvas

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-import numpy as np
-from numpy.typing import NDArray
-
 from data_contracts.records import Record
-from worldpose.release.camera_rows import CameraRows
-from worldpose.release.check_faults import Fault, camera_faults, point_faults
+from worldpose.release.check_faults import Fault
 from worldpose.release.check_plausibility import (
     body_findings,
     camera_findings,
@@ -22,12 +18,10 @@ from worldpose.release.check_reprojection import (
     Agreement,
     agreement,
     agreement_findings,
-    view_share,
 )
 from worldpose.release.check_settings import CheckSettings
+from worldpose.release.check_sight import sight_findings, sight_share
 from worldpose.release.shipped import Finding, PointSource, ShippedClip, View
-
-_Sight = tuple[Fault, CameraRows, NDArray[np.float64]]
 
 
 class ClipFigures(Record):
@@ -69,15 +63,14 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
     ]
     findings += agreement_findings(agreements, settings)
     faults = {one.view: one.fault for one in agreements if one.fault.camera is not None}
-    views = [_mended(view, faults.get(view.name, SOUND)) for view in clip.views]
     shares = []
     for source in clip.sources:
         repaired = _repaired(source, agreements)
         blind = [
             view
-            for view in views
-            if not _compared_view(view, agreements)
-            and view_share(repaired.points, view.rows) < settings.least_seen
+            for view in clip.views
+            if view.name not in {one.view for one in agreements}
+            and sight_share(repaired, repaired.points, view.rows) < settings.least_seen
         ]
         fault, before, after = world_fault(repaired, settings)
         shares.append(plausible_share(repaired, settings))
@@ -85,12 +78,20 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
             findings.append(_world_finding(source, fault, before, after))
             points = fault.points(repaired)
             repaired = repaired if points is None else repaired.moved(points)
-        if repaired.points is source.points and not _compared(source, agreements):
-            findings += ground_findings(repaired, settings)
+        if repaired is source and source.name not in {one.source for one in agreements}:
+            findings += ground_findings(source, settings)
         findings += body_findings(repaired, clip.fps, settings)
-        findings += _sight_findings(repaired, blind, settings)
-    for view in views:
-        findings += camera_findings(view, settings)
+        blind = [
+            view
+            for view in blind
+            if sight_share(repaired, repaired.points, view.rows) < settings.least_seen
+        ]
+        for finding, reason in sight_findings(repaired, blind, settings):
+            findings.append(finding)
+            if reason is not None:
+                faults |= {place.removeprefix("cameras/"): reason for place in finding.where}
+    for view in clip.views:
+        findings += camera_findings(_mended(view, faults.get(view.name, SOUND)), settings)
     seen = [one.median_px for one in agreements]
     worst = max(seen) if seen and max(seen) < float("inf") else None
     figures = ClipFigures(
@@ -121,14 +122,6 @@ def _mended(view: View, fault: Fault) -> View:
     return View(view.name, fault.camera(view.rows), view.pixels, view.skeleton)
 
 
-def _compared(source: PointSource, agreements: Iterable[Agreement]) -> bool:
-    return any(one.source == source.name for one in agreements)
-
-
-def _compared_view(view: View, agreements: Iterable[Agreement]) -> bool:
-    return any(one.view == view.name for one in agreements)
-
-
 def _world_finding(source: PointSource, fault: Fault, before: float, after: float) -> Finding:
     return Finding(
         fault=fault.name,
@@ -137,46 +130,6 @@ def _world_finding(source: PointSource, fault: Fault, before: float, after: floa
         says=f"{fault.says}: so people stand on the pitch",
         figures={"shipped_plausible_share": before, "explained_plausible_share": after},
     )
-
-
-def _sight_findings(
-    source: PointSource, views: Iterable[View], settings: CheckSettings
-) -> Iterator[Finding]:
-    """Cameras that show nobody, and the fault of the camera that would explain it best."""
-    lost: dict[tuple[str, str], list[tuple[str, float, float]]] = {}
-    for view in views:
-        shipped = view_share(source.points, view.rows)
-        if shipped >= settings.least_seen:
-            continue
-        best, most = ("sees_nobody", "the camera shows nobody of the clip"), shipped
-        for fault, rows, points in _sights(source, view):
-            share = view_share(points, rows)
-            if share > max(most + 1e-9, 10.0 * settings.least_seen):
-                best, most = (fault.name, f"{fault.says}: so it shows people"), share
-        lost.setdefault(best, []).append((view.name, shipped, most))
-    for (name, says), group in lost.items():
-        yield Finding(
-            fault=name,
-            kind="damage" if name == "sees_nobody" else "convention",
-            where=tuple(f"cameras/{view}" for view, _, _ in group),
-            says=says,
-            figures={
-                "shipped_share_seen": max(shipped for _, shipped, _ in group),
-                "explained_share_seen": min(share for _, _, share in group),
-            },
-        )
-
-
-def _sights(
-    source: PointSource, view: View
-) -> Iterator[tuple[Fault, CameraRows, NDArray[np.float64]]]:
-    for fault in camera_faults():
-        if fault.camera is not None:
-            yield fault, fault.camera(view.rows), source.points
-    for fault in point_faults():
-        points = None if fault.points is None else fault.points(source)
-        if points is not None:
-            yield fault, view.rows, points
 
 
 def _merged(findings: Iterable[Finding]) -> Iterator[Finding]:

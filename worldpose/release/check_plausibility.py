@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from worldpose.release.camera_rows import CameraRows
 from worldpose.release.check_faults import Fault, point_faults
 from worldpose.release.check_settings import CheckSettings
 from worldpose.release.shipped import Finding, PointSource, View
@@ -28,49 +29,57 @@ def plausible_share(source: PointSource, settings: CheckSettings) -> float:
     """Return which part of all bodies is near the ground, head up, within the bounds.
 
     A body counts from 0.3 to 2.3 m of height from its lowest foot to its nose, so that one who
-    kneels counts and one in other units or axes does not; who lies does not either.
+    kneels counts and one in other units or axes does not; who lies does not either. Where most
+    bodies have left and right exchanged, none counts.
     """
-    feet, nose = _feet(source), source.points[:, :, source.skeleton.index("nose")]
+    feet, nose = _feet(source), _point(source, "nose")
     here = np.isfinite(feet) & np.isfinite(nose).all(-1)
-    if not here.any():
+    if not here.any() or _handedness(source) < 0.0:
         return 0.0
     height, middle = (nose[..., 2] - feet)[here], nose[here]
     good = (height > 0.3) & (height < 2.3) & (np.abs(feet[here]) < 1.5)
-    good &= (np.abs(middle[:, 0]) <= settings.bounds[0]) & (
-        np.abs(middle[:, 1]) <= settings.bounds[1]
-    )
+    good &= (np.abs(middle[:, :2]) <= np.array(settings.bounds)).all(-1)
     return float(good.mean())
 
 
 def world_fault(source: PointSource, settings: CheckSettings) -> tuple[Fault | None, float, float]:
-    """Return what would make people stand on a pitch, and the plausible share before and after."""
+    """Return what would make people stand on a pitch, and the plausible share before and after.
+
+    Among faults that do equally well the one that puts feet nearest to the ground is named, and
+    of these the first.
+    """
     before = plausible_share(source, settings)
     if before >= settings.plausible_share:
         return None, before, before
-    best, most = None, before
+    best, most, nearest = None, before, np.inf
     for fault in point_faults():
         points = None if fault.points is None else fault.points(source)
         if points is None:
             continue
-        share = plausible_share(source.moved(points), settings)
-        if share > most + 1e-9:
-            best, most = fault, share
+        moved = source.moved(points)
+        share = plausible_share(moved, settings)
+        height = abs(foot_height(moved))
+        if share > most + 0.01 or (share >= most - 0.01 and height < nearest - 0.02):
+            best, most, nearest = fault, share, height
     return (best, before, most) if most >= settings.plausible_share else (None, before, before)
+
+
+def foot_height(source: PointSource) -> float:
+    """Return the median height of people's lower foot above z = 0 [m]; NaN without people."""
+    feet = _feet(source)
+    return float(np.median(feet[np.isfinite(feet)])) if np.isfinite(feet).any() else np.nan
 
 
 def ground_findings(source: PointSource, settings: CheckSettings) -> Iterator[Finding]:
     """Feet above or below the pitch, and for poses whether their pivot explains it."""
-    feet = _feet(source)
-    if not np.isfinite(feet).any():
-        return
-    height = float(np.nanmedian(feet))
-    if settings.ground_low <= height <= settings.ground_high:
+    height = foot_height(source)
+    if np.isnan(height) or settings.ground_low <= height <= settings.ground_high:
         return
     says = f"people's lower foot is {height:.2f} m from the ground in half of all frames"
     fault, left = "feet_off_the_ground", height
     if source.pivot is not None:
         moved = source.moved(source.points + source.pivot[:, :, None])
-        left = float(np.nanmedian(_feet(moved)))
+        left = foot_height(moved)
         if settings.ground_low <= left <= settings.ground_high and abs(left) < 0.5 * abs(height):
             fault = "root_about_origin"
             says += "; on the ground if global_orient turned about the model's origin"
@@ -86,11 +95,15 @@ def ground_findings(source: PointSource, settings: CheckSettings) -> Iterator[Fi
 def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> Iterator[Finding]:
     """Limbs of no human length, people faster than people are, people off the pitch."""
     for name, (upper, lower) in BONES.items():
-        ends = [
-            [source.skeleton.index(f"{side}_{end}") for side in ("left", "right")]
-            for end in (upper, lower)
-        ]
-        bone = np.linalg.norm(source.points[:, :, ends[0]] - source.points[:, :, ends[1]], axis=-1)
+        bone = np.stack(
+            [
+                np.linalg.norm(
+                    _point(source, f"{side}_{upper}") - _point(source, f"{side}_{lower}"), axis=-1
+                )
+                for side in ("left", "right")
+            ],
+            axis=-1,
+        )
         seen = np.flatnonzero(np.isfinite(bone).any((0, 2)))
         lengths = np.array([np.nanmedian(bone[:, person]) for person in seen])
         low, high = settings.bones
@@ -102,8 +115,7 @@ def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> I
                 says=f"{name} of {int(wrong.sum())} people are not of human length",
                 figures={"least_m": float(lengths.min()), "greatest_m": float(lengths.max())},
             )
-    hips = source.points[:, :, [source.skeleton.index(f"{s}_hip") for s in ("left", "right")]]
-    middle = hips.mean(2)
+    middle = 0.5 * (_point(source, "left_hip") + _point(source, "right_hip"))
     speed = np.linalg.norm(np.diff(middle, axis=0), axis=-1) * fps
     speed = speed[np.isfinite(speed)]
     if len(speed) and (share := float((speed > settings.top_speed).mean())) > settings.fast_share:
@@ -151,8 +163,7 @@ def camera_findings(view: View, settings: CheckSettings) -> Iterator[Finding]:
             where=where,
             says="R mirrors: its determinant is -1",
         )
-    center = -(np.swapaxes(rotation, -1, -2) @ translation[..., None])[..., 0]
-    drift = float(np.linalg.norm(center - np.median(center, axis=0), axis=-1).max())
+    drift = float(np.linalg.norm(centers(view.rows) - center_of(view.rows), axis=-1).max())
     if drift > settings.center_drift:
         yield Finding(
             fault="moving_center",
@@ -161,6 +172,41 @@ def camera_findings(view: View, settings: CheckSettings) -> Iterator[Finding]:
             says="the camera's centre -R't is not in one place",
             figures={"drift_m": drift},
         )
+
+
+def centers(rows: CameraRows) -> Floats:
+    """Return the centres (n, 3) [m], world, of a camera's rows that have a pose."""
+    all_centers = -(np.swapaxes(rows.rotation, -1, -2) @ rows.translation[..., None])[..., 0]
+    found: Floats = all_centers[np.isfinite(all_centers).all(-1)]
+    return found
+
+
+def center_of(rows: CameraRows) -> Floats:
+    """Return the median centre (3,) [m], world; NaN for a camera without a pose."""
+    found = centers(rows)
+    return np.median(found, axis=0) if len(found) else np.full(3, np.nan)
+
+
+def _point(source: PointSource, name: str) -> Floats:
+    """One point of everybody (frames, persons, 3) [m]."""
+    return source.points[:, :, source.skeleton.index(name)]
+
+
+def _handedness(source: PointSource) -> float:
+    """1 where noses or toes are ahead, as left and up have it, in most bodies; -1 if behind."""
+
+    def middle(name: str) -> Floats:
+        return 0.5 * (_point(source, f"left_{name}") + _point(source, f"right_{name}"))
+
+    if "left_ear" in source.skeleton:
+        left = _point(source, "left_ear") - _point(source, "right_ear")
+        forward = _point(source, "nose") - middle("ear")
+    else:
+        left = _point(source, "left_hip") - _point(source, "right_hip")
+        forward = middle("big_toe") - middle("ankle")
+    ahead = (np.cross(left, middle("shoulder") - middle("hip")) * forward).sum(-1)
+    ahead = ahead[np.isfinite(ahead)]
+    return float(np.median(np.sign(ahead))) if len(ahead) else 0.0
 
 
 def _feet(source: PointSource) -> Floats:

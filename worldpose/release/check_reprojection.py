@@ -120,24 +120,6 @@ def agreement_findings(found: Iterable[Agreement], settings: CheckSettings) -> I
 _UNEXPLAINED = "3D points are not where the 2D has them, and no known convention explains it"
 
 
-def view_share(points: Floats, rows: CameraRows) -> float:
-    """Return which part of all points (frames, persons, n, 3) is in a camera's picture."""
-    camera = rows.camera()
-    middle = points[:, :, :1].mean(2)
-    if len(rows.rotation) > 1:
-        count = min(len(middle), len(rows.rotation))
-        middle, camera = middle[:count], camera[:count]
-        known = np.isfinite(camera.numbers[:, :-1]).all(-1)
-        middle, camera = middle[known], camera[known]
-        edge = camera.image_size[:, None]
-    else:
-        edge = camera.image_size
-    pixels = camera.project(middle)
-    here = np.isfinite(middle).all(-1)
-    inside = ((pixels >= -0.5) & (pixels <= edge - 0.5)).all(-1)
-    return float(inside[here].mean()) if here.any() else 0.0
-
-
 def _candidates(moving: bool) -> Iterator[Fault]:
     yield from camera_faults()
     yield from frame_faults(moving)

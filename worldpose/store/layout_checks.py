@@ -164,6 +164,9 @@ def _check_values(where: str, array: ArrayLayout, values: NDArray[Any]) -> None:
 
 
 def _wrong_values(array: ArrayLayout, values: NDArray[Any]) -> NDArray[np.bool_]:
+    wrong: NDArray[np.bool_] = np.zeros((), dtype=np.bool_)
     if values.dtype.kind == "f":
-        return np.isinf(values) if array.missing == "nan" else ~np.isfinite(values)
-    return values < -1 if array.missing == "-1" else np.zeros((), dtype=np.bool_)
+        wrong = np.isinf(values) if array.missing == "nan" else ~np.isfinite(values)
+    elif array.missing == "-1":
+        wrong = values < -1
+    return wrong

@@ -89,6 +89,45 @@ def test_array_says_what_it_is_without_the_library(tmp_path: Path) -> None:
     assert codecs == ["bytes", "blosc", "crc32c"]
 
 
+@pytest.fixture
+def long_layout(monkeypatch: pytest.MonkeyPatch) -> GroupLayout:
+    """One float array, cut along its second dimension: 100 rows are 50 chunks and four parts."""
+    monkeypatch.setattr("data_contracts.arrays.CHUNK_BYTES", 2 * 3 * 8)
+    array = ArrayLayout(
+        name="x",
+        dims=("a", "b"),
+        dtype="float64",
+        unit="1",
+        missing="nan",
+        about="x",
+        chunk_dim="b",
+    )
+    return GroupLayout(stage="any", about="any", arrays=(array,))
+
+
+def test_array_of_many_parts_is_stored_as_in_one_piece(
+    tmp_path: Path, long_layout: GroupLayout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = np.random.default_rng(0).normal(size=(3, 100))
+    values[1, ::7] = np.nan
+    write_group(tmp_path / "parts", long_layout, {"x": values}, {}, {})
+    monkeypatch.setattr("worldpose.store.layout_checks.PART_CHUNKS", 100)
+    write_group(tmp_path / "whole", long_layout, {"x": values}, {}, {})
+    assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
+    stored = zarr.open_group(tmp_path / "parts", mode="r")["x"]
+    np.testing.assert_array_equal(stored[...], values)  # type: ignore[index]
+
+
+def test_wrong_values_of_all_parts_are_counted_and_nothing_is_written(
+    tmp_path: Path, long_layout: GroupLayout
+) -> None:
+    values = np.zeros((3, 100))
+    values[2, 40], values[0, 99] = np.inf, -np.inf
+    with pytest.raises(InputError, match=r"x\[2, 40\].*found inf, and 2 such in all"):
+        write_group(tmp_path, long_layout, {"x": values}, {}, {})
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -1,0 +1,154 @@
+"""Formats made from what a run would hold, without running anything."""
+
+from collections.abc import Mapping
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from flows.formats import EXPORTS, Origin
+from worldpose.body import BodyParameters, fold_keypoints, load_open_body
+from worldpose.body.skeletons import CHALLENGE15
+from worldpose.errors import WorldposeError
+from worldpose.release import read_camera
+from worldpose.release.challenge_files import read_challenge, read_submission
+from worldpose.release.pose_file import read_poses
+
+FRAMES = np.arange(100, 104)
+
+
+class StubRun(Mapping):
+    """Results by name, as an opened run has them."""
+
+    def __init__(self, **results):
+        self.results = {name.replace("__", "/"): data for name, data in results.items()}
+        self.record = SimpleNamespace(run_id="0001", match_id="m", results=self.results)
+
+    def __getitem__(self, name):
+        return self.results[name]
+
+    def __iter__(self):
+        return iter(self.results)
+
+    def __len__(self):
+        return len(self.results)
+
+
+def bodies():
+    upright = np.tile([np.pi / 2, 0.0, 0.0], (4, 2, 1))
+    transl = np.zeros((4, 2, 3)) + [0.0, 0.0, 1.1]
+    transl[:, 1, 0] = 2.0
+    transl[2, 1] = np.nan  # lost in one frame
+    return xr.Dataset(
+        {
+            "betas": (("person", "shape"), np.zeros((2, 10))),
+            "global_orient": (("frame", "person", "rotation"), upright),
+            "body_pose": (("frame", "person", "rotation_23"), np.zeros((4, 2, 69))),
+            "transl": (("frame", "person", "coordinate"), transl),
+        },
+        coords={"frame": FRAMES, "person": [3, 8]},
+        attrs={"body_model": "open-neutral/2"},
+    )
+
+
+def broadcast():
+    """A camera 70 m in front of the centre spot, known from frame 99 to 102."""
+    frames = np.arange(99, 103)
+    rotation = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    translation = -rotation @ np.array([0.0, -70.0, 2.0])
+    tile = {"focal": [4000.0, 4000.0], "principal_point": [960.0, 540.0], "distortion": [0.0] * 5}
+    return xr.Dataset(
+        {
+            **{n: (("frame", f"{n}_"), np.tile(v, (4, 1))) for n, v in tile.items()},
+            "rotation": (("frame", "a", "b"), np.tile(rotation, (4, 1, 1))),
+            "translation": (("frame", "a"), np.tile(translation, (4, 1))),
+            "image_size": (("axis",), np.array([1920, 1080])),
+            "status": (("frame",), np.ones(4, np.uint8)),
+        },
+        coords={"frame": frames},
+    )
+
+
+@pytest.fixture
+def match_folder(tmp_path):
+    folder = tmp_path / "m"
+    folder.mkdir()
+    (folder / "match.yaml").write_text(
+        "contract: 1\nmatch_id: m\nfps: 50\n"
+        "cameras: [{id: north, width: 1920, height: 1080}, "
+        "{id: main, kind: broadcast, width: 1920, height: 1080}]\n"
+        "clips: [{id: A_1, first_frame: 100, frame_count: 4, broadcast: main}]\n"
+    )
+    (folder / "detections").mkdir()
+    for name in ("north", "A_1"):
+        (folder / "detections" / f"{name}.json").write_text("[]")
+    return folder
+
+
+def origin(folder, **results):
+    spec = MatchSpec(
+        match_id="m",
+        fps=50.0,
+        cameras=(
+            CameraSpec(id="north", width=1920, height=1080),
+            CameraSpec(id="main", kind="broadcast", width=1920, height=1080),
+        ),
+        clips=(ClipSpec(id="A_1", first_frame=100, frame_count=4, broadcast="main"),),
+    )
+    return Origin(StubRun(**results), SimpleNamespace(spec=spec, folder=str(folder)))
+
+
+@pytest.mark.parametrize("form", ["challenge", "challenge-2025"])
+def test_the_challenge_is_written_from_bodies_and_the_broadcast_camera(
+    match_folder, tmp_path, form
+):
+    run = origin(match_folder, body_fitting__A_1=bodies(), broadcast_calibration__A_1=broadcast())
+    out = tmp_path / "out"
+    written = {path.relative_to(out).as_posix() for path in EXPORTS[form](run, out)}
+    kinds = ("boxes", "skel_2d", "skel_3d")
+    files = {f"{k}.npz" for k in kinds} if "2025" in form else {f"{k}/A_1.npy" for k in kinds}
+    assert written == files | {"cameras/A_1.npz", "pitch_points.txt", "submission.zip"}
+    clip = read_challenge(out)["A_1"]
+    there = np.isfinite(clip.boxes).all(-1)
+    # The second person is lost in frame 102, the camera in frame 103.
+    np.testing.assert_array_equal(
+        there, [[True, True], [True, True], [True, False], [False, False]]
+    )
+    poses = BodyParameters(
+        np.zeros(10), [np.pi / 2, 0.0, 0.0], np.zeros(69), np.array([2.0, 0.0, 1.1])
+    )
+    joints = fold_keypoints(load_open_body(), CHALLENGE15)(poses)
+    # Single precision.
+    np.testing.assert_allclose(
+        read_submission(out / "submission.zip")["A_1"][1, 0], joints, atol=1e-6
+    )
+    points = np.loadtxt(out / "pitch_points.txt")
+    assert (np.abs(points).max(0) == [52.5, 34.0, 0.2]).all()
+
+
+def test_the_broadcast_camera_joins_the_release_layout_where_there_is_one(match_folder, tmp_path):
+    run = origin(match_folder, body_fitting__A_1=bodies(), broadcast_calibration__A_1=broadcast())
+    EXPORTS["worldpose"](run, tmp_path / "out")
+    poses, model = read_poses(tmp_path / "out" / "poses" / "A_1.npz")
+    assert (poses.batch_shape, model) == ((2, 4), "open-neutral/2")
+    camera = read_camera(tmp_path / "out" / "cameras" / "A_1.npz")
+    np.testing.assert_array_equal(np.isnan(camera.focal[:, 0]), [False, False, False, True])
+
+
+def test_a_format_that_needs_the_broadcast_camera_says_so(match_folder, tmp_path):
+    run = origin(match_folder, body_fitting__A_1=bodies())
+    with pytest.raises(WorldposeError, match=r"broadcast_calibration/A_1.*calibrate that camera"):
+        EXPORTS["challenge"](run, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_motion_file_is_named_after_person_and_first_frame(match_folder, tmp_path):
+    run = origin(match_folder, body_fitting__A_1=bodies())
+    names = [path.name for path in EXPORTS["bvh"](run, tmp_path / "out")]
+    assert names == [
+        "person_003_frame_000100.bvh",
+        "person_008_frame_000100.bvh",
+        "person_008_frame_000103.bvh",
+    ]
