@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -116,10 +117,12 @@ def simulate_match(
     given = scene.given if calibrated or scenario.calibration != CalibrationErrors() else {}
     painted = PitchTemplate.from_spec(scenario.pitch)
     people = scene.truth.joints[0]
-    pictures = {
-        name: render_pitch(camera, painted, people, seed)
-        for name, camera in (scene.cameras if stills else {}).items()
-    }
+    drawn = scene.cameras if stills else {}
+    with ThreadPoolExecutor() as pool:  # the renderer's kernels let other threads run
+        rendered = pool.map(
+            lambda camera: render_pitch(camera, painted, people, seed), drawn.values()
+        )
+        pictures = dict(zip(drawn, rendered, strict=True))
     width, height = scenario.rig.image_size
     specs = [
         CameraSpec(

@@ -112,11 +112,13 @@ def scenery(
                     red, green, blue = _board(along + 200.0, up, side, look)
                 else:
                     red, green, blue = 0.13, 0.13, 0.14
-        # A stand is a plane that rises outwards from behind the track.
+        # A stand is a plane that rises outwards from behind the track. A camera below it is built
+        # into it and looks out.
         rise = dz - _STAND_SLOPE * toward * step
-        if rise == 0.0:
+        below = _STAND_SLOPE * (toward * start - half[axis] - _STAND_SETBACK) - o[2]
+        if rise == 0.0 or below >= 0.0:
             continue
-        steps = (_STAND_SLOPE * (toward * start - half[axis] - _STAND_SETBACK) - o[2]) / rise
+        steps = below / rise
         if 0.0 < steps < nearest:
             z = o[2] + steps * dz
             along = o[1] + steps * dy if axis == 0 else o[0] + steps * dx
