@@ -9,6 +9,7 @@ from typing import Any
 
 from data_contracts.arrays import GroupLayout
 from data_contracts.body_fitting import BODY_FITTING
+from data_contracts.broadcast_calibration import BROADCAST_CALIBRATION, KeyFrames
 from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
 from data_contracts.cameras import CameraCalibration
 from data_contracts.conventions import CONVENTIONS, Conventions
@@ -30,6 +31,7 @@ RECORDS: dict[str, type[Record]] = {
     "camera": CameraCalibration,
     "pitch": PitchSpec,
     "clicked_markings": ClickedMarkings,
+    "key_frames": KeyFrames,
     "track": Track,
     "join": Join,
     "review_request": ReviewRequest,
@@ -53,6 +55,7 @@ LAYOUTS: tuple[GroupLayout, ...] = (
     BUNDLE_ADJUSTMENT,
     RETRIANGULATION,
     BODY_FITTING,
+    BROADCAST_CALIBRATION,
 )
 
 

@@ -29,7 +29,7 @@ METHOD: tuple[Stage, ...] = (
     bundle_adjustment.STAGE,  #         B1-B3; then gate ADJUSTMENT
     retriangulation.STAGE,  # [clip]    B2
     body_fitting.STAGE,  # [clip]       S1-S3; then gate ACCEPTANCE of the clip
-    broadcast_calibration.STAGE,  # [clip]  M1-M6; then a gate
+    broadcast_calibration.STAGE,  # [clip]  M1-M6; then gate BROADCAST
     # release, evaluation               X1-X3, E1-E6
 )
 
@@ -39,6 +39,7 @@ GATES: tuple[Gate, ...] = (
     gates.JOINTS,
     gates.ADJUSTMENT,
     gates.ACCEPTANCE,
+    gates.BROADCAST,
 )
 """Where people are asked, with `--gates auto` or `always`; each stands behind the stage it names.
 """
