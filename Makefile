@@ -39,8 +39,8 @@ format: install
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Files, not tests, are handed to the processes: tests of a file share what they made.
-PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+# Processes begin with neighbouring tests, which share what they made, and take over the rest of others.
+PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist worksteal
 
 test: install check
 	$(PYTEST) -m "not slow"

@@ -97,7 +97,7 @@ def entries(**changes):
         (entries(drawn=[{"name": "center_mark", "xy": [[1, 2]]}]), "drawn[0].name", "a marking"),
         (entries(points=[{"name": "center_mark", "xy": [1921, 2]}]), "points[0].xy", "1920 x 1080"),
         (
-            entries(drawn=[{"name": "center_circle", "xy": [[1, 2], [3, -0.6]]}]),
+            entries(drawn=[{"name": "center_circle", "xy": [[1, 2], [3, -1.1]]}]),
             "drawn[0].xy[1]",
             "in the picture",
         ),
