@@ -20,6 +20,7 @@ def check(
     *,
     fps: float | None = None,
     body: str | None = None,
+    pitch: bool = True,
     settings: CheckSettings | None = None,
 ) -> CheckReport:
     """What is wrong with a data set, and what was measured; one clip is in memory at a time.
@@ -28,6 +29,7 @@ def check(
         folder: what `worldpose export` wrote, or another of the same layout.
         fps: frames in a second; None = the manifest's, or 50.
         body: body model of pose files that name none; None = the open body.
+        pitch: whether the ground is z = 0; a manifest may say that it is not.
         settings: what counts as wrong.
 
     Raises:
@@ -56,6 +58,7 @@ def check(
             lambda model: find_body(model or body or OPEN_BODY),
             manifest,
             rate,
+            pitch and (manifest is None or manifest.pitch),
         )
         figures[name], found = check_clip(shipped, settings)
         findings += found

@@ -71,11 +71,11 @@ def new_corrections(
             note=note or None,
         )
         replay = replay_corrections(folder, [correction])
-        if replay.stale:
+        if replay.stale or replay.folder == folder:
             raise InputError(
                 f"edit {number + 1} of {len(edits)}, {edit.kind}",
                 expected="one that applies",
-                found=replay.stale[0][1],
+                found=replay.stale[0][1] if replay.stale else "one that changes nothing",
                 todo="Correct it; none of these edits was taken in.",
             )
         folder = replay.folder

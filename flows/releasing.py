@@ -10,6 +10,7 @@ import numpy as np
 from flows.formats import EXPORTS, Origin
 from flows.release import joint_tracks, static_cameras
 from worldpose.errors import UsageError
+from worldpose.ingest.match_folder import NO_PITCH
 from worldpose.release.manifest import (
     ReleasedClip,
     ReleaseManifest,
@@ -99,6 +100,7 @@ def release(origin: Origin, forms: list[str], out: Path, name: str, licence: str
             **{camera: pictures[camera] for camera in cameras},
             **{c.id: pictures[c.broadcast] for c in spec.clips if c.broadcast and c.id in clips},
         },
+        pitch=spec.pitch != NO_PITCH,
         body_model=models.pop() if len(models) == 1 else None,
         worldpose=version("worldpose"),
         versions=record.versions,

@@ -25,6 +25,9 @@ def check(
         str | None,
         typer.Option("--body", help="Body model of pose files that name none; the open body."),
     ] = None,
+    pitch: Annotated[
+        bool, typer.Option("--pitch/--no-pitch", help="The world is no pitch: do not judge by one.")
+    ] = True,
     as_json: JsonOption = False,
 ) -> None:
     """Tell whether a data set explains itself, and which convention is broken where not.
@@ -33,7 +36,7 @@ def check(
     """
     from flows.checking import check as check_data_set
 
-    report = check_data_set(folder, fps=fps, body=body)
+    report = check_data_set(folder, fps=fps, body=body, pitch=pitch)
     if as_json:
         print_json({**report.model_dump(mode="json"), "passed": not report.findings})
     else:

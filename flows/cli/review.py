@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 from pydantic import TypeAdapter, ValidationError
 
-from data_contracts.review import Correction, Edit, MovedPoint, RedrawnMarking
+from data_contracts.review import Edit
 from flows import review
 from flows.cli.console import (
     DEFAULT_PROJECT,
@@ -19,8 +17,8 @@ from flows.cli.console import (
     errors,
     line,
     print_json,
-    print_table,
 )
+from flows.cli.review_text import correction_json, in_words, print_review, review_json, when
 from flows.prefect_environment import has_server
 from flows.registering import find_registration, open_match
 from flows.review import Review, reviews_of
@@ -76,14 +74,14 @@ def list_reviews(
         found += reviews_of(opened, latest_run(store, name))
     shown = [each for each in found if everything or each.state == "waits"]
     if as_json:
-        print_json({"reviews": [_as_json(each) for each in shown]})
+        print_json({"reviews": [review_json(each) for each in shown]})
         return
     if not shown:
         line("nothing waits for review")
         return
     for each in shown:
         request = each.request
-        line(f"{request.id}  {each.state}, {request.match_id}, {_when(request.created_at)}")
+        line(f"{request.id}  {each.state}, {request.match_id}, {when(request.created_at)}")
         for reason in request.reasons:
             line(f"  {reason}")
 
@@ -112,7 +110,7 @@ def show(
                 found="no such review",
                 todo=f"List them: worldpose review list {match} --all.",
             )
-        _show(known[request], as_json)
+        print_review(known[request], as_json)
         return
     origins = review.origins_of(store, opened, latest) if latest else {}
     marked = {name: origin for name, origin in origins.items() if origin != "automatic"}
@@ -120,8 +118,8 @@ def show(
         print_json(
             {
                 "match": match,
-                "corrections": [_correction(each) for each in opened.corrections],
-                "stale": [_correction(each) | {"reason": why} for each, why in opened.stale],
+                "corrections": [correction_json(each) for each in opened.corrections],
+                "stale": [correction_json(each) | {"reason": why} for each, why in opened.stale],
                 "origins": origins,
                 "damage": list(opened.journal.damage),
             }
@@ -129,8 +127,8 @@ def show(
         return
     states = [*((each, "applied") for each in opened.corrections), *opened.stale]
     for correction, state in states:
-        line(f"{correction.id}  {correction.who}, {_when(correction.made_at)}")
-        line(f"  {_in_words(correction)}")
+        line(f"{correction.id}  {correction.who}, {when(correction.made_at)}")
+        line(f"  {in_words(correction)}")
         line(f"  {state if state == 'applied' else f'no longer applies: {state}'}")
     if not states:
         line("no corrections")
@@ -187,10 +185,10 @@ def correct(
     store = Store.open(project)
     said = review.correct(store, open_match(store, match), _read_edits(edits), who=who, why=why)
     if as_json:
-        print_json({"corrections": [_correction(each) for each in said]})
+        print_json({"corrections": [correction_json(each) for each in said]})
         return
     for each in said:
-        line(f"corrected: {_in_words(each)} ({each.id})")
+        line(f"corrected: {in_words(each)} ({each.id})")
     _say_next(match)
 
 
@@ -253,13 +251,13 @@ def _decide(
         edits=_read_edits(edits) if edits else (),
     )
     if as_json:
-        said = [_correction(each) for each in corrections]
+        said = [correction_json(each) for each in corrections]
         print_json({"verdict": verdict, "reviews": ids, "corrections": said})
         return
     for name in ids:
         line(f"{verdict}: {name}")
     for each in corrections:
-        line(f"corrected: {_in_words(each)} ({each.id})")
+        line(f"corrected: {in_words(each)} ({each.id})")
     _say_next(match)
 
 
@@ -275,54 +273,6 @@ def _read_edits(file: Path) -> list[Edit]:
             found=first["msg"],
             todo="docs/review.md shows them; docs/schemas/correction.schema.json has all.",
         ) from None
-
-
-def _show(shown: Review, as_json: bool) -> None:
-    if as_json:
-        print_json(_as_json(shown))
-        return
-    request, decision = shown.request, shown.decision
-    line(f"{request.id}: {shown.state}")
-    line(f"  {shown.question}")
-    for reason in request.reasons:
-        line(f"  because {reason}")
-    if decision is not None:
-        line(f"  {decision.verdict} by {decision.who}, {_when(decision.decided_at)}")
-        line(f"  {decision.why or '(no reason given)'}")
-    for unit, key in request.keys.items():
-        line(f"  {unit} {key}, run {request.run_id}")
-    print_table("figures", ("figure", ">value"), _figures(shown))
-
-
-def _figures(shown: Review) -> list[tuple[str, str]]:
-    return [(name, f"{value:.4g}") for name, value in sorted(shown.request.figures.items())]
-
-
-def _as_json(shown: Review) -> dict[str, Any]:
-    decision = shown.decision
-    return {
-        **shown.request.model_dump(mode="json"),
-        "state": shown.state,
-        "question": shown.question,
-        "decision": None if decision is None else decision.model_dump(mode="json"),
-    }
-
-
-def _correction(correction: Correction) -> dict[str, Any]:
-    return correction.model_dump(mode="json")
-
-
-def _in_words(correction: Correction) -> str:
-    edit = correction.edit
-    if isinstance(edit, MovedPoint | RedrawnMarking):
-        place = edit.camera if edit.frame is None else f"{edit.camera} frame {edit.frame}"
-        was, xy = (json.dumps(it) if it else "nothing" for it in (edit.was, edit.xy))
-        return f"{edit.marking} in {place}: {was} -> {xy}"
-    return f"{edit.kind} {edit.model_dump_json(exclude={'kind'})}"
-
-
-def _when(moment: datetime) -> str:
-    return f"{moment:%Y-%m-%d %H:%M} UTC"
 
 
 def _say_next(match: str) -> None:

@@ -1,8 +1,8 @@
 """Release: results in the forms that other tools and people read.
 
 Inputs: joints, cameras, observations and figures of a run, as plain arrays and records.
-Outputs: joints files, WorldPose cameras, COCO keypoints, one HTML report; pictures are in
-`worldpose.release.*pictures`, which load matplotlib.
+Outputs: the files of docs/formats.md, their readers, what `check` finds wrong with such files, one
+HTML report; pictures are in `worldpose.release.*pictures`, which load matplotlib.
 """
 
 from worldpose.release.archives import Member, read_archive, write_archive

@@ -10,6 +10,7 @@ from worldpose.release.check_plausibility import (
     body_findings,
     camera_findings,
     ground_findings,
+    pitch_findings,
     plausible_share,
     world_fault,
 )
@@ -20,7 +21,7 @@ from worldpose.release.check_reprojection import (
     agreement_findings,
 )
 from worldpose.release.check_settings import CheckSettings
-from worldpose.release.check_sight import sight_findings, sight_share
+from worldpose.release.check_sight import is_blind, sight_findings
 from worldpose.release.shipped import Finding, PointSource, ShippedClip, View
 
 
@@ -66,11 +67,14 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
     shares = []
     for source in clip.sources:
         repaired = _repaired(source, agreements)
+        if not clip.pitch:
+            findings += body_findings(repaired, clip.fps, settings)
+            continue
         blind = [
             view
             for view in clip.views
             if view.name not in {one.view for one in agreements}
-            and sight_share(repaired, repaired.points, view.rows) < settings.least_seen
+            and is_blind(repaired, view.rows, settings)
         ]
         fault, before, after = world_fault(repaired, settings)
         shares.append(plausible_share(repaired, settings))
@@ -81,11 +85,8 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
         if repaired is source and source.name not in {one.source for one in agreements}:
             findings += ground_findings(source, settings)
         findings += body_findings(repaired, clip.fps, settings)
-        blind = [
-            view
-            for view in blind
-            if sight_share(repaired, repaired.points, view.rows) < settings.least_seen
-        ]
+        findings += pitch_findings(repaired, settings)
+        blind = [view for view in blind if is_blind(repaired, view.rows, settings)]
         for finding, reason in sight_findings(repaired, blind, settings):
             findings.append(finding)
             if reason is not None:

@@ -93,7 +93,7 @@ def ground_findings(source: PointSource, settings: CheckSettings) -> Iterator[Fi
 
 
 def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> Iterator[Finding]:
-    """Limbs of no human length, people faster than people are, people off the pitch."""
+    """Limbs of no human length, people faster than people are."""
     for name, (upper, lower) in BONES.items():
         bone = np.stack(
             [
@@ -115,7 +115,7 @@ def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> I
                 says=f"{name} of {int(wrong.sum())} people are not of human length",
                 figures={"least_m": float(lengths.min()), "greatest_m": float(lengths.max())},
             )
-    middle = 0.5 * (_point(source, "left_hip") + _point(source, "right_hip"))
+    middle = _hips(source)
     speed = np.linalg.norm(np.diff(middle, axis=0), axis=-1) * fps
     speed = speed[np.isfinite(speed)]
     if len(speed) and (share := float((speed > settings.top_speed).mean())) > settings.fast_share:
@@ -126,6 +126,11 @@ def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> I
             says=f"people move faster than {settings.top_speed:g} m/s",
             figures={"share_of_steps": share, "fastest_m_per_s": float(speed.max())},
         )
+
+
+def pitch_findings(source: PointSource, settings: CheckSettings) -> Iterator[Finding]:
+    """People off the pitch."""
+    middle = _hips(source)
     here = np.isfinite(middle).all(-1)
     away = np.abs(middle[here][:, :2]) > np.array(settings.bounds)
     if len(away) and (share := float(away.any(-1).mean())) > 1.0 - settings.plausible_share:
@@ -190,6 +195,11 @@ def center_of(rows: CameraRows) -> Floats:
 def _point(source: PointSource, name: str) -> Floats:
     """One point of everybody (frames, persons, 3) [m]."""
     return source.points[:, :, source.skeleton.index(name)]
+
+
+def _hips(source: PointSource) -> Floats:
+    """The middle of everybody's hips (frames, persons, 3) [m]."""
+    return 0.5 * (_point(source, "left_hip") + _point(source, "right_hip"))
 
 
 def _handedness(source: PointSource) -> float:

@@ -64,6 +64,7 @@ def read_clip(
     body: Callable[[str | None], BodyModel],
     manifest: ReleaseManifest | None,
     fps: float,
+    pitch: bool = True,
 ) -> ShippedClip:
     """Everything that a data set has of one clip.
 
@@ -74,6 +75,7 @@ def read_clip(
         body: gives the body model of a name, or of a file that names none.
         manifest: of the release, where it is one.
         fps: frames in a second.
+        pitch: whether the ground is z = 0.
 
     Raises:
         InputError: a file is damaged.
@@ -108,7 +110,7 @@ def read_clip(
             ]
             sources, swapped = _rows_of_boxes(sources, clip, pixels.shape[:2])
             findings += swapped
-    return ShippedClip(clip, fps, tuple(sources), tuple(views), tuple(findings))
+    return ShippedClip(clip, fps, tuple(sources), tuple(views), pitch, tuple(findings))
 
 
 def read_coco(path: Path, ids: tuple[int, ...], frames: int) -> Floats:

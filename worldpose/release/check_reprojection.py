@@ -12,6 +12,7 @@ from worldpose.cameras import Camera
 from worldpose.release.camera_rows import CameraRows
 from worldpose.release.check_faults import Fault, camera_faults, frame_faults, point_faults
 from worldpose.release.check_settings import CheckSettings
+from worldpose.release.check_slips import slip
 from worldpose.release.shipped import Finding, PointSource, View
 
 Floats = NDArray[np.float64]
@@ -52,7 +53,7 @@ def agreement(source: PointSource, view: View, settings: CheckSettings) -> Agree
     """Return how a source and a view agree, and the fault that would explain it best.
 
     A fault is named where undoing it takes away most of the error; a 2D point where the camera
-    cannot see counts as infinitely far.
+    cannot see counts as infinitely far. Slips of frames are also looked for in whole bodies.
 
     Args:
         source: 3D points.
@@ -83,6 +84,11 @@ def agreement(source: PointSource, view: View, settings: CheckSettings) -> Agree
     height = _height(view)
     explains = shipped - least > settings.least_gain_px and least < settings.explained * shipped
     explains = explains and least <= settings.left * height
+    if not explains and np.isfinite(shipped) and shipped > settings.least_gain_px:
+        found = slip(source, view, settings)
+        if found is not None:
+            explains, best = True, found[0]
+            least = _median(_errors(source.points, view.rows, sample, best))
     finite = errors[np.isfinite(errors)]
     return Agreement(
         view=view.name,

@@ -61,6 +61,23 @@ def sight_share(source: PointSource, points: Floats, rows: CameraRows) -> float:
     return float(shown.mean())
 
 
+def is_blind(source: PointSource, rows: CameraRows, settings: CheckSettings) -> bool:
+    """Return whether a camera shows hardly anybody though it should.
+
+    A camera that never moves may look at a part of the pitch where nobody comes: it is only
+    expected to stand upright in the stadium and to have the pitch in the middle of its picture.
+    """
+    if sight_share(source, source.points, rows) >= settings.least_seen:
+        return False
+    if len(rows.rotation) > 1:
+        return True
+    center, forward, down = center_of(rows), rows.rotation[0, 2], rows.rotation[0, 1]
+    if not STAND[0] < center[2] < STAND[1] or not forward[2] < 0.0 or not down[2] < 0.0:
+        return True
+    middle = center - forward * center[2] / forward[2]
+    return bool((np.abs(middle[:2]) > np.array(settings.bounds)).any())
+
+
 def sight_findings(
     source: PointSource, views: Sequence[View], settings: CheckSettings
 ) -> Iterator[tuple[Finding, Fault | None]]:

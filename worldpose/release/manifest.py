@@ -54,6 +54,8 @@ class ReleaseManifest(Record):
     clips: dict[str, ReleasedClip]
     pictures: dict[str, tuple[int, int]]
     """Width and height [px] of every camera's picture."""
+    pitch: bool
+    """Whether the world is a pitch's; without one it is that of the cameras' calibration."""
     body_model: str | None
     """Name and version of the body model of all poses; betas of another mean nothing."""
     conventions: Conventions = CONVENTIONS

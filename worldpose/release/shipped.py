@@ -70,6 +70,8 @@ class ShippedClip:
     fps: float
     sources: tuple[PointSource, ...]
     views: tuple[View, ...]
+    pitch: bool = True
+    """Whether the ground is z = 0; otherwise the world is that of the cameras' calibration."""
     findings: tuple[Finding, ...] = field(default=())
     """What reading alone has shown."""
 

@@ -31,6 +31,8 @@ class Run(Mapping[str, "xr.Dataset"]):
             failures = {failure.unit: failure for failure in self.record.failed}
             if name in failures:
                 why = f"it failed with {failures[name].error}: {failures[name].message}"
+            elif name in self.record.blocked and self.record.waiting:
+                why = f"{len(self.record.waiting)} results before it wait for review"
             else:
                 why = f"the run has {', '.join(self) or 'no results'}"
             raise KeyError(f"run {self.record.run_id} has no result of {name!r}: {why}")

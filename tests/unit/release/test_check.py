@@ -124,9 +124,9 @@ def data_set(written, tmp_path):
     return copy
 
 
-def findings(folder, model):
+def findings(folder, model, pitch=True):
     clips = clips_in(folder)
-    clip = read_clip(folder, clips[0], clips, lambda name: model, None, FPS)
+    clip = read_clip(folder, clips[0], clips, lambda name: model, None, FPS, pitch)
     return check_clip(clip, CheckSettings())
 
 
@@ -247,6 +247,23 @@ def test_a_fault_of_cameras_is_named(data_set, model, kind, fault):
     assert places == expected
 
 
+def test_a_camera_of_a_part_of_the_pitch_where_nobody_comes_is_sound(data_set, model):
+    folder = data_set("plain")
+    corner = looking([60.0, 40.0, 12.0], [50.0, 32.0, 0.0], 4000.0)
+    write_static_camera(folder / "cameras" / "corner.npz", corner.to_calibration("corner"))
+    assert findings(folder, model)[1] == []
+    # Turned by half a turn about the vertical it looks out of the stadium.
+    half = np.diag([-1.0, -1.0, 1.0])
+    edit(
+        folder / "cameras" / "corner.npz",
+        lambda a: a.update(
+            R=a["R"] @ half, t=a["t"] + (a["R"] @ half - a["R"])[0] @ [-60.0, -40.0, -12.0]
+        ),
+    )
+    (found,) = findings(folder, model)[1]
+    assert (found.fault, found.where) == ("sees_nobody", ("cameras/corner",))
+
+
 def test_the_one_camera_that_is_wrong_is_named(data_set, model):
     folder = data_set("static")
     edit(folder / "cameras" / "east.npz", transpose_rotation)
@@ -339,6 +356,17 @@ def test_a_whole_data_set_in_other_axes_is_named_though_it_agrees(data_set, mode
     assert {each.fault for each in found} == {"y_down_world"}
 
 
+def test_a_world_without_a_pitch_may_have_any_axes(data_set, model):
+    folder = data_set("static")
+    edit_cameras(folder, lambda a: a.update(R=a["R"] @ Y_DOWN.T))
+    edit_poses(folder, lambda arrays: turn_poses(arrays, Y_DOWN, model))
+    edit_joints(folder, axes_of("joints", Y_DOWN))
+    assert findings(folder, model, pitch=False)[1] == []
+    edit_cameras(folder, transpose_rotation)
+    found = findings(folder, model, pitch=False)[1]
+    assert {each.fault for each in found} == {"transposed_rotation"}
+
+
 def test_joints_in_millimetres_are_named_with_and_without_cameras(data_set, model):
     folder = data_set("static")
     edit_joints(folder, scaled("joints", 1000.0))
@@ -378,6 +406,19 @@ def test_noise_of_a_detector_is_no_fault(data_set, model, written):
     figures, found = findings(folder, model)
     assert found == []
     assert 1.5 < figures.reprojection_median_px < 3.5
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_slip_is_found_below_a_detectors_noise(data_set, model, late):
+    folder = data_set("challenge")
+    rng = np.random.default_rng(1)
+    path = folder / "skel_2d" / "A_1.npy"
+    # A step at 5 m/s is 0.1 m or 4 px here; the noise of a point is as large.
+    np.save(path, np.load(path) + rng.normal(0.0, 3.0, np.load(path).shape))
+    if late:
+        edit_poses(folder, late_poses)
+    found = findings(folder, model)[1]
+    assert [each.fault for each in found] == (["frame_offset"] if late else [])
 
 
 def test_a_submission_with_frames_first_is_named(data_set, model):

@@ -33,6 +33,7 @@ def manifest_of(folder, **changes):
             "A_1": ReleasedClip(first_frame=100, frame_count=2, person_ids=(0, 4), origins={})
         },
         "pictures": {"north": (1920, 1080)},
+        "pitch": True,
         "body_model": "open-neutral/2",
         "licence": "For tests.",
         "worldpose": "0.1.0",

@@ -1,0 +1,64 @@
+"""How reviews and corrections are shown, to people and as JSON."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime
+from typing import Any
+
+from data_contracts.review import Correction, MovedPoint, RedrawnMarking
+from flows.cli.console import line, print_json, print_table
+from flows.review import Review
+
+
+def print_review(shown: Review, as_json: bool) -> None:
+    """One question, what was said, and all figures."""
+    if as_json:
+        print_json(review_json(shown))
+        return
+    request, decision = shown.request, shown.decision
+    line(f"{request.id}: {shown.state}")
+    line(f"  {shown.question}")
+    for reason in request.reasons:
+        line(f"  because {reason}")
+    if decision is not None:
+        line(f"  {decision.verdict} by {decision.who}, {when(decision.decided_at)}")
+        line(f"  {decision.why or '(no reason given)'}")
+    for unit, key in request.keys.items():
+        line(f"  {unit} {key}, run {request.run_id}")
+    print_table("figures", ("figure", ">value"), _figures(shown))
+
+
+def _figures(shown: Review) -> list[tuple[str, str]]:
+    return [(name, f"{value:.4g}") for name, value in sorted(shown.request.figures.items())]
+
+
+def review_json(shown: Review) -> dict[str, Any]:
+    """One question for machines."""
+    decision = shown.decision
+    return {
+        **shown.request.model_dump(mode="json"),
+        "state": shown.state,
+        "question": shown.question,
+        "decision": None if decision is None else decision.model_dump(mode="json"),
+    }
+
+
+def correction_json(correction: Correction) -> dict[str, Any]:
+    """One correction for machines."""
+    return correction.model_dump(mode="json")
+
+
+def in_words(correction: Correction) -> str:
+    """What a correction changes, on one line."""
+    edit = correction.edit
+    if isinstance(edit, MovedPoint | RedrawnMarking):
+        place = edit.camera if edit.frame is None else f"{edit.camera} frame {edit.frame}"
+        was, xy = (json.dumps(it) if it else "nothing" for it in (edit.was, edit.xy))
+        return f"{edit.marking} in {place}: {was} -> {xy}"
+    return f"{edit.kind} {edit.model_dump_json(exclude={'kind'})}"
+
+
+def when(moment: datetime) -> str:
+    """A moment as people read it."""
+    return f"{moment:%Y-%m-%d %H:%M} UTC"

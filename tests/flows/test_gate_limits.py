@@ -1,0 +1,45 @@
+"""Where gates stand, and which figures let a result pass."""
+
+import pytest
+
+from flows.gates import ACCEPTANCE, ADJUSTMENT, CAMERAS
+from flows.method import GATES, METHOD
+
+
+def test_gates_stand_behind_stages_of_the_method():
+    stages = [stage.name for stage in METHOD]
+    places = [stages.index(gate.stage) for gate in GATES]
+    assert places == sorted(set(places))
+
+
+GOOD_CAMERA = {
+    "expected_ground_error_median_m": 0.01,
+    "expected_ground_error_p95_m": 0.04,
+    "clicks_wrong": 0.0,
+    "weak": 0.0,
+}
+
+
+@pytest.mark.parametrize(
+    ("gate", "figures", "objected"),
+    [
+        (CAMERAS, GOOD_CAMERA, []),
+        (CAMERAS, {}, []),  # a given one was judged by who gave it
+        (CAMERAS, GOOD_CAMERA | {"clicks_wrong": 1.0}, ["clicks_wrong is 1, at most 0 passes"]),
+        (CAMERAS, {"clicks_wrong": 0.0, "weak": 0.0}, ["expected_ground", "expected_ground"]),
+        (ADJUSTMENT, {"held_out_error_before_px": 2.0, "held_out_error_after_px": 1.9}, []),
+        (
+            ADJUSTMENT,
+            {"held_out_error_before_px": 2.0, "held_out_error_after_px": 2.1},
+            ["held_out_growth is 1.05, at most 1 passes"],
+        ),
+        (ADJUSTMENT, {"cameras_changed": 0.0}, ["held_out_error_after_px", "held_out_growth"]),
+        (ACCEPTANCE, {"bodies": 100.0, "filled": 4.0, "offset_rms_m": 0.01}, []),
+        (ACCEPTANCE, {"bodies": 100.0, "filled": 6.0, "offset_rms_m": 0.01}, ["filled_share"]),
+        (ACCEPTANCE, {"bodies": 0.0, "filled": 0.0, "offset_rms_m": 0.01}, []),
+    ],
+)
+def test_auto_objects_to_figures_beyond_their_limits(gate, figures, objected):
+    lines = gate.objections(figures)
+    assert len(lines) == len(objected)
+    assert all(line.startswith(start) for line, start in zip(lines, objected, strict=True))
