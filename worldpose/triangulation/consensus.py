@@ -16,11 +16,11 @@ from worldpose.triangulation.lanes import (
     CHANGED,
     INSIDE,
     LANES,
-    LOSS,
     POINT,
     PRECISION,
     ROWS,
     SEEN,
+    SHARPNESS,
     SQUARED,
     STATE,
     STEP,
@@ -69,18 +69,18 @@ def consensus(
         # All there are are used.
         tile[SQUARED : SQUARED + LANES] = 0.0
     select(tiles, limit, state)
-    state[LOSS : LOSS + LANES] = math.inf
+    state[SHARPNESS : SHARPNESS + LANES] = 0.0
     start(tiles, state)
     step(tiles, depths, noise, state)
     if _graduate(tiles, depths, noise, limit, state):
         survey(tiles, limit, state)
         for j in range(LANES):
-            if state[LOSS + j] < math.inf:
+            if state[SHARPNESS + j] > 0.0:
                 inside = state[INSIDE + j]
                 # A majority of three or more agrees by chance too rarely to look further.
                 if inside < 3 or 2 * inside <= state[SEEN + j]:
                     _take_best_pair(tiles, depths, noise, limit, j, state)
-        state[LOSS : LOSS + LANES] = math.inf
+        state[SHARPNESS : SHARPNESS + LANES] = 0.0
     for _ in range(MAX_REVISIONS):
         select(tiles, limit, state)
         if not largest(state, CHANGED) > 0.0:
@@ -99,14 +99,15 @@ def _graduate(
 ) -> bool:
     """Move lanes whose views do not agree to where a majority does; is there such a lane?
 
-    Their loss stays at `limit`; that of the others is infinite.
+    The scale of their loss stays at `limit`; that of the others is infinite.
     """
     survey(tiles, limit, state)
     most = 0.0
     for j in range(LANES):
         if state[INSIDE + j] < state[SEEN + j]:
-            state[LOSS + j] = max(state[WORST + j], limit)
-            most = max(most, state[LOSS + j])
+            worst = max(state[WORST + j], limit)
+            state[SHARPNESS + j] = 1.0 / worst
+            most = max(most, worst)
     if most == 0.0:
         return False
     while True:
@@ -115,8 +116,7 @@ def _graduate(
             break
         most *= SHRINK
         for j in range(LANES):
-            if state[LOSS + j] < math.inf:
-                state[LOSS + j] = max(limit, SHRINK * state[LOSS + j])
+            state[SHARPNESS + j] = min(1.0 / limit, state[SHARPNESS + j] / SHRINK)
     # Errors are those before a step: one more shows where the last one led.
     step(tiles, depths, noise, state)
     return True
@@ -156,7 +156,7 @@ def _take_best_pair(
                 for j in range(LANES):
                     among = j < filled and (pairs[j, 0] == k or pairs[j, 1] == k)
                     trial[k, USED + j] = 1.0 if among else 0.0
-            points[LOSS : LOSS + LANES] = math.inf
+            points[SHARPNESS : SHARPNESS + LANES] = 0.0
             start(trial, points)
             at = points[POINT : POINT + 3 * LANES].copy()
             step(trial, trial_depths, noise, points)

@@ -41,8 +41,8 @@ ROWS: Final = 14
 
 # Rows of a state.
 POINT: Final = 0
-LOSS: Final = 3 * LANES
-"""Scale of the Geman-McClure loss in units of variance; infinite = least squares."""
+SHARPNESS: Final = 3 * LANES
+"""One over the scale of the Geman-McClure loss in units of variance; 0 = least squares."""
 MATRIX: Final = 4 * LANES
 """Sums of xx xy xz yy yz zz."""
 RIGHT: Final = 10 * LANES
@@ -96,39 +96,42 @@ def accumulate(tile: Floats, depth: Floats, noise: tuple[float, float], state: F
         tile: one camera's rows; writes `SQUARED`.
         depth: (4,), p of the camera.
         noise: standard deviation of the image noise [px], and of its part in metres [m].
-        state: points and loss scales; writes the sums.
+        state: points and sharpness of the loss; writes the sums.
     """
     p, q, r, s = depth[0], depth[1], depth[2], depth[3]
     pixel, metric = noise[0] ** 2, noise[1] ** 2
     for j in range(LANES):
         x, y, z = state[POINT + j], state[POINT + LANES + j], state[POINT + 2 * LANES + j]
         away = p * x + q * y + r * z + s
-        inverse = 1.0 / away
         a0, a1, a2 = tile[A + j], tile[A + LANES + j], tile[A + 2 * LANES + j]
         b0, b1, b2 = tile[B + j], tile[B + LANES + j], tile[B + 2 * LANES + j]
-        e = (a0 * x + a1 * y + a2 * z + tile[A + 3 * LANES + j]) * inverse
-        f = (b0 * x + b1 * y + b2 * z + tile[B + 3 * LANES + j]) * inverse
+        along = a0 * x + a1 * y + a2 * z + tile[A + 3 * LANES + j]
+        across = b0 * x + b1 * y + b2 * z + tile[B + 3 * LANES + j]
+        inverse = 1.0 / away
+        e, f = along * inverse, across * inverse
         size = tile[SCALE + j] * inverse * inverse
         g = tile[PRECISION + j]
         weight = g / (pixel + size * metric + g * tile[EXTRA + j])
         squared = (e * e + f * f) * weight
+        down = inverse / (1.0 + squared * state[SHARPNESS + j])
         squared = squared if away > 0.0 else np.inf
         tile[SQUARED + j] = squared
-        loss = state[LOSS + j]
-        down = 1.0 / (1.0 + squared / loss)
+        # The derivative of an error is (a - e p) / depth: the weight has its squared depth.
         weight *= down * down * tile[USED + j]
         weight = weight if away > 0.0 else 0.0
-        ax, ay, az = (a0 - e * p) * inverse, (a1 - e * q) * inverse, (a2 - e * r) * inverse
-        bx, by, bz = (b0 - f * p) * inverse, (b1 - f * q) * inverse, (b2 - f * r) * inverse
-        state[MATRIX + j] += weight * (ax * ax + bx * bx)
-        state[MATRIX + LANES + j] += weight * (ax * ay + bx * by)
-        state[MATRIX + 2 * LANES + j] += weight * (ax * az + bx * bz)
-        state[MATRIX + 3 * LANES + j] += weight * (ay * ay + by * by)
-        state[MATRIX + 4 * LANES + j] += weight * (ay * az + by * bz)
-        state[MATRIX + 5 * LANES + j] += weight * (az * az + bz * bz)
-        state[RIGHT + j] -= weight * (ax * e + bx * f)
-        state[RIGHT + LANES + j] -= weight * (ay * e + by * f)
-        state[RIGHT + 2 * LANES + j] -= weight * (az * e + bz * f)
+        ax, ay, az = a0 - e * p, a1 - e * q, a2 - e * r
+        bx, by, bz = b0 - f * p, b1 - f * q, b2 - f * r
+        wax, way, waz = weight * ax, weight * ay, weight * az
+        wbx, wby, wbz = weight * bx, weight * by, weight * bz
+        state[MATRIX + j] += wax * ax + wbx * bx
+        state[MATRIX + LANES + j] += wax * ay + wbx * by
+        state[MATRIX + 2 * LANES + j] += wax * az + wbx * bz
+        state[MATRIX + 3 * LANES + j] += way * ay + wby * by
+        state[MATRIX + 4 * LANES + j] += way * az + wby * bz
+        state[MATRIX + 5 * LANES + j] += waz * az + wbz * bz
+        state[RIGHT + j] -= wax * along + wbx * across
+        state[RIGHT + LANES + j] -= way * along + wby * across
+        state[RIGHT + 2 * LANES + j] -= waz * along + wbz * across
 
 
 @compiled
@@ -212,26 +215,35 @@ def weigh(tile: Floats, depth: Floats, noise: tuple[float, float], state: Floats
 def survey(tiles: Floats, limit: float, state: Floats) -> None:
     """Write how many views there are, how many are within the limit, and the worst error."""
     state[SEEN : SEEN + 3 * LANES] = 0.0
-    for tile in tiles:
-        for j in range(LANES):
-            there = 1.0 if tile[PRECISION + j] > 0.0 else 0.0
-            squared = tile[SQUARED + j]
-            finite = there * squared if squared < np.inf else 0.0
-            state[SEEN + j] += there
-            state[INSIDE + j] += there if squared <= limit else 0.0
-            state[WORST + j] = finite if finite > state[WORST + j] else state[WORST + j]
+    for camera in range(len(tiles)):
+        _survey_view(tiles[camera], limit, state)
+
+
+@compiled
+def _survey_view(tile: Floats, limit: float, state: Floats) -> None:
+    for j in range(LANES):
+        there = tile[PRECISION + j] > 0.0
+        squared, worst = tile[SQUARED + j], state[WORST + j]
+        state[SEEN + j] += 1.0 if there else 0.0
+        state[INSIDE + j] += 1.0 if there & (squared <= limit) else 0.0
+        state[WORST + j] = squared if there & (squared < np.inf) & (squared > worst) else worst
 
 
 @compiled
 def select(tiles: Floats, limit: float, state: Floats) -> None:
     """Use the views within the limit; write how many of them were not used or no longer are."""
     state[CHANGED : CHANGED + LANES] = 0.0
-    for tile in tiles:
-        for j in range(LANES):
-            there = 1.0 if tile[PRECISION + j] > 0.0 else 0.0
-            used = there if tile[SQUARED + j] <= limit else 0.0
-            state[CHANGED + j] += abs(used - tile[USED + j])
-            tile[USED + j] = used
+    for camera in range(len(tiles)):
+        _select_view(tiles[camera], limit, state)
+
+
+@compiled
+def _select_view(tile: Floats, limit: float, state: Floats) -> None:
+    for j in range(LANES):
+        precision, squared, before = tile[PRECISION + j], tile[SQUARED + j], tile[USED + j]
+        used = 1.0 if (precision > 0.0) & (squared <= limit) else 0.0
+        state[CHANGED + j] += (used - before) * (used - before)
+        tile[USED + j] = used
 
 
 @compiled
@@ -251,7 +263,8 @@ def measure(tiles: Floats, depths: Floats, centers: Floats, state: Floats, rays:
     largest squared sine of an angle between two rays.
     """
     sums, views, widest = MATRIX, MATRIX + LANES, MATRIX + 2 * LANES
-    state[sums : sums + 3 * LANES] = 0.0
+    state[sums : sums + 2 * LANES] = 0.0
+    state[widest : widest + LANES] = 1.0
     for camera in range(len(tiles)):
         tile, ray = tiles[camera], rays[camera]
         p, q, r, s = depths[camera, 0], depths[camera, 1], depths[camera, 2], depths[camera, 3]
@@ -267,7 +280,9 @@ def measure(tiles: Floats, depths: Floats, centers: Floats, state: Floats, rays:
             state[sums + j] += (e * e + f * f) * used
             state[views + j] += used
             x, y, z = x - cx, y - cy, z - cz
-            length = used / np.sqrt(x * x + y * y + z * z)
+            length = 1.0 / np.sqrt(x * x + y * y + z * z)
+            # A ray of NaN makes no angle.
+            length = length if used > 0.0 else np.nan
             ray[j], ray[LANES + j], ray[2 * LANES + j] = x * length, y * length, z * length
     for camera in range(len(tiles)):
         one = rays[camera]
@@ -276,6 +291,7 @@ def measure(tiles: Floats, depths: Floats, centers: Floats, state: Floats, rays:
             for j in range(LANES):
                 dot = one[j] * two[j]
                 dot += one[LANES + j] * two[LANES + j] + one[2 * LANES + j] * two[2 * LANES + j]
-                both = tiles[camera, USED + j] * tiles[other, USED + j]
-                square = (1.0 - dot * dot) * both
-                state[widest + j] = max(state[widest + j], square)
+                square, least = dot * dot, state[widest + j]
+                state[widest + j] = square if square < least else least
+    for j in range(LANES):
+        state[widest + j] = 1.0 - state[widest + j]

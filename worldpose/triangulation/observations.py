@@ -24,7 +24,7 @@ from worldpose.triangulation.lanes import (
 
 Floats = NDArray[np.float64]
 
-NEWTON_STEPS: Final = 3
+NEWTON_STEPS: Final = 2
 """Steps that invert most lenses to rounding; the others are inverted one by one."""
 MISFIT: Final = 1e-13
 """Largest accepted misfit of an inverse on the plane z = 1."""
@@ -114,38 +114,45 @@ def gather(
     last = min(LANES, frames * persons * joints - first)
     for camera in range(count):
         tile = tiles[camera]
-        tile[A : A + LANES], tile[B : B + LANES] = cameras[camera, 2], cameras[camera, 3]
         tile[PRECISION : PRECISION + 2 * LANES] = 0.0
-        joint = first % joints
-        person = (first // joints) % persons
-        frame = first // (joints * persons)
-        for j in range(last):
+        j = 0
+        while j < last:
+            # A run of one person's joints.
+            joint, which = (first + j) % joints, (first + j) // joints
+            run = min(joints - joint, last - j)
+            frame, person = which // persons, which % persons
             detection = index[frame, camera, person]
             if detection >= 0:
-                u = float(keypoints[frame, camera, detection, joint, 0])
-                v = float(keypoints[frame, camera, detection, joint, 1])
-                g = float(precision[frame, camera, detection, joint])
-                if 0.0 < g < math.inf and abs(u) + abs(v) < math.inf:
-                    if len(shift):
-                        u -= shift[frame, camera, person, 0]
-                        v -= shift[frame, camera, person, 1]
-                        tile[EXTRA + j] = shift[frame, camera, person, 2]
-                    tile[A + j], tile[B + j], tile[PRECISION + j] = u, v, g
-            joint += 1
-            if joint == joints:
-                joint = 0
-                person += 1
-                if person == persons:
-                    person = 0
-                    frame += 1
+                pixels = keypoints[frame, camera, detection, joint : joint + run]
+                weights = precision[frame, camera, detection, joint : joint + run]
+                into = tile[j:]
+                for k in range(run):
+                    into[A + k], into[B + k] = pixels[k, 0], pixels[k, 1]
+                    into[PRECISION + k] = weights[k]
+                if len(shift):
+                    for k in range(run):
+                        into[A + k] -= shift[frame, camera, person, 0]
+                        into[B + k] -= shift[frame, camera, person, 1]
+                        into[EXTRA + k] = shift[frame, camera, person, 2]
+            j += run
+        u, v = cameras[camera, 2], cameras[camera, 3]
+        for j in range(LANES):
+            a, b, g = tile[A + j], tile[B + j], tile[PRECISION + j]
+            there = (g > 0.0) & (g < math.inf) & (abs(a) + abs(b) < math.inf)
+            tile[A + j] = a if there else u
+            tile[B + j] = b if there else v
+            tile[PRECISION + j] = g if there else 0.0
 
 
 @compiled
 def linearize(tile: Floats, c: Floats) -> None:
     """Turn one camera's pixels into equations; no observation where the lens has no inverse."""
+    over_u, over_v = 1.0 / c[0], 1.0 / c[1]
     for j in range(LANES):
-        xd, yd = (tile[A + j] - c[2]) / c[0], (tile[B + j] - c[3]) / c[1]
-        x, y = xd, yd
+        xd, yd = (tile[A + j] - c[2]) * over_u, (tile[B + j] - c[3]) * over_v
+        square = xd * xd + yd * yd
+        over = 1.0 / (1.0 + square * (c[4] + square * c[5]))
+        x, y = xd * over, yd * over
         for _ in range(NEWTON_STEPS):
             fx, fy, dxx, dxy, dyy = distort(x, y, c[4], c[5], c[6], c[7], c[8])
             over = 1.0 / (dxx * dyy - dxy * dxy)
@@ -158,6 +165,7 @@ def linearize(tile: Floats, c: Floats) -> None:
         # Lanes that need another way are marked here.
         tile[SQUARED + j] = 0.0 if inside else 1.0
         tile[A + LANES + j], tile[B + LANES + j] = x, y
+        tile[A + 2 * LANES + j], tile[A + 3 * LANES + j], tile[B + 2 * LANES + j] = dxx, dxy, dyy
     for j in range(LANES):
         if tile[SQUARED + j] > 0.0:
             pixel, plane = np.empty((1, 1, 2)), np.empty((1, 1, 2))
@@ -166,10 +174,15 @@ def linearize(tile: Floats, c: Floats) -> None:
             if not math.isfinite(plane[0, 0, 0]):
                 plane[:] = 0.0
                 tile[PRECISION + j] = 0.0
-            tile[A + LANES + j], tile[B + LANES + j] = plane[0, 0, 0], plane[0, 0, 1]
+            x, y = plane[0, 0, 0], plane[0, 0, 1]
+            _, _, dxx, dxy, dyy = distort(x, y, c[4], c[5], c[6], c[7], c[8])
+            tile[A + LANES + j], tile[B + LANES + j] = x, y
+            tile[A + 2 * LANES + j], tile[A + 3 * LANES + j] = dxx, dxy
+            tile[B + 2 * LANES + j] = dyy
     for j in range(LANES):
         x, y = tile[A + LANES + j], tile[B + LANES + j]
-        _, _, dxx, dxy, dyy = distort(x, y, c[4], c[5], c[6], c[7], c[8])
+        dxx, dxy = tile[A + 2 * LANES + j], tile[A + 3 * LANES + j]
+        dyy = tile[B + 2 * LANES + j]
         m00, m01, m10, m11 = c[0] * dxx, c[0] * dxy, c[1] * dxy, c[1] * dyy
         tile[SCALE + j] = abs(m00 * m11 - m01 * m10)
         there = 1.0 if tile[PRECISION + j] > 0.0 else 0.0

@@ -17,13 +17,13 @@ from worldpose.compiled import compiled
 from worldpose.triangulation.lanes import (
     EXTRA,
     LANES,
-    LOSS,
     MATRIX,
     POINT,
     PRECISION,
     RIGHT,
     ROWS,
     SCALE,
+    SHARPNESS,
     STATE,
     USED,
     A,
@@ -185,7 +185,7 @@ def _body_offsets(
             for j in range(joint_count):
                 for k in range(3):
                     state[POINT + k * LANES + j] = joints[t, n, j, k]
-            state[LOSS : LOSS + LANES] = math.inf
+            state[SHARPNESS : SHARPNESS + LANES] = 0.0
             step(tiles, depths, noise, state)
             h, right = np.zeros((size, size)), np.zeros(size)
             for c in range(count):

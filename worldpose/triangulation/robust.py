@@ -227,15 +227,20 @@ def _agreement(
     views, seen = solution.views, solution.seen
     found = views > 0
     used = seen & found[:, None]
-    trace = np.trace(covariance[found], axis1=-2, axis2=-1)
+    trace = np.einsum("...ii", covariance)[found]
     return Agreement(
         found=int(found.sum()),
         undetermined=int((seen.any(axis=1) & ~found).sum()),
-        seen=int(seen.sum()),
+        seen=int(np.count_nonzero(seen)),
         views=int(views[found].sum(dtype=np.int64)),
-        used=used.sum(axis=(0, 2, 3)),
-        agreed=solution.inliers.sum(axis=(0, 2, 3)),
+        used=_by_camera(used),
+        agreed=_by_camera(solution.inliers),
         error=Histogram.of(solution.reprojection_error[found]),
         deviation=Histogram.of(np.sqrt(trace)),
         misplaced=misplaced,
     )
+
+
+def _by_camera(there: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return how many are true of (frames, cameras, persons, joints), by camera."""
+    return np.array([np.count_nonzero(there[:, c]) for c in range(there.shape[1])], np.int64)

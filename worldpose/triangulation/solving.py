@@ -117,7 +117,8 @@ def _solve_all(
     joint_count = precision.shape[3]
     tiles, rays = np.empty((count, ROWS * LANES)), np.empty((count, 3 * LANES))
     state, sums = np.empty(STATE * LANES), np.empty(STATE * LANES)
-    found, place = np.empty(LANES, np.bool_), np.empty((LANES, 3), np.int64)
+    found, place = np.zeros(LANES, np.bool_), np.empty((LANES, 3), np.int64)
+    agrees = np.empty((2, LANES), np.bool_)
     total = frames * persons * joint_count
     for first in range(0, total, LANES):
         gather(keypoints, precision, index, shift, first, cameras, tiles)
@@ -151,7 +152,14 @@ def _solve_all(
                 error[t, n, joint] = math.sqrt(sums[MATRIX + j] / agreed)
         for camera in range(count):
             tile = tiles[camera]
-            for j in range(last):
+            for j in range(LANES):
+                agrees[0, j] = tile[PRECISION + j] > 0.0
+                agrees[1, j] = found[j] & (tile[USED + j] > 0.0)
+            j = 0
+            while j < last:
                 t, n, joint = place[j]
-                seen[t, camera, n, joint] = tile[PRECISION + j] > 0.0
-                inliers[t, camera, n, joint] = found[j] and tile[USED + j] > 0.0
+                run = min(joint_count - joint, last - j)
+                there, agreed_here = seen[t, camera, n, joint:], inliers[t, camera, n, joint:]
+                for k in range(run):
+                    there[k], agreed_here[k] = agrees[0, j + k], agrees[1, j + k]
+                j += run

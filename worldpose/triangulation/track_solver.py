@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from worldpose.compiled import compiled
 from worldpose.triangulation.lanes import (
     LANES,
-    LOSS,
     MATRIX,
     POINT,
     PRECISION,
     RIGHT,
     ROWS,
+    SHARPNESS,
     SQUARED,
     STATE,
     USED,
@@ -145,7 +145,7 @@ def held_out_cost(
     total = 0.0
     for part in range(len(tiles)):
         _place(points, part, state)
-        state[LOSS : LOSS + LANES] = limit
+        state[SHARPNESS : SHARPNESS + LANES] = 1.0 / limit
         clear(state)
         for camera in range(len(depths)):
             tile = tiles[part, camera]
@@ -183,7 +183,7 @@ def _equations(
     band[:] = 0.0
     for part in range(len(tiles)):
         _place(points, part, state)
-        state[LOSS : LOSS + LANES] = limit
+        state[SHARPNESS : SHARPNESS + LANES] = 1.0 / limit
         clear(state)
         for camera in range(len(depths)):
             accumulate(tiles[part, camera], depths[camera], noise, state)

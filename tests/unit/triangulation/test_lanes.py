@@ -30,7 +30,7 @@ def tiles_of(camera, image, confidence=None):
 def state_at(point):
     state = np.zeros(STATE * LANES)
     state[: 3 * LANES] = np.repeat(point, LANES)
-    state[lanes.LOSS : lanes.LOSS + LANES] = np.inf
+    state[lanes.SHARPNESS : lanes.SHARPNESS + LANES] = 0.0
     return state
 
 
