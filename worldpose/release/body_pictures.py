@@ -86,11 +86,12 @@ def crowded_part(camera: Camera, bodies: Floats) -> tuple[Floats, Floats]:
     size = np.asarray(camera.image_size, dtype=np.float64)
     side = SHARE * size
     middles = camera.project(bodies.mean(axis=1))
-    inside = np.all((middles >= 0.0) & (middles < size), axis=-1)
+    inside: NDArray[np.bool_] = np.all((middles >= 0.0) & (middles < size), axis=-1)
     if not inside.any():
         return np.full(2, -0.5), size
     middles = middles[inside]
-    together = (np.abs(middles[:, None] - middles) < 0.45 * side).all(axis=-1)
+    apart = np.abs(middles[:, None] - middles)
+    together: NDArray[np.bool_] = np.all(apart < 0.45 * side, axis=-1)
     around = middles[together[np.argmax(together.sum(axis=1))]].mean(axis=0)
     return np.clip(around - 0.5 * side, -0.5, size - 0.5 - side), side
 
@@ -162,7 +163,7 @@ def _background(
     for line in markings(pitch) if pitch is not None else ():
         pixels = camera.project(line)
         # What is far outside has no place in 32 bits, and none in the picture.
-        near = (np.abs(pixels) < 1e4).all(axis=-1)
+        near: NDArray[np.bool_] = np.all(np.abs(pixels) < 1e4, axis=-1)
         for start in np.flatnonzero(near[:-1] & near[1:]):
             a, b = np.rint(pixels[start : start + 2] * 2**_SUBPIXEL).astype(int).tolist()
             cv2.line(canvas, a, b, (255, 255, 255), 3, cv2.LINE_AA, _SUBPIXEL)

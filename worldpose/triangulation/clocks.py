@@ -258,10 +258,11 @@ def _regression(
         weight = np.where(usable, weight, 0.0)
         miss = np.where(usable[:, None], miss, 0.0)
         jacobian = np.where(usable[:, None, None], jacobian, 0.0)
-        way = np.einsum("nak,nk->na", jacobian, velocity)
-        matrix += np.einsum("n,nai,naj->nij", weight, jacobian, jacobian)
-        right += np.einsum("n,nai,na->ni", weight, jacobian, miss)
-        mixed[camera] = np.einsum("n,nai,na->ni", weight, jacobian, way)
+        way = (jacobian @ velocity[..., None])[..., 0]
+        weighed = (weight[:, None, None] * jacobian).swapaxes(-1, -2)
+        matrix += weighed @ jacobian
+        right += (weighed @ miss[..., None])[..., 0]
+        mixed[camera] = (weighed @ way[..., None])[..., 0]
         size = np.where(usable, size, 0.0)
         aside[camera] = (weight * np.sqrt((way**2).sum(axis=-1)) * size).sum()
         misses[camera] = (weight * (miss**2).sum(axis=-1)).sum()
@@ -272,9 +273,10 @@ def _regression(
     inverse = np.linalg.inv(matrix + 1e-9 * np.eye(3))
     for one in range(persons):
         its = person == one
-        follows = np.einsum("cni,nij->cnj", mixed[:, its], inverse[its])
-        information[one] -= np.einsum("cnj,dnj->cd", follows, mixed[:, its])
-        score[one] -= np.einsum("cnj,nj->c", follows, right[its])
+        own = mixed[:, its]
+        follows = (own[..., None, :] @ inverse[its])[..., 0, :].reshape(count, -1)
+        information[one] -= follows @ own.reshape(count, -1).T
+        score[one] -= follows @ right[its].ravel()
     return _Sums(information, score, aside, misses, scale)
 
 
