@@ -1,9 +1,9 @@
-# Verbs: install, demo, check, format, test, test-all, schemas, clean. All work from a fresh clone.
+# Verbs: install, demo, demo-quick, check, format, test, test-all, schemas, clean. All work from a fresh clone.
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
 
-.PHONY: install demo check format test test-all schemas benchmarks clean
+.PHONY: install demo demo-quick check format test test-all schemas benchmarks clean
 
 install: $(INSTALLED)
 
@@ -19,10 +19,13 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@rm -rf .venv/first
 	@touch $(INSTALLED)
 
-demo: install
+# What the demo reconstructs: a match of 25 people; demo-quick takes 5 people and 6 cameras.
+demo: MATCH := --scenario match --seed 1 --duration 4
+demo-quick: MATCH := --scenario tiny --seed 1 --duration 1
+demo demo-quick: install
 	@rm -rf demo
 	@echo "1/4  a synthetic match with known truth"
-	@$(BIN)/worldpose simulate --scenario match --seed 1 --duration 4 --out demo/match
+	@$(BIN)/worldpose simulate $(MATCH) --out demo/match
 	@echo "2/4  the factory: Prefect flow, Dask tasks, Zarr store"
 	@$(BIN)/worldpose run demo/match --project demo/project
 	@echo "3/4  figures against truth"

@@ -40,5 +40,5 @@ def test_shelf_is_reconstructed_from_real_detections(tmp_path):
     truth = np.load(SHELF / "gt.npz")
     poses = dict(zip(tracks.frames.tolist(), tracks.joints, strict=True))
     score, _ = pcp.evaluate(truth["gt"], truth["frames"], poses, "shelf")
-    # A plain matcher reaches 98.5; seen here 98.65.
+    # A plain matcher reaches 98.5; seen here 98.53 of fitted bodies, 98.59 of triangulated joints.
     assert score["avg_pcp_actors_1_3"] >= 98.0, score
