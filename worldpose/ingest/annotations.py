@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Final
@@ -49,16 +49,7 @@ def read_clicked(
     """
     static = {camera.id: camera for camera in spec.static_cameras}
     clicked = {}
-    names = sorted(path.name for path in (folder / CLICKED_FOLDER).glob("[!.]*"))
-    for name in names:
-        file = existing_file(folder, f"{CLICKED_FOLDER}/{name}", str(folder))
-        if file.suffix != ".json" or file.stem not in static:
-            raise InputError(
-                str(file),
-                expected=f"<camera>.json of a static camera: {', '.join(static)}",
-                found=repr(name),
-                todo="Rename or remove the file, or add the camera to match.yaml.",
-            )
+    for file in _files(folder, CLICKED_FOLDER, "<camera>.json of a static camera", static):
         clicked[file.stem] = read_clicked_markings(file, static[file.stem], pitch)
     return {name: clicked[name] for name in static if name in clicked}
 
@@ -96,16 +87,8 @@ def read_key_frames(folder: Path, spec: MatchSpec, pitch: PitchSpec | None) -> d
     """
     clips = {clip.id: clip for clip in spec.clips if clip.broadcast is not None}
     picked = {}
-    names = sorted(path.name for path in (folder / KEY_FRAMES_FOLDER).glob("[!.]*"))
-    for name in names:
-        file = existing_file(folder, f"{KEY_FRAMES_FOLDER}/{name}", str(folder))
-        if file.suffix != ".json" or file.stem not in clips:
-            raise InputError(
-                str(file),
-                expected=f"<clip>.json of a clip with a broadcast camera: {', '.join(clips)}",
-                found=repr(name),
-                todo="Rename or remove the file, or name the clip's camera in match.yaml.",
-            )
+    of_clips = "<clip>.json of a clip with a broadcast camera"
+    for file in _files(folder, KEY_FRAMES_FOLDER, of_clips, clips):
         camera = spec.camera(str(clips[file.stem].broadcast))
         template = _template(file, pitch)
         key_frames = validate_record(KeyFrames, read_json(file), str(file))
@@ -130,6 +113,20 @@ def write_key_frames(folder: Path, key_frames: Mapping[str, KeyFrames]) -> None:
         file = folder / key_frames_file(clip_id)
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(picked.model_dump_json(indent=2) + "\n", encoding="utf-8")
+
+
+def _files(folder: Path, place: str, expected: str, known: Collection[str]) -> Iterator[Path]:
+    """The files of a folder of the match, sorted; each must be named after something known."""
+    for name in sorted(path.name for path in (folder / place).glob("[!.]*")):
+        file = existing_file(folder, f"{place}/{name}", str(folder))
+        if file.suffix != ".json" or file.stem not in known:
+            raise InputError(
+                str(file),
+                expected=f"{expected}: {', '.join(known) or 'none here'}",
+                found=repr(name),
+                todo="Rename or remove the file, or mend match.yaml.",
+            )
+        yield file
 
 
 def _template(file: Path, pitch: PitchSpec | None) -> PitchTemplate:
