@@ -50,7 +50,7 @@ def test_a_worker_killed_at_a_commit_point_is_replaced(point, tiny, tiny_run, tm
     assert_same_store(project, tiny_run)
 
 
-@pytest.mark.parametrize("point", IN_MAIN)
+@pytest.mark.parametrize("point", quick(IN_MAIN, {"before_run_record"}))
 def test_the_whole_process_killed_around_the_run_record(point, tiny, tiny_run, tmp_path):
     environment, struck = fault_environment(tmp_path, point)
     project = tmp_path / "worldpose-data"
@@ -158,7 +158,7 @@ def processes_with(marker):
     return [pid for pid in found if pid != os.getpid()]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", quick([signal.SIGINT, signal.SIGTERM], {signal.SIGINT}))
 def test_an_interrupted_run_ends_at_once_and_says_how_to_go_on(number, tiny, tmp_path):
     environment = {**os.environ, "WORLDPOSE_TEST_MARK": tmp_path.name}
     environment.pop("PREFECT_API_URL")
