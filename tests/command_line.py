@@ -26,7 +26,9 @@ class Answer:
 
 
 def worldpose(*arguments, timeout=480, environment=None, program=WORLDPOSE):
-    """Runs the command line in a process of its own."""
+    """Runs the command line in a process of its own; runs get one worker, a core each."""
+    if arguments[0] == "run" and not {"--dask", "--workers", "--help"} & set(arguments):
+        arguments += ("--workers", 1)
     done = subprocess.run(
         [*program, *map(str, arguments)],
         capture_output=True,

@@ -41,6 +41,14 @@ def tiny_run(server, tiny, tmp_path_factory):
     return project
 
 
+@pytest.fixture(scope="session")
+def ingested(server, tiny, tmp_path_factory):
+    """A project whose only run of `tiny` ended after its first stage; read only."""
+    project = tmp_path_factory.mktemp("ingested") / "worldpose-data"
+    succeed("run", tiny, "--project", project, "--until", "ingest")
+    return project
+
+
 @pytest.fixture
 def project_copy(tiny_run, tmp_path):
     """A copy of that project, to be changed."""

@@ -182,4 +182,4 @@ def test_an_interrupted_run_ends_at_once_and_says_how_to_go_on(number, tiny, tmp
     if number == signal.SIGINT:
         assert "run again to go on" in said
         assert process.returncode == 128 + number
-    succeed("run", tiny, "--project", tmp_path / "worldpose-data")
+    succeed("run", tiny, "--project", tmp_path / "worldpose-data", "--until", "tracking")

@@ -182,7 +182,7 @@ def test_a_folder_that_is_not_there_leaves_no_project_behind(command, tmp_path):
 
 def test_a_match_folder_that_is_gone_hides_neither_results_nor_other_matches(match, tmp_path):
     project = tmp_path / "worldpose-data"
-    assert worldpose("run", match, "--project", project).code == 0
+    assert worldpose("run", match, "--project", project, "--until", "triangulation").code == 0
     shutil.rmtree(match)
     status = worldpose("status", "--project", project, "--json")
     assert status.code == 0
@@ -240,7 +240,7 @@ def test_a_place_that_cannot_be_written_is_one_message(tiny_run, tmp_path):
 
 
 def test_finding_nobody_is_said(tiny, tmp_path):
-    asked = ("--set", "triangulation.min_views=9")
+    asked = ("--until", "triangulation", "--set", "triangulation.min_views=9")
     answer = worldpose("run", tiny, "--project", tmp_path / "new", *asked)
     assert answer.code == 0
     assert "triangulation/clip found nobody" in answer.err

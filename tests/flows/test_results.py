@@ -131,11 +131,9 @@ def test_report_is_one_page_that_asks_for_nothing(tiny, tiny_run, tmp_path):
     assert "triangulation/clip" in page
 
 
-def test_a_run_without_joints_cannot_be_exported(server, tiny, tmp_path):
-    project = tmp_path / "worldpose-data"
-    succeed("run", tiny, "--project", project, "--until", "ingest")
+def test_a_run_without_joints_cannot_be_exported(ingested, tmp_path):
     answer = worldpose(
-        *("export", TINY, "--format", "joints", "--out", tmp_path / "out", "--project", project)
+        *("export", TINY, "--format", "joints", "--out", tmp_path / "out", "--project", ingested)
     )
     assert answer.code == 1
     assert "Run the match to the end" in answer.err
