@@ -27,7 +27,7 @@ TRACKING = GroupLayout(
             dtype="int16",
             unit="1",
             missing="-1",
-            about="place in `ingest` detections of this camera and frame",
+            about="place among this camera's detections of the frame, in `ingest` or `detection`",
             chunk_dim="frame",
         ),
         ArrayLayout(
@@ -54,6 +54,8 @@ TRACKING = GroupLayout(
         "camera": "camera ids in the order of the camera dimension",
         "tracks": "one `track` record a person",
         "joins": "`join` records: the undecided first, then the dearest",
+        "objections": "of people's corrections, in order: why each does not apply, null where it "
+        "does",
     },
 )
 

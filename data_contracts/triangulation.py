@@ -7,6 +7,13 @@ from data_contracts.conventions import COCO17
 from data_contracts.observations import FRAME
 from data_contracts.tracking import PERSON
 
+EXCHANGED_PARTS = {
+    "face": ("eye", "ear"),
+    "arms": ("shoulder", "elbow", "wrist"),
+    "legs": ("hip", "knee", "ankle"),
+}
+"""Parts of a body whose left and right a detector exchanges together, and their joints."""
+
 TRIANGULATION = GroupLayout(
     stage="triangulation",
     about="3D joints of every person with covariance and the views that carry them.",
@@ -68,6 +75,16 @@ TRIANGULATION = GroupLayout(
             chunk_dim="frame",
         ),
         ArrayLayout(
+            name="exchanged",
+            dims=("frame", "camera", "person", "part"),
+            dtype="bool",
+            unit="1",
+            missing="none",
+            about="did this camera's detection have left and right of this part exchanged; the "
+            "joints and `inliers` are from it put right",
+            chunk_dim="frame",
+        ),
+        ArrayLayout(
             name="offsets",
             dims=("frame", "camera", "person", "axis"),
             dtype="float32",
@@ -123,6 +140,7 @@ TRIANGULATION = GroupLayout(
     ),
     labels={
         "joint": COCO17,
+        "part": tuple(EXCHANGED_PARTS),
         "axis": ("x", "y"),
         "coordinate": ("x", "y", "z"),
         "coordinate_": ("x", "y", "z"),

@@ -18,7 +18,6 @@ from worldpose.store import ResultWriter, Store
 from worldpose.triangulation import (
     CameraClocks,
     ClipDetections,
-    Reconstruction,
     Smoothing,
     Triangulation,
     TriangulationSettings,
@@ -78,11 +77,6 @@ def place_joints(
         result.figures.update(figures_of(report, clip.camera_ids))
 
 
-def reconstruction_arrays(found: Reconstruction) -> dict[str, NDArray[Any]]:
-    """The stored arrays of a clip's joints, by name."""
-    return part_arrays(found.triangulation, found.smoothing) | clock_arrays(found.clocks)
-
-
 def part_arrays(joints: Triangulation, smooth: Smoothing) -> dict[str, NDArray[Any]]:
     """The stored arrays that have frames."""
     return {
@@ -92,6 +86,7 @@ def part_arrays(joints: Triangulation, smooth: Smoothing) -> dict[str, NDArray[A
         "spread": joints.spread,
         "reprojection_error": joints.reprojection_error,
         "inliers": joints.inliers,
+        "exchanged": joints.exchanged,
         "offsets": joints.offsets.astype("float32"),
         "smoothed": smooth.joints,
         "smoothed_covariance": smooth.covariance,

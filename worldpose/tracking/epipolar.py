@@ -11,8 +11,8 @@ from worldpose.compiled import compiled
 from worldpose.tracking.affinity import ray_affinity
 from worldpose.tracking.intersection import intersect_people
 from worldpose.tracking.limbs import plausible
-from worldpose.tracking.person import Sighting
 from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.sightings import Sighting
 
 
 @compiled

@@ -12,8 +12,9 @@ from worldpose.tracking.affinity import match_greedily, match_optimally, ray_aff
 from worldpose.tracking.epipolar import associate
 from worldpose.tracking.intersection import intersect_people
 from worldpose.tracking.joining import Candidate, End, decide, ends_of, join_costs
-from worldpose.tracking.person import Person, Sighting, separations
+from worldpose.tracking.person import Person, separations
 from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.sightings import Sighting
 
 MIN_AREA = 25.0
 """Least ground on which strangers may appear [m^2]: a room."""

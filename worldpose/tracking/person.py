@@ -10,31 +10,7 @@ from numpy.typing import NDArray
 
 from worldpose.compiled import compiled
 from worldpose.tracking.settings import TrackingSettings
-
-
-@dataclass(frozen=True)
-class Sighting:
-    """Detections of different views, in one frame, that are one person.
-
-    Attributes:
-        index: (cameras,) place among the detections; -1 = not seen.
-        ray_distance: (cameras,) mean distance of the detection's rays to the person [m]; NaN =
-            not seen.
-        joints: (17, 3) [m], world; NaN where the rays do not determine them.
-    """
-
-    index: NDArray[np.int64]
-    ray_distance: NDArray[np.float64]
-    joints: NDArray[np.float64]
-
-    def filled_from(self, other: Sighting) -> Sighting:
-        """Return this with the other's detections in the cameras where this has none."""
-        own = self.index >= 0
-        return Sighting(
-            np.where(own, self.index, other.index),
-            np.where(own, self.ray_distance, other.ray_distance),
-            np.where(np.isfinite(self.joints), self.joints, other.joints),
-        )
+from worldpose.tracking.sightings import Sighting, Sightings
 
 
 @dataclass(eq=False)
@@ -56,7 +32,7 @@ class Person:
     pose: NDArray[np.float64]
     last_fixed: int
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    sightings: dict[int, Sighting] = field(default_factory=dict)
+    sightings: Sightings = field(default_factory=Sightings)
     fixed: int = 0
     evidence: float = 0.0
     shown_from: int = -1

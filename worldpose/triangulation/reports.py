@@ -31,6 +31,9 @@ class TriangulationReport(Record):
     """Keypoints of tracked people [1]."""
     rejected_share: tuple[float | None, ...]
     """Share of each camera's keypoints, among joints found, that disagree; None without any."""
+    exchanged_share: tuple[float | None, ...]
+    """Share of each camera's views of people whose left and right, of a part at least, were
+    exchanged and put right; None without any."""
     mean_views: float | None
     """Mean number of agreeing views of the joints found."""
     reprojection_error_px: float | None
@@ -100,6 +103,8 @@ class Agreement:
         views: agreeing views, over all joints.
         used: (cameras,) observations of joints found.
         agreed: (cameras,) of these, agreeing.
+        people: (cameras,) views of people.
+        exchanged: (cameras,) of these, put right.
         error: reprojection errors [px].
         deviation: roots of traces [m].
         misplaced: misplacements that calibration makes probable, by camera [m].
@@ -111,6 +116,8 @@ class Agreement:
     views: int
     used: NDArray[np.int64]
     agreed: NDArray[np.int64]
+    people: NDArray[np.int64]
+    exchanged: NDArray[np.int64]
     error: Histogram
     deviation: Histogram
     misplaced: tuple[Histogram, ...]
@@ -123,6 +130,8 @@ class Agreement:
             self.views + other.views,
             self.used + other.used,
             self.agreed + other.agreed,
+            self.people + other.people,
+            self.exchanged + other.exchanged,
             self.error + other.error,
             self.deviation + other.deviation,
             tuple(a + b for a, b in zip(self.misplaced, other.misplaced, strict=True)),
@@ -130,12 +139,12 @@ class Agreement:
 
     def report(self, noise_factor: float) -> TriangulationReport:
         """Return the figures."""
-        shares = zip(self.agreed.tolist(), self.used.tolist(), strict=True)
         return TriangulationReport(
             joints=self.found,
             undetermined=self.undetermined,
             observations=self.seen,
-            rejected_share=tuple(1.0 - a / n if n else None for a, n in shares),
+            rejected_share=_shares(self.used - self.agreed, self.used),
+            exchanged_share=_shares(self.exchanged, self.people),
             mean_views=self.views / self.found if self.found else None,
             reprojection_error_px=self.error.median,
             standard_deviation_m=self.deviation.median,
@@ -172,3 +181,9 @@ class Changes:
             repeated=repeated,
             moved_m=self.moved.median,
         )
+
+
+def _shares(part: NDArray[np.int64], whole: NDArray[np.int64]) -> tuple[float | None, ...]:
+    """Return part over whole; None of nothing."""
+    each = zip(part.tolist(), whole.tolist(), strict=True)
+    return tuple(some / number if number else None for some, number in each)

@@ -8,9 +8,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.cameras import Camera
 from worldpose.triangulation.array_checks import check_arrays
 from worldpose.triangulation.calibration_errors import stated_errors
+from worldpose.triangulation.exchanges import find_exchanges, undo_exchanges
 from worldpose.triangulation.midhip import midhip_shift
 from worldpose.triangulation.noise_model import NoiseModel, learn_noise
 from worldpose.triangulation.observations import Rig
@@ -55,6 +57,8 @@ class Triangulation:
         reprojection_error: (frames, persons, 17) float32 [px], root mean square length over the
             agreeing cameras, offsets taken off.
         inliers: (frames, cameras, persons, 17) bool, does this camera agree.
+        exchanged: (frames, cameras, persons, 3) bool, which `EXCHANGED_PARTS` of the detection had
+            left and right exchanged: it was put right.
         offsets: (frames, cameras, persons, 2) [px], by how much the camera sees the person beside
             where all cameras put him; 0 where unknown.
         calibration_covariance: (frames, persons, 17, 3, 3) [m^2], the part of `covariance` that
@@ -69,6 +73,7 @@ class Triangulation:
     spread: NDArray[np.float32]
     reprojection_error: NDArray[np.float32]
     inliers: NDArray[np.bool_]
+    exchanged: NDArray[np.bool_]
     offsets: Floats
     calibration_covariance: Floats
     noise: NoiseModel
@@ -133,10 +138,11 @@ def triangulate_joints(
         spread=solution.spread,
         reprojection_error=solution.reprojection_error,
         inliers=solution.inliers,
+        exchanged=passes.exchanged,
         offsets=shift[..., :2] if len(shift) else np.zeros((*detection_index.shape, 2)),
         calibration_covariance=lasting,
         noise=noise,
-        agreement=_agreement(solution, covariance, passes.misplaced),
+        agreement=_agreement(passes, covariance, detection_index),
     )
 
 
@@ -165,6 +171,7 @@ class _Passes:
     """The last solution and what led to it."""
 
     solution: Solution
+    exchanged: NDArray[np.bool_]
     shift: Floats
     further: Floats | float
     model: DetectorModel
@@ -198,11 +205,20 @@ def _passes(
     if settings.offsets == "midhip":
         shift = midhip_shift(rig, keypoints, confidence, index, settings)
     solution = solved(shift)
+    calibration = None if settings.offsets == "midhip" else camera_covariance
+    exchanged = np.zeros((*index.shape, len(EXCHANGED_PARTS)), np.bool_)
+    if settings.undo_exchanges:
+        seen = (rig, keypoints, models[-1].precision(confidence), index, shift)
+        exchanged = find_exchanges(*seen, settings.noise, limit, solution)
+        keypoints, confidence = undo_exchanges(keypoints, confidence, index, exchanged)
+        if exchanged.any() and calibration is None:
+            precision = models[-1].precision(confidence)
+            solution = solve(rig, keypoints, precision, index, shift, settings)
     further: Floats | float = 0.0
     misplaced = (Histogram.of(np.empty(0)),) * len(rig.cameras)
     factor = 1.0 if known is None else known.factor
-    if camera_covariance is not None and settings.offsets != "midhip":
-        stated = stated_errors(cameras, solution.joints, settings, camera_covariance)
+    if calibration is not None:
+        stated = stated_errors(cameras, solution.joints, settings, calibration)
         # What calibration explains is not the detector's noise, nor a reason to reject a view.
         shift = np.zeros((*stated.variance.shape, 3))
         shift[..., 2] = stated.variance
@@ -217,13 +233,12 @@ def _passes(
         misplaced = stated.misplaced(factor)
         solution = solved(shift)
     model = DetectorModel(tuple(models), factor)
-    return _Passes(solution, shift, further, model, misplaced)
+    return _Passes(solution, exchanged, shift, further, model, misplaced)
 
 
-def _agreement(
-    solution: Solution, covariance: Floats, misplaced: tuple[Histogram, ...]
-) -> Agreement:
+def _agreement(passes: _Passes, covariance: Floats, index: NDArray[np.int16]) -> Agreement:
     """Return how well the views of some frames agree."""
+    solution = passes.solution
     views, seen = solution.views, solution.seen
     found = views > 0
     used = seen & found[:, None]
@@ -237,10 +252,12 @@ def _agreement(
         agreed=_by_camera(solution.inliers),
         error=Histogram.of(solution.reprojection_error[found]),
         deviation=Histogram.of(np.sqrt(trace)),
-        misplaced=misplaced,
+        people=_by_camera(np.asarray(index >= 0)),
+        exchanged=_by_camera(np.asarray(passes.exchanged.any(axis=-1))),
+        misplaced=passes.misplaced,
     )
 
 
 def _by_camera(there: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return how many are true of (frames, cameras, persons, joints), by camera."""
+    """Return how many are true of (frames, cameras, ...), by camera."""
     return np.array([np.count_nonzero(there[:, c]) for c in range(there.shape[1])], np.int64)

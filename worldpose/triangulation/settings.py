@@ -38,6 +38,8 @@ class TriangulationSettings(Record):
     min_angle: float = Field(default=0.1, gt=0)
     """Least angle between the most different agreeing rays [rad]: below it a pixel moves the
     joint ten times as far along the rays as across them."""
+    undo_exchanges: bool = True
+    """Put right detections whose left and right the other views show to be exchanged."""
     offsets: Literal["none", "midhip", "body"] = "body"
     """How calibration errors are kept from a person's pose (T4): "none" takes the cameras as
     exact; "midhip" moves every picture of a person so that the mid-hips meet, as the paper does;

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.cameras import Camera
+from worldpose.triangulation.exchanges import undo_exchanges
 from worldpose.triangulation.motion_model import MotionModel, choose_stretches, learn_motion
 from worldpose.triangulation.observations import Rig, person_observations
 from worldpose.triangulation.reports import Changes, Histogram, SmoothingReport
@@ -64,13 +65,14 @@ def smooth_joints(
         keypoints: (frames, cameras, detections, 17, 2) [px].
         confidence: (frames, cameras, detections, 17).
         detection_index: (frames, cameras, persons).
-        raw: of the same arrays; its noise and offsets are used.
+        raw: of the same arrays; its noise, offsets and exchanges are used.
         fps: frames per second [1/s].
         settings: noise and the longest gap.
         motion: what is usual in the clip that these frames are of; None = they are the clip.
         core: frames to return; the others only lend them support.
     """
     rig = Rig.of(cameras)
+    keypoints, confidence = undo_exchanges(keypoints, confidence, detection_index, raw.exchanged)
     precision = raw.noise.precision(confidence)
     joints, covariance = np.full_like(raw.joints, np.nan), np.full_like(raw.covariance, np.nan)
     arrays = (keypoints, precision, detection_index, raw.offsets)

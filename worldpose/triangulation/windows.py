@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from worldpose.cameras import Camera
 from worldpose.tracking.clip_arrays import ClipArray
 from worldpose.triangulation.clocks import CameraClocks, Moved, estimate_clocks, moved_in_time
+from worldpose.triangulation.exchanges import undo_exchanges
 from worldpose.triangulation.lanes import LANES
 from worldpose.triangulation.motion_model import MotionModel, choose_stretches, learn_motion
 from worldpose.triangulation.observations import Rig, person_observations
@@ -147,6 +148,7 @@ def learn_clip(
         keypoints, confidence, index = detections.between(frames.start, frames.stop)
         alone = (keypoints, confidence, index[:, :, person : person + 1])
         raw = triangulate_joints(cameras, *alone, settings, camera_covariance, detector)
+        keypoints, confidence = undo_exchanges(*alone, raw.exchanged)
         arrays = (keypoints, raw.noise.precision(confidence), alone[2], raw.offsets)
         return (*person_observations(arrays, 0), raw.joints[:, 0])
 
@@ -208,7 +210,7 @@ def _around(
 ) -> Triangulation:
     """Return what smoothing needs of a stretch and of the frames on either side of it."""
 
-    def joined(name: str) -> Floats:
+    def joined(name: str) -> NDArray[Any]:
         parts = [getattr(before, name)[-margin:]] if before is not None and margin else []
         parts.append(getattr(here, name))
         if after is not None:
@@ -220,5 +222,6 @@ def _around(
         joints=joined("joints"),
         covariance=joined("covariance"),
         calibration_covariance=joined("calibration_covariance"),
+        exchanged=joined("exchanged"),
         offsets=joined("offsets"),
     )

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from worldpose.tracking import TrackingSettings
-from worldpose.tracking.person import Person, Sighting, separations
+from worldpose.tracking.person import Person, separations
+from worldpose.tracking.sightings import Sighting
 
 SETTINGS = TrackingSettings()
 FPS = 50.0

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from data_contracts.match import PlayerSpec
-from worldpose.tracking.person import Person, Sighting
+from worldpose.tracking.person import Person
 from worldpose.tracking.rosters import people_allowed, within_limit
+from worldpose.tracking.sightings import Sighting
 
 
 def roster(red, blue, officials):
@@ -25,7 +26,7 @@ def test_eleven_of_each_team_and_the_officials_are_allowed_if_all_are_named(peop
 def person(number, first, last, evidence):
     nothing = Sighting(np.empty(0, int), np.empty(0), np.empty((0, 3)))
     someone = Person(number, np.empty((0, 3)), last, evidence=evidence)
-    someone.sightings = {first: nothing, last: nothing}
+    someone.sightings.update({first: nothing, last: nothing})
     return someone
 
 

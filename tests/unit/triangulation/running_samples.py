@@ -2,9 +2,15 @@
 
 import numpy as np
 
+from data_contracts.conventions import COCO17
 from worldpose.cameras import Camera
 
 FPS = 50.0
+MIRRORED = [
+    COCO17.index(name.replace("left", "*").replace("right", "left").replace("*", "right"))
+    for name in COCO17
+]
+"""The same joint on the other side."""
 
 
 def runner(frames: int, persons: int = 2, seed: int = 0) -> np.ndarray:

@@ -3,7 +3,7 @@ from operator import add
 
 import numpy as np
 import pytest
-from running_samples import FPS, detections, runner
+from running_samples import FPS, MIRRORED, detections, runner
 
 from worldpose.triangulation import (
     ClipDetections,
@@ -36,6 +36,7 @@ def clip(ring):
     """Cameras and arrays of two runners; one is unseen for a while, twice at a part's end."""
     camera = ring(4)
     keypoints, confidence, index = detections(camera, runner(FRAMES), 2.0)
+    keypoints[100:150, 1, 0] = keypoints[100:150, 1, 0][:, MIRRORED]
     index[120:135, :, 1] = -1  # 0.3 s: filled
     index[230:270, :, 0] = -1  # 0.8 s: not filled
     index[300:, 2:, 0] = -1
@@ -52,9 +53,10 @@ def test_parts_give_what_the_whole_clip_gives(clip):
         (128, 256),
         (256, FRAMES),
     ]
-    for name in ("joints", "covariance", "views", "spread", "inliers", "offsets"):
+    for name in ("joints", "covariance", "views", "spread", "inliers", "exchanged", "offsets"):
         joined = np.concatenate([getattr(part.triangulation, name) for part in parts])
         np.testing.assert_array_equal(joined, getattr(whole.triangulation, name))
+    assert whole.triangulation.exchanged[100:150, 1, 0].any(axis=-1).all()
     smooth = np.concatenate([part.smoothing.joints for part in parts])
     # Iterations end at steps of 0.1 mm a coordinate, and not at the same one.
     np.testing.assert_allclose(smooth, whole.smoothing.joints, atol=2e-4)
