@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from math import isnan
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.progress import Progress, TaskID
 
 from flows.cli.console import (
     DEFAULT_PROJECT,
@@ -18,8 +21,9 @@ from flows.cli.console import (
     print_table,
 )
 from flows.registering import register
+from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
-from worldpose.ingest import import_match
+from worldpose.ingest import import_match, import_videos
 from worldpose.store import Store
 
 
@@ -48,6 +52,13 @@ def simulate(
         bool,
         typer.Option(help="Film the broadcast camera where the scenario says so: 0.1 s a frame."),
     ] = True,
+    render: Annotated[
+        bool,
+        typer.Option("--render", help="Film all cameras, and give no detections: pixels only."),
+    ] = False,
+    masks: Annotated[
+        bool, typer.Option("--masks", help="With --render, add who is where in every pixel.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Make a synthetic match folder with known truth.
@@ -74,23 +85,47 @@ def simulate(
         raise UsageError(
             "--out", expected="the folder to make", found="nothing", todo="Add --out FOLDER."
         )
-    spec = simulate_match(
-        SCENARIOS[scenario],
-        seed,
-        out,
-        duration=duration,
-        cameras=cameras,
-        players=players,
-        trajectories=trajectories,
-        mocap=mocap,
-        calibrated=calibrated,
-        stills=stills,
-        video=video,
-    )
+    if masks and not render:
+        raise UsageError(
+            "--masks", expected="--masks with --render", found="no --render", todo="Add --render."
+        )
+    with _filming() as advance:
+        spec = simulate_match(
+            SCENARIOS[scenario],
+            seed,
+            out,
+            duration=duration,
+            cameras=cameras,
+            players=players,
+            trajectories=trajectories,
+            mocap=mocap,
+            calibrated=calibrated,
+            stills=stills,
+            video=video,
+            render=render,
+            masks=masks,
+            advance=advance,
+        )
     if as_json:
         print_json({"match": spec.match_id, "folder": str(out)})
     else:
         line(f"made match {spec.match_id} in {out}")
+
+
+@contextmanager
+def _filming() -> Iterator[Callable[[str, int, int], None]]:
+    """Progress of filming: a bar for each camera, or a line when one is done."""
+    with Progress(console=errors, transient=True, disable=not errors.is_terminal) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def advance(name: str, done: int, frames: int) -> None:
+            if name not in tasks:
+                tasks[name] = bars.add_task(name, total=frames)
+            bars.update(tasks[name], completed=done)
+            if done == frames:
+                line(f"filmed {name}: {frames} frames", to=errors)
+
+        yield advance
 
 
 def import_command(
@@ -101,6 +136,9 @@ def import_command(
     ] = None,
     detections: Annotated[
         Path | None, typer.Option(help="COCO keypoint results, <camera>.json.")
+    ] = None,
+    videos: Annotated[
+        Path | None, typer.Option(help="Videos instead of 2D poses, <camera>.mp4.")
     ] = None,
     fps: Annotated[float | None, typer.Option(help="Frames a second.")] = None,
     match_id: Annotated[
@@ -115,12 +153,12 @@ def import_command(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Bring calibration and 2D poses of other tools, or a surveyed pitch, into a match folder.
+    """Bring calibration and 2D poses or videos, or a surveyed pitch, into a match folder.
 
     Example: worldpose import --calibration cal.toml --detections poses --fps 25 --out matches/lab
     """
     if pitch is not None:
-        if calibration or detections or fps or match_id:
+        if calibration or detections or videos or fps or match_id:
             raise UsageError(
                 "--pitch",
                 expected="--pitch with --out alone",
@@ -129,14 +167,17 @@ def import_command(
             )
         import_pitch(pitch, out, left_handed=left_handed, as_json=as_json)
         return
-    if calibration is None or detections is None or fps is None:
+    if calibration is not None and videos is not None and detections is None:
+        spec = import_videos(calibration, videos, out, fps=fps, match_id=match_id)
+    elif calibration is None or detections is None or videos is not None or fps is None:
         raise UsageError(
             "worldpose import",
-            expected="--calibration, --detections and --fps, or --pitch",
-            found="some of them missing",
+            expected="--calibration with --detections and --fps or with --videos, or --pitch",
+            found="some of them missing, or both",
             todo="See worldpose import --help.",
         )
-    spec = import_match(calibration, detections, fps, out, match_id=match_id)
+    else:
+        spec = import_match(calibration, detections, fps, out, match_id=match_id)
     if as_json:
         print_json({"match": spec.match_id, "folder": str(out)})
     else:
@@ -211,7 +252,7 @@ def ingest(
     refused: list[str] = []
     for folder in folders:
         try:
-            match, changed = register(store, folder)
+            match, changed = register(store, folder, unfinished=True)
         except WorldposeError as failure:
             refused.append(str(failure))
             line(f"error: {failure}", to=errors)
@@ -220,10 +261,19 @@ def ingest(
         if not as_json:
             known = "registered" if changed else "already registered, unchanged:"
             line(f"{known} {match.match_id}")
+            _tell_unclicked(match)
     if as_json:
         print_json({"matches": rows, "refused": refused})
     if refused:
         raise typer.Exit(4 if rows else 1)
+
+
+def _tell_unclicked(match: Match) -> None:
+    """What has to be done before the match can be run."""
+    known = {**match.folder.calibrations, **match.folder.clicked}
+    missing = [each.id for each in match.folder.spec.static_cameras if each.id not in known]
+    if missing:
+        line(f"to be clicked first: {', '.join(missing)}; worldpose review serve shows the pages")
 
 
 def add_to(app: typer.Typer) -> None:

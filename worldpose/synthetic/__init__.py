@@ -1,9 +1,10 @@
 """Synthetic: match folders with known truth, from a scenario and a seed.
 
 Inputs: a `Scenario` (people, cameras, detector errors) and a seed.
-Outputs: a `Scene` in memory, or a match folder with `reference/`.
+Outputs: a `Scene` in memory, a match folder with `reference/`, or pictures of it.
 """
 
+from worldpose.synthetic.looks import RenderingSettings
 from worldpose.synthetic.matches import simulate_match
 from worldpose.synthetic.noise import ObservationNoise
 from worldpose.synthetic.scenarios import SCENARIOS
@@ -25,6 +26,7 @@ __all__ = [
     "CrowdSettings",
     "Identities",
     "ObservationNoise",
+    "RenderingSettings",
     "RigSettings",
     "Scenario",
     "Scene",

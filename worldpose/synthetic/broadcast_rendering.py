@@ -7,7 +7,7 @@ its own lens. People are drawn frame by frame; they throw no shadows.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -19,10 +19,9 @@ from worldpose.cameras import Camera
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.synthetic.capsules import draw_things, goal_capsules, person_capsules
-from worldpose.synthetic.ground_picture import paint_scene
-from worldpose.synthetic.rendering import RenderingSettings
-from worldpose.synthetic.surroundings import BOARD_SETBACK
-from worldpose.synthetic.turf import paint_rows
+from worldpose.synthetic.exposing import Moment, RenderedFrame, expose, sensor_grain
+from worldpose.synthetic.looks import RenderingSettings
+from worldpose.synthetic.venues import Venue, build_venue, paint_venue
 
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -58,16 +57,13 @@ class Panorama:
     center: Floats
 
 
-def render_panorama(
-    cameras: Camera, pitch: PitchTemplate, seed: int, settings: RenderingSettings
-) -> Panorama:
+def render_panorama(cameras: Camera, venue: Venue, *, lit: bool = False) -> Panorama:
     """Return what a turning camera sees of pitch, boards and stands.
 
     Args:
         cameras: a batch (frames,) with one center.
-        pitch: what is painted.
-        seed: the stadium's look, that of `render_pitch`.
-        settings: stripes and paint; the light is even.
+        venue: the stadium.
+        lit: by its lights and through its fog; else in even light.
 
     Raises:
         InputError: the cameras have different centers.
@@ -80,17 +76,11 @@ def render_panorama(
             found=f"centers up to {np.abs(cameras.center - center).max():.3g} m apart",
             todo="Render frames of a moving center one by one, with render_pitch.",
         )
-    looks = np.random.default_rng([seed, 1])
-    table = looks.uniform(-np.sqrt(3.0), np.sqrt(3.0), (64, 64))
-    look = int(looks.integers(1 << 20))
     pan, rise = _seen(cameras)
     scale = _FINER * float(cameras.focal.max())
     left, top = pan[0] - _MARGIN, rise[1] + _MARGIN
     width = int(np.ceil((pan[1] + _MARGIN - left) * scale))
     height = int(np.ceil((top - rise[0] + _MARGIN) * scale))
-    half = 0.5 * np.array([pitch.length, pitch.width]) + BOARD_SETBACK
-    bend = pitch.crown / (0.5 * pitch.width) ** 2
-    scene = np.array([pitch.length, pitch.width, bend, settings.stripes, settings.paint])
     whole = np.empty((height, width, 3), dtype=np.uint8)
     rows = np.arange(-_CELL, height + 2 * _CELL, _CELL)
     for begin in range(0, width, _STRIP):
@@ -104,20 +94,12 @@ def render_panorama(
         cos, sin = np.cos(middle), np.sin(middle)
         # Columns: right, down and ahead of a level camera that looks along this strip.
         turn = np.array([[cos, 0.0, sin], [-sin, 0.0, cos], [0.0, -1.0, 0.0]])
-        color = np.empty((height, count, 3), dtype=np.float32)
-        ground = np.empty((height, count, 2), dtype=np.float32)
-        paint_scene(
-            np.stack([x, y], axis=-1),
-            center,
-            turn,
-            paint_rows(pitch),
-            table,
-            scene,
-            half,
-            look,
-            color,
-            ground,
-        )
+        seen = paint_venue(venue, np.stack([x, y], axis=-1), center, turn, (count, height))
+        color = seen.color
+        if lit:
+            color *= 1.0 - venue.shade * venue.in_shadow(seen.ground[..., 1])[..., None]
+            venue.fogged(color, seen.distance)
+            color *= venue.settings.exposure
         whole[:, begin : begin + count] = np.clip(np.rint(255.0 * color), 0.0, 255.0)
     levels = [whole]
     while scale / 2 ** len(levels) > 0.5 * float(cameras.focal.min()):
@@ -145,7 +127,7 @@ def render_broadcast(
         InputError: the cameras have different centers.
     """
     settings = settings or RenderingSettings()
-    panorama = render_panorama(cameras, pitch, seed, settings)
+    panorama = render_panorama(cameras, build_venue(pitch, seed, settings))
     kits = np.random.default_rng([seed, 2]).integers(1 << 31)
     goals, goal_colors = goal_capsules(pitch)
     noise = np.random.default_rng([seed, 3])
@@ -171,6 +153,30 @@ def render_broadcast(
         down, right = (int(n) for n in noise.integers(0, 256, 2))
         color += field[down : down + height, right : right + width, None]
         yield np.asarray(cv2.convertScaleAbs(np.maximum(color, 0.0)), dtype=np.uint8)
+
+
+def film_broadcast(
+    cameras: Camera, venue: Venue, moments: Iterable[Moment]
+) -> Iterator[RenderedFrame]:
+    """Yield the frames of a clip, as `worldpose.synthetic.filming.render_frame` has them.
+
+    Args:
+        cameras: a batch (frames,) with one center.
+        venue: the stadium.
+        moments: who and what is there in every frame.
+
+    Raises:
+        InputError: the cameras have different centers.
+    """
+    panorama = render_panorama(cameras, venue, lit=True)
+    grain = sensor_grain(venue, cameras[0])
+    width, height = (int(n) for n in cameras.image_size.reshape(-1, 2)[0])
+    for frame, moment in enumerate(moments):
+        sharp = _look_up(panorama, cameras[frame], width, height)
+        blurred = sharp.copy()
+        if venue.settings.blur > 0.0:
+            blurred = np.asarray(cv2.GaussianBlur(sharp, (0, 0), venue.settings.blur))
+        yield expose(venue, cameras[frame], sharp, blurred, grain, moment, frame)
 
 
 def _seen(cameras: Camera) -> tuple[tuple[float, float], tuple[float, float]]:

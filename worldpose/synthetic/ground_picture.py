@@ -58,6 +58,7 @@ def paint_scene(
     look: int,
     color: Pictures,
     ground: Pictures,
+    distance: Pictures,
 ) -> None:
     """Write the colour of every pixel, and its place on the pitch; NaN beyond the boards.
 
@@ -72,6 +73,7 @@ def paint_scene(
         look: which stadium.
         color: (height, width, 3), written.
         ground: (height, width, 2), written.
+        distance: (height, width) from the camera [m], written; infinite in the sky.
     """
     place = np.empty(8)
     bend = scene[2]
@@ -85,6 +87,8 @@ def paint_scene(
             place[0], place[1] = o[0] + s * dx, o[1] + s * dy
             slope = 2.0 * bend * place[1]
             sink = slope * dy + dz
+            step = np.sqrt(dx * dx + dy * dy + dz * dz)
+            distance[v, u] = s * step
             for k in range(2):
                 a, b = (xu, yu) if k == 0 else (xv, yv)
                 ex, ey = r[0, 0] * a + r[0, 1] * b, r[1, 0] * a + r[1, 1] * b
@@ -107,7 +111,7 @@ def paint_scene(
             for part in range(4):
                 du, dv = 0.5 * (part % 2) - 0.25, 0.5 * (part // 2) - 0.25
                 a, b = x + du * xu + dv * xv, y + du * yu + dv * yv
-                red, green, blue, _ = scenery(
+                red, green, blue, far = scenery(
                     o,
                     r[0, 0] * a + r[0, 1] * b + r[0, 2],
                     r[1, 0] * a + r[1, 1] * b + r[1, 2],
@@ -116,6 +120,7 @@ def paint_scene(
                     bend,
                     look,
                 )
+                distance[v, u] = min(distance[v, u], far * step)
                 if red < 0.0:
                     on_ground += 1
                 else:

@@ -8,10 +8,12 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data_contracts.broadcast_calibration import KeyFrames
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from worldpose.body import OPEN_BODY
+from worldpose.cameras import Camera
 from worldpose.ingest import write_calibration_toml, write_match
 from worldpose.pitch import PitchTemplate
 from worldpose.release import (
@@ -23,7 +25,9 @@ from worldpose.release import (
 from worldpose.release.pose_file import write_poses
 from worldpose.synthetic.broadcast_rendering import render_broadcast
 from worldpose.synthetic.clips import read_clip
+from worldpose.synthetic.footage import Advance, film_scene
 from worldpose.synthetic.key_frames import click_key_frames
+from worldpose.synthetic.monocular import write_estimates
 from worldpose.synthetic.rendering import render_pitch
 from worldpose.synthetic.scene import Scene, simulate_scene
 from worldpose.synthetic.settings import CalibrationErrors, Scenario
@@ -47,6 +51,9 @@ def simulate_match(
     calibrated: bool = False,
     stills: bool = True,
     video: bool = True,
+    render: bool = False,
+    masks: bool = False,
+    advance: Advance | None = None,
 ) -> MatchSpec:
     """Write a synthetic match folder with its truth; the same arguments give the same bytes.
 
@@ -79,8 +86,13 @@ def simulate_match(
         calibrated: give the true static cameras, as calibration.toml; else there is such a file
             only where the scenario misjudges cameras.
         stills: add one picture of every static camera, about a second each.
-        video: add the broadcast camera's video, about 0.1 s a frame, and clicked key frames, where
-            the scenario has some.
+        video: add the broadcast camera's video, about 0.1 s a frame, clicked key frames, and
+            bodies that a method of one picture sees in it (`estimates/`), where the scenario has
+            key frames.
+        render: film all cameras (`worldpose.synthetic.footage.film_scene`), and give no detections:
+            there is nothing but pixels to work from. Stills are first frames.
+        masks: add who is where in every pixel of what is filmed.
+        advance: told of the filming's progress.
         mocap: motion capture (`worldpose.synthetic.clips.read_clip`) that one person plays.
 
     Returns:
@@ -115,14 +127,7 @@ def simulate_match(
         changes.append("calibrated")
     scene = simulate_scene(scenario, seed, clip_id=CLIP_ID, driven=driven, clip=clip)
     given = scene.given if calibrated or scenario.calibration != CalibrationErrors() else {}
-    painted = PitchTemplate.from_spec(scenario.pitch)
-    people = scene.truth.joints[0]
-    drawn = scene.cameras if stills else {}
-    with ThreadPoolExecutor() as pool:  # the renderer's kernels let other threads run
-        rendered = pool.map(
-            lambda camera: render_pitch(camera, painted, people, seed), drawn.values()
-        )
-        pictures = dict(zip(drawn, rendered, strict=True))
+    pictures = _stills(scenario, scene, seed) if stills and not render else {}
     width, height = scenario.rig.image_size
     specs = [
         CameraSpec(
@@ -144,18 +149,47 @@ def simulate_match(
             ),
         ),
     )
+
+    def write_further(folder: Path) -> None:
+        write_references(folder / "reference", scenario, scene, detected=not render)
+        if render:
+            film_scene(
+                scene,
+                scenario,
+                seed,
+                folder,
+                clip_id=CLIP_ID,
+                stills=stills,
+                masks=masks,
+                advance=advance,
+            )
+        elif scene.broadcast is not None and scenario.key_frames and video:
+            _write_broadcast(folder, scenario, scene.broadcast, scene, seed)
+
     write_match(
         out,
         spec,
         calibrations={name: camera.to_calibration(name) for name, camera in given.items()},
-        observations=scene.observations,
+        observations={} if render else scene.observations,
         pitch=scene.surveyed,
         clicked={name: clicks.markings for name, clicks in scene.clicks.items()},
         stills=pictures,
-        key_frames=_key_frames(scenario, scene, seed) if video else {},
-        further=lambda folder: _write_further(folder, scenario, scene, seed, video=video),
+        key_frames=_key_frames(scenario, scene, seed) if video or render else {},
+        further=write_further,
     )
     return spec
+
+
+def _stills(scenario: Scenario, scene: Scene, seed: int) -> dict[str, NDArray[np.uint8]]:
+    """One picture of every static camera."""
+    painted = PitchTemplate.from_spec(scenario.pitch)
+    people, drawn = scene.truth.joints[0], scene.cameras
+    with ThreadPoolExecutor() as pool:  # the renderer's kernels let other threads run
+        rendered = pool.map(
+            lambda camera: render_pitch(camera, painted, people, seed, scenario.look),
+            drawn.values(),
+        )
+        return dict(zip(drawn, rendered, strict=True))
 
 
 def _key_frames(scenario: Scenario, scene: Scene, seed: int) -> dict[str, KeyFrames]:
@@ -170,28 +204,37 @@ def _key_frames(scenario: Scenario, scene: Scene, seed: int) -> dict[str, KeyFra
     return {CLIP_ID: clicked}
 
 
-def _write_further(
-    folder: Path, scenario: Scenario, scene: Scene, seed: int, *, video: bool
+def _write_broadcast(
+    folder: Path, scenario: Scenario, camera: Camera, scene: Scene, seed: int
 ) -> None:
-    """Write the truth, and the broadcast camera's video where the scenario has one."""
-    write_references(folder / "reference", scenario, scene)
-    if scene.broadcast is not None and scenario.key_frames and video:
-        file = folder / "broadcast" / f"{CLIP_ID}.mp4"
-        file.parent.mkdir()
-        painted = PitchTemplate.from_spec(scenario.pitch)
-        pictures = render_broadcast(scene.broadcast, painted, scene.truth.joints, seed)
-        write_video(file, pictures, scenario.fps)
+    """Write the broadcast camera's video, and the bodies that were estimated from it."""
+    file = folder / "broadcast" / f"{CLIP_ID}.mp4"
+    file.parent.mkdir()
+    painted = PitchTemplate.from_spec(scenario.pitch)
+    pictures = render_broadcast(camera, painted, scene.truth.joints, seed)
+    write_video(file, pictures, scenario.fps)
+    estimates = folder / "estimates" / f"{CLIP_ID}.npz"
+    write_estimates(estimates, scene.poses, camera, scenario.fps, seed)
 
 
-def write_references(folder: Path, scenario: Scenario, scene: Scene) -> None:
-    """Write the truth of a scene: joints, cameras, clocks, pitch and who every detection is."""
+def write_references(
+    folder: Path, scenario: Scenario, scene: Scene, *, detected: bool = True
+) -> None:
+    """Write the truth of a scene: joints, cameras, clocks, pitch and who every detection is.
+
+    Args:
+        folder: reference/ of the match.
+        scenario: what it is a scene of.
+        scene: the truth.
+        detected: whether the match has the scene's detections.
+    """
     write_joints(folder / "joints.npz", scene.truth)
     write_poses(folder / "poses" / f"{CLIP_ID}.npz", scene.poses, OPEN_BODY)
     for name, camera in scene.cameras.items():
         write_static_camera(folder / "cameras" / f"{name}.npz", camera.to_calibration(name))
     if scene.broadcast is not None:
         write_moving_camera(folder / "cameras" / f"{CLIP_ID}.npz", scene.broadcast)
-    for name, identities in scene.identities.items():
+    for name, identities in scene.identities.items() if detected else ():
         write_archive(
             folder / "identities" / f"{name}.npz",
             {

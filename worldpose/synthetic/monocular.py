@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from data_contracts.records import Record
-from worldpose.body import BodyModel, BodyParameters
+from worldpose.body import BodyModel, BodyParameters, load_open_body
 from worldpose.cameras import Camera, Rigid
+from worldpose.release import write_archive
 from worldpose.synthetic.processes import drift
 
 Floats = NDArray[np.float64]
@@ -99,6 +102,25 @@ def estimate_bodies(
         "box_size": side[frame, person],
         "img_size": camera.image_size[frame],
     }
+
+
+def write_estimates(
+    path: Path, poses: BodyParameters, camera: Camera, fps: float, seed: int
+) -> None:
+    """Write what `estimate_bodies` makes of a scene's open bodies.
+
+    Args:
+        path: the npz file.
+        poses: (persons, frames), world.
+        camera: batch (frames,).
+        fps: [1/s].
+        seed: of the scene.
+    """
+    given = (poses.betas, poses.global_orient, poses.body_pose, poses.transl)
+    bodies = BodyParameters(*(np.swapaxes(values, 0, 1) for values in given))
+    rng = np.random.default_rng([seed, 5])
+    estimates = estimate_bodies(load_open_body(), bodies, camera, fps, MonocularErrors(), rng)
+    write_archive(path, estimates)
 
 
 def _facing(ahead: Floats) -> Floats:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from worldpose.synthetic.looks import RenderingSettings
 from worldpose.synthetic.noise import ObservationNoise
 from worldpose.synthetic.settings import (
     BroadcastSettings,
@@ -68,6 +69,7 @@ _MATCH: Final = Scenario(
     rig=_STADIUM,
     broadcast=BroadcastSettings(),
     noise=ObservationNoise(),
+    look=RenderingSettings(bystanders=8),
 )
 _BOX: Final = CrowdSettings(
     people=6,
@@ -173,6 +175,22 @@ SCENARIOS: Final = {
             rig=RigSettings(cameras=6, seats=CORNER_SEATS, seat_spread=0.3),
             # Among one or two points a wrong one cannot be told.
             clicks=ClickSettings(wrong=0.0),
+        ),
+        Scenario(
+            name="fog",
+            about="To be rendered: 12 people, small, in fog under floodlights, in patterned kits.",
+            duration=4.0,
+            crowd=CrowdSettings(people=12, area_center=(38.0, -6.0), area_size=(26.0, 24.0)),
+            rig=RigSettings(person_height=55.0),
+            broadcast=BroadcastSettings(),
+            look=RenderingSettings(
+                light="floodlights",
+                fog=0.012,
+                exposure=0.85,
+                patterns=("halves", "sash", "chequers"),
+                blur=1.0,
+                noise=4.0,
+            ),
         ),
         _variant("long", "The match for two minutes.", _MATCH, duration=120.0),
         _variant(

@@ -59,6 +59,7 @@ class Scene:
     Attributes:
         truth: `views` counts the static cameras that have the joint in their picture with nobody
             before it.
+        crowd: the people, at any time.
         poses: the bodies (persons, frames) whose keypoints the truth's joints are.
         cameras: the true static cameras by id, in the order of the rig.
         given: the same as calibration.toml has them.
@@ -71,6 +72,7 @@ class Scene:
     """
 
     truth: JointTracks
+    crowd: Crowd
     poses: BodyParameters
     cameras: dict[str, Camera]
     given: dict[str, Camera]
@@ -171,6 +173,7 @@ def simulate_scene(
         reports[clip_id] = _reported(world, broadcast, see(broadcast, bodies), errors)
     return Scene(
         truth=JointTracks(np.arange(len(times)), np.arange(persons), bodies.joints, views=views),
+        crowd=crowd,
         poses=crowd.poses(times),
         cameras=cameras,
         given=misjudge(cameras, scenario.calibration, _rng(error_seed)),

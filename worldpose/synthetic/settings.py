@@ -8,6 +8,7 @@ from pydantic import Field
 
 from data_contracts.pitch import PitchSpec
 from data_contracts.records import Name, Record
+from worldpose.synthetic.looks import RenderingSettings
 from worldpose.synthetic.noise import ObservationNoise
 
 Range = tuple[float, float]
@@ -192,6 +193,8 @@ class Scenario(Record):
     calibration: CalibrationErrors = CalibrationErrors()
     noise: ObservationNoise = ObservationNoise()
     clicks: ClickSettings = ClickSettings()
+    look: RenderingSettings = RenderingSettings()
+    """Of rendered footage."""
     pitch: PitchSpec = PitchSpec()
     """As it is painted."""
     survey_error: float = Field(default=0.006, ge=0)

@@ -21,6 +21,8 @@ _LETTER = 0.42
 _STAND_SETBACK = 4.0
 _STAND_SLOPE = 0.55
 _STAND_TOP = 24.0
+_ROW = 0.45
+_SEAT = 0.52
 
 
 @compiled
@@ -61,14 +63,38 @@ def _board(along: float, up: float, side: int, look: int) -> tuple[float, float,
 
 
 @compiled
-def _crowd(row: int, seat: int, look: int) -> tuple[float, float, float]:
-    """Return the colour of one seat: a person in some jacket, or the empty seat."""
+def _crowd(along: float, z: float, side: int, look: int) -> tuple[float, float, float]:
+    """Return the colour at a place of a stand: somebody seated, or an empty seat.
+
+    Head, hair and shoulders in some jacket, a part of each block in the colours of one club: what
+    a detector of people finds and a filter must drop.
+    """
+    row, seat = int(z / _ROW), int(along / _SEAT)
+    x, up = along - (seat + 0.5) * _SEAT, z - row * _ROW
+    low = 0.45 + 0.55 * up / _ROW
     kind = _hash(row, seat, look)
-    if kind < 0.18:
-        return 0.10, 0.16, 0.34
-    red, green, blue = _hash(row, seat, look + 1), _hash(row, seat, look + 2), kind
-    dim = 0.12 + 0.5 * _hash(row, seat, look + 3) ** 2
-    return dim * (0.6 + 0.4 * red), dim * (0.6 + 0.3 * green), dim * (0.6 + 0.4 * blue)
+    if kind < 0.15 or up > 0.41:
+        empty = abs(x) < 0.21 and up < 0.34
+        return (0.10 * low, 0.16 * low, 0.34 * low) if empty else (0.05, 0.07, 0.12)
+    x -= 0.1 * (_hash(row, seat, look + 4) - 0.5)
+    up -= 0.08 * (_hash(row, seat, look + 5) - 0.5)
+    head_x, head_z = x / 0.09, (up - 0.315) / 0.1
+    if head_x * head_x + head_z * head_z < 1.0:
+        tone = 0.2 + 0.6 * _hash(row, seat, look + 6) ** 0.7
+        if head_z > 0.25 + 0.5 * _hash(row, seat, look + 7):
+            hair = 0.03 + 0.2 * _hash(row, seat, look + 8) ** 2
+            return hair, 0.8 * hair, 0.65 * hair
+        return tone, 0.74 * tone, 0.62 * tone
+    # Shoulders slope from the neck.
+    if up < 0.26 and abs(x) < min(0.07 + 1.6 * (0.26 - up), 0.235):
+        if _hash(row, seat, look + 9) < 0.35:
+            club = int(along / 44.0) + 7 * side
+            red, green, blue = _hash(club, 1, look), _hash(club, 2, look), _hash(club, 3, look)
+            return 0.75 * low * red, 0.75 * low * green, 0.75 * low * blue
+        red, green, blue = _hash(row, seat, look + 1), _hash(row, seat, look + 2), kind
+        dim = low * (0.10 + 0.6 * _hash(row, seat, look + 3) ** 2)
+        return dim * (0.6 + 0.4 * red), dim * (0.6 + 0.3 * green), dim * (0.6 + 0.4 * blue)
+    return 0.06 * low, 0.08 * low, 0.14 * low
 
 
 @compiled
@@ -131,6 +157,5 @@ def scenery(
                 elif (along + 300.0) % 22.0 < 1.1 or z % 8.0 < 0.5:
                     red, green, blue = 0.33, 0.33, 0.34
                 else:
-                    row, seat = int(z / 0.42), int((along + 300.0) / 0.5)
-                    red, green, blue = _crowd(row, seat, look + 10 * side)
+                    red, green, blue = _crowd(along + 300.0, z, side, look + 10 * side)
     return red, green, blue, nearest

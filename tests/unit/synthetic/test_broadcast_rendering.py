@@ -6,12 +6,18 @@ import cv2
 import numpy as np
 import pytest
 
+from worldpose.body import BodyParameters
 from worldpose.cameras import Camera, Rigid
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
-from worldpose.synthetic.broadcast_rendering import render_broadcast
+from worldpose.synthetic.broadcast_rendering import film_broadcast, render_broadcast
+from worldpose.synthetic.casting import dress_people
+from worldpose.synthetic.exposing import Moment
+from worldpose.synthetic.filming import open_view, render_frame
+from worldpose.synthetic.props import goals
 from worldpose.synthetic.rendering import RenderingSettings, render_pitch
 from worldpose.synthetic.stadium import looking
+from worldpose.synthetic.venues import build_venue
 
 PITCH = PitchTemplate.standard()
 PLAIN = RenderingSettings(light="floodlights", noise=0.0, stand_shadow=0.0)
@@ -65,6 +71,24 @@ def test_the_same_arguments_give_the_same_bytes():
         for _ in range(2)
     )
     np.testing.assert_array_equal(one, two)
+
+
+def test_people_of_a_clip_are_those_of_a_static_camera_with_the_same_lens():
+    cameras = turning((2000.0, 2000.0))
+    venue = build_venue(PITCH, 3, PLAIN)
+    cast = dress_people(np.zeros((1, 10)), ["first"], 3)
+    upright = np.array([[np.pi / 2.0, 0.0, 0.0]])
+    stands = BodyParameters(np.zeros((1, 10)), upright, np.zeros((1, 69)), np.array([[0, 2, 1.4]]))
+    posed = cast.posed(stands)
+    moments = [Moment(cast, posed, posed, goals(PITCH))] * 2
+    for index, frame in enumerate(film_broadcast(cameras, venue, moments)):
+        alone = render_frame(open_view(cameras[index], PITCH, 3, PLAIN), cast, posed)
+        assert (frame.person_ids == 0).sum() > 300
+        np.testing.assert_array_equal(frame.person_ids, alone.person_ids)
+        np.testing.assert_array_equal(frame.boxes, alone.boxes)
+        # Grass is looked up between pixels of the panorama: somewhat softer, in the same light.
+        apart = np.abs(frame.picture.astype(int) - alone.picture)
+        assert np.percentile(apart, 90) <= 3.0
 
 
 def test_a_camera_that_walks_is_refused():

@@ -1,0 +1,169 @@
+"""The videos of a scene, and where everybody is in them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.ingest.stills import write_still
+from worldpose.pitch import PitchTemplate
+from worldpose.release import write_archive
+from worldpose.synthetic.broadcast_rendering import film_broadcast
+from worldpose.synthetic.casting import Cast, dress_people, roles_of, stand_by
+from worldpose.synthetic.exposing import Moment, RenderedFrame
+from worldpose.synthetic.filming import open_view, render_frame
+from worldpose.synthetic.props import BALL, Prop, ball, goals
+from worldpose.synthetic.scene import Scene
+from worldpose.synthetic.settings import Scenario
+from worldpose.synthetic.venues import build_venue
+from worldpose.video import write_video
+
+Singles = NDArray[np.float32]
+Advance = Callable[[str, int, int], None]
+
+AT_ONCE: Final = 4
+"""Most cameras filmed at a time: each holds its empty stadium and its encoder's frames."""
+
+
+def film_scene(
+    scene: Scene,
+    scenario: Scenario,
+    seed: int,
+    folder: Path,
+    *,
+    clip_id: str,
+    stills: bool = False,
+    masks: bool = False,
+    advance: Advance | None = None,
+) -> None:
+    """Write the videos of all cameras into a match folder, frame by frame.
+
+    Besides videos/<camera>.mp4 and broadcast/<clip>.mp4, for every camera or clip:
+
+    - reference/boxes/<name>.npz: `boxes` (frames, persons, 4) left, top, right, bottom of
+      everybody's outline [px], hidden parts included; `visible` (frames, persons), the share of
+      it in the picture that nobody hides;
+    - with `stills`, stills/<camera>.png, its first frame as it was before encoding;
+    - with `masks`, reference/masks/<name>/<frame>.png, 8 bit: person + 1, 0 for nobody.
+
+    Args:
+        scene: what happens.
+        scenario: its look, and its frames a second.
+        seed: the stadium, kits and noise.
+        folder: of the match.
+        clip_id: names the broadcast camera's files.
+        stills: also write them.
+        masks: also write them.
+        advance: told the camera or clip, its frames done and all its frames.
+    """
+    stage = _Stage(scene, scenario, seed)
+    names = [*scene.cameras, *([] if scene.broadcast is None else [clip_id])]
+
+    def told(name: str, frames: int, done: int) -> None:
+        if advance is not None:
+            advance(name, done, frames)
+
+    def film(name: str) -> None:
+        frames = stage.broadcast() if name == clip_id else stage.static(name)
+        part = "broadcast" if name == clip_id else "videos"
+        file = folder / part / f"{name}.mp4"
+        file.parent.mkdir(exist_ok=True)
+        still = folder / "stills" / f"{name}.png" if stills and name != clip_id else None
+        mask = folder / "reference" / "masks" / name if masks else None
+        kept = _Kept(still, mask, partial(told, name, len(stage.times) - 1))
+        write_video(file, kept.watched(frames), scenario.fps)
+        boxes = folder / "reference" / "boxes" / f"{name}.npz"
+        write_archive(boxes, {"boxes": np.array(kept.boxes), "visible": np.array(kept.visible)})
+
+    with ThreadPoolExecutor(min(AT_ONCE, os.cpu_count() or 1)) as pool:
+        for _ in pool.map(film, names):
+            pass
+
+
+class _Stage:
+    """A dressed scene before cameras."""
+
+    def __init__(self, scene: Scene, scenario: Scenario, seed: int) -> None:
+        self.scene, self.scenario, self.seed = scene, scenario, seed
+        self.pitch = PitchTemplate.from_spec(scenario.pitch)
+        # One more than there are: where people go while the last frame's shutter is open.
+        self.times = np.arange(len(scene.truth.frames) + 1) / scenario.fps
+        self.poses = scene.crowd.poses(self.times)
+        roles = roles_of(scenario.crowd, len(scene.crowd.paths))
+        betas = np.array([body.figure.betas for body in scene.crowd.bodies]).reshape(-1, 10)
+        self.cast: Cast = dress_people(betas, roles, seed, scenario.look.patterns)
+        self.bystanders = stand_by(self.pitch, scenario.look.bystanders, seed)
+        self.ball = ball() if scenario.crowd.movement == "football" else None
+
+    def static(self, name: str) -> Iterator[RenderedFrame]:
+        """Yield the frames of a static camera."""
+        view = open_view(self.scene.cameras[name], self.pitch, self.seed, self.scenario.look)
+        late = self.scene.clocks[name] / self.scenario.fps
+        for frame, moment in enumerate(self._moments(late)):
+            yield render_frame(
+                view, self.cast, moment.opened, moment.closed, frame=frame, props=moment.props
+            )
+
+    def broadcast(self) -> Iterator[RenderedFrame]:
+        """Yield the frames of the broadcast camera."""
+        assert self.scene.broadcast is not None  # it is asked for where there is one
+        venue = build_venue(self.pitch, self.seed, self.scenario.look)
+        standing = goals(self.pitch)
+        moments = (
+            Moment(each.cast, each.opened, each.closed, [*standing, *each.props])
+            for each in self._moments(0.0)
+        )
+        return film_broadcast(self.scene.broadcast, venue, moments)
+
+    def _moments(self, late: float) -> Iterator[Moment]:
+        """Yield what is there in every frame of a camera whose clock is late [s]."""
+        times = self.times + late
+        poses = self.poses if late == 0.0 else self.scene.crowd.poses(times)
+        share = self.scenario.look.shutter * self.scenario.fps
+        surfaces = (self.cast.posed(poses[:, k]) for k in range(len(times)))
+        for time, (opened, following) in zip(times, pairwise(surfaces), strict=False):
+            closed = opened.toward(following, share) if share > 0.0 else opened
+            yield Moment(self.cast, opened, closed, self._props(float(time)))
+
+    def _props(self, time: float) -> tuple[Prop, ...]:
+        if self.ball is None:
+            return self.bystanders
+        crowd = self.scene.crowd
+        x, y = (float(np.interp(time, crowd.action_times, axis)) for axis in crowd.action.T)
+        at = np.array([x, y, BALL + float(self.pitch.height(x, y))])
+        return (*self.bystanders, self.ball.at(at))
+
+
+class _Kept:
+    """What is kept of a camera's frames besides the video."""
+
+    def __init__(
+        self, still: Path | None, masks: Path | None, advance: Callable[[int], None]
+    ) -> None:
+        self.still, self.masks, self.advance = still, masks, advance
+        self.boxes: list[Singles] = []
+        self.visible: list[Singles] = []
+        if masks is not None:
+            masks.mkdir(parents=True)
+
+    def watched(self, frames: Iterator[RenderedFrame]) -> Iterator[NDArray[np.uint8]]:
+        """Yield the pictures of frames."""
+        for number, frame in enumerate(frames):
+            self.boxes.append(frame.boxes.astype(np.float32))
+            self.visible.append(frame.visible.astype(np.float32))
+            if self.still is not None and number == 0:
+                write_still(self.still, frame.picture)
+            if self.masks is not None:
+                file = self.masks / f"{number:06d}.png"
+                cv2.imwrite(str(file), (frame.person_ids + 1).astype(np.uint8))
+            yield frame.picture
+            self.advance(number + 1)

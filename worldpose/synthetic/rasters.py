@@ -1,0 +1,224 @@
+"""Triangles in a picture: a z-buffer with four samples a pixel, each at its moment of the shutter.
+
+A sample lies at its own place within the pixel and at its own moment while the shutter is open,
+so that one pass smooths edges and blurs what moves. Vertices are projected through the lens one
+by one; between them edges are straight, over some centimetres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.compiled import compiled
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+
+SAMPLES = 4
+_ACROSS = (-0.125, 0.375, -0.375, 0.125)
+_DOWN = (-0.375, -0.125, 0.125, 0.375)
+"""Where samples lie in a pixel [px]: on a turned square, so that no two share a row or column."""
+_WHEN = (0.125, 0.625, 0.375, 0.875)
+"""When, as a share of the time that the shutter is open."""
+NOBODY = -1
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """What the samples of a part of a picture hit.
+
+    Attributes:
+        left, top: pixel of the picture that is the first one here.
+        depth: (height, width, 4) [m] along the camera's axis; infinite where nothing is.
+        who: (height, width, 4) the thing hit; -1 where nothing is.
+        color: (height, width, 4, 3) RGB.
+        last: (height, width, 4) the thing drawn there last, hidden or not.
+    """
+
+    left: int
+    top: int
+    depth: Singles
+    who: NDArray[np.int16]
+    color: Bytes
+    last: NDArray[np.int16]
+
+    @classmethod
+    def empty(cls, left: int, top: int, right: int, bottom: int) -> Samples:
+        """Return samples of pixels from left and top to before right and bottom."""
+        shape = (bottom - top, right - left, SAMPLES)
+        return cls(
+            left,
+            top,
+            np.full(shape, np.inf, dtype=np.float32),
+            np.full(shape, NOBODY, dtype=np.int16),
+            np.empty((*shape, 3), dtype=np.uint8),
+            np.full(shape, NOBODY, dtype=np.int16),
+        )
+
+
+@compiled
+def draw_triangles(
+    opened: Singles,
+    closed: Singles,
+    faces: NDArray[np.int32],
+    backs: NDArray[np.bool_],
+    texels: Singles,
+    pictures: Bytes,
+    light: Singles,
+    haze: Singles,
+    which: int,
+    left: int,
+    top: int,
+    depth: Singles,
+    who: NDArray[np.int16],
+    color: Bytes,
+    last: NDArray[np.int16],
+) -> int:
+    """Draw one thing among those already drawn, and return how many samples it would fill alone.
+
+    Triangles that face away or have a vertex without an image are left out.
+
+    Args:
+        opened: (vertices, 3) pixel [px] and depth [m] when the shutter opens.
+        closed: the same when it closes.
+        faces: (triangles, 3), counter-clockwise seen from outside.
+        backs: (triangles,) which of the two pictures has their colours.
+        texels: (vertices, 2) column and row there.
+        pictures: (2, rows, columns, 3) RGB.
+        light: (vertices,) on each vertex, 1 = as the pictures are.
+        haze: (4,) share of the haze before it, and the haze's colour [levels of 255].
+        which: number of the thing, from 0.
+        left: of the samples' first pixel.
+        top: of the samples' first pixel.
+        depth: of `Samples`, written.
+        who: of `Samples`, written.
+        color: of `Samples`, written.
+        last: of `Samples`, written.
+    """
+    height, width = depth.shape[0], depth.shape[1]
+    count = 0
+    clear = np.float32(1.0) - haze[0]
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        picture = pictures[1 if backs[f] else 0]
+        for s in range(SAMPLES):
+            share, right, down = _WHEN[s], left + _ACROSS[s], top + _DOWN[s]
+            ax = opened[a, 0] + share * (closed[a, 0] - opened[a, 0]) - right
+            ay = opened[a, 1] + share * (closed[a, 1] - opened[a, 1]) - down
+            bx = opened[b, 0] + share * (closed[b, 0] - opened[b, 0]) - right
+            by = opened[b, 1] + share * (closed[b, 1] - opened[b, 1]) - down
+            cx = opened[c, 0] + share * (closed[c, 0] - opened[c, 0]) - right
+            cy = opened[c, 1] + share * (closed[c, 1] - opened[c, 1]) - down
+            area = (cx - ax) * (by - ay) - (bx - ax) * (cy - ay)
+            # Also false where a vertex has no image.
+            if not area > 1e-9:
+                continue
+            u0 = max(int(np.ceil(min(ax, bx, cx))), 0)
+            u1 = min(int(np.floor(max(ax, bx, cx))), width - 1)
+            v0 = max(int(np.ceil(min(ay, by, cy))), 0)
+            v1 = min(int(np.floor(max(ay, by, cy))), height - 1)
+            if u0 > u1 or v0 > v1:
+                continue
+            for v in range(v0, v1 + 1):
+                for u in range(u0, u1 + 1):
+                    wa = ((cx - u) * (by - v) - (bx - u) * (cy - v)) / area
+                    wb = ((ax - u) * (cy - v) - (cx - u) * (ay - v)) / area
+                    wc = 1.0 - wa - wb
+                    if wa < 0.0 or wb < 0.0 or wc < 0.0:
+                        continue
+                    if last[v, u, s] != which:
+                        last[v, u, s] = which
+                        count += 1
+                    z = wa * opened[a, 2] + wb * opened[b, 2] + wc * opened[c, 2]
+                    if not z < depth[v, u, s]:
+                        continue
+                    depth[v, u, s] = z
+                    who[v, u, s] = which
+                    column = int(wa * texels[a, 0] + wb * texels[b, 0] + wc * texels[c, 0])
+                    row = int(wa * texels[a, 1] + wb * texels[b, 1] + wc * texels[c, 1])
+                    lit = clear * (wa * light[a] + wb * light[b] + wc * light[c])
+                    for k in range(3):
+                        value = lit * picture[row, column, k] + haze[0] * haze[1 + k]
+                        color[v, u, s, k] = int(min(value + 0.5, 255.0))
+    return count
+
+
+@compiled
+def cover_triangles(pixels: Singles, faces: NDArray[np.int32], bit: int, mask: Bytes) -> None:
+    """Set a bit in the pixels whose middles lie within triangles, whichever way these face.
+
+    Args:
+        pixels: (vertices, 2) [px]; triangles with a NaN are left out.
+        faces: (triangles, 3).
+        bit: to set, a power of 2.
+        mask: (height, width), written.
+    """
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ax, ay = float(pixels[a, 0]), float(pixels[a, 1])
+        bx, by = float(pixels[b, 0]), float(pixels[b, 1])
+        cx, cy = float(pixels[c, 0]), float(pixels[c, 1])
+        area = (cx - ax) * (by - ay) - (bx - ax) * (cy - ay)
+        if not abs(area) > 1e-9:
+            continue
+        u0 = max(int(np.ceil(min(ax, bx, cx))), 0)
+        u1 = min(int(np.floor(max(ax, bx, cx))), mask.shape[1] - 1)
+        v0 = max(int(np.ceil(min(ay, by, cy))), 0)
+        v1 = min(int(np.floor(max(ay, by, cy))), mask.shape[0] - 1)
+        for v in range(v0, v1 + 1):
+            for u in range(u0, u1 + 1):
+                wa = ((cx - u) * (by - v) - (bx - u) * (cy - v)) / area
+                wb = ((ax - u) * (cy - v) - (cx - u) * (ay - v)) / area
+                if wa >= 0.0 and wb >= 0.0 and wa + wb <= 1.0:
+                    mask[v, u] |= bit
+
+
+@compiled
+def resolve(
+    who: NDArray[np.int16],
+    color: Bytes,
+    picture: Bytes,
+    persons: NDArray[np.int16],
+    seen: NDArray[np.int64],
+) -> None:
+    """Mix samples into a part of a picture, and write who is in at least half of each pixel.
+
+    Args:
+        who: (height, width, 4) of `Samples`.
+        color: (height, width, 4, 3) of `Samples`.
+        picture: (height, width, 3) RGB, changed in place.
+        persons: (height, width), written where somebody is; things from len(seen) on are nobody.
+        seen: (persons,) samples of each, added to.
+    """
+    for v in range(who.shape[0]):
+        for u in range(who.shape[1]):
+            hits, best, most = 0, NOBODY, 0
+            red, green, blue = 0, 0, 0
+            for s in range(SAMPLES):
+                w = who[v, u, s]
+                if w == NOBODY:
+                    continue
+                hits += 1
+                red += color[v, u, s, 0]
+                green += color[v, u, s, 1]
+                blue += color[v, u, s, 2]
+                if w < len(seen):
+                    seen[w] += 1
+                    same = 0
+                    for t in range(SAMPLES):
+                        if who[v, u, t] == w:
+                            same += 1
+                    if same > most:
+                        best, most = w, same
+            if hits == 0:
+                continue
+            rest = SAMPLES - hits
+            picture[v, u, 0] = (red + rest * picture[v, u, 0] + 2) // SAMPLES
+            picture[v, u, 1] = (green + rest * picture[v, u, 1] + 2) // SAMPLES
+            picture[v, u, 2] = (blue + rest * picture[v, u, 2] + 2) // SAMPLES
+            if 2 * most >= SAMPLES:
+                persons[v, u] = best
