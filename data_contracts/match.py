@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import Literal, Self
 
 from pydantic import Field, model_validator
@@ -39,6 +40,8 @@ class ClipSpec(Record):
     """The broadcast camera that filmed this clip, if any."""
     broadcast_offset_frames: float = 0.0
     """Frame of the broadcast clip's own video at the clip's first frame."""
+    people: dict[int, Name] = {}
+    """Person ids of the clip's tracks, and whom of the roster they are, as far as is known."""
 
 
 class PlayerSpec(Record):
@@ -77,6 +80,14 @@ class MatchSpec(Record):
                 raise ValueError(
                     f"clip {clip.id} names broadcast camera {clip.broadcast!r}; "
                     f"broadcast cameras here: {sorted(broadcast)}"
+                )
+        roster = {player.id for player in self.roster}
+        for clip in self.clips:
+            named = list(clip.people.values())
+            wrong = sorted({name for name in named if name not in roster or named.count(name) > 1})
+            if wrong:
+                raise ValueError(
+                    f"clip {clip.id} names {wrong}, who are not in the roster or there twice"
                 )
         for camera in self.cameras:
             if camera.fps is not None and camera.fps != self.fps:
@@ -137,8 +148,17 @@ class Registration(Record):
     files: tuple[SourceFile, ...]
 
     def digest_of(self, path: str) -> str | None:
-        """SHA-256 of a registered file, None when the folder has no such file."""
+        """SHA-256 of a registered file, or of the names and contents of all files of a folder.
+
+        None when the match folder has no such file or folder.
+        """
+        listed = hashlib.sha256()
+        inside = False
         for source in self.files:
             if source.path == path:
                 return source.sha256
-        return None
+            if source.path.startswith(f"{path}/"):
+                inside = True
+                name = source.path.removeprefix(f"{path}/")
+                listed.update(f"{source.sha256} {name}\n".encode())
+        return listed.hexdigest() if inside else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import JsonValue
 
-from flows import tracking
+from flows import detection, tracking
 from flows.stage import Match, Stage
 from worldpose.body import OPEN_BODY, digest_of_body
 from worldpose.body_fitting import BodyFittingSettings
@@ -12,8 +12,8 @@ from worldpose.body_fitting import BodyFittingSettings
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
     """Where everybody's joints are, and what each camera saw of whom."""
-    cameras = [f"ingest/{camera.id}" for camera in match.folder.spec.static_cameras]
-    return (*cameras, "bundle_adjustment/cameras", f"tracking/{unit}", f"retriangulation/{unit}")
+    seen = detection.seen_by_cameras(match, unit)
+    return (*seen, "bundle_adjustment/cameras", f"tracking/{unit}", f"retriangulation/{unit}")
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:

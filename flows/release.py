@@ -17,7 +17,9 @@ from worldpose.store import Run
 if TYPE_CHECKING:
     import xarray as xr
 
-JOINT_STAGES = ("triangulation", "retriangulation", "body_fitting")
+BODY_STAGES = ("body_fitting", "refitting")
+"""Stages that give bodies, the best last."""
+JOINT_STAGES = ("triangulation", "retriangulation", *BODY_STAGES)
 """Stages that give 3D joints, the best last."""
 ADJUSTED = "bundle_adjustment/cameras"
 """Where all static cameras are once people have adjusted them."""
@@ -56,7 +58,7 @@ def joint_tracks(run: Run, clip: str, stage: str | None = None) -> JointTracks:
             todo="Run the match to the end first.",
         )
     result = run[f"{stages[0]}/{clip}"]
-    seen = placed_joints(run, clip) if stages[0] == "body_fitting" else result
+    seen = placed_joints(run, clip) if stages[0] in BODY_STAGES else result
     return JointTracks(
         frames=result["frame"].values,
         person_ids=result["person"].values.astype(np.int64),
@@ -64,6 +66,12 @@ def joint_tracks(run: Run, clip: str, stage: str | None = None) -> JointTracks:
         covariance=result["covariance"].values,
         views=seen["views"].values.astype(np.int64),
     )
+
+
+def bodies_unit(run: Run, clip: str) -> str:
+    """The best fitted bodies of a clip, as `stage/unit`, whether or not the run has any."""
+    first, again = (f"{stage}/{clip}" for stage in BODY_STAGES)
+    return again if again in run else first
 
 
 def placed_joints(run: Run, clip: str) -> xr.Dataset:
@@ -105,9 +113,14 @@ def static_cameras(run: Run, spec: MatchSpec, stage: str | None = None) -> dict[
 
 def broadcast_cameras(run: Run) -> dict[str, Camera]:
     """The broadcast camera of every calibrated clip, a batch (frames,), by clip."""
-    units = (name.partition("/") for name in run)
     return {
-        clip: camera_from_arrays(run[f"{stage}/{clip}"].data_vars)
-        for stage, _, clip in units
+        clip: camera_from_arrays(run[broadcast_unit(run, clip)].data_vars)
+        for stage, _, clip in (name.partition("/") for name in run)
         if stage == "broadcast_calibration"
     }
+
+
+def broadcast_unit(run: Run, clip: str) -> str:
+    """The best broadcast camera of a clip, as `stage/unit`."""
+    pooled = f"broadcast_pooling/{clip}"
+    return pooled if pooled in run else f"broadcast_calibration/{clip}"

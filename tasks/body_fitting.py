@@ -2,73 +2,152 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.arrays import GroupLayout
 from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.pitch import PitchSpec
-from data_contracts.run import Work
-from tasks.clip_inputs import open_clip
+from data_contracts.run import Recipe, Work
+from tasks.clip_inputs import ClipInputs, open_clip
 from tasks.unit import figures_of, open_input, unit_task
 from worldpose.body import BodyModel, digest_of_body, find_body
 from worldpose.body_fitting import (
+    BodyFit,
     BodyFittingSettings,
+    Glimpses,
     Pictures,
+    Shape,
+    Sightings,
     find_sightings,
     fit_bodies,
     report_fit,
 )
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
-from worldpose.store import Store
+from worldpose.store import ResultWriter, Store
+
+Floats = NDArray[np.float64]
 
 
 @unit_task
 def body_fitting(work: Work) -> str:
     """Publishes bodies and their keypoints; returns the key."""
     store = Store.open(work.project)
-    sources: dict[str, Any] = work.recipe.sources
+    with store.publishing(work) as result:
+        people = open_people(store, work)
+        publish_fit(result, BODY_FITTING, people, *fit_people(people, work.recipe))
+    return work.key
+
+
+@dataclass(frozen=True, eq=False)
+class ClipPeople:
+    """What the static cameras say of the people of one clip.
+
+    Attributes:
+        clip: cameras, frames and clock.
+        keypoints: (frames, cameras, detections, 17, 2) [px].
+        index: (frames, cameras, persons), place among the detections; -1 = not seen.
+        person: (persons,) ids.
+        joints: (frames, persons, 17, 3) [m], world, triangulated.
+        covariance: (frames, persons, 17, 3, 3) [m^2].
+    """
+
+    clip: ClipInputs
+    keypoints: Floats
+    index: NDArray[np.integer]
+    person: NDArray[np.integer]
+    joints: Floats
+    covariance: Floats
+
+
+def open_people(store: Store, work: Work) -> ClipPeople:
+    """The tracked and triangulated people of the clip of `work`."""
+    clip = open_clip(store, work)
+    placed = open_input(store, work, f"retriangulation/{work.recipe.unit}")
+    return ClipPeople(
+        clip,
+        clip.keypoints[:],
+        open_input(store, work, f"tracking/{work.recipe.unit}")["detection_index"].values,
+        placed["person"].values,
+        placed["joints"].values,
+        placed["covariance"].values,
+    )
+
+
+def fit_people(
+    people: ClipPeople,
+    recipe: Recipe,
+    *,
+    views: Sequence[Sightings] = (),
+    glimpses: Glimpses | None = None,
+    known: Mapping[int, Shape] | None = None,
+) -> tuple[BodyModel, BodyFit]:
+    """The bodies of a clip.
+
+    Args:
+        people: of the clip.
+        recipe: of this stage: its settings, body model and pitch.
+        views: lines of sight of further cameras.
+        glimpses: bodies of single pictures (S4).
+        known: shapes of some, by their place among the persons, as other clips have them.
+    """
+    sources: dict[str, Any] = recipe.sources
     pitch = sources["pitch"]
     ground = None
     if pitch is not None:
         ground = PitchTemplate.from_spec(PitchSpec.model_validate(pitch)).height
-    settings = BodyFittingSettings.model_validate(work.recipe.settings)
+    settings = BodyFittingSettings.model_validate(recipe.settings)
     model = _body(settings.body_model, sources["body_model_sha256"])
-    with store.publishing(work) as result:
-        clip = open_clip(store, work)
-        keypoints = clip.keypoints[:]
-        index = open_input(store, work, f"tracking/{work.recipe.unit}")["detection_index"].values
-        placed = open_input(store, work, f"retriangulation/{work.recipe.unit}")
-        joints = placed["joints"].values
-        fit = fit_bodies(
-            model,
-            joints,
-            placed["covariance"].values,
-            clip.fps,
-            settings,
-            ground,
-            sightings=find_sightings(clip.cameras, keypoints, index, joints),
-        )
-        result.write(
-            BODY_FITTING,
-            arrays={
-                "betas": fit.betas,
-                "betas_covariance": fit.betas_covariance,
-                "global_orient": fit.parameters.global_orient,
-                "body_pose": fit.parameters.body_pose,
-                "transl": fit.parameters.transl,
-                "joints": fit.joints,
-                "covariance": fit.covariance,
-                "filled": fit.filled,
-                "guided": fit.guided,
-                "joint_offsets": fit.offsets,
-            },
-            coordinates={"frame": clip.frame, "person": placed["person"].values},
-            attributes={"body_model": model.name},
-        )
-        persons = [f"person{person}" for person in placed["person"].values]
-        report = report_fit(fit, joints, clip.fps, Pictures(clip.cameras, keypoints, index))
-        result.figures.update(figures_of(report, persons))
-    return work.key
+    alone = find_sightings(people.clip.cameras, people.keypoints, people.index, people.joints)
+    fit = fit_bodies(
+        model,
+        people.joints,
+        people.covariance,
+        people.clip.fps,
+        settings,
+        ground,
+        known=known,
+        sightings=[alone, *views],
+        glimpses=glimpses,
+    )
+    return model, fit
+
+
+def publish_fit(
+    result: ResultWriter,
+    layout: GroupLayout,
+    people: ClipPeople,
+    model: BodyModel,
+    fit: BodyFit,
+    further: Mapping[str, NDArray[Any]] | None = None,
+) -> None:
+    """Writes bodies, and what a layout has `further`, with their figures."""
+    result.write(
+        layout,
+        arrays={
+            "betas": fit.betas,
+            "betas_covariance": fit.betas_covariance,
+            "global_orient": fit.parameters.global_orient,
+            "body_pose": fit.parameters.body_pose,
+            "transl": fit.parameters.transl,
+            "joints": fit.joints,
+            "covariance": fit.covariance,
+            "filled": fit.filled,
+            "guided": fit.guided,
+            "joint_offsets": fit.offsets,
+            **(further or {}),
+        },
+        coordinates={"frame": people.clip.frame, "person": people.person},
+        attributes={"body_model": model.name},
+    )
+    pictures = Pictures(people.clip.cameras, people.keypoints, people.index)
+    report = report_fit(fit, people.joints, people.clip.fps, pictures)
+    result.figures.update(figures_of(report, [f"person{person}" for person in people.person]))
 
 
 def _body(name: str, sha256: str | None) -> BodyModel:

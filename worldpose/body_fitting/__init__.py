@@ -15,6 +15,7 @@ from worldpose.body_fitting.figures import BodyFittingReport, Pictures, report_f
 from worldpose.body_fitting.fitting import BodyFit, fit_bodies
 from worldpose.body_fitting.glimpses import Glimpses, place_glimpses
 from worldpose.body_fitting.monocular import MonocularEstimates, read_monocular
+from worldpose.body_fitting.moving_view import between_frames, recognise_people, sight_people
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.sightings import Sightings, find_sightings
 
@@ -28,6 +29,7 @@ __all__ = [
     "Pictures",
     "Shape",
     "Sightings",
+    "between_frames",
     "find_sightings",
     "fit_bodies",
     "fit_shape",
@@ -35,5 +37,7 @@ __all__ = [
     "place_glimpses",
     "pool_shapes",
     "read_monocular",
+    "recognise_people",
     "report_fit",
+    "sight_people",
 ]

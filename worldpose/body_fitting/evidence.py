@@ -16,6 +16,9 @@ Floats = NDArray[np.float64]
 DIFFICULTY: Final = np.array(COCO17_SIGMAS) / 0.08
 """Spread of each joint relative to an average one: COCO's sigmas over their mean of 0.08."""
 
+LEAST: Final = 1e-6
+"""Added to information that has no inverse [1/m^2]: one line leaves a direction open."""
+
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
@@ -25,6 +28,11 @@ class Evidence:
     """(frames, 17, 3) [m]; NaN where nothing is known."""
     information: Floats
     """(frames, 17, 3, 3) [1/m^2], inverse covariance; 0 where nothing is known."""
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(frames, 17), joints of which anything is known."""
+        return np.asarray(self.information.any(axis=(-1, -2)))
 
     @classmethod
     def of(
@@ -50,18 +58,21 @@ class Evidence:
     def with_lines(
         self, points: Floats, across: Floats, fps: float, settings: BodyFittingSettings
     ) -> Evidence:
-        """Return the evidence with lines of sight where nothing else is known.
+        """Return the evidence with what lines of sight add.
 
         Args:
             points: (frames, 17, 3) [m], world, on the lines; NaN without.
-            across: (frames, 17, 3, 3) [1], projections across the lines.
+            across: (frames, 17, 3, 3) [1], projections across the lines; 0 without.
             fps: [1/s].
             settings: how far a joint is from its line.
         """
-        added = np.asarray(np.isfinite(points).all(-1) & np.isnan(self.joints).any(-1))
+        seen = np.asarray(np.isfinite(points).all(-1))
         spread = (settings.sight_spread * DIFFICULTY) ** 2 + settings.joint_floor**2
         spread *= 1.0 + settings.noise_time * fps
-        information = np.where(
-            added[..., None, None], across / spread[:, None, None], self.information
-        )
-        return Evidence(np.where(added[..., None], points, self.joints), information)
+        line = np.where(seen[..., None, None], across / spread[:, None, None], 0.0)
+        information = self.information + line
+        # From the point on the line towards what was known; along a lone line nothing pulls.
+        away = np.where(np.isfinite(self.joints), self.joints, points) - points
+        pulled = self.information @ np.nan_to_num(away)[..., None]
+        moved = np.linalg.solve(information + LEAST * np.eye(3), pulled)[..., 0]
+        return Evidence(np.where(seen[..., None], points + moved, self.joints), information)

@@ -31,6 +31,12 @@ class Contacts:
     height: Floats
     """(frames, 2) [m], world: a flat foot's ankle there; nothing is lower."""
 
+    def of(self, seen: NDArray[np.bool_]) -> Contacts:
+        """Return the contacts of ankles that were seen (frames, 17): others may stand or not."""
+        ankles = seen[:, ANKLES]
+        both = ankles[1:] & ankles[:-1]
+        return Contacts(self.standing * ankles, self.slipping * both, self.height)
+
 
 def find_contacts(
     joints: Floats, ankle_height: float, ground: Ground, fps: float, settings: BodyFittingSettings

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -72,7 +72,7 @@ def fit_bodies(
     settings: BodyFittingSettings,
     ground: Ground | None = None,
     known: Mapping[int, Shape] | None = None,
-    sightings: Sightings | None = None,
+    sightings: Sequence[Sightings] = (),
     glimpses: Glimpses | None = None,
 ) -> BodyFit:
     """Return the bodies that explain everybody's triangulated joints (S1-S3).
@@ -89,8 +89,8 @@ def fit_bodies(
         settings: what is expected of detectors, bodies and motion.
         ground: height of the surface under the feet, in a world with z up; None where unknown.
         known: shapes of people, by their place in `joints`, as other clips have them.
-        sightings: lines of sight of joints that are not triangulated, of the same frames and
-            persons; a person without joints is there as long as these last.
+        sightings: lines of sight beside what is triangulated, of the same frames and persons; a
+            person without joints is there as long as these last.
         glimpses: of the same frames and persons, used where few joints are well known (S4).
 
     Raises:
@@ -119,10 +119,10 @@ def fit_bodies(
         for person, span in spans.items()
     }
     there = seen
-    if sightings is not None:
-        there = seen | sightings.seen
+    for view in sightings:
+        there = there | view.seen
         for person, span in spans.items():
-            lines = sightings.points[span, person], sightings.across[span, person]
+            lines = view.points[span, person], view.across[span, person]
             evidence[person] = evidence[person].with_lines(*lines, fps, settings)
     shapes = fit_shapes(
         solver,

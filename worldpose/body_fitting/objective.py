@@ -114,7 +114,7 @@ class Track:
         rows = by_frame.reshape(frames, 51, UNKNOWNS)
 
         axes = body_axes(body.keypoints)
-        known = np.asarray(self.evidence.information.any(axis=(-1, -2)))
+        known = self.evidence.known
         seen_at = body.keypoints + np.einsum("fab,jb->fja", axes, offsets)
         residual = np.where(known[..., None], seen_at - self.evidence.joints, 0.0)
         pulled = np.einsum("fjab,fjb->fja", self.evidence.information, residual)

@@ -24,7 +24,7 @@ class Sightings:
 
     points: Floats
     """(frames, persons, 17, 3) [m], world: of the line, the point nearest to where the track puts
-    the joint; NaN where there is no line or more than one."""
+    the joint; NaN without a line."""
     across: Floats
     """(frames, persons, 17, 3, 3) [1], what takes the part along his lines from a vector."""
 
@@ -52,8 +52,8 @@ def find_sightings(
         joints: (frames, persons, 17, 3) [m], world, triangulated.
     """
     frames, count, persons = detection_index.shape
-    points = np.full(joints.shape, np.nan)
-    ahead = np.full(joints.shape, np.nan)
+    origins = np.full(joints.shape, np.nan)
+    directions = np.full(joints.shape, np.nan)
     frame, camera, person = np.nonzero(detection_index >= 0)
     own = np.full((frames, count, persons, 17, 2), np.nan)
     own[frame, camera, person] = keypoints[frame, camera, detection_index[frame, camera, person]]
@@ -61,29 +61,40 @@ def find_sightings(
     alone = (there.sum(axis=1) == 1) & ~np.isfinite(joints).all(-1)
     frame, person, joint = np.nonzero(alone)
     camera = there.argmax(axis=1)[frame, person, joint]
-    expected = _expected(joints) if len(frame) else joints
     for each in range(count):
         mine = camera == each
         if not mine.any():
             continue
         at = frame[mine], person[mine], joint[mine]
         rays = cameras[each].unproject(own[at[0], each, at[1], at[2]])
-        along = rays.directions / np.linalg.norm(rays.directions, axis=-1, keepdims=True)
-        far = np.maximum(((expected[at] - rays.origins) * along).sum(-1, keepdims=True), 0.0)
-        points[at], ahead[at] = rays.origins + far * along, along
+        origins[at], directions[at] = rays.origins, rays.directions
+    return lines_of_sight(origins, directions, expected_joints(joints) if alone.any() else joints)
+
+
+def lines_of_sight(origins: Floats, directions: Floats, expected: Floats) -> Sightings:
+    """Return rays as lines of sight, all of a person in a frame as one bundle.
+
+    Args:
+        origins: (frames, persons, 17, 3) [m], world.
+        directions: (frames, persons, 17, 3), of any length; NaN without a ray.
+        expected: (frames, persons, 17, 3) [m], world, where the joints are about.
+    """
+    along = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    far = np.maximum(((expected - origins) * along).sum(-1, keepdims=True), 0.0)
+    points = origins + far * along
     lost = ~np.isfinite(points).all(-1)
-    points[lost], ahead[lost] = np.nan, 0.0
-    mean = ahead.sum(axis=2, keepdims=True)
+    points[lost], along[lost] = np.nan, 0.0
+    mean = along.sum(axis=2, keepdims=True)
     length = np.linalg.norm(mean, axis=-1, keepdims=True)
     mean = mean / np.maximum(length, 1e-9)
     across = np.eye(3) - mean[..., :, None] * mean[..., None, :]
     return Sightings(points, np.where(lost[..., None, None], 0.0, across))
 
 
-def _expected(joints: Floats) -> Floats:
-    """Where tracks put joints in every frame: between what is seen, the middle of the others else.
+def expected_joints(joints: Floats) -> Floats:
+    """Return where tracks put joints in every frame; NaN for persons who are never seen.
 
-    NaN for persons whose joints are never seen.
+    A joint is on the way between where it was seen, one that never was in the middle of the others.
     """
     full = np.stack([bridged(joints[:, person]) for person in range(joints.shape[1])], axis=1)
     known = np.isfinite(full)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from worldpose.body_fitting.bones import Shape
 from worldpose.body_fitting.evidence import Evidence
 from worldpose.body_fitting.feet import Ground, ankle_height, find_contacts, level_feet
 from worldpose.body_fitting.guidance import Guidance
-from worldpose.body_fitting.objective import UNKNOWNS, Pose, Track
+from worldpose.body_fitting.objective import LIVELINESS, UNKNOWNS, Pose, Track
 from worldpose.body_fitting.pose_space import PosePrior
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shared_bias import body_axes
@@ -23,6 +24,10 @@ from worldpose.body_fitting.starting import bridged, start_poses
 from worldpose.cameras import Rigid
 
 Floats = NDArray[np.float64]
+
+ALIKE: Final = float((1.0 / LIVELINESS**2).sum())
+"""As many accelerations of the hips are those of all keypoints, each for itself [1]. But a body
+accelerates as one: the search may count them all, how sure its poses are may not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +47,7 @@ class Solver:
         fps: float,
         guidance: Guidance | None = None,
     ) -> tuple[Pose, BandedFactor]:
-        """Return one person's poses in all frames, and the factor of the last step.
+        """Return one person's poses in all frames, and the factor that tells how sure they are.
 
         Poses of `guidance` are where the search begins if the objective is lower there.
         """
@@ -79,9 +84,14 @@ class Solver:
             if self.ground is not None and step == settings.steps // 2:
                 track = self.standing(track, pose)
             equations = track.equations(pose, offsets, bordered=False)
-            solved = factor(equations.blocks)
-            pose = pose.moved(-solved.solve(equations.gradient[..., None])[..., 0])
-        return pose, solved
+            step_of = factor(equations.blocks).solve(equations.gradient[..., None])
+            pose = pose.moved(-step_of[..., 0])
+        doubtful = replace(
+            track,
+            acceleration=track.acceleration * ALIKE**0.5,
+            contacts=None if track.contacts is None else track.contacts.of(evidence.known),
+        )
+        return pose, factor(doubtful.equations(pose, offsets, bordered=False).blocks)
 
     def standing(self, track: Track, pose: Pose) -> Track:
         """Return the track with the ankles that stand in a pose."""

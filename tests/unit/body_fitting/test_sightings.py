@@ -66,7 +66,7 @@ def test_stretches_of_one_view_are_filled_better_than_by_motion_alone(length):
     settings = BodyFittingSettings(longest_gap=2.0)
     lines = find_sightings(CAMERA, keypoints, index, joints)
     alone = fit_bodies(MODEL, joints, covariance, 50.0, settings)
-    lined = fit_bodies(MODEL, joints, covariance, 50.0, settings, sightings=lines)
+    lined = fit_bodies(MODEL, joints, covariance, 50.0, settings, sightings=[lines])
     before, after = (
         np.linalg.norm(x.joints - exact[:, None], axis=-1)[hidden].mean() for x in (alone, lined)
     )
@@ -86,5 +86,5 @@ def test_who_is_seen_by_one_camera_stays_longer_than_the_longest_gap():
     settings = BodyFittingSettings(longest_gap=0.5)
     lines = find_sightings(CAMERA, keypoints, index, joints)
     gone = fit_bodies(MODEL, joints, covariance, 50.0, settings)
-    stays = fit_bodies(MODEL, joints, covariance, 50.0, settings, sightings=lines)
+    stays = fit_bodies(MODEL, joints, covariance, 50.0, settings, sightings=[lines])
     assert np.isnan(gone.joints[20:70]).all() and np.isfinite(stays.joints).all()

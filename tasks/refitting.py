@@ -1,0 +1,153 @@
+"""Task of stage `refitting`: bodies again, with what the broadcast camera and other clips say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.refitting import REFITTING
+from data_contracts.run import Work
+from tasks.body_fitting import fit_people, open_people, publish_fit
+from tasks.unit import open_input, require_registered, unit_task
+from worldpose.body_fitting import (
+    Glimpses,
+    Shape,
+    Sightings,
+    between_frames,
+    place_glimpses,
+    pool_shapes,
+    read_monocular,
+    recognise_people,
+    sight_people,
+)
+from worldpose.cameras import Camera
+from worldpose.cameras.stored import camera_from_arrays
+from worldpose.store import Store
+
+Floats = NDArray[np.float64]
+
+KNOWN: Final = 2.0
+"""Frames whose broadcast camera is expected to put players farther off than this are left out
+[px]: keypoints are about as far off, but not all of a person the same way."""
+
+
+@unit_task
+def refitting(work: Work) -> str:
+    """Publishes bodies and their keypoints; returns the key."""
+    store = Store.open(work.project)
+    unit = work.recipe.unit
+    before = store.manifest(
+        work.recipe.match_id, "body_fitting", unit, work.recipe.inputs[f"body_fitting/{unit}"]
+    ).recipe
+    with store.publishing(work) as result:
+        people = open_people(store, work)
+        joints = open_input(store, work, f"body_fitting/{unit}")["joints"].values
+        views: list[Sightings] = []
+        glimpses: Glimpses | None = None
+        if f"broadcast_calibration/{unit}" in work.recipe.inputs:
+            pictures = _pictures(store, work, people.clip.frame)
+            views = [_view(store, work, pictures, joints)]
+            glimpses = _glimpses(work, pictures, joints)
+        known = _known(store, work, people.person)
+        model, fit = fit_people(people, before, views=views, glimpses=glimpses, known=known)
+        recognised = views[0].seen if views else np.zeros(joints.shape[:2], dtype=bool)
+        pooled = np.isin(np.arange(len(people.person)), list(known))
+        further = {"recognised": recognised, "pooled": pooled}
+        publish_fit(result, REFITTING, people, model, fit, further)
+        moved = np.linalg.norm(fit.joints - joints, axis=-1)
+        result.figures["recognised"] = float(recognised.sum())
+        result.figures["pooled"] = float(pooled.sum())
+        for place, person in enumerate(people.person):
+            if np.isfinite(moved[:, place]).any():
+                figure = float(np.nanmedian(moved[:, place]))
+                result.figures[f"moved_m.person{person}"] = figure
+    return work.key
+
+
+@dataclass(frozen=True, eq=False)
+class _Pictures:
+    """The pictures of a clip's broadcast camera, one a frame of the clip.
+
+    Attributes:
+        number: (frames,) of each picture in its video.
+        camera: batch (frames,); NaN where it is not known well enough.
+        late: how much later than the frame the picture was taken [frame].
+    """
+
+    number: NDArray[np.int64]
+    camera: Camera
+    late: float
+
+
+def _pictures(store: Store, work: Work, frame: NDArray[np.int64]) -> _Pictures:
+    sources: dict[str, Any] = work.recipe.sources
+    name = f"broadcast_calibration/{work.recipe.unit}"
+    found = open_input(store, work, name)
+    camera = camera_from_arrays(found.data_vars)
+    known = found["reprojection_error"].values <= KNOWN
+    offset = float(sources["broadcast_offset_frames"])
+    late = round(offset) - offset
+    ids = work.recipe.match_id, *name.split("/")
+    calibrated = store.manifest(*ids, work.recipe.inputs[name]).recipe
+    measured = (found.attrs["feed_offset"] or {}).get("frames")
+    if calibrated.settings["feed_offset"] == "correct" and measured is not None:
+        late += measured
+    return _Pictures(
+        number=frame + sources["offset_frames"],
+        camera=replace(camera, focal=np.where(known[:, None], camera.focal, np.nan)),
+        late=late,
+    )
+
+
+def _view(store: Store, work: Work, pictures: _Pictures, joints: Floats) -> Sightings:
+    """What the 2D poses in the pictures say of where joints are."""
+    sources: dict[str, Any] = work.recipe.sources
+    first, count = sources["first_frame"], sources["frame_count"]
+    seen = open_input(store, work, sources["seen_in_broadcast"]).sel(
+        frame=np.arange(first, first + count)
+    )
+    then = between_frames(joints, pictures.late)
+    keypoints = seen["keypoints"].values.astype(np.float64)
+    own = recognise_people(pictures.camera, keypoints, then)
+    view = sight_people(pictures.camera, own, then)
+    return Sightings(
+        between_frames(view.points, -pictures.late), between_frames(view.across, -pictures.late)
+    )
+
+
+def _glimpses(work: Work, pictures: _Pictures, joints: Floats) -> Glimpses | None:
+    """The bodies that were estimated from the pictures, where any were."""
+    sources: dict[str, Any] = work.recipe.sources
+    if sources["estimates"] is None:
+        return None
+    path = Path(work.folder) / sources["estimates"]
+    estimates = read_monocular(path)
+    require_registered(path, sources["estimates_sha256"])
+    then = between_frames(joints, pictures.late)
+    seen = place_glimpses(estimates, pictures.camera, pictures.number, then)
+    whole = -round(pictures.late)
+    return Glimpses(between_frames(seen.orient, whole), between_frames(seen.angles, whole))
+
+
+def _known(store: Store, work: Work, persons: NDArray[np.integer]) -> dict[int, Shape]:
+    """The shapes that other clips found, by the place of their people among the persons."""
+    sources: dict[str, Any] = work.recipe.sources
+    named: dict[str, dict[str, str]] = dict(sources["people"])
+    here = named.pop(work.recipe.unit)
+    shapes: dict[str, list[Shape]] = {}
+    for clip, people in named.items():
+        found = open_input(store, work, f"body_fitting/{clip}")
+        for place, person in enumerate(found["person"].values):
+            betas = found["betas"].values[place]
+            if str(person) in people and np.isfinite(betas).all():
+                shape = Shape(betas, found["betas_covariance"].values[place])
+                shapes.setdefault(people[str(person)], []).append(shape)
+    return {
+        place: pool_shapes(shapes[here[str(person)]])
+        for place, person in enumerate(persons)
+        if here.get(str(person)) in shapes
+    }
