@@ -95,6 +95,12 @@ BROADCAST_CALIBRATION = GroupLayout(
             "covariance of a step of the frame's camera, in the units of its parameters; zero for "
             "parameters that were not solved for",
         ),
+        _by_frame(
+            "shared_covariance",
+            ("parameter", "clip_parameter"),
+            "1",
+            "covariance of a step of the frame's camera with what all frames share",
+        ),
         ArrayLayout(
             name="clip_covariance",
             dims=("clip_parameter", "clip_parameter_"),
@@ -134,11 +140,14 @@ BROADCAST_CALIBRATION = GroupLayout(
     attributes={
         "clip_id": "clip of the match",
         "status_names": "meanings of `status`",
-        "key_frames": "frames that were clicked and used",
-        "refused_key_frames": "frames that were clicked and could not be used, and why",
+        "key_frames": "frames that were clicked and used, as the clip's video numbers them, from 0",
+        "refused_key_frames": "frames clicked that could not be used, numbered alike, and why",
         "weights": "weights and noise of the terms, and the rule that each follows",
+        "feed_offset": "the clip's frame t shows what static cameras show at t + `frames`, with "
+        "its standard error [frame], from so many pairs; `frames` is null where it cannot be "
+        "told, all of it where there are no people",
         "drift": "by how much tracking from one key frame missed the next [px], by gap",
-        "pick_next": "frames whose clicks would help most, the best first",
+        "pick_next": "frames whose clicks would help most, numbered alike, the best first",
         "decisions": "what was chosen, and the figures that decided",
         "reasons": "why a person must look at it; empty where nobody must",
     },

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import JsonValue
 
+from flows import detection
 from flows.stage import Match, Stage
 from worldpose.broadcast_calibration import BroadcastCalibrationSettings
 from worldpose.ingest import unit_frames
@@ -18,9 +19,8 @@ def units(match: Match) -> tuple[str, ...]:
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """The fitted people, and 2D poses of the broadcast camera where they were brought in."""
-    seen = (f"ingest/{unit}",) if unit in match.folder.detections else ()
-    return (*seen, f"body_fitting/{unit}")
+    """The fitted people, and whom the broadcast camera saw."""
+    return (*detection.seen_in_broadcast(match, unit), f"body_fitting/{unit}")
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:

@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Final
+
 import numpy as np
 
 from data_contracts.broadcast_calibration import FRAME_STATUS
-from flows.release import broadcast_cameras, joint_tracks
+from flows.release import broadcast_cameras, broadcast_unit, joint_tracks
 from flows.stage import Match
 from worldpose.ingest import unit_frames
-from worldpose.release import Picture
+from worldpose.release import Picture, whole_file
 from worldpose.release.broadcast_pictures import course_picture
+from worldpose.release.overlay_video import overlay_frames
 from worldpose.release.report import Table
 from worldpose.release.stadium_pictures import camera_picture
 from worldpose.store import Run
-from worldpose.video import VideoReader
+from worldpose.video import VideoReader, write_video
+
+WORST: Final = 2
+"""Frames that are shown of those whose cameras are known least [1]."""
+FRAME_RATE: Final = 25.0
+"""Of overlay videos, at most about [1/s]."""
+LENGTH: Final = 30.0
+"""Of overlay videos, at most [s]."""
 
 
 def broadcast_pictures(run: Run, match: Match) -> list[Picture]:
@@ -26,32 +37,72 @@ def broadcast_pictures(run: Run, match: Match) -> list[Picture]:
             Picture(
                 f"Clip {clip}: the broadcast camera over its frames, with bands of two standard "
                 "deviations.",
-                course_picture(frame, camera, result["covariance"].values),
+                course_picture(frame, camera, run[broadcast_unit(run, clip)]["covariance"].values),
             )
         )
         if not np.isfinite(expected).any():
             continue
-        worst = int(np.nanargmax(expected))
-        number = int(frame[worst])
         tracks = joint_tracks(run, clip)
-        video_frame = number + unit_frames(match.folder.spec, clip).offset
-        with VideoReader(match.folder.videos[clip]) as video:
-            still = video.frame(video_frame)
-        pictures.append(
-            Picture(
-                f"Clip {clip}, frame {number}, where the broadcast camera is known least "
-                f"({expected[worst]:.2g} px): markings and people as it projects them.",
-                camera_picture(
-                    camera[worst],
-                    f"broadcast camera, frame {number}",
-                    tracks,
-                    int(np.searchsorted(tracks.frames, number)),
-                    still=still,
-                    pitch=match.folder.pitch,
-                ),
+        offset = unit_frames(match.folder.spec, clip).offset
+        for video_number in result.attrs["pick_next"][:WORST]:
+            number = video_number - offset
+            place = int(np.searchsorted(frame, number))
+            with VideoReader(match.folder.videos[clip]) as video:
+                still = video.frame(video_number)
+            pictures.append(
+                Picture(
+                    f"Clip {clip}, frame {number}, {video_number} of its video, among those where "
+                    f"the broadcast camera is known least ({expected[place]:.2g} px): markings and "
+                    "people as it projects them.",
+                    camera_picture(
+                        camera[place],
+                        f"broadcast camera, frame {number}",
+                        tracks,
+                        int(np.searchsorted(tracks.frames, number)),
+                        still=still,
+                        pitch=match.folder.pitch,
+                    ),
+                )
             )
-        )
     return pictures
+
+
+def write_broadcast_videos(run: Run, match: Match, page: Path) -> list[Path]:
+    """Writes each clip's broadcast video with markings and people over it; returns the files.
+
+    At half the size and at most 25 frames a second; of a longer clip, the 30 s about the frame
+    whose camera is known least.
+
+    Args:
+        run: the run.
+        match: the match.
+        page: beside this file, and named after it.
+    """
+    files = []
+    fps = match.folder.spec.fps
+    every = max(1, round(fps / FRAME_RATE))
+    for clip, camera in broadcast_cameras(run).items():
+        result = run[f"broadcast_calibration/{clip}"]
+        expected = np.nan_to_num(result["reprojection_error"].values)
+        most = round(LENGTH * fps)
+        begin = int(np.clip(int(expected.argmax()) - most // 2, 0, max(0, len(expected) - most)))
+        chosen = np.arange(begin, min(begin + most, len(expected)), every)
+        frames = result["frame"].values[chosen]
+        start = int(frames[0]) + unit_frames(match.folder.spec, clip).offset
+        stop = start + int(chosen[-1] - chosen[0]) + 1
+        file = page.with_name(f"{page.stem}-{clip}.mp4")
+        with VideoReader(match.folder.videos[clip]) as video, whole_file(file) as draft:
+            pictures = (
+                picture
+                for number, picture in video.frames(start, stop)
+                if (number - start) % every == 0
+            )
+            drawn = overlay_frames(
+                pictures, camera[chosen], joint_tracks(run, clip), frames, match.folder.pitch
+            )
+            write_video(draft, drawn, fps / every, quality=26)
+        files.append(file)
+    return files
 
 
 def broadcast_tables(run: Run) -> list[Table]:
@@ -66,18 +117,33 @@ def broadcast_tables(run: Run) -> list[Table]:
                 for name, count in zip(FRAME_STATUS, status, strict=True)
                 if count
             ),
-            ("key frames used", ", ".join(map(str, result.attrs["key_frames"]))),
+            ("key frames used, of its video", ", ".join(map(str, result.attrs["key_frames"]))),
             *(
                 (f"key frame {frame} is not used", why)
                 for frame, why in result.attrs["refused_key_frames"].items()
             ),
             ("tracking missed the next key frame by [px]", _numbers(result.attrs["drift"])),
-            ("frames to click next", ", ".join(map(str, result.attrs["pick_next"]))),
+            ("frames of its video to click next", ", ".join(map(str, result.attrs["pick_next"]))),
             *(("chosen", decision) for decision in result.attrs["decisions"]),
+            *_pooled(run, clip),
             *(("look at it", reason) for reason in result.attrs["reasons"]),
         ]
         tables.append(Table(f"Broadcast camera of clip {clip}", ("", ""), tuple(rows)))
     return tables
+
+
+def _pooled(run: Run, clip: str) -> list[tuple[str, str]]:
+    """What the camera's other clips say of its place, where there are any."""
+    unit = broadcast_unit(run, clip)
+    if "distance" not in run[unit].attrs:
+        return []
+    pooled = run[unit].attrs
+    apart = ", ".join(
+        f"{name} {distance:.1f}"
+        for name, distance in zip(pooled["clips"], pooled["distance"], strict=True)
+    )
+    said = "one place" if pooled["agree"] else "no common place: each clip keeps its own"
+    return [("the camera's clips have", f"{said}; from it [standard deviations]: {apart}")]
 
 
 def _numbers(values: list[float]) -> str:

@@ -54,33 +54,36 @@ def camera_pictures(
         for name in cameras
     }
     weakest = sorted((name for name in cameras if errors[name]), key=lambda name: -errors[name])
-    pictures = []
-    for name in weakest[:SHOWN] if match.folder.pitch is not None else ():
-        result = run[f"static_calibration/{name}"]
-        inlier = dict(zip(_names(run, name), result["point_inlier"].values.tolist(), strict=True))
-        ground_error = ErrorMap(
+    shown = weakest[:SHOWN] if match.folder.pitch is not None else ()
+    return [
+        Picture(
+            f"One of the least certain cameras, {name}: the pitch as it projects it, clicks "
+            "as circles, clicks that it does not rest on as crosses; below, its expected "
+            f"error on the ground, median {errors[name]:.2g} m.",
+            camera_evidence(store, run, match, name, cameras[name]),
+        )
+        for name in shown
+    ]
+
+
+def camera_evidence(store: Store, run: Run, match: Match, name: str, camera: Camera) -> bytes:
+    """A PNG of one calibrated camera: its clicks on its still, and the expected ground error."""
+    assert match.folder.pitch is not None, "nothing is clicked without a pitch"
+    result = run[f"static_calibration/{name}"]
+    inlier = dict(zip(_names(run, name), result["point_inlier"].values.tolist(), strict=True))
+    return calibration_picture(
+        camera,
+        f"camera {name}",
+        match.folder.pitch,
+        clicks=[
+            Click(point, place, inlier[point])
+            for point, place in _clicked_places(store, run, name).items()
+        ],
+        still=still_of(match, name),
+        error_map=ErrorMap(
             result["ground_x"].values, result["ground_y"].values, result["ground_error"].values
-        )
-        png = calibration_picture(
-            cameras[name],
-            f"camera {name}",
-            match.folder.pitch,
-            clicks=[
-                Click(point, place, inlier[point])
-                for point, place in _clicked_places(store, run, name).items()
-            ],
-            still=still_of(match, name),
-            error_map=ground_error,
-        )
-        pictures.append(
-            Picture(
-                f"One of the least certain cameras, {name}: the pitch as it projects it, clicks "
-                "as circles, clicks that it does not rest on as crosses; below, its expected "
-                f"error on the ground, median {errors[name]:.2g} m.",
-                png,
-            )
-        )
-    return pictures
+        ),
+    )
 
 
 def still_of(match: Match, camera_id: str) -> NDArray[np.uint8] | None:

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from data_contracts.conventions import COCO17
-from flows.release import ADJUSTED
+from flows.release import ADJUSTED, bodies_unit
 from worldpose.release.meanings import shown_number
 from worldpose.release.report import Table
 from worldpose.store import Run
@@ -92,7 +92,7 @@ def body_tables(run: Run, clips: tuple[str, ...]) -> list[Table]:
     """Figures of every fitted person, clip by clip."""
     tables = []
     for clip in clips:
-        unit = f"body_fitting/{clip}"
+        unit = bodies_unit(run, clip)
         if unit not in run:
             continue
         figures = run.record.figures.get(unit, {})

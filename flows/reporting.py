@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from data_contracts.evaluation import Evaluation
-from flows.broadcast_reporting import broadcast_pictures, broadcast_tables
+from flows.broadcast_reporting import (
+    broadcast_pictures,
+    broadcast_tables,
+    write_broadcast_videos,
+)
 from flows.camera_reporting import camera_pictures, camera_summaries, still_of
+from flows.detection import seen_by
 from flows.evaluation import load_reference, score
 from flows.people_reporting import adjustment_tables, body_tables
-from flows.release import clips_of, joint_tracks, placed_joints, static_cameras
+from flows.release import bodies_unit, clips_of, joint_tracks, placed_joints, static_cameras
 from flows.stage import Match
 from worldpose.body import BodyParameters, find_body
 from worldpose.cameras import Camera
@@ -24,9 +28,15 @@ from worldpose.store import Run, Store, open_run
 
 
 def write_report(
-    store: Store, match: Match, out: Path, *, run_id: str = "latest", reference: str | None = None
-) -> None:
-    """Writes the HTML page of one run.
+    store: Store,
+    match: Match,
+    out: Path,
+    *,
+    run_id: str = "latest",
+    reference: str | None = None,
+    videos: bool = True,
+) -> list[Path]:
+    """Writes the HTML page of one run, and returns the videos written beside it.
 
     Args:
         store: the project's store.
@@ -34,6 +44,7 @@ def write_report(
         out: the file to write.
         run_id: number of the run.
         reference: truth; None = `reference/` of the match folder, where there is one.
+        videos: write each clip's broadcast video with what was found drawn over it.
     """
     run = open_run(store.url, match.match_id, run_id)
     clips = clips_of(run.record)
@@ -53,7 +64,7 @@ def write_report(
         seconds=seconds,
         scores=scores,
         pictures=[
-            *(picture for clip in clips for picture in _pictures(run, match, clip, cameras, truth)),
+            *(picture for clip in clips for picture in clip_pictures(run, match, clip, truth)),
             *broadcast_pictures(run, match),
         ],
         cameras=camera_summaries(run, match.folder.spec),
@@ -62,6 +73,7 @@ def write_report(
     )
     with whole_file(out) as draft:
         draft.write_text(page, encoding="utf-8")
+    return write_broadcast_videos(run, match, out) if videos else []
 
 
 def _own_reference(match: Match) -> str | None:
@@ -69,10 +81,11 @@ def _own_reference(match: Match) -> str | None:
     return str(folder) if (folder / "joints.npz").is_file() else None
 
 
-def _pictures(
-    run: Run, match: Match, clip: str, cameras: Mapping[str, Camera], truth: JointTracks | None
+def clip_pictures(
+    run: Run, match: Match, clip: str, truth: JointTracks | None = None
 ) -> list[Picture]:
     """The stadium from a camera and from above, people's ways, and the view with most people."""
+    cameras = static_cameras(run, match.folder.spec)
     tracks = joint_tracks(run, clip)
     pitch = match.folder.pitch
     seen = placed_joints(run, clip)["inliers"].any("joint").sum("person").values
@@ -96,7 +109,7 @@ def _pictures(
                 stadium_picture(cameras, "", tracks, 0, pitch=pitch),
             ),
         ]
-        if f"body_fitting/{clip}" in run:
+        if bodies_unit(run, clip) in run:
             pictures.append(_bodies(run, match, clip, widest, cameras[widest]))
     above = paths_picture(tracks, truth=truth, cameras=cameras, pitch=pitch)
     pictures.append(Picture(f"Clip {clip}: everybody's way.", above))
@@ -108,7 +121,7 @@ def _pictures(
     view = view_picture(
         cameras[camera_id],
         f"camera {camera_id}, frame {number}",
-        detections=run[f"ingest/{camera_id}"]["keypoints"].sel(frame=number).values,
+        detections=run[seen_by(match, camera_id, clip)]["keypoints"].sel(frame=number).values,
         joints=tracks.joints[frame],
         person_ids=tracks.person_ids,
         pitch=pitch,
@@ -118,7 +131,7 @@ def _pictures(
 
 def _bodies(run: Run, match: Match, clip: str, camera_id: str, camera: Camera) -> Picture:
     """The bodies of a clip's first frame over a camera's still."""
-    fits = run[f"body_fitting/{clip}"]
+    fits = run[bodies_unit(run, clip)]
     model = find_body(fits.attrs["body_model"])
     poses = BodyParameters(
         fits["betas"].values,

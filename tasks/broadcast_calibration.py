@@ -45,7 +45,7 @@ def broadcast_calibration(work: Work) -> str:
         calibration = calibrate_broadcast(
             PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"])),
             [
-                KeyFrame(frame=int(frame) - start, markings=clicked_markings(markings))
+                KeyFrame(frame=int(frame), markings=clicked_markings(markings))
                 for frame, markings in clicked.items()
                 if start <= int(frame) < start + count
             ],
@@ -54,13 +54,14 @@ def broadcast_calibration(work: Work) -> str:
             people=_people(store, work),
             settings=BroadcastCalibrationSettings.model_validate(work.recipe.settings),
             where=file,
+            first=start,
         )
         require_registered(path, sources["video_sha256"])
         result.write(
             BROADCAST_CALIBRATION,
             arrays=broadcast_arrays(calibration),
             coordinates={"frame": np.arange(first, first + count)},
-            attributes=broadcast_attributes(work.recipe.unit, calibration),
+            attributes=broadcast_attributes(work.recipe.unit, calibration, start),
         )
         result.figures.update(_figures(calibration.report))
     return work.key
@@ -70,34 +71,16 @@ def _people(store: Store, work: Work) -> People | None:
     """Fitted people when each picture was taken, and who was seen in it, where that is known."""
     sources: dict[str, Any] = work.recipe.sources
     unit = work.recipe.unit
-    if f"ingest/{unit}" not in work.recipe.inputs:
+    seen_names = [f"{stage}/{unit}" for stage in ("ingest", "detection")]
+    names = [name for name in seen_names if name in work.recipe.inputs]
+    if not names:
         return None
     first, count, fps = (sources[name] for name in ("first_frame", "frame_count", "fps"))
     offset = float(sources["broadcast_offset_frames"])
-    seen = open_input(store, work, f"ingest/{unit}").sel(frame=np.arange(first, first + count))
+    seen = open_input(store, work, names[0]).sel(frame=np.arange(first, first + count))
     joints = open_input(store, work, f"body_fitting/{unit}")["joints"].values
-    return People(
-        joints=between_frames(joints, round(offset) - offset),
-        keypoints=seen["keypoints"].values.astype(np.float64),
-        fps=float(fps),
-    )
-
-
-def between_frames(values: NDArray[np.float64], late: float) -> NDArray[np.float64]:
-    """Values a part of a frame later, on a straight line between frames; NaN beyond the ends.
-
-    Args:
-        values: (frames, ...).
-        late: in -0.5..0.5 [frames].
-    """
-    if late == 0.0:
-        return values
-    neighbour = np.full_like(values, np.nan)
-    if late > 0.0:
-        neighbour[:-1] = values[1:]
-    else:
-        neighbour[1:] = values[:-1]
-    return (1.0 - abs(late)) * values + abs(late) * neighbour
+    people = People(joints, seen["keypoints"].values.astype(np.float64), float(fps))
+    return people.later(round(offset) - offset)
 
 
 def _figures(report: BroadcastReport) -> dict[str, float]:
@@ -112,4 +95,7 @@ def _figures(report: BroadcastReport) -> dict[str, float]:
         for name, values in named.items()
         if np.isfinite(values).any()
     }
+    offset = report.feed_offset
+    if offset is not None and offset.determined:
+        figures["feed_offset_frames"] = offset.frames
     return figures | {"weak": float(bool(report.reasons))}

@@ -196,6 +196,13 @@ def report(
         str | None,
         typer.Option("--reference", help="Truth; reference/ of the match folder by default."),
     ] = None,
+    videos: Annotated[
+        bool,
+        typer.Option(
+            "--videos/--no-videos",
+            help="Write broadcast videos with what was found drawn over them, beside the page.",
+        ),
+    ] = True,
     run: RunOption = "latest",
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
@@ -209,11 +216,14 @@ def report(
 
     store = Store.open(project)
     known = find_match(store, match)
-    write_report(store, known, out, run_id=run, reference=reference)
+    films = write_report(store, known, out, run_id=run, reference=reference, videos=videos)
     if as_json:
-        print_json({"match": known.match_id, "report": str(out.resolve())})
+        written = {"report": str(out.resolve()), "videos": [str(film.resolve()) for film in films]}
+        print_json({"match": known.match_id, **written})
     else:
         line(f"report:  {out.resolve()}")
+        for film in films:
+            line(f"video:   {film.resolve()}")
         line(f"results: {store.url}/results/{known.match_id}")
 
 

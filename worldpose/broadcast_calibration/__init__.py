@@ -12,13 +12,18 @@ from worldpose.broadcast_calibration.feed_offset import FeedOffset, estimate_fee
 from worldpose.broadcast_calibration.given_lens import follow_given_lens
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.players import People
-from worldpose.broadcast_calibration.pooling import PooledCenter, pool_centers
+from worldpose.broadcast_calibration.pooling import PooledCenter, drawn_to, pool_centers
 from worldpose.broadcast_calibration.report import BroadcastReport
 from worldpose.broadcast_calibration.settings import (
     BroadcastCalibrationSettings,
     BroadcastPrior,
 )
-from worldpose.broadcast_calibration.stored import broadcast_arrays, broadcast_attributes
+from worldpose.broadcast_calibration.stored import (
+    broadcast_arrays,
+    broadcast_attributes,
+    moving_arrays,
+    moving_from_arrays,
+)
 
 __all__ = [
     "BroadcastCalibration",
@@ -32,7 +37,10 @@ __all__ = [
     "broadcast_arrays",
     "broadcast_attributes",
     "calibrate_broadcast",
+    "drawn_to",
     "estimate_feed_offset",
     "follow_given_lens",
+    "moving_arrays",
+    "moving_from_arrays",
     "pool_centers",
 ]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.broadcast_calibration.evidence import PAINT
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.solving import Problem, Solution, equations_at
 
@@ -29,7 +28,7 @@ def descend(camera: MovingCamera, problem: Problem, iterations: int) -> Solution
         iterations: how many.
     """
     frames = len(camera) * FRAME_SIZE
-    beside = np.zeros((len(problem.markings), PAINT))
+    beside = np.zeros((len(problem.painted), 3))
     size = frames + CLIP_SIZE + beside.size
     unit = np.ones(size)
     unit[frames + 3 : frames + CLIP_SIZE] = 1e3

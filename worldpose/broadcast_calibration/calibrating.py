@@ -17,6 +17,7 @@ from worldpose.broadcast_calibration.evidence import (
     PointEvidence,
     together,
 )
+from worldpose.broadcast_calibration.feed_offset import FeedOffset, estimate_feed_offset
 from worldpose.broadcast_calibration.key_frames import Keys, calibrate_keys
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, follow_lines
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
@@ -84,6 +85,7 @@ def calibrate_broadcast(
     boxes: Floats | None = None,
     settings: BroadcastCalibrationSettings = BroadcastCalibrationSettings(),  # noqa: B008
     where: str = "broadcast clip",
+    first: int = 0,
 ) -> BroadcastCalibration:
     """Return the camera of every frame of a clip.
 
@@ -102,6 +104,8 @@ def calibrate_broadcast(
             `people` if None.
         settings: weights, noise and gates.
         where: clip or file, for messages.
+        first: number of the first picture in its video, which key frames are numbered in, and
+            whatever is said of frames.
 
     Raises:
         InputError: the clip has cuts, or no key frame can be used.
@@ -112,8 +116,8 @@ def calibrate_broadcast(
     """
     if boxes is None and people is not None:
         boxes = people.boxes
-    tracked = track(pitch, key_frames, pictures, boxes, settings, where)
-    return refine(pitch, tracked, pictures, fps, people, boxes, settings)
+    tracked = track(pitch, key_frames, pictures, boxes, settings, where, first)
+    return refine(pitch, tracked, pictures, fps, people, boxes, settings, first)
 
 
 def track(
@@ -123,9 +127,10 @@ def track(
     boxes: Floats | None,
     settings: BroadcastCalibrationSettings,
     where: str,
+    first: int = 0,
 ) -> Tracked:
     """Return a clip's cameras from its key frames and followed points (M2); as above."""
-    wanted = {key.frame for key in key_frames}
+    wanted = {key.frame - first for key in key_frames}
     if len(wanted) < len(key_frames):
         raise InputError(
             where,
@@ -139,13 +144,13 @@ def track(
     if missing:
         raise InputError(
             where,
-            expected=f"key frames from 0 to {len(followed)}",
-            found=f"{missing}",
-            todo="Number frames from 0, as the video has them.",
+            expected=f"key frames from {first} to {first + len(followed)}",
+            found=f"{[first + number for number in missing]}",
+            todo="Number frames as the video has them, from 0.",
         )
-    require_one_shot(followed, settings.cut_share, where)
+    require_one_shot(followed, settings.cut_share, where, first)
     height, width = next(iter(kept.values())).shape
-    keys = calibrate_keys(pitch, key_frames, (width, height), kept, settings, where)
+    keys = calibrate_keys(pitch, key_frames, (width, height), kept, settings, where, first)
     links = chain([int(n) for n in keys.frames], keys.camera, followed, settings.flow_outlier)
     return Tracked(keys, links, _flow(followed, links, settings))
 
@@ -158,6 +163,7 @@ def refine(
     people: People | None,
     boxes: Floats | None,
     settings: BroadcastCalibrationSettings,
+    first: int = 0,
 ) -> BroadcastCalibration:
     """Return the fit of all frames at once (M3 to M6); as `calibrate_broadcast`."""
     samples = FieldSamples.of(pitch)
@@ -171,11 +177,17 @@ def refine(
     share = flow_share_of(tracked.chain, tracked.keys.frames, deviation, settings.flow_drift)
     noise, matches = PlayerNoise(0.0, 0.0), None
     solution: Solution | None = None
+    offset: FeedOffset | None = None
     points = clicks
     for _ in range(settings.rounds):
         lines = follow_lines(camera, samples, pictures(), boxes, settings)
         parts = [clicks, lines.evidence]
         if people is not None and settings.player_weight > 0.0:
+            if offset is None:
+                # Before any camera rests on these players.
+                offset = estimate_feed_offset(lines.camera, people)
+                if settings.feed_offset == "correct" and offset.determined:
+                    people = people.later(offset.frames)
             matches = match(lines.camera, people)
             players, noise = player_evidence(lines.camera, people, matches, settings)
             parts.append(players)
@@ -186,7 +198,7 @@ def refine(
     assert solution is not None  # settings have one round or more
     if settings.solver == "adam":
         solution = descend(tracked.chain.camera, problem, settings.adam_iterations)
-    uncertainty = uncertainty_of(solution, problem)
+    uncertainty = uncertainty_of(solution, problem, settings.line_shift)
     weights = Weights(
         flow_deviation_px=deviation,
         flow_share=share,
@@ -198,7 +210,7 @@ def refine(
     )
     report = report_of(
         solution.camera, uncertainty, points, tracked.flow, tracked.keys, tracked.chain, matches,
-        weights, pitch, settings,
+        weights, pitch, settings, offset, first,
     )  # fmt: skip
     return BroadcastCalibration(solution.camera, uncertainty, report, tracked.chain.camera)
 

@@ -18,23 +18,28 @@ def find_cuts(followed: Sequence[Followed], share: float) -> list[int]:
     return [number + 1 for number, pair in enumerate(followed) if pair.together < share]
 
 
-def require_one_shot(followed: Sequence[Followed], share: float, where: str) -> None:
+def require_one_shot(
+    followed: Sequence[Followed], share: float, where: str, first: int = 0
+) -> None:
     """Refuse a clip of several shots.
 
     Args:
         followed: points between all neighbouring frames.
         share: as in `find_cuts`.
         where: clip or file, for the message.
+        first: number of the first picture in its video.
 
     Raises:
         InputError: naming the frames at which other shots begin.
     """
     cuts = find_cuts(followed, share)
     if cuts:
-        shown = ", ".join(map(str, cuts[:10])) + (" and more" if len(cuts) > 10 else "")
+        shown = ", ".join(str(first + cut) for cut in cuts[:10]) + (
+            " and more" if len(cuts) > 10 else ""
+        )
         raise InputError(
             where,
             expected="one shot of one camera",
-            found=f"cuts before frame {shown} of {len(followed) + 1}",
+            found=f"cuts before frame {shown} of {first} to {first + len(followed)}",
             todo="Make a clip of each shot of the main camera; leave replays out.",
         )

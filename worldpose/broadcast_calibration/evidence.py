@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-PAINT = 4
-"""Ways in which a marking may lie beside the template: sideways and upwards at either end of a
-line, or along x, y and z for an arc."""
+ENDS = 2
+"""Points of the template that a place hangs on, at most: the ends of its line, or the center of its
+arc, or itself."""
 CLICK, MARKING, PLAYER = 0, 1, 2
 """Kinds of `PointEvidence`: clicked points and drawn markings, painted lines, players' joints."""
 
@@ -32,8 +32,9 @@ class PointEvidence:
         loss: (n,) scale of the Geman-McClure loss [standard deviations]; infinite = squares.
         kind: (n,) CLICK, MARKING or PLAYER.
         source: (n,) which marking or person, -1 for clicks.
-        paint: (n, PAINT, 3) [m] how the place moves when its marking is painted one standard
-            deviation beside the template in each of the ways that it can be; 0 for others.
+        ends: (n, 2) indices of the template's points that the place hangs on; -1 = none.
+        shares: (n, 2) [m] how far it moves when these are painted one standard deviation beside
+            where the survey has them.
     """
 
     frame: Integers
@@ -44,7 +45,8 @@ class PointEvidence:
     loss: Floats
     kind: Integers
     source: Integers
-    paint: Floats
+    ends: Integers
+    shares: Floats
 
     @classmethod
     def none(cls) -> PointEvidence:
@@ -59,7 +61,8 @@ class PointEvidence:
             empty,
             index,
             index,
-            np.empty((0, PAINT, 3)),
+            np.empty((0, ENDS), dtype=np.int64),
+            np.empty((0, ENDS)),
         )
 
     @classmethod
@@ -73,7 +76,8 @@ class PointEvidence:
         loss: float,
         kind: int,
         source: Integers,
-        paint: Floats | None = None,
+        ends: Integers | None = None,
+        shares: Floats | None = None,
     ) -> PointEvidence:
         """Return places that are known across a line only.
 
@@ -86,15 +90,15 @@ class PointEvidence:
             loss: scale of the loss [standard deviations].
             kind: CLICK or MARKING.
             source: (n,) which marking.
-            paint: (n, PAINT, 3) [m]; None where the template is exact.
+            ends: (n, 2) points of the template that they hang on; None where it is exact.
+            shares: (n, 2) [m], with `ends`.
         """
         whitening = np.zeros((len(frame), 2, 2))
         whitening[:, 0] = normals / deviation[:, None]
         ones = np.ones(len(frame))
         kinds = np.full(len(frame), kind)
-        if paint is None:
-            paint = np.zeros((len(frame), PAINT, 3))
-        return cls(frame, world, image, whitening, ones, loss * ones, kinds, source, paint)
+        hung = _hung(len(frame), ends, shares)
+        return cls(frame, world, image, whitening, ones, loss * ones, kinds, source, *hung)
 
     @classmethod
     def at_points(
@@ -107,6 +111,8 @@ class PointEvidence:
         loss: float,
         kind: int,
         source: Integers,
+        ends: Integers | None = None,
+        shares: Floats | None = None,
     ) -> PointEvidence:
         """Return places that are known alike in both directions.
 
@@ -119,12 +125,14 @@ class PointEvidence:
             loss: scale of the loss [standard deviations].
             kind: CLICK, MARKING or PLAYER.
             source: (n,) which person.
+            ends: (n, 2) points of the template that they hang on; None for others.
+            shares: (n, 2) [m], with `ends`.
         """
         ones = np.ones(len(frame))
         whitening = np.eye(2) / deviation[:, None, None]
         kinds = np.full(len(frame), kind)
-        paint = np.zeros((len(frame), PAINT, 3))
-        return cls(frame, world, image, whitening, weight * ones, loss * ones, kinds, source, paint)
+        hung = _hung(len(frame), ends, shares)
+        return cls(frame, world, image, whitening, weight * ones, loss * ones, kinds, source, *hung)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -166,8 +174,15 @@ class FlowEvidence:
         return FlowEvidence(*(getattr(self, name)[index] for name in _FLOW_PARTS))
 
 
+def _hung(count: int, ends: Integers | None, shares: Floats | None) -> tuple[Integers, Floats]:
+    """Return what places hang on, nothing where it is not said."""
+    if ends is None or shares is None:
+        return np.full((count, ENDS), -1), np.zeros((count, ENDS))
+    return ends, shares
+
+
 _POINT_PARTS = (
-    *("frame", "world", "image", "whitening", "weight", "loss", "kind", "source", "paint"),
+    *("frame", "world", "image", "whitening", "weight", "loss", "kind", "source", "ends", "shares"),
 )
 _FLOW_PARTS = ("frame", "start", "end", "deviation")
 

@@ -15,8 +15,10 @@ Floats = NDArray[np.float64]
 
 _COARSE: Final = 25.0
 """Whole frames up to here are tried [frame]."""
-_STRIDE: Final = 5
-"""Every so many frames are looked at while whole frames are tried [1]."""
+_COARSELY: Final = 80
+"""Frames that are looked at while whole frames are tried, at most [1]."""
+_FINELY: Final = 400
+"""Frames that are looked at about the best of them, at most [1]."""
 _SHARE: Final = 0.03
 """A keypoint's usual error, of the person's height in the picture [1]; the loss bends at three."""
 _LASTS: Final = 0.3
@@ -62,12 +64,13 @@ def estimate_feed_offset(
         reach: offsets up to this far to either side are tried [frame].
     """
     whole = np.arange(-np.floor(reach), np.floor(reach) + 1.0)
-    some = np.arange(0, len(camera), _STRIDE)
+    some, every = (
+        np.arange(0, len(camera), -(-len(camera) // most)) for most in (_COARSELY, _FINELY)
+    )
     coarse = np.array([_cost(camera, people, offset, some)[0] for offset in whole])
     if not np.isfinite(coarse).any():
         return FeedOffset(np.nan, np.inf, False, whole, coarse, 0)
     best = float(whole[int(np.nanargmin(coarse))])
-    every = np.arange(len(camera))
     # Between whole frames joints would be means of two, with less noise: a parabola through whole
     # ones favours none.
     near = best + np.arange(-2.0, 3.0)
@@ -82,7 +85,8 @@ def estimate_feed_offset(
         return FeedOffset(np.nan, np.inf, False, near, fine, pairs)
     offset = float(near[middle] + 0.5 * (left - right) / bend)
     # Half a loss of one unit is one standard deviation; a person counts once in a while.
-    independent = pairs / max(1.0, _LASTS * people.fps)
+    stride = -(-len(camera) // len(every))
+    independent = pairs / max(1.0, _LASTS * people.fps / stride)
     error = float(np.sqrt(1.0 / (0.5 * bend * independent)))
     determined = error < 0.5
     return FeedOffset(offset if determined else np.nan, error, determined, near, fine, pairs)

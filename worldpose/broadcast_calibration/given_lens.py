@@ -101,4 +101,4 @@ def follow_given_lens(
         known=known,
     )
     solution = solve(tracked, problem, settings.iterations)
-    return solution.camera, uncertainty_of(solution, problem)
+    return solution.camera, uncertainty_of(solution, problem, settings.line_shift)

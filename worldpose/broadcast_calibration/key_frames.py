@@ -37,7 +37,7 @@ class Keys:
     """Key frames with one center.
 
     Attributes:
-        frames: (k,) their numbers, rising.
+        frames: (k,) their places in the clip, from 0, rising.
         camera: theirs (k,).
         clicks: evidence of points and drawn markings; `frame` counts key frames.
         refused: frames that could not be used, and why.
@@ -58,6 +58,7 @@ def calibrate_keys(
     pictures: Mapping[int, Picture],
     settings: BroadcastCalibrationSettings,
     where: str,
+    first: int = 0,
 ) -> Keys:
     """Return the key frames' cameras, of one place.
 
@@ -69,6 +70,7 @@ def calibrate_keys(
             their clicks alone.
         settings: noise, prior.
         where: clip or file, for messages.
+        first: number of the clip's first picture in its video, which key frames are numbered in.
 
     Raises:
         InputError: no key frame can be used; the message has each one's reason.
@@ -79,11 +81,11 @@ def calibrate_keys(
         place = f"{where}: frame {key.frame}"
         try:
             # Painted lines come in below, for all key frames at once.
-            found[key.frame] = calibrate(
+            found[key.frame - first] = calibrate(
                 pitch, key.markings, image_size, settings=settings.key_frame, where=place
             )
         except WorldposeError as error:
-            refused[key.frame] = f"{error}"
+            refused[key.frame - first] = f"{error}"
     if not found:
         raise InputError(
             where,
@@ -91,7 +93,7 @@ def calibrate_keys(
             found="; ".join(refused.values()) or "no key frame",
             todo="Click points in frames that show an area's corners or the centre circle.",
         )
-    clicked = {key.frame: key for key in key_frames}
+    clicked = {key.frame - first: key for key in key_frames}
     wrong = {frame: each.report.wrong for frame, each in found.items() if each.report.wrong}
     estimates = [each.estimate for each in found.values()]
     camera = _of_one_place(estimates)
@@ -189,19 +191,20 @@ def _clicks(
     """Return one key frame's clicks, the wrong ones left out."""
     points = [point for point in key.markings.points if point.name not in wrong]
     drawn = [marking for marking in key.markings.drawn if marking.name not in wrong]
-    world = pitch.positions([point.name for point in points])
-    depth = (world - camera.center) @ camera.rotation[0, 2]
-    meter = camera.focal[0] / np.maximum(depth, 1.0)
+    template = {name: number for number, name in enumerate(pitch.points)}
+    own = np.array([[template[point.name], -1] for point in points], dtype=np.int64).reshape(-1, 2)
     parts = [
         PointEvidence.at_points(
             np.full(len(points), index),
-            world,
+            pitch.positions([point.name for point in points]),
             np.array([point.xy for point in points]).reshape(-1, 2),
-            np.hypot(settings.click_noise, settings.survey_error * meter),
+            np.full(len(points), settings.click_noise),
             settings.field_weight,
             settings.loss,
             CLICK,
             np.full(len(points), -1),
+            own,
+            np.where(own >= 0, settings.survey_error, 0.0),
         )
     ]
     numbers = camera.camera[0].numbers
@@ -220,6 +223,7 @@ def _clicks(
             normal,
         )
         known = np.isfinite(place).all(axis=-1)
+        names, shares = _hung(pitch, marking.name, place[known])
         parts.append(
             PointEvidence.across_lines(
                 np.full(int(known.sum()), index),
@@ -230,6 +234,19 @@ def _clicks(
                 settings.loss,
                 CLICK,
                 np.full(int(known.sum()), -1),
+                np.tile([template[name] for name in names], (int(known.sum()), 1)),
+                settings.survey_error * shares,
             )
         )
     return together(parts)
+
+
+def _hung(pitch: PitchTemplate, marking: str, places: Floats) -> tuple[tuple[str, str], Floats]:
+    """Return the two points that a marking hangs on, and their shares (n, 2) of places on it."""
+    if marking in pitch.arcs:
+        center = pitch.arcs[marking].center
+        return (center, center), np.tile([1.0, 0.0], (len(places), 1))
+    line = pitch.lines.get(marking) or pitch.goals[marking]
+    start, way = pitch.points[line.start], pitch.points[line.end] - pitch.points[line.start]
+    share = np.clip((places - start) @ way / (way @ way), 0.0, 1.0)
+    return (line.start, line.end), np.stack([1.0 - share, share], axis=-1)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from worldpose.broadcast_calibration.evidence import (
     MARKING,
-    PAINT,
     PointEvidence,
     bounds,
     together,
@@ -160,19 +159,9 @@ def _look(
         settings.loss,
         MARKING,
         lines.marking[index][found],
-        settings.survey_error * _paint(lines[index[found]]),
+        lines.ends[index][found],
+        settings.survey_error * lines.shares[index][found],
     )
-
-
-def _paint(lines: LineSamples) -> Floats:
-    """Return how samples move with their markings (n, PAINT, 3) [m/m]."""
-    paint = np.zeros((len(lines.marking), PAINT, 3))
-    paint[:, :2] = lines.shares[:, :, None] * lines.across_world[:, None, :]
-    paint[:, 2:, 2] = lines.shares
-    arcs = lines.bend_world.any(axis=1)
-    # An arc moves with its center.
-    paint[arcs, 0], paint[arcs, 1] = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
-    return paint
 
 
 def _near(camera: MovingCamera, lines: LineSamples) -> LineSamples:
@@ -214,9 +203,9 @@ def _corrected(camera: MovingCamera, lines: PointEvidence) -> MovingCamera:
             across / scale,
             lines.weight,
             np.ones(len(lines)),
-            np.full(len(lines), -1),
-            lines.paint,
-            np.zeros((0, PAINT)),
+            np.full_like(lines.ends, -1),
+            lines.shares,
+            np.zeros((0, 3)),
             blocks,
             border,
             corner,

@@ -55,6 +55,11 @@ class MovingCamera:
             image_size=camera.image_size[0],
         )
 
+    @classmethod
+    def from_batch(cls, camera: Camera) -> MovingCamera:
+        """Return cameras (frames,) that have a center and a principal point in common."""
+        return cls.of(camera, camera.center[0], camera.principal_point[0])
+
     def __len__(self) -> int:
         return len(self.focal)
 

@@ -1,7 +1,7 @@
 """Compiled cost and normal equations of known points in all frames (M3, M4).
 
-Unknown are seven numbers a frame, five that all frames share, and where each marking is painted;
-the matrix is an arrow: blocks of frames along a band, and a border of what is shared.
+Unknown are seven numbers a frame, five that all frames share, and where the template's points are
+painted; the matrix is an arrow: blocks of frames along a band, and a border of what is shared.
 """
 
 from __future__ import annotations
@@ -102,8 +102,8 @@ def add_points(
     whitening: Floats,
     weight: Floats,
     loss: Floats,
-    group: Integers,
-    paint: Floats,
+    ends: Integers,
+    shares: Floats,
     beside: Floats,
     blocks: Floats,
     border: Floats,
@@ -125,18 +125,18 @@ def add_points(
         whitening: (n, 2, 2) [1/px].
         weight: (n,).
         loss: (n,) scale of Geman and McClure; infinite = squares.
-        group: (n,) which marking a point lies on; -1 = none.
-        paint: (n, 4, 3) [m] how the point moves with its marking.
-        beside: (markings, 4) where each marking lies [standard deviations].
+        ends: (n, 2) which of `beside` a point hangs on; -1 = none.
+        shares: (n, 2) [m] how far it moves with these.
+        beside: (painted, 3) where points of the template lie beside it [standard deviations].
         blocks: (3, frames, 7, 7), the diagonal added to.
-        border: (frames, 7, 5 + 4 markings), added to.
-        corner: (5 + 4 markings, 5 + 4 markings), added to.
+        border: (frames, 7, 5 + 3 painted), added to.
+        corner: (5 + 3 painted, 5 + 3 painted), added to.
         right: (frames, 7) gradient, added to.
-        right_corner: (5 + 4 markings,), added to.
+        right_corner: (5 + 3 painted,), added to.
     """
     cost = 0.0
     pixel, rows = np.empty(2), np.empty((2, 12))
-    place, moved = np.empty(3), np.empty(4)
+    place, moved = np.empty(3), np.empty(6)
     normal, gradient = np.empty((12, 12)), np.empty(12)
     white = np.empty(12)
     for t in range(len(focal)):
@@ -145,10 +145,10 @@ def add_points(
         for i in range(bounds[t], bounds[t + 1]):
             limit = loss[i] * loss[i]
             place[:] = world[i]
-            if group[i] >= 0:
-                for way in range(4):
+            for end in range(2):
+                if ends[i, end] >= 0:
                     for j in range(3):
-                        place[j] += beside[group[i], way] * paint[i, way, j]
+                        place[j] += shares[i, end] * beside[ends[i, end], j]
             seen = point_row(
                 rotation[t], center, principal, focal[t], distortion[t], place, pixel, rows
             )
@@ -180,26 +180,25 @@ def add_points(
                     gradient[j] += value * e
                     for m in range(j + 1):
                         normal[j, m] += value * white[m]
-                if group[i] < 0:
-                    continue
-                first = 5 + 4 * group[i]
-                for way in range(4):
+                for end in range(2):
                     # A point moves in the picture as if the center moved the other way.
-                    moved[way] = -(
-                        white[7] * paint[i, way, 0]
-                        + white[8] * paint[i, way, 1]
-                        + white[9] * paint[i, way, 2]
-                    )
-                for way in range(4):
-                    value = pull * moved[way]
-                    right_corner[first + way] += value * e
+                    for j in range(3):
+                        moved[3 * end + j] = -white[7 + j] * shares[i, end]
+                for one in range(6):
+                    if ends[i, one // 3] < 0:
+                        continue
+                    row = 5 + 3 * ends[i, one // 3] + one % 3
+                    value = pull * moved[one]
+                    right_corner[row] += value * e
                     for j in range(7):
-                        border[t, j, first + way] += value * white[j]
+                        border[t, j, row] += value * white[j]
                     for j in range(5):
-                        corner[first + way, j] += value * white[7 + j]
-                        corner[j, first + way] += value * white[7 + j]
-                    for other in range(4):
-                        corner[first + way, first + other] += value * moved[other]
+                        corner[row, j] += value * white[7 + j]
+                        corner[j, row] += value * white[7 + j]
+                    for other in range(6):
+                        if ends[i, other // 3] >= 0:
+                            column = 5 + 3 * ends[i, other // 3] + other % 3
+                            corner[row, column] += value * moved[other]
         for j in range(7):
             right[t, j] += gradient[j]
             for m in range(j + 1):

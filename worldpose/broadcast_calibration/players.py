@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -59,6 +59,25 @@ class People:
                 found=f"{len(self.joints)} and {len(self.keypoints)}",
                 todo="Give both for every frame of the clip, missing ones as NaN.",
             )
+
+    def later(self, frames: float) -> People:
+        """Return these keypoints with joints so many frames later, on straight lines between.
+
+        Joints beyond the clip's ends are missing.
+
+        Args:
+            frames: how much [frame]; below zero = earlier.
+        """
+        if frames == 0.0:
+            return self
+        whole = int(np.floor(frames))
+        share = frames - whole
+        padded = np.full((len(self.joints) + 2 * abs(whole) + 2, *self.joints.shape[1:]), np.nan)
+        begin = abs(whole)
+        padded[begin : begin + len(self.joints)] = self.joints
+        here = padded[begin + whole :][: len(self.joints)]
+        after = padded[begin + whole + 1 :][: len(self.joints)]
+        return replace(self, joints=(1.0 - share) * here + share * after if share else here)
 
     @property
     def boxes(self) -> Floats:

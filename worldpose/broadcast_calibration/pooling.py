@@ -9,6 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE, MovingCamera
+from worldpose.broadcast_calibration.uncertainty import Uncertainty
+
 Floats = NDArray[np.float64]
 
 _UNLIKELY = 1e-3
@@ -49,3 +52,25 @@ def pool_centers(centers: Sequence[Floats], covariances: Sequence[Floats]) -> Po
     agree = freedom == 0 or bool(squared.sum() < chi2.isf(_UNLIKELY, freedom))
     nothing = np.full(3, np.nan)
     return PooledCenter(middle if agree else nothing, np.asarray(whole), agree, np.sqrt(squared))
+
+
+def drawn_to(
+    camera: MovingCamera, uncertainty: Uncertainty, pooled: PooledCenter
+) -> tuple[MovingCamera, Uncertainty]:
+    """Return one of the pooled clips' cameras at their common place, and how well it is known.
+
+    What of a frame's turn, zoom and lens went along with its own place goes back along with it.
+
+    Args:
+        camera: all frames of the clip.
+        uncertainty: its covariance.
+        pooled: clips that agree, this one among them.
+    """
+    known = uncertainty.frame
+    place = slice(FRAME_SIZE, FRAME_SIZE + 3)
+    along = known[:, :, place] @ np.linalg.inv(known[:, place, place])
+    step = along @ (pooled.center - camera.center)
+    moved = camera.stepped(step[:, :FRAME_SIZE], step[0, FRAME_SIZE:])
+    gained = known[:, place, place] - pooled.covariance
+    left = known - along @ gained @ np.swapaxes(along, -1, -2)
+    return moved, Uncertainty(0.5 * (left + np.swapaxes(left, -1, -2)))

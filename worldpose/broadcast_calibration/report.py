@@ -17,6 +17,7 @@ from worldpose.broadcast_calibration.evidence import (
     FlowEvidence,
     PointEvidence,
 )
+from worldpose.broadcast_calibration.feed_offset import FeedOffset
 from worldpose.broadcast_calibration.key_frames import Keys
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.normal_equations import point_row
@@ -35,6 +36,8 @@ _FEW_PLAYERS: Final = 3
 """Fewer players do not [1]."""
 _PICKS: Final = 5
 """Frames to pick next that are named."""
+_LATE: Final = 0.5
+"""A feed further beside the static cameras than this is said to be so [frame]."""
 _GRID: Final = 4.0
 """Between places of the pitch whose expected error is looked at [m]."""
 
@@ -56,6 +59,7 @@ class BroadcastReport:
         refused: those that could not be used, and why.
         wrong: clicks and markings that a key frame does not rest on, by frame.
         drift: (gaps,) by how much tracking from one key frame missed the next [px].
+        feed_offset: the clip's clock, as people show it; None without people.
         weights: of the terms.
         pick_next: frames whose clicks would help most, the best first.
         decisions: what was chosen, and the figures that decided.
@@ -73,6 +77,7 @@ class BroadcastReport:
     refused: Mapping[int, str]
     wrong: Mapping[int, tuple[str, ...]]
     drift: Floats
+    feed_offset: FeedOffset | None
     weights: Weights
     pick_next: tuple[int, ...]
     decisions: tuple[str, ...]
@@ -90,6 +95,8 @@ def report_of(
     weights: Weights,
     pitch: PitchTemplate,
     settings: BroadcastCalibrationSettings,
+    offset: FeedOffset | None,
+    first: int,
 ) -> BroadcastReport:
     """Return what there is to say about a calibrated clip.
 
@@ -104,6 +111,8 @@ def report_of(
         weights: of the terms.
         pitch: the template.
         settings: thresholds.
+        offset: the clip's clock; None without people.
+        first: number of the clip's first picture in its video, for what is said in words.
     """
     frames = len(camera)
     off, across = _residuals(camera, points)
@@ -130,11 +139,21 @@ def report_of(
     bridged = int((status == FRAME_STATUS.index("bridged")).sum())
     if bridged:
         reasons.append(f"{bridged} frames have no evidence and follow their neighbours")
-    reasons += [f"key frame {frame} is not used: {why}" for frame, why in keys.refused.items()]
     reasons += [
-        f"key frame {frame} does not rest on {', '.join(names)}"
+        f"key frame {first + frame} is not used: {why}" for frame, why in keys.refused.items()
+    ]
+    reasons += [
+        f"key frame {first + frame} does not rest on {', '.join(names)}"
         for frame, names in keys.wrong.items()
     ]
+    decisions = [
+        f"a followed point counts {weights.flow_share:.2g} of its loss, as tracking drifts",
+        f"errors of a person last {weights.player_frames:.1f} frames",
+    ]
+    if offset is not None:
+        clock, late = _said_of(offset, settings)
+        decisions += [] if late else [clock]
+        reasons += [clock] if late else []
     return BroadcastReport(
         status=status,
         reprojection_error=expected,
@@ -147,12 +166,10 @@ def report_of(
         refused=keys.refused,
         wrong=keys.wrong,
         drift=links.drift,
+        feed_offset=offset,
         weights=weights,
         pick_next=_picks(expected),
-        decisions=(
-            f"a followed point counts {weights.flow_share:.2g} of its loss, as tracking drifts",
-            f"errors of a person last {weights.player_frames:.1f} frames",
-        ),
+        decisions=tuple(decisions),
         reasons=tuple(reasons),
     )
 
@@ -190,6 +207,25 @@ def expected_errors(camera: MovingCamera, uncertainty: Uncertainty, pitch: Pitch
                 count += 1
         expected[frame] = np.sqrt(total / max(count, 1))
     return expected
+
+
+def _said_of(offset: FeedOffset, settings: BroadcastCalibrationSettings) -> tuple[str, bool]:
+    """Return what the clip's clock is in words, and whether a person must look at it."""
+    if not offset.determined:
+        return "the feed's offset in time cannot be told from how people move", False
+    said = (
+        f"the pictures show people as they are {abs(offset.frames):.2f} frames "
+        f"{'later' if offset.frames > 0.0 else 'earlier'} in the static cameras, to "
+        f"{offset.standard_error:.2f} frames"
+    )
+    if settings.feed_offset == "correct":
+        return f"{said}: corrected", False
+    beyond = abs(offset.frames) - 2.0 * offset.standard_error > _LATE
+    todo = (
+        f": lower the clip's broadcast_offset_frames by {offset.frames:.2f}, or set "
+        "broadcast_calibration.feed_offset=correct"
+    )
+    return said + (todo if beyond else ""), beyond
 
 
 def _residuals(camera: MovingCamera, points: PointEvidence) -> tuple[Floats, Floats]:

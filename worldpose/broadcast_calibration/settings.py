@@ -60,6 +60,9 @@ class BroadcastCalibrationSettings(Record):
     line_noise: float = Field(default=0.3, gt=0)
     """Least standard deviation of a painted line's sample across it [px]: the survey's error and
     the paint's edge, which the picture's noise does not show."""
+    line_shift: float = Field(default=0.05, ge=0)
+    """Of all painted lines in the picture, each axis, standard deviation [px], such as sharpening
+    makes, or a lens beyond k1 to k3: the covariance has it, for no residual shows it."""
     line_samples: int = Field(default=240, ge=20)
     """Samples of painted lines in one frame, at most, about [1]."""
     line_reach: float = Field(default=12.0, gt=0)
@@ -78,6 +81,9 @@ class BroadcastCalibrationSettings(Record):
     where two key frames or more tell it, that is taken."""
     smooth: bool = True
     """Let focal length and distortion change evenly, as far as the clip itself does (M6)."""
+    feed_offset: Literal["report", "correct"] = "report"
+    """What is done about a feed that shows people beside where the static cameras have them in
+    time: it is said, or people are taken as much earlier or later where that can be told."""
     rounds: int = Field(default=2, ge=1)
     """Times that players are matched and lines are looked for anew [1]."""
     iterations: int = Field(default=30, ge=1)

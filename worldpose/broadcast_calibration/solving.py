@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from worldpose.body_fitting.banded import BandedFactor
 from worldpose.broadcast_calibration.evidence import (
-    MARKING,
-    PAINT,
     FlowEvidence,
     PointEvidence,
     bounds,
@@ -86,16 +84,16 @@ class Problem:
     known: NDArray[np.bool_] | None = None
 
     @cached_property
-    def markings(self) -> Integers:
-        """Numbers of the markings whose place is solved for, rising (m,)."""
-        painted = self.points.source[self.points.kind == MARKING]
-        return np.asarray(np.unique(painted))
+    def painted(self) -> Integers:
+        """Points of the template whose place is solved for, rising (m,)."""
+        found = np.unique(self.points.ends)
+        return np.asarray(found[found >= 0])
 
     @cached_property
-    def group(self) -> Integers:
-        """Which of `markings` each point lies on (n,); -1 = none."""
-        group = np.searchsorted(self.markings, self.points.source)
-        return np.asarray(np.where(self.points.kind == MARKING, group, -1))
+    def ends(self) -> Integers:
+        """Which of `painted` each piece of evidence hangs on (n, 2); -1 = none."""
+        number = np.searchsorted(self.painted, self.points.ends)
+        return np.asarray(np.where(self.points.ends >= 0, number, -1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +103,10 @@ class Equations:
     Attributes:
         cost: half the sum of losses and squares.
         blocks: (3, frames, 7, 7) band, see `BandedFactor`.
-        border: (frames, 7, 5 + 4 markings).
-        corner: (5 + 4 markings, the same).
+        border: (frames, 7, 5 + 3 painted).
+        corner: (5 + 3 painted, the same).
         right: (frames, 7) gradient by the frames' steps.
-        right_corner: (5 + 4 markings,) gradient by the clip's step and the markings' places.
+        right_corner: (5 + 3 painted,) gradient by the clip's step and the painted points' places.
     """
 
     cost: float
@@ -125,7 +123,8 @@ class Solution:
 
     Attributes:
         camera: the answer.
-        beside: (markings, 4) where its markings lie beside the template [standard deviations].
+        beside: (painted, 3) where points of the template are painted beside where the survey has
+            them [standard deviations].
         cost: at it.
         costs: after every iteration.
         equations: at it.
@@ -143,7 +142,7 @@ def equations_at(camera: MovingCamera, beside: Floats, problem: Problem) -> Equa
 
     Args:
         camera: all frames.
-        beside: (markings, 4) where the problem's markings lie [standard deviations].
+        beside: (painted, 3) where the template's points are painted [standard deviations].
         problem: evidence, smoothness and priors.
     """
     frames = len(camera)
@@ -154,7 +153,7 @@ def equations_at(camera: MovingCamera, beside: Floats, problem: Problem) -> Equa
     corner = np.diag(np.append(np.zeros(CLIP_SIZE), np.ones(beside.size)))
     right = np.zeros((frames, FRAME_SIZE))
     right_corner = np.append(np.zeros(CLIP_SIZE), beside.ravel())
-    points, group = problem.points, problem.group
+    points = problem.points
     system = (blocks, border, corner, right, right_corner)
     flow = problem.flow
     lens = (camera.principal_point, camera.focal, camera.rotation, camera.distortion)
@@ -167,8 +166,8 @@ def equations_at(camera: MovingCamera, beside: Floats, problem: Problem) -> Equa
         points.whitening,
         points.weight,
         points.loss,
-        group,
-        points.paint,
+        problem.ends,
+        points.shares,
         beside,
         *system,
     )
@@ -201,7 +200,7 @@ def solve(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
     Raises:
         DegenerateError: the matrix is singular: some number has neither evidence nor prior.
     """
-    beside = np.zeros((len(problem.markings), PAINT))
+    beside = np.zeros((len(problem.painted), 3))
     here = equations_at(camera, beside, problem)
     damping, costs = _START_DAMPING, [here.cost]
     for _ in range(iterations):

@@ -2,31 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from data_contracts.broadcast_calibration import FRAME_STATUS
 from worldpose.broadcast_calibration.calibrating import BroadcastCalibration
-from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE
+from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
+from worldpose.broadcast_calibration.uncertainty import Uncertainty
+from worldpose.cameras.stored import camera_from_arrays
 
 
 def broadcast_arrays(calibration: BroadcastCalibration) -> dict[str, NDArray[Any]]:
     """The stored arrays of a calibrated clip, by name, without the frame numbers."""
-    moving, report = calibration.camera, calibration.report
-    camera = moving.camera
-    covariance = calibration.uncertainty.frame
+    report = calibration.report
     return {
-        "focal": camera.focal,
-        "principal_point": camera.principal_point,
-        "distortion": camera.distortion,
-        "rotation": camera.cam_from_world.rotation,
-        "translation": camera.cam_from_world.translation,
-        "image_size": moving.image_size,
-        "center": moving.center,
-        "covariance": covariance[:, :FRAME_SIZE, :FRAME_SIZE],
-        "clip_covariance": calibration.uncertainty.clip,
+        **moving_arrays(calibration.camera, calibration.uncertainty),
         "status": report.status,
         "reprojection_error": report.reprojection_error,
         "marking_rms": report.marking_rms,
@@ -37,17 +30,61 @@ def broadcast_arrays(calibration: BroadcastCalibration) -> dict[str, NDArray[Any
     }
 
 
-def broadcast_attributes(clip_id: str, calibration: BroadcastCalibration) -> dict[str, Any]:
-    """The stored attributes of a calibrated clip."""
-    report = calibration.report
+def moving_arrays(moving: MovingCamera, uncertainty: Uncertainty) -> dict[str, NDArray[Any]]:
+    """The stored arrays of a moving camera and its covariance, by name."""
+    camera, covariance = moving.camera, uncertainty.frame
+    return {
+        "focal": camera.focal,
+        "principal_point": camera.principal_point,
+        "distortion": camera.distortion,
+        "rotation": camera.cam_from_world.rotation,
+        "translation": camera.cam_from_world.translation,
+        "image_size": moving.image_size,
+        "center": moving.center,
+        "covariance": covariance[:, :FRAME_SIZE, :FRAME_SIZE],
+        "shared_covariance": covariance[:, :FRAME_SIZE, FRAME_SIZE:],
+        "clip_covariance": uncertainty.clip,
+    }
+
+
+def moving_from_arrays(arrays: Mapping[str, ArrayLike]) -> tuple[MovingCamera, Uncertainty]:
+    """The moving camera of stored arrays, and its covariance."""
+    names = ("covariance", "shared_covariance", "clip_covariance")
+    own, across, shared = (np.asarray(arrays[name]) for name in names)
+    whole = np.empty((len(own), FRAME_SIZE + CLIP_SIZE, FRAME_SIZE + CLIP_SIZE))
+    whole[:, :FRAME_SIZE, :FRAME_SIZE] = own
+    whole[:, :FRAME_SIZE, FRAME_SIZE:] = across
+    whole[:, FRAME_SIZE:, :FRAME_SIZE] = np.swapaxes(across, -1, -2)
+    whole[:, FRAME_SIZE:, FRAME_SIZE:] = shared
+    return MovingCamera.from_batch(camera_from_arrays(arrays)), Uncertainty(whole)
+
+
+def broadcast_attributes(
+    clip_id: str, calibration: BroadcastCalibration, first: int = 0
+) -> dict[str, Any]:
+    """The stored attributes of a calibrated clip; frames are numbered as in its video.
+
+    Args:
+        clip_id: the clip.
+        calibration: its camera.
+        first: number of its first picture in its video.
+    """
+    report, offset = calibration.report, calibration.report.feed_offset
     return {
         "clip_id": clip_id,
         "status_names": list(FRAME_STATUS),
-        "key_frames": [int(frame) for frame in report.key_frames],
-        "refused_key_frames": {str(frame): why for frame, why in report.refused.items()},
+        "key_frames": [first + int(frame) for frame in report.key_frames],
+        "refused_key_frames": {str(first + frame): why for frame, why in report.refused.items()},
         "weights": report.weights.model_dump(),
+        "feed_offset": None
+        if offset is None
+        else {
+            "frames": offset.frames if offset.determined else None,
+            "standard_error": offset.standard_error if offset.determined else None,
+            "pairs": offset.pairs,
+        },
         "drift": [float(drift) for drift in report.drift],
-        "pick_next": list(report.pick_next),
+        "pick_next": [first + frame for frame in report.pick_next],
         "decisions": list(report.decisions),
         "reasons": list(report.reasons),
     }

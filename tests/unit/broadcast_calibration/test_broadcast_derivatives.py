@@ -1,10 +1,12 @@
 """Projection, derivatives and normal equations of the moving camera against differences."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import turning_clip as clip
 
-from worldpose.broadcast_calibration.evidence import PAINT, FlowEvidence, PointEvidence
+from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence
 from worldpose.broadcast_calibration.flow_equations import flow_row, undistorted
 from worldpose.broadcast_calibration.normal_equations import point_row
 from worldpose.broadcast_calibration.priors import prior_of
@@ -95,8 +97,10 @@ def test_the_gradient_is_the_slope_of_the_cost():
     rng = np.random.default_rng(4)
     true = clip.moving(6)
     points, flow = clip.ground_points(true, rng, each=8), clip.followed_points(true, rng, each=8)
-    painted = rng.standard_normal((len(points), PAINT, 3)) * 0.01
-    robust = PointEvidence(**{**vars(points), "loss": np.full(len(points), 3.0), "paint": painted})
+    # On nothing, one point, two points, or one twice, as arcs do.
+    ends = rng.integers(-1, 4, (len(points), 2))
+    shares = 0.01 * rng.uniform(0.2, 1.0, ends.shape)
+    robust = replace(points, loss=np.full(len(points), 3.0), ends=ends, shares=shares)
     problem = Problem(
         robust,
         flow,
@@ -106,10 +110,10 @@ def test_the_gradient_is_the_slope_of_the_cost():
         2.0,
     )
     camera = true.stepped(1e-4 * rng.standard_normal((6, 7)), [0.02, -0.01, 0.03, 0.5, -0.4])
-    beside = 0.3 * rng.standard_normal((1, PAINT))
+    beside = 0.3 * rng.standard_normal((len(problem.painted), 3))
     here = equations_at(camera, beside, problem)
     step, shared = rng.standard_normal((6, 7)), rng.standard_normal(5)
-    paint = rng.standard_normal((1, PAINT))
+    paint = rng.standard_normal(beside.shape)
     size = 1e-8
     ahead, behind = (
         equations_at(camera.stepped(by * step, by * shared), beside + by * paint, problem).cost
@@ -124,7 +128,7 @@ def test_evidence_of_nothing_costs_nothing():
     camera = clip.moving(3)
     prior = prior_of(BroadcastPrior(), camera.focal, camera.image_size)
     problem = Problem(PointEvidence.none(), FlowEvidence.none(), prior)
-    bare = equations_at(camera, np.zeros((0, PAINT)), problem)
+    bare = equations_at(camera, np.zeros((0, 3)), problem)
     # What is left is the prior's: 5 numbers of the clip, 4 of each frame.
     assert np.count_nonzero(bare.blocks[0].diagonal(axis1=1, axis2=2)) == 3 * 4
     assert not bare.border.any()

@@ -8,7 +8,8 @@ import turning_clip as clip
 from scipy.optimize import least_squares
 
 from worldpose.broadcast_calibration.adam import descend
-from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence
+from worldpose.broadcast_calibration.evidence import PLAYER, FlowEvidence, PointEvidence, together
+from worldpose.broadcast_calibration.normal_equations import point_row
 from worldpose.broadcast_calibration.priors import prior_of
 from worldpose.broadcast_calibration.settings import BroadcastPrior
 from worldpose.broadcast_calibration.solving import Problem, solve
@@ -62,6 +63,53 @@ def test_noisy_evidence_gives_the_camera_within_its_covariance():
     # Chi-square of 18 over 18 lies below 2.2 in all but a thousandth; the covariance is at most
     # twice too wide.
     assert 0.05 < np.mean(ratios) < 2.2
+
+
+def place_covariance(camera, uncertainty, place, frame=10):
+    """Covariance of a place in one frame's picture [px^2]."""
+    pixel, rows = np.empty(2), np.empty((2, 12))
+    lens = camera.focal[frame], camera.distortion[frame]
+    point_row(
+        camera.rotation[frame], camera.center, camera.principal_point, *lens, place, pixel, rows
+    )
+    return rows @ uncertainty.frame[frame] @ rows.T
+
+
+def test_a_shift_of_all_lines_moves_what_the_camera_shows_by_as_much():
+    rng = np.random.default_rng(10)
+    true = clip.moving(20)
+    problem = replace(problem_of(true, rng), flow=FlowEvidence.none())
+    solution = solve(true, problem, 20)
+    place = np.array([1.0, -3.0, 0.0])
+    exact, shifted = (
+        place_covariance(solution.camera, uncertainty_of(solution, problem, shift), place)
+        for shift in (0.0, 0.2)
+    )
+    # The camera goes along with its lines; priors hold it back by some percent.
+    np.testing.assert_allclose(shifted - exact, 0.04 * np.eye(2), atol=0.004)
+
+
+def test_people_who_all_err_alike_widen_the_region():
+    true = clip.moving(20)
+    place, spreads = np.array([1.0, -3.0, 0.0]), []
+    for bias in (0.0, 0.8):
+        rng = np.random.default_rng(11)
+        problem = problem_of(true, rng)
+        frame = np.repeat(np.arange(20), 60)
+        world = np.tile(rng.uniform([-8.0, -8.0, 0.0], [8.0, 8.0, 1.8], (60, 3)), (20, 1))
+        pixels = [true.camera[t].project(world[frame == t]) for t in range(20)]
+        image = np.concatenate(pixels) + rng.standard_normal((1200, 2)) + [0.0, bias]
+        people = PointEvidence.at_points(
+            frame, world, image, np.ones(1200), 1.0, np.inf, PLAYER, np.arange(1200) % 60 // 10
+        )
+        problem = replace(problem, points=together([problem.points, people]))
+        solution = solve(true, problem, 20)
+        covariance = place_covariance(solution.camera, uncertainty_of(solution, problem), place)
+        off = solution.camera.camera[10].project(place[None]) - true.camera[10].project(place[None])
+        spreads.append(float(np.sqrt(covariance[1, 1])))
+        # Four deviations: the place errs by a part of the bias, and the lines say so.
+        assert abs(off[0, 1]) < 4.0 * spreads[-1]
+    assert spreads[1] > 1.5 * spreads[0]
 
 
 def test_scipy_finds_no_lower_cost():

@@ -19,6 +19,7 @@ from worldpose.broadcast_calibration import (
     broadcast_attributes,
     calibrate_broadcast,
     follow_given_lens,
+    moving_from_arrays,
 )
 from worldpose.errors import InputError
 from worldpose.synthetic.broadcast_rendering import render_broadcast
@@ -120,6 +121,16 @@ def test_the_stored_form_is_the_contract_s(calibrated):
         assert array.ndim == len(layout.dims), name
 
 
+def test_a_stored_camera_comes_back_with_its_covariance(calibrated):
+    camera, uncertainty = moving_from_arrays(broadcast_arrays(calibrated))
+    for name in ("focal", "rotation", "distortion", "principal_point"):
+        np.testing.assert_array_equal(getattr(camera, name), getattr(calibrated.camera, name))
+    # The center comes back from t = -R C.
+    np.testing.assert_allclose(camera.center, calibrated.camera.center, atol=1e-12)
+    np.testing.assert_array_equal(uncertainty.frame[:, :7], calibrated.uncertainty.frame[:, :7])
+    np.testing.assert_array_equal(uncertainty.clip, calibrated.uncertainty.clip)
+
+
 def test_one_key_frame_is_still_usable(true, pictures):
     found = calibrate_broadcast(
         clip.PITCH, [clicks(true, 8)], lambda: iter(pictures), FPS, settings=SETTINGS
@@ -148,15 +159,57 @@ def test_a_point_under_a_wrong_name_is_left_out_and_named(true, pictures):
     assert np.median(place_errors(found.camera, true)) < 0.5
 
 
-def test_a_key_frame_that_tells_nothing_is_refused_and_the_others_do(true, pictures):
+def test_a_key_frame_that_tells_nothing_is_refused_under_its_number_and_the_others_do(
+    true, pictures
+):
     empty = KeyFrame(
-        frame=2,
+        frame=102,
         markings=ClickedMarkings(points=(ClickedPoint(name="center_mark", xy=(400.0, 300.0)),)),
     )
-    keys = [empty, clicks(true, 8)]
-    found = calibrate_broadcast(clip.PITCH, keys, lambda: iter(pictures), FPS, settings=SETTINGS)
-    assert list(found.report.refused) == [2]
+    keys = [empty, clicks(true, 8).model_copy(update={"frame": 108})]
+    found = calibrate_broadcast(
+        clip.PITCH, keys, lambda: iter(pictures), FPS, settings=SETTINGS, first=100
+    )
+    stored = broadcast_attributes("clip", found, 100)
+    assert list(stored["refused_key_frames"]) == ["102"]
+    assert stored["key_frames"] == [108]
+    assert all(100 <= frame < 100 + FRAMES for frame in stored["pick_next"])
+    assert any("key frame 102 is not used" in reason for reason in found.report.reasons)
     assert np.median(place_errors(found.camera, true)) < 1.0
+
+
+def test_a_feed_beside_the_static_cameras_is_said_and_corrected_on_request(true, pictures):
+    rng = np.random.default_rng(9)
+    x, y = np.meshgrid([-6.0, -2.0, 2.0, 6.0, 10.0], [-9.0, -3.0, 4.0, 9.0])
+    shape = np.stack([np.tile([-0.2, 0.2], 9)[:17], 0.0 * np.arange(17), np.linspace(0.1, 1.8, 17)])
+    way = rng.uniform(-6.0, 6.0, (20, 2))
+
+    def joints(frames):
+        places = np.stack([x.ravel(), y.ravel()], axis=-1) + frames[:, None, None] / FPS * way
+        return np.concatenate([places, np.zeros((*places.shape[:2], 1))], -1)[:, :, None] + shape.T
+
+    frames = np.arange(FRAMES, dtype=np.float64)
+    seen = true.camera.project(joints(frames + 2.0).reshape(FRAMES, -1, 3))
+    seen = seen.reshape(FRAMES, 20, 17, 2) + rng.standard_normal((FRAMES, 20, 17, 2))
+    people = People(joints(frames), seen, FPS)
+    said, corrected = (
+        calibrate_broadcast(
+            clip.PITCH,
+            [clicks(true, 8)],
+            lambda: iter(pictures),
+            FPS,
+            people=people,
+            settings=SETTINGS.model_copy(update={"feed_offset": what}),
+        )
+        for what in ("report", "correct")
+    )
+    # Half a frame is what a static camera's clock is off at most.
+    assert said.report.feed_offset.frames == pytest.approx(2.0, abs=0.5)
+    assert any("frames later in the static cameras" in each for each in said.report.reasons)
+    assert corrected.report.reasons == ()
+    players = [np.nanmedian(each.report.player_rms) for each in (said, corrected)]
+    # People go 0.1 m in two frames, 3 px beside 1.4 px of noise.
+    assert players[1] < 0.8 * players[0]
 
 
 def test_no_usable_key_frame_is_an_error_with_each_reason(pictures):
@@ -215,7 +268,7 @@ def test_a_cut_is_found_and_refused(true, pictures):
     elsewhere = clip.moving(3, pan=(40.0, 40.0), zoom=(2600.0, 2600.0))
     other = [grey(p) for p in render_broadcast(elsewhere.camera, clip.PITCH, None, 5, LOOK)]
     cut = [*pictures[:8], *other, *pictures[8:12]]
-    with pytest.raises(InputError, match=r"cuts before frame 8, 11 of 15"):
+    with pytest.raises(InputError, match=r"cuts before frame 8, 11 of 0 to 14"):
         calibrate_broadcast(
             clip.PITCH, [clicks(true, 2)], lambda: iter(cut), FPS, settings=SETTINGS
         )

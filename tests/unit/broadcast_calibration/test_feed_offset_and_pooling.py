@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 import turning_clip as clip
 
-from worldpose.broadcast_calibration import People, estimate_feed_offset, pool_centers
+from worldpose.broadcast_calibration import (
+    People,
+    drawn_to,
+    estimate_feed_offset,
+    pool_centers,
+)
+from worldpose.broadcast_calibration.uncertainty import Uncertainty
 
 FRAMES, FPS = 120, 50.0
 SHAPE = np.stack([np.tile([-0.2, 0.2], 9)[:17], np.zeros(17), np.linspace(0.1, 1.8, 17)], axis=-1)
@@ -57,6 +63,23 @@ def test_nobody_in_the_picture_tells_no_clock():
     assert not found.determined and found.pairs == 0
 
 
+def test_people_are_taken_later_and_earlier_by_parts_of_a_frame():
+    joints = np.broadcast_to(np.arange(5.0)[:, None, None, None], (5, 1, 17, 3))
+    moving = People(joints, np.zeros((5, 1, 17, 2)), FPS)
+
+    def places(late):
+        return moving.later(late).joints[:, 0, 0, 0]
+
+    nan = np.nan
+    np.testing.assert_array_equal(places(0.0), [0.0, 1.0, 2.0, 3.0, 4.0])
+    np.testing.assert_array_equal(places(2.0), [2.0, 3.0, 4.0, nan, nan])
+    np.testing.assert_array_equal(places(-1.0), [nan, 0.0, 1.0, 2.0, 3.0])
+    # Halves are exact in binary; between two frames both are needed.
+    np.testing.assert_array_equal(places(0.5), [0.5, 1.5, 2.5, 3.5, nan])
+    np.testing.assert_array_equal(places(-1.5), [nan, nan, 0.5, 1.5, 2.5])
+    np.testing.assert_array_equal(places(9.0), [nan] * 5)
+
+
 def test_clips_that_agree_give_their_weighted_mean():
     wide, narrow = 4.0 * np.eye(3), np.eye(3)
     pooled = pool_centers(
@@ -80,3 +103,34 @@ def test_a_single_clip_is_its_own_place():
     pooled = pool_centers([np.ones(3)], [np.eye(3)])
     assert pooled.agree
     np.testing.assert_allclose(pooled.center, np.ones(3))
+
+
+def test_a_camera_goes_to_the_common_place_and_its_frames_go_along():
+    camera = clip.moving(3)
+    # Six centimetres beside, and a turn about y that went along: a milliradian a metre.
+    known = np.tile(1e-12 * np.eye(12), (3, 1, 1))
+    known[:, 7:10, 7:10] = 0.04 * np.eye(3)
+    known[:, 1, 7] = known[:, 7, 1] = 1e-3 * 0.04
+    known[:, 1, 1] = 1e-6 * 0.04 + 1e-12
+    other = camera.center + np.array([0.06, 0.0, 0.0])
+    pooled = pool_centers([camera.center, other], [0.04 * np.eye(3), 0.02 * np.eye(3)])
+    moved, left = drawn_to(camera, Uncertainty(known), pooled)
+    # Weights of one and two thirds.
+    np.testing.assert_allclose(moved.center - camera.center, [0.04, 0.0, 0.0], atol=1e-12)
+    turned = moved.rotation @ np.swapaxes(camera.rotation, -1, -2)
+    np.testing.assert_allclose(turned[:, 0, 2], 4e-5, rtol=1e-6)
+    np.testing.assert_allclose(left.clip[:3, :3], 0.04 / 3.0 * np.eye(3), atol=1e-15)
+    # The turn keeps its own spread and a third of what the place gave it.
+    np.testing.assert_allclose(left.frame[:, 1, 1], 1e-6 * 0.04 / 3.0 + 1e-12, rtol=1e-9)
+
+
+def test_drawing_a_clip_to_its_own_place_changes_nothing():
+    camera, rng = clip.moving(2), np.random.default_rng(5)
+    root = rng.standard_normal((2, 12, 12))
+    known = root @ np.swapaxes(root, -1, -2)
+    known[1, 7:, 7:] = known[0, 7:, 7:]
+    pooled = pool_centers([camera.center], [known[0, 7:10, 7:10]])
+    moved, left = drawn_to(camera, Uncertainty(known), pooled)
+    np.testing.assert_allclose(moved.rotation, camera.rotation, atol=1e-12)
+    # Inverses of matrices of a condition of about 1e3.
+    np.testing.assert_allclose(left.frame, known, atol=1e-9)

@@ -1,0 +1,69 @@
+"""Prints what single key frames of real main cameras give: hand-drawn lines of WorldCup 2014.
+
+    python benchmarks/broadcast_line_sets.py DATA
+
+DATA holds `wc14` (lines.json, calib_eval.py), as for pitch_lines.py. There are no pictures: every
+line set is the only key frame of a clip, and rests on what was drawn alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import pitch_lines
+
+from data_contracts.broadcast_calibration import KeyFrame
+from worldpose.broadcast_calibration import BroadcastCalibrationSettings
+from worldpose.broadcast_calibration.key_frames import calibrate_keys
+from worldpose.cameras import Camera
+from worldpose.errors import WorldposeError
+from worldpose.static_calibration.soccernet import soccernet_markings
+
+_, SIZE = pitch_lines.SETS["wc14"]
+
+
+def cameras(lines: dict[str, dict]) -> dict[str, Camera | None]:
+    """Return each line set's camera as that of a clip with this one key frame."""
+    settings = BroadcastCalibrationSettings()
+    found: dict[str, Camera | None] = {}
+    for name, drawn in lines.items():
+        key = KeyFrame(frame=0, markings=soccernet_markings(drawn, SIZE))
+        try:
+            keys = calibrate_keys(pitch_lines.PITCH, [key], SIZE, {}, settings, name)
+        except WorldposeError:
+            found[name] = None
+        else:
+            found[name] = keys.camera.camera[0]
+    return found
+
+
+def line_sets(folder: Path, count: int = 30) -> dict[str, dict]:
+    """Return line sets of the half that settings were not chosen on."""
+    return dict(list(pitch_lines.load_lines(folder, "wc14", 1, 1).items())[:count])
+
+
+def main() -> None:
+    """Print how many cameras there are, where they stand, and how well they hit what was drawn."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path)
+    options = parser.parse_args()
+    lines, scorer = line_sets(options.data), pitch_lines.load_scorer(options.data)
+    found = {name: each for name, each in cameras(lines).items() if each is not None}
+    hits = [pitch_lines.jaccards(scorer, lines[name], each, SIZE) for name, each in found.items()]
+    centers = np.array([each.center for each in found.values()])
+    away = np.hypot(centers[:, 0], centers[:, 1])
+    print(f"{len(found)} of {len(lines)} line sets give a camera")
+    print(f"from the pitch's centre {away.min():.1f} to {away.max():.1f} m")
+    print(f"height {centers[:, 2].min():.1f} to {centers[:, 2].max():.1f} m")
+    shares = " / ".join(f"{each:.1f}" for each in 100.0 * np.mean(hits, axis=0))
+    print(f"JaC@5 / @10 / @20: {shares} %")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,209 @@
+"""The stage's task in a store: numbers of frames, the clip's clock, people and the layout."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import turning_clip as clip
+
+from data_contracts.body_fitting import BODY_FITTING
+from data_contracts.broadcast_calibration import FRAME_STATUS, KeyFrame, KeyFrames
+from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from data_contracts.pitch import PitchSpec
+from data_contracts.static_calibration import ClickedMarkings
+from flows.broadcast_pooling import STAGE as POOLING
+from flows.planning import plan_run
+from flows.registering import register
+from tasks.broadcast_calibration import broadcast_calibration
+from tasks.broadcast_pooling import broadcast_pooling
+from tasks.ingest import ingest
+from worldpose.cameras import Camera
+from worldpose.ingest import Observations, write_match
+from worldpose.store import Store
+from worldpose.synthetic.broadcast_rendering import render_broadcast
+from worldpose.video import write_video
+
+FIRST, COUNT, OFFSET = 7, 10, 4.4
+"""The clip's first match frame and length; its video's frame there. Frames 4 to 13 are the clip's,
+and people are 0.4 frames earlier than those of the same number."""
+VIDEO = 16
+FPS = 25.0
+SHAPE = np.stack([np.tile([-0.2, 0.2], 9)[:17], np.zeros(17), np.linspace(0.1, 1.8, 17)], axis=-1)
+
+
+def joints(frames):
+    """Twelve people at match frames (n,), each going their way at up to 6 m/s."""
+    x, y = np.meshgrid([-8.0, -2.0, 4.0, 10.0], [-9.0, 0.0, 9.0])
+    way = np.random.default_rng(1).uniform(-6.0, 6.0, (12, 2))
+    places = np.stack([x.ravel(), y.ravel()], axis=-1) + frames[:, None, None] / FPS * way
+    return np.concatenate([places, np.zeros((*places.shape[:2], 1))], -1)[:, :, None] + SHAPE
+
+
+def observed(frame, keypoints):
+    known = np.isfinite(keypoints).all(axis=-1)
+    low, high = keypoints.min(axis=-2), keypoints.max(axis=-2)
+    return Observations(
+        frame=frame,
+        keypoints=keypoints.astype(np.float32),
+        confidence=np.where(known, 0.9, np.nan).astype(np.float32),
+        boxes=np.concatenate([low, high], axis=-1).astype(np.float32),
+        score=np.full(keypoints.shape[:2], 0.9, dtype=np.float32),
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A match of one static camera and two broadcast clips, one in the middle of its video."""
+    true, rng = clip.moving(VIDEO, pan=(-2.0, 6.0)), np.random.default_rng(2)
+    numbers = np.arange(VIDEO)
+    seen = true.camera.project(joints(FIRST + numbers - OFFSET).reshape(VIDEO, -1, 3))
+    seen = seen.reshape(VIDEO, 12, 17, 2) + rng.standard_normal((VIDEO, 12, 17, 2))
+    static: Camera = true.camera[0]
+    width, height = clip.SIZE
+    spec = MatchSpec(
+        match_id="stage",
+        fps=FPS,
+        cameras=(
+            CameraSpec(id="one", width=width, height=height),
+            CameraSpec(id="main", kind="broadcast", width=width, height=height),
+        ),
+        clips=(
+            ClipSpec(
+                id="goal",
+                first_frame=FIRST,
+                frame_count=COUNT,
+                broadcast="main",
+                broadcast_offset_frames=OFFSET,
+            ),
+            ClipSpec(id="shot", first_frame=90, frame_count=COUNT, broadcast="main"),
+        ),
+    )
+    key = KeyFrame(frame=9, markings=clicks(true, 9))
+    other = KeyFrame(frame=2, markings=clicks(true, 2))
+    late = KeyFrame(frame=15, markings=clicks(true, 15))
+
+    def video(draft):
+        (draft / "broadcast").mkdir()
+        goal = draft / "broadcast" / "goal.mp4"
+        write_video(goal, render_broadcast(true.camera, clip.PITCH, None, 5), FPS)
+        shutil.copy(goal, goal.with_name("shot.mp4"))
+
+    path = tmp_path_factory.mktemp("matches") / "stage"
+    inside = np.where(((seen > 0) & (seen < true.image_size - 1)).all(-1, keepdims=True), seen, 5.0)
+    write_match(
+        path,
+        spec,
+        calibrations={"one": static.to_calibration("one")},
+        observations={
+            "one": observed(np.arange(FIRST, FIRST + COUNT), inside[:COUNT]),
+            "goal": observed(numbers, inside),
+            "shot": observed(numbers, inside),
+        },
+        pitch=PitchSpec(),
+        key_frames={
+            "goal": KeyFrames(key_frames=(key, late)),
+            "shot": KeyFrames(key_frames=(other,)),
+        },
+        further=video,
+    )
+    return path
+
+
+def clicks(true, frame):
+    """The centre circle and lines through it as they are in a frame."""
+    drawn = []
+    for name in ("center_circle", "halfway_line", "touch_line_far"):
+        pixels = true.camera[frame].project(clip.PITCH.marking_points(name, 0.5))
+        inside = pixels[((pixels > 3.0) & (pixels < true.image_size - 4.0)).all(axis=-1)]
+        some = inside[np.linspace(0, len(inside) - 1, 9).astype(int)]
+        drawn.append({"name": name, "xy": [(float(x), float(y)) for x, y in some]})
+    return ClickedMarkings.model_validate({"points": [], "drawn": drawn})
+
+
+def prepared(store, work, first, places):
+    """Publishes bodies whose joints are at these places."""
+    sizes = {"frame": COUNT, "person": 12, "joint": 17, "shape_component": 10, "rotation": 3}
+    sizes |= {"shape_component_": 10, "rotation_23": 69, "coordinate": 3, "coordinate_": 3}
+    sizes |= {"body_axis": 3}
+    arrays = {
+        array.name: np.zeros([sizes[dim] for dim in array.dims], dtype=array.dtype)
+        for array in BODY_FITTING.arrays
+    }
+    frames = np.arange(first, first + COUNT)
+    arrays["joints"] = places
+    with store.publishing(work) as result:
+        result.write(
+            BODY_FITTING,
+            arrays=arrays,
+            coordinates={"frame": frames, "person": np.arange(12, dtype=np.int32)},
+            attributes={"body_model": "none"},
+        )
+
+
+@pytest.fixture(scope="module")
+def calibrated(folder, tmp_path_factory):
+    """A store with both clips' cameras, and the plan of the match."""
+    store = Store.create(tmp_path_factory.mktemp("project") / "project")
+    match, _ = register(store, folder)
+    planned = {unit.name: unit for unit in plan_run(store, match, {})}
+    there = joints(FIRST + np.arange(float(COUNT)))
+    # Nobody was found in the second clip.
+    for name, first, places in (("goal", FIRST, there), ("shot", 90, np.full_like(there, np.nan))):
+        ingest.fn(planned[f"ingest/{name}"].work(store.url, match, "0001"))
+        prepared(
+            store, planned[f"body_fitting/{name}"].work(store.url, match, "0001"), first, places
+        )
+        unit = planned[f"broadcast_calibration/{name}"]
+        assert broadcast_calibration.fn(unit.work(store.url, match, "0001")) == unit.key
+    return store, match, planned
+
+
+def test_the_task_publishes_a_camera_for_every_frame_of_the_clip(calibrated):
+    store, _, planned = calibrated
+    unit = planned["broadcast_calibration/goal"]
+    result = store.open_result("stage", "broadcast_calibration", "goal", unit.key, verify=True)
+    assert result["frame"].values.tolist() == list(range(FIRST, FIRST + COUNT))
+    # Frame 15 of the video is none of the clip's.
+    assert result.attrs["key_frames"] == [9]
+    assert FRAME_STATUS[int(result["status"].sel(frame=FIRST + 5))] == "key_frame"
+    assert all(4 <= number < 4 + COUNT for number in result.attrs["pick_next"])
+    true = clip.moving(VIDEO, pan=(-2.0, 6.0)).frames(np.arange(4, 4 + COUNT))
+    off = np.linalg.norm(result["center"].values - true.center)
+    # A key frame of clicks that are true, and lines in every frame of 540 rows.
+    assert off < 0.5
+    assert np.median(np.abs(result["focal"].values[:, 0] / true.focal - 1.0)) < 0.005
+    # What match.yaml says of the clock is right, and people were taken accordingly.
+    offset = result.attrs["feed_offset"]
+    assert offset["frames"] == pytest.approx(0.0, abs=0.3)
+    figures = store.manifest("stage", "broadcast_calibration", "goal", unit.key).figures
+    assert figures["feed_offset_frames"] == offset["frames"]
+    assert figures["weak"] == float(bool(result.attrs["reasons"]))
+
+
+def test_two_clips_of_one_camera_get_one_place_that_is_known_better(calibrated):
+    store, match, planned = calibrated
+    places, before = [], []
+    for name in ("goal", "shot"):
+        unit = planned[f"broadcast_pooling/{name}"]
+        assert broadcast_pooling.fn(unit.work(store.url, match, "0001")) == unit.key
+        pooled = store.open_result("stage", "broadcast_pooling", name, unit.key)
+        key = planned[f"broadcast_calibration/{name}"].key
+        own = store.open_result("stage", "broadcast_calibration", name, key)
+        assert pooled.attrs["agree"] and pooled.attrs["clips"] == ["goal", "shot"]
+        spreads = [np.trace(each["clip_covariance"].values[:3, :3]) for each in (pooled, own)]
+        assert spreads[0] < spreads[1]
+        np.testing.assert_array_equal(pooled["frame"].values, own["frame"].values)
+        places.append(pooled["center"].values)
+        before.append(own["center"].values)
+    # Sums of the same two places in either order.
+    np.testing.assert_allclose(places[0], places[1], atol=1e-9)
+    assert np.linalg.norm(before[0] - before[1]) > 1e-3
+
+
+def test_a_clip_alone_is_not_pooled(calibrated):
+    _, match, _ = calibrated
+    one = match.folder.spec.model_copy(update={"clips": match.folder.spec.clips[:1]})
+    alone = replace(match, folder=replace(match.folder, spec=one))
+    assert POOLING.units(alone) == ()
+    assert POOLING.units(match) == ("goal", "shot")

@@ -1,0 +1,78 @@
+"""The broadcast camera's video with markings and people drawn over it, as its camera has them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17_BONES
+from data_contracts.pitch import PitchSpec
+from worldpose.cameras import Camera
+from worldpose.release.drawing import TEMPLATE, markings, person_color
+from worldpose.release.joints_file import JointTracks
+
+Floats = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+_PARTS: Final = 16
+"""A line's place is told to this part of a pixel."""
+_FAR: Final = 4.0
+"""Beyond so many widths of the picture nothing is drawn [1]."""
+
+
+def overlay_frames(
+    pictures: Iterable[Picture],
+    camera: Camera,
+    tracks: JointTracks,
+    frames: NDArray[np.int64],
+    pitch: PitchSpec | None = None,
+) -> Iterator[Picture]:
+    """Yield pictures at half their size with what the camera puts where.
+
+    Args:
+        pictures: (height, width, 3) RGB, one for each of `frames`.
+        camera: a batch (frames,), theirs.
+        tracks: people, one colour each.
+        frames: (n,) match frames; people are drawn where `tracks` has them.
+        pitch: its markings are drawn; None where there is no pitch.
+    """
+    lines = markings(pitch) if pitch is not None else []
+    rows = {int(frame): row for row, frame in enumerate(tracks.frames)}
+    for place, (frame, picture) in enumerate(zip(frames, pictures, strict=True)):
+        small = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        # What is encoded has even sides.
+        even = small[: small.shape[0] & ~1, : small.shape[1] & ~1]
+        canvas = np.asarray(even, dtype=np.uint8, order="C")
+        single = camera[place]
+        for line in lines:
+            _draw(canvas, single.project(line), _rgb(TEMPLATE))
+        if frame in rows:
+            joints = tracks.joints[rows[frame]]
+            for person_id, own in zip(tracks.person_ids, joints, strict=True):
+                pixels = single.project(own)
+                for bone in COCO17_BONES:
+                    _draw(canvas, pixels[list(bone)], _rgb(person_color(int(person_id))))
+        yield np.asarray(canvas, dtype=np.uint8)
+
+
+def _draw(canvas: Picture, pixels: Floats, color: tuple[int, int, int]) -> None:
+    """Draw a polyline (n, 2) [px] of the whole picture onto the half one, where it is known."""
+    # The half picture's pixel has its middle between two of the whole one's.
+    small = 0.5 * pixels - 0.25
+    with np.errstate(invalid="ignore"):
+        near = (np.abs(small) < _FAR * canvas.shape[1]).all(axis=-1)
+    begins = np.flatnonzero(near & ~np.append(False, near[:-1]))
+    ends = np.flatnonzero(near & ~np.append(near[1:], False)) + 1
+    for begin, end in zip(begins, ends, strict=True):
+        whole = np.rint(_PARTS * small[begin:end]).astype(np.int32)
+        shift = _PARTS.bit_length() - 1
+        cv2.polylines(canvas, [whole], False, color, 1, cv2.LINE_AA, shift)
+
+
+def _rgb(color: str) -> tuple[int, int, int]:
+    """Return `#rrggbb` as numbers."""
+    return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)
