@@ -18,7 +18,8 @@ def test_planted_keypoints_come_first(clip):
     rng = np.random.default_rng(8)
     image = made.keypoints.copy()
     chosen = rng.permutation(20 * 8 * 6 * 17)[:300]
-    planted = set(zip(*(index.tolist() for index in np.unravel_index(chosen, (20, 8, 6, 17)))))
+    rows = np.column_stack(np.unravel_index(chosen, (20, 8, 6, 17)))
+    planted = {tuple(row) for row in rows.tolist()}
     for row in sorted(planted):
         angle, length = rng.uniform(0.0, 2.0 * np.pi), 0.9 * rng.uniform(4.0, 30.0)
         image[row] += length * np.array([np.cos(angle), np.sin(angle)])
@@ -26,7 +27,7 @@ def test_planted_keypoints_come_first(clip):
     first = list(zip(listed.frame, listed.camera, listed.person, listed.joint, strict=True))
     assert (np.diff(listed.surprise) <= 0).all()
     hits = planted & set(first[: len(planted)])
-    # Errors of 4 to 30 standard deviations, give or take a keypoint's own, among 16,320 honest ones.
+    # Errors of 4 to 30 standard deviations, give or take the keypoint's own, among 16,320.
     assert len(hits) >= 0.95 * len(planted)
 
 
