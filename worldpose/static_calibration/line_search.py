@@ -118,9 +118,11 @@ class LineSearch:
                 alone = self.clear(camera, samples, seen)
                 chosen, seen = samples[alone], seen[alone]
                 reach = self._reach(seen, covariance)
+            if not seen.visible.any():
+                return None
             measured = self._measure(seen, reach, fine)
             least = self.settings.least_found * len(chosen.marking) / len(samples.marking)
-            if np.isfinite(measured.offsets).sum() < least:
+            if np.isfinite(measured.offsets).sum() < max(least, 1.0):
                 return None
             found = self._settle(camera, chosen, seen, measured, fine)
             if fine:
@@ -183,7 +185,7 @@ class LineSearch:
             moved = np.abs(seen.by_camera[:, self.free] @ adjusted.step)[seen.visible]
             seen = self.look(camera, samples)
             measured = replace(measured, offsets=((bars - seen.places) * seen.normals).sum(-1))
-            if moved.max() < _SETTLED:
+            if moved.max(initial=0.0) < _SETTLED:
                 break
         return Found(camera, samples, seen, measured, adjusted)
 

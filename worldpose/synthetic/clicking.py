@@ -78,7 +78,7 @@ def click(
     pixels = camera.project(places)
     there = np.flatnonzero(_visible(camera, places, pixels, _boxes(camera, people)))
     chosen = _chosen(there, pixels[:, 0], places, camera.image_size[0], settings, clustered, rng)
-    noisy = pixels + settings.noise * rng.standard_normal(pixels.shape)
+    noisy = _within(camera, pixels + settings.noise * rng.standard_normal(pixels.shape))
     clicked = {names[index]: noisy[index] for index in chosen}
     wrong: dict[str, str] = {}
     if mistaken and len(chosen):
@@ -202,9 +202,14 @@ def _drawn(
         # Clicked at about even steps, wherever a sample is near.
         steps = np.linspace(0.0, len(seen) - 1.0, settings.drawn_points).round().astype(int)
         points = seen[np.unique(steps)]
-        points = points + settings.noise * rng.standard_normal(points.shape)
+        points = _within(camera, points + settings.noise * rng.standard_normal(points.shape))
         drawn.append(DrawnMarking(name=name, xy=tuple(_pixel(xy) for xy in points)))
     return tuple(drawn)
+
+
+def _within(camera: Camera, pixels: Floats) -> Floats:
+    """Pixels (n, 2) as they are clicked: nobody clicks beside the picture."""
+    return np.clip(pixels, 0.0, camera.image_size - 1.0)
 
 
 def _pixel(xy: Floats) -> tuple[float, float]:

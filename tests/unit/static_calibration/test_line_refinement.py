@@ -11,10 +11,12 @@ from worldpose.cameras import Camera
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.clearance import clear, whites_of
+from worldpose.static_calibration.edges import brightness
 from worldpose.static_calibration.line_adjustment import adjust
 from worldpose.static_calibration.line_refinement import refine_on_lines
 from worldpose.static_calibration.line_samples import sample_markings, see_lines
-from worldpose.static_calibration.line_search import difference
+from worldpose.static_calibration.line_search import LineSearch, difference
+from worldpose.static_calibration.line_settings import LineRefinementSettings
 from worldpose.static_calibration.parameters import CameraEstimate, stepped
 from worldpose.synthetic.rendering import RenderingSettings, render_pitch
 from worldpose.synthetic.stadium import looking
@@ -121,6 +123,16 @@ def test_view_without_markings_says_so():
     away = replace(camera(), cam_from_world=camera(aim=(-20.0, -200.0, 60.0)).cam_from_world)
     first = CameraEstimate(away, np.diag(SPREAD**2))
     assert "no painted line" in refine_on_lines(first, PITCH, picture()).reason
+
+
+def test_samples_that_all_lie_on_other_paint_give_no_lines():
+    # Taken for another marking's, every sample has paint of a stranger under it.
+    begin = start(0, factor=0.05)
+    search = LineSearch(begin, PITCH, brightness(picture()), EXACT, LineRefinementSettings())
+    samples = sample_markings(PITCH, 0.5)
+    samples = replace(samples, marking=samples.marking[::-1].copy())
+    alone = search.clear(begin.camera, samples, search.look(begin.camera, samples))
+    assert search.run(begin, samples[~alone]) is None
 
 
 def test_lines_that_contradict_the_start_are_refused():
