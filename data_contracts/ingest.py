@@ -2,14 +2,46 @@
 
 from __future__ import annotations
 
-from data_contracts.arrays import GroupLayout
+from data_contracts.arrays import ArrayLayout, GroupLayout
 from data_contracts.observations import FRAME, OBSERVATION_ARRAYS, OBSERVATION_LABELS
+
+VIDEO_ARRAYS = (
+    ArrayLayout(
+        name="picture_of_frame",
+        dims=("frame",),
+        dtype="int64",
+        unit="1",
+        missing="-1",
+        about="number of the video's picture that shows this match frame",
+    ),
+    ArrayLayout(
+        name="picture_stamp",
+        dims=("picture",),
+        dtype="int64",
+        unit="1",
+        missing="none",
+        about="presentation time stamp of each picture as shown, in units of the time base",
+    ),
+    ArrayLayout(
+        name="picture_key",
+        dims=("picture",),
+        dtype="bool",
+        unit="1",
+        missing="none",
+        about="whether decoding can begin at this picture",
+    ),
+)
+"""The index of a video, and how it lies on the match's clock."""
 
 INGEST = GroupLayout(
     stage="ingest",
-    about="Given 2D poses of one camera, on the match's clock.",
+    about="Given 2D poses of one camera, or the index of its video, on the match's clock.",
     coordinates=(FRAME,),
-    arrays=OBSERVATION_ARRAYS,
+    arrays=(*OBSERVATION_ARRAYS, *VIDEO_ARRAYS),
     labels=OBSERVATION_LABELS,
-    attributes={"camera_id": "camera of the match, or clip of its broadcast camera"},
+    attributes={
+        "camera_id": "camera of the match, or clip of its broadcast camera",
+        "video": "null, or a video's time_base [1, units a second], size [px], missing_frames",
+    },
+    optional=tuple(array.name for array in (*OBSERVATION_ARRAYS, *VIDEO_ARRAYS)),
 )

@@ -1,4 +1,7 @@
-"""Stage `ingest`: one unit a static camera, and one a broadcast clip with given 2D poses."""
+"""Stage `ingest`: one unit a static camera, and one a broadcast clip whose people are to be seen.
+
+A unit brings in given 2D poses, or else the index of its video, in which `detection` finds people.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from pydantic import JsonValue
 from data_contracts.records import Record
 from flows.stage import Match, Stage
 from worldpose.ingest import unit_frames
+from worldpose.ingest.footage import footage_clips, footage_size
 
 
 class IngestSettings(Record):
@@ -14,11 +18,19 @@ class IngestSettings(Record):
 
 
 def units(match: Match) -> tuple[str, ...]:
-    """Static cameras in order, then the broadcast clips that bring 2D poses."""
-    spec = match.folder.spec
+    """Static cameras in order, then broadcast clips with 2D poses, or with a video and clicks.
+
+    A clip without key frames has no use for the people that its broadcast camera sees.
+    """
+    folder = match.folder
     return (
-        *(camera.id for camera in spec.static_cameras),
-        *(clip.id for clip in spec.clips if clip.id in match.folder.detections),
+        *(camera.id for camera in folder.spec.static_cameras),
+        *(
+            clip.id
+            for clip in folder.spec.clips
+            if clip.id in folder.detections
+            or (clip.id in folder.key_frames and clip.id in folder.videos)
+        ),
     )
 
 
@@ -28,22 +40,40 @@ def inputs(match: Match, unit: str) -> tuple[str, ...]:
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The unit's detections, and how its frames lie on the match's clock."""
+    """The unit's detections or else its video, and how its frames lie on the match's clock."""
     folder = match.folder
-    path = folder.detections[unit].relative_to(folder.folder).as_posix()
     frames = unit_frames(folder.spec, unit)
-    return {
-        "detections": path,
-        "detections_sha256": match.registration.digest_of(path),
+    clock: dict[str, JsonValue] = {
         "first_frame": frames.first,
         "frame_count": frames.count,
         "offset_frames": frames.offset,
+    }
+    if unit not in folder.detections:
+        return {**video_sources(match, unit), **clock}
+    path = folder.detections[unit].relative_to(folder.folder).as_posix()
+    return {
+        "detections": path,
+        "detections_sha256": match.registration.digest_of(path),
+        **clock,
+    }
+
+
+def video_sources(match: Match, unit: str) -> dict[str, JsonValue]:
+    """The unit's video, what is taken from it, and what it must be."""
+    folder = match.folder
+    path = folder.videos[unit].relative_to(folder.folder).as_posix()
+    return {
+        "video": path,
+        "video_sha256": match.registration.digest_of(path),
+        "fps": folder.spec.fps,
+        "image_size": list(footage_size(folder.spec, unit)),
+        "clips": {clip: [first, count] for clip, first, count in footage_clips(folder.spec, unit)},
     }
 
 
 STAGE = Stage(
     name="ingest",
-    about="take in 2D poses",
+    about="take in 2D poses and videos",
     settings=IngestSettings,
     units=units,
     inputs=inputs,

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pydantic import JsonValue
 
+from flows.ingest import video_sources
 from flows.stage import Match, Stage
+from worldpose.ingest import unit_frames
 from worldpose.ingest.annotations import clicked_file
 from worldpose.static_calibration import StaticCalibrationSettings
 
@@ -20,7 +22,7 @@ def inputs(match: Match, unit: str) -> tuple[str, ...]:
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The given calibration alone, or else the clicks, the pitch and the still of this camera.
+    """The given calibration alone, or else the clicks, the pitch and a picture of this camera.
 
     Clicks are listed under the file's name, marking by marking, so that a difference of two runs
     names the file and the point.
@@ -45,7 +47,16 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
         "image_size": [camera.width, camera.height],
         "still": path,
         "still_sha256": None if path is None else match.registration.digest_of(path),
+        "filmed": _filmed(match, unit) if still is None else None,
     }
+
+
+def _filmed(match: Match, unit: str) -> dict[str, JsonValue] | None:
+    """The camera's video, out of which a still without people is made where none is given."""
+    if unit not in match.folder.videos:
+        return None
+    offset = unit_frames(match.folder.spec, unit).offset
+    return {**video_sources(match, unit), "offset_frames": offset}
 
 
 STAGE = Stage(

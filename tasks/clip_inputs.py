@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -26,16 +26,21 @@ PAGES = 4
 class StoredClip:
     """One array of every camera's detections, padded to the same number, read when it is used.
 
+    Rejected keypoints are as if they had not been found.
+
     Attributes:
         shape: (frames, cameras, detections, ...).
     """
 
-    def __init__(self, clips: Sequence[xr.Dataset], name: str) -> None:
+    def __init__(
+        self, clips: Sequence[xr.Dataset], name: str, rejected: xr.DataArray | None = None
+    ) -> None:
         arrays = [clip[name] for clip in clips]
         detections = max(1, *(array.sizes["detection"] for array in arrays))
         frames, _, *rest = arrays[0].shape
         self.shape: tuple[int, ...] = (frames, len(arrays), detections, *rest)
         self._arrays = arrays
+        self._rejected = rejected
         self._page = lru_cache(PAGES)(self._read)
 
     def __getitem__(self, frames: slice) -> NDArray[np.float64]:
@@ -53,6 +58,8 @@ class StoredClip:
         page = np.full((stop - start, *self.shape[1:]), np.nan, dtype=np.float32)
         for camera, array in enumerate(self._arrays):
             page[:, camera, : array.sizes["detection"]] = array[start:stop].values
+        if self._rejected is not None:
+            page[self._rejected[start:stop].values] = np.nan
         return page
 
 
@@ -83,37 +90,86 @@ ADJUSTED = "bundle_adjustment/cameras"
 """All static cameras, where they are adjusted to people."""
 
 
-def open_clip(store: Store, work: Work) -> ClipInputs:
-    """The clip of `work`; its detections are read when they are used."""
+def open_clip(store: Store, work: Work, *, filtered: bool = True) -> ClipInputs:
+    """The clip of `work`; its detections are read when they are used.
+
+    Args:
+        store: the store.
+        work: the work under way.
+        filtered: without what the bodies of the iteration before contradicted.
+    """
     first, count = work.recipe.sources["first_frame"], work.recipe.sources["frame_count"]
-    return _open(store, work, np.arange(first, first + count), slice(first, first + count - 1))
+    where = slice(first, first + count - 1)
+    seen = [open_input(store, work, name).sel(frame=where) for name in work.recipe.sources["seen"]]
+    rejected = _rejected(store, work, {work.recipe.unit: where}) if filtered else None
+    return _open(store, work, np.arange(first, first + count), seen, rejected)
 
 
-def open_frames(store: Store, work: Work, frame: NDArray[np.int64]) -> ClipInputs:
-    """Match frames, with every camera's detections in memory."""
-    some = _open(store, work, frame, frame)
+def open_frames(store: Store, work: Work, frames: Mapping[str, NDArray[np.int64]]) -> ClipInputs:
+    """Match frames of each clip, clip by clip, with every camera's detections in memory."""
+    names = work.recipe.sources["seen"]
+    seen = [
+        _together(
+            [open_input(store, work, names[clip][c]).sel(frame=frames[clip]) for clip in frames]
+        )
+        for c in range(len(work.recipe.sources["cameras"]))
+    ]
+    frame = np.concatenate(list(frames.values()))
+    some = _open(store, work, frame, seen, _rejected(store, work, frames))
     keypoints, confidence = some.keypoints[: len(frame)], some.confidence[: len(frame)]
     return replace(some, keypoints=keypoints, confidence=confidence)
 
 
+def _together(clips: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Whom one camera saw, clip by clip, padded to the same number."""
+    most = max(clip.sizes["detection"] for clip in clips)
+    padded = [
+        clip[["keypoints", "confidence"]].pad(detection=(0, most - clip.sizes["detection"]))
+        for clip in clips
+    ]
+    return xr.concat(padded, dim="frame")
+
+
+def _rejected(
+    store: Store, work: Work, frames: Mapping[str, NDArray[np.int64] | slice]
+) -> xr.DataArray | None:
+    """What the iteration before rejected, frames of each clip together; None in the first."""
+    clips = [
+        open_input(store, work, name)["rejected"].sel(frame=where)
+        for clip, where in frames.items()
+        if (name := f"filtering/{clip}") in work.recipe.inputs
+    ]
+    if len(clips) < 2:
+        return clips[0] if clips else None
+    most = max(clip.sizes["detection"] for clip in clips)
+    padded = [
+        clip.pad(detection=(0, most - clip.sizes["detection"]), constant_values=False)
+        for clip in clips
+    ]
+    return xr.concat(padded, dim="frame")
+
+
 def _open(
-    store: Store, work: Work, frame: NDArray[np.int64], where: slice | NDArray[np.int64]
+    store: Store,
+    work: Work,
+    frame: NDArray[np.int64],
+    seen: Sequence[xr.Dataset],
+    rejected: xr.DataArray | None,
 ) -> ClipInputs:
-    """Match frames, which are `where` in what each camera brought in.
+    """Match frames, with whom each camera saw in them.
 
     The cameras are the adjusted ones where `work` is made from them.
     """
     sources = work.recipe.sources
     camera_ids = tuple(sources["cameras"])
-    seen = [open_input(store, work, f"ingest/{camera}").sel(frame=where) for camera in camera_ids]
     cameras, covariance = _cameras(store, work, camera_ids)
     return ClipInputs(
         camera_ids=camera_ids,
         cameras=cameras,
         camera_covariance=covariance,
         frame=frame,
-        keypoints=StoredClip(seen, "keypoints"),
-        confidence=StoredClip(seen, "confidence"),
+        keypoints=StoredClip(seen, "keypoints", rejected),
+        confidence=StoredClip(seen, "confidence", rejected),
         fps=float(sources["fps"]),
     )
 

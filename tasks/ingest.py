@@ -1,4 +1,4 @@
-"""Task of stage `ingest`: one camera's 2D poses into the store."""
+"""Task of stage `ingest`: one camera's 2D poses, or the index of its video, into the store."""
 
 from __future__ import annotations
 
@@ -11,24 +11,58 @@ import numpy as np
 from data_contracts.ingest import INGEST
 from data_contracts.run import Work
 from tasks.unit import require_registered, unit_task
-from worldpose.ingest import Observations, read_observations
+from worldpose.ingest import Observations, UnitFrames, read_observations
+from worldpose.ingest.footage import Footage, read_footage
 from worldpose.store import Store
+from worldpose.store.writer import ResultWriter
 
 
 @unit_task
 def ingest(work: Work) -> str:
-    """Publishes the observations; returns the key."""
+    """Publishes the observations or the index; returns the key."""
     with Store.open(work.project).publishing(work) as result:
-        observations = _observations(work)
-        result.write(
-            INGEST,
-            arrays=observations.arrays(),
-            coordinates={"frame": observations.frame},
-            attributes={"camera_id": work.recipe.unit},
-        )
-        result.figures["frames"] = observations.frame.size
-        result.figures["detections"] = int(np.isfinite(observations.score).sum())
+        if "detections" in work.recipe.sources:
+            _write_observations(result, work)
+        else:
+            _write_footage(result, work)
     return work.key
+
+
+def _write_observations(result: ResultWriter, work: Work) -> None:
+    observations = _observations(work)
+    result.write(
+        INGEST,
+        arrays=observations.arrays(),
+        coordinates={"frame": observations.frame},
+        attributes={"camera_id": work.recipe.unit, "video": None},
+    )
+    result.figures["frames"] = observations.frame.size
+    result.figures["detections"] = int(np.isfinite(observations.score).sum())
+
+
+def _write_footage(result: ResultWriter, work: Work) -> None:
+    footage = _footage(work)
+    base = footage.index.time_base
+    result.write(
+        INGEST,
+        arrays={
+            "picture_of_frame": footage.picture,
+            "picture_stamp": footage.index.stamps,
+            "picture_key": footage.index.key,
+        },
+        coordinates={"frame": footage.frame},
+        attributes={
+            "camera_id": work.recipe.unit,
+            "video": {
+                "time_base": None if base is None else [base.numerator, base.denominator],
+                "size": list(footage.index.size),
+                "missing_frames": footage.missing,
+            },
+        },
+    )
+    result.figures["frames"] = footage.frame.size
+    result.figures["pictures"] = len(footage.index)
+    result.figures["frames_missing"] = int(np.count_nonzero(footage.picture < 0))
 
 
 def _observations(work: Work) -> Observations:
@@ -43,3 +77,19 @@ def _observations(work: Work) -> Observations:
     observations = read_observations(path, first, sources["frame_count"])
     require_registered(path, sources["detections_sha256"])
     return replace(observations, frame=observations.frame - sources["offset_frames"])
+
+
+def _footage(work: Work) -> Footage:
+    """The unit's video on match frames, from the very file that its key stands for; raises so."""
+    sources: dict[str, Any] = work.recipe.sources
+    path = Path(work.folder) / sources["video"]
+    width, height = sources["image_size"]
+    footage = read_footage(
+        path,
+        float(sources["fps"]),
+        (width, height),
+        UnitFrames(sources["first_frame"], sources["frame_count"], sources["offset_frames"]),
+        [(clip, first, count) for clip, (first, count) in sources["clips"].items()],
+    )
+    require_registered(path, sources["video_sha256"])
+    return footage

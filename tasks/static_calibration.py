@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +30,13 @@ from worldpose.static_calibration import (
     calibration_arrays,
     calibration_attributes,
     calibration_coordinates,
+    median_picture,
 )
 from worldpose.store import Store
+from worldpose.video import index_video, open_video
+
+STILL_FRAMES: Final = 25
+"""Pictures of a video of which a still is the median."""
 
 
 @unit_task
@@ -77,19 +82,47 @@ def clicked_markings(listed: Mapping[str, Any]) -> ClickedMarkings:
 
 
 def _still(work: Work) -> NDArray[np.uint8] | None:
-    """The unit's picture, from the very file that its key stands for.
+    """The unit's still, or one without people from its video, from the files of its key.
 
     Raises:
         InputError: the file is not, or no longer, the one that was registered, or no picture.
     """
     sources: dict[str, Any] = work.recipe.sources
     if sources["still"] is None:
-        return None
+        return None if sources["filmed"] is None else _filmed_still(work, sources["filmed"])
     path = Path(work.folder) / sources["still"]
     width, height = sources["image_size"]
     picture = read_still(path, (width, height))
     require_registered(path, sources["still_sha256"])
     return picture
+
+
+def _filmed_still(work: Work, filmed: Mapping[str, Any]) -> NDArray[np.uint8]:
+    """The median of pictures spread evenly over the clips; who stands still stays in it (C4).
+
+    Raises:
+        InputError: the video is not, or no longer, the one that was registered, or none.
+    """
+    path = Path(work.folder) / filmed["video"]
+    every = np.concatenate(
+        [np.arange(first, first + count) for first, count in sorted(filmed["clips"].values())]
+    )
+    chosen = every[np.linspace(0, len(every) - 1, min(STILL_FRAMES, len(every))).astype(int)]
+    index = index_video(path)
+    clock = index.on_clock(float(filmed["fps"]), str(path))
+    numbers = chosen + filmed["offset_frames"]
+    shown = clock[numbers[(numbers >= 0) & (numbers < len(clock))]]
+
+    def pictures() -> Iterator[NDArray[np.uint8]]:
+        with open_video(path, index) as video:
+            for number in shown[shown >= 0]:
+                for _, picture in video.readable(int(number), int(number) + 1):
+                    if picture is not None:
+                        yield picture
+
+    still = median_picture(pictures(), STILL_FRAMES)
+    require_registered(path, filmed["video_sha256"])
+    return still
 
 
 def _figures(report: CalibrationReport) -> dict[str, float]:

@@ -7,6 +7,7 @@ Outputs: `MatchFolder`, `Registration`, `Observations` on match frames.
 
 from worldpose.ingest.calibration_files import read_calibration, write_calibration_toml
 from worldpose.ingest.importing import import_match
+from worldpose.ingest.importing_videos import import_videos
 from worldpose.ingest.keypoint_files import read_observations
 from worldpose.ingest.match_folder import MatchFolder, read_match, require_calibrated
 from worldpose.ingest.observations import Observations
@@ -19,6 +20,7 @@ __all__ = [
     "Observations",
     "UnitFrames",
     "import_match",
+    "import_videos",
     "read_calibration",
     "read_match",
     "read_observations",

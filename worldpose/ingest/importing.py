@@ -43,7 +43,7 @@ def import_match(
             is not empty; nothing is written then.
     """
     cameras = read_calibration(calibration)
-    files = _files_by_camera(detections, list(cameras), calibration)
+    files = files_by_camera(detections, list(cameras), calibration, (".json", ".npz"))
     people = {name: read_observations(file) for name, file in files.items()}
     seen = [frames for frames in map(seen_frames, people.values()) if frames is not None]
     if not seen:
@@ -52,7 +52,7 @@ def import_match(
         )
     first, last = min(frame for frame, _ in seen), max(frame for _, frame in seen)
     content = {
-        "match_id": match_id if match_id is not None else _name_of(out),
+        "match_id": match_id if match_id is not None else name_of(out),
         "fps": fps,
         "cameras": [
             {"id": name, "width": camera.image_size[0], "height": camera.image_size[1]}
@@ -68,16 +68,23 @@ def import_match(
     return spec
 
 
-def _files_by_camera(folder: Path, cameras: list[str], calibration: Path) -> dict[str, Path]:
+def files_by_camera(
+    folder: Path, cameras: list[str], calibration: Path, suffixes: tuple[str, ...]
+) -> dict[str, Path]:
+    """The file of each camera in a folder, by the camera's name.
+
+    Raises:
+        InputError: a camera lacks its file, or a file its camera.
+    """
     files = [
         file
         for file in (sorted(folder.iterdir()) if folder.is_dir() else ())
-        if file.suffix in (".json", ".npz") and not file.name.startswith(".")
+        if file.suffix in suffixes and not file.name.startswith(".")
     ]
     if sorted(file.stem for file in files) != sorted(cameras):
         raise InputError(
             str(folder),
-            expected=f"one .json or .npz file for each camera in {calibration.name}: "
+            expected=f"one {' or '.join(suffixes)} file for each camera in {calibration.name}: "
             + ", ".join(cameras),
             found=", ".join(file.name for file in files) or "no such file",
             todo="Rename the files as the cameras, and leave neither over.",
@@ -86,7 +93,7 @@ def _files_by_camera(folder: Path, cameras: list[str], calibration: Path) -> dic
     return {name: by_name[name] for name in cameras}
 
 
-def _name_of(folder: Path) -> str:
+def name_of(folder: Path) -> str:
     """The folder's name without what an id may not hold."""
     name = re.sub(r"[^A-Za-z0-9._-]+", "-", folder.resolve().name).strip("-._")[:64]
     return name or "match"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -41,6 +41,8 @@ class MatchFolder:
         stills: one picture, by id of a static camera; may lack some.
         key_frames: what people clicked in the broadcast camera's picture, by id of a clip; may
             lack some.
+        estimates: bodies seen in single pictures of the broadcast camera, by id of a clip; may lack
+            some.
     """
 
     folder: Path
@@ -52,6 +54,7 @@ class MatchFolder:
     clicked: Mapping[str, ClickedMarkings]
     stills: Mapping[str, Path]
     key_frames: Mapping[str, KeyFrames]
+    estimates: Mapping[str, Path] = field(default_factory=dict)
 
 
 def read_match(folder: Path) -> MatchFolder:
@@ -87,6 +90,7 @@ def read_match(folder: Path) -> MatchFolder:
         clicked=read_clicked(folder, spec, pitch),
         stills=_stills(folder, spec),
         key_frames=read_key_frames(folder, spec, pitch),
+        estimates=_estimates(folder, spec),
     )
 
 
@@ -196,6 +200,21 @@ def _detections(folder: Path, spec: MatchSpec) -> dict[str, Path]:
                 todo="Remove one of them.",
             )
         found[file.stem] = existing_file(folder, f"detections/{file.name}", str(folder))
+    return found
+
+
+def _estimates(folder: Path, spec: MatchSpec) -> dict[str, Path]:
+    known = [clip.id for clip in spec.clips if clip.broadcast is not None]
+    found = {}
+    for file in sorted((folder / "estimates").glob("*.npz")):
+        if file.stem not in known:
+            raise InputError(
+                str(file),
+                expected=f"a clip with a broadcast camera: {', '.join(known) or '(none)'}",
+                found=repr(file.stem),
+                todo="Rename or remove the file, or add the clip to match.yaml.",
+            )
+        found[file.stem] = existing_file(folder, f"estimates/{file.name}", str(folder))
     return found
 
 

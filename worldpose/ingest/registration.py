@@ -19,10 +19,10 @@ SETTLE_SECONDS: Final = 0.5
 def register_match(match: MatchFolder, previous: Registration | None) -> Registration:
     """The match with the SHA-256 of its files, and the identity that says which match it is.
 
-    Registered are match.yaml, calibration.toml, the pitch file, videos, stills, detections and
-    annotations; `reference/` is not part of a match. The identity covers the paths and contents of
-    videos, detections and pitch alone, so neither the folder's name nor an edited click, still,
-    roster or calibration makes another match.
+    Registered are match.yaml, calibration.toml, the pitch file, videos, stills, detections,
+    estimates and annotations; `reference/` is not part of a match. The identity covers the paths
+    and contents of videos, detections and pitch alone, so neither the folder's name nor an edited
+    click, still, roster, estimate or calibration makes another match.
 
     Args:
         match: as read by `read_match`.
@@ -48,6 +48,23 @@ def register_match(match: MatchFolder, previous: Registration | None) -> Registr
     return Registration(spec=match.spec, folder=folder, identity=identity.hexdigest(), files=files)
 
 
+def digest_of_files(path: Path) -> str:
+    """SHA-256 of a file, or of the names and contents of all files of a folder but hidden ones.
+
+    The same as `Registration.digest_of` of what was registered.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    if not path.is_dir():
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    listed = hashlib.sha256()
+    for name in sorted(_files_under(path, path)):
+        listed.update(f"{digest_of_files(path / name)} {name}\n".encode())
+    return listed.hexdigest()
+
+
 def _identifying_files(match: MatchFolder) -> set[str]:
     pitch = pitch_file(match.folder, match.spec)
     roots = [*match.videos.values(), *match.detections.values(), *([pitch] if pitch else [])]
@@ -57,6 +74,7 @@ def _identifying_files(match: MatchFolder) -> set[str]:
 def _further_files(match: MatchFolder) -> set[str]:
     names = ("match.yaml", "calibration.toml", "annotations")
     roots = [*(match.folder / name for name in names), *match.stills.values()]
+    roots += match.estimates.values()
     return {path for root in roots for path in _files_under(match.folder, root)}
 
 

@@ -141,6 +141,9 @@ def _yaml(spec: MatchSpec) -> str:
     content = spec.model_dump(mode="json", exclude_none=True)
     if not spec.roster:
         del content["roster"]
+    for clip in content["clips"]:
+        if not clip["people"]:
+            del clip["people"]
     text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
     return text
 

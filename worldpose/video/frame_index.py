@@ -1,35 +1,41 @@
-"""Which picture of a video file is frame n: the time stamps of all its pictures in order."""
+"""Which picture of a video is frame n: the time stamps of all its pictures in order."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import Final
 
 import av
 import numpy as np
+from av.container import InputContainer
+from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from worldpose.errors import InputError
 
+RATE_SLACK: Final = 0.1
+"""Share of a clock's frames that a video may lack or double before it is one of another rate."""
+
 
 @dataclass(frozen=True, eq=False)
 class FrameIndex:
-    """The pictures of a video file, in the order in which they are shown.
+    """The pictures of a video, in the order in which they are shown.
 
-    A frame number counts pictures as shown, whatever the file says of its rate: containers round
-    times, begin later than zero, and store pictures in the order of decoding.
+    A picture's number counts pictures as shown, whatever the file says of its rate: containers
+    round times, begin later than zero, and store pictures in the order of decoding.
 
     Attributes:
-        stamps: (frames,) presentation time stamps, rising, in units of `time_base`.
-        key: (frames,) whether decoding can begin there.
-        time_base: seconds a unit.
-        size: width, height [px].
+        stamps: (pictures,) presentation time stamps, rising, in units of `time_base`.
+        key: (pictures,) whether decoding can begin there.
+        time_base: seconds a unit; None where stamps are frame numbers, as in a folder of images.
+        size: width, height of the pictures as shown, after any turn [px].
     """
 
     stamps: NDArray[np.int64]
     key: NDArray[np.bool_]
-    time_base: Fraction
+    time_base: Fraction | None
     size: tuple[int, int]
 
     def __len__(self) -> int:
@@ -37,22 +43,57 @@ class FrameIndex:
 
     @property
     def times(self) -> NDArray[np.float64]:
-        """When each frame is shown, from the first one on (frames,) [s]."""
-        return np.asarray((self.stamps - self.stamps[0]) * float(self.time_base))
+        """When each picture is shown, from the first one on (pictures,) [s]; NaN without times."""
+        unit = np.nan if self.time_base is None else float(self.time_base)
+        return np.asarray((self.stamps - self.stamps[0]) * unit)
 
     @property
     def fps(self) -> float:
-        """Frames a second, from the median time between neighbours; NaN for a single frame."""
-        if len(self) < 2:
+        """Frames a second, from the median time between neighbours; NaN where it is not known."""
+        if len(self) < 2 or self.time_base is None:
             return float("nan")
         # The median of the single steps is rounded to the time base; the whole length is not.
         step = np.diff(self.stamps)
         usual = np.abs(step - np.median(step)) <= 1
         return float(1.0 / (step[usual].mean() * float(self.time_base)))
 
+    def on_clock(self, fps: float, where: str) -> NDArray[np.int64]:
+        """The picture of each frame of a camera's clock (frames,); -1 where the video lacks it.
+
+        Frame n is shown n / fps after the first picture. A picture that a recorder dropped leaves
+        its frame empty and shifts none behind it; of two pictures for a frame the nearer counts.
+
+        Args:
+            fps: frames a second of the clock.
+            where: the video, for messages.
+
+        Raises:
+            InputError: the video has another rate.
+        """
+        if self.time_base is None:
+            exact = (self.stamps - self.stamps[0]).astype(np.float64)
+        else:
+            exact = self.times * fps
+        slot = np.rint(exact).astype(np.int64)
+        late = np.abs(exact - slot)
+        # By frame, and within a frame the nearest last, so that it is what stays.
+        order = np.lexsort((-late, slot))
+        picture = np.full(slot[-1] + 1, -1, dtype=np.int64)
+        picture[slot[order]] = order
+        filled = int(np.count_nonzero(picture >= 0))
+        odd = (len(picture) - filled) + (len(slot) - filled)
+        if self.time_base is not None and odd > RATE_SLACK * max(len(picture), len(slot)):
+            raise InputError(
+                where,
+                expected=f"{fps:g} frames a second, the rate in match.yaml",
+                found=f"{self.fps:.4g}",
+                todo="Correct fps in match.yaml, or write the video anew at that rate.",
+            )
+        return picture
+
 
 def index_frames(path: Path) -> FrameIndex:
-    """Return the index of a file's first video stream, from its packets: nothing is decoded.
+    """Return the index of a file's first video stream, from its packets: one picture is decoded.
 
     Raises:
         InputError: no video, or pictures without time stamps.
@@ -62,12 +103,14 @@ def index_frames(path: Path) -> FrameIndex:
             if not container.streams.video:
                 raise _no_video(path, "no video stream")
             stream = container.streams.video[0]
+            size = _shown_size(container, stream)
+            container.seek(0)
             packets = [
                 (packet.pts, packet.is_keyframe)
-                for packet in container.demux(stream)
+                for packet in _packets(container, stream)
                 if packet.size and not packet.is_discard
             ]
-            base, size = stream.time_base, (stream.width, stream.height)
+            base = stream.time_base
     except (av.error.FFmpegError, OSError) as error:
         raise _no_video(path, f"{error}") from error
     if not packets or base is None or any(stamp is None for stamp, _ in packets):
@@ -76,6 +119,26 @@ def index_frames(path: Path) -> FrameIndex:
     order = np.argsort(stamps, kind="stable")
     key = np.array([key for _, key in packets], dtype=np.bool_)[order]
     return FrameIndex(stamps[order], key, base, size)
+
+
+def _packets(container: InputContainer, stream: VideoStream) -> list[av.Packet[VideoStream]]:
+    """All packets of a stream; a file that was cut off ends where it was cut."""
+    found: list[av.Packet[VideoStream]] = []
+    try:
+        found.extend(container.demux(stream))
+    except av.error.FFmpegError:
+        if not found:
+            raise
+    return found
+
+
+def _shown_size(container: InputContainer, stream: VideoStream) -> tuple[int, int]:
+    """Width and height as shown: a camera held upright stores lying pictures and a turn."""
+    for picture in container.decode(stream):
+        if picture.rotation % 180:
+            return picture.height, picture.width
+        return picture.width, picture.height
+    return stream.width, stream.height
 
 
 def _no_video(path: Path, found: str) -> InputError:

@@ -75,6 +75,21 @@ class VideoReader:
         Raises:
             InputError: there are no such frames, or one cannot be decoded.
         """
+        for number, picture in self.readable(start, stop, grey=grey):
+            if picture is None:
+                raise self._broken(number)
+            yield number, picture
+
+    def readable(
+        self, start: int = 0, stop: int | None = None, *, grey: bool = False
+    ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+        """Yield the same, with None for each picture that cannot be decoded or comes damaged.
+
+        So are those after a damaged one up to the next key frame: they may be predicted from it.
+
+        Raises:
+            InputError: there are no such frames.
+        """
         stop = len(self) if stop is None else stop
         if not 0 <= start <= stop <= len(self):
             raise InputError(
@@ -83,28 +98,52 @@ class VideoReader:
                 found=f"{start} to {stop}",
                 todo="Ask for frames that the video has.",
             )
-        if start == stop:
-            return
+        wanted, sound_from = start, start
+        for picture in self._shown_from(start) if start < stop else ():
+            number = self._number.get(-1 if picture.pts is None else int(picture.pts), -1)
+            if number < wanted:
+                continue
+            if number > wanted or picture.is_corrupt:
+                sound_from = self._next_key(wanted)
+            while wanted < min(number, stop):
+                yield wanted, None
+                wanted += 1
+            if wanted < stop:
+                yield wanted, _pixels(picture, grey) if wanted >= sound_from else None
+                wanted += 1
+            if wanted == stop:
+                return
+        for number in range(wanted, stop):
+            yield number, None
+
+    def _next_key(self, number: int) -> int:
+        """The first picture after a damaged one that is not predicted from it."""
+        keys = np.flatnonzero(self.index.key)
+        after = int(np.searchsorted(keys, number, side="right"))
+        return int(keys[after]) if after < len(keys) else len(self)
+
+    def _shown_from(self, start: int) -> Iterator[av.VideoFrame]:
+        """Pictures as shown, from the last one before `start` at which decoding can begin."""
         before = np.flatnonzero(self.index.key[: start + 1])
         begin = int(before[-1]) if len(before) else 0
         self._container.seek(
             int(self.index.stamps[begin]), stream=self._stream, backward=True, any_frame=False
         )
-        wanted = start
-        try:
-            for picture in self._container.decode(self._stream):
-                number = self._number.get(-1 if picture.pts is None else int(picture.pts), -1)
-                if number < wanted:
-                    continue
-                if number > wanted:
-                    break
-                yield number, _pixels(picture, grey)
-                wanted += 1
-                if wanted == stop:
-                    return
-        except av.error.FFmpegError as error:
-            raise self._broken(wanted) from error
-        raise self._broken(wanted)
+        packets = self._container.demux(self._stream)
+        while True:
+            try:
+                packet = next(packets, None)
+            except av.error.FFmpegError:  # the file ends here, cut off
+                packet = None
+            if packet is None:
+                return
+            try:
+                shown = packet.decode()
+            except av.error.FFmpegError:
+                continue  # what it held is missing; what follows the next key frame is not
+            for picture in shown:
+                assert isinstance(picture, av.VideoFrame)  # of a video stream
+                yield picture
 
     def _broken(self, number: int) -> InputError:
         return InputError(
@@ -116,6 +155,13 @@ class VideoReader:
 
 
 def _pixels(picture: av.VideoFrame, grey: bool) -> NDArray[np.uint8]:
+    """Return the picture as it is to be shown: RGB, or luma alone."""
+    pixels = _stored_pixels(picture, grey)
+    quarters = round(picture.rotation / 90.0) % 4  # counterclockwise, as NumPy turns
+    return pixels if quarters == 0 else np.ascontiguousarray(np.rot90(pixels, quarters))
+
+
+def _stored_pixels(picture: av.VideoFrame, grey: bool) -> NDArray[np.uint8]:
     """Return RGB, or the first plane of a planar format, without the padding of its rows."""
     if not grey:
         return np.asarray(picture.to_ndarray(format="rgb24"))

@@ -1,0 +1,85 @@
+"""How well a run of the real demo explains its own pictures: there is no truth to compare with.
+
+Prints who is tracked how long, how far joints fall from keypoints, how steady bones are, and
+writes a video of one view with joints drawn over it.
+Example: python score.py real-demo/match real-demo/project real-demo/overlay.mp4
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+import worldpose
+from data_contracts.conventions import COCO17_BONES
+from flows.release import joint_tracks, static_cameras
+from worldpose.ingest import read_match
+from worldpose.video import VideoReader, write_video
+
+LIMBS = {
+    "thigh": ((11, 13), (12, 14)),
+    "shank": ((13, 15), (14, 16)),
+    "upper arm": ((5, 7), (6, 8)),
+    "forearm": ((7, 9), (8, 10)),
+}
+COLOURS = ((255, 200, 0), (0, 200, 255), (255, 80, 200), (120, 255, 120))
+
+
+def score(folder: Path, project: str, video: Path) -> None:
+    """Print the figures of the latest run and write the overlay video."""
+    match = read_match(folder)
+    run = worldpose.open_run(project, match.spec.match_id)
+    clip = match.spec.clips[0].id
+    placed_joints = run[f"triangulation/{clip}"]
+    joints = placed_joints["joints"].values
+    inliers = placed_joints["inliers"].transpose("frame", "camera", "person", "joint").values
+    index = run[f"tracking/{clip}"]["detection_index"].values
+    cameras = static_cameras(run, match.spec)
+    frames = len(joints)
+    print(f"{frames} frames, {joints.shape[1]} people")
+    every, used = [], []
+    for person in range(joints.shape[1]):
+        seen = (index[:, :, person] >= 0).sum(axis=1)
+        placed = np.isfinite(joints[:, person]).all(axis=-1).any(axis=-1)
+        print(f"person {person}: placed in {placed.sum()} frames, {seen.mean():.1f} views a frame")
+        for number, (name, camera) in enumerate(cameras.items()):
+            keypoints = run[f"detection/{name}.{clip}"]["keypoints"].values
+            rows = np.flatnonzero(index[:, number, person] >= 0)
+            found = keypoints[rows, index[rows, number, person]]
+            error = np.linalg.norm(camera.project(joints[rows, person]) - found, axis=-1)
+            every.append(error.ravel())
+            used.append(error[inliers[rows, number, person]])
+        for limb, sides in LIMBS.items():
+            lengths = [
+                np.linalg.norm(joints[:, person, a] - joints[:, person, b], axis=-1)
+                for a, b in sides
+            ]
+            text = ", ".join(
+                f"{100 * np.nanmedian(one):.1f} cm, spread {100 * np.nanstd(one):.1f} cm"
+                for one in lengths
+            )
+            print(f"  {limb}: {text}")
+    for name, errors in (("all keypoints", every), ("those that carry joints", used)):
+        print(f"median reprojection error of {name}: {np.nanmedian(np.concatenate(errors)):.1f} px")
+    tracks = joint_tracks(run, clip)
+    name = next(iter(cameras))
+    pictures = []
+    with VideoReader(match.videos[name]) as reader:
+        for row, (_, picture) in enumerate(reader.frames(0, frames)):
+            drawn = picture.copy()
+            for person in range(tracks.joints.shape[1]):
+                pixels = cameras[name].project(tracks.joints[row, person])
+                for a, b in COCO17_BONES:
+                    if np.isfinite(pixels[[a, b]]).all():
+                        ends = [tuple(int(x) for x in pixels[end]) for end in (a, b)]
+                        cv2.line(drawn, *ends, COLOURS[person % len(COLOURS)], 4, cv2.LINE_AA)
+            pictures.append(drawn)
+    write_video(video, pictures, match.spec.fps)
+    print(f"wrote {video}, view {name}")
+
+
+if __name__ == "__main__":
+    score(Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]))

@@ -1,0 +1,132 @@
+"""Task of stage `detection`: the people of one clip in one camera's video."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from data_contracts.detection import DETECTION
+from data_contracts.pitch import PitchSpec
+from data_contracts.run import Work
+from tasks.spool import spooling
+from tasks.unit import open_input, require_registered, unit_task
+from worldpose.cameras.stored import camera_from_arrays
+from worldpose.detection import (
+    DetectionSettings,
+    PeopleFinder,
+    Place,
+    load_detectors,
+    load_pose,
+    weights_of,
+)
+from worldpose.detection.interfaces import Picture
+from worldpose.errors import InputError
+from worldpose.ingest.footage import stretches
+from worldpose.pitch import PitchTemplate
+from worldpose.store import Store
+from worldpose.video import FrameIndex, open_video
+
+
+@unit_task
+def detection(work: Work) -> str:
+    """Publishes boxes and keypoints; returns the key."""
+    store = Store.open(work.project)
+    sources: dict[str, Any] = work.recipe.sources
+    settings = DetectionSettings.model_validate(work.recipe.settings)
+    finder = PeopleFinder(load_detectors(settings), load_pose(settings), settings)
+    _require_weights(settings, sources["weights"])
+    first, count = sources["first_frame"], sources["frame_count"]
+    with store.publishing(work) as result, spooling(store) as spool:
+        unreadable: list[int] = []
+        most = 0
+        for stretch in finder.find(_pictures(store, work), _place(store, work)):
+            spool.add(stretch.arrays())
+            unreadable += stretch.unreadable
+            most = max(most, int(np.isfinite(stretch.score).sum(axis=1).max()))
+        require_registered(Path(work.folder) / sources["video"], sources["video_sha256"])
+        result.write(
+            DETECTION,
+            arrays={name: values[:, :most] for name, values in spool.arrays().items()},
+            coordinates={"frame": np.arange(first, first + count)},
+            attributes={
+                "camera_id": sources["camera"],
+                "unreadable": stretches(np.array(unreadable, dtype=np.int64)),
+            },
+        )
+        report = finder.report
+        result.figures |= {
+            "frames": report.frames,
+            "detections": report.detections,
+            "detections_a_frame": report.detections / report.frames,
+            "unreadable_share": report.unreadable / report.frames,
+            "empty_share": report.empty / report.frames,
+            "stride": settings.stride,
+            "crowd": report.crowd,
+            "bridged_share": report.bridged / max(1, report.detections),
+            "flicker_share": report.flickers / max(1, report.detections),
+        }
+    return work.key
+
+
+def _pictures(store: Store, work: Work) -> Iterator[tuple[int, Picture | None]]:
+    """Every match frame of the clip with its picture, decoded once and in order."""
+    sources: dict[str, Any] = work.recipe.sources
+    first, count = sources["first_frame"], sources["frame_count"]
+    footage = open_input(store, work, f"ingest/{sources['camera']}")
+    numbers = footage["picture_of_frame"].sel(frame=slice(first, first + count - 1)).values
+    there = numbers[numbers >= 0]
+    frame = first
+    with open_video(Path(work.folder) / sources["video"], _index(footage)) as video:
+        shown = video.readable(int(there[0]), int(there[-1]) + 1) if len(there) else iter(())
+        for number in numbers:
+            picture = None
+            while number >= 0:  # pictures that no frame shows are passed over
+                at, picture = next(shown)
+                if at == number:
+                    break
+            yield frame, picture
+            frame += 1
+
+
+def _index(footage: xr.Dataset) -> FrameIndex:
+    video = footage.attrs["video"]
+    width, height = video["size"]
+    base = video["time_base"]
+    return FrameIndex(
+        footage["picture_stamp"].values,
+        footage["picture_key"].values,
+        None if base is None else Fraction(*base),
+        (width, height),
+    )
+
+
+def _place(store: Store, work: Work) -> Place | None:
+    """Where the camera stands, where that is known and there is a pitch."""
+    sources: dict[str, Any] = work.recipe.sources
+    if sources["pitch"] is None:
+        return None
+    known = open_input(store, work, f"static_calibration/{sources['camera']}")
+    pitch = PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"]))
+    return Place(camera_from_arrays(known.data_vars), pitch)
+
+
+def _require_weights(settings: DetectionSettings, planned: dict[str, str | None]) -> None:
+    """Refuse other weights or libraries than the run was planned with.
+
+    Raises:
+        InputError: they differ.
+    """
+    found = weights_of(settings)
+    if found != planned:
+        names = sorted(name for name in planned if found.get(name) != planned[name])
+        raise InputError(
+            f"detection: {', '.join(names)}",
+            expected="the weights and libraries that the run was planned with",
+            found="others",
+            todo="Give all workers the same files and libraries, restart them, and run again.",
+        )

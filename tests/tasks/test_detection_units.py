@@ -1,0 +1,170 @@
+"""From a video to the match's clock: the frame that is read is the one that was shown."""
+
+import numpy as np
+import pytest
+
+import tasks.detection
+from data_contracts.cameras import CameraCalibration
+from data_contracts.match import MatchSpec
+from data_contracts.run import Work
+from flows.match import task_of
+from flows.method import METHOD
+from flows.planning import plan_stage
+from flows.registering import register
+from tasks.clip_inputs import open_clip, open_frames
+from worldpose.detection import People, Poses
+from worldpose.errors import InputError
+from worldpose.ingest import write_match
+from worldpose.store import Store
+from worldpose.video import write_video
+
+SIZE = (64, 48)
+OFFSETS = {"left": 0, "right": 3}
+CLIPS = [
+    {"id": "early", "first_frame": 2, "frame_count": 12},
+    {"id": "late", "first_frame": 20, "frame_count": 10},
+]
+
+
+class Reading:
+    """Finds one person whose box begins at the number that is burnt into the picture."""
+
+    view_size = None
+
+    def detect(self, pictures):
+        numbers = [round((float(picture.mean()) - 10.0) / 4.0) for picture in pictures]
+        return [
+            People(np.array([[float(n), 10.0, n + 8.0, 30.0]]), np.array([0.9])) for n in numbers
+        ]
+
+    def estimate(self, picture, boxes):
+        keypoints = np.repeat(boxes[:, None, :2], 17, axis=1)
+        return Poses(keypoints, np.full((len(boxes), 17), 0.9))
+
+
+@pytest.fixture
+def reading(monkeypatch):
+    monkeypatch.setattr(tasks.detection, "load_detectors", lambda settings: [Reading()])
+    monkeypatch.setattr(tasks.detection, "load_pose", lambda settings: Reading())
+
+
+@pytest.fixture
+def filmed(tmp_path):
+    """A match of two cameras with videos alone; `right` was switched off before the end."""
+    spec = MatchSpec.model_validate(
+        {
+            "match_id": "filmed",
+            "fps": 25,
+            "cameras": [
+                {"id": name, "width": SIZE[0], "height": SIZE[1], "offset_frames": offset}
+                for name, offset in OFFSETS.items()
+            ],
+            "clips": CLIPS,
+            "pitch": "none",
+        }
+    )
+    calibrations = {
+        name: CameraCalibration(
+            id=name,
+            image_size=SIZE,
+            focal_px=(50.0, 50.0),
+            principal_point_px=(31.5, 23.5),
+            rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+            translation=(0.0, 0.0, 5.0),
+        )
+        for name in OFFSETS
+    }
+
+    def film(folder):
+        (folder / "videos").mkdir()
+        for name, count in (("left", 40), ("right", 31)):
+            pictures = [np.full((SIZE[1], SIZE[0], 3), 10 + 4 * n, np.uint8) for n in range(count)]
+            write_video(folder / "videos" / f"{name}.mp4", pictures, 25.0, quality=5)
+
+    folder = tmp_path / "match"
+    write_match(folder, spec, calibrations=calibrations, observations={}, further=film)
+    return folder
+
+
+def computed(store, match, stages):
+    """Results of the first stages, by `stage/unit`."""
+    results = {}
+    for stage in METHOD[:stages]:
+        for unit in plan_stage(store, match, stage, {}, results).units:
+            task_of(stage).fn(unit.work(store.url, match, "0001"))
+            results[unit.name] = unit.key
+    return results
+
+
+def test_people_of_videos_reach_tracking_on_the_match_s_clock(filmed, tmp_path, reading):
+    store = Store.create(tmp_path / "project")
+    match, _ = register(store, filmed)
+    names = [stage.name for stage in METHOD]
+    results = computed(store, match, names.index("detection") + 1)
+    late = store.open_result("filmed", "ingest", "right", results["ingest/right"])
+    # Frames 20 to 29 are pictures 23 to 32 of `right`, which has 31.
+    assert late.attrs["video"]["missing_frames"] == [[28, 29]]
+    plan = plan_stage(store, match, METHOD[names.index("tracking")], {}, results)
+    early, late = (unit.work(store.url, match, "0001") for unit in plan.units)
+    assert set(early.recipe.inputs) == {
+        *("detection/left.early", "detection/right.early"),
+        *("static_calibration/left", "static_calibration/right"),
+    }
+    for work, frames in ((early, np.arange(2, 14)), (late, np.arange(20, 30))):
+        clip = open_clip(store, work)
+        assert clip.keypoints.shape == (len(frames), 2, 1, 17, 2)
+        shown = clip.keypoints[:][:, :, 0, 0, 0]
+        expected = frames[:, None] + list(OFFSETS.values()) + 0.0
+        expected[expected[:, 1] > 30, 1] = np.nan
+        np.testing.assert_array_equal(shown, expected)
+        assert clip.frame.tolist() == frames.tolist()
+    # All clips at once, as bundle adjustment takes them.
+    chosen = {"early": np.array([3, 7]), "late": np.array([21, 28])}
+    recipe = late.recipe.model_copy(
+        update={
+            "inputs": late.recipe.inputs | early.recipe.inputs,
+            "sources": late.recipe.sources
+            | {
+                "seen": {"early": early.recipe.sources["seen"], "late": late.recipe.sources["seen"]}
+            },
+        }
+    )
+    both = open_frames(store, Work(**{**dict(late), "recipe": recipe}), chosen)
+    np.testing.assert_array_equal(
+        both.keypoints[:, :, 0, 0, 0], [[3, 6], [7, 10], [21, 24], [28, np.nan]]
+    )
+    figures = store.manifest("filmed", "detection", "right.late", results["detection/right.late"])
+    assert figures.figures["unreadable_share"] == pytest.approx(0.2)
+
+
+def test_other_weights_than_planned_with_are_refused(filmed, tmp_path, reading, monkeypatch):
+    store = Store.create(tmp_path / "project")
+    match, _ = register(store, filmed)
+    names = [stage.name for stage in METHOD]
+    results = computed(store, match, names.index("detection"))
+    plan = plan_stage(store, match, METHOD[names.index("detection")], {}, results)
+    monkeypatch.setattr(tasks.detection, "weights_of", lambda settings: {"embedded": "another"})
+    with pytest.raises(InputError, match="planned with"):
+        task_of(METHOD[names.index("detection")]).fn(plan.units[0].work(store.url, match, "0001"))
+
+
+def test_a_video_that_is_not_what_match_yaml_says_is_refused_at_once(filmed, tmp_path):
+    store = Store.create(tmp_path / "project")
+    text = (filmed / "match.yaml").read_text()
+    for old, new, told in (
+        ("width: 64", "width: 66", "66 x 48 px"),
+        ("fps: 25.0", "fps: 50.0", "50 frames a second"),
+        ("first_frame: 20", "first_frame: 60", "frames 60 to 69"),
+    ):
+        assert old in text
+        other = text.replace(old, new)
+        (filmed / "match.yaml").write_text(other)
+        if old.startswith("width"):
+            (filmed / "calibration.toml").rename(filmed / "away")
+            (filmed / "calibration.toml").write_text(
+                (filmed / "away").read_text().replace("64", "66", 2)
+            )
+        with pytest.raises(InputError, match=told):
+            register(store, filmed)
+        if old.startswith("width"):
+            (filmed / "away").rename(filmed / "calibration.toml")

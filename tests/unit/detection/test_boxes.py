@@ -1,0 +1,93 @@
+"""One box a person, whoever found it, and in whichever view."""
+
+import numpy as np
+import pytest
+
+from worldpose.detection.boxes import fuse, overlaps, suppress
+from worldpose.detection.interfaces import People
+from worldpose.detection.views import Tiled
+
+
+def people(*rows):
+    rows = np.array(rows, dtype=np.float64).reshape(-1, 5)
+    return People(rows[:, :4], rows[:, 4])
+
+
+def test_overlap_is_the_shared_part_of_the_union():
+    # Two squares of 4 that share 2: 2 of 6.
+    found = overlaps(np.array([[0.0, 0, 2, 2]]), np.array([[1.0, 0, 3, 2], [5, 5, 6, 6]]))
+    np.testing.assert_allclose(found, [[1 / 3, 0.0]])
+
+
+def test_nobody_and_empty_boxes_are_legal():
+    nobody = people()
+    assert len(suppress(nobody, 0.5).scores) == 0
+    assert len(fuse([nobody, nobody], 0.5).scores) == 0
+    flat = np.array([[1.0, 1, 1, 1]])
+    assert overlaps(flat, flat).tolist() == [[0.0]]
+
+
+def test_the_best_of_two_boxes_of_a_person_stays():
+    found = suppress(people([0, 0, 10, 20, 0.5], [1, 0, 11, 20, 0.9], [50, 0, 60, 20, 0.2]), 0.6)
+    assert found.scores.tolist() == [0.9, 0.2]
+
+
+def test_an_ensemble_agrees_on_the_mean_weighted_by_score():
+    one = people([0, 0, 10, 20, 0.9])
+    two = people([2, 0, 12, 20, 0.3], [50, 0, 60, 20, 0.6])
+    found = fuse([one, two], 0.6)
+    # (0.9 * 0 + 0.3 * 2) / 1.2 = 0.5; both members: (0.9 + 0.3) / 2; one of two: 0.6 / 2.
+    np.testing.assert_allclose(found.boxes, [[0.5, 0, 10.5, 20], [50, 0, 60, 20]])
+    np.testing.assert_allclose(found.scores, [0.6, 0.3])
+
+
+def test_a_member_never_joins_two_people_of_its_own():
+    # Two people of a duel, whom each member tells apart, and who overlap by half.
+    duel = people([0, 0, 10, 20, 0.9], [3, 0, 13, 20, 0.8])
+    assert len(fuse([duel, duel], 0.6).scores) == 2
+
+
+class Blobs:
+    """Finds white rectangles of 3 px and more: truth to the pixel, in whatever view."""
+
+    view_size = (64, 48)
+
+    def detect(self, pictures):
+        import cv2
+
+        found = []
+        for picture in pictures:
+            assert picture.shape == (48, 64, 3)
+            _, _, stats, _ = cv2.connectedComponentsWithStats(
+                (picture[..., 0] > 200).astype(np.uint8)
+            )
+            found.append(
+                people(*[(x, y, x + w - 1, y + h - 1, 0.9) for x, y, w, h, _ in stats[1:] if w > 2])
+            )
+        return found
+
+
+def test_everybody_is_found_once_and_whole_whichever_view_shows_them():
+    picture = np.zeros((150, 230, 3), dtype=np.uint8)
+    rng = np.random.default_rng(1)
+    true = []
+    for column in range(9):
+        for row in range(4):
+            x, y = 5 + 25 * column + rng.integers(0, 8), 5 + 36 * row + rng.integers(0, 8)
+            picture[y : y + 12, x : x + 6] = 255
+            true.append([x, y, x + 5, y + 11])
+    found = Tiled(Blobs(), (1.0,), view_overlap=0.4, overlap=0.3).detect([picture])[0]
+    whole = found.boxes[np.lexsort(found.boxes.T)]
+    expected = np.array(true, dtype=np.float64)[np.lexsort(np.array(true).T)]
+    # The whole picture in one view is blurred: it may find a box as well, never another person.
+    assert len(whole) == len(expected)
+    assert np.abs(whole - expected).max() <= 4.0
+
+
+@pytest.mark.parametrize("zoom", [1.0, 2.0])
+def test_a_person_in_a_scaled_view_lies_where_the_picture_has_them(zoom):
+    picture = np.zeros((90, 120, 3), dtype=np.uint8)
+    picture[40:56, 60:70] = 255
+    found = Tiled(Blobs(), (zoom,), view_overlap=0.3, overlap=0.3).detect([picture])[0]
+    # An edge pixel that is half white counts as white or not.
+    np.testing.assert_allclose(found.boxes, [[60, 40, 69, 55]], atol=1.0)

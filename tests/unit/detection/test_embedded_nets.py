@@ -1,0 +1,146 @@
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save
+
+from worldpose.detection.embedded import EmbeddedDetector, EmbeddedPose
+from worldpose.detection.embedded_crops import crops_of_boxes, cut, picture_from_crop
+from worldpose.detection.embedded_nets import CROP, KeypointNet, PeopleNet, peaks
+from worldpose.detection.embedded_peaks import boxes_at_peaks
+from worldpose.detection.embedded_weights import FORMAT, load_weights, save_weights
+from worldpose.errors import InputError
+
+
+def shaken(net):
+    """The net with normalisations that are not trivial."""
+    torch.manual_seed(1)
+    for module in net.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.running_mean.normal_(0.0, 0.1)
+            module.running_var.uniform_(0.5, 1.5)
+    return net.eval()
+
+
+def test_a_crop_shows_its_box_and_goes_back_to_the_picture():
+    picture = np.zeros((200, 300, 3), dtype=np.uint8)
+    picture[50:150, 100:140] = 255
+    box = np.array([[99.5, 49.5, 139.5, 149.5]])
+    for turn, mirrored in ((0.0, False), (0.3, True)):
+        mapping = picture_from_crop(crops_of_boxes(box, CROP)[0], CROP, turn, mirrored)
+        crop = cut(picture, mapping, CROP, outside=0)
+        rows, columns = np.nonzero(crop[..., 0] > 127)
+        middle = np.array([columns.mean(), rows.mean()])
+        np.testing.assert_allclose(middle, (np.array(CROP) - 1) / 2, atol=0.05)
+        np.testing.assert_allclose(mapping[:, :2] @ middle + mapping[:, 2], [119.5, 99.5], atol=0.1)
+        # The box fills the crop but for its margin: its height is the tighter side.
+        area = np.abs(np.linalg.det(mapping[:, :2]))
+        # Its outline of 280 px is known to a quarter of a pixel.
+        assert len(rows) * area == pytest.approx(40 * 100, abs=140)
+        assert np.sqrt(area) == pytest.approx(1.25 * 100 / CROP[1])
+
+
+def test_a_crop_of_a_large_box_is_smooth_and_in_its_place():
+    picture = np.zeros((900, 900, 3), dtype=np.uint8)
+    picture[:, ::2] = 200  # stripes that every second pixel alone would make white or black
+    picture[400:, :] = 100
+    mapping = picture_from_crop(np.array([450.0, 450.0, 7.3]), CROP)
+    crop = cut(picture, mapping, CROP)
+    edge = (399.5 - mapping[1, 2]) / mapping[1, 1]
+    # Rows at both ends are outside of the picture; a crop pixel covers 7 stripes, one more or less.
+    assert np.all(np.abs(crop[3 : int(edge) - 1, :, 0].astype(int) - 100) < 15)
+    assert np.all(crop[int(edge) + 2 : -3, :, 0] == 100)
+
+
+def test_the_peak_of_a_bump_is_found_within_a_cell():
+    y, x = np.mgrid[:64, :48]
+    said = np.array([20.3, 41.6])
+    bump = -0.5 * (((x - said[0]) / 0.8) ** 2 + ((y - said[1]) / 0.8) ** 2)
+    at, mass = peaks(torch.tensor(bump, dtype=torch.float32)[None, None])
+    # Cells are 2 px, the first one's middle is at 0.5; five cells lose a little of one tail.
+    np.testing.assert_allclose(at[0, 0], 2 * said + 0.5, atol=0.05)
+    assert float(mass) > 0.97
+
+
+def test_boxes_stand_at_peaks_best_first():
+    logits, sides = torch.full((8, 10), -9.0), torch.full((4, 8, 10), 5.0)
+    logits[2, 3], logits[2, 4], logits[6, 8] = 1.0, 0.5, 2.0
+    boxes, scores = boxes_at_peaks(logits, sides, 0.05, 300)
+    # Cells of 4 px whose first middle is at 1.5; the neighbour of a better cell is no peak.
+    np.testing.assert_allclose(boxes, [[28.5, 20.5, 38.5, 30.5], [8.5, 4.5, 18.5, 14.5]])
+    np.testing.assert_allclose(scores, torch.sigmoid(torch.tensor([2.0, 1.0])))
+    assert len(boxes_at_peaks(logits, sides, 0.05, 1)[0]) == 1
+
+
+def test_people_and_poses_do_not_depend_on_their_company():
+    rng = np.random.default_rng(0)
+    picture = rng.integers(0, 255, (90, 130, 3), dtype=np.uint8)
+    boxes = np.array([[5.0, 5.0, 30.0, 80.0], [-8.0, 20.0, 40.0, 120.0], [60.0, 1.0, 80.0, 60.0]])
+    pose = EmbeddedPose(shaken(KeypointNet()))
+    together, alone = pose.estimate(picture, boxes), pose.estimate(picture, boxes[1:2])
+    np.testing.assert_array_equal(together.keypoints[1:2], alone.keypoints)
+    np.testing.assert_array_equal(together.confidence[1:2], alone.confidence)
+    assert np.all((together.confidence > 0) & (together.confidence <= 1))
+    nobody = pose.estimate(picture, np.empty((0, 4)))
+    assert nobody.keypoints.shape == (0, 17, 2) and nobody.confidence.shape == (0, 17)
+    net = shaken(PeopleNet())
+    with torch.no_grad():
+        net.head[-1].bias[0] = 0.0
+    both = EmbeddedDetector(net).detect([picture, picture[::-1].copy()])
+    assert len(both[0].boxes) > 0
+    inside = (both[0].boxes >= -0.5) & (both[0].boxes <= np.array([130, 90, 130, 90]) - 0.5)
+    assert inside.all()
+
+
+def test_weights_come_back_and_give_equal_bytes(tmp_path):
+    net, file = shaken(PeopleNet()), tmp_path / "people.safetensors"
+    save_weights(file, net)
+    first = file.read_bytes()
+    save_weights(file, load_weights(file, PeopleNet()))
+    assert file.read_bytes() == first
+
+
+def _tensors(net, change):
+    tensors = {name: value.contiguous() for name, value in net.state_dict().items()}
+    change(tensors)
+    return tensors
+
+
+def _poison(tensors):
+    tensors["head.1.bias"] = tensors["head.1.bias"] * float("nan")
+
+
+def _cut_off(tensors):
+    tensors["head.1.bias"] = tensors["head.1.bias"][:-1].contiguous()
+
+
+def _stranger(tensors):
+    tensors["more"] = torch.zeros(1)
+
+
+@pytest.mark.parametrize("change", [_poison, _cut_off, _stranger])
+def test_weights_with_other_content_are_refused(tmp_path, change):
+    file = tmp_path / "people.safetensors"
+    file.write_bytes(save(_tensors(PeopleNet(), change), {FORMAT: "PeopleNet"}))
+    with pytest.raises(InputError, match=r"people\.safetensors"):
+        load_weights(file, PeopleNet())
+
+
+def test_files_that_are_no_weights_are_refused_and_run_nothing(tmp_path):
+    file, trap = tmp_path / "people.safetensors", tmp_path / "sprung"
+
+    class Trap:
+        def __reduce__(self):
+            return open, (str(trap), "w")
+
+    torch.save({"net": Trap()}, file)
+    with pytest.raises(InputError, match="cannot be read"):
+        load_weights(file, PeopleNet())
+    assert not trap.exists()
+    file.write_bytes(b"")
+    with pytest.raises(InputError, match="cannot be read"):
+        load_weights(file, PeopleNet())
+    with pytest.raises(InputError, match="no file"):
+        load_weights(tmp_path / "none.safetensors", PeopleNet())
+    save_weights(file, KeypointNet())
+    with pytest.raises(InputError, match="weights of KeypointNet"):
+        load_weights(file, PeopleNet())

@@ -1,0 +1,136 @@
+"""Players are found and the crowd is not, by a detector that knows the truth."""
+
+import numpy as np
+import pytest
+
+from worldpose.cameras import Camera
+from worldpose.detection import DetectionSettings, People, PeopleFinder, Place, Poses
+from worldpose.detection.crowd import on_pitch
+from worldpose.detection.people import likeness
+from worldpose.ingest.given_cameras import given_camera
+from worldpose.pitch import PitchTemplate
+
+SIZE = (1920, 1080)
+PITCH = PitchTemplate.standard()
+
+
+@pytest.fixture(scope="module")
+def camera():
+    """From a stand's roof at the half-way line, looking across the pitch."""
+    center, target = np.array([0.0, -75.0, 22.0]), np.array([0.0, 5.0, 0.0])
+    forward = (target - center) / np.linalg.norm(target - center)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return Camera.from_calibration(
+        given_camera(
+            "camera",
+            name="cam",
+            size=np.array(SIZE, dtype=np.float64),
+            focal=np.array([1300.0, 1300.0]),
+            principal_point=np.array([959.5, 539.5]),
+            distortion=np.array([-0.05, 0.01, 0.0, 0.0, 0.0]),
+            rotation=rotation,
+            translation=-rotation @ center,
+        )
+    )
+
+
+def boxes_of(camera, feet, height=1.8):
+    """Boxes of people who stand at `feet` (people, 3) [m]."""
+    low, high = camera.project(feet), camera.project(feet + [0.0, 0.0, height])
+    half = 0.2 * (low[:, 1] - high[:, 1])
+    return np.stack([low[:, 0] - half, high[:, 1], low[:, 0] + half, low[:, 1]], axis=1)
+
+
+def test_players_stay_over_the_touch_line_too_and_the_crowd_goes(camera):
+    rng = np.random.default_rng(5)
+    xy = rng.uniform([-40.0, -34.0], [40.0, 34.0], (200, 2))
+    throwing_in = np.array([[10.0, 35.5], [-20.0, -35.0], [0.0, 36.0]])
+    xy = np.vstack([xy, throwing_in])
+    players = np.column_stack([xy, PITCH.height(xy[:, 0], xy[:, 1])])
+    # Behind boards and a track, in a stand that rises by half a metre a metre.
+    away = rng.uniform(42.0, 70.0, 500)
+    crowd = np.column_stack([rng.uniform(-50.0, 50.0, 500), away, 1.0 + 0.5 * (away - 42.0)])
+    boxes = boxes_of(camera, np.vstack([players, crowd]))
+    boxes += rng.normal(0.0, 1.0, boxes.shape)  # a detector's error at 40 px
+    inside = on_pitch(boxes, camera, SIZE, PITCH, DetectionSettings().pitch_margin_m)
+    visible = (boxes[:203, 0] > 0) & (boxes[:203, 2] < SIZE[0]) & (boxes[:203, 3] < SIZE[1])
+    assert visible.sum() > 150
+    assert inside[:203][visible].all()
+    assert inside[203:].mean() <= 0.01
+
+
+def test_whose_feet_the_border_cuts_off_is_told_by_the_head(camera):
+    boxes = boxes_of(camera, np.array([[0.0, -33.0, 0.0], [0.0, -36.0, 0.0]]))
+    height = int(boxes[0, 3]) - 1  # the picture ends at the player's feet
+    assert boxes[1, 1] < height - 4 < height < boxes[1, 3]
+    boxes[:, 3] = height - 1
+    # By the border the second would stand at the first one's feet.
+    assert on_pitch(boxes, camera, (SIZE[0], height), PITCH, 1.0).tolist() == [True, False]
+
+
+class Knowing:
+    """Boxes and keypoints as they are, from the number that a picture carries."""
+
+    view_size = None
+
+    def __init__(self, boxes, scores):
+        self.boxes, self.scores = boxes, scores
+
+    def detect(self, pictures):
+        return [People(self.boxes[n], self.scores[n]) for n in (int(p[0, 0, 0]) for p in pictures)]
+
+    def estimate(self, picture, boxes):
+        across = np.linspace(0.0, 1.0, 17)
+        keypoints = boxes[:, None, :2] + (boxes[:, 2:] - boxes[:, :2])[:, None] * across[:, None]
+        confidence = np.full((len(boxes), 17), 0.8)
+        confidence[:, 3] = 0.01  # an ear that is not there
+        return Poses(keypoints, confidence)
+
+
+def test_a_video_becomes_arrays_in_the_form_of_given_poses(camera):
+    frames, players = 70, 5
+    paths = np.linspace([-20.0, -20.0], [-5.0, 10.0], frames)[:, None] + 7.0 * np.arange(players)[
+        :, None
+    ] * [1.0, 0.2]
+    crowd = np.array([[0.0, 60.0, 10.0]])
+    boxes = [
+        boxes_of(camera, np.vstack([np.column_stack([xy, np.zeros(players)]), crowd]))
+        for xy in paths
+    ]
+    truth = Knowing(boxes, np.full((frames, players + 1), 0.9))
+    blank = np.zeros((SIZE[1], SIZE[0], 3), dtype=np.uint8)
+
+    def shown():
+        for n in range(frames):
+            picture = blank.copy()
+            picture[0, 0] = n
+            yield 100 + n, None if n == 30 else picture
+
+    finder = PeopleFinder([truth], truth, DetectionSettings())
+    stretches = list(finder.find(shown(), Place(camera, PITCH)))
+    found = {
+        name: np.concatenate([stretch.arrays()[name] for stretch in stretches])
+        for name in stretches[0].arrays()
+    }
+    assert found["keypoints"].shape == (frames, 64, 17, 2)
+    there = np.delete(np.arange(frames), 30)
+    assert np.isfinite(found["score"]).sum(axis=1)[there].tolist() == [players] * 69
+    assert np.isnan(found["score"][30]).all()
+    assert [number for stretch in stretches for number in stretch.unreadable] == [130]
+    np.testing.assert_allclose(found["boxes"][:, :players][there][8], boxes[8][:5], atol=1e-3)
+    assert np.isnan(found["confidence"][:, :, 3]).all()
+    assert np.array_equal(np.isnan(found["confidence"]), np.isnan(found["keypoints"]).any(axis=3))
+    report = finder.report
+    assert (report.crowd, report.unreadable, report.empty, report.flickers) == (69, 1, 0, 0)
+
+
+def test_two_poses_of_one_person_are_alike_and_those_of_two_are_not():
+    person = np.stack([np.linspace(0, 30, 17), np.linspace(0, 80, 17)], axis=1)
+    missing = np.full((17, 2), np.nan)
+    area = np.full(4, 2400.0)
+    alike = likeness(np.stack([person, person + 1.0, person + [30.0, 0.0], missing]), area)
+    assert alike[0, 1] > 0.9
+    assert alike[0, 2] < 0.3
+    assert alike[0, 3] == alike[3, 3] == 0.0

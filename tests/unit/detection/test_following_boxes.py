@@ -1,0 +1,97 @@
+"""Boxes become tracks: half hidden people are kept, gaps filled, flickers dropped."""
+
+import numpy as np
+import pytest
+
+from worldpose.detection.byte_track import BoxTracker
+from worldpose.detection.followed import Follower, looked_at
+from worldpose.detection.interfaces import People
+from worldpose.detection.settings import DetectionSettings
+
+PICTURE = np.zeros((4, 4, 3), dtype=np.uint8)
+
+
+def walker(frame, start=100.0, speed=4.0, height=60.0):
+    x = start + speed * frame
+    return [x, 200.0, x + 0.4 * height, 200.0 + height]
+
+
+def people(*rows):
+    rows = np.array(rows, dtype=np.float64).reshape(-1, 5)
+    return People(rows[:, :4], rows[:, 4])
+
+
+def followed(found, **settings):
+    """Frames in, frames out: who is found a frame, None where nobody looked."""
+    follower = Follower(DetectionSettings(**settings))
+    frames = [(number, PICTURE, one) for number, one in enumerate(found)]
+    return [(number, out) for number, _, out in follower.follow(frames)], follower
+
+
+def test_two_people_who_cross_keep_their_tracks():
+    tracker = BoxTracker(sure=0.4, patience=25)
+    ids = []
+    for frame in range(40):
+        boxes = np.array([walker(frame, 100, 4, 60), walker(frame, 260, -4, 80)])
+        ids.append(tracker.follow(boxes, np.array([0.9, 0.9])))
+    assert np.unique(np.array(ids), axis=0).tolist() == [[0, 1]]
+
+
+def test_a_doubtful_box_continues_a_track_and_begins_none():
+    tracker = BoxTracker(sure=0.4, patience=25)
+    lone = np.array([900.0, 200, 924, 260])
+    assert tracker.follow(np.array([walker(0), lone]), np.array([0.9, 0.2])).tolist() == [0, -1]
+    assert tracker.follow(np.array([walker(1), lone]), np.array([0.2, 0.2])).tolist() == [0, -1]
+
+
+def test_a_track_is_given_up_after_the_patience_and_not_before():
+    for missed, expected in ((5, 0), (6, 1)):
+        tracker = BoxTracker(sure=0.4, patience=5)
+        tracker.follow(np.array([walker(0, speed=0)]), np.array([0.9]))
+        for _ in range(missed):
+            tracker.follow(np.empty((0, 4)), np.empty(0))
+        found = tracker.follow(np.array([walker(0, speed=0)]), np.array([0.9]))
+        assert found.tolist() == [expected]
+
+
+def test_a_gap_is_filled_evenly_and_a_longer_one_is_not():
+    for gap, filled in ((4, 4), (6, 0)):
+        seen = [people() if 10 <= n < 10 + gap else people([*walker(n), 0.9]) for n in range(30)]
+        frames, follower = followed(seen, bridge=5)
+        assert [number for number, _ in frames] == list(range(30))
+        counts = [len(one.scores) for _, one in frames]
+        assert counts.count(1) == 30 - gap + filled
+        assert follower.bridged == filled
+        if filled:
+            np.testing.assert_allclose(frames[12][1].boxes, [walker(12)])
+
+
+def test_a_flicker_is_dropped_and_a_single_picture_is_not():
+    seen = [people([*walker(n), 0.9]) for n in range(20)]
+    seen[7] = people([*walker(7), 0.9], [900, 200, 924, 260, 0.8])
+    frames, follower = followed(seen)
+    assert [len(one.scores) for _, one in frames] == [1] * 20
+    assert follower.flickers == 1
+    frames, _ = followed([people([*walker(0), 0.9])])
+    assert len(frames[0][1].scores) == 1
+
+
+@pytest.mark.parametrize("batch", [1, 3, 8])
+def test_looks_at_every_third_frame_give_boxes_in_all_of_them(batch):
+    looked = []
+
+    def look(pictures):
+        numbers = [int(picture[0, 0, 0]) for picture in pictures]
+        looked.extend(numbers)
+        return [people([*walker(number), 0.9]) for number in numbers]
+
+    frames = [(n, None if n == 5 else np.full((4, 4, 3), n, dtype=np.uint8)) for n in range(21)]
+    follower = Follower(DetectionSettings(stride=3, bridge=0))
+    found = list(follower.follow(looked_at(iter(frames), look, 3, batch)))
+    assert looked == [0, 3, 6, 9, 12, 15, 18, 20]  # and the last, so that boxes reach the end
+    assert [number for number, _, _ in found] == list(range(21))
+    for number, picture, one in found:
+        assert len(one.scores) == (0 if picture is None else 1), number
+        if picture is not None:
+            # Constant speed: boxes between two looks are where the person is.
+            np.testing.assert_allclose(one.boxes, [walker(number)], atol=1e-9)

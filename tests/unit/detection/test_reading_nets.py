@@ -1,0 +1,134 @@
+"""What nets put out, in pixels of the picture: every known form, by numbers made by hand."""
+
+import numpy as np
+import pytest
+
+from worldpose.detection import DetectionSettings, Poses, load_detectors, weights_of
+from worldpose.detection.crops import crop_frames, cut_crops, in_picture
+from worldpose.detection.mirrored import SIDES, Mirrored
+from worldpose.detection.onnx_detectors import _corners, _grid, _multipose
+from worldpose.detection.onnx_pose import _read, from_heat_maps
+from worldpose.errors import InputError
+
+# A box whose outer edges are 10, 20, 30 and 60: pixels 10 to 29 and 20 to 59.
+BOX = [9.5, 19.5, 29.5, 59.5]
+
+
+def test_yolo_boxes_are_people_with_a_good_score():
+    version_8 = np.array([[20, 40, 20, 40, 0.9, 0.1], [80, 40, 20, 40, 0.01, 0.9]], float)
+    found = _grid(version_8, with_object=False)
+    np.testing.assert_allclose(found.boxes, [BOX])
+    assert found.scores.tolist() == [0.9]
+    version_5 = np.array([[20, 40, 20, 40, 0.5, 0.9, 0.1]], float)
+    assert _grid(version_5, with_object=True).scores.tolist() == [0.45]
+    ended = np.array([[10, 20, 30, 60, 0.8, 0], [50, 20, 70, 60, 0.8, 32]], float)
+    np.testing.assert_allclose(_corners(ended).boxes, [BOX])
+
+
+def test_movenet_s_box_stands_behind_its_keypoints():
+    row = np.zeros((1, 56))
+    row[0, 51:] = [20 / 96, 10 / 192, 60 / 96, 30 / 192, 0.7]
+    found = _multipose(row, (192, 96))
+    np.testing.assert_allclose(found.boxes, [BOX])
+    assert found.scores.tolist() == [0.7]
+
+
+def test_a_crop_shows_the_box_and_its_points_come_back():
+    picture = np.zeros((400, 600, 3), dtype=np.uint8)
+    rng = np.random.default_rng(2)
+    for size in (20, 90, 300):  # enlarged, reduced a little and much
+        x, y = rng.uniform([200, 180], [260, 200])
+        column, row = int(x + 0.5 * size * 0.4), int(y)
+        picture[:] = 0
+        picture[row - 6 : row + 7, column - 6 : column + 7] = 255  # a square around the point
+        box = np.array([[x - size * 0.2, y - size / 2, x + size * 0.2, y + size / 2]])
+        frames = crop_frames(box, (48, 64), 1.25)
+        crop = cut_crops(picture, frames, (48, 64))[0, ..., 0].astype(float)
+        middle = np.array(
+            [
+                np.average(np.arange(48), weights=crop.sum(0)),
+                np.average(np.arange(64), weights=crop.sum(1)),
+            ]
+        )
+        back = in_picture(middle[None, None], frames)[0, 0]
+        if crop[0].any() or crop[-1].any() or crop[:, 0].any() or crop[:, -1].any():
+            continue  # the square reaches over the crop: its middle is another
+        # A fifth of a crop's pixel: the square's hard edges are sampled twice.
+        np.testing.assert_allclose(back, [column, row], atol=0.2 * max(1.0, frames[0, 2]))
+
+
+def test_a_crop_beyond_the_border_is_filled():
+    picture = np.full((50, 60, 3), 200, dtype=np.uint8)
+    frames = crop_frames(np.array([[500.0, 500, 540, 580], [-20.0, 10, 20, 40]]), (48, 64), 1.25)
+    crops = cut_crops(picture, frames, (48, 64), fill=7)
+    assert (crops[0] == 7).all()
+    assert {7, 200} <= set(np.unique(crops[1]))
+
+
+def test_the_forms_of_pose_nets_give_the_same_point():
+    size = (48, 64)
+    single = np.zeros((1, 1, 17, 3))
+    single[..., 0], single[..., 1], single[..., 2] = 20 / 64, 10 / 48, 0.8
+    points, confidence = _read([single], size)
+    np.testing.assert_allclose(points[0, 0], [10.0, 20.0])
+    assert confidence[0, 0] == pytest.approx(0.8)
+    across, down = np.zeros((1, 17, 96)), np.zeros((1, 17, 128))
+    across[..., 20], down[..., 40] = 0.8, 0.9
+    points, confidence = _read([across, down], size)
+    np.testing.assert_allclose(points[0, 0], [10.0, 20.0])
+    assert confidence[0, 0] == pytest.approx(0.8)
+
+
+def test_a_heat_map_s_peak_lies_between_cells():
+    size, true = (48, 64), np.array([17.3, 40.9])
+    y, x = np.mgrid[:16, :12]
+    cell = (true + 0.5) / 4.0 - 0.5
+    maps = np.exp(-((x - cell[0]) ** 2 + (y - cell[1]) ** 2) / (2 * 1.5**2))
+    points, height = from_heat_maps(np.broadcast_to(maps, (1, 17, 16, 12)), size)
+    # Of a Gaussian the parabola through three logarithms is exact.
+    np.testing.assert_allclose(points[0, 3], true, atol=1e-6)
+    assert 0.9 < height[0, 0] <= 1.0
+
+
+class Leaning:
+    """Sees joint j at column 10 j of the box, `late` px too far right; no wrists to the left."""
+
+    def estimate(self, picture, boxes):
+        columns = np.where(picture[0, 0, 0] == 1, 10.0 * np.arange(17), 10.0 * np.array(SIDES))
+        sign = 1.0 if picture[0, 0, 0] == 1 else -1.0  # the first column is marked
+        start = boxes[:, 0] if sign > 0 else boxes[:, 2]
+        x = start[:, None] + sign * columns + 2.0
+        confidence = np.full(x.shape, 0.8 if sign > 0 else 0.4)
+        confidence[:, 9] = np.nan
+        keypoints = np.stack([x, np.repeat(boxes[:, 1:2], 17, axis=1)], axis=2)
+        keypoints[:, 9] = np.nan
+        return Poses(keypoints, confidence)
+
+
+def test_what_leans_to_one_side_is_set_right_by_the_mirror():
+    picture = np.zeros((50, 300, 3), dtype=np.uint8)
+    picture[0, 0] = 1
+    boxes = np.array([[20.0, 5.0, 100.0, 45.0]])
+    poses = Mirrored(Leaning()).estimate(picture, boxes)
+    expected = 20.0 + 10.0 * np.arange(17) + (0.8 * 2.0 - 0.4 * 2.0) / 1.2
+    expected[9] = 20.0 + 90.0 - 2.0  # seen in the mirror alone, and the other in the picture
+    expected[10] = 20.0 + 100.0 + 2.0
+    np.testing.assert_allclose(poses.keypoints[0, :, 0], expected)
+    np.testing.assert_allclose(poses.keypoints[0, :, 1], 5.0)
+    assert poses.confidence[0, [0, 9, 10]].tolist() == pytest.approx([0.6, 0.4, 0.8])
+
+
+@pytest.mark.parametrize("name", ["yolo", "onnx:", "transformers"])
+def test_an_unknown_name_of_a_net_is_refused(name):
+    with pytest.raises(InputError, match="onnx:FILE"):
+        weights_of(DetectionSettings(detector=name))
+
+
+def test_a_file_that_is_no_net_is_refused(tmp_path):
+    pytest.importorskip("onnxruntime")
+    file = tmp_path / "net.onnx"
+    file.write_bytes(b"none")
+    with pytest.raises(InputError, match="ONNX file"):
+        load_detectors(DetectionSettings(detector=f"onnx:{file}"))
+    with pytest.raises(InputError, match="nothing"):
+        weights_of(DetectionSettings(detector=f"onnx:{tmp_path / 'other.onnx'}"))

@@ -1,0 +1,130 @@
+"""Videos as recorders leave them: a number that is read is the number that was burnt in."""
+
+from fractions import Fraction
+
+import av
+import numpy as np
+import pytest
+
+from worldpose.errors import InputError
+from worldpose.ingest.stills import write_still
+from worldpose.video import index_video, open_video
+
+SIZE = (48, 64)
+
+
+def numbered(count):
+    """Grey pictures whose left half tells their number in steps of 4, the codec's error below 2."""
+    pictures = np.full((count, *SIZE, 3), 128, dtype=np.uint8)
+    pictures[:, :, :32] = (10 + 4 * np.arange(count, dtype=np.uint8))[:, None, None, None]
+    return pictures
+
+
+def number_of(picture):
+    return round((float(picture[4:40, 4:28].mean()) - 10.0) / 4.0)
+
+
+def encode(path, stamps, *, rotation=None, container_options=None):
+    """H.264 with B-frames and a key frame every 10, shown at `stamps` [ms]."""
+    with av.open(str(path), "w", options=container_options or {}) as container:
+        options = {"crf": "5", "bf": "2", "g": "10", "sc_threshold": "0"}
+        stream = container.add_stream("libx264", rate=25, options=options)
+        stream.height, stream.width, stream.pix_fmt = *SIZE, "yuv420p"
+        stream.codec_context.time_base = Fraction(1, 1000)
+        if rotation is not None:
+            stream.set_display_rotation(rotation)
+        for picture, stamp in zip(numbered(len(stamps)), stamps, strict=True):
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame.pts, frame.time_base = int(stamp), Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+def numbers_read(path, start=0, stop=None):
+    with open_video(path) as video:
+        return [
+            (number, None if picture is None else number_of(picture))
+            for number, picture in video.readable(start, stop)
+        ]
+
+
+def test_pictures_that_predict_from_later_ones_come_in_the_order_shown(tmp_path):
+    path = encode(tmp_path / "b.mp4", 40 * np.arange(30))
+    with av.open(str(path)) as container:
+        stamps = [packet.pts for packet in container.demux(video=0) if packet.size]
+    assert stamps != sorted(stamps)  # stored in another order: there are B-frames
+    assert numbers_read(path, 13, 22) == [(n, n) for n in range(13, 22)]
+
+
+def test_a_dropped_picture_leaves_its_frame_empty_and_shifts_none(tmp_path):
+    shown = np.delete(np.arange(30), [11, 12])
+    index = index_video(encode(tmp_path / "dropped.mkv", 40 * shown))
+    expected = np.full(30, -1)
+    expected[shown] = np.arange(28)
+    assert index.on_clock(25.0, "dropped").tolist() == expected.tolist()
+
+
+def test_uneven_times_count_for_the_nearest_frame(tmp_path):
+    rng = np.random.default_rng(4)
+    jitter = rng.integers(-15, 16, 30)  # a frame is 40 ms long: all stay nearest to their own
+    jitter[0] = 0
+    index = index_video(encode(tmp_path / "uneven.mkv", 40 * np.arange(30) + jitter))
+    assert index.on_clock(25.0, "uneven").tolist() == list(range(30))
+
+
+def test_a_video_of_another_rate_is_refused(tmp_path):
+    index = index_video(encode(tmp_path / "slow.mp4", 80 * np.arange(20)))
+    with pytest.raises(InputError, match="25 frames a second"):
+        index.on_clock(25.0, "slow")
+
+
+@pytest.mark.parametrize("rotation", [90, 180, 270])
+def test_a_turned_camera_s_pictures_stand_upright(tmp_path, rotation):
+    path = encode(tmp_path / "turned.mp4", 40 * np.arange(12), rotation=rotation)
+    with open_video(path) as video:
+        pictures = [picture for _, picture in video.readable()]
+    upright = np.rot90(numbered(12)[7], round(rotation / 90))
+    assert pictures[7].shape == upright.shape
+    assert video.index.size == upright.shape[1::-1]
+    assert np.abs(pictures[7].astype(int) - upright).mean() < 3.0  # the codec's error
+
+
+def test_a_file_cut_off_ends_early_and_says_where(tmp_path):
+    whole = encode(
+        tmp_path / "whole.mp4", 40 * np.arange(50), container_options={"movflags": "faststart"}
+    )
+    cut = tmp_path / "cut.mp4"
+    cut.write_bytes(whole.read_bytes()[: int(0.7 * whole.stat().st_size)])
+    read = numbers_read(cut)
+    good = [number for number, found in read if found is not None]
+    assert 10 <= len(good) < 50
+    assert all(found == number for number, found in read if found is not None)
+    # What is whole on disk is whole: nothing before the cut is lost but the last group's rest.
+    assert good[: len(good) // 10 * 10] == list(range(len(good) // 10 * 10))
+
+
+def test_a_damaged_stretch_is_missing_up_to_the_next_key_frame(tmp_path):
+    path = encode(tmp_path / "damaged.mp4", 40 * np.arange(50))
+    with av.open(str(path)) as container:
+        places = [p.pos for p in container.demux(video=0) if p.size and p.is_keyframe]
+    content = bytearray(path.read_bytes())
+    content[places[1] + 12 : places[1] + 72] = bytes(60)  # in the group of frames 10 to 19
+    path.write_bytes(content)
+    read = dict(numbers_read(path))
+    assert [read[n] for n in range(10)] == list(range(10))
+    assert [read[n] for n in range(10, 20)] == [None] * 10
+    assert [read[n] for n in range(20, 50)] == list(range(20, 50))
+
+
+def test_images_count_by_their_numbers_and_a_gap_is_a_missing_frame(tmp_path):
+    for number in (7, 8, 10):
+        write_still(tmp_path / f"frame_{number:03d}.png", numbered(11)[number])
+    assert index_video(tmp_path).on_clock(25.0, "images").tolist() == [0, 1, -1, 2]
+    assert numbers_read(tmp_path) == [(0, 7), (1, 8), (2, 10)]
+
+
+def test_images_without_numbers_are_refused(tmp_path):
+    write_still(tmp_path / "first.png", numbered(1)[0])
+    with pytest.raises(InputError, match="end in numbers"):
+        index_video(tmp_path)

@@ -1,0 +1,25 @@
+"""Detection: the people of each camera's pictures, with boxes and keypoints (D1-D3).
+
+Inputs: pictures in order, detectors and a pose estimator, the calibrated camera and the pitch.
+Outputs: `Stretch`es of boxes, scores, keypoints and confidences; the crowd is left out.
+"""
+
+from worldpose.detection.interfaces import Detector, People, PoseEstimator, Poses
+from worldpose.detection.models import load_detectors, load_pose, weights_of
+from worldpose.detection.people import DetectionReport, PeopleFinder, Place, Stretch
+from worldpose.detection.settings import DetectionSettings
+
+__all__ = [
+    "DetectionReport",
+    "DetectionSettings",
+    "Detector",
+    "People",
+    "PeopleFinder",
+    "Place",
+    "PoseEstimator",
+    "Poses",
+    "Stretch",
+    "load_detectors",
+    "load_pose",
+    "weights_of",
+]

@@ -1,0 +1,58 @@
+"""Who stands on the pitch, and who watches from outside (D2)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.cameras import Camera
+from worldpose.pitch import PitchTemplate
+
+Floats = NDArray[np.float64]
+
+HEAD_HEIGHT: Final = 1.75
+"""Of a person whose feet the picture's lower border cuts off [m]."""
+CUT: Final = 3.0
+"""A box this near to the lower border goes on below it [px]."""
+
+
+def on_pitch(
+    boxes: Floats, camera: Camera, image_size: tuple[int, int], pitch: PitchTemplate, margin: float
+) -> NDArray[np.bool_]:
+    """Whether people stand on the pitch or close beside it (people,).
+
+    The middle of a box's lower edge is where the feet touch the ground. Whoever sits in a stand is
+    seen against ground farther away than any margin. Where the picture's border cuts the feet off,
+    the head tells: it is at a man's height above the ground.
+
+    Args:
+        boxes: (people, 4) x0, y0, x1, y1 [px].
+        camera: one camera, whose picture it is.
+        image_size: width, height [px].
+        pitch: its lines and its surface.
+        margin: how far outside of the lines is still on the pitch [m].
+    """
+    cut = boxes[:, 3] > image_size[1] - 1 - CUT
+    pixels = np.stack(
+        [boxes[:, [0, 2]].mean(axis=1), np.where(cut, boxes[:, 1], boxes[:, 3])], axis=1
+    )
+    rays = camera.unproject(pixels)
+    height = np.where(cut, HEAD_HEIGHT, 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for _ in range(3):  # the crown is flat: the second step moves by millimetres
+            along = (height - rays.origins[:, 2]) / rays.directions[:, 2]
+            points = rays.origins + along[:, None] * rays.directions
+            inside = np.isfinite(points).all(axis=1)
+            ground = pitch.height(
+                np.clip(np.where(inside, points[:, 0], 0.0), -pitch.length / 2, pitch.length / 2),
+                np.clip(np.where(inside, points[:, 1], 0.0), -pitch.width / 2, pitch.width / 2),
+            )
+            height = np.where(cut, HEAD_HEIGHT, 0.0) + ground
+        return np.asarray(
+            inside
+            & (along > 0.0)
+            & (np.abs(points[:, 0]) <= pitch.length / 2 + margin)
+            & (np.abs(points[:, 1]) <= pitch.width / 2 + margin)
+        )

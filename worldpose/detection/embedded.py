@@ -1,0 +1,176 @@
+"""The detector and the pose estimator that ship with the project, small and quick on a CPU.
+
+They were trained on rendered matches alone (infra/embedded_detector): at home there, and a
+fallback on real pictures, for which fine-tuned or larger models are meant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.detection.boxes import suppress
+from worldpose.detection.embedded_crops import crops_of_boxes, cut, picture_from_crop
+from worldpose.detection.embedded_weights import load_weights
+from worldpose.detection.interfaces import (
+    LEAST_SCORE,
+    Detector,
+    People,
+    Picture,
+    PoseEstimator,
+    Poses,
+)
+from worldpose.errors import InputError
+
+if TYPE_CHECKING:
+    import torch
+
+    from worldpose.detection.embedded_nets import KeypointNet, PeopleNet
+
+Floats = NDArray[np.float64]
+Net = TypeVar("Net", bound="torch.nn.Module")
+
+EMBEDDED: Final = (
+    Path(__file__).with_name("embedded_people.safetensors"),
+    Path(__file__).with_name("embedded_keypoints.safetensors"),
+)
+"""The shipped weights: of the detector, and of the pose estimator."""
+MOST_PEOPLE: Final = 300
+"""In one picture."""
+OVERLAP: Final = 0.7
+"""Two boxes of one person overlap by more [1, intersection over union]."""
+BATCH: Final = 16
+"""Crops computed at once, always as many: kernels for other numbers round otherwise."""
+
+
+def embedded_detector(
+    weights: Path | None = None, device: str = "cpu", half: bool = False
+) -> Detector:
+    """Return the embedded detector.
+
+    Args:
+        weights: a file of a fine-tuned version; the shipped one if None.
+        device: `cpu` or `cuda`.
+        half: compute in half precision, on a GPU only.
+
+    Raises:
+        InputError: the file is none of this detector, or torch is not installed.
+    """
+    nets = _nets()
+    net = load_weights(weights or EMBEDDED[0], nets.PeopleNet())
+    return EmbeddedDetector(net, device, half)
+
+
+def embedded_pose(
+    weights: Path | None = None, device: str = "cpu", half: bool = False
+) -> PoseEstimator:
+    """Return the embedded pose estimator; arguments and errors are those of `embedded_detector`."""
+    nets = _nets()
+    net = load_weights(weights or EMBEDDED[1], nets.KeypointNet())
+    return EmbeddedPose(net, device, half)
+
+
+class EmbeddedDetector:
+    """A net that finds the middles of people and the sides of their boxes."""
+
+    def __init__(self, net: PeopleNet, device: str = "cpu", half: bool = False) -> None:
+        self._net, self._device, self._half = _placed(net, device), device, half
+
+    @property
+    def view_size(self) -> None:
+        """None: pictures of any size, whole."""
+        return
+
+    def detect(self, pictures: Sequence[Picture]) -> list[People]:
+        """The people of each picture, computed one by one."""
+        return [self._people(picture) for picture in pictures]
+
+    def _people(self, picture: Picture) -> People:
+        import torch
+
+        from worldpose.detection.embedded_nets import COARSEST, normalised
+        from worldpose.detection.embedded_peaks import boxes_at_peaks
+
+        height, width = picture.shape[:2]
+        tall, wide = (-(-side // COARSEST) * COARSEST for side in (height, width))
+        padded = np.full((1, tall, wide, 3), 115, dtype=np.uint8)
+        padded[0, :height, :width] = picture
+        with torch.inference_mode(), _precision(self._device, self._half):
+            given = normalised(torch.from_numpy(padded).to(self._device))
+            logits, sides = self._net(given)
+            boxes, scores = boxes_at_peaks(logits[0], sides[0], LEAST_SCORE, MOST_PEOPLE)
+        found = boxes.double().cpu().numpy()
+        found = np.clip(found, -0.5, np.array([width, height, width, height]) - 0.5)
+        real = np.all(found[:, 2:] - found[:, :2] > 1.0, axis=1)
+        return suppress(People(found[real], scores.double().cpu().numpy()[real]), OVERLAP)
+
+
+class EmbeddedPose:
+    """A net that finds the joints of the person in a crop."""
+
+    def __init__(self, net: KeypointNet, device: str = "cpu", half: bool = False) -> None:
+        self._net, self._device, self._half = _placed(net, device), device, half
+
+    def estimate(self, picture: Picture, boxes: NDArray[np.float64]) -> Poses:
+        """The pose of each box; confidence is the chance that a keypoint is right.
+
+        Right is within a twentieth of the box's longer side, about a fifth of a torso.
+        """
+        import torch
+
+        from worldpose.detection.embedded_nets import CROP, JOINTS, normalised, peaks
+
+        keypoints = np.full((len(boxes), JOINTS, 2), np.nan)
+        confidence = np.full((len(boxes), JOINTS), np.nan)
+        maps = [picture_from_crop(crop, CROP) for crop in crops_of_boxes(boxes, CROP)]
+        for start in range(0, len(maps), BATCH):
+            part = maps[start : start + BATCH]
+            crops = np.zeros((BATCH, CROP[1], CROP[0], 3), dtype=np.uint8)
+            for index, mapping in enumerate(part):
+                crops[index] = cut(picture, mapping, CROP)
+            with torch.inference_mode(), _precision(self._device, self._half):
+                logits, doubt = self._net(normalised(torch.from_numpy(crops).to(self._device)))
+                at, mass = peaks(logits)
+                sure = torch.sigmoid(self._net.sureness(doubt, mass))
+            pixels = at.double().cpu().numpy()
+            for index, mapping in enumerate(part):
+                keypoints[start + index] = pixels[index] @ mapping[:, :2].T + mapping[:, 2]
+            confidence[start : start + BATCH] = sure.double().cpu().numpy()[: len(part)]
+        return Poses(keypoints, np.clip(confidence, 1e-3, 1.0))
+
+
+def _nets() -> ModuleType:
+    """The module of the nets, which needs torch."""
+    try:
+        from worldpose.detection import embedded_nets
+    except ImportError as error:
+        raise InputError(
+            "embedded detector",
+            expected="torch and safetensors",
+            found=str(error),
+            todo="Install worldpose[detectors].",
+        ) from error
+    return embedded_nets
+
+
+def _placed(net: Net, device: str) -> Net:
+    """The net on a device, its normalisations folded into convolutions."""
+    import torch
+
+    from worldpose.detection.embedded_nets import folded
+
+    placed = folded(net.eval()).to(device)
+    placed.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return placed
+
+
+def _precision(device: str, half: bool) -> AbstractContextManager[torch.autocast]:
+    import torch
+
+    return torch.autocast(device, torch.float16, enabled=half)

@@ -1,0 +1,96 @@
+"""Crops of a fixed size around boxes, and the way back from their pixels."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+MARGIN: Final = 1.25
+"""Size of a crop over that of the box it shows [1]: keypoints may lie outside of a box."""
+
+
+def crops_of_boxes(boxes: Floats, size: tuple[int, int], margin: float = MARGIN) -> Floats:
+    """Return the crops (people, 3) that show boxes whole: middle x, y [px], picture px a crop px.
+
+    Args:
+        boxes: (people, 4) x0, y0, x1, y1 [px].
+        size: width, height of a crop [px].
+        margin: size of the crop over that of the box.
+    """
+    sides = boxes[:, 2:] - boxes[:, :2]
+    scale = margin * np.max(sides / np.array(size), axis=1)
+    middle = 0.5 * (boxes[:, :2] + boxes[:, 2:])
+    return np.column_stack([middle, np.maximum(scale, 1e-3)])
+
+
+def picture_from_crop(
+    crop: Floats, size: tuple[int, int], turn: float = 0.0, mirrored: bool = False
+) -> Floats:
+    """Return the affine map (2, 3) from pixels of a crop to pixels of the picture.
+
+    Args:
+        crop: (3,) as of `crops_of_boxes`.
+        size: width, height of the crop [px].
+        turn: of the crop within the picture, from x to y [rad].
+        mirrored: left is right in the crop.
+    """
+    x, y, scale = crop
+    cos, sin = scale * np.cos(turn), scale * np.sin(turn)
+    linear = np.array([[cos, -sin], [sin, cos]])
+    if mirrored:
+        linear[:, 0] *= -1.0
+    middle = 0.5 * (np.array(size) - 1.0)
+    return np.column_stack([linear, np.array([x, y]) - linear @ middle])
+
+
+def cut(
+    picture: NDArray[np.uint8], mapping: Floats, size: tuple[int, int], outside: int = 115
+) -> NDArray[np.uint8]:
+    """Return a crop (height, width, 3); what lies outside of the picture is grey.
+
+    Args:
+        picture: (height, width, 3).
+        mapping: (2, 3) from pixels of the crop to those of the picture.
+        size: width, height of the crop [px].
+        outside: level of what is outside [of 255].
+    """
+    shrink = np.sqrt(abs(np.linalg.det(mapping[:, :2])))
+    if shrink > 2.0:
+        # Bilinear reading alone would skip pixels.
+        picture, mapping = _shrunk(picture, mapping, int(shrink), size)
+    return np.asarray(
+        cv2.warpAffine(
+            picture,
+            mapping,
+            size,
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=(outside, outside, outside),
+        ),
+        dtype=np.uint8,
+    )
+
+
+def _shrunk(
+    picture: NDArray[np.uint8], mapping: Floats, factor: int, size: tuple[int, int]
+) -> tuple[NDArray[np.uint8], Floats]:
+    """Return the part of a picture that a crop shows, shrunk by a whole number, and its map."""
+    corners = np.array([[0.0, 0.0], [size[0], 0.0], [0.0, size[1]], [*size]])
+    seen = corners @ mapping[:, :2].T + mapping[:, 2]
+    high = np.array([picture.shape[1], picture.shape[0]])
+    low = np.clip(np.floor(seen.min(axis=0)) - factor, 0, high - 1).astype(int)
+    end = np.clip(np.ceil(seen.max(axis=0)) + factor, low + 1, high).astype(int)
+    cells = -(-(end - low) // factor)
+    part = picture[low[1] : end[1], low[0] : end[0]]
+    if part.shape[1] < factor or part.shape[0] < factor:
+        return part, np.column_stack([mapping[:, :2], mapping[:, 2] - low])
+    below, beside = cells[::-1] * factor - part.shape[:2]
+    whole = np.pad(part, ((0, below), (0, beside), (0, 0)), mode="edge")
+    small = np.asarray(cv2.resize(whole, cells.tolist(), interpolation=cv2.INTER_AREA), np.uint8)
+    moved = (mapping[:, 2] - low - 0.5 * (factor - 1)) / factor
+    return small, np.column_stack([mapping[:, :2] / factor, moved])

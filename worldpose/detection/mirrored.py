@@ -1,0 +1,38 @@
+"""Poses looked at twice, as they are and in the mirror: errors of one side cancel."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.detection.interfaces import Picture, PoseEstimator, Poses
+
+SIDES: Final = (0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15)
+"""The joint of COCO-17 that each joint is in the mirror."""
+
+
+class Mirrored:
+    """An estimator whose poses are the mean of what it sees in a picture and in its mirror image.
+
+    Means are weighted by confidence; a keypoint that only one of the two shows is taken from it.
+    """
+
+    def __init__(self, estimator: PoseEstimator) -> None:
+        self._estimator = estimator
+
+    def estimate(self, picture: Picture, boxes: NDArray[np.float64]) -> Poses:
+        """The pose of each box."""
+        last = picture.shape[1] - 1
+        seen = self._estimator.estimate(picture, boxes)
+        turned = boxes[:, [2, 1, 0, 3]] * [-1.0, 1.0, -1.0, 1.0] + [last, 0.0, last, 0.0]
+        mirror = self._estimator.estimate(np.ascontiguousarray(picture[:, ::-1]), turned)
+        back = mirror.keypoints[:, SIDES] * [-1.0, 1.0] + [last, 0.0]
+        both = np.stack([seen.keypoints, back])
+        weights = np.nan_to_num(np.stack([seen.confidence, mirror.confidence[:, SIDES]]))
+        total = weights.sum(axis=0)
+        found = total > 0.0
+        mean = np.nansum(both * weights[..., None], axis=0) / np.where(found, total, 1.0)[..., None]
+        confidence = total / np.maximum((weights > 0.0).sum(axis=0), 1)
+        return Poses(np.where(found[..., None], mean, np.nan), np.where(found, confidence, np.nan))

@@ -1,0 +1,118 @@
+"""Detectors and pose estimators by their names in the settings, and digests of their weights."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Final
+
+from worldpose.detection.interfaces import Detector, PoseEstimator
+from worldpose.detection.mirrored import Mirrored
+from worldpose.detection.settings import DetectionSettings
+from worldpose.errors import InputError
+from worldpose.ingest.registration import digest_of_files
+
+LIBRARIES: Final = {
+    "embedded": ("torch",),
+    "transformers": ("torch", "transformers"),
+    "onnx": ("onnxruntime",),
+}
+"""What computes each kind of net, and so decides what it finds."""
+
+
+def load_detectors(settings: DetectionSettings) -> list[Detector]:
+    """The detectors that the settings name.
+
+    Raises:
+        InputError: an unknown kind, weights that are not there or not as expected, or a library
+            that is not installed.
+    """
+    return [_detector(name, settings) for name in settings.detector]
+
+
+def load_pose(settings: DetectionSettings) -> PoseEstimator:
+    """The pose estimator that the settings name; raises as `load_detectors`."""
+    estimator = _pose(settings)
+    return Mirrored(estimator) if settings.mirrored else estimator
+
+
+def _pose(settings: DetectionSettings) -> PoseEstimator:
+    kind, path = _parted(settings.pose)
+    if kind == "embedded":
+        from worldpose.detection.embedded import embedded_pose
+
+        return embedded_pose(path, settings.device, settings.half)
+    assert path is not None  # as parted
+    if kind == "onnx":
+        from worldpose.detection.onnx_pose import onnx_pose
+
+        return onnx_pose(path, settings.device)
+    from worldpose.detection.transformers_models import transformers_pose
+
+    return transformers_pose(path, settings.device, settings.half)
+
+
+def _detector(name: str, settings: DetectionSettings) -> Detector:
+    kind, path = _parted(name)
+    if kind == "embedded":
+        from worldpose.detection.embedded import embedded_detector
+
+        return embedded_detector(path, settings.device, settings.half)
+    assert path is not None  # as parted
+    if kind == "onnx":
+        from worldpose.detection.onnx_detectors import onnx_detector
+
+        return onnx_detector(path, settings.device)
+    from worldpose.detection.transformers_models import transformers_detector
+
+    return transformers_detector(path, settings.device, settings.half)
+
+
+def weights_of(settings: DetectionSettings) -> dict[str, str | None]:
+    """SHA-256 of the weights that the settings name, by name, and versions of what computes them.
+
+    The embedded weights are part of the code.
+
+    Raises:
+        InputError: an unknown kind, or weights that are not there.
+    """
+    names = (*settings.detector, settings.pose)
+    found: dict[str, str | None] = {}
+    for name in names:
+        kind, path = _parted(name)
+        found[name] = None if path is None else digest_of_weights(path)
+        for library in LIBRARIES[kind]:
+            try:
+                found[library] = version(library)
+            except PackageNotFoundError:
+                found[library] = None
+    return found
+
+
+def digest_of_weights(path: Path) -> str:
+    """SHA-256 of a file, or of all files of a folder with their names.
+
+    Raises:
+        InputError: it is not there.
+    """
+    if not path.exists():
+        raise InputError(
+            str(path),
+            expected="the weights that detection.detector or detection.pose names",
+            found="nothing",
+            todo="Put them there, or correct the name. Relative names begin where you are.",
+        )
+    return digest_of_files(path)
+
+
+def _parted(name: str) -> tuple[str, Path | None]:
+    """The kind of a model, and where its weights lie; None for those that ship."""
+    kind, colon, path = name.partition(":")
+    if kind not in LIBRARIES or (colon and not path) or (kind != "embedded" and not path):
+        raise InputError(
+            f"detection: {name!r}",
+            expected="embedded, embedded:FILE, transformers:FOLDER or onnx:FILE",
+            found=repr(name),
+            todo="Correct detection.detector or detection.pose.",
+        )
+    return kind, Path(path).expanduser().resolve() if path else None

@@ -1,0 +1,239 @@
+"""People of one camera's video: boxes, then keypoints, a stretch of frames at a time (D1-D3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17_SIGMAS
+from worldpose.cameras import Camera
+from worldpose.detection.boxes import areas, fuse, suppress
+from worldpose.detection.crowd import on_pitch
+from worldpose.detection.followed import Follower, looked_at
+from worldpose.detection.interfaces import Detector, People, Picture, PoseEstimator, Poses
+from worldpose.detection.settings import DetectionSettings
+from worldpose.detection.views import Tiled
+from worldpose.pitch import PitchTemplate
+
+Floats = NDArray[np.float64]
+
+STRETCH: Final = 64
+"""Frames of a stretch."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """People in some neighbouring frames, in the form of given 2D poses.
+
+    Attributes:
+        keypoints: (frames, most_people, 17, 2) float32 [px]; NaN where not found.
+        confidence: (frames, most_people, 17) float32.
+        boxes: (frames, most_people, 4) float32 [px].
+        score: (frames, most_people) float32.
+        unreadable: frame numbers without a picture.
+    """
+
+    keypoints: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    boxes: NDArray[np.float32]
+    score: NDArray[np.float32]
+    unreadable: tuple[int, ...]
+
+    def arrays(self) -> dict[str, NDArray[np.float32]]:
+        """By name, as they are stored."""
+        return {
+            "keypoints": self.keypoints,
+            "confidence": self.confidence,
+            "boxes": self.boxes,
+            "score": self.score,
+        }
+
+
+@dataclass
+class DetectionReport:
+    """What happened on the way; complete when the last stretch has come.
+
+    Attributes:
+        frames: that were asked for.
+        unreadable: without a picture.
+        empty: with a picture, and nobody in it.
+        detections: people in all frames.
+        crowd: boxes outside of the pitch.
+        bridged: boxes that were filled in.
+        flickers: boxes of tracks seen too seldom.
+        unsure: people without a single keypoint, or the second of one pose.
+    """
+
+    frames: int = 0
+    unreadable: int = 0
+    empty: int = 0
+    detections: int = 0
+    crowd: int = 0
+    bridged: int = 0
+    flickers: int = 0
+    unsure: int = 0
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a camera stands, so that the crowd can be told from the players.
+
+    Attributes:
+        camera: the calibrated camera.
+        pitch: what it looks at.
+    """
+
+    camera: Camera
+    pitch: PitchTemplate
+
+
+class PeopleFinder:
+    """Detectors, an estimator and settings, for the videos of a match.
+
+    Attributes:
+        report: of the video that was gone through last.
+    """
+
+    def __init__(
+        self, detectors: Sequence[Detector], estimator: PoseEstimator, settings: DetectionSettings
+    ) -> None:
+        """Put them together.
+
+        Args:
+            detectors: one, or an ensemble.
+            estimator: finds keypoints in their boxes.
+            settings: of the stage.
+        """
+        self._detectors = [
+            detector
+            if detector.view_size is None
+            else Tiled(detector, settings.zooms, settings.view_overlap, settings.overlap)
+            for detector in detectors
+        ]
+        self._estimator, self._settings = estimator, settings
+        self.report = DetectionReport()
+
+    def find(
+        self, frames: Iterable[tuple[int, Picture | None]], place: Place | None = None
+    ) -> Iterator[Stretch]:
+        """Yield the people of a video, stretch by stretch.
+
+        Args:
+            frames: numbers that rise by one, each with its picture; None where there is none.
+            place: where the camera stands; None keeps everybody.
+        """
+        self.report = DetectionReport()
+        follower = Follower(self._settings)
+        looked = looked_at(
+            frames,
+            lambda pictures: self._people(pictures, place),
+            self._settings.stride,
+            self._settings.batch,
+        )
+        rows: list[tuple[People, Poses]] = []
+        unreadable: list[int] = []
+        for number, picture, people in follower.follow(looked):
+            if picture is None:
+                unreadable.append(number)
+                rows.append((_nobody(), Poses(np.empty((0, 17, 2)), np.empty((0, 17)))))
+            else:
+                rows.append(self._posed(picture, people))
+            if len(rows) == STRETCH:
+                yield self._stretch(rows, unreadable)
+        if rows:
+            yield self._stretch(rows, unreadable)
+        self.report.bridged, self.report.flickers = follower.bridged, follower.flickers
+
+    def _people(self, pictures: list[Picture], place: Place | None) -> list[People]:
+        """Who is on the pitch in each picture."""
+        settings = self._settings
+        found = [detector.detect(pictures) for detector in self._detectors]
+        everybody = []
+        for members in zip(*found, strict=True):
+            if settings.fusion == "weighted":
+                people = fuse(list(members), settings.overlap)
+            else:
+                together = People(
+                    np.concatenate([member.boxes for member in members]),
+                    np.concatenate([member.scores for member in members]),
+                )
+                people = suppress(together, settings.overlap)
+            kept = (people.scores >= settings.doubtful) & (areas(people.boxes) > 0.0)
+            people = People(people.boxes[kept], people.scores[kept])
+            if place is not None:
+                size = (pictures[0].shape[1], pictures[0].shape[0])
+                inside = on_pitch(
+                    people.boxes, place.camera, size, place.pitch, settings.pitch_margin_m
+                )
+                self.report.crowd += int(np.count_nonzero(~inside))
+                people = People(people.boxes[inside], people.scores[inside])
+            everybody.append(people)
+        return everybody
+
+    def _posed(self, picture: Picture, people: People) -> tuple[People, Poses]:
+        """Keypoints of everybody; who has none, or the pose of somebody better, is not kept."""
+        poses = self._estimator.estimate(picture, people.boxes)
+        with np.errstate(invalid="ignore"):
+            found = (poses.confidence >= self._settings.least_keypoint) & np.isfinite(
+                poses.keypoints
+            ).all(axis=2)
+        confidence = np.where(found, poses.confidence, np.nan)
+        keypoints = np.where(found[..., None], poses.keypoints, np.nan)
+        alike = likeness(keypoints, areas(people.boxes)) > self._settings.same_pose
+        kept = np.zeros(len(people.scores), dtype=np.bool_)
+        order = np.argsort(-people.scores, kind="stable")
+        for row in order:
+            kept[row] = found[row].any() and not alike[row, kept].any()
+        self.report.unsure += int(np.count_nonzero(~kept))
+        best = np.sort(order[kept[order]][: self._settings.most_people])
+        return (
+            People(people.boxes[best], people.scores[best]),
+            Poses(keypoints[best], confidence[best]),
+        )
+
+    def _stretch(self, rows: list[tuple[People, Poses]], unreadable: list[int]) -> Stretch:
+        shape = (len(rows), self._settings.most_people)
+        stretch = Stretch(
+            keypoints=np.full((*shape, 17, 2), np.nan, dtype=np.float32),
+            confidence=np.full((*shape, 17), np.nan, dtype=np.float32),
+            boxes=np.full((*shape, 4), np.nan, dtype=np.float32),
+            score=np.full(shape, np.nan, dtype=np.float32),
+            unreadable=tuple(unreadable),
+        )
+        for row, (people, poses) in enumerate(rows):
+            count = len(people.scores)
+            stretch.keypoints[row, :count] = poses.keypoints
+            stretch.confidence[row, :count] = poses.confidence
+            stretch.boxes[row, :count] = people.boxes
+            stretch.score[row, :count] = people.scores
+            self.report.detections += count
+        self.report.frames += len(rows)
+        self.report.unreadable += len(unreadable)
+        self.report.empty += sum(not len(people.scores) for people, _ in rows) - len(unreadable)
+        rows.clear()
+        unreadable.clear()
+        return stretch
+
+
+def likeness(keypoints: Floats, area: Floats) -> Floats:
+    """COCO's object keypoint similarity of every pair of poses (people, people) [1].
+
+    Args:
+        keypoints: (people, 17, 2) [px]; NaN where not found.
+        area: (people,) of their boxes [px^2]; the smaller of a pair counts.
+    """
+    apart = np.square(keypoints[:, None] - keypoints[None]).sum(axis=3)
+    scale = 2.0 * np.minimum(area[:, None], area[None])[..., None]
+    alike = np.exp(-apart / (scale * (2.0 * np.array(COCO17_SIGMAS)) ** 2))
+    both = np.isfinite(apart)
+    count = both.sum(axis=2)
+    total = np.where(both, alike, 0.0).sum(axis=2)
+    return np.asarray(np.divide(total, count, out=np.zeros_like(total), where=count > 0))
+
+
+def _nobody() -> People:
+    return People(np.empty((0, 4)), np.empty(0))

@@ -1,0 +1,191 @@
+"""RT-DETR, RT-DETRv2, D-FINE and ViTPose from a folder that transformers saved; nothing is fetched.
+
+Weights are read from safetensors alone: a pickle could run anything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.detection.interfaces import (
+    LEAST_SCORE,
+    Detector,
+    People,
+    Picture,
+    PoseEstimator,
+    Poses,
+)
+from worldpose.errors import InputError
+
+DETECTORS: Final = ("rt_detr", "rt_detr_v2", "d_fine", "detr")
+"""Kinds of detectors, by `model_type` of config.json."""
+POSES: Final = ("vitpose",)
+"""Kinds of pose estimators."""
+PERSON: Final = 0
+"""Class of people where the checkpoint does not name its classes."""
+
+
+def transformers_detector(folder: Path, device: str = "cpu", half: bool = False) -> Detector:
+    """A detector of people from a saved checkpoint.
+
+    Args:
+        folder: with config.json, model.safetensors and preprocessor_config.json.
+        device: `cpu` or `cuda`.
+        half: compute in half precision, on a GPU alone.
+
+    Raises:
+        InputError: transformers is not there, or no GPU, or the folder holds no such detector.
+    """
+    return _TransformersDetector(folder, device, half)
+
+
+def transformers_pose(folder: Path, device: str = "cpu", half: bool = False) -> PoseEstimator:
+    """A ViTPose from a saved checkpoint; arguments and errors are those of the detector."""
+    return _TransformersPose(folder, device, half)
+
+
+class _TransformersDetector:
+    """A net of the DETR family."""
+
+    def __init__(self, folder: Path, device: str, half: bool) -> None:
+        self._torch, library = _libraries(folder)
+        kind = _kind(folder, library, DETECTORS)
+        # The processors without a suffix ask for torchvision.
+        named = library.DetrImageProcessorPil if kind == "detr" else library.RTDetrImageProcessorPil
+        self._processor = _loaded(folder, named)
+        net = _loaded(folder, library.AutoModelForObjectDetection, use_safetensors=True)
+        self._net = _placed(net, self._torch, folder, device, half)
+        self._device, self._half = device, half
+        self._person = next(
+            (number for number, name in net.config.id2label.items() if name.lower() == "person"),
+            PERSON,
+        )
+        size = self._processor.size
+        self._size = (int(size.get("width", 640)), int(size.get("height", 640)))
+
+    @property
+    def view_size(self) -> tuple[int, int]:
+        """What the processor scales pictures to."""
+        return self._size
+
+    def detect(self, pictures: Sequence[Picture]) -> list[People]:
+        """The people of each picture."""
+        people = []
+        for picture in pictures:  # alone: kernels for other batches round otherwise
+            given = _tensors(self._processor([picture], return_tensors="pt"), self)
+            with self._torch.inference_mode():
+                outputs = self._net(**given)
+            outputs.logits, outputs.pred_boxes = outputs.logits.float(), outputs.pred_boxes.float()
+            (found,) = self._processor.post_process_object_detection(
+                outputs, threshold=LEAST_SCORE, target_sizes=[picture.shape[:2]]
+            )
+            person = (found["labels"] == self._person).cpu().numpy()
+            boxes = found["boxes"].cpu().numpy().astype(np.float64)[person] - 0.5
+            scores = found["scores"].cpu().numpy().astype(np.float64)[person]
+            people.append(People(boxes, scores))
+        return people
+
+
+class _TransformersPose:
+    """A ViTPose."""
+
+    def __init__(self, folder: Path, device: str, half: bool) -> None:
+        self._torch, library = _libraries(folder)
+        _kind(folder, library, POSES)
+        self._processor = _loaded(folder, library.VitPoseImageProcessorPil)
+        net = _loaded(folder, library.VitPoseForPoseEstimation, use_safetensors=True)
+        self._net = _placed(net, self._torch, folder, device, half)
+        self._device, self._half = device, half
+        experts = getattr(net.config.backbone_config, "num_experts", 1)
+        self._expert = 0 if experts > 1 else None  # of ViTPose+, the one for COCO
+
+    def estimate(self, picture: Picture, boxes: NDArray[np.float64]) -> Poses:
+        """The pose in each box."""
+        if not len(boxes):
+            return Poses(np.empty((0, 17, 2)), np.empty((0, 17)))
+        each = [self._one(picture, box) for box in boxes]
+        keypoints = np.stack([points for points, _ in each])
+        confidence = np.stack([score for _, score in each])
+        found = confidence > 0.0
+        return Poses(
+            np.where(found[..., None], keypoints, np.nan),
+            np.where(found, np.minimum(confidence, 1.0), np.nan),
+        )
+
+    def _one(
+        self, picture: Picture, box: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        x0, y0, x1, y1 = box
+        corner = [[[float(x0), float(y0), float(x1 - x0), float(y1 - y0)]]]
+        given = _tensors(self._processor([picture], boxes=corner, return_tensors="pt"), self)
+        if self._expert is not None:
+            given["dataset_index"] = self._torch.tensor([self._expert], device=self._device)
+        with self._torch.inference_mode():
+            outputs = self._net(**given)
+        outputs.heatmaps = outputs.heatmaps.float().cpu()
+        ((pose,),) = self._processor.post_process_pose_estimation(outputs, boxes=corner)
+        points = pose["keypoints"].numpy().astype(np.float64)
+        return points, pose["scores"].numpy().astype(np.float64).reshape(-1)
+
+
+def _libraries(folder: Path) -> tuple[ModuleType, ModuleType]:
+    try:
+        import torch
+        import transformers
+    except ImportError as error:
+        raise InputError(
+            str(folder),
+            expected="torch and transformers, which run this checkpoint",
+            found=f"no {error.name}",
+            todo='Install them: pip install "worldpose[detectors]".',
+        ) from error
+    return torch, transformers
+
+
+def _kind(folder: Path, library: ModuleType, known: tuple[str, ...]) -> str:
+    kind = str(_loaded(folder, library.AutoConfig).model_type)
+    if kind not in known:
+        raise InputError(
+            str(folder),
+            expected=f"a checkpoint of kind {', '.join(known)}",
+            found=kind,
+            todo="Name another folder.",
+        )
+    return kind
+
+
+def _loaded(folder: Path, named: Any, **further: bool) -> Any:  # noqa: ANN401
+    try:
+        return named.from_pretrained(str(folder), local_files_only=True, **further)
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(
+            str(folder),
+            expected="a folder with config.json, preprocessor_config.json and model.safetensors",
+            found=str(error).splitlines()[0][:200],
+            todo="Save the checkpoint with save_pretrained; processors too.",
+        ) from error
+
+
+def _placed(net: Any, torch: ModuleType, folder: Path, device: str, half: bool) -> Any:  # noqa: ANN401
+    if device == "cuda" and not torch.cuda.is_available():
+        raise InputError(
+            str(folder),
+            expected="a GPU, as detection.device says",
+            found="none",
+            todo="Set detection.device=cpu.",
+        )
+    net = net.eval().to(device)
+    return net.half() if half and device == "cuda" else net
+
+
+def _tensors(
+    given: Mapping[str, Any], owner: _TransformersDetector | _TransformersPose
+) -> dict[str, Any]:
+    pixels = given["pixel_values"].to(owner._device)
+    return {"pixel_values": pixels.half() if owner._half and owner._device == "cuda" else pixels}

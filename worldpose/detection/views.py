@@ -1,0 +1,134 @@
+"""Pictures cut into overlapping views, for detectors that take one size or lose small people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.detection.boxes import suppress
+from worldpose.detection.interfaces import Detector, People, Picture
+
+EDGE: Final = 3.0
+"""A box this near to a view's cut edge is of a person who was cut [px of the view]."""
+FILLING: Final = 114
+"""Grey beyond a picture's border, as detectors are trained with."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A part of a picture as a detector gets it.
+
+    Attributes:
+        x: left edge in the scaled picture [px].
+        y: upper edge [px].
+        scale: pixels of the view a pixel of the picture.
+    """
+
+    x: int
+    y: int
+    scale: float
+
+    def in_picture(self, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Boxes of the view in the picture's pixels: pixel centres are whole in both."""
+        corner = np.array([self.x, self.y, self.x, self.y], dtype=np.float64)
+        return (boxes + corner + 0.5) / self.scale - 0.5
+
+
+class Tiled:
+    """A detector that looks at views of pictures of any size."""
+
+    def __init__(
+        self, detector: Detector, zooms: Sequence[float], view_overlap: float, overlap: float
+    ) -> None:
+        """Wrap a detector.
+
+        Args:
+            detector: one with a view size.
+            zooms: pictures are scaled by each before they are cut, beside the whole in one view.
+            view_overlap: share of a view that its neighbour shows as well.
+            overlap: above which two boxes are of one person [1].
+        """
+        assert detector.view_size is not None  # others take pictures as they are
+        self._detector, self._size = detector, detector.view_size
+        self._zooms, self._view_overlap, self._overlap = tuple(zooms), view_overlap, overlap
+
+    @property
+    def view_size(self) -> None:
+        """None: any picture."""
+        return
+
+    def detect(self, pictures: Sequence[Picture]) -> list[People]:
+        """The people of each picture, each in the view that shows all of them."""
+        people = []
+        for picture in pictures:
+            views = list(self._views(picture.shape[1], picture.shape[0]))
+            found = self._detector.detect(_cut(picture, views, self._size))
+            seen = [
+                self._whole(view, one, picture.shape[1], picture.shape[0])
+                for view, one in zip(views, found, strict=True)
+            ]
+            people.append(
+                suppress(
+                    People(
+                        np.concatenate([one.boxes for one in seen]),
+                        np.concatenate([one.scores for one in seen]),
+                    ),
+                    self._overlap,
+                )
+            )
+        return people
+
+    def _views(self, width: int, height: int) -> Iterator[View]:
+        fit = min(self._size[0] / width, self._size[1] / height)
+        yield View(0, 0, fit)
+        for zoom in self._zooms:
+            if zoom > fit:
+                across = _starts(round(width * zoom), self._size[0], self._view_overlap)
+                down = _starts(round(height * zoom), self._size[1], self._view_overlap)
+                yield from (View(x, y, zoom) for y in down for x in across)
+
+    def _whole(self, view: View, people: People, width: int, height: int) -> People:
+        """Those whom the view's cut edges do not cut, in the picture's pixels."""
+        x0, y0, x1, y1 = people.boxes.T
+        right, low = round(width * view.scale), round(height * view.scale)
+        cut = (
+            ((x0 < EDGE) & (view.x > 0))
+            | ((y0 < EDGE) & (view.y > 0))
+            | ((x1 > self._size[0] - EDGE) & (view.x + self._size[0] < right))
+            | ((y1 > self._size[1] - EDGE) & (view.y + self._size[1] < low))
+        )
+        return People(view.in_picture(people.boxes[~cut]), people.scores[~cut])
+
+
+def _starts(length: int, view: int, overlap: float) -> list[int]:
+    """Where views begin so that they cover a length, evenly spread."""
+    if length <= view:
+        return [0]
+    count = 1 + int(np.ceil((length - view) / (view * (1.0 - overlap))))
+    return [round(start) for start in np.linspace(0, length - view, count)]
+
+
+def _cut(picture: Picture, views: Sequence[View], size: tuple[int, int]) -> list[Picture]:
+    """Each view of a picture, filled with grey beyond the picture's border."""
+    import cv2  # late: it takes a fifth of a second, and planning a run needs none of it
+
+    scaled: dict[float, Picture] = {}
+    cut = []
+    for view in views:
+        if view.scale not in scaled:
+            target = (
+                round(picture.shape[1] * view.scale),
+                round(picture.shape[0] * view.scale),
+            )
+            way = cv2.INTER_AREA if view.scale < 1.0 else cv2.INTER_LINEAR
+            resized = picture if view.scale == 1.0 else cv2.resize(picture, target, None, 0, 0, way)
+            scaled[view.scale] = np.asarray(resized, dtype=np.uint8)
+        part = scaled[view.scale][view.y : view.y + size[1], view.x : view.x + size[0]]
+        filled = np.full((size[1], size[0], 3), FILLING, dtype=np.uint8)
+        filled[: part.shape[0], : part.shape[1]] = part
+        cut.append(filled)
+    return cut

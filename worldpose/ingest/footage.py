@@ -1,0 +1,111 @@
+"""A unit's video on the match's clock: which picture shows which frame, and which are missing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.match import MatchSpec
+from worldpose.errors import InputError
+from worldpose.ingest.units import UnitFrames, unit_frames
+from worldpose.video import FrameIndex, index_video
+
+
+@dataclass(frozen=True, eq=False)
+class Footage:
+    """A video, and how it lies on the match's clock.
+
+    Attributes:
+        index: all its pictures.
+        frame: (frames,) match frames.
+        picture: (frames,) number of the picture that shows each; -1 where the video lacks it.
+    """
+
+    index: FrameIndex
+    frame: NDArray[np.int64]
+    picture: NDArray[np.int64]
+
+    @property
+    def missing(self) -> list[list[int]]:
+        """First and last match frame of each stretch that the video lacks."""
+        return stretches(self.frame[self.picture < 0])
+
+
+def read_footage(
+    path: Path,
+    fps: float,
+    image_size: tuple[int, int],
+    frames: UnitFrames,
+    clips: Sequence[tuple[str, int, int]],
+) -> Footage:
+    """How a video lies on the match's clock; no picture but the first is decoded.
+
+    Args:
+        path: a video file or a folder of images.
+        fps: frames a second of match time.
+        image_size: width, height that match.yaml says [px].
+        frames: how the unit's frames lie in the match.
+        clips: id, first match frame and number of frames of what is taken from it.
+
+    Raises:
+        InputError: no video, one of another size or rate, or one without a frame of some clip.
+    """
+    index = index_video(path)
+    if index.size != image_size:
+        raise InputError(
+            str(path),
+            expected=f"{image_size[0]} x {image_size[1]} px, the size in match.yaml",
+            found=f"{index.size[0]} x {index.size[1]} as shown",
+            todo="Correct width and height in match.yaml, or give the video in that size.",
+        )
+    clock = index.on_clock(fps, str(path))
+    frame = np.arange(frames.first, frames.first + frames.count)
+    number = frame + frames.offset
+    inside = (number >= 0) & (number < len(clock))
+    picture = np.full(len(frame), -1, dtype=np.int64)
+    picture[inside] = clock[number[inside]]
+    for clip, first, count in clips:
+        if (picture[first - frames.first : first - frames.first + count] < 0).all():
+            begin = first + frames.offset
+            raise InputError(
+                f"{path}: clip {clip}",
+                expected=f"frames {begin} to {begin + count - 1} of this video",
+                found=f"frames 0 to {len(clock) - 1}",
+                todo="Check the clip's first_frame and the camera's offset_frames.",
+            )
+    return Footage(index, frame, picture)
+
+
+def footage_clips(spec: MatchSpec, unit_id: str) -> list[tuple[str, int, int]]:
+    """What is taken from a video: every clip of a static camera, its own of a broadcast camera."""
+    clips = spec.clips
+    if unit_id in {clip.id for clip in clips}:
+        clips = (spec.clip(unit_id),)
+    return [(clip.id, clip.first_frame, clip.frame_count) for clip in clips]
+
+
+def footage_size(spec: MatchSpec, unit_id: str) -> tuple[int, int]:
+    """Width, height that match.yaml says of a static camera, or of a clip's broadcast camera."""
+    broadcast = {clip.id: clip.broadcast for clip in spec.clips}.get(unit_id)
+    camera = spec.camera(broadcast or unit_id)
+    return camera.width, camera.height
+
+
+def require_footage(spec: MatchSpec, unit_id: str, path: Path) -> None:
+    """Refuse a video that cannot be what match.yaml says; raises as `read_footage`."""
+    frames, clips = unit_frames(spec, unit_id), footage_clips(spec, unit_id)
+    read_footage(path, spec.fps, footage_size(spec, unit_id), frames, clips)
+
+
+def stretches(numbers: NDArray[np.int64]) -> list[list[int]]:
+    """First and last of each run of neighbours in rising numbers."""
+    if not len(numbers):
+        return []
+    breaks = np.flatnonzero(np.diff(numbers) > 1)
+    firsts = np.concatenate([numbers[:1], numbers[breaks + 1]])
+    lasts = np.concatenate([numbers[breaks], numbers[-1:]])
+    return [[int(a), int(b)] for a, b in zip(firsts, lasts, strict=True)]

@@ -1,0 +1,129 @@
+"""Folders of numbered images, read as videos are."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.errors import InputError
+from worldpose.video.frame_index import FrameIndex, index_frames
+from worldpose.video.reading import VideoReader
+
+SUFFIXES: Final = (".png", ".jpg", ".jpeg")
+
+
+class ImageFolder:
+    """Images whose names end in their number; the lowest is frame 0, and a gap is a missing one."""
+
+    def __init__(self, folder: Path, index: FrameIndex | None = None) -> None:
+        """Open a folder.
+
+        Args:
+            folder: holds the images.
+            index: of them, where it is known; else it is made.
+
+        Raises:
+            InputError: no images, or names without a number or with the same one.
+        """
+        self.path = folder
+        self._files = [file for _, file in numbered_images(folder)]
+        self.index = index_images(folder) if index is None else index
+
+    def __enter__(self) -> ImageFolder:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def close(self) -> None:
+        """Nothing stays open."""
+
+    def readable(
+        self, start: int = 0, stop: int | None = None, *, grey: bool = False
+    ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+        """Yield picture numbers from `start` up to before `stop`; None where one is no picture.
+
+        Args:
+            start: first picture, in the order of the numbers.
+            stop: one past the last; all if None.
+            grey: (height, width) instead of RGB.
+        """
+        for number in range(start, len(self) if stop is None else stop):
+            yield number, _read(self._files[number], grey=grey)
+
+
+def numbered_images(folder: Path) -> list[tuple[int, Path]]:
+    """The images of a folder by the number that their names end in.
+
+    Raises:
+        InputError: no images, or names without a number or with the same one.
+    """
+    files = sorted(
+        file
+        for file in folder.iterdir()
+        if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
+    )
+    ends = [re.search(r"\d+$", file.stem) for file in files]
+    numbers = [int(end.group()) for end in ends if end]
+    if not files or len(set(numbers)) < len(files):
+        raise InputError(
+            str(folder),
+            expected=f"images ({', '.join(SUFFIXES)}) whose names end in numbers that differ",
+            found=f"{len(files)} images with {len(set(numbers))} numbers",
+            todo="Name them in order, for example 000123.jpg.",
+        )
+    return sorted(zip(numbers, files, strict=True))
+
+
+def index_images(folder: Path) -> FrameIndex:
+    """Return the index of a folder of images; the first one is read for its size.
+
+    Raises:
+        InputError: no images, or names without a number or with the same one.
+    """
+    images = numbered_images(folder)
+    stamps = np.array([number for number, _ in images], dtype=np.int64)
+    first = _read(images[0][1], grey=True)
+    if first is None:
+        raise InputError(
+            str(images[0][1]), expected="a picture", found="none", todo="Write it again."
+        )
+    return FrameIndex(stamps, np.ones(len(stamps), dtype=np.bool_), None, first.shape[::-1])
+
+
+def index_video(path: Path) -> FrameIndex:
+    """The index of a video file or of a folder of images.
+
+    Raises:
+        InputError: neither.
+    """
+    return index_images(path) if path.is_dir() else index_frames(path)
+
+
+def open_video(path: Path, index: FrameIndex | None = None) -> VideoReader | ImageFolder:
+    """A video file or a folder of images, to be read by picture number."""
+    return ImageFolder(path, index) if path.is_dir() else VideoReader(path, index)
+
+
+def _read(file: Path, *, grey: bool) -> NDArray[np.uint8] | None:
+    """A picture as it is to be shown, RGB or grey; None where the file is no picture."""
+    import cv2  # late: it takes a fifth of a second, and most videos are files
+
+    content = np.fromfile(file, dtype=np.uint8)
+    flag = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR_RGB
+    picture = cv2.imdecode(content, flag) if len(content) else None
+    return None if picture is None else np.ascontiguousarray(picture, dtype=np.uint8)
