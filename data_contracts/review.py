@@ -132,13 +132,27 @@ class MovedKeypoint(Record):
     """[px]"""
 
 
+class Sighting(Record):
+    """One detection that tells who is meant, whatever ids the tracker gives."""
+
+    camera: Name
+    frame: int
+    """Match frame."""
+    detection: int
+    """Its place among the camera's detections of the frame."""
+
+
 class MergedTracks(Record):
     """Two person ids of a clip that are one person."""
 
     kind: Literal["merged_tracks"] = "merged_tracks"
     clip: Name
     kept: int
+    kept_seen: Sighting | None = None
+    """Where the person saw who that is; no longer so, and the correction does not apply."""
     merged: int
+    merged_seen: Sighting | None = None
+    """As `kept_seen`."""
 
 
 class SplitTrack(Record):
@@ -147,7 +161,22 @@ class SplitTrack(Record):
     kind: Literal["split_track"] = "split_track"
     clip: Name
     person: int
+    seen: Sighting | None = None
+    """Where the person saw who that is; no longer so, and the correction does not apply."""
     first_frame_of_new: int
+    """Match frame."""
+
+
+class NamedTrack(Record):
+    """The roster's name of a person id of a clip."""
+
+    kind: Literal["named_track"] = "named_track"
+    clip: Name
+    person: int
+    seen: Sighting | None = None
+    """Where the person saw who that is; no longer so, and the correction does not apply."""
+    name: Name | None
+    """Id in the roster; None takes it away."""
 
 
 Edit = Annotated[
@@ -158,6 +187,7 @@ Edit = Annotated[
     | MovedKeypoint
     | MergedTracks
     | SplitTrack
+    | NamedTrack
     | ChosenFrames,
     Field(discriminator="kind"),
 ]

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 
 from data_contracts.match import Registration
-from data_contracts.review import Correction, Edit, Withdrawal
+from data_contracts.review import Correction, Edit, MovedPoint, RedrawnMarking, Withdrawal
+from flows.identities import require_fitting
 from flows.stage import Match
+from flows.stale import StaleEditError
 from worldpose.errors import InputError
 from worldpose.ingest import MatchFolder
 from worldpose.review import (
     Journal,
+    append,
     read_journal,
     replay_corrections,
     standing_corrections,
+    value_now,
     with_was,
 )
+from worldpose.review.identities import IDENTITY_EDITS
 from worldpose.store import Store
 
 
@@ -36,6 +41,7 @@ def new_corrections(
     who: str,
     note: str,
     results: Mapping[str, str],
+    ids: Sequence[str] = (),
 ) -> list[Correction]:
     """Edits as corrections to be said, each based on those before it.
 
@@ -46,8 +52,10 @@ def new_corrections(
         who: the person.
         note: in the person's words.
         results: `stage/unit` to key of what the person looked at.
+        ids: of the corrections, one an edit; none = new ones.
 
     Raises:
+        StaleEditError: what an edit changes is no longer what it says that it was.
         InputError: an edit that does not apply, because of what it names or of what somebody else
             did in between; nothing is kept of any.
     """
@@ -60,18 +68,21 @@ def new_corrections(
             todo="Look at them with `worldpose review show`, and correct again.",
         )
     folder, said = match.folder, []
-    for number, edit in enumerate(edits):
+    for number, given in enumerate(edits):
+        edit = with_was(folder, given)
+        _require_unchanged(folder, standing, edit)
         correction = Correction(
-            id=f"{edit.kind}.{uuid.uuid4().hex[:12]}",
+            id=ids[number] if ids else f"{edit.kind}.{uuid.uuid4().hex[:12]}",
             match_id=match.match_id,
-            edit=with_was(folder, edit),
+            edit=edit,
             who=who,
             made_at=datetime.now(UTC),
             based_on=_looked_at(edit, results),
             note=note or None,
         )
         replay = replay_corrections(folder, [correction])
-        if replay.stale or replay.folder == folder:
+        is_identity = isinstance(edit, IDENTITY_EDITS)
+        if replay.stale or (replay.folder == folder and not is_identity):
             raise InputError(
                 f"edit {number + 1} of {len(edits)}, {edit.kind}",
                 expected="one that applies",
@@ -81,6 +92,74 @@ def new_corrections(
         folder = replay.folder
         said.append(correction)
     return said
+
+
+def keep_edits(
+    store: Store, open_match: Callable[[], Match], given: Mapping[str, Edit], *, who: str, note: str
+) -> list[Correction]:
+    """Edits as corrections in the journal, all or none; durable when this returns.
+
+    What was kept already under an id is the same edit sent again, and is kept once.
+
+    Args:
+        store: where the journal lies.
+        open_match: gives the match with its journal as it is.
+        given: id to edit, in the order they are to be applied.
+        who: the person.
+        note: in the person's words.
+
+    Raises:
+        StaleEditError: what an edit changes is no longer what it says that it was.
+        InputError: an edit does not apply.
+    """
+    while True:
+        match = open_match()
+        said = {each.id: each for each in match.journal.records if isinstance(each, Correction)}
+        fresh = {name: edit for name, edit in given.items() if name not in said}
+        require_fitting(store, match, [*fresh.values()])
+        runs = store.runs(match.match_id)
+        corrections = new_corrections(
+            match,
+            match.journal,
+            tuple(fresh.values()),
+            who=who,
+            note=note,
+            results=store.run(match.match_id).results if runs else {},
+            ids=tuple(fresh),
+        )
+        said |= {each.id: each for each in corrections}
+        if not corrections or append(store, match.journal, corrections) is not None:
+            return [said[name] for name in given]
+
+
+def _require_unchanged(folder: MatchFolder, standing: Sequence[Correction], edit: Edit) -> None:
+    """Refuse an edit of what is not as it says that it was, and tell who changed it."""
+    if not isinstance(edit, MovedPoint | RedrawnMarking) or value_now(folder, edit) == edit.was:
+        return
+    place = (edit.camera, edit.frame, edit.marking)
+    last = [
+        each
+        for each in standing
+        if isinstance(each.edit, MovedPoint | RedrawnMarking)
+        and (each.edit.camera, each.edit.frame, each.edit.marking) == place
+    ][-1:]
+    now = value_now(folder, edit)
+    found = f"{now or 'not there'}" + "".join(f", by {each.who}" for each in last)
+    error = StaleEditError(
+        f"{edit.marking} in {edit.camera}",
+        expected=f"{edit.was or 'not there'}, as it was when this was begun",
+        found=found,
+        todo="Look at it, and correct it again where it is still wrong.",
+    )
+    error.difference = {
+        "camera": edit.camera,
+        "frame": edit.frame,
+        "marking": edit.marking,
+        "was": edit.was,
+        "now": now,
+        "who": last[0].who if last else None,
+    }
+    raise error
 
 
 def withdrawal(journal: Journal, correction: str, *, who: str, why: str) -> Withdrawal:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Literal
@@ -14,6 +14,7 @@ from flows.method import GATES
 from flows.prefect_environment import has_server
 from flows.run_record import latest_run
 from flows.stage import Match
+from flows.stale import StaleEditError
 from worldpose.errors import InputError
 from worldpose.review import Journal, decision_on, requests_by_id, say, unit_origins
 from worldpose.store import Store
@@ -99,6 +100,7 @@ def decide(
     who: str,
     why: str,
     edits: Sequence[Edit] = (),
+    seen: Mapping[str, str] | None = None,
 ) -> tuple[list[str], list[Correction]]:
     """Keep a verdict and its corrections, all at once; gives the ids decided and the corrections.
 
@@ -110,8 +112,10 @@ def decide(
         who: the person.
         why: in the person's words.
         edits: what is wrong in what was looked at.
+        seen: id of each question to the state that the person saw; None = whatever it is.
 
     Raises:
+        StaleEditError: somebody else decided since the person looked.
         InputError: no such question, nothing waits, or an edit does not apply; nothing is kept.
     """
     latest = latest_run(store, match.match_id)
@@ -130,6 +134,9 @@ def decide(
                 found="no such question" if unknown else "nothing that waits",
                 todo=f"List them: worldpose review list {match.match_id}.",
             )
+        for name in ids if seen is not None else ():
+            if current[name].state != seen.get(name):
+                raise _decided_meanwhile(name, current[name], seen.get(name))
         results = {} if latest is None else latest.results
         corrections[:] = new_corrections(match, journal, edits, who=who, note=why, results=results)
         now = datetime.now(UTC)
@@ -148,6 +155,24 @@ def decide(
 
     say(store, match.match_id, decisions)
     return ids, corrections
+
+
+def _decided_meanwhile(name: str, review: Review, seen: str | None) -> StaleEditError:
+    decision = review.decision
+    found = review.state if decision is None else f"{decision.verdict} by {decision.who}"
+    error = StaleEditError(
+        f"review {name}",
+        expected=f"{seen}, as it was shown",
+        found=found,
+        todo="Look at it again.",
+    )
+    error.difference = {
+        "review": name,
+        "was": seen,
+        "now": review.state,
+        "who": None if decision is None else decision.who,
+    }
+    return error
 
 
 def correct(

@@ -18,6 +18,7 @@ from flows.cli.console import (
     line,
     print_json,
 )
+from flows.cli.review_serve import serve
 from flows.cli.review_text import correction_json, in_words, print_review, review_json, when
 from flows.prefect_environment import has_server
 from flows.registering import find_registration, open_match
@@ -287,4 +288,5 @@ def _tell_damage(match: Match) -> None:
 
 def add_to(app: typer.Typer) -> None:
     """Register these commands."""
+    commands.command()(serve)
     app.add_typer(commands)

@@ -4,7 +4,7 @@ Input: the journal of a match in the store, and what the match folder holds. Out
 results, corrected clicks, the corrections that no longer apply, and the origin of every value.
 """
 
-from worldpose.review.clicks import Replay, replay_corrections, with_was
+from worldpose.review.clicks import Replay, replay_corrections, value_now, with_was
 from worldpose.review.journal import Journal, append, read_journal, say
 from worldpose.review.origins import ORIGINS, joint_origins, unit_origins
 from worldpose.review.verdicts import decision_on, requests_by_id, standing_corrections
@@ -22,5 +22,6 @@ __all__ = [
     "say",
     "standing_corrections",
     "unit_origins",
+    "value_now",
     "with_was",
 ]

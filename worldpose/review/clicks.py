@@ -10,6 +10,7 @@ from data_contracts.review import Correction, Edit, MovedPoint, RedrawnMarking
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking, Pixel
 from worldpose.ingest import MatchFolder
 from worldpose.pitch import PitchTemplate
+from worldpose.review.identities import IDENTITY_EDITS
 
 Picture = tuple[str, int | None]
 """A static camera and None, or a clip and a frame of its video."""
@@ -45,6 +46,14 @@ def replay_corrections(folder: MatchFolder, corrections: Iterable[Correction]) -
     applied, stale = [], []
     for correction in corrections:
         edit = correction.edit
+        if isinstance(edit, IDENTITY_EDITS):
+            # Whether it fits the tracks is known where they are: the stage `tracking` says it.
+            known = edit.clip in {clip.id for clip in folder.spec.clips}
+            if known:
+                applied.append(correction)
+            else:
+                stale.append((correction, f"there is no clip {edit.clip}"))
+            continue
         if not isinstance(edit, MovedPoint | RedrawnMarking):
             stale.append((correction, f"nothing takes in a {edit.kind} yet"))
             continue
@@ -55,8 +64,8 @@ def replay_corrections(folder: MatchFolder, corrections: Iterable[Correction]) -
             applied.append(correction)
         else:
             stale.append((correction, reason))
-    if not applied:
-        return Replay(folder, (), tuple(stale))
+    if not any(isinstance(each.edit, MovedPoint | RedrawnMarking) for each in applied):
+        return Replay(folder, tuple(applied), tuple(stale))
     corrected = replace(folder, clicked=_clicked(folder, pictures), key_frames=_picked(pictures))
     return Replay(corrected, tuple(applied), tuple(stale))
 
@@ -70,7 +79,19 @@ def with_was(folder: MatchFolder, edit: Edit) -> Edit:
     """
     if not isinstance(edit, MovedPoint | RedrawnMarking) or "was" in edit.model_fields_set:
         return edit
-    return edit.model_copy(update={"was": _now(_pictures(folder), edit)})
+    return edit.model_copy(update={"was": value_now(folder, edit)})
+
+
+def value_now(
+    folder: MatchFolder, edit: MovedPoint | RedrawnMarking
+) -> Pixel | tuple[Pixel, ...] | None:
+    """What an edit changes, as it is: None or empty where it was not clicked.
+
+    Args:
+        folder: with the corrections so far.
+        edit: names the place; what it makes of it decides nothing.
+    """
+    return _now(_pictures(folder), edit)
 
 
 def _pictures(folder: MatchFolder) -> dict[Picture, ClickedMarkings]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.review import Correction, MovedPoint, Origin, RedrawnMarking
+from worldpose.review.identities import IDENTITY_EDITS
 
 ORIGINS: Final[tuple[Origin, ...]] = get_args(Origin)
 """In the order of their codes in arrays: automatic 0, corrected 1, filled 2, rejected 3."""
@@ -29,11 +30,13 @@ def unit_origins(
         applied: the corrections that the results hold.
         rejected: units whose last verdict is a refusal.
     """
-    corrected = {
-        f"{'static' if edit.frame is None else 'broadcast'}_calibration/{edit.camera}"
-        for edit in (correction.edit for correction in applied)
-        if isinstance(edit, MovedPoint | RedrawnMarking)
-    }
+    corrected = set()
+    for edit in (correction.edit for correction in applied):
+        if isinstance(edit, MovedPoint | RedrawnMarking):
+            stage = "static_calibration" if edit.frame is None else "broadcast_calibration"
+            corrected.add(f"{stage}/{edit.camera}")
+        elif isinstance(edit, IDENTITY_EDITS):
+            corrected.add(f"tracking/{edit.clip}")
     refused = set(rejected)
     while more := {
         unit for unit, sources in made_from.items() if unit not in refused and refused & {*sources}

@@ -1,0 +1,81 @@
+"""Who is who in a clip by now: the tracker's output with all that people said since."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from data_contracts.review import Edit
+from flows.stage import Match
+from flows.stale import StaleEditError
+from worldpose.errors import InputError
+from worldpose.review.identities import (
+    IDENTITY_EDITS,
+    Identities,
+    IdentityReplay,
+    objection_to,
+    replay_identities,
+    stored_identities,
+)
+from worldpose.store import Store, key_of
+
+
+def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
+    """The tracks of a clip with people's corrections, whether or not a run has taken them in.
+
+    Raises:
+        InputError: the match's latest run has no tracks of this clip.
+    """
+    said = [
+        correction.edit
+        for correction in match.corrections
+        if isinstance(correction.edit, IDENTITY_EDITS) and correction.edit.clip == clip
+    ]
+    found, taken_in = _found(store, match, clip)
+    return replay_identities(found, said[taken_in:])
+
+
+def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> None:
+    """Refuse corrections of who is who that do not fit the tracks as they are by now.
+
+    Raises:
+        StaleEditError: somebody changed who is who, or the edit never fitted.
+    """
+    found: dict[str, Identities] = {}
+    for edit in edits:
+        if not isinstance(edit, IDENTITY_EDITS):
+            continue
+        if edit.clip not in found:
+            found[edit.clip] = identities_now(store, match, edit.clip).identities
+        objection = objection_to(found[edit.clip], edit)
+        if objection is not None:
+            error = StaleEditError(
+                f"clip {edit.clip}, {edit.kind}",
+                expected="a correction that fits who is who by now",
+                found=objection,
+                todo="Look at the clip again.",
+            )
+            error.difference = {"clip": edit.clip, "kind": edit.kind, "now": objection}
+            raise error
+        found[edit.clip] = replay_identities(found[edit.clip], [edit]).identities
+
+
+def _found(store: Store, match: Match, clip: str) -> tuple[Identities, int]:
+    """What the tracker found in the latest run, and how many corrections it holds already."""
+    runs = store.runs(match.match_id)
+    key = store.run(match.match_id).results.get(f"tracking/{clip}") if runs else None
+    if key is None:
+        raise InputError(
+            f"{match.match_id}, clip {clip}",
+            expected="tracks in the latest run",
+            found="none",
+            todo=f"Run it first: worldpose run {match.match_id}.",
+        )
+    unit = (match.match_id, "tracking", clip)
+    recipe = store.manifest(*unit, key).recipe
+    sources = dict(recipe.sources)
+    taken_in = sources.pop("identities", None)
+    plain = key_of(recipe.model_copy(update={"sources": sources}))
+    if taken_in and not store.has(*unit, plain):
+        assert isinstance(taken_in, list)
+        return stored_identities(store.open_result(*unit, key)), len(taken_in)
+    return stored_identities(store.open_result(*unit, plain)), 0

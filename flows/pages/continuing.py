@@ -1,0 +1,102 @@
+"""Runs that go on because somebody decided on a page."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Lock, Thread
+from typing import Any
+
+from flows.prefect_environment import has_server
+from flows.registering import open_for_review
+from flows.review import resume
+from worldpose.store import Store
+
+_COMMAND = [sys.executable, "-c", "from flows.cli import main; main()", "run"]
+LAST_LINES = 12
+"""Lines of a run's output that a page shows."""
+
+
+@dataclass
+class _Run:
+    process: subprocess.Popen[bytes]
+    said: Path
+
+
+@dataclass
+class Continuing:
+    """Runs that people let go on from a page: at most one a match, each in its own process.
+
+    A run outlives the pages' server; killed, it is found as any killed run is.
+
+    Attributes:
+        store: the project.
+    """
+
+    store: Store
+    _runs: dict[str, _Run] = field(default_factory=dict)
+    _once_more: set[str] = field(default_factory=set)
+    _lock: Lock = field(default_factory=Lock)
+
+    def go_on(self, match_id: str, gates: str | None = None) -> dict[str, Any]:
+        """Resume the match's suspended runs, or do what `worldpose run` does; tells which.
+
+        Args:
+            match_id: a registered match.
+            gates: policy of a match's first run; None = as the command line would take it.
+
+        Raises:
+            InputError: a suspended run whose questions are not all decided.
+        """
+        with self._lock:
+            if self._at_work(match_id):
+                # It may have asked its questions already, and not take in what was answered.
+                self._once_more.add(match_id)
+                return {"state": "running", "how": "once more when the run at work has ended"}
+            if has_server():
+                resumed = resume(self.store, open_for_review(self.store, match_id))
+                if resumed:
+                    return {"state": "resumed", "how": f"resumed {', '.join(resumed)}"}
+            self._start(match_id, gates)
+            return {"state": "running", "how": "worldpose run"}
+
+    def state(self, match_id: str) -> dict[str, Any] | None:
+        """How the last run that was begun here goes, None where there was none."""
+        run = self._runs.get(match_id)
+        if run is None:
+            return None
+        code = run.process.poll()
+        lines = run.said.read_text(errors="replace").splitlines()[-LAST_LINES:]
+        return {"state": "running" if code is None else "ended", "code": code, "lines": lines}
+
+    def _start(self, match_id: str, gates: str | None) -> None:
+        folder = Path(tempfile.mkdtemp(prefix="worldpose-run-"))
+        said = folder / "output.txt"
+        command = [*_COMMAND, match_id, "--project", self.store.url]
+        if gates is not None:
+            command += ["--gates", gates]
+        with said.open("wb") as output:
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        self._runs[match_id] = _Run(process, said)
+        Thread(target=self._watch, args=[match_id, process], daemon=True).start()
+
+    def _watch(self, match_id: str, process: subprocess.Popen[bytes]) -> None:
+        """Begin the run once more where that was asked for while it was at work."""
+        process.wait()
+        with self._lock:
+            if match_id in self._once_more:
+                self._once_more.discard(match_id)
+                self._start(match_id, None)
+
+    def _at_work(self, match_id: str) -> bool:
+        run = self._runs.get(match_id)
+        return run is not None and run.process.poll() is None

@@ -1,0 +1,35 @@
+"""What goes wrong, as answers that a page can show."""
+
+from __future__ import annotations
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+
+from flows.stale import StaleEditError
+from worldpose.errors import InputError, WorldposeError
+
+
+def add_answers(app: FastAPI) -> None:
+    """Answer with JSON: 409 and the difference, 422 and what to do, 500 and the reason."""
+
+    @app.exception_handler(StaleEditError)
+    def stale(request: Request, error: StaleEditError) -> JSONResponse:
+        return JSONResponse(
+            {"error": str(error), "difference": dict(error.difference)}, status_code=409
+        )
+
+    @app.exception_handler(InputError)
+    def unfit(request: Request, error: InputError) -> JSONResponse:
+        parts = {name: getattr(error, name) for name in ("where", "expected", "found", "todo")}
+        return JSONResponse({"error": str(error), **parts}, status_code=422)
+
+    @app.exception_handler(RequestValidationError)
+    def malformed(request: Request, error: RequestValidationError) -> JSONResponse:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        return JSONResponse({"error": f"{place}: {first['msg']}"}, status_code=422)
+
+    @app.exception_handler(WorldposeError)
+    def failed(request: Request, error: WorldposeError) -> JSONResponse:
+        return JSONResponse({"error": str(error)}, status_code=500)

@@ -1,0 +1,36 @@
+"use strict";
+const form = document.getElementById("login");
+const message = document.getElementById("message");
+const field = (name) => document.getElementById(name);
+
+// The token stands behind the #: browsers keep that to themselves.
+const given = new URLSearchParams(location.hash.slice(1)).get("token");
+if (given) {
+  field("token").value = given;
+  history.replaceState(null, "", "/login");
+}
+field("who").value = localStorage.getItem("who") || "";
+(field("who").value ? field("token") : field("who")).focus();
+
+fetch("/api/session").then((answer) => { if (answer.ok) location.replace("/"); });
+
+form.addEventListener("submit", async (event) => {
+  event.preventDefault();
+  message.textContent = "";
+  const who = field("who").value.trim();
+  try {
+    const answer = await fetch("/api/login", {
+      method: "POST",
+      headers: { "content-type": "application/json" },
+      body: JSON.stringify({ who, token: field("token").value.trim() }),
+    });
+    if (answer.ok) {
+      localStorage.setItem("who", who);
+      location.replace("/");
+    } else {
+      message.textContent = (await answer.json()).error || "That did not work.";
+    }
+  } catch {
+    message.textContent = "The server does not answer. Is worldpose review serve still running?";
+  }
+});

@@ -1,0 +1,52 @@
+"""Serving the pages until somebody ends it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import uvicorn
+
+from flows.pages.access import LOOPBACK, Access
+from flows.pages.app import create_app
+
+PORT = 8571
+"""Where the pages are unless told otherwise."""
+
+
+def serve(
+    project: str, access: Access, *, host: str, port: int, tls: tuple[Path, Path] | None
+) -> None:
+    """Serve a project's pages; returns when it is interrupted.
+
+    Args:
+        project: folder or URL of the store.
+        access: who may use them.
+        host: address to listen at.
+        port: 0 = one that is free.
+        tls: files of certificate and key.
+
+    Raises:
+        InputError: no such project.
+    """
+    certificate, key = (None, None) if tls is None else map(str, tls)
+    uvicorn.run(
+        create_app(project, access),
+        host=host,
+        port=port,
+        log_level="warning",
+        server_header=False,
+        access_log=False,
+        ws="none",
+        ssl_certfile=certificate,
+        ssl_keyfile=key,
+        timeout_graceful_shutdown=2,
+    )
+
+
+def address(access: Access, host: str, port: int) -> str:
+    """Where a person opens the pages; the token stands where browsers keep it to themselves."""
+    name = host
+    if host not in LOOPBACK:
+        name = sorted(access.hosts - LOOPBACK)[0]
+    name = f"[{name}]" if ":" in name else name
+    return f"{'https' if access.secure else 'http'}://{name}:{port}/login#token={access.token}"

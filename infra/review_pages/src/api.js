@@ -1,0 +1,44 @@
+// Asking the server: one session, its form secret with everything that changes something.
+
+export class Refusal extends Error {
+  constructor(status, body) {
+    super(body.error || body.detail || `the server answers ${status}`);
+    this.status = status;
+    this.body = body;
+  }
+}
+
+let session = null;
+
+export async function openSession() {
+  session = await ask("GET", "/api/session");
+  return session;
+}
+
+export const get = (path) => ask("GET", path);
+export const post = (path, body) => ask("POST", path, body);
+
+async function ask(method, path, body) {
+  const answer = await fetch(path, {
+    method,
+    headers:
+      method === "GET"
+        ? {}
+        : { "content-type": "application/json", "x-form-secret": session?.form_secret ?? "" },
+    body: body === undefined ? undefined : JSON.stringify(body),
+  });
+  if (answer.status === 401) {
+    location.assign("/login");
+    throw new Refusal(401, { error: "log in first" });
+  }
+  const content = await answer.json().catch(() => ({}));
+  if (!answer.ok) throw new Refusal(answer.status, content);
+  return content;
+}
+
+export const matchPath = (match) => `/api/matches/${encodeURIComponent(match)}`;
+
+export function picturePath(match, owner, part = "", frame = null) {
+  const query = frame === null ? "" : `?frame=${frame}`;
+  return `${matchPath(match)}/pictures/${encodeURIComponent(owner)}${part}${query}`;
+}

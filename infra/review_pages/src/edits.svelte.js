@@ -1,0 +1,140 @@
+// What somebody clicked, how it came to be, and keeping it: undo, redo, autosave.
+//
+// Every change is an edit with what it changes (`was`). The server takes an edit in while that is
+// so still; otherwise somebody else was quicker, and the person decides whose it shall be. An edit
+// keeps its id until the server acknowledged it: sent twice, it is kept once.
+
+import { post, Refusal, matchPath } from "./api.js";
+
+const same = (a, b) => JSON.stringify(a ?? null) === JSON.stringify(b ?? null);
+const RETRY = 2000; // [ms]
+
+export class Edits {
+  points = $state({});
+  drawn = $state({});
+  done = $state([]);
+  undone = $state([]);
+  state = $state("saved"); // saved, saving, unsaved, refused
+  problem = $state("");
+  conflict = $state(null);
+  #waiting = [];
+  #sending = false;
+
+  constructor(match, owner, frame, clicked) {
+    this.match = match;
+    this.owner = owner;
+    this.frame = frame;
+    this.points = { ...clicked.points };
+    this.drawn = { ...clicked.drawn };
+  }
+
+  value(kind, name) {
+    return kind === "point" ? (this.points[name] ?? null) : (this.drawn[name] ?? []);
+  }
+
+  // What is on the screen, before it is an edit: while something is dragged.
+  show(kind, name, xy) {
+    const shown = kind === "point" ? this.points : this.drawn;
+    if (xy === null || xy.length === 0) delete shown[name];
+    else shown[name] = xy;
+  }
+
+  // An edit of what was `was` before it was shown.
+  commit(kind, name, was, xy) {
+    this.show(kind, name, xy);
+    if (same(was, xy)) return;
+    this.done.push({ kind, name, was, xy });
+    this.undone = [];
+    this.#keep({ kind, name, was, xy });
+  }
+
+  undo() {
+    const edit = this.done.pop();
+    if (!edit) return null;
+    this.undone.push(edit);
+    this.show(edit.kind, edit.name, edit.was);
+    this.#keep({ ...edit, was: edit.xy, xy: edit.was });
+    return edit;
+  }
+
+  redo() {
+    const edit = this.undone.pop();
+    if (!edit) return null;
+    this.done.push(edit);
+    this.show(edit.kind, edit.name, edit.xy);
+    this.#keep(edit);
+    return edit;
+  }
+
+  get pending() {
+    return this.#waiting.length;
+  }
+
+  // Somebody else was quicker: theirs stays, or mine goes over it.
+  settle(mine) {
+    const { kind, name, now } = this.conflict;
+    const ours = this.#waiting.filter((each) => each.kind === kind && each.name === name);
+    this.#waiting = this.#waiting.filter((each) => !ours.includes(each));
+    this.conflict = null;
+    // What was done to it here is no longer a step from one state to the next.
+    const others = (edit) => edit.kind !== kind || edit.name !== name;
+    this.done = this.done.filter(others);
+    this.undone = this.undone.filter(others);
+    const wanted = ours[ours.length - 1]?.xy;
+    this.show(kind, name, now);
+    if (mine && ours.length) this.commit(kind, name, now, wanted);
+    else this.#send();
+  }
+
+  #keep(edit) {
+    const kind = edit.kind === "point" ? "moved_point" : "redrawn_marking";
+    const bytes = crypto.getRandomValues(new Uint8Array(8));
+    const id = `${kind}.${[...bytes].map((b) => b.toString(16).padStart(2, "0")).join("")}`;
+    this.#waiting.push({ ...edit, id });
+    this.#send();
+  }
+
+  async #send() {
+    if (this.#sending || this.conflict) return;
+    if (!this.#waiting.length) {
+      this.state = "saved";
+      return;
+    }
+    this.#sending = true;
+    this.state = "saving";
+    const batch = this.#waiting.slice(0, 50);
+    try {
+      await post(`${matchPath(this.match)}/corrections`, {
+        edits: batch.map((each) => ({
+          id: each.id,
+          edit: {
+            kind: each.kind === "point" ? "moved_point" : "redrawn_marking",
+            camera: this.owner,
+            frame: this.frame,
+            marking: each.name,
+            was: each.was,
+            xy: each.xy,
+          },
+        })),
+      });
+      this.#waiting.splice(0, batch.length);
+      this.problem = "";
+      this.#sending = false;
+      this.#send();
+    } catch (error) {
+      this.#sending = false;
+      this.problem = error.message;
+      if (error instanceof Refusal && error.status === 409) {
+        const difference = error.body.difference;
+        const kind = batch.find((each) => each.name === difference.marking)?.kind ?? "point";
+        this.conflict = { ...difference, kind, name: difference.marking };
+        this.state = "refused";
+      } else if (error instanceof Refusal && error.status < 500) {
+        this.state = "refused"; // sent again it would be refused again
+      } else {
+        this.state = "unsaved";
+        setTimeout(() => this.#send(), RETRY);
+      }
+    }
+  }
+}

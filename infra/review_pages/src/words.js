@@ -1,0 +1,36 @@
+// How numbers and moments are written.
+
+export const spoken = (name) => name.replaceAll("_", " ");
+
+export function shown(value) {
+  if (value === null || value === undefined || !Number.isFinite(value)) return "–";
+  if (value !== 0 && Math.abs(value) < 0.001) return value.toExponential(1);
+  return Number(value.toPrecision(3)).toString();
+}
+
+// An expected error on the ground, in the unit that a person thinks in.
+export function ground(metres) {
+  if (metres === null || metres === undefined) return "–";
+  return metres < 1 ? `${Number((100 * metres).toPrecision(2))} cm` : `${metres.toPrecision(2)} m`;
+}
+
+export function ago(moment) {
+  if (!moment) return "–";
+  const seconds = (Date.now() - new Date(moment)) / 1000;
+  const steps = [
+    [60, "s"],
+    [60, "min"],
+    [24, "h"],
+    [Infinity, "d"],
+  ];
+  let value = Math.max(0, seconds);
+  for (const [length, unit] of steps) {
+    if (value < length) return `${Math.floor(value)} ${unit}`;
+    value /= length;
+  }
+}
+
+export const parts = (unit) => {
+  const at = unit.indexOf("/");
+  return [unit.slice(0, at), unit.slice(at + 1)];
+};

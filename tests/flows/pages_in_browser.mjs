@@ -1,0 +1,126 @@
+// Drives the review pages as a person would; prints what it saw as one JSON object.
+
+import { readFileSync } from "node:fs";
+import { createRequire } from "node:module";
+
+const task = JSON.parse(readFileSync(process.argv[2], "utf8"));
+const { chromium } = createRequire(task.modules)("playwright-core");
+const browser = await chromium.launch({
+  executablePath: task.chromium,
+  args: ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
+    "--disable-background-networking", "--disable-component-update"],
+});
+const page = await browser.newPage({ viewport: { width: 1366, height: 768 } });
+const seen = { errors: [], outside: [], states: [] };
+page.on("pageerror", (error) => seen.errors.push(error.message));
+page.on("console", (message) => {
+  // The log-in page asks whether it is needed, and is told so with a 401.
+  if (message.type() === "error" && !message.text().includes("401")) seen.errors.push(message.text());
+});
+page.on("request", (request) => {
+  if (!/^(http:\/\/127\.0\.0\.1|data:|blob:)/.test(request.url())) seen.outside.push(request.url());
+});
+let shots = 0;
+const shot = (name) => task.shots && page.screenshot({ path: `${task.shots}/${++shots}_${name}.png` });
+const match = encodeURIComponent(task.match);
+
+await page.goto(`${task.base}/login#token=${task.token}`);
+await page.fill("#who", task.who);
+await page.click("button");
+await page.waitForSelector("li.panel");
+await shot("queue");
+
+// The camera that nobody clicked, from the queue by the way a person takes.
+await page.click(`a.name[href="#/match/${match}"]`);
+await page.click(`p.note a >> text=${task.camera}`);
+await page.waitForSelector(".stage canvas");
+await shot("nothing");
+const box = await page.locator(".stage").boundingBox();
+const scale = Math.min(box.width / task.size[0], box.height / task.size[1]);
+const corner = [box.x + (box.width - scale * task.size[0]) / 2, box.y + (box.height - scale * task.size[1]) / 2];
+const middle = [box.x + box.width / 2, box.y + box.height / 2];
+const hundredth = (value) => Math.round(100 * value) / 100;
+const choose = (name) => page.locator(`[data-name="${name}"]`).first().dispatchEvent("click");
+
+// Roughly in the whole picture, then close up.
+async function click([x, y]) {
+  const rough = [Math.round(corner[0] + scale * x), Math.round(corner[1] + scale * y)];
+  await page.mouse.click(...rough);
+  return rough.map((value, k) => hundredth((value - corner[k]) / scale));
+}
+for (const [name, place] of Object.entries(task.points)) {
+  await choose(name);
+  const rough = await click(place);
+  await page.keyboard.press("z");
+  for (let k = 0; k < 3; k++) await page.keyboard.press("+");
+  await page.mouse.move(...middle);
+  await page.mouse.down();
+  await page.mouse.move(...place.map((value, k) => middle[k] + 6 * 1.4 ** 3 * (value - rough[k])), { steps: 3 });
+  await page.mouse.up();
+  await page.keyboard.press("0");
+}
+for (const [name, places] of Object.entries(task.lines)) {
+  await choose(name);
+  for (const place of places) await click(place);
+}
+const saved = () => page.waitForSelector('[data-state="saved"]', { timeout: 60000 });
+await saved();
+await page.waitForSelector('[data-figure="lines"]', { timeout: 60000 });
+seen.figures = await page.locator("[data-figure]").allTextContents();
+await shot("calibrated");
+
+// One mark is dragged about: each move is a camera.
+await page.evaluate(() => performance.clearMeasures("preview"));
+await choose(task.dragged);
+await page.keyboard.press("z");
+await page.mouse.move(...middle);
+await page.mouse.down();
+for (let k = 1; k <= 40; k++) {
+  await page.mouse.move(middle[0] + 2 * Math.sin(k / 3) + k / 2, middle[1] + k / 3, { steps: 1 });
+  await page.waitForTimeout(60);
+}
+await shot("dragging");
+await page.mouse.up();
+await saved();
+seen.previews = await page.evaluate(() => performance.getEntriesByName("preview").map((each) => each.duration));
+// Undone, redone, nudged there and back, undone: it is where it was.
+await page.keyboard.press("Control+z");
+await page.keyboard.press("Control+y");
+await page.keyboard.press("Control+z");
+await page.keyboard.press("ArrowLeft");
+await page.keyboard.press("Shift+ArrowUp");
+await page.keyboard.press("Alt+ArrowDown");
+await page.waitForTimeout(900);
+await page.keyboard.press("Control+z");
+await page.keyboard.press("?");
+await page.waitForSelector("dialog[open]");
+await shot("help");
+await page.keyboard.press("Escape");
+await saved();
+
+// The run, from its beginning; whatever it asks is approved until it is complete.
+await page.click(`nav a >> text=${task.match}`);
+if (task.run) {
+  await page.click("button >> text=Run it");
+  const end = Date.now() + 1000 * task.patience;
+  while (Date.now() < end) {
+    const state = await (await page.request.get(`${task.base}/api/matches/${match}`)).json();
+    const at = state.at_work?.state === "running" ? "running" : (state.run?.state ?? "not run");
+    if (seen.states.at(-1) !== at) seen.states.push(at);
+    if (at === "complete" || at === "failed" || at === "partial") break;
+    if (at === "waiting" && state.waiting.length) {
+      const approve = page.locator("button.first >> text=Approve").first();
+      await approve.waitFor({ timeout: 30000 });
+      if (seen.states.filter((each) => each === "waiting").length === 1) {
+        await page.waitForSelector("figure img, .evidence p", { timeout: 60000 });
+        await page.waitForLoadState("networkidle", { timeout: 5000 }).catch(() => {});
+        await shot("question");
+      }
+      await page.locator("body").press("a");
+    }
+    await page.waitForTimeout(1500);
+  }
+  await shot("complete");
+}
+console.log(JSON.stringify(seen));
+await browser.close();

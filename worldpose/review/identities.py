@@ -1,0 +1,255 @@
+"""Corrections of who is who, laid over what the tracker found (T2, D6)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.review import MergedTracks, NamedTrack, Sighting, SplitTrack
+from data_contracts.tracking import Join, Track
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+IdentityEdit: TypeAlias = MergedTracks | SplitTrack | NamedTrack
+T = TypeVar("T", bound=np.generic)
+IDENTITY_EDITS = (MergedTracks, SplitTrack, NamedTrack)
+
+
+@dataclass(frozen=True, eq=False)
+class Identities:
+    """Who is who in one clip, as the tracker found it or as people corrected it.
+
+    Attributes:
+        frame: (frames,) match frames.
+        cameras: ids in the order of the camera dimension.
+        person: (persons,) ids.
+        detection_index: (frames, cameras, persons), -1 = not seen.
+        ray_distance: (frames, cameras, persons) [m]; NaN = not seen.
+        joints: (frames, persons, 17, 3) [m], world; NaN where missing.
+        names: roster id by person, of those that have one.
+        joins: where one track went on as another, or may have.
+    """
+
+    frame: NDArray[np.integer]
+    cameras: tuple[str, ...]
+    person: NDArray[np.int32]
+    detection_index: NDArray[np.int16]
+    ray_distance: NDArray[np.float32]
+    joints: NDArray[np.float32]
+    names: dict[int, str]
+    joins: tuple[Join, ...]
+
+    @property
+    def tracks(self) -> tuple[Track, ...]:
+        """One summary a person, in the order of `person`."""
+        found = []
+        for k, person in enumerate(self.person.tolist()):
+            views = np.count_nonzero(self.detection_index[:, :, k] >= 0, axis=1)
+            present = np.flatnonzero(views)
+            found.append(
+                Track(
+                    person=person,
+                    first_frame=int(present[0]),
+                    last_frame=int(present[-1]),
+                    frames_seen=len(present),
+                    views=float(views[present].mean()),
+                    name=self.names.get(person),
+                )
+            )
+        return tuple(found)
+
+
+@dataclass(frozen=True, eq=False)
+class IdentityReplay:
+    """Identities with people's corrections.
+
+    Attributes:
+        identities: as corrected.
+        objections: for each edit why it does not apply; None where it does.
+    """
+
+    identities: Identities
+    objections: tuple[str | None, ...]
+
+
+def stored_identities(result: xr.Dataset) -> Identities:
+    """The identities of a published result of stage `tracking`."""
+    tracks = (Track.model_validate(track) for track in result.attrs["tracks"])
+    return Identities(
+        frame=result["frame"].values,
+        cameras=tuple(str(name) for name in result["camera"].values),
+        person=result["person"].values,
+        detection_index=result["detection_index"].values,
+        ray_distance=result["ray_distance"].values,
+        joints=result["joints"].values,
+        names={track.person: track.name for track in tracks if track.name is not None},
+        joins=tuple(Join.model_validate(join) for join in result.attrs["joins"]),
+    )
+
+
+def replay_identities(found: Identities, edits: Iterable[IdentityEdit]) -> IdentityReplay:
+    """Identities with edits applied one after the other; nothing is computed anew.
+
+    Ids are those after the edits before. An edit applies while the people that it names are still
+    those that the person saw; what a merged person has goes to the kept one.
+
+    Args:
+        found: as the tracker found them.
+        edits: of this clip, in the order they were made.
+    """
+    objections = []
+    for edit in edits:
+        objection = objection_to(found, edit)
+        objections.append(objection)
+        if objection is None:
+            found = _apply(found, edit)
+    return IdentityReplay(found, tuple(objections))
+
+
+def objection_to(found: Identities, edit: IdentityEdit) -> str | None:
+    """Why an edit does not apply to these identities; None where it does."""
+    if isinstance(edit, MergedTracks):
+        people: Sequence[tuple[int, Sighting | None]] = (
+            (edit.kept, edit.kept_seen),
+            (edit.merged, edit.merged_seen),
+        )
+    else:
+        people = ((edit.person, edit.seen),)
+    ids = found.person.tolist()
+    for person, seen in people:
+        if person not in ids:
+            return f"clip {edit.clip} has no person {person}"
+        if seen is not None and not _is_seen(found, person, seen):
+            return f"person {person} is not who was seen in {seen.camera}, frame {seen.frame}"
+    if isinstance(edit, MergedTracks):
+        if edit.kept == edit.merged:
+            return f"person {edit.kept} is one person already"
+        kept, merged = (found.detection_index[:, :, ids.index(n)] for n, _ in people)
+        both = np.flatnonzero(((kept >= 0) & (merged >= 0)).any(axis=1))
+        if len(both):
+            frame = int(found.frame[both[0]])
+            return (
+                f"one camera sees persons {edit.kept} and {edit.merged} side by side in "
+                f"{len(both)} frames, the first is {frame}"
+            )
+    if isinstance(edit, SplitTrack):
+        seen_in = (found.detection_index[:, :, ids.index(edit.person)] >= 0).any(axis=1)
+        later = found.frame >= edit.first_frame_of_new
+        if not (seen_in & later).any() or not (seen_in & ~later).any():
+            return (
+                f"person {edit.person} is not seen both before and from {edit.first_frame_of_new}"
+            )
+    return None
+
+
+def sighting_of(
+    found: Identities, person: int, first: int | None = None, last: int | None = None
+) -> Sighting | None:
+    """A detection that tells who a person is: the one that fits best, None where there is none.
+
+    Args:
+        found: the identities.
+        person: an id in them.
+        first: first match frame to look in; None = the clip's.
+        last: last match frame to look in; None = the clip's.
+    """
+    k = found.person.tolist().index(person)
+    inside = np.ones(len(found.frame), dtype=np.bool_)
+    if first is not None:
+        inside &= found.frame >= first
+    if last is not None:
+        inside &= found.frame <= last
+    seen = (found.detection_index[:, :, k] >= 0) & inside[:, None]
+    if not seen.any():
+        return None
+    distance = np.where(seen, np.nan_to_num(found.ray_distance[:, :, k], nan=1e9), np.inf)
+    frame, camera = np.unravel_index(int(np.argmin(distance)), distance.shape)
+    return Sighting(
+        camera=found.cameras[int(camera)],
+        frame=int(found.frame[frame]),
+        detection=int(found.detection_index[frame, camera, k]),
+    )
+
+
+def _is_seen(found: Identities, person: int, seen: Sighting) -> bool:
+    frame = np.flatnonzero(found.frame == seen.frame)
+    if seen.camera not in found.cameras or not len(frame):
+        return False
+    k = found.person.tolist().index(person)
+    camera = found.cameras.index(seen.camera)
+    return bool(found.detection_index[frame[0], camera, k] == seen.detection)
+
+
+def _apply(found: Identities, edit: IdentityEdit) -> Identities:
+    if isinstance(edit, MergedTracks):
+        return _merged(found, edit.kept, edit.merged)
+    if isinstance(edit, SplitTrack):
+        return _split(found, edit.person, edit.first_frame_of_new)
+    names = {n: name for n, name in found.names.items() if n != edit.person}
+    return replace(found, names=names if edit.name is None else {**names, edit.person: edit.name})
+
+
+def _merged(found: Identities, kept: int, merged: int) -> Identities:
+    ids = found.person.tolist()
+    a, b = ids.index(kept), ids.index(merged)
+    index, distance = found.detection_index.copy(), found.ray_distance.copy()
+    joints = found.joints.copy()
+    taken = index[:, :, b] >= 0
+    index[:, :, a] = np.where(taken, index[:, :, b], index[:, :, a])
+    distance[:, :, a] = np.where(taken, distance[:, :, b], distance[:, :, a])
+    joints[:, a] = np.where(np.isfinite(joints[:, a]), joints[:, a], joints[:, b])
+    left = [k for k in range(len(ids)) if k != b]
+    names = {n: name for n, name in found.names.items() if n != merged}
+    if merged in found.names:
+        names.setdefault(kept, found.names[merged])
+    joins = []
+    for join in found.joins:
+        ends = [kept if n == merged else n for n in (join.before, join.after)]
+        said = {join.before, join.after} == {kept, merged}
+        update = {"before": ends[0], "after": ends[1], "decided": join.decided or said}
+        joins.append(join.model_copy(update=update))
+    return replace(
+        found,
+        person=found.person[left],
+        detection_index=index[:, :, left],
+        ray_distance=distance[:, :, left],
+        joints=joints[:, left],
+        names=names,
+        joins=tuple(joins),
+    )
+
+
+def _split(found: Identities, person: int, first_frame_of_new: int) -> Identities:
+    k = found.person.tolist().index(person)
+    later = found.frame >= first_frame_of_new
+
+    def halves(array: NDArray[T], axis: int, missing: float) -> NDArray[T]:
+        moved = np.moveaxis(array, axis, 1)
+        new = moved[:, k].copy()
+        new[~later] = missing
+        old = moved.copy()
+        old[later, k] = missing
+        return np.moveaxis(np.concatenate([old, new[:, None]], axis=1), 1, axis)
+
+    number = int(found.person.max()) + 1
+    # Of a join that the person's two halves were joined by, the second half is another now.
+    joins = tuple(
+        join.model_copy(update={"after": number})
+        if join.before == join.after == person
+        and found.frame[join.last_frame] < first_frame_of_new <= found.frame[join.first_frame]
+        else join
+        for join in found.joins
+    )
+    return replace(
+        found,
+        person=np.append(found.person, np.int32(number)).astype(np.int32),
+        detection_index=halves(found.detection_index, 2, -1),
+        ray_distance=halves(found.ray_distance, 2, np.nan),
+        joints=halves(found.joints, 1, np.nan),
+        joins=joins,
+    )
