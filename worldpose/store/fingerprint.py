@@ -97,7 +97,7 @@ def _data(code: ast.AST, path: Path) -> Iterator[Path]:
     yield from (
         file
         for file in sorted(path.parent.iterdir())
-        if file.suffix == ".npz" and file.name in texts
+        if file.suffix in (".npz", ".safetensors") and file.name in texts
     )
 
 

@@ -1,0 +1,199 @@
+"""Commands label and finetune: make the embedded nets better at what people correct."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, get_args
+
+import typer
+from pydantic import JsonValue, ValidationError
+
+from data_contracts.finetune import NetKind, NetVersion
+from flows.cli.console import (
+    DEFAULT_PROJECT,
+    JsonOption,
+    ProjectOption,
+    errors,
+    line,
+    print_json,
+    print_table,
+)
+from worldpose.errors import UsageError
+
+if TYPE_CHECKING:
+    from worldpose.training import FineTuningSettings
+
+SETTING = {"people": "detection.detector", "keypoints": "detection.pose"}
+"""What names each net in a run's settings."""
+
+
+class _Lines(logging.Handler):
+    """Shows the lines of training."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        line(record.getMessage(), to=errors)
+
+
+def label(
+    videos: Annotated[list[Path], typer.Argument(metavar="VIDEO...", help="Videos of one size.")],
+    out: Annotated[Path, typer.Option(help="Folder to write; absent or empty.")],
+    every: Annotated[int, typer.Option(min=1, help="Frames from one label to the next.")] = 50,
+    detectors: Annotated[
+        list[str] | None,
+        typer.Option("--detector", help="As in detection.detector; several are an ensemble."),
+    ] = None,
+    pose: Annotated[str, typer.Option(help="As in detection.pose.")] = "embedded",
+    as_json: JsonOption = False,
+) -> None:
+    """Propose labels of every so many frames, for people to correct.
+
+    Example: worldpose label cam00.mp4 cam01.mp4 --out labels
+    """
+    from flows.labelling import propose
+    from worldpose.detection import DetectionSettings
+
+    settings = DetectionSettings(detector=tuple(detectors or ["embedded"]), pose=pose)
+    frames = propose(videos, every, out, settings)
+    if as_json:
+        print_json({"frames": frames, "labels": str(out / "labels.json")})
+    else:
+        line(f"proposed labels of {frames} frames: correct {out / 'labels.json'}")
+
+
+def finetune(
+    annotations: Annotated[
+        Path, typer.Argument(metavar="LABELS", help="Reviewed labels: COCO keypoints, a JSON file.")
+    ],
+    pictures: Annotated[
+        Path | None, typer.Option(help="Folder of the pictures; that of LABELS by default.")
+    ] = None,
+    nets: Annotated[
+        list[str] | None, typer.Option("--net", help="people or keypoints; both by default.")
+    ] = None,
+    starts: Annotated[
+        list[str] | None,
+        typer.Option("--start", metavar="NET=FILE", help="Begin from a version; else the shipped."),
+    ] = None,
+    assignments: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="A setting, such as training.steps=800."),
+    ] = None,
+    project: ProjectOption = DEFAULT_PROJECT,
+    as_json: JsonOption = False,
+) -> None:
+    """Train on labels; a version that is not better on held-out frames is not adopted.
+
+    Example: worldpose finetune labels/person_keypoints.json --project worldpose-data
+    """
+    from flows.prefect_environment import prefect_server
+
+    if "://" in project:
+        raise UsageError(
+            f"--project {project}",
+            expected="a folder",
+            found="a URL",
+            todo="Train in a local project; weights are named by their file.",
+        )
+    kinds = tuple(_kind(name, "--net") for name in nets or get_args(NetKind))
+    begin = {_kind(name, "--start"): Path(file) for name, file in map(_parted, starts or [])}
+    settings = _settings(assignments or [])
+    logger = logging.getLogger("worldpose.finetune")
+    logger.setLevel(logging.INFO)
+    shown = _Lines()
+    logger.addHandler(shown)
+    try:
+        with prefect_server(project) as wait_until_ready:
+            from prefect.logging.handlers import APILogHandler
+
+            from flows.finetune import FOLDER, fine_tune_nets
+
+            wait_until_ready()
+            try:
+                versions = fine_tune_nets(
+                    annotations, pictures, Path(project) / FOLDER, kinds, settings, begin
+                )
+            finally:
+                APILogHandler().flush()  # while the server is there to take the last lines
+    finally:
+        logger.removeHandler(shown)
+    folder = Path(project) / FOLDER
+    if as_json:
+        print_json({"versions": [version.model_dump(mode="json") for version in versions]})
+    else:
+        _print(versions, folder)
+
+
+def _print(versions: list[NetVersion], folder: Path) -> None:
+    rows = [
+        (v.net, v.figure, f"{v.before:.3f}", f"{v.after:.3f}", str(len(v.held_out)), _verdict(v))
+        for v in versions
+    ]
+    columns = ("net", "figure", ">before", ">after", ">held-out pictures", "")
+    print_table("fine-tuning", columns, rows)
+    chosen = [f"--set {SETTING[v.net]}=embedded:{folder / v.file}" for v in versions if v.adopted]
+    if chosen:
+        line(f"use it with: worldpose run MATCH {' '.join(chosen)}")
+
+
+def _verdict(version: NetVersion) -> str:
+    return "adopted" if version.adopted else "not better: the old version stays"
+
+
+def _kind(name: str, where: str) -> NetKind:
+    kinds: tuple[NetKind, ...] = get_args(NetKind)
+    for kind in kinds:
+        if name == kind:
+            return kind
+    raise UsageError(
+        f"{where} {name}",
+        expected=" or ".join(kinds),
+        found=repr(name),
+        todo="Name one of the two nets.",
+    )
+
+
+def _parted(assignment: str) -> tuple[str, str]:
+    name, equals, value = assignment.partition("=")
+    if not equals:
+        raise UsageError(
+            assignment, expected="NAME=VALUE", found="no =", todo="For example: training.steps=800."
+        )
+    return name, value
+
+
+def _settings(assignments: list[str]) -> FineTuningSettings:
+    """Settings by name, those of the training with `training.` before them.
+
+    Raises:
+        UsageError: no such setting, or a value that does not fit.
+    """
+    from worldpose.training import FineTuningSettings
+
+    groups: dict[str, dict[str, JsonValue]] = {"": {}, "training": {}}
+    for assignment in assignments:
+        name, text = _parted(assignment)
+        try:
+            value = json.loads(text)
+        except ValueError:
+            value = text
+        group, _, field = name.rpartition(".")
+        groups.setdefault(group, {})[field] = value
+    given = {**groups.pop(""), **groups}
+    try:
+        return FineTuningSettings.model_validate(given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise UsageError(
+            f"--set {'.'.join(map(str, first['loc']))}",
+            expected=first["msg"],
+            found=repr(first["input"]),
+            todo="Its settings are those of FineTuningSettings.",
+        ) from None
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register these commands."""
+    app.command()(label)
+    app.command()(finetune)

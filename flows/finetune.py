@@ -1,0 +1,44 @@
+"""The flow of fine-tuning: reviewed labels in, new versions of the embedded nets out (D3-D5).
+
+Labels come from people: detections of chosen frames, corrected in review and exported as COCO
+keypoints. A version is adopted only where it is better on frames it has not seen; adopted or not,
+it is kept with its figures, and later runs use whichever their settings name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from prefect import flow
+
+from data_contracts.finetune import NetKind, NetVersion
+from tasks.finetune import finetune
+from worldpose.training import FineTuningSettings
+
+FOLDER = "detectors"
+"""Of a project: versions of nets, `<net>-<fingerprint>.safetensors` and their records."""
+
+
+@flow(name="finetune", validate_parameters=False)
+def fine_tune_nets(
+    annotations: Path,
+    pictures: Path | None,
+    folder: Path,
+    nets: Sequence[NetKind],
+    settings: FineTuningSettings,
+    starts: dict[NetKind, Path],
+) -> list[NetVersion]:
+    """Train each net in turn, and return the records of their new versions.
+
+    Args:
+        annotations: COCO keypoints.
+        pictures: the folder of their pictures; that of the annotations if None.
+        folder: where versions are kept.
+        nets: which.
+        settings: steps, rate, shares of pictures, seed.
+        starts: weights to begin from, where not the shipped ones.
+    """
+    return [
+        finetune(kind, annotations, pictures, folder, settings, starts.get(kind)) for kind in nets
+    ]

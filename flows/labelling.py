@@ -1,0 +1,64 @@
+"""Frames of videos with proposed labels, for people to correct before a fine-tuning."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.detection import DetectionSettings, load_detectors, load_pose
+from worldpose.errors import InputError, UsageError
+from worldpose.training.proposing import propose_labels
+from worldpose.video import VideoReader
+
+
+def propose(videos: Sequence[Path], every: int, folder: Path, settings: DetectionSettings) -> int:
+    """Write every so many frames of videos with proposed labels; returns how many frames.
+
+    Args:
+        videos: of pictures of one size.
+        every: frames from one to the next.
+        folder: absent or empty.
+        settings: which detectors propose.
+
+    Raises:
+        UsageError: the folder holds something.
+        InputError: two videos of one name or of different sizes, or a damaged one.
+    """
+    if folder.exists() and any(folder.iterdir()):
+        raise UsageError(
+            str(folder),
+            expected="an absent or empty folder",
+            found="files",
+            todo="Name another folder: labels that people corrected are never overwritten.",
+        )
+    if len({video.stem for video in videos}) < len(videos):
+        raise InputError(
+            "videos",
+            expected="files of different names",
+            found=", ".join(video.name for video in videos),
+            todo="Rename one: its name is that of its frames' pictures.",
+        )
+    frames = _frames(videos, every)
+    return len(
+        propose_labels(frames, load_detectors(settings), load_pose(settings), folder, settings)
+    )
+
+
+def _frames(videos: Sequence[Path], every: int) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+    shape: tuple[int, ...] | None = None
+    for video in videos:
+        with VideoReader(video) as reader:
+            for number in range(0, len(reader), every):
+                picture = reader.frame(number)
+                if shape is not None and picture.shape != shape:
+                    raise InputError(
+                        str(video),
+                        expected=f"pictures of {shape[1]} x {shape[0]} as in the videos before",
+                        found=f"{picture.shape[1]} x {picture.shape[0]}",
+                        todo="Label videos of another size in a folder of their own.",
+                    )
+                shape = picture.shape
+                yield f"{video.stem}_{number:06d}", picture

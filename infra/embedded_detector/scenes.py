@@ -1,0 +1,201 @@
+"""Rendered scenes with labels: people in many kits, stadiums, lights and lenses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.pitch import PitchSpec
+from worldpose.cameras import Camera
+from worldpose.pitch import PitchTemplate
+from worldpose.synthetic.casting import dress_people, roles_of
+from worldpose.synthetic.crowd import Crowd, gather
+from worldpose.synthetic.filming import RenderedFrame, open_view, render_frame
+from worldpose.synthetic.kits import PATTERNS
+from worldpose.synthetic.settings import CrowdSettings, RigSettings, Scenario
+from worldpose.synthetic.stadium import place_camera
+from worldpose.synthetic.venues import RenderingSettings
+from worldpose.training import LabelledPicture, read_labels, write_labels
+
+HIDDEN = 0.3
+"""People of whom less can be seen are ignored [1]."""
+SIZE = (1920, 1080)
+
+
+@dataclass(frozen=True)
+class SceneKind:
+    """What a set of scenes is drawn from.
+
+    Attributes:
+        first_seed: of its stadiums, kits and people; sets do not share any.
+        patterns: of shirts.
+        heights: of people [m].
+        person_height: of people in the middle of the pictures [px].
+        hazy: share of scenes with fog [1].
+        fog: thickest [1/m].
+    """
+
+    first_seed: int
+    patterns: tuple[str, ...]
+    heights: tuple[float, float]
+    person_height: tuple[float, float] = (36.0, 140.0)
+    hazy: float = 0.15
+    fog: float = 0.006
+
+
+TRAINING = SceneKind(
+    10_000, tuple(p for p in PATTERNS if p not in ("chequers", "sash")), (1.66, 1.97)
+)
+VARIETY = replace(TRAINING, first_seed=50_000)
+"""More stadiums, kits and people, in fewer pictures each."""
+CHECKING = SceneKind(20_000, TRAINING.patterns, TRAINING.heights)
+HELD_OUT = SceneKind(30_000, PATTERNS, (1.60, 2.02))
+"""Kits with patterns that training has not seen, and shorter and taller people."""
+SHIFTED = SceneKind(
+    40_000, ("chequers", "sash"), (1.60, 2.02), person_height=(34.0, 48.0), hazy=1.0, fog=0.02
+)
+"""A change of domain: other kits, fog, lower zoom."""
+
+
+def render_set(
+    folder: Path, kind: SceneKind, scenes: int, *, views: int = 4, frames: int = 2
+) -> Iterator[str]:
+    """Write scenes, each a folder of pictures with labels.json; yields a line for each.
+
+    Scenes whose labels are there are left alone.
+    """
+    for seed in range(kind.first_seed, kind.first_seed + scenes):
+        labels = folder / str(seed) / "labels.json"
+        if not labels.exists():
+            labels.parent.mkdir(parents=True, exist_ok=True)
+            write_labels(labels, _scene(labels.parent, kind, seed, views, frames), SIZE)
+        yield f"{folder.name}: scene {seed - kind.first_seed + 1} of {scenes}"
+
+
+def read_set(folder: Path) -> list[LabelledPicture]:
+    """Return the pictures of all scenes of a folder."""
+    scenes = sorted(folder.glob("*/labels.json"))
+    return [picture for labels in scenes for picture in read_labels(labels)]
+
+
+def _scene(
+    folder: Path, kind: SceneKind, seed: int, views: int, frames: int
+) -> list[LabelledPicture]:
+    rng = np.random.default_rng(seed)
+    scenario = _scenario(kind, rng)
+    pitch = PitchTemplate.from_spec(scenario.pitch)
+    crowd = gather(scenario, pitch, np.random.SeedSequence(seed))
+    times = np.sort(rng.uniform(0.2, scenario.duration - 0.2, frames))
+    settings = _rendering(kind, rng)
+    poses, later = crowd.poses(times), crowd.poses(times + settings.shutter)
+    joints = crowd.joints(times)
+    roles = roles_of(scenario.crowd, len(crowd.paths))
+    cast = dress_people(poses.betas[:, 0], roles, seed, settings.patterns)
+    pictures = []
+    for index in range(views):
+        camera = _camera(kind, scenario.pitch, crowd, joints[0], rng)
+        view = open_view(camera, pitch, seed, settings)
+        for frame in range(frames):
+            rendered = render_frame(
+                view, cast, cast.posed(poses[:, frame]), cast.posed(later[:, frame]), frame=frame
+            )
+            path = folder / f"{index}_{frame}.jpg"
+            cv2.imwrite(str(path), rendered.picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+            pictures.append(label(path, rendered, camera, joints[frame]))
+    return pictures
+
+
+def label(
+    path: Path, rendered: RenderedFrame, camera: Camera, joints: NDArray[np.float64]
+) -> LabelledPicture:
+    """Return who is where in a rendered frame; joints (persons, 17, 3) [m], world."""
+    height, width = rendered.picture.shape[:2]
+    limits = np.array([width, height, width, height]) - 0.5
+    boxes = np.clip(rendered.boxes, -0.5, limits)
+    sides = boxes[:, 2:] - boxes[:, :2]
+    there = np.isfinite(boxes).all(axis=1) & (np.nan_to_num(sides) > 1.0).all(axis=1)
+    pixels = camera.project(joints.reshape(-1, 3)).reshape(-1, 17, 2)
+    visible = np.where(_shown(rendered.person_ids, pixels), 2, 1)
+    visible[~np.isfinite(pixels).all(axis=-1)] = 0
+    return LabelledPicture(
+        path=path,
+        boxes=boxes[there],
+        keypoints=pixels[there],
+        visible=visible[there].astype(np.int8),
+        ignored=rendered.visible[there] < HIDDEN,
+    )
+
+
+def _shown(person_ids: NDArray[np.int16], pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether a person fills a pixel about each of his joints (persons, 17)."""
+    height, width = person_ids.shape
+    shown = np.zeros(pixels.shape[:2], dtype=bool)
+    at = np.nan_to_num(np.round(pixels), nan=-9.0)
+    for down in (-1, 0, 1):
+        for across in (-1, 0, 1):
+            x, y = (at + np.array([across, down])).swapaxes(0, -1).swapaxes(1, -1).astype(int)
+            inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            who = person_ids[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
+            shown |= inside & (who == np.arange(len(pixels))[:, None])
+    return shown
+
+
+def _scenario(kind: SceneKind, rng: np.random.Generator) -> Scenario:
+    movement = str(
+        rng.choice(["football", "corner", "wander", "crossing"], p=[0.3, 0.2, 0.35, 0.15])
+    )
+    people = {"football": 25, "corner": 18}.get(movement, int(rng.integers(6, 17)))
+    side = float(rng.uniform(10.0, 26.0))
+    center = (
+        (45.0, 0.0)
+        if movement == "corner"
+        else (float(rng.uniform(-44, 44)), float(rng.uniform(-26, 26)))
+    )
+    crowd = CrowdSettings(
+        people=people,
+        movement=movement,
+        officials=3 if movement == "football" else 0,
+        area_center=center,
+        area_size=(11.0, 15.0) if movement == "corner" else (side, 0.7 * side),
+        speed=(float(rng.uniform(-0.8, 1.0)), float(rng.uniform(3.5, 6.5))),
+        personal_space=float(rng.uniform(0.8, 1.6)),
+        height=kind.heights,
+    )
+    return Scenario(name="scene", about="To learn from.", duration=4.0, crowd=crowd)
+
+
+def _rendering(kind: SceneKind, rng: np.random.Generator) -> RenderingSettings:
+    return RenderingSettings(
+        stripes=float(rng.uniform(0.0, 0.3)),
+        paint=float(rng.uniform(0.7, 1.0)),
+        light="sun" if rng.random() < 0.55 else "floodlights",
+        stand_shadow=float(rng.choice([0.0, 0.3, 0.45, 0.6])),
+        fog=float(rng.uniform(0.4, 1.0) * kind.fog) if rng.random() < kind.hazy else 0.0,
+        exposure=float(np.exp(rng.uniform(-0.35, 0.3))),
+        patterns=kind.patterns,
+        blur=float(rng.uniform(0.4, 1.3)),
+        noise=float(rng.uniform(0.5, 5.0)),
+    )
+
+
+def _camera(
+    kind: SceneKind,
+    pitch: PitchSpec,
+    crowd: Crowd,
+    joints: NDArray[np.float64],
+    rng: np.random.Generator,
+) -> Camera:
+    """A camera off the pitch that looks at somebody, or past him."""
+    target = joints[int(rng.integers(len(joints))), 11] + [*rng.uniform(-3.0, 3.0, 2), 0.0]
+    target = np.clip(target, [-50.0, -32.0, 0.0], [50.0, 32.0, 0.0])
+    rig = RigSettings(
+        person_height=float(np.exp(rng.uniform(*np.log(kind.person_height)))),
+        height=(7.0, 30.0),
+        image_size=SIZE,
+    )
+    return place_camera(rig, int(rng.integers(1000)), target, pitch, rng)

@@ -1,0 +1,108 @@
+"""Makes the weights that ship with the project: renders scenes, trains both nets, scores them.
+
+    python infra/embedded_detector/train.py FOLDER
+
+Every part goes on where it was interrupted. Weights and figures.json end in FOLDER; weights with
+another seed or torch differ in their bytes, not in their figures' size.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from scenes import CHECKING, HELD_OUT, TRAINING, VARIETY, read_set, render_set
+
+from worldpose.detection.embedded import EmbeddedDetector, EmbeddedPose
+from worldpose.detection.embedded_nets import KeypointNet, PeopleNet
+from worldpose.detection.embedded_weights import load_weights, save_weights
+from worldpose.training import LabelledPicture, PictureCache, TrainingSettings
+from worldpose.training.nets import LEAST_HEIGHT, train_keypoint_net, train_people_net
+from worldpose.training.scoring import HEIGHTS, score_keypoints, score_people
+
+SEED = 1
+SCENES = {
+    "training": (TRAINING, 50, 4, 2),
+    "variety": (VARIETY, 200, 2, 1),
+    "checking": (CHECKING, 4, 4, 2),
+    "held_out": (HELD_OUT, 10, 4, 2),
+}
+"""Kind, scenes, views of each and moments of each view."""
+PEOPLE = TrainingSettings(steps=6000, check_every=500, rate=1.5e-3, seed=SEED, bfloat16=True)
+KEYPOINTS = TrainingSettings(steps=8000, check_every=500, rate=1.5e-3, seed=SEED, bfloat16=True)
+ABOUT = {"trained-on": "rendered scenes", "seed": str(SEED)}
+
+
+def main(folder: Path, parts: Sequence[str]) -> None:
+    """Render, train and score what is named: `scenes`, `people`, `keypoints`, `figures`."""
+    torch.set_num_threads(1)
+    if "scenes" in parts:
+        for name, (kind, count, views, frames) in SCENES.items():
+            for line in render_set(folder / name, kind, count, views=views, frames=frames):
+                say(line)
+    cache = PictureCache()
+    learned = [*read_set(folder / "training"), *read_set(folder / "variety")]
+    checked = read_set(folder / "checking")[::2]
+    if "people" in parts:
+        train_people(folder, learned, checked, cache)
+    if "keypoints" in parts:
+        train_keypoints(folder, learned, checked, cache)
+    if "figures" in parts:
+        figures = score(folder, read_set(folder / "held_out"), cache)
+        (folder / "figures.json").write_text(json.dumps(figures, indent=2) + "\n")
+        say(json.dumps(figures))
+
+
+def train_people(
+    folder: Path,
+    learned: Sequence[LabelledPicture],
+    checked: Sequence[LabelledPicture],
+    cache: PictureCache,
+) -> None:
+    """Train the detector; its weights are those of the best check."""
+    torch.manual_seed(SEED)
+    net, checkpoint = PeopleNet(), folder / "people.checkpoint"
+    train_people_net(net, learned, checked, cache, PEOPLE, checkpoint=checkpoint, progress=say)
+    save_weights(folder / "embedded_people.safetensors", net, ABOUT)
+
+
+def train_keypoints(
+    folder: Path,
+    learned: Sequence[LabelledPicture],
+    checked: Sequence[LabelledPicture],
+    cache: PictureCache,
+) -> None:
+    """Train the pose estimator; its weights are those of the best check."""
+    torch.manual_seed(SEED)
+    net, checkpoint = KeypointNet(), folder / "keypoints.checkpoint"
+    train_keypoint_net(net, learned, checked, cache, KEYPOINTS, checkpoint=checkpoint, progress=say)
+    save_weights(folder / "embedded_keypoints.safetensors", net, ABOUT)
+
+
+def score(
+    folder: Path, pictures: Sequence[LabelledPicture], cache: PictureCache
+) -> dict[str, object]:
+    """Return the figures on scenes that nothing was learned from or chosen by."""
+    detector = EmbeddedDetector(load_weights(folder / "embedded_people.safetensors", PeopleNet()))
+    pose = EmbeddedPose(load_weights(folder / "embedded_keypoints.safetensors", KeypointNet()))
+    classes = ["all", *(f"{low:g} to {high:g} px" for low, high in HEIGHTS)]
+    found = dict(zip(classes, score_people(detector, pictures, cache), strict=True))
+    limits = [(LEAST_HEIGHT, 1e9), *HEIGHTS]
+    placed = {
+        name: score_keypoints(pose, pictures, cache, each).__dict__
+        for name, each in zip(classes, limits, strict=True)
+    }
+    return {"pictures": len(pictures), "ap50": found, "keypoints": placed}
+
+
+def say(line: str) -> None:
+    """Print a line with the processor time so far."""
+    print(f"{time.process_time():7.0f} s  {line}", flush=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2:] or ["scenes", "people", "keypoints", "figures"])

@@ -1,0 +1,138 @@
+"""Pictures with labelled people, as COCO keypoints data sets on disk."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17
+from worldpose.errors import InputError
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledPicture:
+    """One picture and the people in it.
+
+    Attributes:
+        path: of the picture.
+        boxes: (people, 4) x0, y0, x1, y1 [px]; (0, 0) is the centre of the top-left pixel.
+        keypoints: (people, 17, 2) COCO-17 [px]; NaN where not labelled.
+        visible: (people, 17) int8: 2 seen, 1 hidden or outside of the picture, 0 not labelled.
+        ignored: (people,) people too hidden or too small to be asked for, or groups: to find them
+            is neither right nor wrong.
+    """
+
+    path: Path
+    boxes: Floats
+    keypoints: Floats
+    visible: NDArray[np.int8]
+    ignored: NDArray[np.bool_]
+
+
+def read_labels(annotations: Path, pictures: Path | None = None) -> list[LabelledPicture]:
+    """Return the pictures of a COCO keypoints data set, in the order of their ids.
+
+    `iscrowd` 1 marks people to be ignored. Boxes are taken as x, y, width, height in the pixels of
+    the keypoints, which begin at the centre of the top-left pixel.
+
+    Args:
+        annotations: the JSON file.
+        pictures: the folder that file names are in; the folder of the JSON file if None.
+
+    Raises:
+        InputError: the file is none of COCO keypoints, or a picture lies outside of the folder.
+    """
+    folder = annotations.parent if pictures is None else pictures
+
+    def refusal(expected: str, found: str) -> InputError:
+        return InputError(
+            str(annotations),
+            expected=expected,
+            found=found,
+            todo="Export the labels again as COCO keypoints of 17 joints.",
+        )
+
+    try:
+        dataset: dict[str, Any] = json.loads(annotations.read_bytes())
+        people: dict[int, list[dict[str, Any]]] = {
+            int(image["id"]): [] for image in dataset["images"]
+        }
+        for person in dataset["annotations"]:
+            people[int(person["image_id"])].append(person)
+        images = sorted(dataset["images"], key=lambda image: int(image["id"]))
+        read = [_picture(folder, image, people[int(image["id"])]) for image in images]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        found = f"{type(error).__name__}: {error}"
+        raise refusal("a COCO keypoints data set", found) from error
+    for picture in read:
+        if not picture.path.resolve().is_relative_to(folder.resolve()):
+            raise refusal("pictures within the data set's folder", str(picture.path))
+    return read
+
+
+def write_labels(
+    annotations: Path, pictures: Sequence[LabelledPicture], size: tuple[int, int]
+) -> None:
+    """Write a COCO keypoints data set; pictures are named relative to the file's folder.
+
+    Args:
+        annotations: the JSON file.
+        pictures: within its folder.
+        size: width, height of the pictures [px].
+    """
+    images: list[dict[str, Any]] = []
+    people: list[dict[str, Any]] = []
+    for number, picture in enumerate(pictures):
+        name = picture.path.relative_to(annotations.parent).as_posix()
+        images.append({"id": number, "file_name": name, "width": size[0], "height": size[1]})
+        rows = zip(picture.boxes, picture.keypoints, picture.visible, picture.ignored, strict=True)
+        for box, keypoints, visible, ignored in rows:
+            people.append(
+                {
+                    "id": len(people) + 1,
+                    "image_id": number,
+                    "category_id": 1,
+                    "iscrowd": int(ignored),
+                    **_annotation(box, keypoints, visible),
+                }
+            )
+    category = {"id": 1, "name": "person", "keypoints": list(COCO17)}
+    dataset = {"images": images, "annotations": people, "categories": [category]}
+    annotations.write_text(json.dumps(dataset, separators=(",", ":")) + "\n", encoding="utf-8")
+
+
+def _annotation(box: Floats, keypoints: Floats, visible: NDArray[np.int8]) -> dict[str, Any]:
+    x, y, right, bottom = np.round(box, 2).tolist()
+    triples = np.column_stack([np.nan_to_num(np.round(keypoints, 2)), visible])
+    return {
+        "bbox": [x, y, round(right - x, 2), round(bottom - y, 2)],
+        "area": round((right - x) * (bottom - y), 2),
+        "num_keypoints": int((visible > 0).sum()),
+        "keypoints": [value for a, b, v in triples.tolist() for value in (a, b, int(v))],
+    }
+
+
+def _picture(
+    folder: Path, image: dict[str, Any], people: Sequence[dict[str, Any]]
+) -> LabelledPicture:
+    boxes = np.array([person["bbox"] for person in people], dtype=np.float64).reshape(-1, 4)
+    given = [person.get("keypoints") or [0.0] * 51 for person in people]
+    triples = np.array(given, dtype=np.float64).reshape(len(people), 17, 3)
+    if not (np.isfinite(boxes).all() and np.isfinite(triples).all()):
+        raise ValueError("a number that is not finite")
+    visible = triples[..., 2].astype(np.int8)
+    return LabelledPicture(
+        path=folder / str(image["file_name"]),
+        boxes=np.column_stack([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]]),
+        keypoints=np.where(visible[..., None] > 0, triples[..., :2], np.nan),
+        visible=visible,
+        ignored=np.array([bool(person.get("iscrowd", 0)) for person in people], dtype=np.bool_),
+    )

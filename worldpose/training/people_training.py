@@ -1,0 +1,201 @@
+"""What the people net learns from: windows of pictures, and how far its maps are from the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from data_contracts.records import Record
+from worldpose.detection.embedded_crops import cut, picture_from_crop
+from worldpose.detection.embedded_nets import STRIDE, PeopleNet, normalised
+from worldpose.detection.embedded_peaks import cell_middles
+from worldpose.training.labels import LabelledPicture
+from worldpose.training.looks import LookSettings, changed_look
+from worldpose.training.pictures import PictureCache
+
+Floats = NDArray[np.float64]
+
+SPREAD: Final = 0.12
+"""Standard deviation of the target about a middle, as a share of the box's sides [1]."""
+NEAR: Final = 0.5
+"""Cells with a target from this on learn the box's sides [1]."""
+LEAST_SEEN: Final = 0.3
+"""Share of a box within a window from which on the person is asked for [1]."""
+
+
+class PeopleWindows(Record):
+    """Windows cut from pictures."""
+
+    windows: int = 4
+    """In a batch."""
+    side: int = 256
+    """Width and height of a window [px], a multiple of 32."""
+    height: tuple[float, float] = (28.0, 160.0)
+    """Shortest and tallest people that windows are scaled to [px]."""
+    aimed: float = 0.75
+    """Share of windows put around somebody [1]; the others lie anywhere."""
+    looks: LookSettings = LookSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class PeopleBatch:
+    """Windows and what the net should say of them.
+
+    Attributes:
+        pictures: (windows, side, side, 3) bytes.
+        target: (windows, rows, columns) in [0, 1]; 1 at the cell of a middle.
+        weight: (windows, rows, columns), 0 where ignored people are.
+        boxes: (windows, 4, rows, columns) [px] of whom a cell belongs to.
+    """
+
+    pictures: NDArray[np.uint8]
+    target: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    boxes: NDArray[np.float32]
+
+
+def people_batch(
+    pictures: Sequence[LabelledPicture],
+    cache: PictureCache,
+    settings: PeopleWindows,
+    rng: np.random.Generator,
+) -> PeopleBatch:
+    """Return a batch; the same generator gives the same one.
+
+    Args:
+        pictures: to draw from, each as often.
+        cache: reads them.
+        settings: number, size and looks of the windows.
+        rng: draws pictures, places, scales and looks.
+    """
+    side, cells = settings.side, settings.side // STRIDE
+    seen = np.empty((settings.windows, side, side, 3), dtype=np.uint8)
+    target = np.zeros((settings.windows, cells, cells), dtype=np.float32)
+    weight = np.ones_like(target)
+    boxes = np.zeros((settings.windows, 4, cells, cells), dtype=np.float32)
+    for index in range(settings.windows):
+        labelled = pictures[int(rng.integers(len(pictures)))]
+        picture = cache[labelled.path]
+        crop = _window(labelled, picture.shape, settings, rng)
+        mapping = picture_from_crop(crop, (side, side), 0.0, bool(rng.random() < 0.5))
+        seen[index] = changed_look(cut(picture, mapping, (side, side)), settings.looks, rng)
+        inside, ignored = boxes_in_window(labelled, picture.shape, mapping, side)
+        draw_targets(inside, ignored, target[index], weight[index], boxes[index])
+    return PeopleBatch(seen, target, weight, boxes)
+
+
+def _window(
+    labelled: LabelledPicture,
+    shape: tuple[int, ...],
+    settings: PeopleWindows,
+    rng: np.random.Generator,
+) -> Floats:
+    """Middle x, y [px] and picture px a window px of a random window."""
+    tall = np.exp(rng.uniform(*np.log(settings.height)))
+    wanted = np.flatnonzero(~labelled.ignored)
+    sides = labelled.boxes[:, 2:] - labelled.boxes[:, :2]
+    if len(wanted):
+        person = int(rng.choice(wanted))
+        scale = float(np.clip(sides[person].max() / tall, 0.3, 3.0))
+        if rng.random() < settings.aimed:
+            middle = labelled.boxes[person].reshape(2, 2).mean(axis=0)
+            reach = 0.45 * settings.side * scale
+            return np.array([*(middle + rng.uniform(-reach, reach, 2)), scale])
+    else:
+        scale = float(np.exp(rng.uniform(np.log(0.4), np.log(2.0))))
+    return np.array([rng.uniform(0, shape[1]), rng.uniform(0, shape[0]), scale])
+
+
+def boxes_in_window(
+    labelled: LabelledPicture, shape: tuple[int, ...], mapping: Floats, side: int
+) -> tuple[Floats, Floats]:
+    """Boxes of people to be found in a window (n, 4), and of those to be ignored (m, 4) [px]."""
+    inverse = np.linalg.inv(mapping[:, :2])
+    corners = (labelled.boxes.reshape(-1, 2, 2) - mapping[:, 2]) @ inverse.T
+    limits = (np.array([[0.0, 0.0], [shape[1], shape[0]]]) - 0.5 - mapping[:, 2]) @ inverse.T
+    low = np.maximum(limits.min(axis=0), -0.5)
+    high = np.minimum(limits.max(axis=0), side - 0.5)
+    whole = np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1)
+    clipped = np.concatenate(
+        [np.clip(whole[:, :2], low, high), np.clip(whole[:, 2:], low, high)], 1
+    )
+    area = np.prod(whole[:, 2:] - whole[:, :2], axis=1)
+    share = np.prod(clipped[:, 2:] - clipped[:, :2], axis=1) / np.maximum(area, 1e-9)
+    there = share > 0.0
+    wanted = (share >= LEAST_SEEN) & ~labelled.ignored
+    return clipped[there & wanted], clipped[there & ~wanted]
+
+
+def draw_targets(
+    boxes: Floats,
+    ignored: Floats,
+    target: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    sides: NDArray[np.float32],
+) -> None:
+    """Fill in one window's target, weight and boxes, in place."""
+    middles = np.arange(target.shape[0]) * STRIDE + 0.5 * (STRIDE - 1)
+    for x0, y0, x1, y1 in ignored:
+        rows, columns = (middles >= y0) & (middles <= y1), (middles >= x0) & (middles <= x1)
+        weight[np.ix_(rows, columns)] = 0.0
+    for box in boxes:
+        x, y = 0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3])
+        spread = np.maximum(SPREAD * (box[2:] - box[:2]), 0.5 * STRIDE)
+        across = np.exp(-0.5 * ((middles - x) / spread[0]) ** 2)
+        down = np.exp(-0.5 * ((middles - y) / spread[1]) ** 2)
+        bump = np.asarray(down[:, None] * across[None, :], dtype=np.float32)
+        row, column = (int(np.abs(middles - value).argmin()) for value in (y, x))
+        bump[row, column] = 1.0
+        mine = bump > target
+        target[mine] = bump[mine]
+        sides[:, mine] = box[:, None]
+        weight[row, column] = 1.0
+
+
+def people_loss(net: PeopleNet, batch: PeopleBatch) -> Tensor:
+    """Return how far the net's maps are from the batch's truth.
+
+    Middles by a penalty-reduced focal loss (Zhou, Objects as Points, 2019), boxes by generalised
+    intersection over union (Rezatofighi, 2019) at the cells about a middle.
+    """
+    device = next(net.parameters()).device
+    target, weight, boxes = (
+        torch.from_numpy(each).to(device) for each in (batch.target, batch.weight, batch.boxes)
+    )
+    logits, sides = net(normalised(torch.from_numpy(batch.pictures).to(device)))
+    chance = torch.sigmoid(logits)
+    found = (1.0 - chance).square() * functional.logsigmoid(logits)
+    empty = (1.0 - target) ** 4 * chance.square() * functional.logsigmoid(-logits)
+    middle = target == 1.0
+    people = middle.sum().clamp(min=1)
+    focal = -(weight * torch.where(middle, found, empty)).sum() / people
+    near = torch.where(target >= NEAR, target, 0.0)
+    overlap = _overlap(sides, boxes)
+    return focal + 2.0 * (near * (1.0 - overlap)).sum() / near.sum().clamp(min=1.0)
+
+
+def _overlap(sides: Tensor, boxes: Tensor) -> Tensor:
+    """Generalised intersection over union (batch, rows, columns) of boxes said and true."""
+    x = cell_middles(sides.shape[3], sides.device)[None, None, :]
+    y = cell_middles(sides.shape[2], sides.device)[None, :, None]
+    said = (x - sides[:, 0], y - sides[:, 1], x + sides[:, 2], y + sides[:, 3])
+    true = (boxes[:, 0], boxes[:, 1], boxes[:, 2], boxes[:, 3])
+
+    def span(most: bool, axis: int) -> Tensor:
+        outer, inner = torch.maximum, torch.minimum
+        if not most:
+            outer, inner = inner, outer
+        return (outer(said[axis + 2], true[axis + 2]) - inner(said[axis], true[axis])).clamp(min=0)
+
+    shared = span(False, 0) * span(False, 1)
+    hull = span(True, 0) * span(True, 1) + 1e-6
+    area = (said[2] - said[0]) * (said[3] - said[1])
+    union = area + (true[2] - true[0]) * (true[3] - true[1]) - shared + 1e-6
+    return shared / union - (hull - union) / hull

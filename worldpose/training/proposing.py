@@ -1,0 +1,63 @@
+"""Labels that detectors propose for chosen frames, for people to correct (D3-D4)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+
+from worldpose.detection import DetectionSettings, Detector, People, PoseEstimator
+from worldpose.detection.boxes import fuse
+from worldpose.detection.interfaces import Picture
+from worldpose.training.labels import LabelledPicture, write_labels
+
+SEEN: Final = 0.5
+"""Keypoints from this confidence on are proposed as seen, others as hidden [1]."""
+
+
+def propose_labels(
+    frames: Iterable[tuple[str, Picture]],
+    detectors: list[Detector],
+    pose: PoseEstimator,
+    folder: Path,
+    settings: DetectionSettings | None = None,
+) -> list[LabelledPicture]:
+    """Return what detectors say of frames, after writing it as a COCO data set.
+
+    The folder then holds pictures/<name>.png and labels.json, which any editor of COCO keypoints
+    takes and `read_labels` reads again.
+
+    Args:
+        frames: name and picture of each, in the order they were taken, all of one size.
+        detectors: an ensemble; its boxes of one person become one.
+        pose: finds the keypoints.
+        folder: absent or empty.
+        settings: what is sure enough to be proposed; the defaults if None.
+    """
+    settings = settings or DetectionSettings()
+    (folder / "pictures").mkdir(parents=True)
+    proposed, size = [], (0, 0)
+    for name, picture in frames:
+        people = fuse([each.detect([picture])[0] for each in detectors], settings.overlap)
+        sure = people.scores >= settings.sure
+        kept = People(people.boxes[sure], people.scores[sure])
+        poses = pose.estimate(picture, kept.boxes)
+        found = poses.confidence >= settings.least_keypoint
+        path = folder / "pictures" / f"{name}.png"
+        cv2.imwrite(str(path), picture[..., ::-1])
+        visible = np.where(poses.confidence >= SEEN, 2, 1) * found
+        proposed.append(
+            LabelledPicture(
+                path=path,
+                boxes=kept.boxes,
+                keypoints=np.where(found[..., None], poses.keypoints, np.nan),
+                visible=visible.astype(np.int8),
+                ignored=np.zeros(len(kept.boxes), dtype=np.bool_),
+            )
+        )
+        size = (picture.shape[1], picture.shape[0])
+    write_labels(folder / "labels.json", proposed, size)
+    return proposed

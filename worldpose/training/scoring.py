@@ -1,0 +1,92 @@
+"""Figures of the embedded nets on labelled pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.detection.interfaces import Detector, PoseEstimator
+from worldpose.training.average_precision import average_precision
+from worldpose.training.keypoint_accuracy import calibration_error, correct_keypoints
+from worldpose.training.keypoint_training import RIGHT
+from worldpose.training.labels import LabelledPicture
+from worldpose.training.pictures import PictureCache
+
+Floats = NDArray[np.float64]
+
+HEIGHTS = ((34.0, 46.0), (52.0, 70.0), (70.0, 160.0))
+"""Classes of people's heights [px]: of about 40, of about 60, and taller."""
+
+
+@dataclass(frozen=True)
+class KeypointFigures:
+    """How well keypoints are placed in given boxes.
+
+    Attributes:
+        people: how many.
+        pck: share of seen keypoints within a fifth of the torso [1].
+        hidden_pck: the same of hidden ones in the picture [1]; NaN without.
+        median_error: of seen keypoints, as a share of the longer side of the box [1].
+        calibration: mean gap between confidence and share of right keypoints [1].
+    """
+
+    people: int
+    pck: float
+    hidden_pck: float
+    median_error: float
+    calibration: float
+
+
+def score_people(
+    detector: Detector,
+    pictures: Sequence[LabelledPicture],
+    cache: PictureCache,
+    heights: Sequence[tuple[float, float]] = HEIGHTS,
+) -> tuple[float, ...]:
+    """Return AP50 of all people, and of those in each class of heights [px]."""
+    found = [detector.detect([cache[picture.path]])[0] for picture in pictures]
+    classes = [(0.0, np.inf), *heights]
+    return tuple(average_precision(found, pictures, each) for each in classes)
+
+
+def score_keypoints(
+    estimator: PoseEstimator,
+    pictures: Sequence[LabelledPicture],
+    cache: PictureCache,
+    heights: tuple[float, float] = (0.0, np.inf),
+) -> KeypointFigures:
+    """Return figures of the people of some heights [px], each in the true box."""
+    correct, visible, error, confidence, right = [], [], [], [], []
+    for picture in pictures:
+        tall = picture.boxes[:, 3] - picture.boxes[:, 1]
+        asked = ~picture.ignored & (tall >= heights[0]) & (tall < heights[1])
+        if not asked.any():
+            continue
+        boxes, true = picture.boxes[asked], picture.keypoints[asked]
+        said = estimator.estimate(cache[picture.path], boxes)
+        off = np.linalg.norm(said.keypoints - true, axis=-1)
+        longer = np.max(boxes[:, 2:] - boxes[:, :2], axis=1)
+        correct.append(correct_keypoints(said.keypoints, true))
+        error.append(off / longer[:, None])
+        right.append(off <= RIGHT * longer[:, None])
+        visible.append(picture.visible[asked])
+        confidence.append(said.confidence)
+    if not correct:
+        return KeypointFigures(0, *(np.nan,) * 4)
+    good, seen = np.concatenate(correct), np.concatenate(visible)
+    sure, fine = np.concatenate(confidence), np.concatenate(right)
+    counted = np.isfinite(good) & np.isfinite(sure)
+
+    def share(of: NDArray[np.bool_]) -> float:
+        return float(np.mean(good[of & np.isfinite(good)])) if of.any() else np.nan
+
+    return KeypointFigures(
+        people=len(good),
+        pck=share(seen == 2),
+        hidden_pck=share(seen == 1),
+        median_error=float(np.nanmedian(np.concatenate(error)[seen == 2])),
+        calibration=calibration_error(sure[counted], fine[counted]),
+    )
