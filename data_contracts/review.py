@@ -128,7 +128,10 @@ class MovedKeypoint(Record):
     detection: int
     """Its place among the camera's detections of the frame."""
     joint: Name
-    xy: tuple[float, float] | None
+    """Name in COCO-17."""
+    was: Pixel | None = None
+    """Where it was when the person moved it [px]; None where it was not seen."""
+    xy: Pixel | None
     """[px]"""
 
 

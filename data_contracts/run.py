@@ -136,6 +136,8 @@ class RunRecord(Record):
     match_id: Name
     parent: Name | None
     """The run before this one."""
+    iteration: int = 1
+    """Which pass over the method; from the second on, results of the one before have a say."""
     state: RunState
     """waiting: nothing failed, but a person has to approve results; partial: some units failed, but
     units of the last stage asked for have results."""

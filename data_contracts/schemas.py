@@ -10,14 +10,19 @@ from typing import Any
 from data_contracts.arrays import GroupLayout
 from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.broadcast_calibration import BROADCAST_CALIBRATION, KeyFrames
+from data_contracts.broadcast_pooling import BROADCAST_POOLING
 from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
 from data_contracts.cameras import CameraCalibration
 from data_contracts.conventions import CONVENTIONS, Conventions
+from data_contracts.detection import DETECTION
 from data_contracts.evaluation import Evaluation
+from data_contracts.filtering import FILTERING
+from data_contracts.finetune import NetVersion
 from data_contracts.ingest import INGEST
 from data_contracts.match import MatchSpec, Registration
 from data_contracts.pitch import PitchSpec
 from data_contracts.records import Record
+from data_contracts.refitting import REFITTING
 from data_contracts.retriangulation import RETRIANGULATION
 from data_contracts.review import Correction, JournalEntry, ReviewDecision, ReviewRequest
 from data_contracts.run import Project, Reservation, ResultManifest, RunRecord
@@ -43,6 +48,7 @@ RECORDS: dict[str, type[Record]] = {
     "result_manifest": ResultManifest,
     "run": RunRecord,
     "evaluation": Evaluation,
+    "net_version": NetVersion,
     "conventions": Conventions,
     "layout": GroupLayout,
 }
@@ -50,12 +56,16 @@ RECORDS: dict[str, type[Record]] = {
 LAYOUTS: tuple[GroupLayout, ...] = (
     INGEST,
     STATIC_CALIBRATION,
+    DETECTION,
     TRACKING,
     TRIANGULATION,
     BUNDLE_ADJUSTMENT,
     RETRIANGULATION,
     BODY_FITTING,
     BROADCAST_CALIBRATION,
+    BROADCAST_POOLING,
+    REFITTING,
+    FILTERING,
 )
 
 

@@ -39,5 +39,6 @@ STAGE = Stage(
     units=tracking.units,
     inputs=inputs,
     sources=sources,
+    again=tracking.filtered,
     outside=outside,
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import JsonValue
 
-from flows import tracking
+from flows import detection, tracking
 from flows.stage import Match, Stage
 from worldpose.bundle_adjustment import BundleAdjustmentSettings
 
@@ -15,10 +15,16 @@ def units(match: Match) -> tuple[str, ...]:
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Every static camera, what it brought in, and who is where in every clip."""
+    """Every static camera, whom it saw, and who is where in every clip."""
     clips = tracking.units(match)
     people = [f"{stage}/{clip}" for stage in ("tracking", "triangulation") for clip in clips]
-    return (*tracking.camera_inputs(match), *people)
+    seen = {name: None for clip in clips for name in tracking.camera_inputs(match, clip)}
+    return (*seen, *people)
+
+
+def again(match: Match, unit: str) -> tuple[str, ...]:
+    """What the bodies contradicted of every clip's detections."""
+    return tuple(name for clip in tracking.units(match) for name in tracking.filtered(match, clip))
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
@@ -26,6 +32,7 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     spec, pitch = match.folder.spec, match.folder.pitch
     return {
         "cameras": [camera.id for camera in spec.static_cameras],
+        "seen": {clip.id: list(detection.seen_by_cameras(match, clip.id)) for clip in spec.clips},
         "clips": {clip.id: [clip.first_frame, clip.frame_count] for clip in spec.clips},
         "fps": spec.fps,
         "pitch": None if pitch is None else pitch.model_dump(mode="json"),
@@ -39,4 +46,5 @@ STAGE = Stage(
     units=units,
     inputs=inputs,
     sources=sources,
+    again=again,
 )

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 
 from data_contracts.match import Registration
 from data_contracts.review import Correction, Edit, MovedPoint, RedrawnMarking, Withdrawal
+from flows.detections import require_seen
 from flows.identities import require_fitting
 from flows.stage import Match
 from flows.stale import StaleEditError
@@ -22,6 +23,7 @@ from worldpose.review import (
     value_now,
     with_was,
 )
+from worldpose.review.detections import DETECTION_EDITS
 from worldpose.review.identities import IDENTITY_EDITS
 from worldpose.store import Store
 
@@ -81,8 +83,8 @@ def new_corrections(
             note=note or None,
         )
         replay = replay_corrections(folder, [correction])
-        is_identity = isinstance(edit, IDENTITY_EDITS)
-        if replay.stale or (replay.folder == folder and not is_identity):
+        is_of_results = isinstance(edit, (*IDENTITY_EDITS, *DETECTION_EDITS))
+        if replay.stale or (replay.folder == folder and not is_of_results):
             raise InputError(
                 f"edit {number + 1} of {len(edits)}, {edit.kind}",
                 expected="one that applies",
@@ -117,6 +119,7 @@ def keep_edits(
         said = {each.id: each for each in match.journal.records if isinstance(each, Correction)}
         fresh = {name: edit for name, edit in given.items() if name not in said}
         require_fitting(store, match, [*fresh.values()])
+        require_seen(store, match, [*fresh.values()])
         runs = store.runs(match.match_id)
         corrections = new_corrections(
             match,

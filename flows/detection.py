@@ -61,7 +61,7 @@ def _stages(match: Match, footage: str) -> tuple[str, ...]:
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The video, the clip, and the pitch around which the crowd sits."""
+    """The video, the clip, the pitch around which the crowd sits, and what people corrected."""
     footage, clip_id = _units(match)[unit]
     clip, pitch = match.folder.spec.clip(clip_id), match.folder.pitch
     known = len(_stages(match, footage)) > 1
@@ -73,6 +73,7 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
         "first_frame": clip.first_frame,
         "frame_count": clip.frame_count,
         "pitch": pitch.model_dump(mode="json") if known and pitch is not None else None,
+        **ingest.edits_of(match, footage, clip.first_frame, clip.frame_count),
     }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.match import MatchSpec, Registration
-from flows.release import clips_of, joint_tracks, placed_joints, static_cameras
+from flows.release import bodies_unit, clips_of, joint_tracks, placed_joints, static_cameras
 from worldpose.body import BodyModel, BodyParameters, find_body
 from worldpose.cameras import Camera
 from worldpose.cameras.stored import camera_from_arrays
@@ -62,7 +62,7 @@ def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArr
     Raises:
         WorldposeError: the run has no fitted bodies.
     """
-    fits = run[_needed(run, f"body_fitting/{clip}", "Run the match to the end first.")]
+    fits = run[_needed(run, bodies_unit(run, clip), "Run the match to the end first.")]
     poses = BodyParameters(
         fits["betas"].values[:, None],
         *(fits[name].values.swapaxes(0, 1) for name in ("global_orient", "body_pose", "transl")),
@@ -82,7 +82,7 @@ def broadcast_camera(run: Run, clip: str) -> Camera:
     )
     found = run[_needed(run, f"broadcast_calibration/{clip}", todo)]
     by_frame = found[["focal", "principal_point", "distortion", "rotation", "translation"]]
-    frames = run[f"body_fitting/{clip}"]["frame"].values
+    frames = run[bodies_unit(run, clip)]["frame"].values
     arrays = by_frame.reindex(frame=frames).data_vars
     return camera_from_arrays({**arrays, "image_size": found["image_size"]})
 
@@ -160,7 +160,7 @@ def export_motion(origin: Origin, out: Path) -> list[Path]:
     written = []
     for clip in origin.clips:
         model, poses, persons = fitted_bodies(origin.run, clip)
-        frames = origin.run[f"body_fitting/{clip}"]["frame"].values
+        frames = origin.run[bodies_unit(origin.run, clip)]["frame"].values
         for person, person_id in enumerate(persons):
             for part in stretches(poses[person]):
                 name = f"person_{person_id:03d}_frame_{frames[part.start]:06d}.bvh"

@@ -53,6 +53,19 @@ class Gate:
                 lines.append(f"{name} is {judged[name]:.4g}, at most {limit:.4g} passes")
         return tuple(lines)
 
+    def excess(self, figures: Figures) -> float:
+        """How far the worst figure is beyond its limit [1]: 0 within, 1 at twice the limit.
+
+        Of a limit of zero it is the figure itself.
+        """
+        judged = self.judged(figures)
+        beyond = [
+            judged[name] / limit - 1.0 if limit else judged[name]
+            for name, limit in self.limits
+            if name in judged
+        ]
+        return max([0.0, *beyond])
+
 
 class CameraLimits(Record):
     """What a calibrated static camera may show."""
@@ -70,6 +83,22 @@ class CameraLimits(Record):
     """1 where the clicks leave a direction of the camera open [1]."""
 
 
+class PeopleLimits(Record):
+    """What the people found in a camera's clip may show (D6)."""
+
+    unreadable_share: float = Field(default=0.02, ge=0)
+    """Frames whose picture is missing or damaged [1]: half a second of a minute is a recorder's
+    hiccup; more is a video to be looked at."""
+    empty_share: float = Field(default=0.5, ge=0)
+    """Pictures in which nobody was found [1]. A camera looks away from play at times; one that sees
+    nobody for half a clip is turned, dark or beyond what the detector knows."""
+    bridged_share: float = Field(default=0.25, ge=0)
+    """Boxes that were filled in between two looks [1]; a quarter says that the detector misses."""
+    flicker_share: float = Field(default=0.10, ge=0)
+    """Boxes of tracks seen too seldom to be kept, per box that was [1]: turf, boards and crowd that
+    now and then look like somebody."""
+
+
 class IdentityLimits(Record):
     """What the tracks of a clip may show."""
 
@@ -82,6 +111,9 @@ class IdentityLimits(Record):
     mean_ray_distance_m: float = Field(default=0.15, ge=0)
     """How far the rays of matched detections pass each other [m]: beyond a shoulder's width of
     0.4 m people are mixed up, and a third of it says that cameras disagree."""
+    corrections_refused: float = Field(default=0, ge=0)
+    """Corrections of who is who that do not fit these tracks [1]: what a person said is not in
+    them."""
 
 
 class JointLimits(Record):
@@ -127,6 +159,11 @@ class BroadcastLimits(Record):
     """1 where something of the clip has to be looked at, as its report says [1]."""
 
 
+def _of_people(figures: Figures) -> Figures:
+    """With a stride, boxes between two looks are filled in on purpose and tell nothing."""
+    return {**figures, "bridged_share": 0.0} if figures.get("stride", 1) > 1 else figures
+
+
 def _of_adjustment(figures: Figures) -> Figures:
     after, before = (figures.get(f"held_out_error_{side}_px") for side in ("after", "before"))
     if after is None or not before:
@@ -141,6 +178,9 @@ def _of_bodies(figures: Figures) -> Figures:
 
 CAMERAS = Gate(
     "static_calibration", "Do the markings lie on the picture's, all over it?", CameraLimits()
+)
+PEOPLE = Gate(
+    "detection", "Is everybody on the pitch found, and nobody else?", PeopleLimits(), _of_people
 )
 IDENTITIES = Gate("tracking", "Is every person one track, from end to end?", IdentityLimits())
 JOINTS = Gate("triangulation", "Are the joints where the pictures show them?", JointLimits())

@@ -11,6 +11,7 @@ from data_contracts.records import Record
 from flows.stage import Match, Stage
 from worldpose.ingest import unit_frames
 from worldpose.ingest.footage import footage_clips, footage_size
+from worldpose.review.detections import DETECTION_EDITS
 
 
 class IngestSettings(Record):
@@ -40,7 +41,10 @@ def inputs(match: Match, unit: str) -> tuple[str, ...]:
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The unit's detections or else its video, and how its frames lie on the match's clock."""
+    """The unit's detections or else its video, and how its frames lie on the match's clock.
+
+    With what people corrected of given detections; the key of others knows nothing of that.
+    """
     folder = match.folder
     frames = unit_frames(folder.spec, unit)
     clock: dict[str, JsonValue] = {
@@ -55,7 +59,20 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
         "detections": path,
         "detections_sha256": match.registration.digest_of(path),
         **clock,
+        **edits_of(match, unit),
     }
+
+
+def edits_of(match: Match, camera: str, first: int = 0, count: int = 2**62) -> dict[str, JsonValue]:
+    """What people corrected of whom a camera saw in some frames; nothing where they did not."""
+    said: list[JsonValue] = [
+        correction.edit.model_dump(mode="json")
+        for correction in match.corrections
+        if isinstance(correction.edit, DETECTION_EDITS)
+        and correction.edit.camera == camera
+        and first <= correction.edit.frame < first + count
+    ]
+    return {"edits": said} if said else {}
 
 
 def video_sources(match: Match, unit: str) -> dict[str, JsonValue]:

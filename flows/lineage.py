@@ -111,7 +111,8 @@ def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
     match = open_match(store, match_id)
     latest = latest_run(store, match_id)
     asked = overrides or ({} if latest is None else latest.overrides)
-    planned = {unit.name: unit for unit in plan_run(store, match, asked)}
+    iteration = 1 if latest is None else latest.iteration
+    planned = {unit.name: unit for unit in plan_run(store, match, asked, iteration=iteration)}
     if unit_name not in planned:
         raise InputError(
             name,

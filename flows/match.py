@@ -18,7 +18,7 @@ from pydantic import JsonValue
 from data_contracts.run import GatePolicy, RunRecord
 from flows.gatekeeping import Gatekeeper, undecided
 from flows.outlook import look_ahead
-from flows.planning import PlannedUnit, plan_stage
+from flows.planning import PlannedUnit
 from flows.progress import reporter
 from flows.registering import open_match
 from flows.run_record import RunLog, latest_run, standing_results
@@ -48,6 +48,7 @@ def process_match(
     from_stage: str | None = None,
     until_stage: str | None = None,
     gates: GatePolicy | None = None,
+    iteration: int = 1,
 ) -> str:
     """Runs the method on one match, records the run and returns its number.
 
@@ -61,6 +62,7 @@ def process_match(
         from_stage: first stage to run; earlier ones are taken from the latest run as they stand.
         until_stage: last stage to run.
         gates: when results wait for a person; None is `auto` for a deployment, else `never`.
+        iteration: which pass over the method; the ones before it have their results.
 
     Raises:
         IncompleteRunError: some units failed or wait; the others have their results.
@@ -78,12 +80,13 @@ def process_match(
                 settings,
                 stages,
                 standing_results(latest, stages),
+                iteration,
             )
             open_questions = undecided(outlook.waiting)
             if open_questions and outlook.is_recorded_by(latest):
                 take_verdict(store, match_id, open_questions)
                 continue
-        record = _run_stages(store, match, stages, settings, policy)
+        record = _run_stages(store, match, stages, settings, policy, iteration)
         if record.failed or not (is_deployed() and undecided(record.waiting)):
             break
     if record.failed or record.waiting:
@@ -97,10 +100,11 @@ def _run_stages(
     stages: tuple[Stage, ...],
     settings: Overrides,
     policy: GatePolicy,
+    iteration: int,
 ) -> RunRecord:
-    log = RunLog.begin(store, match, stages, settings, policy)
+    log = RunLog.begin(store, match, stages, settings, policy, iteration)
     for stage in stages:
-        plan = plan_stage(store, match, stage, settings, log.passed)
+        plan = log.plan(stage)
         missing = [unit for unit in plan.units if not unit.published]
         log.blocked += plan.blocked
         log.reuse(unit for unit in plan.units if unit.published)

@@ -9,9 +9,13 @@ from __future__ import annotations
 from flows import (
     body_fitting,
     broadcast_calibration,
+    broadcast_pooling,
     bundle_adjustment,
+    detection,
+    filtering,
     gates,
     ingest,
+    refitting,
     retriangulation,
     static_calibration,
     tracking,
@@ -23,18 +27,22 @@ from flows.stage import Stage
 METHOD: tuple[Stage, ...] = (
     ingest.STAGE,  # [camera]
     static_calibration.STAGE,  # [camera]  C1-C5; then gate CAMERAS, C7
-    # detection [camera, chunk]         people and keypoints from pixels, D1-D5; then a gate, D6
+    detection.STAGE,  # [camera, clip]  D1-D5; then gate PEOPLE, D6
     tracking.STAGE,  # [clip]           T1, T2; then gate IDENTITIES
     triangulation.STAGE,  # [clip]      T3, T4; then gate JOINTS
     bundle_adjustment.STAGE,  #         B1-B3; then gate ADJUSTMENT
     retriangulation.STAGE,  # [clip]    B2
     body_fitting.STAGE,  # [clip]       S1-S3; then gate ACCEPTANCE of the clip
     broadcast_calibration.STAGE,  # [clip]  M1-M6; then gate BROADCAST
+    broadcast_pooling.STAGE,  # [clip]  M1
+    refitting.STAGE,  # [clip]          S1, S4
+    filtering.STAGE,  # [clip]          R2; then again from tracking, R1 (flows/iteration.py)
     # release, evaluation               X1-X3, E1-E6
 )
 
 GATES: tuple[Gate, ...] = (
     gates.CAMERAS,
+    gates.PEOPLE,
     gates.IDENTITIES,
     gates.JOINTS,
     gates.ADJUSTMENT,

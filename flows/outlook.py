@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from data_contracts.run import RunRecord, WaitingUnit
 from flows.gatekeeping import Gatekeeper, passed
 from flows.method import METHOD
-from flows.planning import PlannedUnit, plan_run, plan_stage
+from flows.planning import PlannedUnit, plan_run, plan_stage, results_before
 from flows.settings import Overrides
 from flows.stage import Stage
 
@@ -50,6 +50,7 @@ def look_ahead(
     overrides: Overrides,
     stages: tuple[Stage, ...],
     standing: Mapping[str, str],
+    iteration: int = 1,
 ) -> Outlook:
     """What a run of `stages` would do.
 
@@ -58,6 +59,7 @@ def look_ahead(
         overrides: settings that differ from their defaults.
         stages: the stages to run.
         standing: results of the stages before them, as `stage/unit` to key.
+        iteration: which, from 1.
 
     Raises:
         UsageError: `standing` lacks what the stages are made from.
@@ -69,11 +71,12 @@ def look_ahead(
         for stage in METHOD[: METHOD.index(stages[0])]
         for unit in gatekeeper.held(stage.name, standing)
     ]
+    before = results_before(store, match, overrides, iteration)
     units: list[PlannedUnit] = []
     for stage in stages:
-        plan = plan_stage(store, match, stage, overrides, passed(results, waiting))
+        plan = plan_stage(store, match, stage, overrides, passed(results, waiting), before)
         if plan.blocked and not waiting:
-            plan_run(store, match, overrides, stages, standing)  # says what is not there
+            plan_run(store, match, overrides, stages, standing, iteration)  # says what is not there
         units += plan.units
         results |= {unit.name: unit.key for unit in plan.units}
         there = {unit.name: unit.key for unit in plan.units if unit.published}

@@ -55,7 +55,12 @@ class StagePlan:
 
 
 def plan_stage(
-    store: Store, match: Match, stage: Stage, overrides: Overrides, results: Mapping[str, str]
+    store: Store,
+    match: Match,
+    stage: Stage,
+    overrides: Overrides,
+    results: Mapping[str, str],
+    before: Mapping[str, str] | None = None,
 ) -> StagePlan:
     """What a stage has to do.
 
@@ -65,13 +70,17 @@ def plan_stage(
         stage: the stage to plan.
         overrides: settings that differ from their defaults.
         results: `stage/unit` to key of what earlier stages have, or will have, computed.
+        before: the same of the iteration before; None in the first.
     """
     settings = settings_of(stage, overrides)
     outside = stage.outside(settings)
     units, blocked = [], []
     for unit in stage.units(match):
-        inputs = stage.inputs(match, unit)
-        if not all(name in results for name in inputs):
+        inputs = {name: results.get(name) for name in stage.inputs(match, unit)}
+        if before is not None:
+            inputs |= {name: before.get(name) for name in stage.again(match, unit)}
+        known = {name: key for name, key in inputs.items() if key is not None}
+        if known.keys() != inputs.keys():
             blocked.append(f"{stage.name}/{unit}")
             continue
         recipe = Recipe(
@@ -79,7 +88,7 @@ def plan_stage(
             stage=stage.name,
             unit=unit,
             sources=stage.sources(match, unit) | outside,
-            inputs={name: results[name] for name in inputs},
+            inputs=known,
             settings=settings.model_dump(mode="json"),
             code=code_version(f"tasks.{stage.name}"),
             libraries=libraries(),
@@ -96,6 +105,7 @@ def plan_run(
     overrides: Overrides,
     stages: tuple[Stage, ...] = METHOD,
     standing: Mapping[str, str] | None = None,
+    iteration: int = 1,
 ) -> list[PlannedUnit]:
     """All units of `stages` in order, as they would be if every one succeeded.
 
@@ -105,14 +115,16 @@ def plan_run(
         overrides: settings that differ from their defaults.
         stages: the stages to plan.
         standing: results of the stages before them, as `stage/unit` to key.
+        iteration: which, from 1.
 
     Raises:
         UsageError: `standing` lacks what the stages are made from.
     """
     planned: list[PlannedUnit] = []
     results = dict(standing or {})
+    before = results_before(store, match, overrides, iteration)
     for stage in stages:
-        plan = plan_stage(store, match, stage, overrides, results)
+        plan = plan_stage(store, match, stage, overrides, results, before)
         if plan.blocked:
             raise UsageError(
                 f"--from {stages[0].name}",
@@ -123,3 +135,13 @@ def plan_run(
         results |= {unit.name: unit.key for unit in plan.units}
         planned += plan.units
     return planned
+
+
+def results_before(
+    store: Store, match: Match, overrides: Overrides, iteration: int
+) -> dict[str, str] | None:
+    """The results that the iteration before has, as `stage/unit` to key; None before the first."""
+    if iteration == 1:
+        return None
+    planned = plan_run(store, match, overrides, iteration=iteration - 1)
+    return {unit.name: unit.key for unit in planned}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import JsonValue
 
 from data_contracts.records import Record
-from flows import body_fitting, broadcast_calibration, detection
+from flows import body_fitting, broadcast_calibration, detection, tracking
 from flows.stage import Match, Stage
 from worldpose.ingest import unit_frames
 
@@ -74,4 +74,5 @@ STAGE = Stage(
     units=units,
     inputs=inputs,
     sources=sources,
+    again=tracking.filtered,
 )

@@ -7,6 +7,7 @@ from pathlib import Path
 from data_contracts.match import Registration, SourceFile
 from flows.corrections import corrected_match
 from flows.stage import Match
+from worldpose.body_fitting import read_monocular
 from worldpose.errors import InputError
 from worldpose.ingest import (
     MatchFolder,
@@ -15,25 +16,32 @@ from worldpose.ingest import (
     register_match,
     require_calibrated,
 )
+from worldpose.ingest.footage import require_footage
 from worldpose.ingest.stills import read_still
 from worldpose.store import Store
 
 
-def register(store: Store, folder: Path) -> tuple[Match, bool]:
+def register(store: Store, folder: Path, *, unfinished: bool = False) -> tuple[Match, bool]:
     """Validate a match folder and make it known; tells whether it was new or changed.
 
     The same content under another name is the same match. A known match whose videos, detections
     or pitch changed is another match and needs another id.
 
+    Args:
+        store: the project.
+        folder: the match folder.
+        unfinished: take it without knowing all of its cameras; people click them on the pages.
+
     Raises:
         InputError: the folder is not a valid match, or its id or content is taken.
     """
     match_folder = read_match(folder)
-    _require_inputs(match_folder)
     match_id = match_folder.spec.match_id
     previous = store.registration(match_id)
     registration = register_match(match_folder, previous)
     match = corrected_match(store, match_folder, registration)
+    if not unfinished:
+        require_calibrated(match.folder)
     if previous is not None:
         if previous.identity != registration.identity:
             raise InputError(
@@ -57,6 +65,12 @@ def open_match(store: Store, match_id: str) -> Match:
         InputError: no such match, or its folder is not as it must be.
     """
     return register(store, Path(find_registration(store, match_id).folder))[0]
+
+
+def open_for_review(store: Store, match_id: str) -> Match:
+    """A registered match as `open_match` gives it, whether or not all its cameras are known."""
+    folder = Path(find_registration(store, match_id).folder)
+    return register(store, folder, unfinished=True)[0]
 
 
 def find_registration(store: Store, name: str) -> Registration:
@@ -90,19 +104,6 @@ def find_match(store: Store, name: str) -> Match:
     return open_match(store, name)
 
 
-def _require_inputs(match: MatchFolder) -> None:
-    """Refuse a match whose static cameras are not all calibrated and observed."""
-    require_calibrated(match)
-    for camera in match.spec.static_cameras:
-        if camera.id not in match.detections:
-            raise InputError(
-                f"{match.folder}: camera {camera.id}",
-                expected="2D poses in detections/",
-                found="none",
-                todo=f"Add detections/{camera.id}.json or .npz, or remove the camera.",
-            )
-
-
 def _refuse_duplicate(store: Store, registration: Registration) -> None:
     """Refuse a second folder of known content; a folder that moved is no second one."""
     for known in filter(None, map(store.registration, store.matches())):
@@ -121,7 +122,7 @@ def _refuse_duplicate(store: Store, registration: Registration) -> None:
 def _read_new_files(
     match: MatchFolder, registration: Registration, previous: Registration | None
 ) -> None:
-    """Refuse broken 2D poses and stills now, by file and place, not in the middle of a run."""
+    """Refuse broken 2D poses, videos and stills now, not in the middle of a run."""
     known = {source.sha256 for source in previous.files} if previous is not None else set()
 
     def is_new(path: Path) -> bool:
@@ -130,6 +131,11 @@ def _read_new_files(
     for unit, path in match.detections.items():
         if is_new(path):
             read_unit(match, unit)
+    for unit, path in match.videos.items():
+        if unit not in match.detections and (path.is_dir() or is_new(path)):
+            require_footage(match.spec, unit, path)
+    for path in filter(is_new, match.estimates.values()):
+        read_monocular(path)
     for name, path in match.stills.items():
         camera = match.spec.camera(name)
         if is_new(path):

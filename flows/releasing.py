@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from flows.formats import EXPORTS, Origin
-from flows.release import joint_tracks, static_cameras
+from flows.release import bodies_unit, joint_tracks, static_cameras
 from worldpose.errors import UsageError
 from worldpose.ingest.match_folder import NO_PITCH
 from worldpose.release.manifest import (
@@ -88,7 +88,7 @@ def release(origin: Origin, forms: list[str], out: Path, name: str, licence: str
             person_ids=tuple(tracks.person_ids.tolist()),
             origins=dict(zip(ORIGINS, counts.tolist(), strict=True)),
         )
-    bodies = [f"body_fitting/{clip}" for clip in origin.clips]
+    bodies = [bodies_unit(origin.run, clip) for clip in origin.clips]
     models = {origin.run[unit].attrs["body_model"] for unit in bodies if unit in origin.run}
     cameras = static_cameras(origin.run, spec, origin.stage)
     pictures = {camera.id: (camera.width, camera.height) for camera in spec.cameras}

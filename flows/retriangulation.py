@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from data_contracts.records import Record
-from flows import tracking
+from flows import detection, tracking
 from flows.stage import Match, Stage
 
 
@@ -12,9 +12,9 @@ class RetriangulationSettings(Record):
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """The cameras, what they brought in, who is who, and how it was triangulated before."""
-    cameras = [f"ingest/{camera.id}" for camera in match.folder.spec.static_cameras]
-    return (*cameras, "bundle_adjustment/cameras", f"tracking/{unit}", f"triangulation/{unit}")
+    """The cameras, whom they saw, who is who, and how it was triangulated before."""
+    seen = detection.seen_by_cameras(match, unit)
+    return (*seen, "bundle_adjustment/cameras", f"tracking/{unit}", f"triangulation/{unit}")
 
 
 STAGE = Stage(
@@ -24,4 +24,5 @@ STAGE = Stage(
     units=tracking.units,
     inputs=inputs,
     sources=tracking.clip_sources,
+    again=tracking.filtered,
 )

@@ -11,7 +11,7 @@ from typing import Self
 from data_contracts.run import GatePolicy, RunRecord, RunState, UnitFailure, WaitingUnit
 from flows.gatekeeping import Gatekeeper, passed
 from flows.method import METHOD
-from flows.planning import PlannedUnit, plan_stage
+from flows.planning import PlannedUnit, StagePlan, plan_stage, results_before
 from flows.progress import reporter
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
@@ -45,6 +45,8 @@ class RunLog:
     latest: RunRecord | None
     results: dict[str, str]
     gatekeeper: Gatekeeper
+    iteration: int = 1
+    before: Mapping[str, str] | None = None
     started_at: datetime = field(default_factory=lambda: datetime.now(UTC))
     started: float = field(default_factory=time.monotonic)
     executed: list[str] = field(default_factory=list)
@@ -61,6 +63,7 @@ class RunLog:
         stages: tuple[Stage, ...],
         overrides: Overrides,
         gates: GatePolicy = "never",
+        iteration: int = 1,
     ) -> Self:
         """A new run with its number reserved; earlier stages stand as the latest run has them."""
         latest = latest_run(store, match.match_id)
@@ -68,7 +71,8 @@ class RunLog:
         run_id = store.reserve_run(match.match_id)
         gatekeeper = Gatekeeper(store, match, gates)
         log = cls(
-            *(store, match, stages, overrides, run_id, latest, standing, gatekeeper),
+            *(store, match, stages, overrides, run_id, latest, standing, gatekeeper, iteration),
+            before=results_before(store, match, overrides, iteration),
             reused=list(standing),
         )
         for stage in METHOD[: METHOD.index(stages[0])]:
@@ -79,6 +83,11 @@ class RunLog:
     def passed(self) -> dict[str, str]:
         """The results that later stages may be made from."""
         return passed(self.results, self.waiting)
+
+    def plan(self, stage: Stage) -> StagePlan:
+        """What a stage has to do, now that those before it have run."""
+        given = (self.store, self.match, stage, self.overrides)
+        return plan_stage(*given, self.passed, self.before)
 
     def hold(self, stage: Stage) -> None:
         """Keep back what waits for a person behind a stage that has run."""
@@ -119,6 +128,7 @@ class RunLog:
             run_id=self.run_id,
             match_id=self.match.match_id,
             parent=None if self.latest is None else self.latest.run_id,
+            iteration=self.iteration,
             state=self._state(),
             results=dict(sorted(self.results.items())),
             settings=settings,
@@ -142,7 +152,7 @@ class RunLog:
     def _carry_over(self) -> None:
         """Keep results of later stages that are current all the same, and wait for nobody."""
         for stage in METHOD[METHOD.index(self.stages[-1]) + 1 :]:
-            plan = plan_stage(self.store, self.match, stage, self.overrides, self.passed)
+            plan = self.plan(stage)
             current = {unit.name: unit for unit in plan.units if unit.published}
             keys = {name: unit.key for name, unit in current.items()}
             let_pass = passed(keys, self.gatekeeper.held(stage.name, keys))

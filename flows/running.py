@@ -14,7 +14,7 @@ from types import FrameType
 from data_contracts.run import GatePolicy, RunRecord
 from flows.gatekeeping import Gatekeeper
 from flows.outlook import look_ahead
-from flows.planning import PlannedUnit, plan_stage
+from flows.planning import PlannedUnit
 from flows.prefect_environment import prefect_server
 from flows.progress import reporter
 from flows.run_record import RunLog, latest_run, standing_results
@@ -40,6 +40,8 @@ class RunRequest:
             is work for them.
         gates: when results wait for a person; None = as in the latest run while that waits, else
             never.
+        iteration: which pass over the method, unless `from_stage` goes on with the latest run's;
+            the passes before it have their results.
     """
 
     settings: Overrides
@@ -48,6 +50,7 @@ class RunRequest:
     dask: str | None = None
     workers: int | None = None
     gates: GatePolicy | None = None
+    iteration: int = 1
 
 
 def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
@@ -63,11 +66,13 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
     stages = selected_stages(request.from_stage, request.until_stage)
     latest = latest_run(store, match.match_id)
     standing = standing_results(latest, stages)
+    if request.from_stage is not None and latest is not None:
+        request = replace(request, iteration=latest.iteration)  # what stands is of that pass
     policy: GatePolicy = request.gates or "never"
     if request.gates is None and latest is not None and latest.state == "waiting":
         policy = latest.gates
     gatekeeper = Gatekeeper(store, match, policy)
-    outlook = look_ahead(gatekeeper, request.settings, stages, standing)
+    outlook = look_ahead(gatekeeper, request.settings, stages, standing, request.iteration)
     if outlook.missing:
         return _with_prefect(store, match, replace(request, gates=policy), outlook.missing)
     if latest is not None and outlook.is_recorded_by(latest):
@@ -80,17 +85,17 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
                 "waiting": outlook.waiting,
             }
         )
-    return _without_work(gatekeeper, stages, request.settings)
+    return _without_work(gatekeeper, stages, request)
 
 
 def _without_work(
-    gatekeeper: Gatekeeper, stages: tuple[Stage, ...], overrides: Overrides
+    gatekeeper: Gatekeeper, stages: tuple[Stage, ...], request: RunRequest
 ) -> RunRecord:
     """A new record of results that are all there: an earlier setting, or a verdict since."""
     store, match, policy = gatekeeper.store, gatekeeper.match, gatekeeper.policy
-    log = RunLog.begin(store, match, stages, overrides, policy)
+    log = RunLog.begin(store, match, stages, request.settings, policy, request.iteration)
     for stage in stages:
-        plan = plan_stage(store, match, stage, overrides, log.passed)
+        plan = log.plan(stage)
         log.blocked += plan.blocked
         log.reuse(plan.units)
         log.hold(stage)
@@ -118,6 +123,7 @@ def _with_prefect(
                 from_stage=request.from_stage,
                 until_stage=request.until_stage,
                 gates=request.gates,
+                iteration=request.iteration,
             )
         except IncompleteRunError as failure:
             run_id = failure.run_id

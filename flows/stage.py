@@ -43,6 +43,10 @@ def _nothing(settings: Record) -> dict[str, JsonValue]:
     return {}
 
 
+def _no_results(match: Match, unit: str) -> tuple[str, ...]:
+    return ()
+
+
 @dataclass(frozen=True)
 class Stage:
     """One step of the method; its task is the function of the same name in `tasks`.
@@ -54,6 +58,7 @@ class Stage:
         units: names of the pieces that are computed, retried and stored on their own.
         inputs: for a unit, the `stage/unit` names of the results it is made from.
         sources: for a unit, everything the match folder contributes to its result.
+        again: for a unit, the results of the iteration before that it is made from too.
         outside: for its settings, what they name outside of the match: digests of those files.
     """
 
@@ -63,4 +68,5 @@ class Stage:
     units: Callable[[Match], tuple[str, ...]]
     inputs: Callable[[Match, str], tuple[str, ...]]
     sources: Callable[[Match, str], dict[str, JsonValue]]
+    again: Callable[[Match, str], tuple[str, ...]] = _no_results
     outside: Callable[[Any], dict[str, JsonValue]] = _nothing

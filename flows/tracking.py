@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pydantic import JsonValue
 
+from flows import detection
 from flows.stage import Match, Stage
+from worldpose.review.identities import IDENTITY_EDITS
 from worldpose.tracking import TrackingSettings, people_allowed
 
 
@@ -14,20 +16,39 @@ def units(match: Match) -> tuple[str, ...]:
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Every static camera, and what it brought in."""
-    return camera_inputs(match)
+    """Every static camera, and whom it saw in the clip."""
+    return camera_inputs(match, unit)
 
 
-def camera_inputs(match: Match) -> tuple[str, ...]:
-    """Every static camera, and what it brought in."""
+def again(match: Match, unit: str) -> tuple[str, ...]:
+    """Cameras that agree with people (C6), and what the bodies contradicted (R2)."""
+    return ("bundle_adjustment/cameras", *filtered(match, unit))
+
+
+def filtered(match: Match, unit: str) -> tuple[str, ...]:
+    """What the bodies contradicted of the clip's detections."""
+    return (f"filtering/{unit}",)
+
+
+def camera_inputs(match: Match, clip_id: str) -> tuple[str, ...]:
+    """Every static camera, and whom it saw in a clip."""
     cameras = [camera.id for camera in match.folder.spec.static_cameras]
-    stages = ("ingest", "static_calibration")
-    return tuple(f"{stage}/{camera}" for stage in stages for camera in cameras)
+    known = (f"static_calibration/{camera}" for camera in cameras)
+    return (*detection.seen_by_cameras(match, clip_id), *known)
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The clip, whether there is a ground to walk on, and how many people the roster allows."""
+    """The clip, its ground, how many people the roster allows, and what people said of who is who.
+
+    Without such corrections the key is the tracker's alone.
+    """
+    said = [
+        correction.edit.model_dump(mode="json")
+        for correction in match.corrections
+        if isinstance(correction.edit, IDENTITY_EDITS) and correction.edit.clip == unit
+    ]
     return {
+        **({"identities": said} if said else {}),
         **clip_sources(match, unit),
         "ground": match.folder.pitch is not None,
         "people": people_allowed(match.folder.spec.roster),
@@ -35,11 +56,12 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
 
 
 def clip_sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The clip's place in the match, the clock, and the order of the cameras."""
+    """The clip's place in the match, the clock, the cameras in order, and whom each saw."""
     spec = match.folder.spec
     clip = spec.clip(unit)
     return {
         "cameras": [camera.id for camera in spec.static_cameras],
+        "seen": list(detection.seen_by_cameras(match, unit)),
         "first_frame": clip.first_frame,
         "frame_count": clip.frame_count,
         "fps": spec.fps,
@@ -53,4 +75,5 @@ STAGE = Stage(
     units=units,
     inputs=inputs,
     sources=sources,
+    again=again,
 )

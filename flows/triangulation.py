@@ -19,4 +19,5 @@ STAGE = Stage(
     units=tracking.units,
     inputs=inputs,
     sources=tracking.clip_sources,
+    again=tracking.again,
 )

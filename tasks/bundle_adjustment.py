@@ -51,6 +51,7 @@ class _People:
 
     Attributes:
         frame: (frames,) match frames, clip by clip.
+        clip_frames: the same by clip.
         fps: of them a second.
         person: (persons,) ids; one id in two clips need not be one person, and nothing here takes
             them for one.
@@ -60,6 +61,7 @@ class _People:
     """
 
     frame: NDArray[np.int64]
+    clip_frames: dict[str, NDArray[np.int64]]
     fps: float
     person: NDArray[np.int64]
     detection_index: NDArray[np.int64]
@@ -91,6 +93,7 @@ def _open_people(store: Store, work: Work, settings: BundleAdjustmentSettings) -
     count = len(sources["cameras"])
     people = _People(
         frame=frame,
+        clip_frames=frames,
         fps=float(sources["fps"]) / stride,
         person=person,
         detection_index=np.full((len(frame), count, len(person)), -1),
@@ -112,7 +115,7 @@ def _open_people(store: Store, work: Work, settings: BundleAdjustmentSettings) -
 def _open_clip(store: Store, work: Work, people: _People) -> Clip:
     """The cameras as calibrated, what was clicked in them, and what they saw of `people`."""
     sources = work.recipe.sources
-    opened = open_frames(store, work, people.frame)
+    opened = open_frames(store, work, people.clip_frames)
     pitch = sources["pitch"]
     template = None if pitch is None else PitchTemplate.from_spec(PitchSpec.model_validate(pitch))
     known = [

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from pydantic import TypeAdapter
 
 from data_contracts.detection import DETECTION
 from data_contracts.pitch import PitchSpec
 from data_contracts.run import Work
-from tasks.spool import spooling
+from tasks.spool import Spool, spooling
 from tasks.unit import open_input, require_registered, unit_task
 from worldpose.cameras.stored import camera_from_arrays
 from worldpose.detection import (
@@ -26,9 +28,11 @@ from worldpose.detection import (
 )
 from worldpose.detection.interfaces import Picture
 from worldpose.errors import InputError
+from worldpose.ingest import Observations
 from worldpose.ingest.footage import stretches
 from worldpose.pitch import PitchTemplate
-from worldpose.store import Store
+from worldpose.review.detections import DetectionEdit, replay_detections
+from worldpose.store import Store, key_of
 from worldpose.video import FrameIndex, open_video
 
 
@@ -36,30 +40,91 @@ from worldpose.video import FrameIndex, open_video
 def detection(work: Work) -> str:
     """Publishes boxes and keypoints; returns the key."""
     store = Store.open(work.project)
+    edits = TypeAdapter(list[DetectionEdit]).validate_python(work.recipe.sources.get("edits") or [])
+    with store.publishing(work) as result, spooling(store) as spool:
+        found = _published(store, work) if edits else None
+        found = found or _detected(store, work, spool)
+        result.figures |= found.figures
+        observations = found.observations
+        if edits:
+            replay = replay_detections(observations, edits)
+            observations = replay.observations
+            result.figures["corrections_refused"] = float(sum(map(bool, replay.objections)))
+        result.write(
+            DETECTION,
+            arrays=observations.arrays(),
+            coordinates={"frame": observations.frame},
+            attributes={
+                "camera_id": work.recipe.sources["camera"],
+                "unreadable": found.unreadable,
+            },
+        )
+    return work.key
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What the nets found.
+
+    Attributes:
+        observations: the people.
+        unreadable: [first, last] of each stretch of frames without a picture.
+        figures: of the work.
+    """
+
+    observations: Observations
+    unreadable: list[list[int]]
+    figures: dict[str, float]
+
+
+def _published(store: Store, work: Work) -> _Found | None:
+    """What the nets found, as it is published without corrections; None where it is not.
+
+    Found anew it is the same bytes.
+    """
+    recipe = work.recipe
+    sources = {name: each for name, each in recipe.sources.items() if name != "edits"}
+    plain = key_of(recipe.model_copy(update={"sources": sources}))
+    unit = (recipe.match_id, recipe.stage, recipe.unit, plain)
+    if not store.has(*unit):
+        return None
+    stored = store.open_result(*unit)
+    return _Found(
+        Observations(
+            frame=stored["frame"].values,
+            keypoints=stored["keypoints"].values,
+            confidence=stored["confidence"].values,
+            boxes=stored["boxes"].values,
+            score=stored["score"].values,
+        ),
+        stored.attrs["unreadable"],
+        dict(store.manifest(*unit).figures),
+    )
+
+
+def _detected(store: Store, work: Work, spool: Spool) -> _Found:
+    """What the nets find now."""
     sources: dict[str, Any] = work.recipe.sources
     settings = DetectionSettings.model_validate(work.recipe.settings)
     finder = PeopleFinder(load_detectors(settings), load_pose(settings), settings)
     _require_weights(settings, sources["weights"])
-    first, count = sources["first_frame"], sources["frame_count"]
-    with store.publishing(work) as result, spooling(store) as spool:
-        unreadable: list[int] = []
-        most = 0
-        for stretch in finder.find(_pictures(store, work), _place(store, work)):
-            spool.add(stretch.arrays())
-            unreadable += stretch.unreadable
-            most = max(most, int(np.isfinite(stretch.score).sum(axis=1).max()))
-        require_registered(Path(work.folder) / sources["video"], sources["video_sha256"])
-        result.write(
-            DETECTION,
-            arrays={name: values[:, :most] for name, values in spool.arrays().items()},
-            coordinates={"frame": np.arange(first, first + count)},
-            attributes={
-                "camera_id": sources["camera"],
-                "unreadable": stretches(np.array(unreadable, dtype=np.int64)),
-            },
-        )
-        report = finder.report
-        result.figures |= {
+    unreadable: list[int] = []
+    most = 0
+    for stretch in finder.find(_pictures(store, work), _place(store, work)):
+        spool.add(stretch.arrays())
+        unreadable += stretch.unreadable
+        most = max(most, int(np.isfinite(stretch.score).sum(axis=1).max()))
+    require_registered(Path(work.folder) / sources["video"], sources["video_sha256"])
+    report = finder.report
+    return _Found(
+        Observations(
+            frame=np.arange(
+                sources["first_frame"], sources["first_frame"] + sources["frame_count"]
+            ),
+            **{name: values[:, :most] for name, values in spool.arrays().items()},
+        ),
+        stretches(np.array(unreadable, dtype=np.int64)),
+        {
             "frames": report.frames,
             "detections": report.detections,
             "detections_a_frame": report.detections / report.frames,
@@ -69,8 +134,8 @@ def detection(work: Work) -> str:
             "crowd": report.crowd,
             "bridged_share": report.bridged / max(1, report.detections),
             "flicker_share": report.flickers / max(1, report.detections),
-        }
-    return work.key
+        },
+    )
 
 
 def _pictures(store: Store, work: Work) -> Iterator[tuple[int, Picture | None]]:

@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from data_contracts.ingest import INGEST
 from data_contracts.run import Work
 from tasks.unit import require_registered, unit_task
 from worldpose.ingest import Observations, UnitFrames, read_observations
 from worldpose.ingest.footage import Footage, read_footage
+from worldpose.review.detections import DetectionEdit, replay_detections
 from worldpose.store import Store
 from worldpose.store.writer import ResultWriter
 
@@ -30,6 +32,11 @@ def ingest(work: Work) -> str:
 
 def _write_observations(result: ResultWriter, work: Work) -> None:
     observations = _observations(work)
+    if "edits" in work.recipe.sources:
+        edits = TypeAdapter(list[DetectionEdit]).validate_python(work.recipe.sources["edits"])
+        replay = replay_detections(observations, edits)
+        observations = replay.observations
+        result.figures["corrections_refused"] = float(sum(map(bool, replay.objections)))
     result.write(
         INGEST,
         arrays=observations.arrays(),

@@ -2,42 +2,88 @@
 
 from __future__ import annotations
 
+import numpy as np
+from pydantic import TypeAdapter
+
 from data_contracts.run import Work
 from data_contracts.tracking import TRACKING
 from tasks.clip_inputs import open_clip
 from tasks.unit import figures_of, unit_task
-from worldpose.store import Store
+from worldpose.review.identities import (
+    Identities,
+    IdentityEdit,
+    replay_identities,
+    stored_identities,
+)
+from worldpose.store import Store, key_of
 from worldpose.tracking import TrackingSettings, track_people
 
 
 @unit_task
 def tracking(work: Work) -> str:
-    """Publishes which detection is which person; returns the key."""
+    """Publishes which detection is which person, as corrected by people; returns the key."""
     store = Store.open(work.project)
     with store.publishing(work) as result:
-        clip = open_clip(store, work)
-        tracks = track_people(
-            clip.cameras,
-            clip.keypoints,
-            clip.confidence,
-            clip.fps,
-            TrackingSettings.model_validate(work.recipe.settings),
-            ground=bool(work.recipe.sources["ground"]),
-            people=work.recipe.sources["people"],
-        )
+        said = work.recipe.sources.get("identities") or []
+        edits = TypeAdapter(list[IdentityEdit]).validate_python(said)
+        found, figures = _automatic(store, work) if edits else _tracked(store, work)
+        replay = replay_identities(found, edits)
+        corrected = replay.identities
+        if edits:
+            figures["undecided"] = float(sum(not join.decided for join in corrected.joins))
+        figures["corrections_refused"] = float(sum(map(bool, replay.objections)))
         result.write(
             TRACKING,
             arrays={
-                "detection_index": tracks.detection_index,
-                "ray_distance": tracks.ray_distance,
-                "joints": tracks.joints,
+                "detection_index": corrected.detection_index,
+                "ray_distance": corrected.ray_distance,
+                "joints": corrected.joints,
             },
-            coordinates={"frame": clip.frame, "person": tracks.person},
+            coordinates={"frame": corrected.frame, "person": corrected.person},
             attributes={
-                "camera": list(clip.camera_ids),
-                "tracks": [track.model_dump(mode="json") for track in tracks.tracks],
-                "joins": [join.model_dump(mode="json") for join in tracks.joins],
+                "camera": list(corrected.cameras),
+                "tracks": [track.model_dump(mode="json") for track in corrected.tracks],
+                "joins": [join.model_dump(mode="json") for join in corrected.joins],
+                "objections": list(replay.objections),
             },
         )
-        result.figures.update(figures_of(tracks.report, clip.camera_ids))
+        result.figures.update(figures)
     return work.key
+
+
+def _automatic(store: Store, work: Work) -> tuple[Identities, dict[str, float]]:
+    """What the tracker found and its figures: as they are published, else tracked anew.
+
+    Both are the same bytes.
+    """
+    recipe = work.recipe
+    sources = {name: each for name, each in recipe.sources.items() if name != "identities"}
+    plain = recipe.model_copy(update={"sources": sources})
+    unit = (recipe.match_id, recipe.stage, recipe.unit, key_of(plain))
+    if not store.has(*unit):
+        return _tracked(store, work)
+    return stored_identities(store.open_result(*unit)), dict(store.manifest(*unit).figures)
+
+
+def _tracked(store: Store, work: Work) -> tuple[Identities, dict[str, float]]:
+    clip = open_clip(store, work)
+    tracks = track_people(
+        clip.cameras,
+        clip.keypoints,
+        clip.confidence,
+        clip.fps,
+        TrackingSettings.model_validate(work.recipe.settings),
+        ground=bool(work.recipe.sources["ground"]),
+        people=work.recipe.sources["people"],
+    )
+    found = Identities(
+        frame=np.asarray(clip.frame),
+        cameras=tuple(clip.camera_ids),
+        person=tracks.person,
+        detection_index=tracks.detection_index,
+        ray_distance=tracks.ray_distance,
+        joints=tracks.joints,
+        names={},
+        joins=tracks.joins,
+    )
+    return found, figures_of(tracks.report, clip.camera_ids)

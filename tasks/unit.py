@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import platform
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from prefect.client.schemas.objects import State, TaskRun
 from data_contracts.records import Record
 from data_contracts.run import Work
 from worldpose.errors import CorruptionError, InputError, NondeterminismError, StoreError
+from worldpose.ingest.registration import digest_of_files
 from worldpose.store import Store, code_version, libraries
 
 
@@ -71,16 +71,14 @@ def open_input(store: Store, work: Work, name: str) -> xr.Dataset:
 
 
 def require_registered(path: Path, sha256: str) -> None:
-    """Refuse what was read of a file of the match folder if it is not what the key stands for.
+    """Refuse what was read of a file or folder of the match if it is not what the key stands for.
 
     Call it after reading: what is changed meanwhile is then seen.
 
     Raises:
         InputError: the file is not, or no longer, the one that was registered.
     """
-    with path.open("rb") as file:
-        found = hashlib.file_digest(file, "sha256").hexdigest()
-    if found != sha256:
+    if digest_of_files(path) != sha256:
         raise InputError(
             str(path),
             expected="the file that was registered when the run began",

@@ -109,7 +109,8 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
         problem = str(failure)
     else:
         waiting = still_waiting(match, latest)
-        for unit in plan_run(store, match, {} if latest is None else latest.overrides):
+        asked, iteration = ({}, 1) if latest is None else (latest.overrides, latest.iteration)
+        for unit in plan_run(store, match, asked, iteration=iteration):
             units[unit_state(unit, latest)].append(unit.name)
     return {
         "match": match_id,

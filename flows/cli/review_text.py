@@ -6,7 +6,13 @@ import json
 from datetime import datetime
 from typing import Any
 
-from data_contracts.review import Correction, MovedPoint, RedrawnMarking
+from data_contracts.review import (
+    Correction,
+    DeletedDetection,
+    MovedKeypoint,
+    MovedPoint,
+    RedrawnMarking,
+)
 from flows.cli.console import line, print_json, print_table
 from flows.review import Review
 
@@ -56,6 +62,15 @@ def in_words(correction: Correction) -> str:
         place = edit.camera if edit.frame is None else f"{edit.camera} frame {edit.frame}"
         was, xy = (json.dumps(it) if it else "nothing" for it in (edit.was, edit.xy))
         return f"{edit.marking} in {place}: {was} -> {xy}"
+    if isinstance(edit, MovedKeypoint | DeletedDetection):
+        place = f"detection {edit.detection} in {edit.camera} frame {edit.frame}"
+        if isinstance(edit, DeletedDetection):
+            return f"{place}: taken out"
+        was, xy = (
+            "nothing" if it is None else json.dumps([round(value, 2) for value in it])
+            for it in (edit.was, edit.xy)
+        )
+        return f"{edit.joint} of {place}: {was} -> {xy}"
     return f"{edit.kind} {edit.model_dump_json(exclude={'kind'})}"
 
 

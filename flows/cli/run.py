@@ -20,6 +20,9 @@ from flows.cli.console import (
     print_table,
     progress,
 )
+from flows.cli.iterations import as_json as iterations_as_json
+from flows.cli.iterations import parse_iterations, print_iterations
+from flows.iteration import iterate_match
 from flows.method import METHOD
 from flows.registering import find_match
 from flows.review import warnings_of
@@ -62,6 +65,15 @@ def run(
             "or always; while the latest run waits, as in that.",
         ),
     ] = None,
+    iterations: Annotated[
+        str,
+        typer.Option(
+            metavar="N",
+            help="How often to go through the method, each time without the keypoints that the "
+            "bodies of the time before contradict; auto: until left-out cameras are foreseen no "
+            "better.",
+        ),
+    ] = "1",
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -76,12 +88,14 @@ def run(
     overrides = parse_overrides(assignments or [], selected_stages(from_stage, until_stage))
     store = Store.open_or_new(project)
     policy = None if gates is None else _policy(gates)
+    most = parse_iterations(iterations)
     request = RunRequest(overrides, from_stage, until_stage, dask, workers, policy)
     with progress():
         opened = find_match(store, match)
         for text in warnings_of(opened):
             line(f"warning: {text}", to=errors)
-        record = run_match(store, opened, request)
+        passes = None if most == 1 else iterate_match(store, opened, request, most)
+        record = run_match(store, opened, request) if passes is None else passes.record
     seconds = time.monotonic() - started
     if as_json:
         print_json(
@@ -96,9 +110,12 @@ def run(
                 "failures": [failure.model_dump() for failure in record.failed],
                 "gates": record.gates,
                 "reviews": [unit.model_dump() for unit in record.waiting],
+                **({} if passes is None else iterations_as_json(passes)),
             }
         )
     else:
+        if passes is not None:
+            print_iterations(passes)
         _print(record, store.url, seconds)
     raise typer.Exit(EXIT_CODES[record.state])
 

@@ -13,7 +13,7 @@ from fastapi.responses import JSONResponse, Response
 from pydantic import Field
 
 from data_contracts.records import Record
-from flows.pages import calibration, decisions, evidence, identities, queue
+from flows.pages import calibration, decisions, detections, evidence, identities, outliers, queue
 from flows.pages.access import NAME_LENGTH, SESSION_SECONDS, Access
 from flows.pages.desk import Desk, Person
 from flows.pages.errors import add_answers
@@ -64,7 +64,7 @@ def create_app(project: str, access: Access) -> FastAPI:
     )
     add_answers(app)
     app.include_router(_sessions(desk))
-    for module in (queue, decisions, evidence, calibration, identities):
+    for module in (queue, decisions, evidence, outliers, calibration, detections, identities):
         app.include_router(module.routes(desk))
     app.include_router(_files())
     app.add_middleware(Guard, access=access)

@@ -123,7 +123,7 @@ def _clip(store: Store, run: Run, match: Match, clip: str) -> Evidence:
 
 
 def _adjustment(store: Store, run: Run, match: Match, unit: str) -> Evidence:
-    return Evidence((), tuple(adjustment_tables(run)))
+    return Evidence((), tuple(adjustment_tables(run)[:1]))  # the others are lists to choose from
 
 
 def _broadcast(store: Store, run: Run, match: Match, clip: str) -> Evidence:

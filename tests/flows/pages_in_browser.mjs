@@ -116,11 +116,35 @@ if (task.run) {
         await page.waitForLoadState("networkidle", { timeout: 5000 }).catch(() => {});
         await shot("question");
       }
+      // What contradicts the adjustment the most is taken out with one key.
+      if (!seen.out && state.waiting.some((each) => each.unit.startsWith("bundle_adjustment/"))) {
+        await page.waitForSelector("[data-outlier]", { timeout: 60000 });
+        await page.locator("body").press("x");
+        await page.waitForSelector('[data-outlier="0"] >> text=✕ out', { timeout: 60000 });
+        seen.out = await page.locator('[data-outlier="0"] td').allTextContents();
+        await shot("outliers");
+      }
       await page.locator("body").press("a");
     }
     await page.waitForTimeout(1500);
   }
   await shot("complete");
+  // A keypoint is put elsewhere, taken out, and that is taken back.
+  await page.goto(`${task.base}/#/detections/${match}/${encodeURIComponent(task.camera)}`);
+  await page.waitForSelector("[data-keypoint]", { timeout: 60000 });
+  await page.keyboard.press("n");
+  const keypoint = page.locator("g.on [data-keypoint]").first();
+  const at = await keypoint.boundingBox();
+  seen.fixed = await keypoint.getAttribute("data-keypoint");
+  await page.mouse.move(at.x + at.width / 2, at.y + at.height / 2);
+  await page.mouse.down();
+  await page.mouse.move(at.x + 20, at.y + 12, { steps: 3 });
+  await page.mouse.up();
+  for (const [key, kept] of [[null, 1], ["Delete", 2], ["Control+z", 1]]) {
+    if (key) await page.keyboard.press(key);
+    await page.waitForSelector(`[data-kept="${kept}"]`, { timeout: 60000 });
+  }
+  await shot("detections");
 }
 console.log(JSON.stringify(seen));
 await browser.close();

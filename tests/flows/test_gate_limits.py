@@ -2,7 +2,7 @@
 
 import pytest
 
-from flows.gates import ACCEPTANCE, ADJUSTMENT, CAMERAS
+from flows.gates import ACCEPTANCE, ADJUSTMENT, CAMERAS, PEOPLE
 from flows.method import GATES, METHOD
 
 
@@ -20,6 +20,14 @@ GOOD_CAMERA = {
 }
 
 
+GOOD_VIDEO = {
+    "unreadable_share": 0.0,
+    "empty_share": 0.1,
+    "bridged_share": 0.5,
+    "flicker_share": 0.01,
+}
+
+
 @pytest.mark.parametrize(
     ("gate", "figures", "objected"),
     [
@@ -27,6 +35,8 @@ GOOD_CAMERA = {
         (CAMERAS, {}, []),  # a given one was judged by who gave it
         (CAMERAS, GOOD_CAMERA | {"clicks_wrong": 1.0}, ["clicks_wrong is 1, at most 0 passes"]),
         (CAMERAS, {"clicks_wrong": 0.0, "weak": 0.0}, ["expected_ground", "expected_ground"]),
+        (PEOPLE, GOOD_VIDEO | {"stride": 2.0}, []),  # filled in between two looks on purpose
+        (PEOPLE, GOOD_VIDEO | {"stride": 1.0}, ["bridged_share is 0.5, at most 0.25 passes"]),
         (ADJUSTMENT, {"held_out_error_before_px": 2.0, "held_out_error_after_px": 1.9}, []),
         (
             ADJUSTMENT,

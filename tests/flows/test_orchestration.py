@@ -129,6 +129,7 @@ def test_a_damaged_input_fails_its_unit_and_repair_mends_it(server, tiny, tmp_pa
         "bundle_adjustment/cameras",
         "retriangulation/clip",
         "body_fitting/clip",
+        "filtering/clip",
     ]
     again = succeed("run", tiny, "--project", project, *joints, "--json").json
     assert (again["executed"], again["failed"]) == (2, 0)

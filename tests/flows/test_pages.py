@@ -7,20 +7,24 @@ import time
 import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command_line import TINY
 
+from data_contracts.conventions import COCO17
 from flows import corrections
 from flows.pages import continuing
 from flows.pages.access import SESSION_SECONDS, access_for
 from flows.pages.app import create_app
 from flows.pages.continuing import Continuing
 from flows.pages.guard import BODY_BYTES, OPEN
+from flows.planning import plan_run
 from flows.registering import open_match, register
 from flows.running import RunRequest, run_match
+from tasks.ingest import ingest
 from worldpose.errors import StoreError, UsageError
 from worldpose.review import read_journal
-from worldpose.store import Store
+from worldpose.store import Store, open_run
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # of the web framework, about its own test client
@@ -304,6 +308,37 @@ def test_edits_are_kept_all_or_none(ada, project_copy):
     answer = ada.post(f"{MATCH}/corrections", json=both)
     assert (answer.status_code, "no_such_point" in answer.text) == (422, True)
     assert read_journal(Store.open(str(project_copy)), TINY).entries == ()
+
+
+def test_a_keypoint_that_is_taken_out_is_gone_from_all_that_follows(ada, bob, project_copy):
+    store = Store.open(str(project_copy))
+    seen = open_run(str(project_copy), TINY)["ingest/cam00"]
+    frame, joint = int(seen["frame"].values[3]), COCO17.index("left_wrist")
+    detection = int(np.argmax(np.isfinite(seen["keypoints"].values[3, :, joint, 0])))
+    was = seen["keypoints"].values[3, detection, joint].astype(float).tolist()
+    place = {"camera": "cam00", "frame": frame, "detection": detection, "joint": "left_wrist"}
+    edit = {"kind": "moved_keypoint", **place, "was": was, "xy": None}
+    before = {each.name: each.key for each in plan_run(store, open_match(store, TINY), {})}
+    keep = {"edits": [{"id": "moved_keypoint.1", "edit": edit}]}
+    assert ada.post(f"{MATCH}/corrections", json=keep).status_code == 200
+    again = {"edits": [{"id": "moved_keypoint.2", "edit": edit}]}
+    answer = bob.post(f"{MATCH}/corrections", json=again)
+    assert (answer.status_code, "is not seen" in answer.text) == (409, True)
+    shown = ada.get(f"{MATCH}/detections/cam00", params={"frame": frame}).json()["people"]
+    (person,) = (each for each in shown if each["detection"] == detection)
+    assert person["keypoints"][joint] is None
+    assert person["keypoints"][0] is not None
+    match = open_match(store, TINY)
+    units = {each.name: each for each in plan_run(store, match, {})}
+    changed = {name for name, unit in units.items() if unit.key != before[name]}
+    assert {"ingest/cam00", "tracking/clip", "bundle_adjustment/cameras"} <= changed
+    assert not changed & {"ingest/cam01", "static_calibration/cam00"}
+    unit = units["ingest/cam00"]
+    ingest.fn(unit.work(store.url, match, "0001"))
+    found = store.open_result(TINY, "ingest", "cam00", unit.key)["keypoints"].values
+    gone = np.isnan(found) & np.isfinite(seen["keypoints"].values)
+    assert np.argwhere(gone).tolist() == [[3, detection, joint, 0], [3, detection, joint, 1]]
+    assert store.manifest(TINY, "ingest", "cam00", unit.key).figures["corrections_refused"] == 0
 
 
 @pytest.fixture

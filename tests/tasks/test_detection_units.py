@@ -1,11 +1,15 @@
 """From a video to the match's clock: the frame that is read is the one that was shown."""
 
+from dataclasses import replace
+from datetime import UTC, datetime
+
 import numpy as np
 import pytest
 
 import tasks.detection
 from data_contracts.cameras import CameraCalibration
 from data_contracts.match import MatchSpec
+from data_contracts.review import Correction, DeletedDetection
 from data_contracts.run import Work
 from flows.match import task_of
 from flows.method import METHOD
@@ -135,6 +139,50 @@ def test_people_of_videos_reach_tracking_on_the_match_s_clock(filmed, tmp_path, 
     )
     figures = store.manifest("filmed", "detection", "right.late", results["detection/right.late"])
     assert figures.figures["unreadable_share"] == pytest.approx(0.2)
+
+
+def test_a_corrected_detection_is_the_same_whether_or_not_the_nets_look_again(
+    filmed, tmp_path, reading, monkeypatch
+):
+    edit = DeletedDetection(camera="left", frame=4, detection=0)
+    said = Correction(
+        id="c1",
+        match_id="filmed",
+        edit=edit,
+        who="Ada",
+        made_at=datetime(2026, 1, 2, tzinfo=UTC),
+        based_on={},
+    )
+    stages = [stage.name for stage in METHOD].index("detection") + 1
+    found = []
+    for project in ("fresh", "kept"):
+        store = Store.create(tmp_path / project)
+        match, _ = register(store, filmed)
+        corrected = replace(match, corrections=(said,))
+        if project == "fresh":
+            after = computed(store, corrected, stages)
+        else:
+            before = computed(store, match, stages)
+            monkeypatch.setattr(tasks.detection, "load_detectors", None)  # would fail
+            after = computed_again(store, corrected, stages, before)
+            assert {n for n in after if after[n] != before[n]} == {"detection/left.early"}
+        unit = ("filmed", "detection", "left.early", after["detection/left.early"])
+        found.append((store.manifest(*unit), store.open_result(*unit)["score"].values))
+    (fresh, score), (kept, _) = found
+    assert np.isnan(score[:, 0]).tolist() == [n == 4 - 2 for n in range(12)]
+    assert (fresh.content, fresh.figures) == (kept.content, kept.figures)
+    assert fresh.figures["corrections_refused"] == 0
+
+
+def computed_again(store, match, stages, before):
+    """The same where what is there already is not computed."""
+    results = {}
+    for stage in METHOD[:stages]:
+        for unit in plan_stage(store, match, stage, {}, results).units:
+            if before.get(unit.name) != unit.key:
+                task_of(stage).fn(unit.work(store.url, match, "0001"))
+            results[unit.name] = unit.key
+    return results
 
 
 def test_other_weights_than_planned_with_are_refused(filmed, tmp_path, reading, monkeypatch):

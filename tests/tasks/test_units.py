@@ -94,7 +94,7 @@ def test_a_moved_click_reaches_its_camera_and_what_sees_through_it_alone(clicked
     after = {unit.name: unit for unit in plan_run(store, match, {})}
     changed = {name for name, unit in after.items() if unit.key != before[name].key}
     camera = f"static_calibration/{file.stem}"
-    clip = ("tracking", "triangulation", "retriangulation", "body_fitting")
+    clip = ("tracking", "triangulation", "retriangulation", "body_fitting", "filtering")
     assert changed == {camera, "bundle_adjustment/cameras", *(f"{stage}/clip" for stage in clip)}
     # What `worldpose why` and `worldpose diff` say.
     (reason,) = explain_difference(before[camera].recipe, after[camera].recipe)
@@ -203,12 +203,13 @@ def test_units_behind_a_failed_one_are_recorded_as_blocked(planned, failing):
     assert record.blocked == (
         "body_fitting/clip",
         "bundle_adjustment/cameras",
+        "filtering/clip",
         "retriangulation/clip",
         "tracking/clip",
         "triangulation/clip",
     )
     # The other cameras have their results: only what needs all of them waits.
-    assert len(record.executed) == len(plan_run(store, match, {})) - 6
+    assert len(record.executed) == len(plan_run(store, match, {})) - 7
 
 
 def test_a_run_until_a_stage_is_partial_when_some_of_its_units_are_there(planned):

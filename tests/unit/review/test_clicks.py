@@ -14,8 +14,10 @@ from data_contracts.cameras import CameraCalibration
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.review import (
+    AddedDetection,
     Correction,
     DeletedDetection,
+    MovedKeypoint,
     MovedPoint,
     RedrawnMarking,
 )
@@ -86,6 +88,10 @@ def made(*edits):
 
 def moved(xy, was, camera="a", marking=CORNER, frame=None):
     return MovedPoint(camera=camera, marking=marking, frame=frame, was=was, xy=xy)
+
+
+def hidden(joint, xy=None):
+    return MovedKeypoint(camera="a", frame=0, detection=0, joint=joint, was=(1.0, 1.0), xy=xy)
 
 
 def points(clicked):
@@ -163,7 +169,12 @@ def test_a_point_clicked_anew_in_the_folder_is_not_moved_back(folder):
         (moved((9.0, 9.0), (3.0, 4.0)), "was (3.0, 4.0) when"),
         (moved((9.0, 9.0), (1.0, 2.0), marking="corner_left_far"), "is not there now"),
         (moved((9.0, 9.0), None), "was not there when"),
-        (DeletedDetection(camera="a", frame=0, detection=0), "nothing takes in"),
+        (AddedDetection(camera="a", frame=0, box=(0, 0, 9, 9)), "nothing takes in"),
+        (DeletedDetection(camera="tv", frame=0, detection=0), "no camera tv"),
+        (DeletedDetection(camera="clip", frame=0, detection=0), None),
+        (hidden("nose"), None),
+        (hidden("tail"), "no joint tail"),
+        (hidden("nose", (100.0, 9.0)), "outside of the picture a"),
     ],
 )
 def test_what_does_not_apply_says_why_and_changes_nothing(folder, edit, reason):

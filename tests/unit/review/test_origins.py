@@ -4,7 +4,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from data_contracts.review import Correction, MovedPoint
+from data_contracts.review import Correction, DeletedDetection, MovedPoint
 from worldpose.review import ORIGINS, joint_origins, unit_origins
 
 MADE_FROM = {
@@ -31,6 +31,16 @@ def moved(camera, frame=None):
 def test_a_correction_marks_what_it_corrects_alone():
     origins = unit_origins(MADE_FROM, [moved("a")], ())
     assert origins == dict.fromkeys(MADE_FROM, "automatic") | {"static_calibration/a": "corrected"}
+
+
+def test_a_correction_of_a_detection_marks_whatever_found_it():
+    edit = DeletedDetection(camera="a", frame=3, detection=0)
+    out = moved("a").model_copy(update={"edit": edit})
+    given = dict.fromkeys(("ingest/a", "ingest/ab", "detection/ab.one"), ())
+    assert unit_origins(given, [out], ())["ingest/a"] == "corrected"
+    found = {**given, "detection/a.one": ()}
+    origins = unit_origins(found, [out], ())
+    assert [unit for unit in found if origins[unit] == "corrected"] == ["detection/a.one"]
 
 
 def test_a_key_frame_s_correction_marks_the_clip_s_moving_camera():

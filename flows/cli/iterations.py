@@ -1,0 +1,98 @@
+"""What `worldpose run --iterations` reads and prints."""
+
+from __future__ import annotations
+
+from statistics import median
+
+from pydantic import JsonValue
+
+from data_contracts.run import RunRecord
+from flows.cli.console import line, print_table
+from flows.iteration import Iteration, Iterations
+from worldpose.errors import UsageError
+
+UNTIL_BEST = "auto"
+
+
+def parse_iterations(text: str) -> int | None:
+    """How many; None until one is no better.
+
+    Raises:
+        UsageError: neither a number from 1 nor `auto`.
+    """
+    if text == UNTIL_BEST:
+        return None
+    if text.isascii() and text.isdigit() and int(text) > 0:
+        return int(text)
+    raise UsageError(
+        f"--iterations {text}",
+        expected="a number from 1, or auto",
+        found=repr(text),
+        todo="See worldpose run --help.",
+    )
+
+
+def figures_of(iteration: Iteration) -> dict[str, float | None]:
+    """The figures by which iterations are compared, over all clips."""
+    record = iteration.record
+    judged = _total(record, "filtering", "judged")
+    rejected = _total(record, "filtering", "keypoints_rejected")
+    reprojection = [
+        value for name, value in _last_bodies(record).items() if ".reprojection_px." in name
+    ]
+    return {
+        "held_out_error": iteration.held_out_error,
+        "rejected_share": rejected / judged if judged else None,
+        "boxes_dropped": _total(record, "filtering", "boxes_dropped"),
+        "boxes_of_others": _total(record, "filtering", "boxes_of_others"),
+        "bodies": _total(record, "body_fitting", "bodies"),
+        "reprojection_px": median(reprojection) if reprojection else None,
+        "computed": float(len(record.executed)),
+        "seconds": record.seconds,
+    }
+
+
+def as_json(found: Iterations) -> dict[str, JsonValue]:
+    """All iterations with their figures, and which one stands."""
+    return {
+        "iterations": [
+            {"iteration": each.number, "run": each.record.run_id, **figures_of(each)}
+            for each in found.passes
+        ],
+        "kept": found.kept.number,
+        "ended": found.ended,
+    }
+
+
+def print_iterations(found: Iterations) -> None:
+    """One column an iteration, and which one stands."""
+    columns = [figures_of(each) for each in found.passes]
+    rows = [
+        (name, *("" if column[name] is None else f"{column[name]:.4g}" for column in columns))
+        for name in columns[0]
+    ]
+    heads = [f"{each.number} (run {each.record.run_id})" for each in found.passes]
+    print_table("iterations", ("figure", *heads), rows)
+    line(
+        f"iteration {found.kept.number} stands, as run {found.record.run_id}: {found.ended}; "
+        "a later one is kept only if people are foreseen better in cameras left out"
+    )
+
+
+def _total(record: RunRecord, stage: str, name: str) -> float:
+    return sum(
+        figures.get(name, 0.0)
+        for unit, figures in record.figures.items()
+        if unit.startswith(f"{stage}/")
+    )
+
+
+def _last_bodies(record: RunRecord) -> dict[str, float]:
+    """Figures of the bodies of all clips, `unit.figure`, refitted where they were."""
+    found: dict[str, float] = {}
+    for stage in ("body_fitting", "refitting"):
+        for unit, figures in record.figures.items():
+            if unit.startswith(f"{stage}/"):
+                clip = unit.partition("/")[2]
+                found |= {f"{clip}.{name}": value for name, value in figures.items()}
+    return found

@@ -1,0 +1,112 @@
+"""Whom a camera saw by now: what was given or detected, with all that people said since."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import xarray as xr
+
+from data_contracts.review import Edit
+from flows.detection import seen_by, seen_in_broadcast
+from flows.stage import Match
+from flows.stale import StaleEditError
+from worldpose.errors import InputError
+from worldpose.ingest import Observations
+from worldpose.review.detections import (
+    DETECTION_EDITS,
+    DetectionEdit,
+    objection_to,
+    replay_detections,
+)
+from worldpose.store import Store, key_of
+
+
+def detections_now(store: Store, match: Match, camera: str, frame: int) -> Observations:
+    """Whom a camera saw in one match frame, as corrected; a frame that it lacks has no row.
+
+    Args:
+        store: the store.
+        match: with the corrections so far.
+        camera: a static camera, or the clip of a broadcast camera.
+        frame: match frame.
+
+    Raises:
+        InputError: the latest run has nobody seen by this camera in this frame.
+    """
+    stored, taken_in = _stored(store, match, camera, frame)
+    row = stored.sel(frame=slice(frame, frame))
+    found = Observations(
+        frame=row["frame"].values,
+        keypoints=row["keypoints"].values,
+        confidence=row["confidence"].values,
+        boxes=row["boxes"].values,
+        score=row["score"].values,
+    )
+    said = [
+        correction.edit
+        for correction in match.corrections
+        if isinstance(correction.edit, DETECTION_EDITS)
+        and (correction.edit.camera, correction.edit.frame) == (camera, frame)
+    ]
+    return replay_detections(found, said[taken_in:]).observations
+
+
+def require_seen(store: Store, match: Match, edits: Sequence[Edit]) -> None:
+    """Refuse corrections of detections that do not fit what the cameras saw, as corrected by now.
+
+    Raises:
+        StaleEditError: somebody changed it, or the edit never fitted.
+    """
+    found: dict[tuple[str, int], Observations] = {}
+    for edit in edits:
+        if not isinstance(edit, DETECTION_EDITS):
+            continue
+        place = (edit.camera, edit.frame)
+        if place not in found:
+            found[place] = detections_now(store, match, *place)
+        objection = objection_to(found[place], edit) if len(found[place].frame) else "no such frame"
+        if objection is not None:
+            raise _stale(edit, objection)
+        found[place] = replay_detections(found[place], [edit]).observations
+
+
+def _stale(edit: DetectionEdit, objection: str) -> StaleEditError:
+    error = StaleEditError(
+        f"{edit.camera}, frame {edit.frame}, {edit.kind}",
+        expected="a correction that fits what is seen by now",
+        found=objection,
+        todo="Look at it again.",
+    )
+    error.difference = {"camera": edit.camera, "frame": edit.frame, "now": objection}
+    return error
+
+
+def _stored(store: Store, match: Match, camera: str, frame: int) -> tuple[xr.Dataset, int]:
+    """The result that has a frame of a camera, and how many of that frame's edits it holds."""
+    spec = match.folder.spec
+    clips = [clip for clip in spec.clips if 0 <= frame - clip.first_frame < clip.frame_count]
+    names: list[str] = []
+    if camera in {each.id for each in spec.static_cameras}:
+        names = [seen_by(match, camera, clip.id) for clip in clips]
+    elif camera in {clip.id for clip in clips}:
+        names = [*seen_in_broadcast(match, camera)]
+    results = store.run(match.match_id).results if store.runs(match.match_id) else {}
+    name = next((name for name in names if name in results), None)
+    if name is None:
+        raise InputError(
+            f"{match.match_id}, {camera}, frame {frame}",
+            expected="people seen there in the latest run",
+            found="none",
+            todo=f"Run it first: worldpose run {match.match_id}.",
+        )
+    stage, _, unit = name.partition("/")
+    place = (match.match_id, stage, unit)
+    recipe = store.manifest(*place, results[name]).recipe
+    sources = dict(recipe.sources)
+    taken_in = sources.pop("edits", None) or []
+    assert isinstance(taken_in, list)
+    plain = key_of(recipe.model_copy(update={"sources": sources}))
+    if store.has(*place, plain):
+        return store.open_result(*place, plain), 0
+    here = [each for each in taken_in if isinstance(each, dict) and each["frame"] == frame]
+    return store.open_result(*place, results[name]), len(here)

@@ -1,0 +1,190 @@
+"""Task of stage `filtering`: the detections of one clip beside its bodies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from data_contracts.filtering import FILTERING
+from data_contracts.run import Work
+from tasks.clip_inputs import ClipInputs, open_clip
+from tasks.spool import spooling
+from tasks.triangulation import settings_before
+from tasks.unit import open_input, unit_task
+from worldpose.filtering import (
+    BodyViews,
+    FilteringSettings,
+    Judgement,
+    Suspects,
+    judge_detections,
+    learn_from,
+    measure_held_out,
+    perceived_joints,
+    view_bodies,
+)
+from worldpose.store import Store
+from worldpose.triangulation import TriangulationSettings
+
+PART = 128
+"""Frames judged at a time: 200 MB with 25 people before 16 cameras."""
+
+
+@unit_task
+def filtering(work: Work) -> str:
+    """Publishes which keypoints and boxes the bodies contradict; returns the key."""
+    store = Store.open(work.project)
+    settings = FilteringSettings.model_validate(work.recipe.settings)
+    with store.publishing(work) as result, spooling(store) as spool:
+        case = _open(store, work)
+        chosen = _evenly(len(case.clip.frame), settings.held_out_frames)
+        spread = learn_from(*case.at(chosen))
+        counts = np.zeros(5)
+        rejected = np.zeros((2, len(case.clip.camera_ids)))
+        for first in range(0, len(case.clip.frame), PART):
+            views, suspects = case.at(np.arange(first, min(first + PART, len(case.clip.frame))))
+            judged = judge_detections(views, suspects, spread, settings)
+            counts += _counts(judged, suspects)
+            rejected += [
+                judged.rejected.sum(axis=(0, 2, 3)),
+                np.isfinite(suspects.confidence).sum(axis=(0, 2, 3)),
+            ]
+            spool.add(
+                {
+                    "rejected": judged.rejected,
+                    "surprise": judged.surprise,
+                    "dropped": judged.dropped,
+                    "fits": judged.fits,
+                    "similarity": judged.similarity,
+                }
+            )
+        result.write(
+            FILTERING,
+            arrays=spool.arrays(),
+            coordinates={"frame": case.clip.frame, "person": case.person},
+            attributes={"camera": list(case.clip.camera_ids)},
+        )
+        names = ("judged", "keypoints_rejected", "boxes_dropped", "boxes_of_others", "boxes_found")
+        figures = {name: float(count) for name, count in zip(names, counts, strict=True)}
+        for c, camera in enumerate(case.clip.camera_ids):
+            figures[f"rejected_share.{camera}"] = float(rejected[0, c] / max(rejected[1, c], 1.0))
+        result.figures.update(figures | _held_out(store, work, case, chosen))
+    return work.key
+
+
+@dataclass(frozen=True, eq=False)
+class _Case:
+    """A clip with the bodies fitted to it, read a stretch at a time.
+
+    Attributes:
+        clip: with all that was detected, whatever was rejected before.
+        person: (persons,) ids.
+        index: (frames, cameras, persons).
+        joints: (frames, persons, 17, 3) [m], world, where the detector sees the bodies' joints.
+        covariance: (frames, persons, 17, 3, 3) [m^2].
+        placed: the result of `retriangulation`.
+        dropped: (frames, cameras, detections), boxes that the iteration before dropped; None in
+            the first.
+        triangulation: how joints were placed.
+    """
+
+    clip: ClipInputs
+    person: NDArray[np.integer]
+    index: NDArray[np.integer]
+    joints: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    placed: xr.Dataset
+    dropped: NDArray[np.bool_] | None
+    triangulation: TriangulationSettings
+
+    def at(self, frames: NDArray[np.int64]) -> tuple[BodyViews, Suspects]:
+        """The bodies in all pictures, and what was detected there."""
+        views = view_bodies(self.clip.cameras, self.joints[frames], self.covariance[frames])
+        keypoints, confidence = _taken(self.clip, frames)
+        placed = self.placed.isel(frame=frames)
+        boxes = confidence.shape[:3]
+        before = np.zeros(boxes, dtype=np.bool_) if self.dropped is None else self.dropped[frames]
+        suspects = Suspects(
+            keypoints,
+            confidence,
+            self.index[frames],
+            placed["offsets"].values.astype(np.float64),
+            placed["exchanged"].values,
+            before,
+            self.triangulation.noise,
+        )
+        return views, suspects
+
+
+def _open(store: Store, work: Work) -> _Case:
+    unit = work.recipe.unit
+    before = f"filtering/{unit}"
+    known = before in work.recipe.inputs
+    tracks = open_input(store, work, f"tracking/{unit}")
+    (bodies,) = (
+        open_input(store, work, name)
+        for name in (f"refitting/{unit}", f"body_fitting/{unit}")
+        if name in work.recipe.inputs
+    )
+    return _Case(
+        clip=open_clip(store, work, filtered=False),
+        person=tracks["person"].values,
+        index=tracks["detection_index"].values,
+        joints=perceived_joints(bodies["joints"].values, bodies["joint_offsets"].values),
+        covariance=bodies["covariance"].values,
+        placed=open_input(store, work, f"retriangulation/{unit}"),
+        dropped=open_input(store, work, before)["dropped"].values if known else None,
+        triangulation=settings_before(store, work, unit),
+    )
+
+
+def _counts(judged: Judgement, suspects: Suspects) -> list[float]:
+    """Keypoints judged and rejected; boxes dropped, of other bodies, and of nobody till now."""
+    frame, camera, person = np.nonzero(suspects.index >= 0)
+    taken = np.full(judged.fits.shape, -1)
+    taken[frame, camera, suspects.index[frame, camera, person]] = person
+    moved = (judged.fits >= 0) & (judged.fits != taken)
+    return [
+        float(np.isfinite(judged.surprise).sum()),
+        float(judged.rejected.sum()),
+        float(judged.dropped.sum()),
+        float((moved & (taken >= 0)).sum()),
+        float((moved & (taken < 0)).sum()),
+    ]
+
+
+def _held_out(store: Store, work: Work, case: _Case, frames: NDArray[np.int64]) -> dict[str, float]:
+    """How well left-out cameras are foreseen from the keypoints that this iteration rests on."""
+    clip = open_clip(store, work)
+    found = measure_held_out(
+        clip.cameras,
+        _taken(clip, frames),
+        _taken(case.clip, frames)[0],
+        case.index[frames].astype(np.int16),
+        case.triangulation,
+        clip.camera_covariance,
+    )
+    if found is None:
+        return {}
+    return {"held_out_error": found.error, "held_out_keypoints": float(found.keypoints)}
+
+
+def _evenly(frames: int, most: int) -> NDArray[np.int64]:
+    """Frames all over a clip."""
+    return np.unique(np.linspace(0, frames - 1, min(frames, most)).astype(np.int64))
+
+
+def _taken(
+    clip: ClipInputs, frames: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Keypoints and confidence of some frames."""
+    first, last = int(frames[0]), int(frames[-1]) + 1
+    if last - first == len(frames):
+        return clip.keypoints[first:last], clip.confidence[first:last]
+    each = [slice(frame, frame + 1) for frame in frames.tolist()]
+    return (
+        np.concatenate([clip.keypoints[frame] for frame in each]),
+        np.concatenate([clip.confidence[frame] for frame in each]),
+    )

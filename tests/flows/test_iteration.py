@@ -1,0 +1,238 @@
+"""The method again and again: which units an edit reaches, which iteration stands, and why."""
+
+import json
+import shutil
+
+import pytest
+from command_line import TINY, succeed, worldpose
+from test_refitting import halves
+
+from data_contracts.review import DeletedDetection
+from data_contracts.run import RunRecord
+from flows import iteration
+from flows.cli.iterations import parse_iterations
+from flows.iteration import Iteration, held_out_error, iterate_match
+from flows.method import METHOD
+from flows.planning import plan_run, results_before
+from flows.registering import register
+from flows.review import correct
+from flows.running import RunRequest
+from worldpose.errors import UsageError
+from worldpose.store import Store
+
+LATER = ("tracking", "triangulation", "bundle_adjustment", "retriangulation", "body_fitting")
+"""Stages that from the second iteration on look at what was filtered."""
+
+
+@pytest.fixture
+def clips(tiny, tmp_path):
+    """A store, and a folder with two clips."""
+    folder = halves(tiny, tmp_path / "match")
+    (folder / "calibration.toml").unlink()
+    return Store.create(tmp_path / "project"), folder
+
+
+def keys(store, folder, number, overrides=None):
+    """The keys of all units of all iterations to one, by iteration and name."""
+    match, _ = register(store, folder)
+    return {
+        (each, unit.name): unit
+        for each in range(1, number + 1)
+        for unit in plan_run(store, match, overrides or {}, iteration=each)
+    }
+
+
+def reached(match, number, *starts):
+    """What is made from `starts`, found by walking the stages' declared inputs alone."""
+    found = set()
+    for each in range(1, number + 1):
+        for stage in METHOD:
+            for unit in stage.units(match):
+                again = stage.again(match, unit) if each > 1 else ()
+                name = (each, f"{stage.name}/{unit}")
+                sources = {(each, up) for up in stage.inputs(match, unit)}
+                sources |= {(each - 1, up) for up in again}
+                # Without anything of the iteration before in it, a unit is the same one.
+                if name[1] in starts or sources & found:
+                    found.add(name)
+    return found
+
+
+def test_the_first_iteration_has_the_keys_of_a_plain_run(clips):
+    store, folder = clips
+    match, _ = register(store, folder)
+    plain = plan_run(store, match, {})
+    assert results_before(store, match, {}, 1) is None
+    assert not any(name.startswith("filtering/") for unit in plain for name in unit.recipe.inputs)
+
+
+def test_later_iterations_are_made_from_the_one_before_and_nothing_else_is_new(clips):
+    store, folder = clips
+    units = keys(store, folder, 3)
+    for (number, name), unit in units.items():
+        if number == 1:
+            continue
+        before = units[number - 1, name]
+        stage = name.partition("/")[0]
+        assert (unit.key != before.key) == (stage in (*LATER, "filtering")), name
+        clip = {f"filtering/{each}" for each in ("first", "second") if each in name}
+        wanted = clip or {"filtering/first", "filtering/second"}
+        if stage in LATER:
+            assert wanted <= unit.recipe.inputs.keys()
+            for each in wanted:
+                assert unit.recipe.inputs[each] == units[number - 1, each].key
+        if stage == "tracking":
+            # Cameras that agree with people (C6).
+            cameras = "bundle_adjustment/cameras"
+            assert unit.recipe.inputs[cameras] == units[number - 1, cameras].key
+
+
+@pytest.mark.parametrize("edit", ["click", "box", "setting"])
+def test_an_edit_recomputes_its_dependency_set_in_every_iteration(clips, edit):
+    store, folder = clips
+    before = keys(store, folder, 3)
+    overrides = {}
+    if edit == "click":
+        file = sorted((folder / "annotations" / "static_calibration").iterdir())[2]
+        content = json.loads(file.read_text())
+        content["points"][0]["xy"][1] += 0.5
+        file.write_text(json.dumps(content))
+        starts = [f"static_calibration/{file.stem}"]
+    elif edit == "box":
+        match, _ = register(store, folder)
+        deleted = DeletedDetection(camera="cam01", frame=5, detection=0)
+        correct(store, match, [deleted], who="Ada", why="a shadow")
+        starts = ["ingest/cam01"]
+    else:
+        overrides = {"body_fitting": {"tail": 3.0}}
+        starts = ["body_fitting/first", "body_fitting/second"]
+    after = keys(store, folder, 3, overrides)
+    match, _ = register(store, folder)
+    changed = {name for name in after if after[name].key != before[name].key}
+    assert changed == reached(match, 3, *starts)
+    if edit == "setting":
+        assert (1, "retriangulation/first") not in changed
+        assert (2, "tracking/first") in changed
+
+
+def record(number, error, state="complete"):
+    figures = {} if error is None else {"held_out_error": error, "held_out_keypoints": 100.0}
+    return RunRecord.model_validate(
+        {
+            "run_id": f"{number:04}",
+            "match_id": "m",
+            "parent": None,
+            "iteration": number,
+            "state": state,
+            **{name: {} for name in ("results", "settings", "overrides", "versions")},
+            **dict.fromkeys(("executed", "reused", "failed", "blocked"), ()),
+            "figures": {"filtering/clip": figures},
+            "started_at": "2024-01-01T00:00:00Z",
+            "finished_at": "2024-01-01T00:00:00Z",
+            "seconds": 1.0,
+        }
+    )
+
+
+@pytest.fixture
+def looped(monkeypatch):
+    """The loop over iterations with given errors; what it ran, by number."""
+
+    def loop(errors, most, states=None):
+        ran = []
+
+        def run(store, match, request):
+            ran.append(request.iteration)
+            state = (states or {}).get(request.iteration, "complete")
+            return record(request.iteration, errors[request.iteration - 1], state)
+
+        monkeypatch.setattr(iteration, "run_match", run)
+        monkeypatch.setattr(iteration, "_recorded", lambda *_: None)
+        monkeypatch.setattr(
+            iteration, "latest_run", lambda *_: record(ran[-1], errors[ran[-1] - 1])
+        )
+
+        class Anything:
+            match_id = "m"
+
+        return iterate_match(None, Anything(), RunRequest({}), most), ran
+
+    return loop
+
+
+def test_the_loop_ends_by_itself_when_left_out_cameras_are_foreseen_no_better(looped):
+    found, ran = looped([0.040, 0.0399, 0.02], None)
+    # The first stands, and is made the latest run again.
+    assert ran == [1, 2, 1]
+    assert found.kept.number == 1
+    assert found.record.iteration == 1
+    assert found.ended == "iteration 2 is no better"
+
+
+def test_the_loop_goes_on_while_it_helps_and_keeps_the_best(looped):
+    found, ran = looped([0.040, 0.036, 0.034, 0.0341], None)
+    assert (found.kept.number, ran) == (3, [1, 2, 3, 4, 3])
+
+
+def test_a_loop_of_a_number_keeps_the_best_of_them(looped):
+    found, ran = looped([0.040, 0.036, 0.037], 3)
+    assert (found.kept.number, ran) == (2, [1, 2, 3, 2])
+    found, ran = looped([0.040, 0.036, 0.034], 3)
+    assert (found.kept.number, ran) == (3, [1, 2, 3])
+
+
+def test_a_run_that_waits_or_fails_ends_the_loop_and_is_what_the_loop_says(looped):
+    found, ran = looped([0.040, None, 0.03], 3, {2: "waiting"})
+    assert ran == [1, 2]
+    assert found.record.state == "waiting"
+    assert found.kept.number == 1
+
+
+def test_without_a_held_out_error_no_iteration_is_better():
+    first, second = (Iteration(n, record(n, None), None) for n in (1, 2))
+    assert not second.is_better_than(first)
+
+
+def test_clips_count_by_their_keypoints():
+    both = {
+        "filtering/a": {"held_out_error": 0.02, "held_out_keypoints": 300.0},
+        "filtering/b": {"held_out_error": 0.06, "held_out_keypoints": 100.0},
+    }
+    assert held_out_error(record(1, None).model_copy(update={"figures": both})) == pytest.approx(
+        0.03
+    )
+
+
+def test_the_number_of_iterations_is_checked():
+    assert parse_iterations("3") == 3
+    assert parse_iterations("auto") is None
+    for text in ("0", "-1", "x", "1.5"):
+        with pytest.raises(UsageError):
+            parse_iterations(text)
+
+
+def test_a_part_of_the_method_has_no_iterations():
+    with pytest.raises(UsageError, match="whole method"):
+        iterate_match(None, None, RunRequest({}, until_stage="tracking"), 2)
+
+
+@pytest.mark.slow
+def test_iterations_are_runs_that_a_second_call_finds_finished(server, tiny, tmp_path):
+    project = tmp_path / "worldpose-data"
+    folder = shutil.copytree(tiny, tmp_path / "match")
+    shutil.copy(folder / "reference" / "calibration.toml", folder)
+    asked = ("run", folder, "--project", project, "--iterations", 2)
+    answer = succeed(*asked, "--json").json
+    assert [each["iteration"] for each in answer["iterations"]] == [1, 2]
+    store = Store.open(str(project))
+    first, second = (store.run(TINY, each["run"]) for each in answer["iterations"])
+    assert (first.iteration, second.iteration) == (1, 2)
+    assert second.parent == first.run_id
+    assert {name.partition("/")[0] for name in second.executed} == {*LATER, "filtering"}
+    status = succeed("status", "--project", project, "--json").json["matches"][0]["units"]
+    assert not status["stale"] and not status["missing"] and not status["ready"]
+
+    again = succeed(*asked, "--json").json
+    assert (again["run"], again["executed"]) == (answer["run"], 0)
+    assert again["kept"] == answer["kept"]
+    assert worldpose(*asked, "--until", "tracking").code == 2

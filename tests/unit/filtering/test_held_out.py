@@ -1,0 +1,56 @@
+"""How well left-out cameras are foreseen: only better people make it better."""
+
+import numpy as np
+import pytest
+from planted_errors import plant
+
+from worldpose.filtering import measure_held_out
+from worldpose.filtering.held_out import FARTHEST
+from worldpose.triangulation import TriangulationSettings
+
+SETTINGS = TriangulationSettings()
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return plant(41, duration=0.4)
+
+
+def measured(scene, index=None, used=None):
+    suspects = scene.suspects
+    used = (suspects.keypoints, suspects.confidence) if used is None else used
+    index = suspects.index if index is None else index
+    return measure_held_out(
+        scene.cameras, used, suspects.keypoints, index.astype(np.int16), SETTINGS
+    )
+
+
+def test_people_who_are_not_followed_make_it_worse_though_nothing_contradicts_them(scene):
+    index = scene.suspects.index.copy()
+    index[:, :, 0] = -1
+    whole, fewer = measured(scene), measured(scene, index)
+    assert fewer.keypoints == whole.keypoints
+    assert fewer.error > 1.1 * whole.error
+
+
+def test_people_placed_from_planted_keypoints_are_foreseen_worse_than_without_them(scene):
+    rng = np.random.default_rng(5)
+    wrong = rng.random(scene.suspects.confidence.shape) < 0.4
+    keypoints = scene.suspects.keypoints.copy()
+    keypoints[wrong] += 25.0
+    spoilt = measured(scene, used=(keypoints, scene.suspects.confidence))
+    without = np.where(wrong, np.nan, scene.suspects.confidence)
+    kept = np.where(wrong[..., None], np.nan, scene.suspects.keypoints)
+    assert measured(scene, used=(kept, without)).error < spoilt.error
+
+
+def test_what_nobody_foresees_counts_as_the_farthest(scene):
+    nobody = np.full_like(scene.suspects.index, -1)
+    assert measured(scene, nobody).error == pytest.approx(FARTHEST)
+
+
+def test_without_keypoints_there_is_nothing_to_foresee(scene):
+    nothing = np.full_like(scene.suspects.keypoints, np.nan)
+    index = scene.suspects.index.astype(np.int16)
+    used = (nothing, nothing[..., 0])
+    assert measure_held_out(scene.cameras, used, nothing, index, SETTINGS) is None

@@ -1,0 +1,136 @@
+"""Keypoints and boxes beside bodies: what is put wrong on purpose is found, little else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planted_errors import plant
+
+from worldpose.filtering import FilteringSettings, judge_detections, learn_from
+
+SETTINGS = FilteringSettings()
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return plant(31)
+
+
+def judged(scene, **changes):
+    suspects = replace(scene.suspects, **changes)
+    spread = learn_from(scene.views, suspects)
+    return judge_detections(scene.views, suspects, spread, SETTINGS)
+
+
+def test_nine_of_ten_planted_keypoints_are_found_and_few_honest_ones_rejected(scene):
+    found = judged(scene)
+    seen = np.isfinite(scene.suspects.confidence) & (scene.person >= 0)[..., None]
+    planted = scene.displaced & seen
+    assert planted.sum() > 500
+    assert found.rejected[planted].mean() >= 0.9
+    assert found.rejected[seen & ~planted].mean() < 0.02
+
+
+def test_everybody_fits_the_body_that_is_his(scene):
+    found = judged(scene)
+    known = found.fits >= 0
+    assert (found.fits[known] == scene.person[known]).mean() > 0.99
+    mine = (scene.person >= 0) & (np.isfinite(scene.suspects.confidence).sum(-1) >= 10)
+    assert (found.fits[mine] >= 0).mean() > 0.95
+
+
+def test_a_box_that_nobody_claims_is_given_to_the_body_that_it_fits(scene):
+    frame, camera, person = 3, 1, 2
+    index = scene.suspects.index.copy()
+    place = index[frame, camera, person]
+    assert place >= 0
+    index[frame, camera, person] = -1
+    found = judged(scene, index=index)
+    assert found.fits[frame, camera, place] == person
+    assert not found.dropped[frame, camera, place]
+
+
+def test_two_boxes_under_each_other_s_names_fit_the_other_and_are_kept(scene):
+    index = scene.suspects.index.copy()
+    frame, camera = 5, 0
+    first, second = np.flatnonzero(index[frame, camera] >= 0)[:2]
+    places = index[frame, camera, [first, second]]
+    index[frame, camera, [first, second]] = places[::-1]
+    found = judged(scene, index=index)
+    assert found.fits[frame, camera, places].tolist() == [first, second]
+    assert not found.dropped[frame, camera, places].any()
+    assert found.rejected[frame, camera, places].mean() < 0.3
+
+
+def test_a_box_that_fits_nobody_is_dropped_whole(scene):
+    keypoints = scene.suspects.keypoints.copy()
+    frame, camera, person = 4, 2, 1
+    place = scene.suspects.index[frame, camera, person]
+    keypoints[frame, camera, place, :, 0] += 400.0
+    found = judged(scene, keypoints=keypoints)
+    assert found.dropped[frame, camera, place]
+    there = np.isfinite(scene.suspects.confidence[frame, camera, place])
+    np.testing.assert_array_equal(found.rejected[frame, camera, place], there)
+    assert found.fits[frame, camera, place] == -1
+
+
+def test_a_dropped_box_that_nobody_claims_any_more_stays_dropped_until_it_fits(scene):
+    frame, camera, person = 4, 2, 1
+    place = scene.suspects.index[frame, camera, person]
+    before = np.zeros_like(scene.suspects.dropped)
+    before[frame, camera, place] = True
+    assert not judged(scene, dropped=before).dropped[frame, camera, place]
+    keypoints, index = scene.suspects.keypoints.copy(), scene.suspects.index.copy()
+    keypoints[frame, camera, place, :, 0] += 400.0
+    index[frame, camera, person] = -1
+    unclaimed = {"keypoints": keypoints, "index": index}
+    assert judged(scene, dropped=before, **unclaimed).dropped[frame, camera, place]
+    assert not judged(scene, **unclaimed).dropped[frame, camera, place]
+
+
+def test_a_body_upside_down_has_the_distance_but_not_the_similarity(scene):
+    frame, camera, person = 4, 2, 1
+    place = scene.suspects.index[frame, camera, person]
+    keypoints = scene.suspects.keypoints.copy()
+    own = keypoints[frame, camera, place]
+    keypoints[frame, camera, place] = 2.0 * np.nanmean(own, axis=0) - own
+    found = judged(scene, keypoints=keypoints)
+    assert found.similarity[frame, camera, place] < -0.8
+    assert found.dropped[frame, camera, place]
+
+
+def test_sides_that_were_put_right_are_no_contradiction(scene):
+    frame, camera, person = 6, 3, 0
+    place = scene.suspects.index[frame, camera, person]
+    honest = judged(scene).surprise[frame, camera, place]
+    left_right = [0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15]
+    keypoints, confidence = scene.suspects.keypoints.copy(), scene.suspects.confidence.copy()
+    for array in (keypoints, confidence):
+        array[frame, camera, place] = array[frame, camera, place][left_right]
+    exchanged = scene.suspects.exchanged.copy()
+    exchanged[frame, camera, person] = True
+    found = judged(scene, keypoints=keypoints, confidence=confidence, exchanged=exchanged)
+    # Each keypoint keeps its verdict at the place where the detector put it.
+    np.testing.assert_allclose(found.surprise[frame, camera, place], honest[left_right], rtol=1e-3)
+
+
+def test_a_person_without_a_body_is_not_judged(scene):
+    gone = 2
+    views = replace(scene.views, image=scene.views.image.copy())
+    views.image[:, :, gone] = np.nan
+    spread = learn_from(scene.views, scene.suspects)
+    found = judge_detections(views, scene.suspects, spread, SETTINGS)
+    his = scene.person == gone
+    assert his.any()
+    assert not found.dropped[his].any()
+    assert (found.fits[his] != gone).all()
+    unjudged = his & (found.fits < 0)
+    assert not found.rejected[unjudged].any()
+
+
+def test_nothing_to_judge_is_no_error(scene):
+    index = np.full_like(scene.suspects.index, -1)
+    keypoints = np.full_like(scene.suspects.keypoints, np.nan)
+    found = judged(scene, index=index, keypoints=keypoints)
+    assert not found.rejected.any()
+    assert (found.fits == -1).all()

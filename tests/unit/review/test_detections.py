@@ -1,0 +1,109 @@
+"""Corrections of detections change what they name and nothing else, or say why not."""
+
+import numpy as np
+import pytest
+
+from data_contracts.conventions import COCO17
+from data_contracts.review import DeletedDetection, MovedKeypoint
+from worldpose.ingest import Observations
+from worldpose.review.detections import replay_detections
+
+FIRST = 50
+"""Match frame of the first row."""
+
+
+def observations():
+    """Two frames, two people; the second is not there in the second frame."""
+    keypoints = np.arange(2 * 2 * 17 * 2, dtype=np.float32).reshape(2, 2, 17, 2)
+    confidence = np.full((2, 2, 17), 0.5, dtype=np.float32)
+    boxes = np.ones((2, 2, 4), dtype=np.float32)
+    score = np.full((2, 2), 0.9, dtype=np.float32)
+    for array in (keypoints, confidence, boxes, score):
+        array[1, 1] = np.nan
+    return Observations(np.arange(FIRST, FIRST + 2), keypoints, confidence, boxes, score)
+
+
+def keypoint(xy, was=(0.0, 1.0), **where):
+    place = {"camera": "a", "frame": FIRST, "detection": 0, "joint": "nose"} | where
+    return MovedKeypoint(**place, was=was, xy=xy)
+
+
+def deleted(frame=FIRST, detection=0):
+    return DeletedDetection(camera="a", frame=frame, detection=detection)
+
+
+def changed(edit):
+    """What an edit changed, as (name, place) of every value."""
+    found, before = observations(), observations()
+    replay = replay_detections(found, [edit])
+    assert replay.objections == (None,)
+    assert all(map(same, found.arrays().values(), before.arrays().values()))  # the input stays
+    after = replay.observations.arrays()
+    return {
+        name: np.argwhere(~((array == after[name]) | (np.isnan(array) & np.isnan(after[name]))))
+        for name, array in before.arrays().items()
+    }
+
+
+def same(one, other):
+    return np.array_equal(one, other, equal_nan=True)
+
+
+def test_a_keypoint_taken_out_is_not_seen_any_more():
+    places = changed(keypoint(None))
+    assert places["keypoints"].tolist() == [[0, 0, 0, 0], [0, 0, 0, 1]]
+    assert places["confidence"].tolist() == [[0, 0, 0]]
+    assert len(places["boxes"]) == len(places["score"]) == 0
+
+
+def test_a_keypoint_put_elsewhere_is_certain():
+    replay = replay_detections(observations(), [keypoint((7.5, 8.5))])
+    assert replay.observations.keypoints[0, 0, 0].tolist() == [7.5, 8.5]
+    assert replay.observations.confidence[0, 0, 0] == 1.0
+    again = keypoint((0.0, 1.0), was=(7.5, 8.5))
+    there_and_back = replay_detections(observations(), [keypoint((7.5, 8.5)), again])
+    assert there_and_back.objections == (None, None)
+    assert same(there_and_back.observations.keypoints, observations().keypoints)
+
+
+def test_a_detection_taken_out_leaves_the_others_in_their_places():
+    places = changed(deleted())
+    assert {name: set(map(tuple, where[:, :2].tolist())) for name, where in places.items()} == {
+        name: {(0, 0)} for name in ("keypoints", "confidence", "boxes", "score")
+    }
+
+
+@pytest.mark.parametrize(
+    ("edit", "reason"),
+    [
+        (keypoint(None, frame=FIRST - 1), f"no frame {FIRST - 1}"),
+        (keypoint(None, frame=FIRST + 2), f"no frame {FIRST + 2}"),
+        (keypoint(None, detection=2), "no detection 2"),
+        (keypoint(None, frame=FIRST + 1, detection=1), "no detection 1"),
+        (keypoint(None, was=(0.0, 1.5)), "was (0.0, 1.5) when it was corrected, and is [0.0, 1.0]"),
+        (keypoint((1.0, 1.0), was=None), "was not seen when"),
+        (deleted(frame=FIRST + 1, detection=1), "no detection 1"),
+        (deleted(detection=-1), "no detection -1"),
+    ],
+)
+def test_what_does_not_fit_what_was_seen_says_why_and_changes_nothing(edit, reason):
+    replay = replay_detections(observations(), [edit])
+    (objection,) = replay.objections
+    assert reason in objection
+    for name, array in replay.observations.arrays().items():
+        assert same(array, observations().arrays()[name])
+
+
+@pytest.mark.parametrize("edit", [keypoint(None), deleted()])
+def test_the_same_twice_is_refused_the_second_time(edit):
+    once, twice = (replay_detections(observations(), [edit] * count) for count in (1, 2))
+    assert twice.objections[0] is None
+    assert twice.objections[1] is not None
+    assert same(once.observations.keypoints, twice.observations.keypoints)
+
+
+def test_a_keypoint_that_was_not_seen_can_be_placed():
+    hidden = replay_detections(observations(), [keypoint(None)]).observations
+    replay = replay_detections(hidden, [keypoint((3.0, 4.0), was=None)])
+    assert replay.objections == (None,)
+    assert replay.observations.keypoints[0, 0, COCO17.index("nose")].tolist() == [3.0, 4.0]

@@ -1,0 +1,93 @@
+"""How well people are foreseen in cameras that had no part in placing them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.cameras import Camera
+from worldpose.triangulation import TriangulationSettings, triangulate_joints
+
+Floats = NDArray[np.float64]
+
+FOLDS: Final = 4
+"""Parts of the cameras; each is left out once."""
+FARTHEST: Final = 0.2
+"""A keypoint that is farther off, or that nobody foresees, counts as this much [box height]: half
+a metre is no measure of how well somebody is placed."""
+SMALLEST: Final = 10.0
+"""Boxes count as at least this high [px]."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Keypoints in cameras that were left out.
+
+    Attributes:
+        error: mean distance to where the other cameras put the nearest person [box height].
+        keypoints: how many.
+    """
+
+    error: float
+    keypoints: int
+
+
+def measure_held_out(
+    cameras: Camera,
+    used: tuple[NDArray[np.floating], NDArray[np.floating]],
+    detected: NDArray[np.floating],
+    detection_index: NDArray[np.int16],
+    settings: TriangulationSettings,
+    camera_covariance: Floats | None = None,
+) -> HeldOut | None:
+    """Return how well left-out cameras are foreseen; None without keypoints.
+
+    A quarter of the cameras after the other is left out; the others place everybody, and every
+    keypoint that was detected in it is compared with them. What is compared is the same whoever was
+    followed and whatever was rejected: nothing gets better by being left away.
+
+    Args:
+        cameras: batch (cameras,).
+        used: keypoints (frames, cameras, detections, 17, 2) [px] and confidence that people are
+            placed from; NaN where rejected.
+        detected: (frames, cameras, detections, 17, 2) [px], all keypoints; NaN where not found.
+        detection_index: (frames, cameras, persons), place among the detections; -1 = not seen.
+        settings: of triangulation.
+        camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
+    """
+    count = cameras.batch_shape[0]
+    fold = np.arange(count) % FOLDS
+    total, keypoints = 0.0, 0
+    for left_out in range(min(FOLDS, count)):
+        index = np.where((fold == left_out)[:, None], np.int16(-1), detection_index)
+        placed = triangulate_joints(
+            cameras, *used, index.astype(np.int16), settings, camera_covariance
+        )
+        for camera in np.flatnonzero(fold == left_out):
+            seen = np.asarray(detected[:, camera], dtype=np.float64)
+            away = _distances(cameras[int(camera)], seen, placed.joints)
+            total += float(away.sum())
+            keypoints += int(np.isfinite(seen[..., 0]).sum())
+    return HeldOut(total / keypoints, keypoints) if keypoints else None
+
+
+def _distances(camera: Camera, seen: Floats, joints: Floats) -> Floats:
+    """Distances (frames, detections, 17) [box height] to the nearest person, 0 where not seen."""
+    frames, persons = joints.shape[:2]
+    there = np.isfinite(seen).all(-1)
+    high = np.where(there, seen[..., 1], -np.inf).max(-1, initial=-np.inf)
+    low = np.where(there, seen[..., 1], np.inf).min(-1, initial=np.inf)
+    height = np.where(there.any(-1), np.maximum(high - low, SMALLEST), SMALLEST)
+    image = camera.project(joints.reshape(frames, -1, 3)).reshape(frames, persons, -1, 2)
+    nearest = np.where(there, FARTHEST, 0.0)
+    best = nearest.sum(-1)
+    for person in range(persons):
+        away = np.linalg.norm(seen - image[:, None, person], axis=-1) / height[..., None]
+        away = np.where(there, np.fmin(away, FARTHEST), 0.0)
+        total = away.sum(-1)
+        better = total < best
+        nearest[better], best[better] = away[better], total[better]
+    return nearest
