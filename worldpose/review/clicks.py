@@ -6,10 +6,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
-from data_contracts.review import Correction, Edit, MovedPoint, RedrawnMarking
+from data_contracts.conventions import COCO17
+from data_contracts.review import Correction, Edit, MovedKeypoint, MovedPoint, RedrawnMarking
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking, Pixel
 from worldpose.ingest import MatchFolder
 from worldpose.pitch import PitchTemplate
+from worldpose.review.detections import DETECTION_EDITS, DetectionEdit
 from worldpose.review.identities import IDENTITY_EDITS
 
 Picture = tuple[str, int | None]
@@ -53,6 +55,14 @@ def replay_corrections(folder: MatchFolder, corrections: Iterable[Correction]) -
                 applied.append(correction)
             else:
                 stale.append((correction, f"there is no clip {edit.clip}"))
+            continue
+        if isinstance(edit, DETECTION_EDITS):
+            # Whether it fits what was seen is known where that is: the camera's stage says it.
+            reason = _unknown(folder, edit)
+            if reason is None:
+                applied.append(correction)
+            else:
+                stale.append((correction, reason))
             continue
         if not isinstance(edit, MovedPoint | RedrawnMarking):
             stale.append((correction, f"nothing takes in a {edit.kind} yet"))
@@ -122,13 +132,34 @@ def _objection(
     if edit.marking not in (template.points if is_point else template.marking_names):
         return f"the pitch has no {'point' if is_point else 'marking'} {edit.marking}"
     for pixel in _pixels(edit.xy):
-        if not all(-0.5 <= value <= side - 0.5 for value, side in zip(pixel, size, strict=True)):
+        if not _is_inside(pixel, size):
             return f"{list(pixel)} is outside of the picture {place}"
     now = _now(pictures, edit)
     if now != edit.was:
         was, found = (", ".join(map(str, _pixels(it))) or "not there" for it in (edit.was, now))
         return f"{edit.marking} in {place} was {was} when it was corrected, and is {found} now"
     return None
+
+
+def _unknown(folder: MatchFolder, edit: DetectionEdit) -> str | None:
+    """Why a correction of detections names nothing in the match; None where it does."""
+    spec = folder.spec
+    owners = {camera.id: camera.id for camera in spec.static_cameras}
+    owners |= {clip.id: clip.broadcast for clip in spec.clips if clip.broadcast is not None}
+    if edit.camera not in owners:
+        return f"there is no camera {edit.camera}"
+    if not isinstance(edit, MovedKeypoint):
+        return None
+    if edit.joint not in COCO17:
+        return f"COCO-17 has no joint {edit.joint}"
+    camera = spec.camera(owners[edit.camera])
+    if edit.xy is not None and not _is_inside(edit.xy, (camera.width, camera.height)):
+        return f"{list(edit.xy)} is outside of the picture {edit.camera}"
+    return None
+
+
+def _is_inside(pixel: Pixel, size: tuple[int, int]) -> bool:
+    return all(-0.5 <= value <= side - 0.5 for value, side in zip(pixel, size, strict=True))
 
 
 def _picture_size(folder: MatchFolder, edit: MovedPoint | RedrawnMarking) -> tuple[int, int] | None:

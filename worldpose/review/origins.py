@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.review import Correction, MovedPoint, Origin, RedrawnMarking
+from worldpose.review.detections import DETECTION_EDITS
 from worldpose.review.identities import IDENTITY_EDITS
 
 ORIGINS: Final[tuple[Origin, ...]] = get_args(Origin)
@@ -37,6 +38,8 @@ def unit_origins(
             corrected.add(f"{stage}/{edit.camera}")
         elif isinstance(edit, IDENTITY_EDITS):
             corrected.add(f"tracking/{edit.clip}")
+        elif isinstance(edit, DETECTION_EDITS):
+            corrected |= _seen_by(edit.camera, made_from)
     refused = set(rejected)
     while more := {
         unit for unit, sources in made_from.items() if unit not in refused and refused & {*sources}
@@ -46,6 +49,13 @@ def unit_origins(
         unit: "rejected" if unit in refused else "corrected" if unit in corrected else "automatic"
         for unit in made_from
     }
+
+
+def _seen_by(camera: str, units: Collection[str]) -> set[str]:
+    """The units with whom a camera sees: where it has none that found them, they were given."""
+    found = f"detection/{camera}"
+    detected = {unit for unit in units if unit == found or unit.startswith(f"{found}.")}
+    return detected or {f"ingest/{camera}"}
 
 
 def joint_origins(

@@ -52,6 +52,20 @@ class ImageFolder:
     def close(self) -> None:
         """Nothing stays open."""
 
+    def frame(self, number: int) -> NDArray[np.uint8]:
+        """Return one picture (height, width, 3) RGB.
+
+        Raises:
+            InputError: it is no picture.
+        """
+        file = self._files[number]
+        picture = _read(file, grey=False)
+        if picture is None:
+            raise InputError(
+                str(file), expected="a PNG or JPEG picture", found="none", todo="Write it anew."
+            )
+        return picture
+
     def readable(
         self, start: int = 0, stop: int | None = None, *, grey: bool = False
     ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:

@@ -50,8 +50,7 @@ export class Preview {
       this.advice = found.camera ? "" : `${found.expected}. ${found.todo}`;
       this.now = found.camera ? found : null;
       this.ondrawn(this.now);
-      this.seconds = (performance.now() - since) / 1000;
-      performance.measure("preview", { start: since, end: performance.now() });
+      this.#shown(since);
       if (!this.#asked) this.#quiet = setTimeout(() => this.#refine(clicked), QUIET);
     } catch (error) {
       this.problem = error.message;
@@ -59,6 +58,16 @@ export class Preview {
       this.#busy = this.asking = false;
       this.#next();
     }
+  }
+
+  // How long it took until the browser has painted it, with all that the page says of it.
+  #shown(since) {
+    requestAnimationFrame(() =>
+      setTimeout(() => {
+        this.seconds = (performance.now() - since) / 1000;
+        performance.measure("preview", { start: since, end: performance.now() });
+      }),
+    );
   }
 
   async #refine(clicked) {

@@ -93,9 +93,10 @@ def test_people_and_poses_do_not_depend_on_their_company():
 
 def test_weights_come_back_and_give_equal_bytes(tmp_path):
     net, file = shaken(PeopleNet()), tmp_path / "people.safetensors"
-    save_weights(file, net)
+    about = {name: name for name in "fedcba"}
+    save_weights(file, net, about)
     first = file.read_bytes()
-    save_weights(file, load_weights(file, PeopleNet()))
+    save_weights(file, load_weights(file, PeopleNet()), about)
     assert file.read_bytes() == first
 
 

@@ -1,0 +1,89 @@
+"""Corrections of what a detector saw, laid over its keypoints and boxes (B3, D6)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final, TypeAlias
+
+import numpy as np
+
+from data_contracts.conventions import COCO17
+from data_contracts.review import DeletedDetection, MovedKeypoint
+from worldpose.ingest import Observations
+
+DetectionEdit: TypeAlias = DeletedDetection | MovedKeypoint
+DETECTION_EDITS = (DeletedDetection, MovedKeypoint)
+SAME: Final = 0.01
+"""How far a keypoint may be from where a person saw it and be the same one [px]: places are stored
+in single precision, and shown rounded."""
+
+
+@dataclass(frozen=True, eq=False)
+class DetectionReplay:
+    """What one camera saw, with people's corrections.
+
+    Attributes:
+        observations: as corrected.
+        objections: for each edit why it does not apply; None where it does.
+    """
+
+    observations: Observations
+    objections: tuple[str | None, ...]
+
+
+def replay_detections(found: Observations, edits: Iterable[DetectionEdit]) -> DetectionReplay:
+    """The people of one camera with corrections applied one after the other.
+
+    An edit applies while what it changes is as the person saw it. A keypoint that a person placed
+    has confidence 1; other keypoints, and a person's place among the detections, stay.
+
+    Args:
+        found: as detected, or given; stays as it is.
+        edits: of this camera, in the order they were made.
+    """
+    changed = Observations(
+        frame=found.frame,
+        keypoints=found.keypoints.copy(),
+        confidence=found.confidence.copy(),
+        boxes=found.boxes.copy(),
+        score=found.score.copy(),
+    )
+    objections = []
+    for edit in edits:
+        objection = objection_to(changed, edit)
+        objections.append(objection)
+        if objection is not None:
+            continue
+        at = _row(changed, edit.frame), edit.detection
+        if isinstance(edit, DeletedDetection):
+            for array in changed.arrays().values():
+                array[at] = np.nan
+        else:
+            joint = COCO17.index(edit.joint)
+            changed.keypoints[(*at, joint)] = np.nan if edit.xy is None else edit.xy
+            changed.confidence[(*at, joint)] = np.nan if edit.xy is None else 1.0
+    return DetectionReplay(changed, tuple(objections))
+
+
+def objection_to(found: Observations, edit: DetectionEdit) -> str | None:
+    """Why an edit does not apply to what a camera saw; None where it does."""
+    place = f"detection {edit.detection} of {edit.camera} in frame {edit.frame}"
+    row = _row(found, edit.frame)
+    if not 0 <= row < len(found.frame):
+        return f"{edit.camera} has no frame {edit.frame}"
+    if not 0 <= edit.detection < found.score.shape[1] or np.isnan(found.score[row, edit.detection]):
+        return f"there is no {place}"
+    if isinstance(edit, DeletedDetection):
+        return None
+    now = found.keypoints[row, edit.detection, COCO17.index(edit.joint)].astype(np.float64)
+    if np.isnan(now).any():
+        return f"{edit.joint} of {place} is not seen" if edit.was or edit.xy is None else None
+    if edit.was is None or np.abs(now - edit.was).max() > SAME:
+        was, seen = edit.was or "not seen", [round(float(value), 2) for value in now]
+        return f"{edit.joint} of {place} was {was} when it was corrected, and is {seen} now"
+    return None
+
+
+def _row(found: Observations, frame: int) -> int:
+    return frame - int(found.frame[0])
