@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
@@ -28,6 +29,13 @@ def save_weights(path: Path, net: nn.Module, about: dict[str, str] | None = None
 
     tensors = {name: value.detach().contiguous() for name, value in net.state_dict().items()}
     data = save(tensors, {**(about or {}), FORMAT: type(net).__name__})
+    # The library orders metadata by chance.
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    written = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    written = written.ljust(-(-len(written) // 8) * 8)
+    data = len(written).to_bytes(8, "little") + written + data[8 + length :]
     draft = path.with_suffix(".part")
     draft.write_bytes(data)
     draft.replace(path)

@@ -57,9 +57,10 @@ class DetectionSettings(Record):
     held back for as long, which costs memory. A third of a second is a step of a sprint."""
     sightings: int = Field(default=2, ge=1)
     """A track that was seen less often, where there were as many looks, is a flicker [1]."""
-    pitch_margin_m: float = Field(default=4.0, ge=0)
-    """People whose feet are farther outside of the pitch than this are crowd (D2) [m]. Throw-ins
-    and officials stay; boards stand 3 to 6 m out, and a far foot is known to 1 m."""
+    pitch_margin_m: float = Field(default=2.5, ge=0)
+    """People whose feet are farther outside of the pitch than this are crowd (D2) [m]. Throw-ins,
+    sprints over the line and assistants, 1.5 m out, stay: a far foot is known to 1 m. Who waits
+    behind the lines goes from 2.5 m on, boards stand 3 to 6 m out."""
     least_keypoint: float = Field(default=0.05, ge=0, lt=1)
     """A keypoint below this confidence was not found [1]."""
     same_pose: float = Field(default=0.85, gt=0, le=1)

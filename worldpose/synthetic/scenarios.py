@@ -55,6 +55,14 @@ CORNER_SEATS: Final = (
 )
 """Six of these stands, with lenses so long that one or two corners of markings are in a picture."""
 
+_TINY: Final = Scenario(
+    name="tiny",
+    about="5 people walk and run for 4 s before 6 static cameras and the broadcast camera: "
+    "seconds to reconstruct.",
+    duration=4.0,
+    rig=RigSettings(person_height=95.0),
+    broadcast=BroadcastSettings(),
+)
 _STADIUM: Final = RigSettings(cameras=16, seats=STADIUM_SEATS)
 _TEAMS: Final = CrowdSettings(
     people=25, movement="football", officials=3, area_center=(0.0, 0.0), area_size=(105.0, 68.0)
@@ -99,13 +107,12 @@ def _variant(name: str, about: str, base: Scenario, **changes: object) -> Scenar
 SCENARIOS: Final = {
     scenario.name: scenario
     for scenario in (
-        Scenario(
-            name="tiny",
-            about="5 people walk and run for 4 s before 6 static cameras and the broadcast camera: "
-            "seconds to reconstruct.",
-            duration=4.0,
-            rig=RigSettings(person_height=95.0),
-            broadcast=BroadcastSettings(),
+        _TINY,
+        _variant(
+            "tiny-broadcast",
+            "The same, and key frames clicked in the broadcast camera's video.",
+            _TINY,
+            key_frames=4,
         ),
         _MATCH,
         Scenario(
