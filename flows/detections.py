@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-
-import xarray as xr
+from typing import TYPE_CHECKING
 
 from data_contracts.review import Edit
 from flows.detection import seen_by, seen_in_broadcast
@@ -19,6 +18,9 @@ from worldpose.review.detections import (
     replay_detections,
 )
 from worldpose.store import Store, key_of
+
+if TYPE_CHECKING:  # it imports dask, which deciding what to run must not
+    import xarray as xr
 
 
 def detections_now(store: Store, match: Match, camera: str, frame: int) -> Observations:

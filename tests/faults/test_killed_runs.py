@@ -50,7 +50,8 @@ def test_a_worker_killed_at_a_commit_point_is_replaced(point, tiny, tiny_run, tm
     assert_same_store(project, tiny_run)
 
 
-@pytest.mark.parametrize("point", quick(IN_MAIN, {"before_run_record"}))
+@pytest.mark.slow
+@pytest.mark.parametrize("point", IN_MAIN)
 def test_the_whole_process_killed_around_the_run_record(point, tiny, tiny_run, tmp_path):
     environment, struck = fault_environment(tmp_path, point)
     project = tmp_path / "worldpose-data"
@@ -77,7 +78,8 @@ def test_the_whole_process_group_killed_at_a_commit_point(point, tiny, tiny_run,
     assert_same_store(project, tiny_run)
 
 
-@pytest.mark.parametrize("seed", quick(range(20), {0}))
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(20))
 def test_the_whole_process_group_killed_at_a_random_moment(seed, tiny, tiny_run, tmp_path):
     project = tmp_path / "worldpose-data"
     # A moment is a number of files in the project, so that it means the same on any machine.

@@ -192,7 +192,7 @@ def test_a_correction_on_what_somebody_else_changed_is_refused(store):
     fresh = open_match(store, TINY)
     gone = match.folder.clicked["cam03"].points[0].name
     twice = MovedPoint(camera="cam03", marking=gone, was=(1.0, 1.0), xy=(2.0, 2.0))
-    with pytest.raises(InputError, match=r"edit 1 of 1.*not there now"):
+    with pytest.raises(InputError, match=r"in cam03: expected .*found not there"):
         correct(store, fresh, [twice], who="Bob", why="")
     with pytest.raises(InputError, match="changes nothing"):
         correct(store, fresh, [wrong_click(match)], who="Bob", why="")  # it is gone already

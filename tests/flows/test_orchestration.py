@@ -32,12 +32,13 @@ def test_an_embedded_run_reaches_nothing_but_this_machine(no_server, tiny, tmp_p
     assert "192.0.2.1" in notes.read_text(), "the guard does not work"
     notes.unlink()
     project = tmp_path / "worldpose-data"
-    succeed("run", tiny, "--project", project, environment=environment)
+    joints = ("--until", "triangulation")
+    succeed("run", tiny, "--project", project, *joints, environment=environment)
     assert not notes.exists(), notes.read_text()
 
 
 def test_a_run_is_visible_at_the_server_by_name(server, tiny, tmp_path):
-    succeed("run", tiny, "--project", tmp_path / "worldpose-data")
+    succeed("run", tiny, "--project", tmp_path / "worldpose-data", "--until", "triangulation")
 
     def ask(kind):
         request = urllib.request.Request(
@@ -100,6 +101,7 @@ def wait_for_port(port):
     raise TimeoutError(port)
 
 
+@pytest.mark.slow
 def test_a_damaged_input_fails_its_unit_and_repair_mends_it(server, tiny, tmp_path):
     project = tmp_path / "worldpose-data"
     succeed("run", tiny, "--project", project, "--until", "tracking")

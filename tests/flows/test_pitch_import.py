@@ -63,4 +63,4 @@ def test_a_pitch_is_imported_on_its_own(survey, tmp_path, more):
 def test_a_match_needs_its_calibration_and_detections(tmp_path):
     answer = worldpose("import", "--out", tmp_path / "match", "--fps", 25)
     assert answer.code == 2
-    assert "--calibration, --detections and --fps, or --pitch" in answer.err
+    assert "--calibration with --detections and --fps or with --videos" in answer.err
