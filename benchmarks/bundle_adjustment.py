@@ -7,7 +7,8 @@
 the surveyed points hold the world. Everybody starts from the same cameras, 1 % of focal length, 3
 mrad and 0.2 m off, and stops where a step gains less than 1e-8 of the cost (scipy: 1e-6, which
 favours it; not with --large, where it does not end). All sides take turns, one thread each; the
-best round counts. What a side is prepared with, such as COLMAP's reconstruction, is not timed.
+best round counts. What a side is prepared with, such as COLMAP's reconstruction, is not timed; no
+side computes a covariance.
 
 pycolmap adjusts with Ceres and weighs all observations alike, so weights are one and no loss is
 robust here. The scipy side is what a user writes: residuals in numpy, the sparsity of the
@@ -129,7 +130,7 @@ def ours(problem: Problem) -> Run:
     """The solver of this package."""
 
     def run() -> Solution:
-        solved = solve(problem, SolverSettings(cost_change=1e-8))
+        solved = solve(problem, SolverSettings(cost_change=1e-8), covariance=False)
         return solved.cameras, solved.points
 
     return run

@@ -2,6 +2,8 @@
 
 Every point meets only the cameras that see it. With its block of the normal equations factored as
 L L^T, the cameras' system loses Y^T Y, where the three rows of Y are L^-1 times the mixed block.
+L^-1 times the gradient by the point stands in a last column of Y: Y^T Y has what the cameras'
+gradient loses there.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from worldpose.cameras.distortion import distort
 from worldpose.cameras.projection import project_point
 from worldpose.compiled import compiled
 
@@ -48,8 +51,8 @@ def eliminate(
     damping: float,
     first: int,
     last: int,
+    columns: Integers,
     rows: Floats,
-    reduced: Floats,
     blocks: Floats,
     gradient: Floats,
 ) -> None:
@@ -62,32 +65,34 @@ def eliminate(
         damping: Marquardt's, of the points.
         first: of the points.
         last: exclusive.
-        rows: (3 (last - first), 12 cameras), written: Y.
-        reduced: (3 (last - first),), written: L^-1 times the gradient by the points.
+        columns: (cameras, 12); those of the parameters in Y, -1 = the parameter may not move.
+        rows: (3 (last - first), free parameters + 1), written: Y and, last, L^-1 times the
+            gradient by the points.
         blocks: (cameras, 12, 12), added to; lower triangle.
         gradient: (cameras, 12), added to.
     """
     rows[:] = 0.0
-    reduced[:] = 0.0
     by_camera = np.empty((2, STEPS))
     by_point = np.empty((2, 3))
     normal = np.empty(6)
     slope = np.empty(3)
-    mixed = np.empty((cameras.shape[0], STEPS, 3))
+    mixed = np.empty((cameras.shape[0], 3, STEPS))
     for p in range(first, last):
         known = evidence.information[p]
         start, end = evidence.first_of[p], evidence.first_of[p + 1]
         _prior(points[p], evidence.anchors[p], known, normal, slope)
         for o in range(start, end):
             c = evidence.camera_of[o]
-            w, dx, dy = _observe(cameras[c], points[p], evidence, o, by_camera, by_point)
+            w, dx, dy = _observe(cameras, c, points, p, evidence, o, by_camera, by_point)
             for i in range(STEPS):
                 left, right = w * by_camera[0, i], w * by_camera[1, i]
                 gradient[c, i] += left * dx + right * dy
                 for j in range(i + 1):
                     blocks[c, i, j] += left * by_camera[0, j] + right * by_camera[1, j]
-                for j in range(3):
-                    mixed[o - start, i, j] = left * by_point[0, j] + right * by_point[1, j]
+            for j in range(3):
+                left, right = w * by_point[0, j], w * by_point[1, j]
+                for i in range(STEPS):
+                    mixed[o - start, j, i] = left * by_camera[0, i] + right * by_camera[1, i]
             _add_point(w, dx, dy, by_point, normal, slope)
         if known == np.inf:
             continue
@@ -95,17 +100,18 @@ def eliminate(
         row = 3 * (p - first)
         z0 = slope[0] / a
         z1 = (slope[1] - b * z0) / c_
-        reduced[row], reduced[row + 1] = z0, z1
-        reduced[row + 2] = (slope[2] - d * z0 - e * z1) / f
+        rows[row, -1], rows[row + 1, -1] = z0, z1
+        rows[row + 2, -1] = (slope[2] - d * z0 - e * z1) / f
         for o in range(start, end):
-            column = STEPS * evidence.camera_of[o]
+            camera = evidence.camera_of[o]
             for i in range(STEPS):
-                m = mixed[o - start, i]
-                y0 = m[0] / a
-                y1 = (m[1] - b * y0) / c_
-                rows[row, column + i] += y0
-                rows[row + 1, column + i] += y1
-                rows[row + 2, column + i] += (m[2] - d * y0 - e * y1) / f
+                column = columns[camera, i]
+                if column >= 0:
+                    y0 = mixed[o - start, 0, i] / a
+                    y1 = (mixed[o - start, 1, i] - b * y0) / c_
+                    rows[row, column] += y0
+                    rows[row + 1, column] += y1
+                    rows[row + 2, column] += (mixed[o - start, 2, i] - d * y0 - e * y1) / f
 
 
 @compiled
@@ -139,7 +145,7 @@ def substitute(
         _prior(points[p], evidence.anchors[p], known, normal, slope)
         for o in range(evidence.first_of[p], evidence.first_of[p + 1]):
             c = evidence.camera_of[o]
-            w, dx, dy = _observe(cameras[c], points[p], evidence, o, by_camera, by_point)
+            w, dx, dy = _observe(cameras, c, points, p, evidence, o, by_camera, by_point)
             # The residual after the camera's step, to first order.
             for i in range(STEPS):
                 dx += by_camera[0, i] * steps[c, i]
@@ -224,35 +230,55 @@ def _factor(normal: Floats, damping: float) -> tuple[float, float, float, float,
 
 @compiled
 def _observe(
-    camera: Floats,
-    point: Floats,
+    cameras: Floats,
+    c: int,
+    points: Floats,
+    p: int,
     evidence: Evidence,
     o: int,
     by_camera: Floats,
     by_point: Floats,
 ) -> tuple[float, float, float]:
-    """Write both Jacobians of observation `o`; return its weight and residual [px]."""
-    _, xd, yd, a, b, z, dxx, dxy, dyy = project_point(camera, point[0], point[1], point[2])
+    """Write both Jacobians of observation `o` of point `p`; return its weight and residual [px].
+
+    In scalars and without views of rows: that is a quarter of the time.
+    """
+    fx, fy = cameras[c, 0], cameras[c, 1]
+    r00, r01, r02 = cameras[c, 9], cameras[c, 10], cameras[c, 11]
+    r10, r11, r12 = cameras[c, 12], cameras[c, 13], cameras[c, 14]
+    r20, r21, r22 = cameras[c, 15], cameras[c, 16], cameras[c, 17]
+    px, py, pz = points[p, 0], points[p, 1], points[p, 2]
+    x = r00 * px + r01 * py + r02 * pz + cameras[c, 18]
+    y = r10 * px + r11 * py + r12 * pz + cameras[c, 19]
+    z = r20 * px + r21 * py + r22 * pz + cameras[c, 20]
+    a, b = x / z, y / z
+    k1, k2, k3 = cameras[c, 4], cameras[c, 5], cameras[c, 8]
+    xd, yd, dxx, dxy, dyy = distort(a, b, k1, k2, cameras[c, 6], cameras[c, 7], k3)
+    # By the point in the camera's frame: g of the column, h of the row.
+    gx, gy = fx * dxx / z, fx * dxy / z
+    hx, hy = fy * dxy / z, fy * dyy / z
+    gz, hz = -(gx * a + gy * b), -(hx * a + hy * b)
+    by_point[0, 0] = gx * r00 + gy * r10 + gz * r20
+    by_point[0, 1] = gx * r01 + gy * r11 + gz * r21
+    by_point[0, 2] = gx * r02 + gy * r12 + gz * r22
+    by_point[1, 0] = hx * r00 + hy * r10 + hz * r20
+    by_point[1, 1] = hx * r01 + hy * r11 + hz * r21
+    by_point[1, 2] = hx * r02 + hy * r12 + hz * r22
+    by_camera[0, 0], by_camera[1, 0] = y * gz - z * gy, y * hz - z * hy
+    by_camera[0, 1], by_camera[1, 1] = z * gx - x * gz, z * hx - x * hz
+    by_camera[0, 2], by_camera[1, 2] = x * gy - y * gx, x * hy - y * hx
+    by_camera[0, 3], by_camera[1, 3] = gx, hx
+    by_camera[0, 4], by_camera[1, 4] = gy, hy
+    by_camera[0, 5], by_camera[1, 5] = gz, hz
+    by_camera[0, 6], by_camera[1, 6] = fx * xd, fy * yd
+    by_camera[0, 7], by_camera[1, 7] = 1.0, 0.0
+    by_camera[0, 8], by_camera[1, 8] = 0.0, 1.0
     s = a * a + b * b
-    for k in range(2):
-        f = camera[k]
-        gx, gy = (dxx, dxy) if k == 0 else (dxy, dyy)
-        hx, hy = f * gx / z, f * gy / z
-        hz = -(hx * a + hy * b)
-        for j in range(3):
-            by_point[k, j] = hx * camera[9 + j] + hy * camera[12 + j] + hz * camera[15 + j]
-        d = by_camera[k]
-        d[0] = b * z * hz - z * hy
-        d[1] = z * hx - a * z * hz
-        d[2] = a * z * hy - b * z * hx
-        d[3], d[4], d[5] = hx, hy, hz
-        d[6] = f * (xd if k == 0 else yd)
-        d[7], d[8] = (1.0, 0.0) if k == 0 else (0.0, 1.0)
-        d[9] = f * (a if k == 0 else b) * s
-        d[10] = d[9] * s
-        d[11] = d[10] * s
-    dx = camera[0] * xd + camera[2] - evidence.image[o, 0]
-    dy = camera[1] * yd + camera[3] - evidence.image[o, 1]
+    by_camera[0, 9], by_camera[1, 9] = fx * a * s, fy * b * s
+    by_camera[0, 10], by_camera[1, 10] = fx * a * s * s, fy * b * s * s
+    by_camera[0, 11], by_camera[1, 11] = fx * a * s * s * s, fy * b * s * s * s
+    dx = fx * xd + cameras[c, 2] - evidence.image[o, 0]
+    dy = fy * yd + cameras[c, 3] - evidence.image[o, 1]
     weight, scale = evidence.weight[o], evidence.scale[o]
     if scale < np.inf:
         weight /= 1.0 + weight * (dx * dx + dy * dy) / (scale * scale)

@@ -144,9 +144,10 @@ def solve(
 
 
 def _require_two_views(problem: Problem) -> None:
-    pairs = np.unique(problem.point_of * len(problem.free) + problem.camera_of)
-    views = np.bincount(pairs // len(problem.free), minlength=len(problem.points))
-    few = np.flatnonzero((problem.point_information == 0.0) & (views < 2))
+    first = np.searchsorted(problem.point_of, problem.point_of)
+    several = np.zeros(len(problem.points), dtype=np.bool_)
+    several[problem.point_of[problem.camera_of != problem.camera_of[first]]] = True
+    few = np.flatnonzero((problem.point_information == 0.0) & ~several)
     if few.size:
         raise InputError(
             "bundle adjustment: points",
@@ -172,8 +173,9 @@ class _System:
             problem.scale,
         )
         self.free = np.flatnonzero(problem.free.ravel())
-        self.rows = np.zeros((3 * BLOCK, problem.free.size))
-        self.reduced = np.zeros(3 * BLOCK)
+        self.columns = np.full(problem.free.shape, -1)
+        self.columns.ravel()[self.free] = np.arange(self.free.size)
+        self.rows = np.zeros((3 * BLOCK, self.free.size + 1))
 
     def cost(self, cameras: Camera, points: Floats, offset: Floats) -> float:
         """The robust sum of squares with all priors."""
@@ -186,9 +188,9 @@ class _System:
         """A damped step of the cameras (cameras, 12), and where the points go with it."""
         matrix, diagonal, slope = self._assembled(cameras, points, damping)
         matrix[np.diag_indices_from(matrix)] += damping * diagonal
-        slope += np.einsum("cij,cj->ci", self.prior, offset).ravel()
+        slope += np.einsum("cij,cj->ci", self.prior, offset).ravel()[self.free]
         step = np.zeros(offset.shape)
-        step.ravel()[self.free] = -self._solved(matrix, slope[self.free])
+        step.ravel()[self.free] = -self._solved(matrix, slope)
         trial = np.empty_like(points)
         substitute(cameras.numbers, points, self.evidence, damping, step, trial)
         return step, trial
@@ -196,17 +198,16 @@ class _System:
     def covariance(self, cameras: Camera, points: Floats) -> Floats:
         """The inverse of the undamped system, zero where nothing is free."""
         matrix, _, _ = self._assembled(cameras, points, 0.0)
-        covariance = np.zeros_like(matrix)
+        covariance = np.zeros((self.columns.size, self.columns.size))
         covariance[np.ix_(self.free, self.free)] = self._solved(matrix, np.eye(self.free.size))
         return covariance
 
     def _solved(self, matrix: Floats, right: Floats) -> Floats:
-        """The free part of the system solved; scaled, for its units differ by many powers of 10.
+        """The system solved; scaled, for its units differ by many powers of 10.
 
         Raises:
             InputError: the system is singular.
         """
-        matrix = matrix[np.ix_(self.free, self.free)]
         scale = 1.0 / np.sqrt(np.diag(matrix))
         columns = scale if right.ndim == 1 else scale[:, None]
         try:
@@ -223,22 +224,23 @@ class _System:
     def _assembled(
         self, cameras: Camera, points: Floats, damping: float
     ) -> tuple[Floats, Floats, Floats]:
-        """The reduced matrix, the diagonal before the reduction, and the slope."""
+        """Of the free parameters: reduced matrix, diagonal before the reduction, and slope."""
         numbers = cameras.numbers
-        width = self.rows.shape[1]
+        width = self.free.size
         blocks = np.zeros((len(numbers), STEPS, STEPS))
         gradient = np.zeros((len(numbers), STEPS))
-        loss = np.zeros((width, width), order="F")
-        lowered = np.zeros(width)
+        loss = np.zeros((width + 1, width + 1), order="F")
         for first in range(0, len(points), BLOCK):
             last = min(first + BLOCK, len(points))
-            rows, reduced = self.rows[: 3 * (last - first)], self.reduced[: 3 * (last - first)]
+            rows = self.rows[: 3 * (last - first)]
             eliminate(
                 *(numbers, points, self.evidence, damping, first, last),
-                *(rows, reduced, blocks, gradient),
+                *(self.columns, rows, blocks, gradient),
             )
             loss = dsyrk(1.0, rows.T, beta=1.0, c=loss, overwrite_c=True)
-            lowered += rows.T @ reduced
+        lost = loss[:width, :width]
         blocks = np.tril(blocks) + np.tril(blocks, -1).swapaxes(1, 2) + self.prior
-        matrix = block_diag(*blocks) - (np.triu(loss) + np.triu(loss, 1).T)
-        return matrix, np.diagonal(blocks, axis1=1, axis2=2).ravel(), gradient.ravel() - lowered
+        matrix = block_diag(*blocks)[np.ix_(self.free, self.free)]
+        diagonal = np.diag(matrix)
+        matrix = matrix - (np.triu(lost) + np.triu(lost, 1).T)
+        return matrix, diagonal, gradient.ravel()[self.free] - loss[:width, width]

@@ -65,9 +65,9 @@ def test_the_gradient_is_the_slope_of_the_cost(scene, scale):
     problem = replace(problem, scale=np.full(len(problem.image), scale))
     evidence = evidence_of(problem)
     numbers = problem.cameras.numbers
-    rows, reduced = np.zeros((3 * len(points), 4 * STEPS)), np.zeros(3 * len(points))
+    rows, columns = np.zeros((3 * len(points), 1)), np.full((4, STEPS), -1)
     blocks, gradient = np.zeros((4, STEPS, STEPS)), np.zeros((4, STEPS))
-    eliminate(numbers, points, evidence, 0.0, 0, len(points), rows, reduced, blocks, gradient)
+    eliminate(numbers, points, evidence, 0.0, 0, len(points), columns, rows, blocks, gradient)
     for parameter in range(STEPS):
         step = np.zeros((4, STEPS))
         step[1, parameter] = 1e-6
