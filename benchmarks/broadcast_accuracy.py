@@ -1,12 +1,15 @@
 """Prints how exactly broadcast cameras of simulated clips are found, and how honest regions are.
 
     worldpose simulate --scenario broadcast-pan --duration 30 --cameras 1 --no-stills --out A
-    python benchmarks/broadcast_accuracy.py A [MORE ...] [--key-frames 1]
+    python benchmarks/broadcast_accuracy.py A [MORE ...] [--key-frames 1] [--without-m6]
 
 People of the static cameras are emulated: the true joints, every joint of a person off by 1 cm for
 the whole clip and by 2 cm anew in every frame. The first line of a clip is of its key frames and
-followed points alone, the second of everything. Regions: the share of centers, of frames' cameras
-with the center, and of players' places in the picture that lie within what is stated.
+followed points alone, the second of the same turned onto the painted lines, the third of all.
+Off: painted lines, and people by the mean over their keypoints, before and after the third step.
+Rough: root mean square second differences of log focal length, k1 and k2. Regions: the share of
+centers, of frames' cameras with the center, and of players' places in the picture that lie within
+what is stated.
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ from worldpose.broadcast_calibration import (
 from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE
 from worldpose.broadcast_calibration.normal_equations import point_row
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
+from worldpose.broadcast_calibration.weights import roughness
 from worldpose.cameras import Rigid
 from worldpose.ingest import MatchFolder, read_match, read_unit
 from worldpose.pitch import PitchTemplate
@@ -125,7 +129,13 @@ def main() -> None:
     parser.add_argument("matches", nargs="+", type=Path)
     parser.add_argument("--key-frames", type=int, default=0, help="of each clip's; 0 = all")
     parser.add_argument("--without-players", action="store_true")
+    parser.add_argument(
+        "--without-m6", action="store_true", help="neither smoothness nor followed points"
+    )
     options = parser.parse_args()
+    settings = BroadcastCalibrationSettings()
+    if options.without_m6:
+        settings = settings.model_copy(update={"smooth": False, "flow_weight": 0.0})
     told: dict[str, list[Floats]] = {}
     for folder in options.matches:
         match = read_match(folder)
@@ -150,12 +160,19 @@ def main() -> None:
                 match.spec.fps,
                 people=None if options.without_players else people,
                 boxes=people.boxes,
-                settings=BroadcastCalibrationSettings(),
+                settings=settings,
             )
             spent = time.perf_counter() - begin
             print(f"{folder.name}: {len(true)} frames, {count} key frames, {spent:.0f} s")
             print(f"  tracked  {errors(found.tracked, true, joints)}")
-            print(f"  all      {errors(found.camera, true, joints)}", flush=True)
+            print(f"  lines    {errors(found.before, true, joints)}")
+            print(f"  all      {errors(found.camera, true, joints)}")
+            for name in ("markings_off", "players_off"):
+                print(
+                    "  {} {:.3f} px before, {:.3f} after".format(name, *getattr(found.report, name))
+                )
+            rough = "  ".join(f"{value:.3g}" for value in roughness(found.camera)[3:6])
+            print(f"  rough    {rough}", flush=True)
             for name, shares in distances(found.camera, found.uncertainty, true, joints).items():
                 told.setdefault(name, []).append(shares)
                 print(f"  {name}: inside the region of {np.median(shares):.3f} in the median")

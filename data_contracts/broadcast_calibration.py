@@ -62,6 +62,8 @@ def _counted(name: str, about: str) -> ArrayLayout:
     )
 
 
+_BEFORE = "the same before players and all frames together: each frame on its painted lines"
+
 BROADCAST_CALIBRATION = GroupLayout(
     stage="broadcast_calibration",
     about="The broadcast camera in every frame of a clip, how well it is known and why.",
@@ -109,6 +111,11 @@ BROADCAST_CALIBRATION = GroupLayout(
             missing="none",
             about="covariance of what all frames share",
         ),
+        _by_frame("focal_before", ("axis",), "px", _BEFORE),
+        _by_frame("principal_point_before", ("axis",), "px", _BEFORE),
+        _by_frame("distortion_before", ("coefficient",), "1", _BEFORE),
+        _by_frame("rotation_before", ("cam_coordinate", "coordinate"), "1", _BEFORE),
+        _by_frame("translation_before", ("cam_coordinate",), "m", _BEFORE),
         ArrayLayout(
             name="status",
             dims=("frame",),
@@ -148,6 +155,9 @@ BROADCAST_CALIBRATION = GroupLayout(
         "told, all of it where there are no people",
         "drift": "by how much tracking from one key frame missed the next [px], by gap",
         "pick_next": "frames whose clicks would help most, numbered alike, the best first",
+        "markings_off": "median distance of painted lines from their projection [px], before "
+        "players and all frames together and after",
+        "players_off": "the same of people, by the mean over a person's keypoints",
         "decisions": "what was chosen, and the figures that decided",
         "reasons": "why a person must look at it; empty where nobody must",
     },

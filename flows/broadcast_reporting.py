@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Final
 
@@ -10,14 +11,21 @@ import numpy as np
 from data_contracts.broadcast_calibration import FRAME_STATUS
 from flows.release import broadcast_cameras, broadcast_unit, joint_tracks
 from flows.stage import Match
+from worldpose.broadcast_calibration import camera_before
+from worldpose.cameras.stored import camera_from_arrays
 from worldpose.ingest import unit_frames
-from worldpose.release import Picture, whole_file
-from worldpose.release.broadcast_pictures import course_picture
+from worldpose.release import JointTracks, Picture, whole_file
+from worldpose.release.broadcast_pictures import (
+    angles_of,
+    before_after_picture,
+    course_picture,
+    most_moved,
+)
 from worldpose.release.overlay_video import overlay_frames
 from worldpose.release.report import Table
 from worldpose.release.stadium_pictures import camera_picture
 from worldpose.store import Run
-from worldpose.video import VideoReader, write_video
+from worldpose.video import open_video, write_video
 
 WORST: Final = 2
 """Frames that are shown of those whose cameras are known least [1]."""
@@ -43,11 +51,12 @@ def broadcast_pictures(run: Run, match: Match) -> list[Picture]:
         if not np.isfinite(expected).any():
             continue
         tracks = joint_tracks(run, clip)
+        pictures += _before_and_after(run, match, clip, tracks)
         offset = unit_frames(match.folder.spec, clip).offset
         for video_number in result.attrs["pick_next"][:WORST]:
             number = video_number - offset
             place = int(np.searchsorted(frame, number))
-            with VideoReader(match.folder.videos[clip]) as video:
+            with open_video(match.folder.videos[clip]) as video:
                 still = video.frame(video_number)
             pictures.append(
                 Picture(
@@ -67,7 +76,46 @@ def broadcast_pictures(run: Run, match: Match) -> list[Picture]:
     return pictures
 
 
-def write_broadcast_videos(run: Run, match: Match, page: Path) -> list[Path]:
+def _before_and_after(run: Run, match: Match, clip: str, tracks: JointTracks) -> list[Picture]:
+    """Zooms of the person whom the refinement by players moved most; none without players."""
+    result = run[f"broadcast_calibration/{clip}"]
+    if result.attrs["players_off"][1] is None:
+        return []
+    frame = result["frame"].values
+    both = np.intersect1d(frame, tracks.frames)
+    before, after = (
+        whole[np.searchsorted(frame, both)]
+        for whole in (camera_before(result.data_vars), camera_from_arrays(result.data_vars))
+    )
+    joints = tracks.joints[np.searchsorted(tracks.frames, both)]
+    shared = JointTracks(both, tracks.person_ids, joints)
+    place, person = most_moved(before, after, shared)
+    number = int(both[place])
+    with open_video(match.folder.videos[clip]) as video:
+        still = video.frame(number + unit_frames(match.folder.spec, clip).offset)
+    markings, players = (
+        "{:.2f} and {:.2f}".format(*result.attrs[name]) for name in ("markings_off", "players_off")
+    )
+    return [
+        Picture(
+            f"Clip {clip}, frame {number}: before and after players and all frames together. In "
+            f"the median, markings are {markings} px off, people {players} px.",
+            before_after_picture(
+                before[place],
+                after[place],
+                shared,
+                place,
+                person,
+                still=still,
+                pitch=match.folder.pitch,
+            ),
+        )
+    ]
+
+
+def write_broadcast_videos(
+    run: Run, match: Match, page: Path, *, clips: Collection[str] | None = None
+) -> list[Path]:
     """Writes each clip's broadcast video with markings and people over it; returns the files.
 
     At half the size and at most 25 frames a second; of a longer clip, the 30 s about the frame
@@ -77,11 +125,14 @@ def write_broadcast_videos(run: Run, match: Match, page: Path) -> list[Path]:
         run: the run.
         match: the match.
         page: beside this file, and named after it.
+        clips: which clips; None = all.
     """
     files = []
     fps = match.folder.spec.fps
     every = max(1, round(fps / FRAME_RATE))
     for clip, camera in broadcast_cameras(run).items():
+        if clips is not None and clip not in clips:
+            continue
         result = run[f"broadcast_calibration/{clip}"]
         expected = np.nan_to_num(result["reprojection_error"].values)
         most = round(LENGTH * fps)
@@ -91,7 +142,7 @@ def write_broadcast_videos(run: Run, match: Match, page: Path) -> list[Path]:
         start = int(frames[0]) + unit_frames(match.folder.spec, clip).offset
         stop = start + int(chosen[-1] - chosen[0]) + 1
         file = page.with_name(f"{page.stem}-{clip}.mp4")
-        with VideoReader(match.folder.videos[clip]) as video, whole_file(file) as draft:
+        with open_video(match.folder.videos[clip]) as video, whole_file(file) as draft:
             pictures = (
                 picture
                 for number, picture in video.frames(start, stop)
@@ -105,7 +156,7 @@ def write_broadcast_videos(run: Run, match: Match, page: Path) -> list[Path]:
     return files
 
 
-def broadcast_tables(run: Run) -> list[Table]:
+def broadcast_tables(run: Run, match: Match) -> list[Table]:
     """What the frames of each clip rest on, and what a person should look at."""
     tables = []
     for clip in broadcast_cameras(run):
@@ -122,6 +173,12 @@ def broadcast_tables(run: Run) -> list[Table]:
                 (f"key frame {frame} is not used", why)
                 for frame, why in result.attrs["refused_key_frames"].items()
             ),
+            *_motion(run, clip, match.folder.spec.fps),
+            *(
+                (f"{name} miss by, before and after players [px]", _numbers(result.attrs[key]))
+                for name, key in (("markings", "markings_off"), ("people", "players_off"))
+                if None not in result.attrs[key]
+            ),
             ("tracking missed the next key frame by [px]", _numbers(result.attrs["drift"])),
             ("frames of its video to click next", ", ".join(map(str, result.attrs["pick_next"]))),
             *(("chosen", decision) for decision in result.attrs["decisions"]),
@@ -130,6 +187,16 @@ def broadcast_tables(run: Run) -> list[Table]:
         ]
         tables.append(Table(f"Broadcast camera of clip {clip}", ("", ""), tuple(rows)))
     return tables
+
+
+def _motion(run: Run, clip: str, fps: float) -> list[tuple[str, str]]:
+    """How long the clip is, and how far it pans."""
+    camera = broadcast_cameras(run)[clip]
+    pan, _, _ = angles_of(camera)
+    return [
+        ("length [s]", f"{len(pan) / fps:.1f}"),
+        ("pan, from leftmost to rightmost [deg]", f"{np.nanmax(pan) - np.nanmin(pan):.1f}"),
+    ]
 
 
 def _pooled(run: Run, clip: str) -> list[tuple[str, str]]:

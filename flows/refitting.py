@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import JsonValue
 
 from data_contracts.records import Record
-from flows import body_fitting, broadcast_calibration, detection, tracking
+from flows import body_fitting, broadcast_calibration, broadcast_pooling, detection, tracking
 from flows.stage import Match, Stage
 from worldpose.ingest import unit_frames
 
@@ -25,6 +25,8 @@ def inputs(match: Match, unit: str) -> tuple[str, ...]:
     names = [*body_fitting.inputs(match, unit), f"body_fitting/{unit}"]
     if _is_broadcast(match, unit):
         names += [f"broadcast_calibration/{unit}", *detection.seen_in_broadcast(match, unit)]
+    if _is_broadcast(match, unit) and unit in broadcast_pooling.units(match):
+        names.append(f"broadcast_pooling/{unit}")
     return (*names, *(f"body_fitting/{clip}" for clip in _namesakes(match, unit)))
 
 

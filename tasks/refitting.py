@@ -87,7 +87,9 @@ def _pictures(store: Store, work: Work, frame: NDArray[np.int64]) -> _Pictures:
     sources: dict[str, Any] = work.recipe.sources
     name = f"broadcast_calibration/{work.recipe.unit}"
     found = open_input(store, work, name)
-    camera = camera_from_arrays(found.data_vars)
+    pooled = f"broadcast_pooling/{work.recipe.unit}"
+    best = open_input(store, work, pooled) if pooled in work.recipe.inputs else found
+    camera = camera_from_arrays(best.data_vars)
     known = found["reprojection_error"].values <= KNOWN
     offset = float(sources["broadcast_offset_frames"])
     late = round(offset) - offset

@@ -21,6 +21,7 @@ from worldpose.broadcast_calibration.settings import (
 from worldpose.broadcast_calibration.stored import (
     broadcast_arrays,
     broadcast_attributes,
+    camera_before,
     moving_arrays,
     moving_from_arrays,
 )
@@ -37,6 +38,7 @@ __all__ = [
     "broadcast_arrays",
     "broadcast_attributes",
     "calibrate_broadcast",
+    "camera_before",
     "drawn_to",
     "estimate_feed_offset",
     "follow_given_lens",

@@ -33,7 +33,12 @@ from worldpose.broadcast_calibration.report import BroadcastReport, report_of
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.solving import Problem, Solution, solve
 from worldpose.broadcast_calibration.uncertainty import Uncertainty, uncertainty_of
-from worldpose.broadcast_calibration.weights import Weights, flow_share_of, smoothness_of
+from worldpose.broadcast_calibration.weights import (
+    Weights,
+    flow_share_of,
+    lasting_of,
+    smoothness_of,
+)
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 
@@ -52,12 +57,15 @@ class BroadcastCalibration:
         uncertainty: its covariance.
         report: residuals, drift, frames to pick next.
         tracked: what came from key frames and followed points alone, before any refinement.
+        before: the same with every frame turned and zoomed onto its painted lines, before players
+            and all frames together.
     """
 
     camera: MovingCamera
     uncertainty: Uncertainty
     report: BroadcastReport
     tracked: MovingCamera
+    before: MovingCamera
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,9 +186,10 @@ def refine(
     noise, matches = PlayerNoise(0.0, 0.0), None
     solution: Solution | None = None
     offset: FeedOffset | None = None
-    points = clicks
-    for _ in range(settings.rounds):
+    points, before = clicks, camera
+    for number in range(settings.rounds):
         lines = follow_lines(camera, samples, pictures(), boxes, settings)
+        before = lines.camera if number == 0 else before
         parts = [clicks, lines.evidence]
         if people is not None and settings.player_weight > 0.0:
             if offset is None:
@@ -198,21 +207,24 @@ def refine(
     assert solution is not None  # settings have one round or more
     if settings.solver == "adam":
         solution = descend(tracked.chain.camera, problem, settings.adam_iterations)
-    uncertainty = uncertainty_of(solution, problem, settings.line_shift)
+    lasting = lasting_of(tracked.chain.camera, fps)
+    shifts = settings.line_shift, settings.player_shift
+    uncertainty = uncertainty_of(solution, problem, *shifts, lasting)
     weights = Weights(
         flow_deviation_px=deviation,
         flow_share=share,
         smooth_log_focal=_number(spread[3]),
         smooth_k1=_number(spread[4]),
         smooth_k2=_number(spread[5]),
+        smooth_frames=lasting,
         player_share=noise.share,
         player_frames=noise.frames,
     )
     report = report_of(
-        solution.camera, uncertainty, points, tracked.flow, tracked.keys, tracked.chain, matches,
-        weights, pitch, settings, offset, first,
+        solution.camera, before, uncertainty, points, tracked.flow, tracked.keys, tracked.chain,
+        matches, weights, pitch, settings, offset, first,
     )  # fmt: skip
-    return BroadcastCalibration(solution.camera, uncertainty, report, tracked.chain.camera)
+    return BroadcastCalibration(solution.camera, uncertainty, report, tracked.chain.camera, before)
 
 
 def _problem(

@@ -18,6 +18,7 @@ from worldpose.broadcast_calibration.evidence import (
     PointEvidence,
 )
 from worldpose.broadcast_calibration.feed_offset import FeedOffset
+from worldpose.broadcast_calibration.fit import misses, pixels_off
 from worldpose.broadcast_calibration.key_frames import Keys
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.normal_equations import point_row
@@ -62,6 +63,9 @@ class BroadcastReport:
         feed_offset: the clip's clock, as people show it; None without people.
         weights: of the terms.
         pick_next: frames whose clicks would help most, the best first.
+        markings_off: median distance of painted lines from their projection [px], before players
+            and all frames together, and after; NaN without any.
+        players_off: the same of people, by the mean over a person's keypoints.
         decisions: what was chosen, and the figures that decided.
         reasons: why a person must look at it; empty where nobody must.
     """
@@ -80,12 +84,15 @@ class BroadcastReport:
     feed_offset: FeedOffset | None
     weights: Weights
     pick_next: tuple[int, ...]
+    markings_off: tuple[float, float]
+    players_off: tuple[float, float]
     decisions: tuple[str, ...]
     reasons: tuple[str, ...]
 
 
 def report_of(
     camera: MovingCamera,
+    before: MovingCamera,
     uncertainty: Uncertainty,
     points: PointEvidence,
     flow: FlowEvidence,
@@ -102,6 +109,7 @@ def report_of(
 
     Args:
         camera: all frames.
+        before: the same before players and all frames together.
         uncertainty: its covariance.
         points: what it rests on.
         flow: followed points that it rests on.
@@ -130,6 +138,7 @@ def report_of(
     status[player_count >= _FEW_PLAYERS] = FRAME_STATUS.index("players")
     status[line_count >= _FEW_LINES] = FRAME_STATUS.index("lines")
     status[keys.frames] = FRAME_STATUS.index("key_frame")
+    earlier, later = misses(before, points), misses(camera, points)
     reasons = []
     share = float(np.mean(expected > settings.weak_error))
     if share > 0.05:
@@ -169,6 +178,8 @@ def report_of(
         feed_offset=offset,
         weights=weights,
         pick_next=_picks(expected),
+        markings_off=(earlier[0], later[0]),
+        players_off=(earlier[1], later[1]),
         decisions=tuple(decisions),
         reasons=tuple(reasons),
     )
@@ -230,12 +241,7 @@ def _said_of(offset: FeedOffset, settings: BroadcastCalibrationSettings) -> tupl
 
 def _residuals(camera: MovingCamera, points: PointEvidence) -> tuple[Floats, Floats]:
     """Return residuals (n,) in pixels, those of lines across them, and in deviations (n,)."""
-    off = np.full((len(points), 2), np.inf)
-    for frame in np.unique(points.frame):
-        mine = np.flatnonzero(points.frame == frame)
-        single = camera.frames(slice(int(frame), int(frame) + 1)).camera[0]
-        off[mine] = single.project(points.world[mine]) - points.image[mine]
-    off = np.where(np.isfinite(off), off, 1e6)
+    off = np.clip(pixels_off(camera, points), -1e6, 1e6)
     white = np.linalg.norm(np.einsum("nij,nj->ni", points.whitening, off), axis=-1)
     scale = np.linalg.norm(points.whitening[:, 0], axis=-1)
     return white / np.maximum(scale, 1e-12), white

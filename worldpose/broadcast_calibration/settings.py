@@ -63,6 +63,10 @@ class BroadcastCalibrationSettings(Record):
     line_shift: float = Field(default=0.05, ge=0)
     """Of all painted lines in the picture, each axis, standard deviation [px], such as sharpening
     makes, or a lens beyond k1 to k3: the covariance has it, for no residual shows it."""
+    player_shift: float = Field(default=0.05, ge=0)
+    """Of all keypoints of all people in all pictures, each axis, standard deviation [standard
+    deviations of a keypoint], such as joints by another definition make: the covariance has it;
+    0.05 is 3 mm on a person."""
     line_samples: int = Field(default=240, ge=20)
     """Samples of painted lines in one frame, at most, about [1]."""
     line_reach: float = Field(default=12.0, gt=0)

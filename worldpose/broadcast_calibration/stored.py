@@ -12,14 +12,20 @@ from data_contracts.broadcast_calibration import FRAME_STATUS
 from worldpose.broadcast_calibration.calibrating import BroadcastCalibration
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
+from worldpose.cameras import Camera
 from worldpose.cameras.stored import camera_from_arrays
 
 
 def broadcast_arrays(calibration: BroadcastCalibration) -> dict[str, NDArray[Any]]:
     """The stored arrays of a calibrated clip, by name, without the frame numbers."""
-    report = calibration.report
+    report, before = calibration.report, calibration.before.camera
     return {
         **moving_arrays(calibration.camera, calibration.uncertainty),
+        "focal_before": before.focal,
+        "principal_point_before": before.principal_point,
+        "distortion_before": before.distortion,
+        "rotation_before": before.cam_from_world.rotation,
+        "translation_before": before.cam_from_world.translation,
         "status": report.status,
         "reprojection_error": report.reprojection_error,
         "marking_rms": report.marking_rms,
@@ -45,6 +51,13 @@ def moving_arrays(moving: MovingCamera, uncertainty: Uncertainty) -> dict[str, N
         "shared_covariance": covariance[:, :FRAME_SIZE, FRAME_SIZE:],
         "clip_covariance": uncertainty.clip,
     }
+
+
+def camera_before(arrays: Mapping[str, ArrayLike]) -> Camera:
+    """The stored camera (frames,) before players and all frames together."""
+    names = ("focal", "principal_point", "distortion", "rotation", "translation")
+    stored = {name: arrays[f"{name}_before"] for name in names}
+    return camera_from_arrays({**stored, "image_size": arrays["image_size"]})
 
 
 def moving_from_arrays(arrays: Mapping[str, ArrayLike]) -> tuple[MovingCamera, Uncertainty]:
@@ -85,6 +98,13 @@ def broadcast_attributes(
         },
         "drift": [float(drift) for drift in report.drift],
         "pick_next": [first + frame for frame in report.pick_next],
+        "markings_off": _pair(report.markings_off),
+        "players_off": _pair(report.players_off),
         "decisions": list(report.decisions),
         "reasons": list(report.reasons),
     }
+
+
+def _pair(values: tuple[float, float]) -> list[float | None]:
+    """Figures for a record, which has no NaN."""
+    return [value if np.isfinite(value) else None for value in values]

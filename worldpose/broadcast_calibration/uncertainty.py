@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.body_fitting.banded import BandedFactor
-from worldpose.broadcast_calibration.evidence import CLICK, MARKING, PLAYER
+from worldpose.broadcast_calibration.evidence import CLICK, PLAYER
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE
 from worldpose.broadcast_calibration.normal_equations import point_row
 from worldpose.broadcast_calibration.solving import Problem, Solution
@@ -20,6 +20,10 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 
+_LENS: Final = 3
+"""Numbers of a frame's step before those of its lens."""
+_STRETCHES: Final = 64
+"""Of a clip, in each of which its lens bends as one, at most [1]."""
 _STRETCH: Final = 3.0
 """Of a marking, whose paint errs as one [m]."""
 
@@ -40,19 +44,30 @@ class Uncertainty:
         return np.asarray(self.frame[0, FRAME_SIZE:, FRAME_SIZE:])
 
 
-def uncertainty_of(solution: Solution, problem: Problem, line_shift: float = 0.0) -> Uncertainty:
+def uncertainty_of(
+    solution: Solution,
+    problem: Problem,
+    line_shift: float = 0.0,
+    player_shift: float = 0.0,
+    smooth_frames: float = 1.0,
+) -> Uncertainty:
     """Return the covariance of a solution, the places of the painted markings accounted for.
 
     Noise that is new in every sample comes with the inverse of the system. What a stretch of a
     marking, or a person, gets wrong lasts for the whole clip and does not average out: the pull
     that each of them is left with as a whole is carried to the solution and added, so that the
     covariance is too wide by a factor of two where there is no such error. A shift of all lines in
-    the picture leaves no pull, since the camera goes along with it: it is carried by its size.
+    the picture, or of all keypoints of all people, leaves no pull, since the camera goes along with
+    it: these are carried by their size. So is what makes a lens bend more evenly than chance does:
+    an operator who zooms in does so for many frames, and second differences err alike in these.
 
     Args:
         solution: the camera, and where its markings lie.
         problem: what it rests on.
         line_shift: of all painted lines in the picture, each axis, standard deviation [px].
+        player_shift: of all keypoints in all pictures, each axis, standard deviation [standard
+            deviations of a keypoint].
+        smooth_frames: over how many frames second differences of the lens last [frame].
 
     Raises:
         DegenerateError: the system is singular.
@@ -72,44 +87,41 @@ def uncertainty_of(solution: Solution, problem: Problem, line_shift: float = 0.0
     whole = np.empty((len(by_shared), FRAME_SIZE + CLIP_SIZE, FRAME_SIZE + CLIP_SIZE))
     whole[:, :FRAME_SIZE, :FRAME_SIZE] = factor.inverse_blocks()
     whole[:, :FRAME_SIZE, :FRAME_SIZE] += by_shared @ shared @ np.swapaxes(by_shared, -1, -2)
-    columns = _left_pulls(solution, problem, system.border.shape[2], line_shift)
-    if columns is not None:
-        own = factor.solve(columns[0])
-        rest = shared @ (columns[1] - flat.T @ own.reshape(len(flat), -1))
-        moved = np.concatenate(
-            [own - by_shared @ rest, np.broadcast_to(rest, (len(own), *rest.shape))], axis=1
-        )[:, : FRAME_SIZE + CLIP_SIZE]
-        lasting = moved @ np.swapaxes(moved, -1, -2)
-    else:
-        lasting = np.zeros_like(whole)
+    pulls, rest = _left_pulls(solution, problem, count, line_shift, player_shift)
+    bent = _bends(problem, len(by_shared), smooth_frames)
+    rest = np.concatenate([rest, np.zeros((count, bent.shape[2]))], axis=1)
+    own = factor.solve(np.concatenate([pulls, bent], axis=2))
+    rest = shared @ (rest - flat.T @ own.reshape(len(flat), -1))
+    moved = np.concatenate(
+        [own - by_shared @ rest, np.broadcast_to(rest, (len(own), *rest.shape))], axis=1
+    )[:, : FRAME_SIZE + CLIP_SIZE]
     across = -(by_shared @ shared)[..., :CLIP_SIZE]
     whole[:, :FRAME_SIZE, FRAME_SIZE:] = across
     whole[:, FRAME_SIZE:, :FRAME_SIZE] = np.swapaxes(across, -1, -2)
     whole[:, FRAME_SIZE:, FRAME_SIZE:] = shared[:CLIP_SIZE, :CLIP_SIZE]
-    whole += lasting
+    whole += moved @ np.swapaxes(moved, -1, -2)
     return Uncertainty(0.5 * (whole + np.swapaxes(whole, -1, -2)))
 
 
 def _left_pulls(
-    solution: Solution, problem: Problem, shared: int, line_shift: float
-) -> tuple[Floats, Floats] | None:
+    solution: Solution, problem: Problem, shared: int, line_shift: float, player_shift: float
+) -> tuple[Floats, Floats]:
     """Return each lasting source's gradient (frames, 7, n) and (shared, n) at the solution.
 
-    Behind them are those of a shift of all lines along x and y, and of all people together: what a
-    detector gets wrong of everybody pulls against the lines.
+    Behind them are those of a shift of all lines, and of all people, along x and y each, and what
+    all people together pull.
     """
     points, camera = problem.points, solution.camera
     chosen = points.kind != CLICK
-    if not chosen.any():
-        return None
     cell = np.floor(points.world[:, :2] / _STRETCH).astype(np.int64)
     cell[points.kind == PLAYER] = 0
     key = np.column_stack([points.kind, points.source, cell])[chosen]
     sources, cluster = np.unique(key, axis=0, return_inverse=True)
-    count = len(sources)
-    columns = count + 2
+    columns = len(sources) + 4
     by_frame, by_shared = np.zeros((len(camera), FRAME_SIZE, columns)), np.zeros((shared, columns))
-    shift = np.where(points.kind[chosen] == MARKING, line_shift, 0.0)
+    people = points.kind[chosen] == PLAYER
+    deviation = 1.0 / np.maximum(np.linalg.norm(points.whitening[chosen, 0], axis=-1), 1e-12)
+    shift = np.where(people, player_shift * deviation, line_shift)
     _add_pulls(
         camera.center,
         camera.principal_point,
@@ -127,12 +139,13 @@ def _left_pulls(
         solution.beside,
         cluster.astype(np.int64).ravel(),
         shift,
+        len(sources) + 2 * people.astype(np.int64),
         by_frame,
         by_shared,
     )
-    people = np.flatnonzero(sources[:, 0] == PLAYER)
+    together = np.flatnonzero(sources[:, 0] == PLAYER)
     by_frame, by_shared = (
-        np.concatenate([each, each[..., people].sum(axis=-1, keepdims=True)], axis=-1)
+        np.concatenate([each, each[..., together].sum(axis=-1, keepdims=True)], axis=-1)
         for each in (by_frame, by_shared)
     )
     fixed = ~problem.free_frame
@@ -141,6 +154,30 @@ def _left_pulls(
     if problem.known is not None:
         by_frame[problem.known] = 0.0
     return by_frame, by_shared
+
+
+def _bends(problem: Problem, frames: int, lasting: float) -> Floats:
+    """Return the gradients (frames, 7, n) of second differences that are one deviation together.
+
+    In every number of the lens and every stretch of so many frames; none where they do not last.
+    """
+    length = max(round(lasting), -(-frames // _STRETCHES))
+    numbers = np.flatnonzero(np.isfinite(problem.smoothness) & problem.free_frame)
+    numbers = numbers[numbers >= _LENS]
+    starts = range(0, frames - 2, length) if lasting > 1.0 else range(0)
+    # Longer stretches than errors last have as much less in common.
+    common = np.sqrt(min(1.0, lasting / length))
+    bends = np.zeros((frames, FRAME_SIZE, len(numbers), len(starts)))
+    for place, begin in enumerate(starts):
+        end = min(begin + length, frames - 2)
+        for kind, number in enumerate(numbers):
+            # The sum of (1, -2, 1) over a stretch is its change at the end less that before it.
+            column = bends[:, number, kind, place]
+            np.add.at(column, [begin, begin + 1, end, end + 1], [1.0, -1.0, -1.0, 1.0])
+            column *= common / problem.smoothness[number]
+    if problem.known is not None:
+        bends[problem.known] = 0.0
+    return bends.reshape(frames, FRAME_SIZE, -1)
 
 
 @compiled
@@ -161,14 +198,14 @@ def _add_pulls(
     beside: Floats,
     cluster: Integers,
     shift: Floats,
+    common: Integers,
     by_frame: Floats,
     by_shared: Floats,
 ) -> None:
     """Add every point's gradient to its cluster's columns; arguments as `add_points`.
 
-    The last two columns are for a shift [px] of the points (n,) along x and y.
+    A shift [px] of the points (n,) along x and y is for the columns `common` (n,) and the next.
     """
-    last = by_shared.shape[1] - 2
     pixel, rows, place = np.empty(2), np.empty((2, 12)), np.empty(3)
     for i in range(len(frame)):
         t = frame[i]
@@ -189,7 +226,7 @@ def _add_pulls(
             if source == 0:
                 column, e, f = cluster[i], one, two
             else:
-                column = last + source - 1
+                column = common[i] + source - 1
                 e = shift[i] * whitening[i, 0, source - 1]
                 f = shift[i] * whitening[i, 1, source - 1]
             # By the pixel itself, x and y.

@@ -42,6 +42,8 @@ class Weights(Record):
     """As the focal length's, times 1.6 and k1: a zoom lens bends as it zooms."""
     smooth_k2: float
     """As the focal length's, times k2."""
+    smooth_frames: float
+    """Over how many frames these last: the sum of their autocorrelation."""
     player_share: float
     """Deviation of a keypoint over the person's height: 1.4826 times the median absolute
     residual."""
@@ -62,16 +64,42 @@ def smoothness_of(camera: MovingCamera, fps: float) -> Floats:
     if len(camera) < 3 * width:
         spread[3:] = 1.0
         return spread
-    window = np.hanning(width + 2)[1:-1]
-    window /= window.sum()
-    padded = np.pad(np.log(camera.focal), width, mode="reflect", reflect_type="odd")
-    even = np.convolve(padded, window, mode="same")[width:-width]
-    change = float(np.sqrt(np.mean(np.diff(even, n=2) ** 2)))
+    change = float(np.sqrt(np.mean(_bends(camera, width) ** 2)))
     lens = np.median(np.abs(camera.distortion), axis=0)
     # k3 is that of k2, which it stands beside.
     lens[2] = max(lens[2], lens[1])
     spread[3:] = np.maximum(np.concatenate([[change], change * _LENS * lens]), _LEAST)
     return spread
+
+
+def lasting_of(camera: MovingCamera, fps: float) -> float:
+    """Return over how many frames second differences of a tracked clip's zoom last [frame].
+
+    The sum of their autocorrelation: they are worth one of each so many.
+
+    Args:
+        camera: all frames, as tracked.
+        fps: frames a second.
+    """
+    width = max(1, round(_WINDOW * fps))
+    if len(camera) < 3 * width:
+        return 1.0
+    bends = _bends(camera, width)
+    power, total = float(np.mean(bends**2)), 1.0
+    for lag in range(1, len(bends) // 2):
+        correlation = float(np.mean(bends[lag:] * bends[:-lag])) / max(power, 1e-300)
+        if correlation < 0.05:
+            break
+        total += 2.0 * correlation
+    return total
+
+
+def _bends(camera: MovingCamera, width: int) -> Floats:
+    """Return second differences of log focal length, evened over so many frames."""
+    window = np.hanning(width + 2)[1:-1]
+    window /= window.sum()
+    padded = np.pad(np.log(camera.focal), width, mode="reflect", reflect_type="odd")
+    return np.diff(np.convolve(padded, window, mode="same")[width:-width], n=2)
 
 
 def flow_share_of(links: Chain, key_frames: Integers, deviation: float, drift: float) -> float:

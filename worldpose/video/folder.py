@@ -58,13 +58,30 @@ class ImageFolder:
         Raises:
             InputError: it is no picture.
         """
-        file = self._files[number]
-        picture = _read(file, grey=False)
-        if picture is None:
-            raise InputError(
-                str(file), expected="a PNG or JPEG picture", found="none", todo="Write it anew."
-            )
-        return picture
+        return next(self.frames(number, number + 1))[1]
+
+    def frames(
+        self, start: int = 0, stop: int | None = None, *, grey: bool = False
+    ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """Yield picture numbers from `start` up to before `stop`, each with its picture.
+
+        Args:
+            start: first picture, in the order of the numbers.
+            stop: one past the last; all if None.
+            grey: (height, width) instead of RGB.
+
+        Raises:
+            InputError: one is no picture.
+        """
+        for number, picture in self.readable(start, stop, grey=grey):
+            if picture is None:
+                raise InputError(
+                    str(self._files[number]),
+                    expected="a PNG or JPEG picture",
+                    found="none",
+                    todo="Write it anew.",
+                )
+            yield number, picture
 
     def readable(
         self, start: int = 0, stop: int | None = None, *, grey: bool = False

@@ -81,11 +81,22 @@ class VideoReader:
             yield number, picture
 
     def readable(
-        self, start: int = 0, stop: int | None = None, *, grey: bool = False
+        self,
+        start: int = 0,
+        stop: int | None = None,
+        *,
+        grey: bool = False,
+        width: int | None = None,
     ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
         """Yield the same, with None for each picture that cannot be decoded or comes damaged.
 
         So are those after a damaged one up to the next key frame: they may be predicted from it.
+
+        Args:
+            start: first frame.
+            stop: one past the last; the end of the video if None.
+            grey: luma instead of RGB.
+            width: RGB pictures are made this wide, before they are turned [px]; None = as they are.
 
         Raises:
             InputError: there are no such frames.
@@ -109,7 +120,7 @@ class VideoReader:
                 yield wanted, None
                 wanted += 1
             if wanted < stop:
-                yield wanted, _pixels(picture, grey) if wanted >= sound_from else None
+                yield wanted, _pixels(picture, grey, width) if wanted >= sound_from else None
                 wanted += 1
             if wanted == stop:
                 return
@@ -154,17 +165,21 @@ class VideoReader:
         )
 
 
-def _pixels(picture: av.VideoFrame, grey: bool) -> NDArray[np.uint8]:
+def _pixels(picture: av.VideoFrame, grey: bool, width: int | None) -> NDArray[np.uint8]:
     """Return the picture as it is to be shown: RGB, or luma alone."""
-    pixels = _stored_pixels(picture, grey)
+    pixels = _stored_pixels(picture, grey, width)
     quarters = round(picture.rotation / 90.0) % 4  # counterclockwise, as NumPy turns
     return pixels if quarters == 0 else np.ascontiguousarray(np.rot90(pixels, quarters))
 
 
-def _stored_pixels(picture: av.VideoFrame, grey: bool) -> NDArray[np.uint8]:
+def _stored_pixels(picture: av.VideoFrame, grey: bool, width: int | None) -> NDArray[np.uint8]:
     """Return RGB, or the first plane of a planar format, without the padding of its rows."""
-    if not grey:
+    if not grey and width is None:
         return np.asarray(picture.to_ndarray(format="rgb24"))
+    if not grey and width is not None:
+        height = round(picture.height * width / picture.width)
+        small = picture.reformat(width, height, "rgb24", interpolation="AREA")
+        return np.asarray(small.to_ndarray())
     if not picture.format.name.startswith(("yuv4", "yuvj4", "gray")):
         return np.asarray(picture.to_ndarray(format="gray"))
     plane = picture.planes[0]

@@ -14,6 +14,7 @@ from worldpose.broadcast_calibration.priors import prior_of
 from worldpose.broadcast_calibration.settings import BroadcastPrior
 from worldpose.broadcast_calibration.solving import Problem, solve
 from worldpose.broadcast_calibration.uncertainty import uncertainty_of
+from worldpose.broadcast_calibration.weights import lasting_of
 from worldpose.errors import DegenerateError
 
 SMOOTH = np.array([np.inf] * 3 + [1e-4, 1e-3, 1e-2, 1e-2])
@@ -87,6 +88,70 @@ def test_a_shift_of_all_lines_moves_what_the_camera_shows_by_as_much():
     )
     # The camera goes along with its lines; priors hold it back by some percent.
     np.testing.assert_allclose(shifted - exact, 0.04 * np.eye(2), atol=0.004)
+
+
+def test_a_shift_of_all_keypoints_moves_what_the_camera_shows_by_as_much():
+    rng = np.random.default_rng(12)
+    true = clip.moving(20)
+    problem = replace(problem_of(true, rng), flow=FlowEvidence.none())
+    points = problem.points
+    people = replace(points, kind=np.full(len(points), PLAYER), whitening=points.whitening / 4.0)
+    problem = replace(problem, points=people)
+    solution = solve(true, problem, 20)
+    place = np.array([1.0, -3.0, 0.0])
+    exact, shifted = (
+        place_covariance(solution.camera, uncertainty_of(solution, problem, 0.0, shift), place)
+        for shift in (0.0, 0.25)
+    )
+    deviation = 1.0 / np.linalg.norm(people.whitening[0, 0])
+    expected = (0.25 * deviation) ** 2 * np.eye(2)
+    # The camera goes along with its people; priors hold it back by some percent.
+    np.testing.assert_allclose(shifted - exact, expected, atol=0.1 * expected[0, 0])
+
+
+def test_a_lens_that_bends_evenly_widens_the_region_by_what_its_stretches_carry():
+    rng = np.random.default_rng(13)
+    true = clip.moving(8)
+    problem = replace(problem_of(true, rng), flow=FlowEvidence.none())
+    solution = solve(true, problem, 20)
+    by_chance, evenly = (
+        uncertainty_of(solution, problem, smooth_frames=length).frame for length in (1.0, 3.0)
+    )
+    system = solution.equations
+    whole = np.zeros((61, 61))
+    for below in range(3):
+        for t in range(8 - below):
+            rows, columns = slice(7 * (t + below), 7 * (t + below) + 7), slice(7 * t, 7 * t + 7)
+            whole[rows, columns] = system.blocks[below, t]
+            whole[columns, rows] = system.blocks[below, t].T
+    whole[:56, 56:] = system.border.reshape(56, 5)
+    whole[56:, :56], whole[56:, 56:] = whole[:56, 56:].T, system.corner
+    # Six second differences of each number of the lens, in two stretches of three.
+    added = np.zeros((61, 61))
+    for number in range(3, 7):
+        for begin in (0, 3):
+            column = np.zeros(61)
+            for t in range(begin, begin + 3):
+                column[7 * np.arange(t, t + 3) + number] += np.array([1.0, -2.0, 1.0])
+            moved = np.linalg.solve(whole, column / SMOOTH[number])
+            added += np.outer(moved, moved)
+    own = np.append(7 * 4 + np.arange(7), 56 + np.arange(5))
+    expected = added[np.ix_(own, own)]
+    # Two factorisations of a matrix whose condition is 1e9.
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose((evenly - by_chance)[4] / scale, expected / scale, atol=1e-4)
+
+
+def test_bends_last_as_long_as_zooming_does():
+    true = clip.moving(1000)
+    waves = np.exp(0.3 * np.sin(2.0 * np.pi * np.arange(1000) / 200.0))
+    zooming = replace(true, focal=2000.0 * waves)
+    # The autocorrelation of a wave of 200 frames falls to nothing in 50: twice 200 over 2 pi.
+    assert lasting_of(zooming, 50.0) == pytest.approx(64.0, rel=0.1)
+    jitter = 1.0 + 1e-4 * np.random.default_rng(14).standard_normal(1000)
+    # Jitter is evened over 10 frames, and its second differences turn about within these.
+    assert lasting_of(replace(true, focal=2000.0 * jitter), 50.0) < 10.0
+    assert lasting_of(true.frames(slice(0, 20)), 50.0) == 1.0
 
 
 def test_people_who_all_err_alike_widen_the_region():

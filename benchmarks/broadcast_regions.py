@@ -1,0 +1,138 @@
+"""Prints how often the regions of broadcast cameras hold the true ones, on many emulated clips.
+
+    python benchmarks/broadcast_regions.py --seeds 106 107 108 109 110 [--seconds 30]
+
+Nothing is rendered: painted lines are emulated with 0.15 px of noise, the survey's errors and a
+shift of the whole picture; people are those of the simulated detector, and joints as in
+broadcast_accuracy.py. No points are followed. Scenarios broadcast-pan and broadcast-zoom of every
+seed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from broadcast_accuracy import ANEW, LASTING, SHARES, distances, errors
+
+from worldpose.broadcast_calibration import BroadcastCalibrationSettings, MovingCamera, People
+from worldpose.broadcast_calibration.evidence import (
+    MARKING,
+    FlowEvidence,
+    PointEvidence,
+    together,
+)
+from worldpose.broadcast_calibration.players import match, player_evidence
+from worldpose.broadcast_calibration.priors import prior_of
+from worldpose.broadcast_calibration.solving import Problem, solve
+from worldpose.broadcast_calibration.uncertainty import uncertainty_of
+from worldpose.broadcast_calibration.weights import lasting_of, smoothness_of
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration.line_samples import (
+    LineSamples,
+    sample_markings,
+    see_lines,
+    thinned,
+)
+from worldpose.synthetic.scenarios import SCENARIOS
+from worldpose.synthetic.scene import simulate_scene
+
+Floats = NDArray[np.float64]
+NOISE = 0.15
+"""Of a line's sample [px]."""
+
+
+def lines_of(
+    true: MovingCamera,
+    samples: LineSamples,
+    settings: BroadcastCalibrationSettings,
+    rng: np.random.Generator,
+) -> PointEvidence:
+    """Return painted lines as they are found in every frame."""
+    painted = rng.standard_normal((int(samples.ends.max()) + 1, 3))
+    shift = settings.line_shift * rng.standard_normal(2)
+    parts = []
+    for frame in range(len(true)):
+        camera = true.camera[frame]
+        seen = see_lines(camera, samples, 0.12, 0.0, 0.0)
+        index = thinned(seen, samples, 4.0, settings.line_samples)
+        world, ends = samples.points_world[index], samples.ends[index]
+        shares = settings.survey_error * samples.shares[index]
+        hung = np.where(ends[..., None] >= 0, shares[..., None] * painted[ends], 0.0)
+        pixels = camera.project(world + hung.sum(axis=1)) + shift
+        parts.append(
+            PointEvidence.across_lines(
+                np.full(len(index), frame),
+                world,
+                pixels + NOISE * rng.standard_normal(pixels.shape),
+                seen.normals[index],
+                np.full(len(index), np.hypot(NOISE, settings.line_noise)),
+                settings.loss,
+                MARKING,
+                samples.marking[index],
+                ends,
+                shares,
+            )
+        )
+    return together(parts)
+
+
+def judged(name: str, seed: int, seconds: float, fps: float) -> dict[str, Floats]:
+    """Return an emulated clip's squared errors as shares of the law of its regions."""
+    settings = BroadcastCalibrationSettings()
+    scenario = SCENARIOS[name]
+    rig = scenario.rig.model_copy(update={"cameras": 1})
+    scene = simulate_scene(
+        scenario.model_copy(update={"duration": seconds, "fps": fps, "rig": rig}), seed
+    )
+    film, joints = scene.broadcast, scene.truth.joints
+    assert film is not None  # the scenario has a broadcast camera
+    true = MovingCamera.of(film, film.center[0], film.principal_point[0])
+    rng = np.random.default_rng([seed, 77])
+    given = joints + ANEW * rng.standard_normal(joints.shape)
+    given = given + LASTING * rng.standard_normal(joints.shape[1:])
+    people = People(given, scene.observations["clip"].keypoints.astype(np.float64), fps)
+    samples = sample_markings(PitchTemplate.from_spec(scene.surveyed), 0.25)
+    lines = lines_of(true, samples, settings, rng)
+    players, _ = player_evidence(true, people, match(true, people), settings)
+    problem = Problem(
+        points=together([lines, players]),
+        flow=FlowEvidence.none(),
+        prior=prior_of(settings.prior, true.focal, true.image_size),
+        smoothness=smoothness_of(true, fps),
+    )
+    solution = solve(true, problem, settings.iterations)
+    shifts = settings.line_shift, settings.player_shift
+    known = uncertainty_of(solution, problem, *shifts, lasting_of(true, fps))
+    print(f"{name} {seed}: {errors(solution.camera, true, joints)}", flush=True)
+    return distances(solution.camera, known, true, joints)
+
+
+def main() -> None:
+    """Print a line a clip, and the regions of all together."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", nargs="+", type=int, required=True)
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--fps", type=float, default=10.0)
+    options = parser.parse_args()
+    told: dict[str, list[float]] = {}
+    for seed in options.seeds:
+        for name in ("broadcast-pan", "broadcast-zoom"):
+            clip = judged(name, seed, options.seconds, options.fps)
+            for kind, shares in clip.items():
+                held = [float((shares < share).mean()) for share in SHARES]
+                told.setdefault(kind, []).append(held)
+    wanted = " / ".join(f"{100.0 * share:g}" for share in SHARES)
+    for kind, parts in told.items():
+        held = " / ".join(f"{100.0 * each:.1f}" for each in np.mean(parts, axis=0))
+        print(f"{kind} in regions of {wanted} %: {held}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,148 @@
+"""Command `clips`: proposes clips of a whole programme, and cuts out what a person confirms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.progress import Progress
+
+from flows.cli.console import JsonOption, errors, line, print_json, print_table
+from worldpose.errors import UsageError
+
+WIDTH = 320
+"""Of the pictures that are looked at [px]."""
+
+
+def clips(
+    programme: Annotated[Path, typer.Argument(metavar="VIDEO", help="The programme feed.")],
+    sheet: Annotated[
+        Path | None, typer.Option("--sheet", help="PNG to write: some of every proposed clip.")
+    ] = None,
+    take: Annotated[
+        str | None,
+        typer.Option("--take", metavar="FIRST:STOP", help="Cut these pictures out instead."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="With --take: <match>/broadcast/<clip>.mp4.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Propose clips of a programme: shots of the main camera, without a cut, with a pan.
+
+    A person looks at the sheet and takes those that are right; no picture is coded anew.
+
+    Example: worldpose clips feed.mp4 --sheet feed.png
+    """
+    if (take is None) != (out is None) or (take is not None and sheet is not None):
+        raise UsageError(
+            "worldpose clips",
+            expected="--take with --out, or neither",
+            found="one of them, or --sheet too",
+            todo="See worldpose clips --help.",
+        )
+    if take is not None and out is not None:
+        _take(programme, take, out, as_json=as_json)
+        return
+    from worldpose.broadcast_calibration.programme import find_shots
+    from worldpose.video import index_frames
+
+    index = index_frames(programme)
+    shots = list(find_shots(_pictures(programme), index.fps))
+    proposed = [shot for shot in shots if not shot.unfit]
+    if sheet is not None:
+        from worldpose.release import whole_file
+        from worldpose.release.programme_sheet import programme_sheet
+
+        with whole_file(sheet) as draft:
+            draft.write_bytes(programme_sheet(proposed))
+    if as_json:
+        print_json(
+            {
+                "pictures": len(index),
+                "shots": [
+                    {
+                        "first": shot.first,
+                        "stop": shot.first + shot.count,
+                        "seconds": shot.seconds,
+                        "pan_widths": shot.pan,
+                        "grass": shot.grass,
+                        "tallest": shot.tallest,
+                        "unfit": shot.unfit,
+                    }
+                    for shot in shots
+                ],
+            }
+        )
+        return
+    columns = ("take", ">begins at", ">seconds", ">pan in widths", ">% grass")
+    rows = [
+        (
+            f"{shot.first}:{shot.first + shot.count}",
+            "{:.0f}:{:04.1f}".format(*divmod(shot.first / index.fps, 60.0)),
+            f"{shot.seconds:.1f}",
+            f"{shot.pan:.2f}",
+            f"{100.0 * shot.grass:.0f}",
+        )
+        for shot in proposed
+    ]
+    print_table("proposed clips", columns, rows)
+    reasons = sorted({reason for shot in shots for reason in shot.unfit})
+    for reason in reasons:
+        line(f"{sum(reason in shot.unfit for shot in shots)} shots not proposed: {reason}")
+
+
+def _pictures(programme: Path) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+    """All pictures, small, with progress on a terminal."""
+    from worldpose.video import VideoReader
+
+    with (
+        VideoReader(programme) as video,
+        Progress(console=errors, transient=True, disable=not errors.is_terminal) as bars,
+    ):
+        bar = bars.add_task(programme.name, total=len(video))
+        for number, picture in video.readable(width=WIDTH):
+            yield number, picture
+            bars.update(bar, completed=number + 1)
+
+
+def _take(programme: Path, take: str, out: Path, *, as_json: bool) -> None:
+    """Cut pictures out, and say what match.yaml is to say of them."""
+    from worldpose.release import whole_file
+    from worldpose.video.cutting import cut_video
+
+    first, _, stop = take.partition(":")
+    if not (first.isdecimal() and stop.isdecimal()):
+        raise UsageError(
+            "--take", expected="FIRST:STOP, numbers of pictures", found=repr(take),
+            todo="Copy one from the table of proposed clips.",
+        )  # fmt: skip
+    if out.exists():
+        raise UsageError(
+            str(out), expected="no file there yet", found="one", todo="Choose another name."
+        )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(out) as draft:
+        offset = cut_video(programme, int(first), int(stop), draft)
+    entry: dict[str, Any] = {
+        "id": out.stem,
+        "first_frame": "?",
+        "frame_count": int(stop) - int(first),
+        "broadcast": "main",
+        "broadcast_offset_frames": offset,
+    }
+    if as_json:
+        print_json({"video": str(out), "clip": {**entry, "first_frame": None}})
+        return
+    said = ", ".join(f"{key}: {value}" for key, value in entry.items())
+    line(f"wrote {out}; for match.yaml, first_frame being its match frame:")
+    line(f"  - {{{said}}}")
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register this command."""
+    app.command()(clips)

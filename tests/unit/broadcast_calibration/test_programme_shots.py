@@ -1,0 +1,141 @@
+"""Shots of a programme that is cut together from rendered cameras, and a stretch cut out of it."""
+
+import cv2
+import numpy as np
+import pytest
+
+from worldpose.broadcast_calibration.programme import find_shots, grass_and_people
+from worldpose.cameras import Camera, Rigid
+from worldpose.errors import InputError
+from worldpose.pitch import PitchTemplate
+from worldpose.synthetic.broadcast_rendering import render_broadcast
+from worldpose.synthetic.stadium import looking
+from worldpose.video import VideoReader, index_frames, write_video
+from worldpose.video.cutting import cut_video
+
+SIZE = np.array([320, 180])
+FPS = 10.0
+
+
+def filmed(center, aims, focal):
+    """Pictures of an empty pitch from a tripod."""
+    poses = [looking(np.array(center), np.array([*aim, 0.0]), 0.0) for aim in aims]
+    count = len(poses)
+    cameras = Camera(
+        focal=np.full((count, 2), focal),
+        principal_point=np.broadcast_to((SIZE - 1.0) / 2.0, (count, 2)),
+        distortion=np.zeros((count, 5)),
+        cam_from_world=Rigid(
+            np.stack([pose.rotation for pose in poses]),
+            np.stack([pose.translation for pose in poses]),
+        ),
+        image_size=SIZE,
+    )
+    return list(render_broadcast(cameras, PitchTemplate.standard(), None, 3))
+
+
+def sweep(begin, end, count):
+    return [(x, -4.0) for x in np.linspace(begin, end, count)]
+
+
+def wipe():
+    """A growing disc: 0.8 s."""
+    pictures = []
+    for radius in range(20, 84, 8):
+        picture = np.full((180, 320, 3), (30, 30, 160), np.uint8)
+        cv2.circle(picture, (160, 90), radius, (220, 200, 40), -1)
+        pictures.append(picture)
+    return pictures
+
+
+@pytest.fixture(scope="module")
+def programme():
+    """Names of what follows one another, and its pictures."""
+    main = (0.0, -80.0, 16.0)
+    shots = [
+        ("main", filmed(main, sweep(-25.0, 15.0, 44), 600.0)),
+        ("crowd", filmed((0.0, 0.0, 3.0), [(x, 700.0) for x in range(-300, 300, 30)], 500.0)),
+        ("still", filmed(main, [(10.0, 5.0)] * 44, 650.0)),
+        ("low", filmed((-52.0, -40.0, 2.0), [(x, 100.0) for x in range(-40, 44, 2)], 500.0)),
+        ("wipe", wipe()),
+        ("replay", filmed(main, sweep(0.0, 25.0, 44), 700.0)),
+        ("wipe", wipe()),
+        ("later", filmed(main, sweep(20.0, -20.0, 44), 600.0)),
+        ("short", filmed(main, sweep(10.0, 30.0, 20), 600.0)),
+    ]
+    return shots, [picture for _, pictures in shots for picture in pictures]
+
+
+@pytest.fixture(scope="module")
+def found(programme):
+    return list(find_shots(enumerate(programme[1]), FPS))
+
+
+def test_shots_end_where_pictures_were_cut_together(programme, found):
+    shots, _ = programme
+    begins = np.cumsum([0, *(len(pictures) for _, pictures in shots)])
+    expected = [
+        (begin, len(pictures))
+        for begin, (name, pictures) in zip(begins, shots, strict=False)
+        if name != "wipe"
+    ]
+    assert [(shot.first, shot.count) for shot in found] == expected
+
+
+def test_only_live_pans_of_the_main_camera_are_proposed(found):
+    said = dict(
+        zip(
+            ["main", "crowd", "still", "low", "replay", "later", "short"],
+            (shot.unfit for shot in found),
+            strict=True,
+        )
+    )
+    assert said["main"] == said["later"] == ()
+    assert "too little grass" in said["crowd"]
+    assert said["still"] == ("hardly a pan",)
+    assert "too little grass" in said["low"]
+    assert said["replay"] == ("between two wipes, as replays are",)
+    assert "shorter than 4 s" in said["short"]
+
+
+def test_a_pan_is_measured_in_widths_of_the_picture(found):
+    # 40 m at 77.6 m, and half of it to either side: 27 degrees of 0.533 rad wide pictures.
+    turned = np.arctan((25.0 + 15.0) / 2.0 / np.hypot(76.0, 16.0)) * 2.0 / (320.0 / 600.0)
+    # Aimed at 25 m to the left and 15 m to the right, which is not the same angle to both sides,
+    # and followed at a twentieth of the picture's size.
+    assert abs(found[0].pan - turned) < 0.15 * turned
+
+
+def test_a_person_close_by_is_tall():
+    lawn = np.full((180, 320, 3), (70, 130, 50), np.uint8)
+    assert grass_and_people(lawn) == (1.0, 0.0)
+    near = lawn.copy()
+    near[30:180, 140:180] = (200, 30, 30)
+    # The picture's border closes him off from below; the hull of the grass is the whole picture.
+    share, tallest = grass_and_people(near)
+    assert tallest == pytest.approx(150.0 / 180.0, abs=0.02)
+    assert share == pytest.approx(1.0 - 40.0 * 150.0 / (180.0 * 320.0), abs=0.02)
+    assert grass_and_people(np.zeros_like(lawn)) == (0.0, 1.0)
+
+
+def test_a_damaged_picture_ends_a_shot(programme):
+    pictures = programme[1][:44]
+    broken = [(n, None if n == 20 else each) for n, each in enumerate(pictures)]
+    assert [(shot.first, shot.count) for shot in find_shots(broken, FPS)] == [(0, 20), (21, 23)]
+
+
+def test_a_stretch_is_cut_out_picture_for_picture(programme, tmp_path):
+    video, cut = tmp_path / "programme.mp4", tmp_path / "cut.mp4"
+    write_video(video, programme[1][:90], FPS)
+    place = cut_video(video, 41, 70, cut)
+    # A key frame a second: 10 pictures.
+    assert place == 41 % 10
+    assert index_frames(cut).fps == pytest.approx(FPS)
+    with VideoReader(video) as one, VideoReader(cut) as two:
+        for number in range(29):
+            assert np.array_equal(one.frame(41 + number), two.frame(place + number))
+        small = dict(one.readable(40, 42, width=160))
+        assert small[41].shape == (90, 160, 3)
+        assert abs(small[41].mean() - one.frame(41).mean()) < 1.0
+    with pytest.raises(InputError, match="90 pictures"):
+        cut_video(video, 80, 91, tmp_path / "none.mp4")

@@ -1,0 +1,51 @@
+"""How far markings and people lie from where a moving camera puts them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.broadcast_calibration.evidence import MARKING, PLAYER, PointEvidence
+from worldpose.broadcast_calibration.moving_camera import MovingCamera
+
+Floats = NDArray[np.float64]
+
+
+def pixels_off(camera: MovingCamera, points: PointEvidence) -> Floats:
+    """Return projected minus seen pixels (n, 2); infinite where there is no projection."""
+    off = np.full((len(points), 2), np.inf)
+    for frame in np.unique(points.frame):
+        mine = np.flatnonzero(points.frame == frame)
+        single = camera.frames(slice(int(frame), int(frame) + 1)).camera[0]
+        off[mine] = single.project(points.world[mine]) - points.image[mine]
+    return np.where(np.isfinite(off), off, np.inf)
+
+
+def misses(camera: MovingCamera, points: PointEvidence) -> tuple[float, float]:
+    """Return by how much a camera misses markings and people in the median [px]; NaN without any.
+
+    Painted lines across them, within their loss; people by the mean over a person's keypoints in a
+    frame, in which what keypoints err by averages out and what the camera errs by does not.
+
+    Args:
+        camera: all frames.
+        points: what was seen.
+    """
+    off = pixels_off(camera, points)
+    lines = points.kind == MARKING
+    with np.errstate(invalid="ignore"):
+        white = np.abs(np.einsum("nj,nj->n", points.whitening[lines, 0], off[lines]))
+    across = white / np.linalg.norm(points.whitening[lines, 0], axis=-1)
+    across = across[white < points.loss[lines]]
+    people = np.flatnonzero((points.kind == PLAYER) & np.isfinite(off).all(axis=-1))
+    # Keypoints that are put far off are not the camera's doing.
+    far = np.linalg.norm(off[people] * points.whitening[people][:, [0, 1], [0, 1]], axis=-1)
+    people = people[far < 2.0 * points.loss[people]]
+    key = np.column_stack([points.frame[people], points.source[people]])
+    _, person, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(person.ravel(), off[people, axis]) for axis in range(2)], axis=-1)
+    beside = np.linalg.norm(sums[: len(count)] / count[:, None], axis=-1)
+    return (
+        float(np.median(across)) if len(across) else float("nan"),
+        float(np.median(beside)) if len(beside) else float("nan"),
+    )
