@@ -104,8 +104,12 @@ class AddedDetection(Record):
     camera: Name
     frame: int
     """Match frame."""
+    detection: int = Field(ge=0)
+    """The place that the person takes among the camera's detections of the frame: a free one."""
     box: tuple[float, float, float, float]
     """x0, y0, x1, y1 [px]."""
+    keypoints: tuple[Pixel | None, ...] = Field(default=(None,) * 17, min_length=17, max_length=17)
+    """[px], in the order of COCO-17; None where a joint cannot be seen."""
 
 
 class ChosenFrames(Record):
@@ -224,8 +228,29 @@ class Withdrawal(Record):
     withdrawn_at: datetime
 
 
+class Acceptance(Record):
+    """Detections that a person found right; it tells what is left to look at, and changes nothing.
+
+    It holds for the results that it names: found anew with other bytes, they are to be looked at.
+    """
+
+    kind: Literal["acceptance"] = "acceptance"
+    contract: Literal[1] = CONTRACT_VERSION
+    id: Name
+    match_id: Name
+    results: dict[str, Key]
+    """Of one camera, as they are without corrections: `stage/unit` to key."""
+    at_least: float | None = Field(default=None, ge=0, le=1)
+    """Everybody whose score is at least this [1]; None = nobody but those named."""
+    people: tuple[tuple[int, int], ...] = ()
+    """Match frame, and place among the detections of the frame."""
+    who: str = Field(min_length=1)
+    accepted_at: datetime
+
+
 ReviewRecord = Annotated[
-    ReviewRequest | ReviewDecision | Correction | Withdrawal, Field(discriminator="kind")
+    ReviewRequest | ReviewDecision | Correction | Withdrawal | Acceptance,
+    Field(discriminator="kind"),
 ]
 
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+from pydantic import JsonValue
 
 from data_contracts.review import Edit
 from flows.detection import seen_by, seen_in_broadcast
@@ -83,32 +86,82 @@ def _stale(edit: DetectionEdit, objection: str) -> StaleEditError:
     return error
 
 
-def _stored(store: Store, match: Match, camera: str, frame: int) -> tuple[xr.Dataset, int]:
-    """The result that has a frame of a camera, and how many of that frame's edits it holds."""
+def results_of(
+    store: Store, match: Match, camera: str, frame: int | None = None
+) -> tuple[str, ...]:
+    """The results of the latest run with whom a camera saw, as `stage/unit`.
+
+    Args:
+        store: the store.
+        match: the match.
+        camera: a static camera, or the clip of a broadcast camera.
+        frame: of the clips that have this match frame; None = of all.
+
+    Raises:
+        InputError: there are none.
+    """
     spec = match.folder.spec
-    clips = [clip for clip in spec.clips if 0 <= frame - clip.first_frame < clip.frame_count]
+    clips = [
+        clip
+        for clip in spec.clips
+        if frame is None or 0 <= frame - clip.first_frame < clip.frame_count
+    ]
     names: list[str] = []
     if camera in {each.id for each in spec.static_cameras}:
         names = [seen_by(match, camera, clip.id) for clip in clips]
     elif camera in {clip.id for clip in clips}:
         names = [*seen_in_broadcast(match, camera)]
     results = store.run(match.match_id).results if store.runs(match.match_id) else {}
-    name = next((name for name in names if name in results), None)
-    if name is None:
+    found = tuple(dict.fromkeys(name for name in names if name in results))
+    if not found:
+        place = f"{match.match_id}, {camera}"
         raise InputError(
-            f"{match.match_id}, {camera}, frame {frame}",
+            place if frame is None else f"{place}, frame {frame}",
             expected="people seen there in the latest run",
             found="none",
             todo=f"Run it first: worldpose run {match.match_id}.",
         )
+    return found
+
+
+def stored_people(store: Store, match: Match, name: str) -> tuple[xr.Dataset, str]:
+    """Whom a camera saw, by `stage/unit`, and the key of that without corrections."""
+    stored = _result(store, match, name)
+    return stored.result, stored.plain
+
+
+def _stored(store: Store, match: Match, camera: str, frame: int) -> tuple[xr.Dataset, int]:
+    """The result that has a frame of a camera, and how many of that frame's edits it holds."""
+    stored = _result(store, match, results_of(store, match, camera, frame)[0])
+    here = [each for each in stored.edits if isinstance(each, dict) and each["frame"] == frame]
+    return stored.result, len(here)
+
+
+@dataclass(frozen=True, eq=False)
+class _Result:
+    """Whom a camera saw, as it is stored.
+
+    Attributes:
+        result: without corrections where it is there so.
+        plain: its key without corrections.
+        edits: the corrections that it holds.
+    """
+
+    result: xr.Dataset
+    plain: str
+    edits: list[JsonValue]
+
+
+def _result(store: Store, match: Match, name: str) -> _Result:
+    """A result of the latest run, by `stage/unit`."""
     stage, _, unit = name.partition("/")
+    key = store.run(match.match_id).results[name]
     place = (match.match_id, stage, unit)
-    recipe = store.manifest(*place, results[name]).recipe
+    recipe = store.manifest(*place, key).recipe
     sources = dict(recipe.sources)
     taken_in = sources.pop("edits", None) or []
     assert isinstance(taken_in, list)
     plain = key_of(recipe.model_copy(update={"sources": sources}))
     if store.has(*place, plain):
-        return store.open_result(*place, plain), 0
-    here = [each for each in taken_in if isinstance(each, dict) and each["frame"] == frame]
-    return store.open_result(*place, results[name]), len(here)
+        return _Result(store.open_result(*place, plain), plain, [])
+    return _Result(store.open_result(*place, key), plain, taken_in)

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from worldpose.detection import DetectionSettings, load_detectors, load_pose
 from worldpose.errors import InputError, UsageError
 from worldpose.training.proposing import propose_labels
-from worldpose.video import VideoReader
+from worldpose.video import open_video
 
 
 def propose(videos: Sequence[Path], every: int, folder: Path, settings: DetectionSettings) -> int:
     """Write every so many frames of videos with proposed labels; returns how many frames.
 
     Args:
-        videos: of pictures of one size.
+        videos: files or folders of images, of pictures of one size.
         every: frames from one to the next.
         folder: absent or empty.
         settings: which detectors propose.
@@ -50,7 +50,7 @@ def propose(videos: Sequence[Path], every: int, folder: Path, settings: Detectio
 def _frames(videos: Sequence[Path], every: int) -> Iterator[tuple[str, NDArray[np.uint8]]]:
     shape: tuple[int, ...] | None = None
     for video in videos:
-        with VideoReader(video) as reader:
+        with open_video(video) as reader:
             for number in range(0, len(reader), every):
                 picture = reader.frame(number)
                 if shape is not None and picture.shape != shape:

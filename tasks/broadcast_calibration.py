@@ -24,7 +24,7 @@ from worldpose.broadcast_calibration import (
 )
 from worldpose.pitch import PitchTemplate
 from worldpose.store import Store
-from worldpose.video import VideoReader
+from worldpose.video import open_video
 
 
 @unit_task
@@ -38,7 +38,7 @@ def broadcast_calibration(work: Work) -> str:
     ((file, clicked),) = sources["key_frames"].items()
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
-        with VideoReader(path) as video:
+        with open_video(path) as video:
             yield from (picture for _, picture in video.frames(start, start + count, grey=True))
 
     with store.publishing(work) as result:

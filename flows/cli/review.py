@@ -10,6 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from data_contracts.review import Edit
 from flows import review
+from flows.cli import review_exchange
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -289,4 +290,5 @@ def _tell_damage(match: Match) -> None:
 def add_to(app: typer.Typer) -> None:
     """Register these commands."""
     commands.command()(serve)
+    review_exchange.add_to(commands)
     app.add_typer(commands)

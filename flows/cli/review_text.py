@@ -7,6 +7,7 @@ from datetime import datetime
 from typing import Any
 
 from data_contracts.review import (
+    AddedDetection,
     Correction,
     DeletedDetection,
     MovedKeypoint,
@@ -62,10 +63,12 @@ def in_words(correction: Correction) -> str:
         place = edit.camera if edit.frame is None else f"{edit.camera} frame {edit.frame}"
         was, xy = (json.dumps(it) if it else "nothing" for it in (edit.was, edit.xy))
         return f"{edit.marking} in {place}: {was} -> {xy}"
-    if isinstance(edit, MovedKeypoint | DeletedDetection):
+    if isinstance(edit, AddedDetection | MovedKeypoint | DeletedDetection):
         place = f"detection {edit.detection} in {edit.camera} frame {edit.frame}"
         if isinstance(edit, DeletedDetection):
             return f"{place}: taken out"
+        if isinstance(edit, AddedDetection):
+            return f"{place}: added"
         was, xy = (
             "nothing" if it is None else json.dumps([round(value, 2) for value in it])
             for it in (edit.was, edit.xy)

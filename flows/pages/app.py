@@ -13,7 +13,17 @@ from fastapi.responses import JSONResponse, Response
 from pydantic import Field
 
 from data_contracts.records import Record
-from flows.pages import calibration, decisions, detections, evidence, identities, outliers, queue
+from flows.operations import status_page
+from flows.pages import (
+    calibration,
+    decisions,
+    detections,
+    evidence,
+    identities,
+    outliers,
+    queue,
+    views,
+)
 from flows.pages.access import NAME_LENGTH, SESSION_SECONDS, Access
 from flows.pages.desk import Desk, Person
 from flows.pages.errors import add_answers
@@ -64,7 +74,17 @@ def create_app(project: str, access: Access) -> FastAPI:
     )
     add_answers(app)
     app.include_router(_sessions(desk))
-    for module in (queue, decisions, evidence, outliers, calibration, detections, identities):
+    for module in (
+        queue,
+        decisions,
+        evidence,
+        outliers,
+        calibration,
+        detections,
+        views,
+        identities,
+        status_page,
+    ):
         app.include_router(module.routes(desk))
     app.include_router(_files())
     app.add_middleware(Guard, access=access)

@@ -2,20 +2,38 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from fastapi import APIRouter, HTTPException
 from fastapi.responses import Response
 from numpy.typing import NDArray
+from pydantic import Field
 
 from data_contracts.conventions import COCO17, COCO17_BONES
+from data_contracts.records import Record
+from flows.acceptance import accept, left_to_look_at
 from flows.detections import detections_now
-from flows.pages.desk import Desk
+from flows.match_pictures import frame_picture
+from flows.pages.desk import Desk, Person
 from flows.stage import Match
 from worldpose.errors import InputError
-from worldpose.ingest import Observations, unit_frames
-from worldpose.video import open_video
+from worldpose.ingest import Observations
+from worldpose.store import Store
+
+LISTED: Final = 60
+"""People who are listed of those to look at."""
+ACCEPTED: Final = 500
+"""Most people who are accepted by name at once."""
+
+
+class Accepting(Record):
+    """Detections that a person found right."""
+
+    at_least: float | None = Field(default=None, ge=0, le=1)
+    """Everybody whose score is at least this [1]; None = nobody but those named."""
+    people: tuple[tuple[int, int], ...] = Field(default=(), max_length=ACCEPTED)
+    """Match frame, and place among the detections of the frame."""
 
 
 def routes(desk: Desk) -> APIRouter:
@@ -41,7 +59,7 @@ def routes(desk: Desk) -> APIRouter:
             "has_picture": owner in match.folder.videos,
             "joints": COCO17,
             "bones": COCO17_BONES,
-            "people": _people(detections_now(desk.store, match, owner, frame)),
+            **_seen(detections_now(desk.store, match, owner, frame)),
             "cameras": [camera.id for camera in spec.static_cameras],
         }
 
@@ -49,21 +67,47 @@ def routes(desk: Desk) -> APIRouter:
     def image(match_id: str, owner: str, frame: int) -> Response:
         import cv2  # late: few pages open a picture
 
-        match = desk.match(match_id)
-        if owner not in match.folder.videos:
-            raise HTTPException(404, "there is no video")
-        number = frame + unit_frames(match.folder.spec, owner).offset
-        with open_video(match.folder.videos[owner]) as video:
-            if not 0 <= number < len(video):
-                raise HTTPException(404, "the video has no such frame")
-            try:
-                picture = video.frame(number)
-            except InputError as error:
-                raise HTTPException(404, error.found) from error
+        try:
+            picture = frame_picture(desk.store, desk.match(match_id), owner, frame)
+        except InputError as error:
+            raise HTTPException(404, error.found) from error
+        if picture is None:
+            raise HTTPException(404, "there is no picture of this frame")
         content = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1]
         return Response(bytes(content), media_type="image/jpeg")
 
+    @router.get("/queue")
+    def queue(match_id: str, owner: str) -> dict[str, Any]:
+        return _queue(desk.store, desk.match(match_id), owner)
+
+    @router.post("/acceptances")
+    def take(match_id: str, owner: str, given: Accepting, who: Person) -> dict[str, Any]:
+        match = desk.match(match_id)
+        said = {"at_least": given.at_least, "people": given.people, "who": who}
+        accept(desk.store, match, owner, **said)
+        return _queue(desk.store, desk.match(match_id), owner)
+
     return router
+
+
+def _queue(store: Store, match: Match, owner: str) -> dict[str, Any]:
+    """How many of a camera's people nobody has looked at, and the least certain of them."""
+    left = left_to_look_at(store, match, owner)
+    rows = sorted(
+        (float(score), int(frame), int(detection))
+        for each in left
+        for frame, detection, score in zip(
+            each.frame[:LISTED], each.detection[:LISTED], each.score[:LISTED], strict=True
+        )
+    )
+    return {
+        "left": sum(len(each.frame) for each in left),
+        "people": sum(each.people for each in left),
+        "next": [
+            {"frame": frame, "detection": detection, "score": round(score, 3)}
+            for score, frame, detection in rows[:LISTED]
+        ],
+    }
 
 
 def _size(match: Match, owner: str) -> tuple[int, int]:
@@ -71,6 +115,14 @@ def _size(match: Match, owner: str) -> tuple[int, int]:
     broadcast = {clip.id: clip.broadcast for clip in spec.clips if clip.broadcast is not None}
     camera = spec.camera(broadcast.get(owner, owner))
     return camera.width, camera.height
+
+
+def _seen(found: Observations) -> dict[str, Any]:
+    """Everybody in the first row, and the place that an added person takes."""
+    there = np.isfinite(found.score[:1]).any(axis=0)
+    occupied = np.flatnonzero(there)
+    free = int(occupied[-1]) + 1 if len(occupied) else 0
+    return {"people": _people(found), "free": free}
 
 
 def _people(found: Observations) -> list[dict[str, Any]]:

@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Lock
 from typing import Any, Final
 
 import numpy as np
 from fastapi import APIRouter, HTTPException
-from fastapi.responses import Response
+from fastapi.responses import FileResponse, Response
+from numpy.typing import NDArray
 
 from data_contracts.review import ReviewRequest
 from flows.broadcast_reporting import broadcast_pictures, broadcast_tables
 from flows.camera_reporting import camera_evidence
+from flows.clip_video import clip_view, write_clip_video
 from flows.pages.desk import Desk
 from flows.people_reporting import adjustment_tables, body_tables
-from flows.release import static_cameras
+from flows.release import placed_joints, static_cameras
 from flows.reporting import clip_pictures
 from flows.stage import Match
 from worldpose.release import JointTracks, Picture
 from worldpose.release.pictures import paths_picture
 from worldpose.release.report import Table
 from worldpose.review import requests_by_id
+from worldpose.review.curves import Curve, clip_curves
 from worldpose.store import Run, Store, open_run
 
 KEPT: Final = 16
@@ -35,13 +41,18 @@ class Evidence:
 
     pictures: tuple[Picture, ...] = ()
     tables: tuple[Table, ...] = ()
+    curves: tuple[Curve, ...] = ()
+    first_frame: int = 0
+    video: str | None = None
+    """Whose video shows it; None where none does."""
 
 
 def routes(desk: Desk) -> APIRouter:
     """Routes of the evidence of one question."""
     router = APIRouter(prefix="/api/matches/{match_id}/reviews/{request}")
     drawn: dict[tuple[str, str], Evidence] = {}
-    lock = Lock()
+    lock, filming = Lock(), Lock()
+    videos = TemporaryDirectory(prefix="worldpose-pages-")
 
     def evidence_of(match_id: str, request: str) -> Evidence:
         match = desk.match(match_id)
@@ -64,6 +75,11 @@ def routes(desk: Desk) -> APIRouter:
                 {"title": table.heading, "columns": table.columns, "rows": table.rows}
                 for table in found.tables
             ],
+            "curves": [
+                {"title": curve.title, "values": _numbers(curve.values)} for curve in found.curves
+            ],
+            "first_frame": found.first_frame,
+            "video": found.video,
         }
 
     @router.get("/pictures/{number}")
@@ -73,7 +89,28 @@ def routes(desk: Desk) -> APIRouter:
             raise HTTPException(404, "no such picture")
         return Response(pictures[number].png, media_type="image/png")
 
+    @router.get("/video")
+    def video(match_id: str, request: str) -> FileResponse:
+        if evidence_of(match_id, request).video is None:
+            raise HTTPException(404, "no camera of this clip has a video")
+        match = desk.match(match_id)
+        asked = requests_by_id(match.journal.records)[request]
+        name = hashlib.sha256(f"{match_id} {request}".encode()).hexdigest()
+        file = Path(videos.name) / f"{name}.mp4"
+        with filming:
+            if not file.is_file():
+                run = open_run(desk.store.url, match_id, asked.run_id)
+                (unit,) = asked.keys
+                draft = file.with_suffix(".draft.mp4")
+                write_clip_video(desk.store, run, match, unit.partition("/")[2], draft)
+                draft.replace(file)
+        return FileResponse(file, media_type="video/mp4")
+
     return router
+
+
+def _numbers(values: NDArray[np.float64]) -> list[float | None]:
+    return [None if np.isnan(value) else round(float(value), 5) for value in values]
 
 
 def draw_evidence(store: Store, match: Match, request: ReviewRequest) -> Evidence:
@@ -122,12 +159,28 @@ def _clip(store: Store, run: Run, match: Match, clip: str) -> Evidence:
     return Evidence(tuple(clip_pictures(run, match, clip)), tuple(body_tables(run, (clip,))))
 
 
+def _acceptance(store: Store, run: Run, match: Match, clip: str) -> Evidence:
+    """Of a clip that is to be released: its pictures and tables, figures over its frames, video."""
+    fits, joints = run[f"body_fitting/{clip}"], placed_joints(run, clip)
+    placed = joints["joints"].reindex(frame=fits["frame"].values, person=fits["person"].values)
+    curves = clip_curves(
+        fits["joints"].values.astype(np.float64),
+        fits["covariance"].values,
+        fits["filled"].values,
+        placed.values.astype(np.float64),
+    )
+    shown = _clip(store, run, match, clip)
+    first = int(fits["frame"].values[0]) if fits.sizes["frame"] else 0
+    video = clip_view(run, match, clip)
+    return replace(shown, curves=curves, first_frame=first, video=video)
+
+
 def _adjustment(store: Store, run: Run, match: Match, unit: str) -> Evidence:
     return Evidence((), tuple(adjustment_tables(run)[:1]))  # the others are lists to choose from
 
 
 def _broadcast(store: Store, run: Run, match: Match, clip: str) -> Evidence:
-    return Evidence(tuple(broadcast_pictures(run, match)), tuple(broadcast_tables(run)))
+    return Evidence(tuple(broadcast_pictures(run, match)), tuple(broadcast_tables(run, match)))
 
 
 def _nothing(store: Store, run: Run, match: Match, unit: str) -> Evidence:
@@ -139,6 +192,6 @@ _DRAWN: Final[dict[str, Callable[[Store, Run, Match, str], Evidence]]] = {
     "tracking": _identities,
     "triangulation": _clip,
     "bundle_adjustment": _adjustment,
-    "body_fitting": _clip,
+    "body_fitting": _acceptance,
     "broadcast_calibration": _broadcast,
 }

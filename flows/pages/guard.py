@@ -22,9 +22,10 @@ BODY_BYTES: Final = 1 << 20
 SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
-    "connect-src 'self'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
+    "media-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'self'; "
+    "frame-ancestors 'none'"
 )
-"""What a page may load: scripts, styles and pictures of this server, and nothing written inline."""
+"""What a page may load: scripts, styles, pictures, videos of this server; nothing is inline."""
 
 logger = logging.getLogger("worldpose.pages")
 

@@ -3,16 +3,13 @@
 import json
 import os
 import shutil
-import socket
 import subprocess
-import time
-import urllib.error
-import urllib.request
 from pathlib import Path
 
 import numpy as np
+import page_client
 import pytest
-from command_line import WORLDPOSE, succeed
+from command_line import succeed
 
 from data_contracts.pitch import PitchSpec
 from flows.registering import open_match
@@ -24,7 +21,6 @@ from worldpose.store import Store, open_run
 
 MODULES = Path(__file__).parents[2] / "infra" / "review_pages" / "node_modules"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-TOKEN = "0123456789abcdefghij"
 MATCH = "tiny-5-0.6s"
 
 pytestmark = [
@@ -80,24 +76,8 @@ def drawn(camera, pitch, names, margin=15.0, count=4):
 def served(rendered, tmp_path):
     project = tmp_path / "project"
     succeed("ingest", rendered[0], "--project", project)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    environment = {**os.environ, "WORLDPOSE_REVIEW_TOKEN": TOKEN}
-    command = [*WORLDPOSE, "review", "serve", "--port", str(port), "--project", str(project)]
-    server = subprocess.Popen(
-        command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    base = f"http://127.0.0.1:{port}"
-    for _ in range(240):
-        try:
-            with urllib.request.urlopen(f"{base}/api/health"):
-                break
-        except urllib.error.URLError:
-            time.sleep(0.5)
-    yield base, project
-    server.terminate()
-    server.wait(30)
+    with page_client.serving(project, tmp_path) as base:
+        yield base, project
 
 
 def ground_errors(found, truth, pitch):
@@ -127,7 +107,7 @@ def test_a_camera_is_calibrated_from_nothing_and_the_run_goes_on_by_itself(
     lines = dict(list(lines.items())[:10])
     task = {
         "base": base,
-        "token": TOKEN,
+        "token": page_client.TOKEN,
         "who": "Ada <b>L.</b>",
         "match": MATCH,
         "camera": camera,

@@ -7,7 +7,14 @@ from dataclasses import dataclass, replace
 
 from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
 from data_contracts.conventions import COCO17
-from data_contracts.review import Correction, Edit, MovedKeypoint, MovedPoint, RedrawnMarking
+from data_contracts.review import (
+    AddedDetection,
+    Correction,
+    Edit,
+    MovedKeypoint,
+    MovedPoint,
+    RedrawnMarking,
+)
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking, Pixel
 from worldpose.ingest import MatchFolder
 from worldpose.pitch import PitchTemplate
@@ -148,13 +155,21 @@ def _unknown(folder: MatchFolder, edit: DetectionEdit) -> str | None:
     owners |= {clip.id: clip.broadcast for clip in spec.clips if clip.broadcast is not None}
     if edit.camera not in owners:
         return f"there is no camera {edit.camera}"
-    if not isinstance(edit, MovedKeypoint):
-        return None
-    if edit.joint not in COCO17:
-        return f"COCO-17 has no joint {edit.joint}"
     camera = spec.camera(owners[edit.camera])
-    if edit.xy is not None and not _is_inside(edit.xy, (camera.width, camera.height)):
-        return f"{list(edit.xy)} is outside of the picture {edit.camera}"
+    size = (camera.width, camera.height)
+    placed: tuple[Pixel | None, ...] = ()
+    if isinstance(edit, MovedKeypoint):
+        if edit.joint not in COCO17:
+            return f"COCO-17 has no joint {edit.joint}"
+        placed = (edit.xy,)
+    elif isinstance(edit, AddedDetection):
+        x0, y0, x1, y1 = edit.box
+        if not (x0 < x1 and y0 < y1 and x0 < size[0] and y0 < size[1] and x1 > 0 and y1 > 0):
+            return f"{list(edit.box)} is no box in the picture {edit.camera}"
+        placed = edit.keypoints
+    for xy in placed:
+        if xy is not None and not _is_inside(xy, size):
+            return f"{list(xy)} is outside of the picture {edit.camera}"
     return None
 
 

@@ -9,11 +9,11 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from data_contracts.conventions import COCO17
-from data_contracts.review import DeletedDetection, MovedKeypoint
+from data_contracts.review import AddedDetection, DeletedDetection, MovedKeypoint
 from worldpose.ingest import Observations
 
-DetectionEdit: TypeAlias = DeletedDetection | MovedKeypoint
-DETECTION_EDITS = (DeletedDetection, MovedKeypoint)
+DetectionEdit: TypeAlias = AddedDetection | DeletedDetection | MovedKeypoint
+DETECTION_EDITS = (AddedDetection, DeletedDetection, MovedKeypoint)
 SAME: Final = 0.01
 """How far a keypoint may be from where a person saw it and be the same one [px]: places are stored
 in single precision, and shown rounded."""
@@ -36,7 +36,8 @@ def replay_detections(found: Observations, edits: Iterable[DetectionEdit]) -> De
     """The people of one camera with corrections applied one after the other.
 
     An edit applies while what it changes is as the person saw it. A keypoint that a person placed
-    has confidence 1; other keypoints, and a person's place among the detections, stay.
+    has confidence 1, and so has an added person; other keypoints, and a person's place among the
+    detections, stay. Where all places are taken, an added person makes one more in every frame.
 
     Args:
         found: as detected, or given; stays as it is.
@@ -59,6 +60,13 @@ def replay_detections(found: Observations, edits: Iterable[DetectionEdit]) -> De
         if isinstance(edit, DeletedDetection):
             for array in changed.arrays().values():
                 array[at] = np.nan
+        elif isinstance(edit, AddedDetection):
+            changed = _with_place(changed, edit.detection)
+            keypoints = np.array([xy or (np.nan, np.nan) for xy in edit.keypoints])
+            changed.keypoints[at] = keypoints
+            changed.confidence[at] = np.where(np.isnan(keypoints[:, 0]), np.nan, 1.0)
+            changed.boxes[at] = edit.box
+            changed.score[at] = 1.0
         else:
             joint = COCO17.index(edit.joint)
             changed.keypoints[(*at, joint)] = np.nan if edit.xy is None else edit.xy
@@ -72,7 +80,13 @@ def objection_to(found: Observations, edit: DetectionEdit) -> str | None:
     row = _row(found, edit.frame)
     if not 0 <= row < len(found.frame):
         return f"{edit.camera} has no frame {edit.frame}"
-    if not 0 <= edit.detection < found.score.shape[1] or np.isnan(found.score[row, edit.detection]):
+    places = found.score.shape[1]
+    is_there = 0 <= edit.detection < places and not np.isnan(found.score[row, edit.detection])
+    if isinstance(edit, AddedDetection):
+        if edit.detection > places:
+            return f"{place} would leave places free before it: {places} is the next"
+        return f"there is a {place} already" if is_there else None
+    if not is_there:
         return f"there is no {place}"
     if isinstance(edit, DeletedDetection):
         return None
@@ -83,6 +97,17 @@ def objection_to(found: Observations, edit: DetectionEdit) -> str | None:
         was, seen = edit.was or "not seen", [round(float(value), 2) for value in now]
         return f"{edit.joint} of {place} was {was} when it was corrected, and is {seen} now"
     return None
+
+
+def _with_place(found: Observations, detection: int) -> Observations:
+    """The same with a place for a person, empty where there was none."""
+    if detection < found.score.shape[1]:
+        return found
+    widened = {
+        name: np.pad(array, [(0, 0), (0, 1)] + [(0, 0)] * (array.ndim - 2), constant_values=np.nan)
+        for name, array in found.arrays().items()
+    }
+    return Observations(frame=found.frame, **widened)
 
 
 def _row(found: Observations, frame: int) -> int:

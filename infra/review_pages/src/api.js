@@ -42,3 +42,9 @@ export function picturePath(match, owner, part = "", frame = null) {
   const query = frame === null ? "" : `?frame=${frame}`;
   return `${matchPath(match)}/pictures/${encodeURIComponent(owner)}${part}${query}`;
 }
+
+// Made here: an edit that is sent again is the same edit.
+export function newId(kind) {
+  const bytes = crypto.getRandomValues(new Uint8Array(8));
+  return `${kind}.${[...bytes].map((b) => b.toString(16).padStart(2, "0")).join("")}`;
+}

@@ -4,7 +4,7 @@
 // so still; otherwise somebody else was quicker, and the person decides whose it shall be. An edit
 // keeps its id until the server acknowledged it: sent twice, it is kept once.
 
-import { post, Refusal, matchPath } from "./api.js";
+import { matchPath, newId, post, Refusal } from "./api.js";
 
 const same = (a, b) => JSON.stringify(a ?? null) === JSON.stringify(b ?? null);
 const RETRY = 2000; // [ms]
@@ -88,8 +88,7 @@ export class Edits {
 
   #keep(edit) {
     const kind = edit.kind === "point" ? "moved_point" : "redrawn_marking";
-    const bytes = crypto.getRandomValues(new Uint8Array(8));
-    const id = `${kind}.${[...bytes].map((b) => b.toString(16).padStart(2, "0")).join("")}`;
+    const id = newId(kind);
     this.#waiting.push({ ...edit, id });
     this.#send();
   }

@@ -15,6 +15,7 @@ from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.review import (
     AddedDetection,
+    ChosenFrames,
     Correction,
     DeletedDetection,
     MovedKeypoint,
@@ -153,6 +154,11 @@ def test_a_point_clicked_anew_in_the_folder_is_not_moved_back(folder):
     assert "was (1.0, 2.0) when it was corrected, and is (2.0, 2.0) now" in replay.stale[0][1]
 
 
+def added(box, nose=None):
+    keypoints = (nose,) + (None,) * 16
+    return AddedDetection(camera="a", frame=0, detection=0, box=box, keypoints=keypoints)
+
+
 @pytest.mark.parametrize(
     ("edit", "reason"),
     [
@@ -169,7 +175,11 @@ def test_a_point_clicked_anew_in_the_folder_is_not_moved_back(folder):
         (moved((9.0, 9.0), (3.0, 4.0)), "was (3.0, 4.0) when"),
         (moved((9.0, 9.0), (1.0, 2.0), marking="corner_left_far"), "is not there now"),
         (moved((9.0, 9.0), None), "was not there when"),
-        (AddedDetection(camera="a", frame=0, box=(0, 0, 9, 9)), "nothing takes in"),
+        (ChosenFrames(stage="bundle_adjustment", clip="clip", frames=(1,)), "nothing takes in"),
+        (added((0, 0, 9, 9)), None),
+        (added((9, 9, 0, 0)), "no box in the picture a"),
+        (added((200, 9, 300, 30)), "no box in the picture a"),
+        (added((0, 0, 9, 9), nose=(100.0, 9.0)), "outside of the picture a"),
         (DeletedDetection(camera="tv", frame=0, detection=0), "no camera tv"),
         (DeletedDetection(camera="clip", frame=0, detection=0), None),
         (hidden("nose"), None),

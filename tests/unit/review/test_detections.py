@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from data_contracts.conventions import COCO17
-from data_contracts.review import DeletedDetection, MovedKeypoint
+from data_contracts.review import AddedDetection, DeletedDetection, MovedKeypoint
 from worldpose.ingest import Observations
 from worldpose.review.detections import replay_detections
 
@@ -30,6 +30,14 @@ def keypoint(xy, was=(0.0, 1.0), **where):
 
 def deleted(frame=FIRST, detection=0):
     return DeletedDetection(camera="a", frame=frame, detection=detection)
+
+
+def added(detection, frame=FIRST + 1, nose=(3.0, 4.0)):
+    keypoints = (nose,) + (None,) * 16
+    box = (1.0, 2.0, 5.0, 9.0)
+    return AddedDetection(
+        camera="a", frame=frame, detection=detection, box=box, keypoints=keypoints
+    )
 
 
 def changed(edit):
@@ -84,6 +92,8 @@ def test_a_detection_taken_out_leaves_the_others_in_their_places():
         (keypoint((1.0, 1.0), was=None), "was not seen when"),
         (deleted(frame=FIRST + 1, detection=1), "no detection 1"),
         (deleted(detection=-1), "no detection -1"),
+        (added(0), "there is a detection 0"),
+        (added(3), "2 is the next"),
     ],
 )
 def test_what_does_not_fit_what_was_seen_says_why_and_changes_nothing(edit, reason):
@@ -107,3 +117,24 @@ def test_a_keypoint_that_was_not_seen_can_be_placed():
     replay = replay_detections(hidden, [keypoint((3.0, 4.0), was=None)])
     assert replay.objections == (None,)
     assert replay.observations.keypoints[0, 0, COCO17.index("nose")].tolist() == [3.0, 4.0]
+
+
+def test_an_added_person_takes_a_free_place_and_is_certain():
+    places = changed(added(1))
+    assert places["keypoints"].tolist() == [[1, 1, 0, 0], [1, 1, 0, 1]]
+    assert places["confidence"].tolist() == [[1, 1, 0]]
+    assert places["boxes"].tolist() == [[1, 1, k] for k in range(4)]
+    after = replay_detections(observations(), [added(1)]).observations
+    assert (after.score[1, 1], after.confidence[1, 1, 0]) == (1.0, 1.0)
+    assert after.boxes[1, 1].tolist() == [1.0, 2.0, 5.0, 9.0]
+
+
+def test_where_all_places_are_taken_an_added_person_makes_one_more():
+    edits = [added(2, FIRST), added(3, FIRST), deleted(detection=2), added(2, FIRST)]
+    replay = replay_detections(observations(), edits)
+    assert replay.objections == (None,) * 4
+    found = replay.observations
+    assert found.keypoints.shape == (2, 4, 17, 2)
+    assert np.isfinite(found.score).tolist() == [[True] * 4, [True, False, False, False]]
+    for name, before in observations().arrays().items():
+        assert same(found.arrays()[name][:, :2], before)

@@ -1,0 +1,166 @@
+"""People in pictures out to the annotator that a team has, and what it changed back in."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from data_contracts.review import Correction, Edit
+from flows.corrections import keep_edits
+from flows.detections import detections_now
+from flows.match_pictures import frame_picture
+from flows.stage import Match
+from worldpose.errors import UsageError
+from worldpose.exchange import (
+    AnnotatedPerson,
+    AnnotatedPicture,
+    Changes,
+    Format,
+    changes_of,
+    read_annotations,
+    write_annotations,
+)
+from worldpose.exchange.changes import picture_name
+from worldpose.exchange.formats import suffix_of
+from worldpose.exchange.pictures import SEEN
+from worldpose.ingest import Observations
+from worldpose.review.detections import DETECTION_EDITS
+from worldpose.store import Store
+
+EXPORTED: Final = "exported.json"
+"""What was exported, beside the annotator's file: what comes back is compared with it."""
+PICTURES: Final = "pictures"
+"""Folder of the pictures."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What an export holds.
+
+    Attributes:
+        annotations: the annotator's file.
+        pictures: how many.
+        people: in them.
+        unseen: pictures that have no file, since their camera has no video of the frame.
+    """
+
+    annotations: Path
+    pictures: int
+    people: int
+    unseen: int
+
+
+def export_people(
+    store: Store,
+    match: Match,
+    places: Sequence[tuple[str, int]],
+    folder: Path,
+    form: Format,
+) -> Exported:
+    """Write whom cameras saw, with the pictures, for an annotator.
+
+    Args:
+        store: the project's store.
+        match: with the corrections so far.
+        places: camera (or clip of a broadcast camera) and match frame of each picture.
+        folder: absent or empty; then has labels.json or labels.xml, pictures/ and exported.json.
+        form: of the annotator.
+
+    Raises:
+        UsageError: the folder holds something.
+        InputError: nobody was seen there in the latest run, or a picture is damaged.
+    """
+    if folder.exists() and any(folder.iterdir()):
+        raise UsageError(
+            str(folder),
+            expected="an absent or empty folder",
+            found="files",
+            todo="Name another folder: what people annotated is never overwritten.",
+        )
+    (folder / PICTURES).mkdir(parents=True)
+    exported, unseen = [], 0
+    for camera, frame in places:
+        found = detections_now(store, match, camera, frame)
+        name = f"{PICTURES}/{picture_name(camera, frame)}"
+        exported.append(_annotated(match, camera, found, name))
+        unseen += not _write_picture(store, match, camera, frame, folder / name)
+    annotations = folder / f"labels{suffix_of(form)}"
+    write_annotations(annotations, exported, form)
+    write_annotations(folder / EXPORTED, exported)
+    people = sum(len(picture.people) for picture in exported)
+    return Exported(annotations, len(exported), people, unseen)
+
+
+def import_people(
+    store: Store,
+    open_match: Callable[[], Match],
+    file: Path,
+    exported: Path,
+    form: Format | None,
+    *,
+    who: str,
+) -> tuple[Changes, list[Correction]]:
+    """Take what an annotator changed in as corrections, all or none; the same file again is none.
+
+    Args:
+        store: where the journal lies.
+        open_match: gives the match with its journal as it is.
+        file: the annotator's.
+        exported: what was exported.
+        form: of the annotator; None = as the file's content says.
+        who: the person who annotated.
+
+    Raises:
+        StaleEditError: somebody corrected the same in between.
+        InputError: a file is not what it must be, or a change does not apply; nothing is kept.
+    """
+    changes = changes_of(
+        read_annotations(exported, "coco"), read_annotations(file, form), str(file)
+    )
+    content = hashlib.sha256(exported.read_bytes() + file.read_bytes()).hexdigest()
+    edits: dict[str, Edit] = {}
+    for number, edit in enumerate(changes.edits):
+        digest = hashlib.sha256(f"{content} {number}".encode()).hexdigest()
+        edits[f"{edit.kind}.{digest[:12]}"] = edit
+    note = f"annotated in {file.name}, SHA-256 {hashlib.sha256(file.read_bytes()).hexdigest()}"
+    return changes, keep_edits(store, open_match, edits, who=who, note=note) if edits else []
+
+
+def _annotated(match: Match, camera: str, found: Observations, name: str) -> AnnotatedPicture:
+    broadcast = {clip.id: clip.broadcast for clip in match.folder.spec.clips}
+    spec = match.folder.spec.camera(broadcast.get(camera) or camera)
+    corrected = {
+        (correction.edit.frame, correction.edit.detection)
+        for correction in match.corrections
+        if isinstance(correction.edit, DETECTION_EDITS) and correction.edit.camera == camera
+    }
+    people = []
+    for k in np.flatnonzero(np.isfinite(found.score[0])) if len(found.frame) else ():
+        keypoints = found.keypoints[0, k].astype(np.float64)
+        there = np.isfinite(keypoints).all(axis=1)
+        sure = np.nan_to_num(found.confidence[0, k]) >= SEEN
+        is_corrected = (int(found.frame[0]), int(k)) in corrected
+        people.append(
+            AnnotatedPerson(
+                box=found.boxes[0, k].astype(np.float64),
+                keypoints=np.where(there[:, None], keypoints, np.nan),
+                visible=(np.where(sure, 2, 1) * there).astype(np.int8),
+                detection=int(k),
+                origin="corrected" if is_corrected else "automatic",
+                score=float(found.score[0, k]),
+            )
+        )
+    return AnnotatedPicture(name, (spec.width, spec.height), tuple(people))
+
+
+def _write_picture(store: Store, match: Match, camera: str, frame: int, file: Path) -> bool:
+    """Write a camera's picture of a frame; False where there is none."""
+    import cv2  # late: few commands write a picture
+
+    picture = frame_picture(store, match, camera, frame)
+    return picture is not None and cv2.imwrite(str(file), picture[..., ::-1])

@@ -1,0 +1,71 @@
+"""Pictures of a match by camera and match frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.stage import Match
+from worldpose.ingest import unit_frames
+from worldpose.store import Store
+from worldpose.video import open_video
+
+
+def frame_picture(store: Store, match: Match, owner: str, frame: int) -> NDArray[np.uint8] | None:
+    """What a camera saw (height, width, 3) RGB in a match frame; None where it has no picture.
+
+    Args:
+        store: its latest run knows which picture of a video a frame is.
+        match: names the videos.
+        owner: a static camera, or the clip of a broadcast camera.
+        frame: match frame.
+
+    Raises:
+        InputError: the picture is damaged.
+    """
+    return next(frame_pictures(store, match, owner, [frame]))
+
+
+def frame_pictures(
+    store: Store, match: Match, owner: str, frames: Sequence[int]
+) -> Iterator[NDArray[np.uint8] | None]:
+    """Yield the same of several match frames, decoded once and in order.
+
+    Args:
+        store: as above.
+        match: as above.
+        owner: as above.
+        frames: rising match frames.
+
+    Raises:
+        InputError: a picture is damaged.
+    """
+    if owner not in match.folder.videos:
+        yield from (None for _ in frames)
+        return
+    numbers = _numbers(store, match, owner, np.asarray(frames, dtype=np.int64))
+    with open_video(match.folder.videos[owner]) as video:
+        numbers[numbers >= len(video)] = -1
+        there = numbers[numbers >= 0]
+        shown = video.frames(int(there[0]), int(there[-1]) + 1) if len(there) else iter(())
+        at, picture = -1, None
+        for number in numbers.tolist():
+            while at < number:
+                at, picture = next(shown)
+            yield picture if number >= 0 else None
+
+
+def _numbers(
+    store: Store, match: Match, owner: str, frames: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """The pictures of the video that match frames are; -1 where there is none."""
+    results = store.run(match.match_id).results if store.runs(match.match_id) else {}
+    key = results.get(f"ingest/{owner}")
+    if key is not None:
+        footage = store.open_result(match.match_id, "ingest", owner, key)
+        if "picture_of_frame" in footage:
+            known = footage["picture_of_frame"].reindex(frame=frames, fill_value=-1)
+            return known.values.astype(np.int64)
+    return np.maximum(-1, frames + unit_frames(match.folder.spec, owner).offset)

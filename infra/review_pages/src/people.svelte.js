@@ -1,0 +1,155 @@
+// The people in one frame of a camera: what is seen, what the other cameras say, what was corrected.
+
+import { get, matchPath, newId, post } from "./api.js";
+
+export class People {
+  info = $state(null);
+  problem = $state("");
+  who = $state(null); // number of a detection
+  joint = $state(null); // its place in COCO-17
+  views = $state(null); // what the other cameras say of the chosen person
+  queue = $state(null); // whom nobody has looked at
+  done = $state([]); // ids of corrections made here
+  busy = $state(false);
+
+  #last = Promise.resolve();
+  #asking = false;
+  #wanted = null;
+
+  constructor(match, owner) {
+    this.owner = owner;
+    this.path = matchPath(match);
+    this.where = `${this.path}/detections/${encodeURIComponent(owner)}`;
+    this.chosen = $derived(this.info?.people.find((each) => each.detection === this.who));
+  }
+
+  async load(number) {
+    try {
+      const found = await get(number === null ? this.where : `${this.where}?frame=${number}`);
+      this.info = found;
+      if (!found.people.some((each) => each.detection === this.who)) this.choose(null);
+      else this.ask();
+      this.problem = "";
+    } catch (error) {
+      this.problem = error.message;
+    }
+  }
+
+  async loadQueue() {
+    try {
+      this.queue = await get(`${this.where}/queue`);
+    } catch (error) {
+      this.problem = error.message;
+    }
+  }
+
+  choose(who, joint = null) {
+    if (who !== this.who) this.views = null;
+    this.who = who;
+    this.joint = joint;
+    this.ask();
+  }
+
+  // What the other cameras say, of the joint at a place while it is dragged; the last question counts.
+  ask(at = null) {
+    this.#wanted = this.who === null ? null : { who: this.who, joint: this.joint, at };
+    if (this.who === null) this.views = null;
+    else if (!this.#asking) this.#answer();
+  }
+
+  async #answer() {
+    this.#asking = true;
+    while (this.#wanted) {
+      const { who, joint, at } = this.#wanted;
+      this.#wanted = null;
+      const asked = new URLSearchParams({ frame: this.info.frame, detection: who });
+      if (joint !== null) asked.set("joint", joint);
+      if (at) ["x", "y"].forEach((name, k) => asked.set(name, at[k]));
+      try {
+        const found = await get(`${this.where}/views?${asked}`);
+        if (who === this.who) this.views = found;
+      } catch (error) {
+        this.views = null;
+      }
+    }
+    this.#asking = false;
+  }
+
+  // One after the other: each looks at what the one before made of it.
+  #inTurn(step) {
+    this.#last = this.#last.then(async () => {
+      this.busy = true;
+      try {
+        await step();
+      } catch (error) {
+        await this.load(this.info.frame);
+        this.problem = error.message;
+      } finally {
+        this.busy = false;
+      }
+    });
+    return this.#last;
+  }
+
+  #correct(made) {
+    return this.#inTurn(async () => {
+      const edit = made();
+      if (!edit) return;
+      const id = newId(edit.kind);
+      const whole = { camera: this.owner, frame: this.info.frame, ...edit };
+      await post(`${this.path}/corrections`, { edits: [{ id, edit: whole }] });
+      await this.load(this.info.frame);
+      this.done.push(id);
+      this.loadQueue();
+    });
+  }
+
+  move(detection, joint, was, xy) {
+    // On the screen at once, where it was put.
+    this.info.people.find((each) => each.detection === detection).keypoints[joint] = xy;
+    return this.#correct(() => this.#moved(detection, joint, was, xy));
+  }
+
+  #moved = (detection, joint, was, xy) => ({ kind: "moved_keypoint", detection, joint: this.info.joints[joint], was, xy });
+
+  hide() {
+    return this.#correct(() => {
+      const was = this.joint === null ? null : this.chosen?.keypoints[this.joint];
+      return was ? this.#moved(this.who, this.joint, was, null) : null;
+    });
+  }
+
+  // A joint that is not seen is put where the other cameras expect it.
+  putExpected() {
+    return this.#correct(() => {
+      const xy = this.joint === null ? null : this.views?.here?.expected[this.joint];
+      return xy && this.chosen ? this.#moved(this.who, this.joint, this.chosen.keypoints[this.joint], xy) : null;
+    });
+  }
+
+  drop() {
+    return this.#correct(() => (this.chosen ? { kind: "deleted_detection", detection: this.who } : null));
+  }
+
+  async add(box, keypoints) {
+    const detection = this.info.free;
+    await this.#correct(() => ({ kind: "added_detection", detection, box, keypoints }));
+    this.choose(detection);
+  }
+
+  undo() {
+    return this.#inTurn(async () => {
+      if (!this.done.length) return;
+      await post(`${this.path}/withdrawals`, { correction: this.done.at(-1) });
+      await this.load(this.info.frame);
+      this.done.pop();
+      this.loadQueue();
+    });
+  }
+
+  accept(what) {
+    return this.#inTurn(async () => {
+      this.queue = await post(`${this.where}/acceptances`, what);
+    });
+  }
+}

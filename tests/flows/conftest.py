@@ -1,0 +1,31 @@
+"""What tests of the review pages share: their server, and who looks at them."""
+
+import pytest
+
+
+@pytest.fixture
+def app(project_copy):
+    import page_client  # late: most tests here need no web framework
+
+    return page_client.served(project_copy)
+
+
+@pytest.fixture
+def stranger(app):
+    import page_client
+
+    return page_client.browser(app)
+
+
+@pytest.fixture
+def ada(app):
+    import page_client
+
+    return page_client.log_in(app, "Ada")
+
+
+@pytest.fixture
+def bob(app):
+    import page_client
+
+    return page_client.log_in(app, "Bob")

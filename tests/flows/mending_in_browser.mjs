@@ -1,0 +1,97 @@
+// Mends people on the review pages as a person would; prints what it saw as one JSON object.
+
+import { readFileSync } from "node:fs";
+import { createRequire } from "node:module";
+
+const task = JSON.parse(readFileSync(process.argv[2], "utf8"));
+const { chromium } = createRequire(task.modules)("playwright-core");
+const browser = await chromium.launch({
+  executablePath: task.chromium,
+  args: ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
+    "--disable-background-networking", "--disable-component-update"],
+});
+const page = await browser.newPage({ viewport: { width: 1366, height: 768 } });
+page.setDefaultTimeout(120000);
+const seen = { errors: [], outside: [], states: [] };
+page.on("pageerror", (error) => seen.errors.push(error.message));
+page.on("console", (message) => {
+  // The log-in page asks whether it is needed, and is told so with a 401.
+  if (message.type() === "error" && !message.text().includes("401")) seen.errors.push(message.text());
+});
+page.on("request", (request) => {
+  if (!/^(http:\/\/127\.0\.0\.1|data:|blob:)/.test(request.url())) seen.outside.push(request.url());
+});
+const shot = (name) => task.shots && page.screenshot({ path: `${task.shots}/${name}.png` });
+const match = encodeURIComponent(task.match);
+
+await page.goto(`${task.base}/login#token=${task.token}`);
+await page.fill("#who", "Ada");
+await page.click("button");
+await page.waitForSelector("li.panel");
+
+if (task.mends) await mend();
+else await approve();
+console.log(JSON.stringify(seen));
+await browser.close();
+
+async function mend() {
+  // Two people who change places: split where they do, then each is joined with their own end.
+  await page.goto(`${task.base}/#/identities/${match}/clip`);
+  const [one, other, tail] = task.swapped;
+  const row = (id) => page.locator(`[data-person="${id}"]`);
+  await row(one).click();
+  await page.locator("input[type=range]").fill(String(task.middle));
+  await shot("identities");
+  const before = await page.locator("[data-person]").evaluateAll((rows) => rows.map((each) => each.dataset.person));
+  const isSaid = (text) => page.waitForSelector(`[role=status] >> text=${text}`);
+  await page.locator("body").press("s");
+  await isSaid("is another person from frame");
+  await page.waitForFunction((count) => document.querySelectorAll("[data-person]").length > count, before.length);
+  const after = await page.locator("[data-person]").evaluateAll((rows) => rows.map((each) => each.dataset.person));
+  const [end] = after.filter((id) => !before.includes(id));
+  for (const [kept, merged] of [[one, tail], [other, end]]) {
+    await row(kept).click();
+    await row(merged).click({ modifiers: ["Shift"] });
+    await page.locator("body").press("m");
+    await row(merged).waitFor({ state: "detached" });
+}
+
+// A keypoint that the other cameras contradict is put where they expect it.
+const { camera, frame, detection, joint } = task.keypoint;
+await page.goto(`${task.base}/#/detections/${match}/${camera}?frame=${frame}`);
+const keypoint = page.locator(`[data-keypoint="${detection}.${joint}"]`);
+await keypoint.waitFor();
+await page.locator("aside > table tr", { has: page.locator(`td:first-child:text-is("${detection}")`) }).click();
+const at = await keypoint.boundingBox();
+await page.mouse.click(at.x + at.width / 2, at.y + at.height / 2);
+await page.waitForSelector("[data-error-here]");
+await page.waitForSelector("[data-curve]");
+const error = async () => Number.parseFloat(await page.locator("[data-error-here]").textContent());
+seen.error = await error();
+seen.curves = await page.locator("[data-here]").count();
+await shot("detections");
+await page.locator("body").press("e");
+await page.waitForSelector('[data-kept="1"]');
+for (let k = 0; k < 100 && (await error()) > 5; k++) await page.waitForTimeout(200);
+seen.mended = await error();
+await shot("mended");
+
+}
+
+// Whatever waits is approved; the run goes on by itself until it is complete.
+async function approve() {
+  await page.goto(`${task.base}/#/match/${match}`);
+  const limit = Date.now() + 1000 * task.patience;
+  while (Date.now() < limit) {
+    const state = await (await page.request.get(`${task.base}/api/matches/${match}`)).json();
+    const now = state.at_work?.state === "running" ? "running" : (state.run?.state ?? "not run");
+    if (seen.states.at(-1) !== now) seen.states.push(now);
+    if (now === "complete" || now === "failed" || now === "partial") break;
+    if (now === "waiting" && state.waiting.length) {
+      await page.locator("button.first >> text=Approve").first().waitFor();
+      await page.locator("body").press("a");
+    }
+    await page.waitForTimeout(1500);
+}
+await shot("approved");
+}

@@ -1,0 +1,108 @@
+"""People go out to annotators and come back as corrections that say where they come from."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from command_line import TINY
+
+from flows.detections import detections_now
+from flows.exchange import export_people, import_people
+from flows.registering import open_match
+from flows.stale import StaleEditError
+from worldpose.errors import InputError, UsageError
+from worldpose.exchange import FORMATS, read_annotations, write_annotations
+from worldpose.store import Store
+
+PLACES = [("cam00", 3), ("cam01", 4)]
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_what_people_annotate_elsewhere_is_corrected_here_once(project_copy, tmp_path, form):
+    store = Store.open(str(project_copy))
+    match = open_match(store, TINY)
+    out = tmp_path / "out"
+    written = export_people(store, match, PLACES, out, form)
+    exported = read_annotations(out / "exported.json")
+    assert (written.pictures, written.unseen) == (2, 2)  # the match has no videos
+    assert [picture.name for picture in exported] == [
+        "pictures/cam00_000003.png",
+        "pictures/cam01_000004.png",
+    ]
+    assert written.people == sum(len(picture.people) for picture in exported) > 2
+
+    def take_in(file):
+        opening = lambda: open_match(store, TINY)  # noqa: E731 - as the command does
+        return import_people(store, opening, file, out / "exported.json", None, who="Ada")
+
+    assert take_in(written.annotations)[1] == []  # nothing was changed
+    first, second = exported
+    gone, kept = first.people[0], first.people[1]
+    joint = int(np.flatnonzero(kept.visible)[0])
+    kept.keypoints[joint] += 3.25
+    edited = tmp_path / f"back{written.annotations.suffix}"
+    write_annotations(edited, [type(first)(first.name, first.size, first.people[1:]), second], form)
+    _, corrections = take_in(edited)
+    assert [each.edit.kind for each in corrections] == ["deleted_detection", "moved_keypoint"]
+    assert all(
+        each.who == "Ada" and f"annotated in {edited.name}" in each.note for each in corrections
+    )
+    now = detections_now(store, open_match(store, TINY), "cam00", 3)
+    assert np.isnan(now.score[0, gone.detection])
+    assert now.keypoints[0, kept.detection, joint].tolist() == pytest.approx(
+        kept.keypoints[joint].tolist(),
+        abs=1e-3,  # single precision of places up to 1920
+    )
+    # The same file again is the same corrections; another one of the same export comes too late.
+    assert take_in(edited)[1] == corrections
+    assert len(open_match(store, TINY).corrections) == 2
+    kept.keypoints[joint] += 1.0
+    write_annotations(edited, [type(first)(first.name, first.size, first.people[1:]), second], form)
+    with pytest.raises(StaleEditError):
+        take_in(edited)
+    again = export_people(store, open_match(store, TINY), PLACES, tmp_path / "again", "coco")
+    origins = {
+        person.detection: person.origin for person in read_annotations(again.annotations)[0].people
+    }
+    assert origins.pop(kept.detection) == "corrected"
+    assert {*origins.values()} == {"automatic"}
+    with pytest.raises(UsageError, match="absent or empty"):
+        export_people(store, match, PLACES, out, form)
+
+
+def test_pictures_go_out_as_the_camera_took_them(project_copy, tiny, tmp_path):
+    """A folder of images, with one missing, is a video as any other."""
+    folder = shutil.copytree(tiny, tmp_path / "match")
+    frames = folder / "videos" / "cam00"
+    frames.mkdir(parents=True)
+    store = Store.open(str(project_copy))
+    match = open_match(store, TINY)
+    clip = match.folder.spec.clips[0]
+    size = match.folder.spec.camera("cam00")
+    for number in range(clip.first_frame, clip.first_frame + 5):
+        picture = np.full((size.height, size.width, 3), 40 * (number - clip.first_frame), np.uint8)
+        cv2.imwrite(str(frames / f"{number:06d}.png"), picture)
+    match.folder.videos["cam00"] = frames
+    export_people(store, match, [("cam00", clip.first_frame + 3)], tmp_path / "out", "coco")
+    name = f"cam00_{clip.first_frame + 3:06d}.png"
+    assert cv2.imread(str(tmp_path / "out" / "pictures" / name))[0, 0].tolist() == [120, 120, 120]
+
+
+def test_a_file_that_is_none_changes_nothing(project_copy, tmp_path):
+    store = Store.open(str(project_copy))
+    written = export_people(store, open_match(store, TINY), PLACES, tmp_path / "out", "coco")
+    dataset = json.loads(written.annotations.read_text())
+    dataset["annotations"][0]["keypoints"] = dataset["annotations"][0]["keypoints"][:-1]
+    written.annotations.write_text(json.dumps(dataset))
+    with pytest.raises(InputError, match=r"annotations\.0\.keypoints"):
+        import_people(
+            store,
+            lambda: open_match(store, TINY),
+            written.annotations,
+            tmp_path / "out" / "exported.json",
+            None,
+            who="Ada",
+        )
+    assert open_match(store, TINY).corrections == ()

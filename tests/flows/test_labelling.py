@@ -1,0 +1,49 @@
+"""Frames are labelled whatever form their video has."""
+
+import cv2
+import numpy as np
+import pytest
+
+from flows import labelling
+from worldpose.detection import DetectionSettings, People, Poses
+from worldpose.errors import InputError
+from worldpose.training import read_labels
+
+
+class Brightness:
+    """Sees one person, whose keypoints say how bright the picture is."""
+
+    def detect(self, pictures):
+        return [People(np.array([[1.0, 1.0, 9.0, 19.0]]), np.array([0.9])) for _ in pictures]
+
+    def estimate(self, picture, boxes):
+        value = float(picture[0, 0, 0])
+        return Poses(np.full((len(boxes), 17, 2), value), np.ones((len(boxes), 17)))
+
+
+@pytest.fixture(autouse=True)
+def detectors(monkeypatch):
+    monkeypatch.setattr(labelling, "load_detectors", lambda settings: [Brightness()])
+    monkeypatch.setattr(labelling, "load_pose", lambda settings: Brightness())
+
+
+def images(folder, size=(20, 24)):
+    folder.mkdir()
+    for number in range(5):
+        cv2.imwrite(str(folder / f"{number:04d}.png"), np.full((*size, 3), 10 * number, np.uint8))
+    return folder
+
+
+def test_a_folder_of_images_is_labelled_as_a_video_is(tmp_path):
+    videos = [images(tmp_path / "cam00"), images(tmp_path / "cam01")]
+    assert labelling.propose(videos, 2, tmp_path / "labels", DetectionSettings()) == 6
+    found = read_labels(tmp_path / "labels" / "labels.json")
+    names = [f"{camera}_{number:06d}.png" for camera in ("cam00", "cam01") for number in (0, 2, 4)]
+    assert [picture.path.name for picture in found] == names
+    assert [picture.keypoints[0, 0, 0] for picture in found] == [0.0, 20.0, 40.0] * 2
+
+
+def test_pictures_of_another_size_are_refused(tmp_path):
+    videos = [images(tmp_path / "cam00"), images(tmp_path / "cam01", (30, 24))]
+    with pytest.raises(InputError, match="24 x 30"):
+        labelling.propose(videos, 2, tmp_path / "labels", DetectionSettings())

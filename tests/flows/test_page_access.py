@@ -1,0 +1,204 @@
+"""The pages' server lets in who it should, and refuses what a page does not send."""
+
+import logging
+import sys
+from pathlib import Path
+
+import page_client
+import pytest
+from command_line import TINY
+from page_client import HERE, MATCH, TOKEN, a_click, moved
+
+from flows import corrections
+from flows.pages.access import SESSION_SECONDS, access_for
+from flows.pages.app import create_app
+from flows.pages.guard import BODY_BYTES, OPEN
+from worldpose.errors import UsageError
+from worldpose.review import read_journal
+from worldpose.store import Store
+
+
+def every_route(app):
+    """Method and path of every route of the server, from the server itself."""
+    names = {"match_id": TINY, "owner": "cam00", "request": "r", "number": "0", "clip": "clip"}
+    for path, methods in app.openapi()["paths"].items():
+        for method in methods:
+            yield method.upper(), path.format_map(names)
+
+
+def refused(browser, method, path, **keywords):
+    return browser.request(method, path, follow_redirects=False, **keywords)
+
+
+def test_every_route_but_log_in_and_health_refuses_a_stranger(app, stranger):
+    routes = list(every_route(app))
+    assert {path for _, path in routes} >= {MATCH, f"{MATCH}/decisions", "/", "/api/session"}
+    for method, path in routes:
+        answer = refused(stranger, method, path, json={} if method == "POST" else None)
+        if path in OPEN:
+            assert answer.status_code in (200, 422), path
+        elif path == "/":
+            assert (answer.status_code, answer.headers["location"]) == (303, "/login")
+        else:
+            assert answer.status_code == 401, path
+    assert refused(stranger, "GET", "/api/no-such-route").status_code == 401
+
+
+def test_a_wrong_token_a_forged_session_and_one_that_is_over_open_nothing(app, stranger):
+    answer = stranger.post("/api/login", json={"who": "Eve", "token": TOKEN + "x"})
+    assert (answer.status_code, "set-cookie" in answer.headers) == (401, False)
+    access = app.state.access
+    good = access.session("Ada")
+    packed, signature = good.split(".")
+    other = access_for("127.0.0.1", token="another token, as long", names=(), secure=False)
+    over = access.session("Ada", now=0.0)
+    last = "0" if signature[-1] != "0" else "1"
+    forged = [
+        f"{packed}.{signature[:-1]}{last}",
+        f"{packed[:-2]}.{signature}",
+        other.session("Ada"),
+    ]
+    for cookie in [*forged, over, "", ".", "%%", "é"]:
+        assert access.person(cookie) is None
+    for cookie in (forged[0], over):
+        answer = stranger.get(MATCH, headers={"cookie": f"{access.cookie}={cookie}"})
+        assert answer.status_code == 401
+    assert access.person(good) == "Ada"
+    assert access.person(access.session("Ada", now=0.0), now=SESSION_SECONDS - 1.0) == "Ada"
+
+
+def test_the_cookie_is_out_of_reach_of_scripts_and_of_other_sites(project_copy, stranger):
+    cookie = stranger.post("/api/login", json={"who": "Ada", "token": TOKEN}).headers["set-cookie"]
+    assert {"HttpOnly", "SameSite=strict", "Path=/"} <= set(cookie.split("; "))
+    assert "Secure" not in cookie
+    access = access_for("127.0.0.1", token=TOKEN, names=(), secure=True)
+    browser = page_client.browser(create_app(str(project_copy), access))
+    cookie = browser.post("/api/login", json={"who": "A", "token": TOKEN}).headers["set-cookie"]
+    assert "Secure" in cookie
+
+
+def test_a_change_needs_the_form_secret_json_and_this_origin(ada, project_copy):
+    before = read_journal(Store.open(str(project_copy)), TINY).entries
+    body = {"correction": "c"}
+    secret = ada.headers["x-form-secret"]
+    wrong = [
+        ({"x-form-secret": ""}, 403),
+        ({"x-form-secret": secret[:-1] + ("0" if secret[-1] != "0" else "1")}, 403),
+        ({"origin": "http://evil.example"}, 403),
+        ({"origin": "null"}, 403),
+        ({"origin": "http://127.0.0.1:9999"}, 403),
+        ({"sec-fetch-site": "cross-site"}, 403),
+        ({"sec-fetch-site": "same-site"}, 403),
+        ({"content-type": "text/plain"}, 415),
+        ({"content-type": "application/x-www-form-urlencoded"}, 415),
+    ]
+    for headers, status in wrong:
+        answer = ada.post(f"{MATCH}/withdrawals", json=body, headers=headers)
+        assert answer.status_code == status, headers
+    # The same from the page itself reaches the journal, which has no such correction.
+    right = {"origin": HERE, "sec-fetch-site": "same-origin"}
+    assert ada.post(f"{MATCH}/withdrawals", json=body, headers=right).status_code == 422
+    assert read_journal(Store.open(str(project_copy)), TINY).entries == before
+    assert "access-control-allow-origin" not in ada.get("/api/matches").headers
+
+
+def test_nothing_is_changed_by_getting(app):
+    changing = {path for method, path in every_route(app) if method == "POST"}
+    getting = {path for method, path in every_route(app) if method == "GET"}
+    assert changing.isdisjoint(getting)
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:8571", "127.0.0.1.evil.example", ""]
+)
+def test_a_name_that_leads_here_by_rebinding_is_refused(ada, host):
+    assert ada.get("/api/matches", headers={"host": host}).status_code == 421
+    assert ada.get("/api/health", headers={"host": host}).status_code == 421
+
+
+def test_a_body_that_is_too_long_or_of_unknown_length_is_refused(ada):
+    long = ada.post(f"{MATCH}/runs", content=b" " * (BODY_BYTES + 1), headers=JSON)
+    assert long.status_code == 413
+    pieces = ada.post(f"{MATCH}/runs", content=iter([b"{", b"}"]), headers=JSON)
+    assert pieces.status_code == 411
+
+
+JSON = {"content-type": "application/json"}
+
+
+def test_listening_to_other_machines_needs_a_token_and_a_name():
+    for keywords in ({"token": None, "names": ["host"]}, {"token": TOKEN, "names": []}):
+        with pytest.raises(UsageError, match=r"--host 0\.0\.0\.0"):
+            access_for("0.0.0.0", secure=False, **keywords)
+    with pytest.raises(UsageError, match="16 characters"):
+        access_for("127.0.0.1", token="short", names=(), secure=False)
+    access = access_for("0.0.0.0", token=TOKEN, names=["review.example"], secure=True)
+    assert "review.example" in access.hosts
+    assert "0.0.0.0" not in access.hosts
+    tokens = {access_for("::1", token=None, names=(), secure=False).token for _ in range(2)}
+    assert len(tokens) == 2
+
+
+def test_every_answer_forbids_what_pages_do_not_need(ada, stranger):
+    for browser, path in (
+        (ada, "/"),
+        (ada, "/api/matches"),
+        (stranger, "/login"),
+        (stranger, "/x"),
+    ):
+        policy = browser.get(path).headers["content-security-policy"]
+        assert "default-src 'none'" in policy
+        assert "unsafe" not in policy
+        assert browser.get(path).headers["x-content-type-options"] == "nosniff"
+
+
+def test_no_page_asks_anything_of_another_server():
+    for file in Path(corrections.__file__).parent.glob("pages/*/**/*.*"):
+        if file.suffix in (".html", ".css"):
+            assert "//" not in file.read_text().replace("<!--", ""), file
+
+
+ASCENDING = [
+    "%2e%2e",
+    "..%2f..%2fetc",
+    "%2Fetc%2Fpasswd",
+    "....//",
+    "..%5c..",
+    "%00",
+    "a/../b",
+]
+
+
+@pytest.mark.parametrize("name", ASCENDING)
+def test_a_name_never_becomes_a_path(ada, name, project_copy, tiny):
+    opened = []
+    sys.addaudithook(
+        lambda event, args: opened.append(str(args[0])) if event == "open" and listening else None
+    )
+    paths = [
+        f"/api/matches/{name}",
+        f"{MATCH}/pictures/{name}",
+        f"{MATCH}/pictures/{name}/image",
+        f"{MATCH}/reviews/{name}/evidence",
+        f"/assets/{name}",
+        f"/login/{name}",
+    ]
+    listening = True
+    for path in paths:
+        assert ada.get(path, follow_redirects=False).status_code in (400, 404, 405), path
+    listening = False
+    outside = [
+        path
+        for path in opened
+        if not path.startswith((str(project_copy), str(tiny), sys.prefix, sys.base_prefix))
+        and not path.endswith((".py", ".pyc", ".so", ".nbi", ".nbc"))
+    ]
+    assert outside == []
+
+
+def test_every_change_is_logged_with_who_and_what_came_of_it(ada, caplog):
+    name, was = a_click(ada)
+    with caplog.at_level(logging.INFO, logger="worldpose.pages"):
+        ada.post(f"{MATCH}/corrections", json=moved(name, was, [was[0] + 1.0, was[1]]))
+        ada.get(MATCH)
+    assert caplog.messages == [f"Ada: 'POST {MATCH}/corrections': 200"]

@@ -1,0 +1,20 @@
+"""Exchange: people in pictures out to annotators that a team has, and back in.
+
+Inputs and outputs: `AnnotatedPicture`s; COCO keypoints JSON, CVAT for images XML 1.1 or Label
+Studio JSON; what an annotator changed, as corrections.
+"""
+
+from worldpose.exchange.changes import Changes, changes_of
+from worldpose.exchange.formats import FORMATS, Format, read_annotations, write_annotations
+from worldpose.exchange.pictures import AnnotatedPerson, AnnotatedPicture
+
+__all__ = [
+    "FORMATS",
+    "AnnotatedPerson",
+    "AnnotatedPicture",
+    "Changes",
+    "Format",
+    "changes_of",
+    "read_annotations",
+    "write_annotations",
+]

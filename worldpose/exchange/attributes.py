@@ -1,0 +1,46 @@
+"""What is carried beside a person's shape, in whichever way a format has for it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TypedDict, get_args
+
+from data_contracts.review import Origin
+from worldpose.exchange.pictures import AnnotatedPerson
+
+
+class Attributes(TypedDict):
+    """Fields of `AnnotatedPerson` that are no shape."""
+
+    detection: int | None
+    origin: Origin | None
+    score: float | None
+
+
+def attributes_of(person: AnnotatedPerson) -> dict[str, str]:
+    """What is known of a person, as text by name."""
+    given = {"detection": person.detection, "origin": person.origin, "score": person.score}
+    return {name: str(value) for name, value in given.items() if value is not None}
+
+
+def read_attributes(given: Mapping[str, str]) -> Attributes:
+    """The same, read again; names that others gave are passed over, an empty text is nothing.
+
+    Raises:
+        ValueError: one is not what it must be.
+    """
+    detection, origin, score = (given.get(name) for name in ("detection", "origin", "score"))
+    origins: tuple[Origin, ...] = get_args(Origin)
+    if detection and not (detection.isdecimal() and detection.isascii() and len(detection) < 10):
+        raise ValueError(f"attribute detection is {detection[:40]!r}")
+    if origin and origin not in origins:
+        raise ValueError(f"attribute origin is {origin[:40]!r}")
+    value = float(score) if score else None
+    if value is not None and not math.isfinite(value):
+        raise ValueError(f"attribute score is {value}")
+    return Attributes(
+        detection=int(detection) if detection else None,
+        origin=next((each for each in origins if each == origin), None),
+        score=value,
+    )

@@ -1,0 +1,96 @@
+"""The formats by name, and files of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final, Literal, NamedTuple, TypeAlias, get_args
+
+from pydantic import ValidationError
+
+from worldpose.errors import InputError
+from worldpose.exchange.coco import coco_bytes, read_coco
+from worldpose.exchange.cvat import cvat_bytes, read_cvat
+from worldpose.exchange.label_studio import label_studio_bytes, read_label_studio
+from worldpose.exchange.pictures import AnnotatedPicture
+
+Format: TypeAlias = Literal["coco", "cvat", "label-studio"]
+FORMATS: Final[tuple[Format, ...]] = get_args(Format)
+MOST: Final = 1 << 28
+"""Largest file that is read [bytes]: a hundred thousand people take about as much."""
+
+
+class _Codec(NamedTuple):
+    name: str
+    suffix: str
+    encode: Callable[[Sequence[AnnotatedPicture]], bytes]
+    decode: Callable[[bytes], list[AnnotatedPicture]]
+
+
+_CODECS: Final[dict[Format, _Codec]] = {
+    "coco": _Codec("COCO keypoints JSON", ".json", coco_bytes, read_coco),
+    "cvat": _Codec("CVAT for images XML 1.1", ".xml", cvat_bytes, read_cvat),
+    "label-studio": _Codec("Label Studio JSON", ".json", label_studio_bytes, read_label_studio),
+}
+
+
+def suffix_of(form: Format) -> str:
+    """How names of files of a format end."""
+    return _CODECS[form].suffix
+
+
+def format_of(content: bytes) -> Format:
+    """The format of a file's content, by how it begins: XML, a list of tasks, or an object."""
+    begin = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1]
+    return "cvat" if begin == b"<" else "label-studio" if begin == b"[" else "coco"
+
+
+def write_annotations(
+    path: Path, pictures: Sequence[AnnotatedPicture], form: Format = "coco"
+) -> None:
+    """Write pictures' people in a format.
+
+    Args:
+        path: the file; overwritten.
+        pictures: of names that differ.
+        form: the format.
+    """
+    path.write_bytes(_CODECS[form].encode(pictures))
+
+
+def read_annotations(path: Path, form: Format | None = None) -> list[AnnotatedPicture]:
+    """Return the pictures of a file, in its order.
+
+    Args:
+        path: the file.
+        form: its format; None = as its content says.
+
+    Raises:
+        InputError: it is not what it must be; nothing of it is taken.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MOST:
+            raise ValueError(f"{size} bytes, more than {MOST}")
+        content = path.read_bytes()
+        form = form or format_of(content)
+        pictures = _CODECS[form].decode(content)
+        if len({picture.name for picture in pictures}) < len(pictures):
+            raise ValueError("two pictures of one name")
+        return pictures
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        raise _refusal(path, form, f"{place}: {first['msg']}" if place else first["msg"]) from None
+    except (OSError, ValueError) as error:
+        raise _refusal(path, form, str(error)) from error
+
+
+def _refusal(path: Path, form: Format | None, found: str) -> InputError:
+    known = " or ".join(codec.name for codec in _CODECS.values())
+    return InputError(
+        str(path),
+        expected=known if form is None else _CODECS[form].name,
+        found=found,
+        todo="Export it again from the annotator; docs/review.md says how.",
+    )

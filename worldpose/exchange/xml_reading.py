@@ -1,0 +1,44 @@
+"""XML from strangers: what can make a small file large, or read another one, is refused."""
+
+from __future__ import annotations
+
+from typing import Final
+from xml.etree import ElementTree
+from xml.parsers import expat
+
+DEEPEST: Final = 16
+"""Elements within each other; annotations have five."""
+
+
+def read_xml(content: bytes) -> ElementTree.Element:
+    """The root element of a document without a document type, and so without any entity.
+
+    Raises:
+        ValueError: it is no XML, declares a document type, or is nested deeply.
+    """
+    parser, builder = expat.ParserCreate(), ElementTree.TreeBuilder()
+    depth = 0
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal depth
+        depth += 1
+        if depth > DEEPEST:
+            raise ValueError(f"elements nested more than {DEEPEST} deep")
+        builder.start(tag, attributes)
+
+    def end(tag: str) -> None:
+        nonlocal depth
+        depth -= 1
+        builder.end(tag)
+
+    def refuse(*_: object) -> None:
+        raise ValueError("a document type declaration, which can hide other files and floods")
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.CharacterDataHandler = builder.data
+    parser.StartDoctypeDeclHandler = refuse
+    try:
+        parser.Parse(content, True)
+    except expat.ExpatError as error:
+        raise ValueError(f"no XML: {error}") from error
+    return builder.close()

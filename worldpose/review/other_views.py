@@ -1,0 +1,148 @@
+"""What the other cameras say of a keypoint: its epipolar curve, and where they expect it (D4, D6).
+
+A fix in one picture is checked in all: the curve is where another camera may show what this one
+shows at a pixel, the expectation where it must be if the others are right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldpose.cameras import Camera, Rays, intersect_rays
+
+Floats = NDArray[np.float64]
+
+HEIGHTS: Final = (-0.3, 3.2)
+"""Where joints are above the ground [m]: the ground may lie lower at its edges, arms are raised in
+a jump."""
+DISTANCES: Final = (0.5, 300.0)
+"""From a camera to what it shows [m]: across the largest stadium."""
+BEGIN: Final = 33
+"""Places along a ray that are looked at first."""
+APART: Final = 12.0
+"""Most between two places of a curve [px]: its arc is within a hundredth of a pixel of their
+chord where the lens bends a line by 10 px over 400."""
+HALVINGS: Final = 8
+"""Most times that gaps are halved."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewCheck:
+    """How the views of one person fit together.
+
+    Attributes:
+        joints: (joints, 3) [m], world: from all views; NaN with fewer than two.
+        expected: (cameras, joints, 2) [px]: where each camera should show a joint that the others
+            place; NaN where fewer than two others do.
+        error: (cameras, joints) [px]: from each keypoint to the joint from all views.
+    """
+
+    joints: Floats
+    expected: Floats
+    error: Floats
+
+
+def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Floats]:
+    """Return where `target` may show what `source` shows at a pixel.
+
+    The ray of the pixel, as far as people's joints can be on it, in the other picture: the lens
+    bends it, and its ends and the picture's border cut it.
+
+    Args:
+        source: one camera.
+        target: another.
+        pixel: (2,) in the picture of `source` [px].
+
+    Returns:
+        Polylines (n, 2) [px] within the picture of `target`; none where it shows nothing of the
+        ray.
+    """
+    rays = source.unproject(np.asarray(pixel, dtype=np.float64)[None])
+    span = _span(rays)
+    if span is None:
+        return []
+    origin, direction = rays.origins[0], rays.directions[0]
+
+    def shown(along: Floats) -> Floats:
+        return target.project(origin + along[:, None] * direction)
+
+    along = np.linspace(*span, BEGIN)
+    places = shown(along)
+    for _ in range(HALVINGS):
+        gap = np.linalg.norm(np.diff(places, axis=0), axis=1)
+        inside = _inside(places, target)
+        wide = np.flatnonzero((gap > APART) & (inside[1:] | inside[:-1]))
+        # One end may be behind the camera, or beyond what its lens model knows.
+        cut = np.flatnonzero(np.isfinite(places[1:, 0]) != np.isfinite(places[:-1, 0]))
+        halved = np.union1d(wide, cut)
+        if not len(halved):
+            break
+        middle = (along[halved] + along[halved + 1]) / 2
+        along = np.insert(along, halved + 1, middle)
+        places = np.insert(places, halved + 1, shown(middle), axis=0)
+    inside = _inside(places, target)
+    bounds = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
+    runs = [places[begin:end] for begin, end in zip(bounds[::2], bounds[1::2], strict=True)]
+    return [run for run in runs if len(run) > 1]
+
+
+def check_views(cameras: Camera, keypoints: ArrayLike) -> ViewCheck:
+    """Return how the views of one person in one frame fit together.
+
+    A joint is where its rays pass nearest, each weighed by what a pixel is at its distance.
+
+    Args:
+        cameras: a batch (cameras,).
+        keypoints: (cameras, joints, 2) [px]; NaN where not seen.
+    """
+    places = np.asarray(keypoints, dtype=np.float64)
+    rays = cameras.unproject(places)
+    count = len(places)
+    joints = _joints(cameras, rays, np.ones((1, count)))[0]
+    without = _joints(cameras, rays, 1.0 - np.eye(count))
+    expected = cameras.project(without)
+    error = np.linalg.norm(cameras.project(np.broadcast_to(joints, without.shape)) - places, axis=2)
+    return ViewCheck(joints, expected, error)
+
+
+def _joints(cameras: Camera, rays: Rays, chosen: Floats) -> Floats:
+    """Joints (choices, joints, 3) [m] from the cameras of each choice (choices, cameras)."""
+    bundles = Rays(
+        origins=np.broadcast_to(rays.origins, rays.directions.shape).swapaxes(0, 1),
+        directions=rays.directions.swapaxes(0, 1),
+        status=rays.status.swapaxes(0, 1),
+    )
+    share = np.broadcast_to(chosen[:, None, :], (len(chosen), *bundles.status.shape))
+    many = Rays(
+        origins=np.broadcast_to(bundles.origins, (*share.shape, 3)),
+        directions=np.broadcast_to(bundles.directions, (*share.shape, 3)),
+        status=np.broadcast_to(bundles.status, share.shape),
+    )
+    near, _ = intersect_rays(many, share)
+    distance = np.linalg.norm(near[..., None, :] - cameras.center, axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weight = share * (cameras.focal.mean(axis=-1) / distance) ** 2
+    return intersect_rays(many, np.nan_to_num(weight, posinf=0.0))[0]
+
+
+def _span(rays: Rays) -> tuple[float, float] | None:
+    """From where to where on the ray joints can be [m]; None where they cannot."""
+    if not rays.valid[0]:
+        return None
+    height, slope = float(rays.origins[0, 2]), float(rays.directions[0, 2])
+    low, high = HEIGHTS
+    if abs(slope) < 1e-9:
+        return DISTANCES if low <= height <= high else None
+    ends = sorted(((low - height) / slope, (high - height) / slope))
+    span = max(ends[0], DISTANCES[0]), min(ends[1], DISTANCES[1])
+    return span if span[0] < span[1] else None
+
+
+def _inside(places: Floats, camera: Camera) -> NDArray[np.bool_]:
+    with np.errstate(invalid="ignore"):
+        inside = (places >= -0.5) & (places <= camera.image_size - 0.5)
+    return np.asarray(inside.all(axis=1), dtype=np.bool_)
