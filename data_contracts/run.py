@@ -93,6 +93,8 @@ class UnitFailure(Record):
     """Name of the error's class."""
     message: str
     """What the error said."""
+    key: Key | None = None
+    """Of the result that it would have had: the same key would fail in the same way."""
 
 
 class Reservation(Record):
@@ -140,7 +142,8 @@ class RunRecord(Record):
     """Which pass over the method; from the second on, results of the one before have a say."""
     state: RunState
     """waiting: nothing failed, but a person has to approve results; partial: some units failed, but
-    units of the last stage asked for have results."""
+    units of the last stage asked for have results, or bodies where stages after `body_fitting` were
+    asked for too: those add to bodies that are there without them."""
     results: dict[str, Key]
     """Unit, as `stage/unit`, to key."""
     settings: dict[str, dict[str, JsonValue]]

@@ -6,18 +6,21 @@ people (C6) and without the keypoints and boxes that no body fits (R2). Every it
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Final
 
 from data_contracts.run import RunRecord
 from flows.gatekeeping import Gatekeeper
 from flows.method import METHOD
-from flows.outlook import look_ahead
+from flows.outlook import Outlook, look_ahead
+from flows.planning import PlannedUnit
 from flows.progress import reporter
+from flows.registering import open_match
 from flows.run_record import latest_run
-from flows.running import RunRequest, run_match
+from flows.running import RunRequest, run_match, shared_machines
 from flows.stage import Match
+from flows.stale import EditedMeanwhileError
 from worldpose.errors import UsageError
 from worldpose.store import Store
 
@@ -71,7 +74,8 @@ def iterate_match(store: Store, match: Match, request: RunRequest, most: int | N
     """Runs the method `most` times over and lets the best iteration stand.
 
     What a run of an iteration holds already is not computed again; killed anywhere, the next call
-    goes on from what is finished.
+    goes on from what is finished. Where the match is edited between two passes, they begin again
+    with the edit, so that none is made from another state of the match than the next.
 
     Args:
         store: the store.
@@ -89,42 +93,61 @@ def iterate_match(store: Store, match: Match, request: RunRequest, most: int | N
             found="--from or --until",
             todo="Leave these out, or --iterations.",
         )
+    while True:
+        try:
+            return _iterate(store, match, request, most)
+        except EditedMeanwhileError:
+            reporter().say("the match was edited meanwhile: its iterations begin again")
+            match = open_match(store, match.match_id)
+
+
+def _iterate(store: Store, match: Match, request: RunRequest, most: int | None) -> Iterations:
     passes: list[Iteration] = []
     ended = "that many were asked for"
-    for iteration in _passes(store, match, request, most or MOST):
-        passes.append(iteration)
-        if iteration.record.state != "complete":
-            ended = f"iteration {iteration.number} is {iteration.record.state}"
-            return Iterations(tuple(passes), _best(passes), iteration.record, ended)
-        if most is None and _best(passes) is not iteration:
-            ended = f"iteration {iteration.number} is no better"
-            break
-    kept = _best(passes)
-    latest = latest_run(store, match.match_id)
-    record = kept.record
-    if latest is None or latest.run_id != record.run_id:
-        record = run_match(store, match, replace(request, iteration=kept.number))
+    with shared_machines(store, request) as machines_for:
+        for number in range(1, (most or MOST) + 1):
+            iteration = _pass(store, match, replace(request, iteration=number), machines_for)
+            passes.append(iteration)
+            if iteration.record.state != "complete":
+                ended = f"iteration {number} is {iteration.record.state}"
+                return Iterations(tuple(passes), _best(passes), iteration.record, ended)
+            if most is None and _best(passes) is not iteration:
+                ended = f"iteration {number} is no better"
+                break
+        kept = _best(passes)
+        latest = latest_run(store, match.match_id)
+        record = kept.record
+        if latest is None or latest.run_id != record.run_id:
+            record = run_match(store, match, replace(request, iteration=kept.number))
     return Iterations(tuple(passes), kept, record, ended)
 
 
-def _passes(store: Store, match: Match, request: RunRequest, most: int) -> Iterator[Iteration]:
-    for number in range(1, most + 1):
-        asked = replace(request, iteration=number)
-        record = _recorded(store, match, asked)
-        if record is None:
-            reporter().say(f"iteration {number}")
-            record = run_match(store, match, asked)
-        yield Iteration(number, record, held_out_error(record))
+def _pass(
+    store: Store,
+    match: Match,
+    request: RunRequest,
+    machines_for: Callable[[Iterable[PlannedUnit]], RunRequest],
+) -> Iteration:
+    """One pass over the method: the run that has it already, or a new one."""
+    outlook = _outlook(store, match, request)
+    record = _recorded(store, match, outlook)
+    if record is None:
+        reporter().say(f"iteration {request.iteration}")
+        machines = machines_for(outlook.missing)
+        record = run_match(store, match, replace(machines, iteration=request.iteration))
+    return Iteration(request.iteration, record, held_out_error(record))
 
 
-def _recorded(store: Store, match: Match, request: RunRequest) -> RunRecord | None:
-    """The run, if any, that has all results of an iteration already, whichever came after it."""
+def _outlook(store: Store, match: Match, request: RunRequest) -> Outlook:
     latest = latest_run(store, match.match_id)
-    if latest is None:
-        return None
-    policy = request.gates or (latest.gates if latest.state == "waiting" else "never")
+    waits = latest is not None and latest.state == "waiting"
+    policy = request.gates or (latest.gates if latest is not None and waits else "never")
     gatekeeper = Gatekeeper(store, match, policy)
-    outlook = look_ahead(gatekeeper, request.settings, METHOD, {}, request.iteration)
+    return look_ahead(gatekeeper, request.settings, METHOD, {}, request.iteration)
+
+
+def _recorded(store: Store, match: Match, outlook: Outlook) -> RunRecord | None:
+    """The run, if any, that has all results of an iteration already, whichever came after it."""
     runs = (store.run(match.match_id, run_id) for run_id in reversed(store.runs(match.match_id)))
     found = next((run for run in runs if outlook.is_recorded_by(run)), None)
     if found is None:

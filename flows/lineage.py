@@ -11,7 +11,7 @@ from flows.registering import open_match
 from flows.run_record import latest_run
 from flows.settings import Overrides
 from worldpose.errors import InputError
-from worldpose.store import Store, explain_difference
+from worldpose.store import Store, explain_difference, list_pins
 
 
 @dataclass(frozen=True)
@@ -42,19 +42,20 @@ class Explanation:
 
 
 def find_run(store: Store, name: str) -> RunRecord:
-    """The run that a person means by `match/number`, or `match` for its latest.
+    """The run that a person means by `match/number` or `match/name`, or `match` for its latest.
 
     Raises:
         InputError: no such run.
     """
     match_id, _, number = name.partition("/")
     runs = store.runs(match_id) if match_id in store.matches() else []
-    run_id = number or (runs[-1] if runs else "")
+    names = {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)} if runs else {}
+    run_id = names.get(number, number) or (runs[-1] if runs else "")
     if run_id not in runs:
         raise InputError(
             name,
-            expected=f"MATCH/NUMBER; matches here: {', '.join(store.matches()) or '(none)'}",
-            found=f"runs {', '.join(runs)}" if runs else "no run of that match",
+            expected=f"MATCH/NUMBER or MATCH/NAME, of {', '.join(store.matches()) or '(none)'}",
+            found=f"runs {', '.join((*runs, *names))}" if runs else "no run of that match",
             todo="See worldpose status.",
         )
     return store.run(match_id, run_id)
@@ -121,14 +122,18 @@ def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
             todo="Write it as MATCH/STAGE/UNIT.",
         )
     unit = planned[unit_name]
-    state = unit_state(unit, latest)
-    if latest is None or unit_name not in latest.results:
-        return Explanation(name, state, unit.key, ("no run has computed it",))
-    if latest.results[unit_name] == unit.key:
+    return Explanation(name, unit_state(unit, latest), unit.key, unit_reasons(store, unit, latest))
+
+
+def unit_reasons(store: Store, unit: PlannedUnit, latest: RunRecord | None) -> tuple[str, ...]:
+    """Why a unit stands where `unit_state` says."""
+    if latest is None or unit.name not in latest.results:
+        return ("no run has computed it",)
+    if latest.results[unit.name] == unit.key:
         lost = () if unit.published else ("its result was withdrawn or removed",)
-        return Explanation(name, state, unit.key, (f"run {latest.run_id} has it", *lost))
-    reasons = explain_difference(_recipe(store, latest, unit_name), unit.recipe)
-    return Explanation(name, state, unit.key, (f"since run {latest.run_id}:", *reasons))
+        return (f"run {latest.run_id} has it", *lost)
+    reasons = explain_difference(_recipe(store, latest, unit.name), unit.recipe)
+    return (f"since run {latest.run_id}:", *reasons)
 
 
 def _recipe(store: Store, run: RunRecord, unit: str) -> Recipe:

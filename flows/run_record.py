@@ -9,12 +9,14 @@ from datetime import UTC, datetime
 from typing import Self
 
 from data_contracts.run import GatePolicy, RunRecord, RunState, UnitFailure, WaitingUnit
+from flows import body_fitting
 from flows.gatekeeping import Gatekeeper, passed
 from flows.method import METHOD
 from flows.planning import PlannedUnit, StagePlan, plan_stage, results_before
 from flows.progress import reporter
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
+from flows.stale import EditedMeanwhileError
 from worldpose.store import Store, libraries
 
 
@@ -65,14 +67,21 @@ class RunLog:
         gates: GatePolicy = "never",
         iteration: int = 1,
     ) -> Self:
-        """A new run with its number reserved; earlier stages stand as the latest run has them."""
+        """A new run with its number reserved; earlier stages stand as the latest run has them.
+
+        Raises:
+            EditedMeanwhileError: the iteration before has not the results that this one is made of.
+        """
+        before = results_before(store, match, overrides, iteration)
+        if before is not None:
+            _require_there(store, match, stages, before)
         latest = latest_run(store, match.match_id)
         standing = standing_results(latest, stages)
         run_id = store.reserve_run(match.match_id)
         gatekeeper = Gatekeeper(store, match, gates)
         log = cls(
             *(store, match, stages, overrides, run_id, latest, standing, gatekeeper, iteration),
-            before=results_before(store, match, overrides, iteration),
+            before=before,
             reused=list(standing),
         )
         for stage in METHOD[: METHOD.index(stages[0])]:
@@ -112,7 +121,12 @@ class RunLog:
             reporter().unit_done(unit.name, manifest.seconds, manifest.figures)
         else:
             self.failed.append(
-                UnitFailure(unit=unit.name, error=type(failure).__name__, message=str(failure))
+                UnitFailure(
+                    unit=unit.name,
+                    error=type(failure).__name__,
+                    message=str(failure),
+                    key=unit.key,
+                )
             )
             reporter().unit_failed(unit.name, str(failure))
 
@@ -176,5 +190,29 @@ class RunLog:
     def _state(self) -> RunState:
         if not self.failed:
             return "waiting" if self.waiting else "complete"
-        last = f"{self.stages[-1].name}/"
-        return "partial" if any(name.startswith(last) for name in self.results) else "failed"
+        asked = [stage.name for stage in self.stages if stage.units(self.match)]
+        through = [stage.name for stage in METHOD[: METHOD.index(body_fitting.STAGE) + 1]]
+        last = next((name for name in reversed(asked) if name in through), asked[-1])
+        there = any(name.startswith(f"{last}/") for name in self.results)
+        return "partial" if there else "failed"
+
+
+def _require_there(
+    store: Store, match: Match, stages: tuple[Stage, ...], before: Mapping[str, str]
+) -> None:
+    """Refuse an iteration if the one before has other results than it would be made of."""
+    used = {
+        name for each in stages for unit in each.units(match) for name in each.again(match, unit)
+    }
+    lost = [
+        name
+        for name in sorted(used & before.keys())
+        if not store.has(match.match_id, *name.split("/", 1), before[name])
+    ]
+    if lost:
+        raise EditedMeanwhileError(
+            f"another iteration of {match.match_id}",
+            expected="the results of the one before as the match is now",
+            found=f"none of {', '.join(lost)}",
+            todo=f"Run: worldpose run {match.match_id} --iterations N.",
+        )

@@ -5,17 +5,19 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from types import FrameType
+from typing import Any
 
 from data_contracts.run import GatePolicy, RunRecord
 from flows.gatekeeping import Gatekeeper
 from flows.outlook import look_ahead
 from flows.planning import PlannedUnit
-from flows.prefect_environment import prefect_server
+from flows.prefect_environment import has_server, local_cluster, prefect_server
 from flows.progress import reporter
 from flows.run_record import RunLog, latest_run, standing_results
 from flows.settings import Overrides, selected_stages
@@ -105,7 +107,8 @@ def _without_work(
 def _with_prefect(
     store: Store, match: Match, request: RunRequest, missing: list[PlannedUnit]
 ) -> RunRecord:
-    reporter().say("starting Prefect and Dask")
+    if request.dask is None or not has_server():
+        reporter().say("starting Prefect and Dask")
     with _ending_at_once(), prefect_server(store.url) as wait_until_ready:
         # Late: they take seconds to import, which pass while the server starts.
         from prefect.logging.handlers import APILogHandler
@@ -133,12 +136,56 @@ def _with_prefect(
 
 
 @contextmanager
+def shared_machines(
+    store: Store, request: RunRequest
+) -> Iterator[Callable[[Iterable[PlannedUnit]], RunRequest]]:
+    """A function that gives the request a server and workers, which all runs inside then use.
+
+    Starting them takes seconds, and Prefect keeps to the first server that it was shown. They start
+    when the function is first given units to compute, as many as those need.
+
+    Args:
+        store: the store.
+        request: what is asked of every run.
+    """
+    with ExitStack() as stack:
+        started: list[RunRequest] = []
+
+        def machines_for(missing: Iterable[PlannedUnit]) -> RunRequest:
+            units = list(missing)
+            if units and not started:
+                started.append(stack.enter_context(_machines(store, request, units)))
+            return started[0] if started else request
+
+        yield machines_for
+
+
+@contextmanager
+def _machines(
+    store: Store, request: RunRequest, missing: list[PlannedUnit]
+) -> Iterator[RunRequest]:
+    reporter().say("starting Prefect and Dask")
+    with _ending_at_once(), prefect_server(store.url) as wait_until_ready, ExitStack() as stack:
+        if request.dask is None:
+            # Late: it takes a second to import, while the server starts.
+            from distributed import LocalCluster
+
+            cluster = stack.enter_context(LocalCluster(**_workers(request, missing)))
+            request = replace(request, dask=cluster.scheduler_address)
+        wait_until_ready()
+        yield request
+
+
+@contextmanager
 def _ending_at_once() -> Iterator[None]:
     """Let Ctrl-C and SIGTERM end the run without ceremony.
 
     A killed run loses nothing that was finished, and its workers and server end with it. An orderly
     end would wait for the tasks at work, which can take minutes.
     """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals go to the main thread, whose owner decides
+        return
 
     def end(number: int, frame: FrameType | None) -> None:
         sys.stderr.write("\ninterrupted: run again to go on from what is finished\n")
@@ -158,16 +205,13 @@ def _cluster(request: RunRequest, missing: list[PlannedUnit]) -> dict[str, objec
     if request.dask is not None:
         _require_scheduler(request.dask)
         return {"address": request.dask}
+    return {"cluster_kwargs": _workers(request, missing)}
+
+
+def _workers(request: RunRequest, missing: list[PlannedUnit]) -> dict[str, Any]:
+    """Workers on this machine, as Dask starts them."""
     widest = max(Counter(unit.recipe.stage for unit in missing).values())
-    return {
-        "cluster_kwargs": {
-            "n_workers": request.workers or min(os.cpu_count() or 1, widest),
-            "threads_per_worker": 1,
-            "memory_limit": 0,  # a limit of one worker's share would kill a long clip's only task
-            "dashboard_address": "127.0.0.1:0",
-            "silence_logs": "CRITICAL",
-        }
-    }
+    return local_cluster(request.workers or min(os.cpu_count() or 1, widest))
 
 
 def _require_scheduler(address: str) -> None:

@@ -1,4 +1,4 @@
-"""The error of an edit that somebody else was quicker than."""
+"""The errors of an edit that somebody else was quicker than, and of work that an edit overtook."""
 
 from __future__ import annotations
 
@@ -17,3 +17,7 @@ class StaleEditError(InputError):
     """
 
     difference: Mapping[str, JsonValue] = {}
+
+
+class EditedMeanwhileError(InputError):
+    """The match is no longer as it was when the iteration before was computed."""

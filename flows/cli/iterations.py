@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from itertools import pairwise
 from statistics import median
 
 from pydantic import JsonValue
 
 from data_contracts.run import RunRecord
 from flows.cli.console import line, print_table
+from flows.comparison import KINDS, Mark, compare_runs, count_marks
 from flows.iteration import Iteration, Iterations
 from worldpose.errors import UsageError
+from worldpose.store import Store
 
 UNTIL_BEST = "auto"
 
@@ -52,27 +56,49 @@ def figures_of(iteration: Iteration) -> dict[str, float | None]:
     }
 
 
-def as_json(found: Iterations) -> dict[str, JsonValue]:
+def marks_of(store: Store, found: Iterations) -> list[dict[str, str]]:
+    """How cameras, clips and players of each iteration fare against the one before it."""
+    marks: list[dict[str, str]] = [{}]
+    for before, after in pairwise(found.passes):
+        changes = compare_runs(store, before.record, after.record)
+        marks.append({kind: _in_short(count_marks(changes, kind)) for kind in KINDS})
+    return marks
+
+
+def _in_short(marks: Mapping[Mark, int]) -> str:
+    shown: tuple[Mark, ...] = ("better", "worse", "mixed", "unchanged")
+    return " / ".join(str(marks.get(mark, 0)) for mark in shown)
+
+
+def as_json(store: Store, found: Iterations) -> dict[str, JsonValue]:
     """All iterations with their figures, and which one stands."""
     return {
         "iterations": [
-            {"iteration": each.number, "run": each.record.run_id, **figures_of(each)}
-            for each in found.passes
+            {
+                "iteration": each.number,
+                "run": each.record.run_id,
+                **figures_of(each),
+                "better_worse_mixed_unchanged": marks,
+            }
+            for each, marks in zip(found.passes, marks_of(store, found), strict=True)
         ],
         "kept": found.kept.number,
         "ended": found.ended,
     }
 
 
-def print_iterations(found: Iterations) -> None:
+def print_iterations(store: Store, found: Iterations) -> None:
     """One column an iteration, and which one stands."""
     columns = [figures_of(each) for each in found.passes]
     rows = [
         (name, *("" if column[name] is None else f"{column[name]:.4g}" for column in columns))
         for name in columns[0]
     ]
+    marks = marks_of(store, found)
+    rows += [(f"{kind}: b/w/m/u", *(each.get(kind, "") for each in marks)) for kind in KINDS]
     heads = [f"{each.number} (run {each.record.run_id})" for each in found.passes]
     print_table("iterations", ("figure", *heads), rows)
+    line("b/w/m/u: better, worse, mixed, unchanged against the iteration before (worldpose diff)")
     line(
         f"iteration {found.kept.number} stands, as run {found.record.run_id}: {found.ended}; "
         "a later one is kept only if people are foreseen better in cameras left out"

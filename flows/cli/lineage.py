@@ -15,7 +15,9 @@ from flows.cli.console import (
     print_json,
     print_table,
 )
+from flows.comparison import KINDS, SubjectChange, compare_runs, count_marks
 from flows.lineage import explain_unit, find_run, run_difference
+from flows.moved import most_moved
 from flows.settings import parse_overrides
 from worldpose.store import Store
 
@@ -26,14 +28,24 @@ def diff(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Say what changed between two runs: keys, reasons and figures, unit by unit.
+    """Say what changed between two runs: keys, reasons and figures, and who fares better or worse.
+
+    A figure of which less is better is better or worse where it changed by more than 1 % and by
+    more than matters of it (flows/comparison.py). A camera, clip or player is better where some
+    figures are better and none is worse, worse the other way round, mixed where both are.
 
     Example: worldpose diff tiny-1/0001 tiny-1/0002
     """
     store = Store.open(project)
-    changes = run_difference(store, find_run(store, run_a), find_run(store, run_b))
+    a, b = find_run(store, run_a), find_run(store, run_b)
+    changes = run_difference(store, a, b)
+    is_one_match = a.match_id == b.match_id
+    compared = compare_runs(store, a, b) if is_one_match else []
+    pictures = most_moved(store, a, b) if is_one_match else []
     if as_json:
-        print_json({"a": run_a, "b": run_b, "units": [asdict(change) for change in changes]})
+        found = {"units": changes, "compared": compared, "moved": pictures}
+        rows_of = {name: [asdict(each) for each in rows] for name, rows in found.items()}
+        print_json({"a": run_a, "b": run_b, **rows_of})
         return
     rows = [
         (
@@ -45,6 +57,41 @@ def diff(
         for change in changes
     ]
     print_table(f"{run_a} to {run_b}", ("unit", "result", "why", "figures"), rows)
+    _print_compared(compared)
+    if pictures:
+        print_table(
+            "pictures in which people moved most",
+            ("clip", "camera", ">frame", ">person", ">px"),
+            [
+                (each.clip, each.camera, str(each.frame), str(each.person), f"{each.moved_px:.2f}")
+                for each in pictures
+            ],
+        )
+
+
+def _print_compared(compared: list[SubjectChange]) -> None:
+    """Cameras, clips and players with the figures that made them better or worse."""
+    rows = [
+        (
+            change.kind,
+            change.name,
+            change.mark,
+            "\n".join(
+                f"{each.figure} {each.before:.4g} -> {each.after:.4g}, {each.mark}"
+                for each in change.figures
+                if each.mark != "unchanged"
+            ),
+        )
+        for change in compared
+        if change.mark != "unchanged"
+    ]
+    if rows:
+        print_table("better and worse", ("kind", "which", "is", "figures"), rows)
+    for kind in KINDS:
+        marks = count_marks(compared, kind)
+        if marks:
+            each = ", ".join(f"{count} {mark}" for mark, count in sorted(marks.items()))
+            line(f"{kind}: {each}")
 
 
 def why(

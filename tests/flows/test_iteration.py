@@ -13,6 +13,7 @@ from flows import iteration
 from flows.cli.iterations import parse_iterations
 from flows.iteration import Iteration, held_out_error, iterate_match
 from flows.method import METHOD
+from flows.outlook import Outlook
 from flows.planning import plan_run, results_before
 from flows.registering import register
 from flows.review import correct
@@ -147,6 +148,7 @@ def looped(monkeypatch):
             return record(request.iteration, errors[request.iteration - 1], state)
 
         monkeypatch.setattr(iteration, "run_match", run)
+        monkeypatch.setattr(iteration, "_outlook", lambda *_: Outlook((), {}, ()))
         monkeypatch.setattr(iteration, "_recorded", lambda *_: None)
         monkeypatch.setattr(
             iteration, "latest_run", lambda *_: record(ran[-1], errors[ran[-1] - 1])

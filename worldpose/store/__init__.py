@@ -10,6 +10,7 @@ from worldpose.store.garbage import Garbage, GcPlan, collect, plan_gc
 from worldpose.store.integrity import Finding, repair, verify
 from worldpose.store.opened_run import Run, open_run
 from worldpose.store.paths import ResultId
+from worldpose.store.pins import list_pins, pin_run, unpin_run
 from worldpose.store.recipes import explain_difference, key_of
 from worldpose.store.store import Store
 from worldpose.store.writer import ResultWriter
@@ -28,8 +29,11 @@ __all__ = [
     "explain_difference",
     "key_of",
     "libraries",
+    "list_pins",
     "open_run",
+    "pin_run",
     "plan_gc",
     "repair",
+    "unpin_run",
     "verify",
 ]

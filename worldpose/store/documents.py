@@ -17,6 +17,9 @@ from worldpose.store.canonical import canonical_json, digest
 
 R = TypeVar("R", bound=Record)
 
+_FURTHER = "extra_forbidden"
+"""What pydantic calls a field that a record does not have."""
+
 
 def checksum_of(record: Record) -> str:
     """The digest that seals `record`: of all its fields but `checksum`."""
@@ -39,7 +42,8 @@ def unseal(kind: type[R], data: bytes, where: str) -> R:
 
     Raises:
         CorruptionError: the bytes are not the bytes that were sealed.
-        InputError: a whole document, of another contract version than this worldpose reads.
+        InputError: a whole document, of another contract version than this worldpose reads, or
+            with fields of a later version.
     """
     try:
         fields = json.loads(data)
@@ -62,6 +66,14 @@ def unseal(kind: type[R], data: bytes, where: str) -> R:
     try:
         return kind.model_validate_json(json.dumps(fields))
     except ValidationError as error:
+        further = {str(each["loc"][0]) for each in error.errors() if each["type"] == _FURTHER}
+        if len(further) == error.error_count():
+            raise InputError(
+                where,
+                expected=f"a {kind.__name__} as this version of worldpose knows it",
+                found=f"{', '.join(sorted(further))} beside, of a later version",
+                todo="Use the worldpose version that wrote it, or a later one.",
+            ) from error
         raise CorruptionError(f"{where} is not a {kind.__name__}: {error}") from error
 
 

@@ -20,6 +20,9 @@ STORE_FORMAT = "1"
 """Raised when the same arrays are written as other bytes."""
 NUMERIC_LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "av", "zarr", "numcodecs")
 
+PARSING_ATTEMPTS = 10
+"""Soon over where it is another trouble."""
+
 _HOME = (Path(__file__).resolve().parents[2],)
 
 
@@ -51,7 +54,7 @@ def code_version(root_module: str, roots: tuple[Path, ...] = _HOME) -> dict[str,
         if path is None:
             raise StoreError(f"no source of module {name} below {', '.join(map(str, roots))}")
         try:
-            tree = ast.parse(path.read_bytes())
+            tree = _parsed(path.read_bytes())
         except (OSError, SyntaxError, ValueError) as error:
             raise StoreError(f"{path}: cannot read module {name}: {error}") from error
         code = _WithoutText().visit(tree)
@@ -75,6 +78,20 @@ def libraries() -> dict[str, str]:
         except PackageNotFoundError:
             versions[name] = "absent"
     return versions
+
+
+def _parsed(source: bytes) -> ast.Module:
+    """The tree of a source, also where another thread parses at the same time.
+
+    Python 3.11 counts how deep it is for all threads together, and gives up where the count is off
+    in the end (python/cpython issue 106905).
+    """
+    for _ in range(PARSING_ATTEMPTS - 1):
+        try:
+            return ast.parse(source)
+        except SystemError:
+            continue
+    return ast.parse(source)
 
 
 def _is_followed(name: str) -> bool:

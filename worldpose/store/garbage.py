@@ -10,6 +10,7 @@ from data_contracts.run import Reservation, RunRecord
 from worldpose.errors import InputError, StoreError
 from worldpose.store.blobs import Entry
 from worldpose.store.paths import MANIFEST, ResultId, record_path, reservation_path
+from worldpose.store.pins import list_pins
 from worldpose.store.runs import may_be_at_work, run_order
 from worldpose.store.store import Store
 
@@ -33,7 +34,7 @@ class GcPlan:
     held: tuple[str, ...]
     """One line for each run that may be at work, whose match is left alone."""
     runs: frozenset[str]
-    """The run records and reservations that the plan knows of."""
+    """The run records, reservations and pins that the plan knows of."""
 
     @property
     def size(self) -> int:
@@ -50,7 +51,8 @@ def plan_gc(
 ) -> GcPlan:
     """What can go: results that no kept run reaches, leftovers and reservations of dead runs.
 
-    A result is reached when a kept run's record names it or something made from it. Results and
+    A result is reached when a kept run's record names it or something made from it. A pinned run
+    is kept, however old. Results and
     leftovers are spared while young, and while a run of their match may be at work: it may be
     about to name them. Reservations stay while they hold the highest number, so that no number
     is given twice unless `forget` frees it. Nothing is removed by planning.
@@ -58,20 +60,22 @@ def plan_gc(
     Args:
         store: the project.
         keep_last: keep only this many of each match's newest run records; None keeps all.
-        forget: runs to drop, as `match/0003`; an unfinished one is taken to be dead.
+        forget: runs to drop, as `match/0003`; an unfinished one is taken to be dead, and a pinned
+            one has to be unpinned first.
         older_than: the age below which results and leftovers are spared.
 
     Raises:
-        InputError: `forget` names a run that is not there, or `keep_last` is below 1.
+        InputError: `forget` names a run that is not there or is pinned, or `keep_last` is below 1.
         CorruptionError: a run record or manifest is damaged, so that what it reaches is unknown.
     """
+    known = _known(store)
     _check_arguments(store, keep_last, forget)
     sizes = {entry.path: entry.size for entry in store.blobs.entries("runs")}
     garbage: list[Garbage] = []
     at_work: list[Reservation] = []
     reached: set[ResultId] = set()
     for match_id in sorted({path.split("/")[1] for path in sizes}):
-        dropped, kept = _sorted_out(store.runs(match_id), match_id, keep_last, forget)
+        dropped, kept = _sorted_out(store, match_id, keep_last, forget)
         for run_id in dropped:
             path = record_path(match_id, run_id)
             garbage.append(Garbage(path, "run forgotten", sizes[path]))
@@ -95,7 +99,7 @@ def plan_gc(
         f"{run.match_id}/{run.run_id}."
         for run in at_work
     )
-    return GcPlan(tuple(garbage), held, frozenset(sizes))
+    return GcPlan(tuple(garbage), held, known)
 
 
 def collect(store: Store, plan: GcPlan) -> int:
@@ -105,12 +109,13 @@ def collect(store: Store, plan: GcPlan) -> int:
     it, nothing that can be read is half, and the next plan finds the rest.
 
     Raises:
-        StoreError: a run has begun or ended since the plan was made; nothing is removed.
+        StoreError: a run has begun, ended or been pinned since the plan was made; nothing is
+            removed.
     """
-    if plan.runs != {entry.path for entry in store.blobs.entries("runs")}:
+    if plan.runs != _known(store):
         raise StoreError(
-            f"{store.url}: a run has begun or ended since this was planned. Nothing was removed; "
-            "plan again."
+            f"{store.url}: a run has begun, ended or been pinned since this was planned. Nothing "
+            "was removed; plan again."
         )
     for item in sorted(plan.garbage, key=lambda item: not item.path.startswith("runs/")):
         if item.path.startswith("runs/"):
@@ -118,6 +123,17 @@ def collect(store: Store, plan: GcPlan) -> int:
         else:
             store.blobs.delete_tree(item.path, MANIFEST)
     return plan.size
+
+
+def _known(store: Store) -> frozenset[str]:
+    """Everything that says which runs there are and which are kept."""
+    folders = (store.blobs.entries(top) for top in ("runs", "pins"))
+    return frozenset(entry.path for entries in folders for entry in entries)
+
+
+def _pinned(store: Store, match_id: str) -> dict[str, str]:
+    """Run to a name that keeps it."""
+    return {pin.run_id: pin.name for pin in list_pins(store.blobs, match_id)}
 
 
 def _check_arguments(store: Store, keep_last: int | None, forget: Collection[str]) -> None:
@@ -138,14 +154,26 @@ def _check_arguments(store: Store, keep_last: int | None, forget: Collection[str
                 found="no such run",
                 todo="List the runs with `worldpose status`.",
             )
+        if run_id in (pinned := _pinned(store, match_id)):
+            raise InputError(
+                f"run to forget, {name}",
+                expected="one that is not pinned",
+                found=f"the name {pinned[run_id]}",
+                todo=f"Run first: worldpose unpin {match_id}/{pinned[run_id]}.",
+            )
 
 
 def _sorted_out(
-    finished: tuple[str, ...], match_id: str, keep_last: int | None, forget: Collection[str]
+    store: Store, match_id: str, keep_last: int | None, forget: Collection[str]
 ) -> tuple[list[str], list[str]]:
     """Run records to drop, and to keep."""
+    finished, pinned = store.runs(match_id), _pinned(store, match_id)
     newest = finished if keep_last is None else finished[-keep_last:]
-    kept = [run_id for run_id in newest if f"{match_id}/{run_id}" not in forget]
+    kept = [
+        run_id
+        for run_id in finished
+        if run_id in pinned or (run_id in newest and f"{match_id}/{run_id}" not in forget)
+    ]
     return [run_id for run_id in finished if run_id not in kept], kept
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from data_contracts.match import Registration
+from data_contracts.pin import Pin
 from data_contracts.review import JournalEntry
 from data_contracts.run import Project, Reservation, RunRecord
 from worldpose.errors import CorruptionError, InputError, StoreError
@@ -36,8 +37,9 @@ def verify(
 ) -> tuple[Finding, ...]:
     """All damage in a project, or in one match of it; empty when all is as published.
 
-    Reads everything: each result's files against its manifest, each manifest, run record, journal
-    entry, reservation and registration against its own checksum, and each run record's results.
+    Reads everything: each result's files against its manifest, each manifest, run record, pin,
+    journal entry, reservation and registration against its own checksum, and each run record's
+    results.
     """
     below = "" if match_id is None else f"/{match_id}"
     results = store.blobs.entries(f"results{below}")
@@ -45,6 +47,7 @@ def verify(
         *(store.blobs.entries("matches") if match_id is None else []),
         *store.blobs.entries(f"runs{below}"),
         *store.blobs.entries(f"reviews{below}"),
+        *store.blobs.entries(f"pins{below}"),
     ]
     total = sum(entry.size for entry in (*results, *documents))
     done = 0
@@ -140,6 +143,9 @@ def _check_document(store: Store, path: str, published: set[ResultId]) -> Iterat
             case ["reviews", match_id, name] if name.endswith(".json"):
                 entry = unseal(JournalEntry, data, where)
                 fits = (match_id, name) == (entry.match_id, f"{entry.number:06d}.json")
+            case ["pins", match_id, name] if name.endswith(".json"):
+                pin = unseal(Pin, data, where)
+                fits = (match_id, name) == (pin.match_id, f"{pin.name}.json")
             case _:
                 raise CorruptionError(f"{where} is not a file of a project")
         if not fits:

@@ -94,6 +94,11 @@ def reservation_path(match_id: str, run_id: str) -> str:
     return f"runs/{checked_name(match_id)}/{checked_name(run_id)}.open.json"
 
 
+def pin_path(match_id: str, name: str) -> str:
+    """Where a run's name lies."""
+    return f"pins/{checked_name(match_id)}/{checked_name(name)}.json"
+
+
 def checked_name(name: str) -> str:
     """`name`, when it is safe as a file's name.
 

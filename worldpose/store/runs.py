@@ -12,6 +12,7 @@ from worldpose.store.blobs import Blobs
 from worldpose.store.commit_points import reached
 from worldpose.store.documents import seal, unseal
 from worldpose.store.paths import checked_name, record_path, reservation_path
+from worldpose.store.pins import read_pin
 
 LATEST = "latest"
 
@@ -75,7 +76,7 @@ def read_reservation(blobs: Blobs, match_id: str, run_id: str) -> Reservation | 
 
 
 def read_record(blobs: Blobs, match_id: str, run_id: str = LATEST) -> RunRecord:
-    """The record of a finished run; `latest` is the one with the highest number.
+    """The record of a finished run by its number or name; `latest` has the highest number.
 
     Raises:
         InputError: there is none.
@@ -83,6 +84,9 @@ def read_record(blobs: Blobs, match_id: str, run_id: str = LATEST) -> RunRecord:
     """
     finished, reserved = list_runs(blobs, match_id)
     wanted = finished[-1] if run_id == LATEST and finished else run_id
+    if wanted not in finished:
+        pin = read_pin(blobs, match_id, run_id)
+        wanted = run_id if pin is None else pin.run_id
     if wanted not in finished:
         raise InputError(
             f"run {run_id} of match {match_id} in {blobs.url}",

@@ -263,7 +263,7 @@ class Store:
         return tuple(reservation for reservation in found if reservation)
 
     def run(self, match_id: str, run_id: str = LATEST) -> RunRecord:
-        """The record of a finished run; `latest` is the one with the highest number.
+        """The record of a finished run by number or name; `latest` has the highest number.
 
         Raises:
             InputError: there is none.

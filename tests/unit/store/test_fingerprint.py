@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import ast
 import sys
 from pathlib import Path
 
@@ -148,6 +149,28 @@ def test_unknown_module_is_an_error(tree: Path) -> None:
 def test_broken_module_is_an_error_that_names_it(tree: Path) -> None:
     (tree / "worldpose/late.py").write_text("def (")
     with pytest.raises(StoreError, match=r"late\.py: cannot read module worldpose\.late"):
+        version_of(tree)
+
+
+def test_a_parser_that_gives_up_because_of_another_thread_is_asked_again(
+    tree: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = version_of(tree)
+    code_version.cache_clear()
+    parse, left = ast.parse, [3]
+
+    def gives_up(source: bytes) -> ast.Module:
+        if left[0]:
+            left[0] -= 1
+            raise SystemError("AST constructor recursion depth mismatch (before=60, after=89)")
+        return parse(source)
+
+    monkeypatch.setattr(ast, "parse", gives_up)
+    assert version_of(tree) == before
+    assert left == [0]
+    code_version.cache_clear()
+    left[0] = 1_000_000
+    with pytest.raises(SystemError):
         version_of(tree)
 
 

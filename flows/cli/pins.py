@@ -1,0 +1,78 @@
+"""Commands that name runs and keep them: pin, unpin."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Annotated
+
+import typer
+
+from data_contracts.pin import Pin
+from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption, line, print_json
+from flows.lineage import find_run
+from worldpose.errors import UsageError
+from worldpose.store import Store, pin_run, unpin_run
+from worldpose.store.paths import checked_name
+
+
+def pin(
+    run: Annotated[str, typer.Argument(metavar="RUN", help="MATCH/NUMBER, or MATCH: its latest.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="What to call it, such as v1.")],
+    who: Annotated[
+        str, typer.Option("--who", envvar="WORLDPOSE_REVIEWER", help="Your name; kept with it.")
+    ],
+    why: Annotated[str, typer.Option(help="What it is kept for.")] = "",
+    project: ProjectOption = DEFAULT_PROJECT,
+    as_json: JsonOption = False,
+) -> None:
+    """Give a run a name and keep it: gc never forgets it; --run takes the name too.
+
+    Example: worldpose pin tiny-1/0002 paper --who Ada --why "figures of the paper"
+    """
+    store = Store.open(project)
+    record = find_run(store, run)
+    kept = pin_run(
+        store.blobs,
+        Pin(
+            match_id=record.match_id,
+            name=checked_name(name),
+            run_id=record.run_id,
+            who=who,
+            why=why,
+            pinned_at=datetime.now(UTC),
+        ),
+    )
+    _say(kept, "pinned", as_json)
+
+
+def unpin(
+    named: Annotated[str, typer.Argument(metavar="MATCH/NAME", help="A name given by pin.")],
+    project: ProjectOption = DEFAULT_PROJECT,
+    as_json: JsonOption = False,
+) -> None:
+    """Take a run's name back; gc may then forget it as any other.
+
+    Example: worldpose unpin tiny-1/paper
+    """
+    match_id, slash, name = named.partition("/")
+    if not (match_id and slash and name):
+        raise UsageError(
+            f"unpin {named}",
+            expected="MATCH/NAME",
+            found=repr(named),
+            todo="List the names with worldpose status.",
+        )
+    _say(unpin_run(Store.open(project).blobs, match_id, name), "unpinned", as_json)
+
+
+def _say(kept: Pin, verb: str, as_json: bool) -> None:
+    if as_json:
+        print_json(kept.model_dump(mode="json"))
+    else:
+        line(f"{verb} run {kept.run_id} of {kept.match_id} as {kept.name}")
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register these commands."""
+    for command in (pin, unpin):
+        app.command()(command)

@@ -1,0 +1,153 @@
+"""Iterations killed anywhere, gone on with: the store is that of undisturbed ones, bit by bit."""
+
+import json
+import multiprocessing
+import os
+import random
+import signal
+import subprocess
+import time
+from contextlib import contextmanager
+
+import pytest
+from command_line import WORLDPOSE, succeed
+from test_killed_runs import assert_nothing_half_written, assert_same_store, files_of
+
+from flows import iteration
+from flows import match as match_flow
+from flows.iteration import iterate_match
+from flows.registering import register
+from flows.running import RunRequest
+from flows.settings import selected_stages
+from worldpose.store import Store
+from worldpose.store.commit_points import install_fault_hook
+from worldpose.synthetic import SCENARIOS, simulate_match
+
+pytestmark = pytest.mark.faults
+
+PASSES = 2
+LOOPED = ["--iterations", str(PASSES), "--workers", "2"]
+
+
+def compute_here(store, match, stage, units, run_id):
+    """Each unit in this process: what Prefect and Dask do for it, but for their start."""
+    task = match_flow.task_of(stage)
+    for unit in units:
+        task.fn(unit.work(store.url, match, run_id))
+        yield unit, None
+
+
+def run_here(store, match, request):
+    stages = selected_stages(request.from_stage, request.until_stage)
+    settings = (request.settings, "never", request.iteration)
+    return match_flow._run_stages(store, match, stages, *settings)
+
+
+@contextmanager
+def no_machines(store, request):
+    yield lambda missing: request
+
+
+def loop(project, folder, at_commit_point):
+    """The loop over iterations in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(match_flow, "_compute", compute_here)
+        patch.setattr(iteration, "run_match", run_here)
+        patch.setattr(iteration, "shared_machines", no_machines)
+        install_fault_hook(at_commit_point)
+        store = Store.open_or_new(str(project))
+        match, _ = register(store, folder)
+        iterate_match(store, match, RunRequest({}), PASSES)
+        install_fault_hook(None)
+
+
+def loop_and_die(project, folder, skip):
+    """The loop in a copy of this process that is killed at a commit point, after so many."""
+    visits = []
+
+    def strike(point):
+        visits.append(point)
+        if len(visits) > skip:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def run():
+        loop(project, folder, strike)
+        os._exit(0)  # nothing of the test session ends with its copy
+
+    process = multiprocessing.get_context("fork").Process(target=run)
+    process.start()
+    process.join(300)
+    return process.exitcode
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """A third of a second of a small match with given cameras."""
+    folder = tmp_path_factory.mktemp("short") / "match"
+    options = {"duration": 0.32, "calibrated": True, "stills": False, "video": False}
+    simulate_match(SCENARIOS["tiny"], 3, folder, **options)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def undisturbed(short, tmp_path_factory):
+    """A project in which nothing went wrong, and the commit points it came to."""
+    project = tmp_path_factory.mktemp("undisturbed") / "project"
+    visits = []
+    # Here, so that copies of this process find every kernel loaded.
+    loop(project, short, visits.append)
+    return project, visits
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(20))
+def test_killed_at_a_random_commit_point_of_the_loop(seed, short, undisturbed, tmp_path):
+    reference, visits = undisturbed
+    skip = random.Random(seed).randrange(len(visits))
+    project = tmp_path / "project"
+    assert loop_and_die(project, short, skip) == -signal.SIGKILL
+    assert_nothing_half_written(project)
+    loop(project, short, None)
+    assert_same_store(project, reference)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_the_whole_command_killed_at_a_random_moment(seed, server, short, tmp_path):
+    undisturbed, project = tmp_path / "undisturbed", tmp_path / "project"
+    succeed("run", short, "--project", undisturbed, *LOOPED)
+    moment = random.Random(seed).randrange(1, len(files_of(undisturbed)) - 1)
+    process = start(short, project)
+    while len(files_of(project)) < moment:
+        assert process.poll() is None, "the run ended before it was killed"
+        time.sleep(0.002)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert_nothing_half_written(project)
+    succeed("run", short, "--project", project, *LOOPED)
+    assert_same_store(project, undisturbed)
+
+
+@pytest.mark.slow
+def test_two_loops_over_one_match_at_once_end_with_one_result(server, short, tmp_path):
+    undisturbed, project = tmp_path / "undisturbed", tmp_path / "project"
+    succeed("run", short, "--project", undisturbed, *LOOPED)
+    both = [start(short, project) for _ in range(2)]
+    assert [process.wait() for process in both] == [0, 0]
+    store = Store.open(str(project))
+    records = [store.run(match, run) for match in store.matches() for run in store.runs(match)]
+    for number in (1, PASSES):
+        of_pass = [json.dumps(each.results) for each in records if each.iteration == number]
+        assert len(of_pass) >= 2
+        assert len(set(of_pass)) == 1
+    assert_same_store(project, undisturbed)
+
+
+def start(folder, project):
+    """The command, leading a process group of its own."""
+    return subprocess.Popen(
+        [*WORLDPOSE, "run", str(folder), "--project", str(project), *LOOPED],
+        start_new_session=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )

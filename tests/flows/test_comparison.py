@@ -1,0 +1,153 @@
+"""Two runs in figures: who is better or worse by the stated rule, whatever ids people have."""
+
+import numpy as np
+import pytest
+
+from data_contracts.run import RunRecord
+from flows import comparison, moved
+from flows.comparison import compare_runs, count_marks
+from flows.pairing import BodiesOfBoth, pair_people
+from worldpose.cameras import Camera, Rigid
+
+
+def record(figures):
+    return RunRecord.model_validate(
+        {
+            "run_id": "0001",
+            "match_id": "m",
+            "parent": None,
+            "state": "complete",
+            **{name: {} for name in ("results", "settings", "overrides", "versions")},
+            **dict.fromkeys(("executed", "reused", "failed", "blocked"), ()),
+            "figures": figures,
+            "started_at": "2024-01-01T00:00:00Z",
+            "finished_at": "2024-01-01T00:00:00Z",
+            "seconds": 1.0,
+        }
+    )
+
+
+@pytest.fixture
+def compared(monkeypatch):
+    """Marks of all subjects by name, with people of B named as given."""
+
+    def compare(before, after, names=None):
+        monkeypatch.setattr(comparison, "paired_people", lambda *_: names or {})
+        changes = compare_runs(None, record(before), record(after))
+        return {f"{change.kind} {change.name}": change for change in changes}
+
+    return compare
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "mark"),
+    [
+        (0.100, 0.0985, "better"),  # 1.5 %, 1.5 mm
+        (0.100, 0.1015, "worse"),
+        (0.100, 0.0992, "unchanged"),  # 0.8 %
+        (0.010, 0.0095, "unchanged"),  # 5 %, but half a millimetre of at least one
+    ],
+)
+def test_a_figure_must_change_by_a_part_and_by_what_matters(compared, before, after, mark):
+    name = "expected_ground_error_median_m"
+    found = compared(*({"static_calibration/cam01": {name: x}} for x in (before, after)))
+    assert found["camera cam01"].mark == mark
+    assert found["camera cam01"].figures[0].mark == mark
+
+
+def test_better_and_worse_together_are_mixed(compared):
+    one = {"residual_m.person1": 0.020, "reprojection_px.person1": 2.0, "jerk_m_s3.person1": 9.0}
+    other = {"residual_m.person1": 0.018, "reprojection_px.person1": 2.2, "jerk_m_s3.person1": 1.0}
+    found = compared({"body_fitting/clip": one}, {"body_fitting/clip": other})
+    (person,) = found.values()
+    assert (person.kind, person.name, person.mark) == ("player", "clip: person 1", "mixed")
+    # Less jerk may be too much smoothing: it is not judged.
+    assert len(person.figures) == 2
+
+
+def test_bodies_are_those_that_were_fitted_last(compared):
+    first, again = {"residual_m.person1": 0.020}, {"residual_m.person1": 0.010}
+    found = compared(
+        {"body_fitting/clip": first}, {"body_fitting/clip": first, "refitting/clip": again}
+    )
+    assert found["player clip: person 1"].mark == "better"
+
+
+def test_figures_of_a_clip_tell_of_its_cameras_and_the_match(compared):
+    before = {
+        "filtering/clip": {"held_out_error": 0.04, "rejected_share.cam01": 0.02},
+        "bundle_adjustment/cameras": {"held_out_error_after_px": 2.0},
+    }
+    after = {
+        "filtering/clip": {"held_out_error": 0.03, "rejected_share.cam01": 0.05},
+        "bundle_adjustment/cameras": {"held_out_error_after_px": 2.01},
+    }
+    found = compared(before, after)
+    assert {name: change.mark for name, change in found.items()} == {
+        "match cameras": "unchanged",
+        "clip clip": "better",
+        "camera cam01": "worse",
+    }
+    assert count_marks(list(found.values()), "camera") == {"worse": 1}
+
+
+def test_people_are_compared_by_who_they_are(compared):
+    before = {"body_fitting/clip": {"residual_m.person0": 0.010, "residual_m.person1": 0.030}}
+    after = {"body_fitting/clip": {"residual_m.person0": 0.030, "residual_m.person7": 0.010}}
+    names = {("clip", "person0"): "person1", ("clip", "person7"): "person0"}
+    found = compared(before, after, names)
+    assert [change.mark for change in found.values()] == ["unchanged", "unchanged"]
+    names = {("clip", "person7"): "person7 of B"}
+    found = compared(before, after, names)
+    assert {name: change.mark for name, change in found.items()} == {
+        "player clip: person 0": "worse",
+        "player clip: person 1": "only in A",
+        "player clip: person 7 of B": "only in B",
+    }
+
+
+def test_who_stands_where_somebody_stood_is_that_person():
+    before = np.zeros((4, 2, 3, 3))
+    before[:, 1, :, 0] = 5.0
+    after = before[:, ::-1] + 0.1
+    assert pair_people(before, after) == {0: 1, 1: 0}
+    # Frames in which one is missing say nothing of them.
+    after[0, 0] = np.nan
+    assert pair_people(before, after) == {0: 1, 1: 0}
+    # Beyond a metre, or with another nearer, it is somebody else.
+    assert pair_people(before, after + 2.0) == {}
+    assert pair_people(before, np.repeat(before[:, :1], 2, axis=1)) == {0: 0}
+    assert pair_people(before[:, :0], after) == {}
+
+
+def test_people_who_are_never_there_together_are_no_pair():
+    before = np.zeros((2, 1, 3, 3))
+    after = before.copy()
+    before[0], after[1] = np.nan, np.nan
+    assert pair_people(before, after) == {}
+
+
+def test_the_picture_in_which_somebody_moved_most_is_found(monkeypatch):
+    # Two metres in front of 1000 px: 2 cm are 10 px. The second person moves most, in frame 11.
+    camera = Camera(
+        focal=[1000.0, 1000.0],
+        principal_point=[500.0, 500.0],
+        distortion=np.zeros(5),
+        image_size=[1000, 1000],
+        cam_from_world=Rigid(np.eye(3), np.zeros(3)),
+    )
+    before = np.zeros((3, 2, 17, 3))
+    before[..., 2] = 2.0
+    before[:, 1, :, 0] = 0.5
+    after = before[:, ::-1].copy()
+    after[1, 0, :, 1] += 0.02
+    after[2, 1, :, 1] += 0.01
+    bodies = BodiesOfBoth("clip", *map(np.array, ([10, 11, 12], [4, 7], [0, 1])), before, after)
+    (picture,) = moved._worst(bodies, "cam01", {"cam01": camera}, {"cam01": camera})
+    assert (picture.camera, picture.frame, picture.person) == ("cam01", 11, 7)
+    assert picture.moved_px == pytest.approx(10.0)
+    # Nobody in the picture, nothing to look at.
+    away = BodiesOfBoth(
+        "clip", *map(np.array, ([10, 11, 12], [4, 7], [0, 1])), before + 9.0, after + 9.0
+    )
+    assert moved._worst(away, "cam01", {"cam01": camera}, {"cam01": camera}) == []

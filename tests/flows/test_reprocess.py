@@ -1,0 +1,230 @@
+"""What an edit touches, match by match: exactly what was made from it, found without running."""
+
+import sys
+from contextlib import contextmanager
+
+import pytest
+from command_line import TINY, succeed
+from test_refitting import halves
+from typer.testing import CliRunner
+
+from data_contracts.review import DeletedDetection, MergedTracks, MovedPoint
+from data_contracts.run import UnitFailure
+from flows import planning, reprocessing
+from flows.cli import app
+from flows.cli.reprocess import exit_code
+from flows.method import METHOD
+from flows.registering import open_match, register
+from flows.reprocess import UnprocessedError, reprocess
+from flows.reprocessing import Reprocessed, reprocess_matches
+from flows.review import correct
+from flows.running import RunRequest
+from flows.touched import find_touched
+from flows.tracking import STAGE
+from worldpose.store import ResultId, Store
+
+FLOW = [
+    sys.executable,
+    "-c",
+    "import json, sys; from flows.reprocess import reprocess as flow; "
+    "print(json.dumps(flow(sys.argv[1])))",
+]
+
+
+@pytest.fixture
+def store(project_copy):
+    """A finished run, to be edited in the journal."""
+    return Store.open(project_copy)
+
+
+def made_from(store, *starts):
+    """`starts` and all that the finished run made from them, as its results' manifests tell."""
+    results = store.run(TINY).results
+    inputs = {
+        name: set(store.manifest(TINY, *name.split("/"), key).recipe.inputs)
+        for name, key in results.items()
+    }
+    found = set(starts)
+    while True:
+        more = {name for name, sources in inputs.items() if sources & found} - found
+        if not more:
+            return found
+        found |= more
+
+
+def edit_point(store):
+    match = open_match(store, TINY)
+    clicked = match.folder.clicked["cam02"]
+    (x, y) = clicked.points[0].xy
+    moved = MovedPoint(camera="cam02", marking=clicked.points[0].name, was=(x, y), xy=(x + 0.5, y))
+    correct(store, match, [moved], who="Ada", why="on the line")
+    return {}, ["static_calibration/cam02"]
+
+
+def edit_box(store):
+    deleted = DeletedDetection(camera="cam01", frame=5, detection=0)
+    correct(store, open_match(store, TINY), [deleted], who="Ada", why="a shadow")
+    return {}, ["ingest/cam01"]
+
+
+def edit_identity(store):
+    merged = MergedTracks(clip="clip", kept=0, merged=1)
+    correct(store, open_match(store, TINY), [merged], who="Ada", why="one person")
+    return {}, ["tracking/clip"]
+
+
+def edit_setting(store):
+    return {"body_fitting": {"tail": 3.0}}, ["body_fitting/clip"]
+
+
+@pytest.mark.parametrize("edit", [edit_point, edit_box, edit_identity, edit_setting])
+def test_an_edit_touches_what_was_made_from_it_and_nothing_else(store, edit):
+    assert not find_touched(store, TINY).is_touched
+    settings, starts = edit(store)
+    found = find_touched(store, TINY, settings)
+    expected = made_from(store, *starts)
+    assert {unit.unit for unit in found.units} == expected
+    assert len(found.to_compute) == len(expected)
+    assert {unit.unit for unit in found.units if unit.own_reasons} == set(starts)
+
+
+def test_new_code_touches_what_is_computed_with_it(store, monkeypatch):
+    real = planning.code_version
+
+    def newer(module):
+        return real(module) | ({"worldpose.filtering.judging": "new"} if "filter" in module else {})
+
+    monkeypatch.setattr(planning, "code_version", newer)
+    (unit,) = find_touched(store, TINY).units
+    assert (unit.unit, unit.state) == ("filtering/clip", "stale")
+    assert any("worldpose.filtering.judging" in reason for reason in unit.own_reasons)
+
+
+def finish(store, **changes):
+    """A later run that stands, as the first but for some of its fields."""
+    before = store.run(TINY)
+    changes = {"run_id": store.reserve_run(TINY), "parent": before.run_id, **changes}
+    store.finish_run(before.model_copy(update=changes))
+    return store.run(TINY)
+
+
+def without(record, *stages):
+    return {name: key for name, key in record.results.items() if name.split("/")[0] not in stages}
+
+
+def test_a_run_that_ended_earlier_is_made_current_as_far_as_it_went(store):
+    later = ("bundle_adjustment", "retriangulation", "body_fitting", "filtering")
+    finish(store, results=without(store.run(TINY), *later))
+    assert not find_touched(store, TINY).is_touched
+    edit_identity(store)
+    found = find_touched(store, TINY)
+    assert found.until_stage == "triangulation"
+    assert [unit.unit for unit in found.units] == ["tracking/clip", "triangulation/clip"]
+
+
+@pytest.mark.parametrize(("error", "again"), [("ValueError", False), ("StoreError", True)])
+def test_what_failed_is_tried_again_when_something_is_another(store, error, again):
+    tracking = store.run(TINY).results["tracking/clip"]
+    store.withdraw(ResultId(TINY, "tracking", "clip", tracking))
+    failure = UnitFailure(unit="tracking/clip", error=error, message="x", key=tracking)
+    later = [stage.name for stage in METHOD[METHOD.index(STAGE) :]]
+    results = without(store.run(TINY), *later)
+    finish(store, state="failed", results=results, failed=(failure,), figures={}, reused=())
+    assert find_touched(store, TINY).is_touched == again
+    if not again:
+        said = CliRunner().invoke(app, ["reprocess", "--project", store.url]).stdout
+        assert "nothing was edited since run 0002 was failed: --retry" in said
+    assert find_touched(store, TINY, retry=True).is_touched
+    edit_box(store)
+    assert "tracking/clip" in {unit.unit for unit in find_touched(store, TINY).units}
+
+
+def test_a_later_iteration_is_touched_in_every_pass(store):
+    finish(store, iteration=2)
+    found = find_touched(store, TINY)
+    # Nothing of the second pass is there; the first pass stands in the run before.
+    assert {unit.iteration for unit in found.units} == {2}
+    edit_box(store)
+    found = find_touched(store, TINY)
+    assert {unit.iteration for unit in found.units} == {1, 2}
+    assert len({unit.key for unit in found.to_compute}) == len(found.to_compute)
+
+
+def test_a_match_that_fails_stops_no_other(store, tiny, tmp_path, monkeypatch):
+    edit_box(store)
+    folder = halves(tiny, tmp_path / "other")
+    register(store, folder)
+    ran = []
+
+    def run(store, match, request):
+        ran.append((match.match_id, request.gates, request.workers))
+        return store.run(match.match_id)
+
+    @contextmanager
+    def machines(store, request):
+        yield lambda missing: request
+
+    monkeypatch.setattr(reprocessing, "run_match", run)
+    monkeypatch.setattr(reprocessing, "shared_machines", machines)
+    real = reprocessing.find_touched
+
+    def broken(store, match_id, settings, *, retry):
+        if match_id == "halves":
+            raise OSError("its folder is gone")
+        return real(store, match_id, settings, retry=retry)
+
+    request = RunRequest({}, workers=3)
+    first = reprocess_matches(store, (), request)
+    assert [(each.match_id, each.state) for each in first] == [
+        ("halves", "never run"),
+        (TINY, "complete"),
+    ]
+    assert ran == [(TINY, "never", 3)]
+    monkeypatch.setattr(reprocessing, "find_touched", broken)
+    second = reprocess_matches(store, (), request)
+    assert [(each.state, each.problem) for each in second] == [
+        ("failed", "its folder is gone"),
+        ("complete", None),
+    ]
+    assert exit_code(second) == 4
+    with pytest.raises(UnprocessedError, match="halves is failed: its folder is gone"):
+        reprocess.fn(store.url)
+    rehearsed = reprocess_matches(store, (TINY,), request, is_rehearsal=True)
+    assert [each.state for each in rehearsed] == ["touched"]
+    assert len(ran) == 3
+
+
+def test_the_exit_code_says_how_far_it_came():
+    def code(*states):
+        return exit_code([Reprocessed("m", state) for state in states])
+
+    assert code() == code("untouched", "never run", "touched", "complete") == 0
+    assert code("failed") == 1
+    assert code("failed", "untouched") == code("partial") == 4
+    assert code("waiting", "complete") == 3
+
+
+def test_the_command_lists_what_it_would_compute_and_why(store):
+    edit_box(store)
+    answer = CliRunner().invoke(app, ["reprocess", "--dry-run", "--project", store.url])
+    assert answer.exit_code == 0
+    assert f"{TINY}: touched, run 0001; 7 units to compute" in answer.stdout
+    assert "made from ingest/cam01" in " ".join(answer.stdout.split())
+    assert store.runs(TINY) == ("0001",)
+
+
+@pytest.mark.slow
+def test_reprocessing_computes_what_was_listed(server, store):
+    edit_point(store)
+    expected = made_from(store, "static_calibration/cam02")
+    answer = succeed("reprocess", "--project", store.url, "--json").json["matches"]
+    assert [each["state"] for each in answer] == ["complete"]
+    assert set(answer[0]["executed"]) == expected
+    assert store.run(TINY).parent == "0001"
+    again = succeed("reprocess", "--project", store.url, "--json").json["matches"]
+    assert [(each["state"], each["executed"]) for each in again] == [("untouched", [])]
+    # As a deployment does it.
+    edit_identity(store)
+    assert succeed(store.url, program=FLOW).json == {TINY: "complete"}
+    executed = store.run(TINY, "0003").executed
+    assert set(executed) == made_from(store, "tracking/clip")

@@ -1,0 +1,94 @@
+"""What a run's record says when units fail, and when the match is edited under it."""
+
+import pytest
+from command_line import TINY
+
+from data_contracts.review import MergedTracks
+from flows import iteration
+from flows.iteration import Iteration, iterate_match
+from flows.method import METHOD
+from flows.registering import open_match
+from flows.review import correct
+from flows.run_record import RunLog
+from flows.running import RunRequest
+from flows.stale import EditedMeanwhileError
+from flows.touched import find_touched
+from worldpose.store import Store
+
+
+@pytest.fixture
+def store(project_copy):
+    return Store.open(project_copy)
+
+
+def merge(store):
+    """Somebody says that two people are one."""
+    edit = MergedTracks(clip="clip", kept=0, merged=1)
+    correct(store, open_match(store, TINY), [edit], who="Ada", why="one person")
+
+
+def recorded(store, stages, failing=None, before_stage=None):
+    """A run of `stages` that finds everything in the store, but for what fails."""
+    log = RunLog.begin(store, open_match(store, TINY), stages, {})
+    for stage in stages:
+        if before_stage == stage.name:
+            merge(store)
+        plan = log.plan(stage)
+        log.blocked += plan.blocked
+        for unit in plan.units:
+            log.finished(unit, RuntimeError("x") if stage.name == failing else None)
+    return log.close()
+
+
+@pytest.mark.parametrize(
+    ("failing", "until", "state"),
+    [
+        ("filtering", "filtering", "partial"),  # the bodies are there
+        ("filtering", "refitting", "complete"),  # it was not asked for
+        ("body_fitting", "filtering", "failed"),
+        # No unit is refitted here: that the last stage has none makes nothing fail.
+        ("ingest", "refitting", "failed"),
+        ("tracking", "tracking", "failed"),
+    ],
+)
+def test_a_run_with_bodies_is_partial_whatever_fails_after_them(store, failing, until, state):
+    names = [stage.name for stage in METHOD]
+    record = recorded(store, METHOD[: names.index(until) + 1], failing)
+    assert record.state == state
+    if record.failed:
+        assert {failure.unit.split("/")[0] for failure in record.failed} == {failing}
+        assert all(failure.key is not None for failure in record.failed)
+
+
+def test_a_run_during_an_edit_has_the_match_as_it_began_and_the_edit_is_seen_next(store):
+    before = store.run(TINY)
+    record = recorded(store, METHOD, before_stage="tracking")
+    assert record.state == "complete"
+    assert record.results == before.results, "no unit of the edited match is among the others"
+    found = find_touched(store, TINY)
+    assert found.latest.run_id == record.run_id
+    assert {unit.unit for unit in found.units if unit.own_reasons} == {"tracking/clip"}
+
+
+def test_an_iteration_is_refused_when_the_one_before_is_of_another_state_of_the_match(store):
+    match = open_match(store, TINY)
+    RunLog.begin(store, match, METHOD, {}, iteration=2)  # the first is there
+    merge(store)
+    RunLog.begin(store, match, METHOD, {}, iteration=2)  # and stays there for who began earlier
+    with pytest.raises(EditedMeanwhileError, match="filtering/clip"):
+        RunLog.begin(store, open_match(store, TINY), METHOD, {}, iteration=2)
+
+
+def test_iterations_begin_again_when_the_match_is_edited_between_two(store, monkeypatch):
+    begun = []
+
+    def one_pass(store, match, request, machines_for):
+        begun.append((request.iteration, len(match.corrections)))
+        if request.iteration == 2 and not match.corrections:
+            merge(store)
+            raise EditedMeanwhileError("x", expected="a", found="b", todo="c")
+        return Iteration(request.iteration, store.run(TINY), None)
+
+    monkeypatch.setattr(iteration, "_pass", one_pass)
+    iterate_match(store, open_match(store, TINY), RunRequest({}), 2)
+    assert begun == [(1, 0), (2, 0), (1, 1), (2, 1)]
