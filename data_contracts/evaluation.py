@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
+from pydantic import JsonValue
+
 from data_contracts.records import Record
 
 
@@ -100,3 +104,28 @@ class Evaluation(Record):
     """Frames scored."""
     cameras: CameraEvaluation | None = None
     """Errors of cameras."""
+
+
+class MethodScore(Record):
+    """How well another method's result agrees with the truth, and under which settings."""
+
+    method: str
+    """Name of the method."""
+    title: str
+    """What tables call it."""
+    source: str
+    """File or folder of its result."""
+    world: Literal["shared", "own", "camera"]
+    """Where it puts people: in one world, each in one of his own, or relative to the camera. What
+    then means nothing is absent from the scores."""
+    body_model: str
+    """Body that its poses were put on."""
+    notes: dict[str, str]
+    """What was done beyond reading."""
+    match_in: str | None
+    """Camera in whose picture tracks were matched; None = by distance in the world."""
+    first_frame: int
+    """Match frame of the method's first picture."""
+    settings: dict[str, JsonValue]
+    """Settings of the evaluation."""
+    evaluation: Evaluation

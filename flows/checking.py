@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from data_contracts.release import CheckReport, Finding
 from worldpose.body import OPEN_BODY, find_body
-from worldpose.release.check import CheckReport, check_clip
+from worldpose.release.check import check_clip
 from worldpose.release.check_reading import clips_in, read_clip
 from worldpose.release.check_settings import CheckSettings
 from worldpose.release.manifest import changed_files, read_manifest
-from worldpose.release.shipped import Finding
 
 USUAL_FPS = 50.0
 """Frames in a second where neither a manifest nor a person says it: the released clips'."""

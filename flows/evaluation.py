@@ -19,6 +19,14 @@ from flows.release import (
 from worldpose.cameras import Camera
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation import CameraScore, PersonScore, evaluate_cameras, evaluate_joints
+from worldpose.evaluation.marker_files import (
+    SUFFIXES,
+    joints_of_markers,
+    marker_joints,
+    read_marker_map,
+    read_markers,
+)
+from worldpose.evaluation.marker_reference import ReferenceAlignment, lay_over
 from worldpose.ingest import MatchFolder, read_match
 from worldpose.pitch import PitchTemplate
 from worldpose.release import JointTracks, read_camera, read_joints
@@ -32,6 +40,8 @@ class Scores:
     evaluation: Evaluation
     people: tuple[PersonScore, ...]
     cameras: tuple[CameraScore, ...]
+    laid: ReferenceAlignment | None = None
+    """How markers were laid over the prediction, where they are the truth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,27 +64,37 @@ def score(
     stage: str | None = None,
     fps: float | None = None,
     match_in: str | None = None,
+    marker_map: Path | None = None,
 ) -> Scores:
     """Every score of a prediction against a reference that both sides have the data for.
 
     Args:
         prediction: a joints file, a folder with `joints.npz` and `cameras/`, or a match.
-        reference: a joints file, or a folder with `joints.npz`, `cameras/` or both.
+        reference: a joints file, a folder with `joints.npz`, `cameras/` or both, or a C3D or TRC
+            file of markers, which is laid over the prediction in time and space.
         project: where runs of matches are kept.
         run_id: number of the run, of a match.
         stage: whose joints are scored, of a match; None = the latest there are.
         fps: frames in a second; None = the match's, where there is one.
         match_in: the reference's camera in whose picture tracks are matched (E3).
+        marker_map: YAML file that says which markers make which joints; None = they are called
+            after them.
 
     Raises:
         UsageError: a name that does not exist, or nothing that both sides have.
         InputError: a file is not what it must be.
     """
-    truth = _reference(reference)
+    measured = Path(reference).suffix.lower() in SUFFIXES
+    truth = Side(None, {}) if measured else reference_side(reference)
     estimate = _prediction(prediction, project, truth, run_id=run_id, stage=stage)
     match = estimate.match or truth.match
+    laid = None
+    if measured:
+        rate = fps or (None if match is None else match.spec.fps)
+        tracks, laid = _laid_over(Path(reference), estimate.joints, rate, marker_map)
+        truth = Side(tracks, {})
     spec = None if match is None else match.spec
-    true_cameras = _sized(reference, truth, spec)
+    true_cameras = cameras_of(reference, truth, spec)
     if match_in is not None and match_in not in true_cameras:
         raise UsageError(
             f"--match-in {match_in}",
@@ -99,7 +119,23 @@ def score(
             found=f"{_contents(estimate)} against {_contents(truth)}",
             todo="Name files or folders that hold the same things.",
         )
-    return Scores(evaluation.model_copy(update={"cameras": errors}), people, cameras)
+    return Scores(evaluation.model_copy(update={"cameras": errors}), people, cameras, laid)
+
+
+def _laid_over(
+    path: Path, prediction: JointTracks | None, fps: float | None, marker_map: Path | None
+) -> tuple[JointTracks, ReferenceAlignment]:
+    """Joints of a marker file in the prediction's frames and world."""
+    if prediction is None or fps is None:
+        raise UsageError(
+            f"--reference {path}",
+            expected="joints to lay markers over, and their frame rate",
+            found="no joints" if prediction is None else "no frame rate",
+            todo="Name a prediction with joints, and give --fps where it belongs to no match.",
+        )
+    markers = read_markers(path)
+    people = joints_of_markers(markers.names) if marker_map is None else read_marker_map(marker_map)
+    return lay_over(prediction, marker_joints(markers, people), markers.rate, fps)
 
 
 def load_reference(name: str) -> JointTracks:
@@ -112,7 +148,12 @@ def load_reference(name: str) -> JointTracks:
     return read_joints(path / "joints.npz" if path.is_dir() else path)
 
 
-def _reference(name: str) -> Side:
+def reference_side(name: str) -> Side:
+    """What a file or folder of truth brings, and the match beside it.
+
+    Raises:
+        InputError: there is no such file, or it is not what it must be.
+    """
     path = Path(name)
     above = [folder for folder in path.resolve().parents[:2] if (folder / "match.yaml").is_file()]
     match = read_match(above[0]) if above else None
@@ -126,7 +167,7 @@ def _reference(name: str) -> Side:
 def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str | None) -> Side:
     path = Path(name)
     if path.is_file() or (path / "joints.npz").is_file() or (path / "cameras").is_dir():
-        return _reference(name)
+        return reference_side(name)
     match = find_match(Store.open(project), name)
     run = open_run(project, match.match_id, run_id)
     spec = match.folder.spec
@@ -145,7 +186,7 @@ def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str
     return Side(joint_tracks(run, clips[0], stage), cameras, match.folder)
 
 
-def _sized(reference: str, truth: Side, spec: MatchSpec | None) -> dict[str, Camera]:
+def cameras_of(reference: str, truth: Side, spec: MatchSpec | None) -> dict[str, Camera]:
     """The true cameras with the pictures of the match: the files do not tell their size."""
     if spec is None:
         return dict(truth.cameras)

@@ -10,7 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.match import MatchSpec, Registration
-from flows.release import bodies_unit, clips_of, joint_tracks, placed_joints, static_cameras
+from data_contracts.release import BaselineSettings
+from flows.release import (
+    bodies_unit,
+    broadcast_unit,
+    clips_of,
+    joint_tracks,
+    placed_joints,
+    static_cameras,
+)
 from worldpose.body import BodyModel, BodyParameters, find_body
 from worldpose.cameras import Camera
 from worldpose.cameras.stored import camera_from_arrays
@@ -18,8 +26,13 @@ from worldpose.errors import WorldposeError
 from worldpose.ingest import read_match
 from worldpose.pitch import PitchTemplate
 from worldpose.release import coco_dataset, write_coco, write_joints
+from worldpose.release.baseline_inputs import (
+    write_baseline_settings,
+    write_slahmr_cameras,
+    write_tracks,
+)
 from worldpose.release.camera_file import write_moving_camera, write_static_camera
-from worldpose.release.challenge import ChallengeTruth, challenge_truth
+from worldpose.release.challenge import ChallengeClip, challenge_truth
 from worldpose.release.challenge_files import (
     Edition,
     write_challenge,
@@ -80,9 +93,13 @@ def broadcast_camera(run: Run, clip: str) -> Camera:
         "This format is about the broadcast camera's picture: calibrate that camera first, or "
         "choose another format."
     )
-    found = run[_needed(run, f"broadcast_calibration/{clip}", todo)]
+    _needed(run, f"broadcast_calibration/{clip}", todo)
+    return _camera_in(run, clip, run[bodies_unit(run, clip)]["frame"].values)
+
+
+def _camera_in(run: Run, clip: str, frames: NDArray[np.int64]) -> Camera:
+    found = run[broadcast_unit(run, clip)]
     by_frame = found[["focal", "principal_point", "distortion", "rotation", "translation"]]
-    frames = run[bodies_unit(run, clip)]["frame"].values
     arrays = by_frame.reindex(frame=frames).data_vars
     return camera_from_arrays({**arrays, "image_size": found["image_size"]})
 
@@ -171,29 +188,82 @@ def export_motion(origin: Origin, out: Path) -> list[Path]:
 
 def export_challenge(origin: Origin, out: Path, edition: Edition = 2026) -> list[Path]:
     """Writes cameras, boxes, skeletons, the pitch's points and what to submit."""
-    truths: dict[str, ChallengeTruth] = {}
-    fits = {clip: fitted_bodies(origin.run, clip) for clip in origin.clips}
-    cameras = {clip: broadcast_camera(origin.run, clip) for clip in origin.clips}
     pitch = read_match(Path(origin.registration.folder)).pitch
+    for clip in origin.clips:
+        fitted_bodies(origin.run, clip)
+        broadcast_camera(origin.run, clip)
     written = []
-    for clip, camera in cameras.items():
-        model, poses, _ = fits[clip]
-        truths[clip] = challenge_truth(model, poses, camera)
+    together: dict[str, ChallengeClip] = {}
+    submissions: dict[str, NDArray[np.float64]] = {}
+    for clip in origin.clips:
+        camera = broadcast_camera(origin.run, clip)
+        model, poses, _ = fitted_bodies(origin.run, clip)
+        truth = challenge_truth(model, poses, camera)
+        submissions[clip] = truth.submission
         written.append(out / "cameras" / f"{clip}.npz")
         write_challenge_camera(written[-1], camera, edition)
-    written += write_challenge(out, {clip: t.clip for clip, t in truths.items()}, edition)
+        if edition == 2025:
+            together[clip] = truth.clip
+        else:
+            written += write_challenge(out, {clip: truth.clip}, edition)
+    if edition == 2025:
+        written += write_challenge(out, together, edition)
     if pitch is not None:
         written.append(out / "pitch_points.txt")
         samples = PitchTemplate.from_spec(pitch).sample_lines(PITCH_SPACING)
         write_pitch_points(written[-1], samples.points_world)
     written.append(out / "submission.zip")
-    write_submission(written[-1], {clip: truth.submission for clip, truth in truths.items()})
+    write_submission(written[-1], submissions)
     return written
 
 
 def export_challenge_2025(origin: Origin, out: Path) -> list[Path]:
     """Writes what `export_challenge` writes, in the layout of the edition of 2025."""
     return export_challenge(origin, out, 2025)
+
+
+def export_tracks(origin: Origin, out: Path) -> list[Path]:
+    """Writes `tracks/<clip>.txt`, our boxes in the broadcast picture, and the paper's settings."""
+    written = [out / "baseline_settings.json"]
+    write_baseline_settings(written[0], BaselineSettings())
+    for clip in origin.clips:
+        model, poses, persons = fitted_bodies(origin.run, clip)
+        truth = challenge_truth(model, poses, broadcast_camera(origin.run, clip))
+        written.append(out / "tracks" / f"{clip}.txt")
+        write_tracks(written[-1], truth.clip.boxes, persons[truth.persons].astype(np.int64))
+    return written
+
+
+def export_slahmr_cameras(origin: Origin, out: Path) -> list[Path]:
+    """Writes `slahmr/cameras/<clip>/shot-0/cameras.npz`, and the paper's settings."""
+    written = [out / "baseline_settings.json"]
+    write_baseline_settings(written[0], BaselineSettings())
+    for clip in origin.clips:
+        written.append(out / "slahmr" / "cameras" / clip / "shot-0" / "cameras.npz")
+        write_slahmr_cameras(written[-1], broadcast_camera(origin.run, clip))
+    return written
+
+
+def export_recording(origin: Origin, out: Path) -> list[Path]:
+    """Writes `rerun/<clip>.rrd` for the rerun viewer."""
+    # Late: it draws with matplotlib's colours, which cost half a second to load.
+    from worldpose.release.recording import write_recording
+
+    written = []
+    for clip in origin.clips:
+        tracks = joint_tracks(origin.run, clip, origin.stage)
+        known = f"broadcast_calibration/{clip}" in origin.run
+        moving = _camera_in(origin.run, clip, tracks.frames) if known else None
+        written.append(out / "rerun" / f"{clip}.rrd")
+        write_recording(
+            written[-1],
+            tracks,
+            origin.spec.fps,
+            cameras=static_cameras(origin.run, origin.spec, origin.stage),
+            broadcast=moving,
+            pitch=read_match(Path(origin.registration.folder)).pitch,
+        )
+    return written
 
 
 EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
@@ -204,5 +274,8 @@ EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
     "bvh": export_motion,
     "challenge": export_challenge,
     "challenge-2025": export_challenge_2025,
+    "tracks": export_tracks,
+    "slahmr-cameras": export_slahmr_cameras,
+    "rerun": export_recording,
 }
 """Formats by name; each takes what it is made from and a folder, and returns the files."""

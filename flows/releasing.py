@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
+from data_contracts.pin import Pin
+from data_contracts.release import ReleasedClip, ReleaseManifest
 from flows.formats import EXPORTS, Origin
 from flows.release import bodies_unit, joint_tracks, static_cameras
 from worldpose.errors import UsageError
 from worldpose.ingest.match_folder import NO_PITCH
 from worldpose.release.manifest import (
-    ReleasedClip,
-    ReleaseManifest,
     read_manifest,
     released_files,
     write_manifest,
 )
 from worldpose.release.origins import ORIGINS, origins_of, write_origins
+from worldpose.store import Store, pin_run
 
 CLASHING = {"worldpose", "challenge", "challenge-2025"}
 """Formats that want the same file names; a folder holds one of them."""
@@ -48,13 +50,30 @@ def export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
     return [path for form in dict.fromkeys(forms) for path in EXPORTS[form](origin, out)]
 
 
-def release(origin: Origin, forms: list[str], out: Path, name: str, licence: str) -> list[Path]:
+def _keep(store: Store, origin: Origin, name: str) -> None:
+    """Pins the run of a release, so that nothing that the release names is ever collected."""
+    record = origin.run.record
+    pin = Pin(
+        match_id=record.match_id,
+        name=f"release-{name}",
+        run_id=record.run_id,
+        who="worldpose export",
+        why=f"release {name}",
+        pinned_at=datetime.now(UTC),
+    )
+    pin_run(store.blobs, pin)
+
+
+def release(
+    store: Store, origin: Origin, forms: list[str], out: Path, name: str, licence: str
+) -> list[Path]:
     """Writes a release: the formats, origins/<clip>.npz and manifest.json; returns the files.
 
-    A release is frozen: its folder takes the same release again, and no other.
+    A release is frozen: its folder takes the same release again, and no other. Its run is pinned.
 
     Raises:
         UsageError: the folder holds another release.
+        InputError: another run of the match was released under this name.
     """
     record, spec = origin.run.record, origin.spec
     frozen = read_manifest(out)
@@ -74,6 +93,8 @@ def release(origin: Origin, forms: list[str], out: Path, name: str, licence: str
             found=f"release {frozen.release} of run {frozen.run_id} of {frozen.match_id}",
             todo="A release is never overwritten: name another folder.",
         )
+    # First, so that the run cannot be collected while its files are written.
+    _keep(store, origin, name)
     written = export(origin, forms, out)
     clips = {}
     for clip in origin.clips:

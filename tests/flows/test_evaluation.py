@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 from command_line import succeed, worldpose
 
+from worldpose.release import JointTracks
+from worldpose.release.marker_file import write_markers
+
 
 def changed(source, target, **changes):
     """A copy of an npz file with some arrays replaced by a function of themselves."""
@@ -80,3 +83,17 @@ def test_nothing_in_common_is_refused(tiny, tmp_path):
     )
     assert answer.code == 2
     assert "expected joints on both sides, or cameras of the same names" in answer.err
+
+
+def test_markers_are_laid_over_and_scored(tiny, tmp_path):
+    with np.load(tiny / "reference" / "joints.npz") as stored:
+        tracks = JointTracks(stored["frames"], stored["person_ids"], stored["joints"])
+    seen = np.isfinite(tracks.joints).all((0, 2, 3))
+    # One person's markers, from 6 frames later on, and so on a clock that is early.
+    later = JointTracks(tracks.frames[6:] - 6, tracks.person_ids, tracks.joints[6:])
+    write_markers(tmp_path / "a.trc", later, int(np.flatnonzero(seen)[0]), 25.0)
+    figures = evaluate(tiny / "reference" / "joints.npz", tmp_path / "a.trc", "--fps", "25")
+    assert figures["reference_offset_s"] == pytest.approx(-6 / 25, abs=1e-3)
+    # Micrometres in the file; the offset is found to a tenth of a millisecond.
+    assert figures["mpjpe_mm"] == pytest.approx(0.0, abs=1.0)
+    assert figures["persons"] == 1

@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 from command_line import TINY, succeed, worldpose
 
+from worldpose.errors import InputError
 from worldpose.release.origins import read_origins
+from worldpose.store import Store, list_pins
+from worldpose.store.garbage import plan_gc
 from worldpose.synthetic.bvh import read_bvh
 
 pytestmark = pytest.mark.usefixtures("server")
@@ -61,6 +64,17 @@ def test_a_release_passes_its_check_and_a_changed_one_fails_by_name(released, tm
     faults = {finding["fault"] for finding in answer.json["findings"]}
     assert faults == {"changed_files", "transposed_rotation"}
     assert "transposed_rotation: R is world_from_cam" in worldpose("check", spoilt).out
+
+
+def test_the_run_of_a_release_is_never_collected(released, tiny_run):
+    store = Store.open(tiny_run)
+    manifest = json.loads((released / "manifest.json").read_text())
+    match, run = manifest["match_id"], manifest["run_id"]
+    assert [(pin.name, pin.run_id) for pin in list_pins(store.blobs, match)] == [
+        ("release-first", run)
+    ]
+    with pytest.raises(InputError, match=r"the name release-first\. .*worldpose unpin"):
+        plan_gc(store, forget=[f"{match}/{run}"])
 
 
 def test_a_release_is_frozen(released, exporting):

@@ -8,10 +8,11 @@ import pytest
 import xarray as xr
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from data_contracts.release import BaselineSettings
 from flows.formats import EXPORTS, Origin
 from worldpose.body import BodyParameters, fold_keypoints, load_open_body
 from worldpose.body.skeletons import CHALLENGE15
-from worldpose.errors import WorldposeError
+from worldpose.errors import InputError, WorldposeError
 from worldpose.release import read_camera
 from worldpose.release.challenge_files import read_challenge, read_submission
 from worldpose.release.pose_file import read_poses
@@ -152,3 +153,41 @@ def test_a_motion_file_is_named_after_person_and_first_frame(match_folder, tmp_p
         "person_008_frame_000100.bvh",
         "person_008_frame_000103.bvh",
     ]
+
+
+def test_other_methods_get_our_boxes_as_mot_lines(match_folder, tmp_path):
+    run = origin(match_folder, body_fitting__A_1=bodies(), broadcast_calibration__A_1=broadcast())
+    written = EXPORTS["tracks"](run, tmp_path / "out")
+    assert [path.name for path in written] == ["baseline_settings.json", "A_1.txt"]
+    rows = np.loadtxt(written[1], delimiter=",")
+    # The second person is lost in the third picture, the camera in the fourth.
+    assert rows[:, :2].tolist() == [[1, 4], [1, 9], [2, 4], [2, 9], [3, 4]]
+    EXPORTS["challenge"](run, tmp_path / "challenge")
+    boxes = read_challenge(tmp_path / "challenge")["A_1"].boxes
+    x0, y0, x1, y1 = boxes[0, 1]
+    # Pixels count from 1, at corners, there; texts hold hundredths.
+    assert rows[1, 2:6] == pytest.approx([x0 + 1.5, y0 + 1.5, x1 - x0, y1 - y0], abs=0.006)
+    settings = BaselineSettings.model_validate_json(written[0].read_bytes())
+    assert (settings.slahmr_max_num_tracks, settings.slahmr_chunk_frames) == (30, 100)
+
+
+def test_slahmr_gets_true_cameras_over_a_ground_with_y_down(match_folder, tmp_path):
+    results = {"body_fitting__A_1": bodies(), "broadcast_calibration__A_1": broadcast()}
+    with pytest.raises(InputError, match="none in 1 of 4, the first 3"):
+        EXPORTS["slahmr-cameras"](origin(match_folder, **results), tmp_path / "gap")
+    results["body_fitting__A_1"] = bodies().isel(frame=slice(0, 3))
+    path = EXPORTS["slahmr-cameras"](origin(match_folder, **results), tmp_path / "out")[1]
+    assert path.relative_to(tmp_path).as_posix() == "out/slahmr/cameras/A_1/shot-0/cameras.npz"
+    with np.load(path) as found:
+        w2c, (fx, fy, cx, cy) = found["w2c"][0], found["intrins"][0]
+        assert (int(found["width"]), int(found["height"]), float(found["focal"])) == (
+            1920,
+            1080,
+            4000.0,
+        )
+    # A head 1.8 m above a spot 3 m to the right and 5 m beyond the centre, y down there.
+    x, y, z, _ = w2c @ [3.0, -1.8, 5.0, 1.0]
+    # The camera stands at (0, -70, 2), looks along y.
+    assert (fx * x / z + cx, fy * y / z + cy) == pytest.approx(
+        (960 + 4000 * 3 / 75, 540 + 4000 * 0.2 / 75), abs=1e-9
+    )

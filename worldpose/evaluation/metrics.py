@@ -10,19 +10,11 @@ from numpy.typing import NDArray
 from data_contracts.evaluation import Evaluation
 from data_contracts.records import Record
 from worldpose.cameras import Camera
-from worldpose.errors import InputError
-from worldpose.evaluation.boxes import box_overlaps, joint_boxes
 from worldpose.evaluation.identity import identity_scores
 from worldpose.evaluation.limbs import correct_limbs, limb_ends
-from worldpose.evaluation.matching import (
-    joint_distances,
-    match_boxes,
-    match_people,
-    merge_tracks,
-    taken,
-)
-from worldpose.evaluation.registration import register_world
+from worldpose.evaluation.matching import joint_distances, match_people, taken
 from worldpose.evaluation.settings import EvaluationSettings
+from worldpose.evaluation.tracks import match_tracks
 from worldpose.evaluation.trajectories import (
     acceleration_errors,
     aligned_errors,
@@ -64,6 +56,7 @@ def evaluate_joints(
     *,
     fps: float | None = None,
     camera: Camera | None = None,
+    boxes: NDArray[np.float64] | None = None,
 ) -> tuple[Evaluation, tuple[PersonScore, ...]]:
     """Return scores over all frames of the reference, and per true person.
 
@@ -78,12 +71,14 @@ def evaluate_joints(
         fps: match frames in a second [1/s]; without it there are no figures in time.
         camera: the camera in whose picture tracks are matched by their boxes, single or one for
             each frame of the reference; without it they are matched by distance.
+        boxes: (frames, persons, 4) x0 y0 x1 y1 [px] of the prediction in that picture, for one
+            whose joints are not where the camera sees them; None = around the joints.
 
     Raises:
         InputError: the camera has another number of frames than the reference.
     """
     settings = settings or EvaluationSettings()
-    people = _in_frames(prediction, reference.frames)
+    people = _in_frames(prediction, reference.frames, prediction.joints)
     distances = joint_distances(people, reference.joints)
     match = match_people(distances, settings.match_gate)
     counts = _counting_joints(reference, settings)
@@ -98,7 +93,8 @@ def evaluate_joints(
     true = np.where(counts[..., None], reference.joints, np.nan)
     tally = _tally(taken(people, match), true, present, settings.pcp_alpha)
     identity = identity_scores(distances, present, exists & ~idle, settings.match_gate)
-    tracks = _match_tracks(people, reference, distances, match, camera, settings)
+    around = None if boxes is None else _in_frames(prediction, reference.frames, boxes)
+    tracks = match_tracks(people, reference.joints, distances, match, camera, around, settings)
     figures, persons = _track_figures(
         taken(people, tracks), true, present, reference.frames, fps, settings
     )
@@ -181,13 +177,15 @@ def _mean(values: NDArray[np.float64], factor: float = 1.0) -> float | None:
     return _ratio(factor * np.where(known, values, 0.0).sum(), int(known.sum()))
 
 
-def _in_frames(prediction: JointTracks, frames: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return predicted joints in these frames, NaN in those that the prediction lacks."""
-    people = np.full((len(frames), *prediction.joints.shape[1:]), np.nan)
-    _, rows, places = np.intersect1d(
+def _in_frames(
+    prediction: JointTracks, frames: NDArray[np.int64], rows: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return rows of predicted frames in these frames, NaN in those that the prediction lacks."""
+    people = np.full((len(frames), *rows.shape[1:]), np.nan)
+    _, own, places = np.intersect1d(
         prediction.frames, frames, assume_unique=True, return_indices=True
     )
-    people[places] = prediction.joints[rows]
+    people[places] = rows[own]
     return people
 
 
@@ -205,40 +203,6 @@ def _minutes(frames: NDArray[np.int64], fps: float | None) -> float | None:
     if fps is None or not len(frames):
         return None
     return float(frames[-1] - frames[0] + 1) / fps / 60.0
-
-
-def _match_tracks(
-    people: NDArray[np.float64],
-    reference: JointTracks,
-    distances: NDArray[np.float64],
-    match: NDArray[np.int64],
-    camera: Camera | None,
-    settings: EvaluationSettings,
-) -> NDArray[np.int64]:
-    """Return the predicted person of each true one (frames, true), by whole tracks (E3)."""
-    true = reference.joints
-    if camera is not None:
-        if camera.batch_shape not in ((), (1,), (len(true),)):
-            raise InputError(
-                "camera to match in",
-                expected=f"one row, or {len(true)}: one for each frame of the reference",
-                found=f"{camera.batch_shape}",
-                todo="Name the camera of the clip that the reference belongs to.",
-            )
-        overlap = box_overlaps(joint_boxes(people, camera), joint_boxes(true, camera))
-        cost = np.where(np.isnan(overlap), np.inf, 1.0 - overlap)
-        return merge_tracks(match_boxes(overlap, settings.min_overlap), cost)
-    possible = min(
-        int(np.isfinite(side[..., 0]).any(-1).sum())
-        for side in (people, true[np.isfinite(people[..., 0]).any((-1, -2))])
-    )
-    if (match >= 0).sum() < settings.min_matched_share * possible:
-        motion = register_world(people, true, settings.match_gate)
-        if motion is not None:
-            moved = motion.apply(people.reshape(len(people), -1, 3)).reshape(people.shape)
-            distances = joint_distances(moved, true)
-            match = match_people(distances, settings.match_gate)
-    return merge_tracks(match, distances)
 
 
 def _track_figures(

@@ -40,7 +40,7 @@ def write_archive(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write arrays as npz, whole or not at all; the same arrays give the same bytes."""
     with whole_file(path) as draft, zipfile.ZipFile(draft, "w") as file:
         for name, array in arrays.items():
-            little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
+            little = np.asarray(array, array.dtype.newbyteorder("<"), order="C")
             # A ZipInfo made by name alone carries the fixed date 1980-01-01.
             with file.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
                 npy.write_array(member, little, version=(1, 0), allow_pickle=False)

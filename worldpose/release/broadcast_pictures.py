@@ -8,8 +8,19 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from data_contracts.pitch import PitchSpec
 from worldpose.cameras import Camera
-from worldpose.release.drawing import INK, PALETTE, png, style
+from worldpose.release.drawing import (
+    INK,
+    PALETTE,
+    TEMPLATE,
+    draw_skeleton,
+    markings,
+    person_color,
+    png,
+    style,
+)
+from worldpose.release.joints_file import JointTracks
 
 Floats = NDArray[np.float64]
 
@@ -52,6 +63,73 @@ def course_picture(frame: NDArray[np.int64], camera: Camera, covariance: Floats)
         style(axes)
     for axes in panels[3:]:
         axes.set_xlabel("frame", color=INK)
+    return png(figure)
+
+
+def most_moved(before: Camera, after: Camera, tracks: JointTracks) -> tuple[int, int]:
+    """Return the place in the clip and the person whom two cameras see farthest apart.
+
+    Among people well inside the picture; (0, 0) where there are none.
+
+    Args:
+        before: a batch (frames,).
+        after: another.
+        tracks: people in the same frames.
+    """
+    frames, persons = tracks.joints.shape[:2]
+    one, two = (
+        camera.project(tracks.joints.reshape(frames, -1, 3)).reshape(frames, persons, -1, 2)
+        for camera in (before, after)
+    )
+    width, height = (int(n) for n in after.image_size.reshape(-1, 2)[0])
+    with np.errstate(invalid="ignore"):
+        inside = ((two > 0.1 * height) & (two < np.array([width, height]) - 0.1 * height)).all(-1)
+        apart = np.linalg.norm((one - two).mean(axis=2), axis=-1)
+    apart = np.where(inside.all(axis=-1) & np.isfinite(apart), apart, -1.0)
+    frame, person = np.unravel_index(int(apart.argmax()), apart.shape)
+    return (int(frame), int(person)) if apart.max() >= 0.0 else (0, 0)
+
+
+def before_after_picture(
+    before: Camera,
+    after: Camera,
+    tracks: JointTracks,
+    frame: int,
+    person: int,
+    *,
+    still: NDArray[np.uint8],
+    pitch: PitchSpec | None = None,
+) -> bytes:
+    """Return a PNG of a person and who is about, as two cameras put them and the markings.
+
+    Args:
+        before: a single camera.
+        after: another.
+        tracks: people, one colour each.
+        frame: place in `tracks`.
+        person: place in `tracks` of whom the picture is about.
+        still: the picture (height, width, 3), RGB, beneath.
+        pitch: its markings are drawn; None where there is no pitch.
+    """
+    seen = after.project(tracks.joints[frame, person])
+    middle = np.nan_to_num(seen[np.isfinite(seen).all(axis=-1)].mean(axis=0))
+    tall = max(float(np.ptp(seen[np.isfinite(seen[:, 1]), 1])), 30.0)
+    gone = seen - before.project(tracks.joints[frame, person])
+    moved = float(np.nanmean(np.linalg.norm(gone, axis=-1)))
+    titles = ("before", f"after, {moved:.1f} px beside")
+    figure = Figure(figsize=(14.0, 5.6), dpi=110, layout="constrained", facecolor="white")
+    for axes, camera, title in zip(figure.subplots(1, 2), (before, after), titles, strict=True):
+        axes.imshow(still, zorder=0, interpolation="nearest")
+        for line in markings(pitch) if pitch is not None else ():
+            axes.plot(*camera.project(line).T, color=TEMPLATE, linewidth=1.3, zorder=1)
+        for person_id, joints in zip(tracks.person_ids, tracks.joints[frame], strict=True):
+            draw_skeleton(axes, camera.project(joints), person_color(int(person_id)), 1.6, zorder=3)
+        axes.set(
+            xlim=(middle[0] - 1.3 * tall, middle[0] + 1.3 * tall),
+            ylim=(middle[1] + 0.85 * tall, middle[1] - 0.85 * tall),
+        )
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(title, color=INK, loc="left", fontsize=12)
     return png(figure)
 
 

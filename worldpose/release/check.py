@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from data_contracts.records import Record
+from data_contracts.release import ClipFigures, Finding
 from worldpose.release.check_faults import Fault
 from worldpose.release.check_plausibility import (
     body_findings,
@@ -22,31 +22,7 @@ from worldpose.release.check_reprojection import (
 )
 from worldpose.release.check_settings import CheckSettings
 from worldpose.release.check_sight import is_blind, sight_findings
-from worldpose.release.shipped import Finding, PointSource, ShippedClip, View
-
-
-class ClipFigures(Record):
-    """What was measured in one clip."""
-
-    frames: int
-    persons: int
-    sources: tuple[str, ...]
-    """Files with 3D points."""
-    cameras: int
-    compared: int
-    """2D points that were compared with 3D points."""
-    reprojection_median_px: float | None = None
-    """Of the worst pair of a source and a camera; None where there is no 2D, or nothing is seen."""
-    plausible_share: float | None = None
-    """Of bodies near the ground, head up, within the pitch's bounds."""
-
-
-class CheckReport(Record):
-    """The outcome of a check."""
-
-    clips: dict[str, ClipFigures]
-    findings: tuple[Finding, ...]
-    """Empty where nothing is wrong."""
+from worldpose.release.shipped import PointSource, ShippedClip, View
 
 
 def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures, list[Finding]]:

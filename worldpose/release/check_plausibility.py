@@ -7,10 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.release import Finding
 from worldpose.release.camera_rows import CameraRows
 from worldpose.release.check_faults import Fault, point_faults
 from worldpose.release.check_settings import CheckSettings
-from worldpose.release.shipped import Finding, PointSource, View
+from worldpose.release.shipped import PointSource, View
 
 Floats = NDArray[np.float64]
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17
+from data_contracts.release import Finding, ReleaseManifest
 from worldpose.body import BODY25, CHALLENGE15, BodyModel, BodyParameters, fold_keypoints
 from worldpose.cameras import Rigid
 from worldpose.errors import InputError
@@ -18,9 +19,8 @@ from worldpose.release.archives import wrong
 from worldpose.release.camera_rows import read_camera_rows
 from worldpose.release.challenge_files import read_challenge, read_submission
 from worldpose.release.joints_file import read_joints
-from worldpose.release.manifest import ReleaseManifest
 from worldpose.release.pose_file import read_poses
-from worldpose.release.shipped import Finding, PointSource, ShippedClip, View, absent_rows
+from worldpose.release.shipped import PointSource, ShippedClip, View, absent_rows
 
 Floats = NDArray[np.float64]
 

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.release import Finding
 from worldpose.cameras import Camera
 from worldpose.release.camera_rows import CameraRows
 from worldpose.release.check_faults import Fault, camera_faults, frame_faults, point_faults
 from worldpose.release.check_settings import CheckSettings
 from worldpose.release.check_slips import slip
-from worldpose.release.shipped import Finding, PointSource, View
+from worldpose.release.shipped import PointSource, View
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -8,11 +8,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.release import Finding
 from worldpose.release.camera_rows import CameraRows
 from worldpose.release.check_faults import Fault, camera_faults, point_faults
 from worldpose.release.check_plausibility import center_of, centers
 from worldpose.release.check_settings import CheckSettings
-from worldpose.release.shipped import Finding, PointSource, View
+from worldpose.release.shipped import PointSource, View
 
 Floats = NDArray[np.float64]
 

@@ -5,71 +5,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
-from pydantic import Field, JsonValue, ValidationError
+from pydantic import ValidationError
 
-from data_contracts.conventions import CONVENTIONS, Conventions
-from data_contracts.records import CONTRACT_VERSION, Digest, Key, Name, Record
+from data_contracts.records import CONTRACT_VERSION
+from data_contracts.release import ReleasedFile, ReleaseManifest
 from worldpose.errors import InputError
 from worldpose.release.files import whole_file
 
 MANIFEST: Final = "manifest.json"
-
-
-class ReleasedFile(Record):
-    """One file of a release."""
-
-    path: str
-    """Relative to the manifest, with forward slashes."""
-    size: int
-    """[byte]"""
-    sha256: Digest
-
-
-class ReleasedClip(Record):
-    """One clip of a release."""
-
-    first_frame: int
-    """Match frame of the first row of every array."""
-    frame_count: int
-    person_ids: tuple[int, ...]
-    """People in the order of every person dimension."""
-    origins: dict[str, int]
-    """How many joints are of which origin; each joint's is in origins/<clip>.npz."""
-
-
-class ReleaseManifest(Record):
-    """A named, frozen run: the same name, run and licence give the same bytes."""
-
-    contract: Literal[1] = CONTRACT_VERSION
-    release: Name
-    match_id: Name
-    run_id: Name
-    formats: tuple[str, ...]
-    stage: str | None = None
-    """Whose joints were asked for; None = the best there are."""
-    fps: float = Field(gt=0)
-    """[1/s]"""
-    clips: dict[str, ReleasedClip]
-    pictures: dict[str, tuple[int, int]]
-    """Width and height [px] of every camera's picture."""
-    pitch: bool
-    """Whether the world is a pitch's; without one it is that of the cameras' calibration."""
-    body_model: str | None
-    """Name and version of the body model of all poses; betas of another mean nothing."""
-    conventions: Conventions = CONVENTIONS
-    licence: str = Field(min_length=1)
-    """The text under which the owner of the data gives it out."""
-    worldpose: str
-    """Version that wrote the release."""
-    versions: dict[str, str]
-    """Python and numeric libraries that computed it."""
-    settings: dict[str, dict[str, JsonValue]]
-    """Stage to all its settings."""
-    results: dict[str, Key]
-    """Stored results that it was made from: `stage/unit` to key."""
-    files: tuple[ReleasedFile, ...]
 
 
 def released_files(folder: Path, paths: Iterable[Path]) -> tuple[ReleasedFile, ...]:

@@ -4,29 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.records import Record
+from data_contracts.release import Finding
 from worldpose.release.camera_rows import CameraRows
 
 Floats = NDArray[np.float64]
-
-
-class Finding(Record):
-    """One thing that is wrong with a data set."""
-
-    fault: str
-    """Its name, such as `transposed_rotation`; docs/formats.md lists them."""
-    kind: Literal["convention", "damage", "plausibility"]
-    where: tuple[str, ...]
-    """Files or clips, and cameras."""
-    says: str
-    """What was found, in a sentence."""
-    figures: dict[str, float] = {}
-    """What decided, with the unit in the name."""
 
 
 @dataclass(frozen=True, eq=False)

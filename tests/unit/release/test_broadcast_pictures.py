@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from worldpose.cameras import Camera, Rigid
-from worldpose.release.broadcast_pictures import angles_of, course_picture
+from worldpose.release import JointTracks
+from worldpose.release.broadcast_pictures import (
+    angles_of,
+    before_after_picture,
+    course_picture,
+    most_moved,
+)
 
 LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Rows right, down and ahead of a camera that looks along y."""
@@ -54,3 +60,33 @@ def test_the_course_is_drawn_also_where_frames_have_no_camera():
     covariance[2] = np.nan
     picture = course_picture(np.arange(5), moving, covariance)
     assert matplotlib.image.imread(io.BytesIO(picture)).shape[:2] == (704, 1540)
+
+
+def people(*places):
+    """Somebody still at each place (x, y) [m], in two frames, whose joints go from 0 to 1.7 m."""
+    joints = np.empty((2, len(places), 17, 3))
+    joints[..., :2] = np.array(places)[None, :, None]
+    joints[..., 2] = np.linspace(-0.8, 0.9, 17)
+    return JointTracks(np.arange(2), np.arange(len(places)), joints)
+
+
+def test_whom_a_refinement_moves_most_is_shown_before_and_after():
+    after = cameras(turned(), turned())
+    # Half a degree in the second frame: all move by 35 px, who is aside by more.
+    before = cameras(turned(), turned(tilt=0.5))
+    # The third stands where the picture ends, and is not shown.
+    tracks = people((0.0, 80.0), (9.0, 80.0), (18.2, 80.0))
+    assert most_moved(before, after, tracks) == (1, 1)
+    still = np.full((1080, 1920, 3), 90, np.uint8)
+    picture = before_after_picture(before[1], after[1], tracks, 1, 1, still=still)
+    shown = matplotlib.image.imread(io.BytesIO(picture))[..., :3]
+    # Skeletons are coloured on grey, and lie elsewhere in the two halves.
+    colored = np.ptp(shown, axis=-1) > 0.3
+    left, right = colored[:, :770], colored[:, 770:]
+    assert left.any() and right.any()
+    assert abs(np.nonzero(left)[0].mean() - np.nonzero(right)[0].mean()) > 50.0
+
+
+def test_nobody_in_the_picture_is_moved_most():
+    some = cameras(turned(), turned())
+    assert most_moved(some, some, people((200.0, 80.0))) == (0, 0)

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from data_contracts.release import ReleasedClip, ReleaseManifest
 from worldpose.errors import InputError
 from worldpose.release import JointTracks
 from worldpose.release.manifest import (
-    ReleasedClip,
-    ReleaseManifest,
     changed_files,
     read_manifest,
     released_files,

@@ -1,0 +1,54 @@
+"""Statistics of data sets, clip by clip."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from data_contracts.release import DataSetStatistics
+from flows.checking import USUAL_FPS
+from worldpose.errors import UsageError
+from worldpose.release.check_reading import clips_in
+from worldpose.release.manifest import read_manifest
+from worldpose.release.statistics import (
+    camera_kind,
+    clip_statistics,
+    data_set_statistics,
+    read_places,
+)
+
+
+def count(folders: Sequence[Path], *, fps: float | None = None) -> DataSetStatistics:
+    """How much there is in one data set, which may lie in several folders.
+
+    One clip is in memory at a time.
+
+    Args:
+        folders: what `worldpose export` wrote, or others of the same layouts.
+        fps: frames in a second; None = the manifests', or 50.
+
+    Raises:
+        InputError: a file cannot be read.
+        UsageError: two folders have the same name and clips.
+    """
+    clips = {}
+    for folder in folders:
+        manifest = read_manifest(folder)
+        rate = fps or (USUAL_FPS if manifest is None else manifest.fps)
+        names = clips_in(folder)
+        cameras = sorted((folder / "cameras").glob("*.npz"))
+        for name in names:
+            own = folder / "cameras" / f"{name}.npz"
+            kind = camera_kind(own)
+            if not own.is_file() and any(file.stem not in names for file in cameras):
+                kind = "S"
+            label = name if len(folders) == 1 else f"{folder.resolve().name}/{name}"
+            if label in clips:
+                raise UsageError(
+                    str(folder),
+                    expected="folders of different names",
+                    found=f"{label} twice",
+                    todo="Name each folder once, or rename one.",
+                )
+            clips[label] = clip_statistics(read_places(folder, name), rate, kind)
+    return data_set_statistics(clips)

@@ -1,0 +1,167 @@
+"""What a method has found in a clip, in one form whatever the method wrote."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17
+from worldpose.body import OPEN_BODY, BodyModel, BodyParameters, fold_keypoints
+from worldpose.cameras import Rigid
+from worldpose.errors import InputError
+from worldpose.release import JointTracks
+
+Floats = NDArray[np.float64]
+World = Literal["shared", "own", "camera"]
+"""In which frame people stand: one for all, one for each person, the camera's of each frame."""
+Shape = Literal["smpl", "open", "other"]
+"""Whose betas a file has: SMPL's, the open body's, or those of SMPL+H, SMPL-X or another body,
+which mean nothing here."""
+Place = Literal["transl", "pelvis", "mid_hip"]
+"""What a place is of: `transl` is added to SMPL's joints; the others are where that point is."""
+
+BODY_ANGLES: Final = 69
+_CHUNK: Final = 4096
+"""Bodies posed at a time: 50 MB."""
+
+
+@dataclass(frozen=True, eq=False)
+class MethodResult:
+    """People of a clip as a method found them."""
+
+    joints: JointTracks
+    """Frames count the pictures from 0; COCO-17 [m]."""
+    world: World
+    boxes: Floats | None = None
+    """(frames, persons, 4) x0 y0 x1 y1 [px] in the picture; None where the file tells nothing."""
+    picture: tuple[float, float] | None = None
+    """Width and height of the picture that the boxes are in [px]; None = that of the video."""
+    notes: Mapping[str, str] = field(default_factory=dict)
+    """What was done beyond reading, for the settings that are recorded with a score."""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """The bodies of one person, one for each of some frames."""
+
+    frames: NDArray[np.int64]
+    """(frames,) pictures from 0, rising."""
+    global_orient: Floats
+    """(frames, 3) [rad]."""
+    body_pose: Floats
+    """(frames, 63 or 69) [rad]; hands that are lacking are flat."""
+    place: Floats
+    """(frames, 3) [m]."""
+    betas: Floats | None = None
+    """(frames, 10 or more), or (10 or more,)."""
+    scale: Floats | None = None
+    """(frames,) by which the body is enlarged about its pelvis; None = 1."""
+
+
+def posed(
+    track: Track, model: BodyModel, shape: Shape, place: Place = "transl"
+) -> tuple[Floats, str]:
+    """Return the joints (frames, 17, 3) [m] of one person, and whose shape the body has.
+
+    Args:
+        track: the bodies.
+        model: the body that is posed.
+        shape: whose betas these are; they are used where the model is that body.
+        place: what the track's place is of.
+
+    Raises:
+        InputError: arrays of other shapes.
+    """
+    count = len(track.frames)
+    pose = np.zeros((count, BODY_ANGLES))
+    pose[:, : track.body_pose.shape[-1]] = track.body_pose
+    betas = np.zeros((count, model.shapes))
+    used = shape == ("open" if model.name == OPEN_BODY else "smpl") and track.betas is not None
+    if used and track.betas is not None:
+        known = min(model.shapes, track.betas.shape[-1])
+        betas[:, :known] = track.betas[..., :known]
+    shift = track.place if place == "transl" else np.zeros((count, 3))
+    names = (*COCO17, "mid_hip")
+    keypoints = fold_keypoints(model, names)
+    points = np.empty((count, len(names), 3))
+    for start in range(0, count, _CHUNK):
+        part = slice(start, start + _CHUNK)
+        points[part] = keypoints(
+            BodyParameters(betas[part], track.global_orient[part], pose[part], shift[part])
+        )
+    joints, pelvis = points[:, :-1], points[:, -1:]
+    if track.scale is not None:
+        joints = pelvis + track.scale[:, None, None] * (joints - pelvis)
+    if place == "pelvis":
+        joints = joints - pelvis + track.place[:, None]
+    elif place == "mid_hip":
+        hips = joints[:, COCO17.index("left_hip")] + joints[:, COCO17.index("right_hip")]
+        joints = joints - 0.5 * hips[:, None] + track.place[:, None]
+    return joints, "the file's betas" if used else f"the mean shape of {model.name}"
+
+
+def gathered(
+    people: Sequence[tuple[int, NDArray[np.int64], Floats]],
+    boxes: Sequence[Floats | None] | None = None,
+) -> tuple[JointTracks, Floats | None]:
+    """Return people with frames of their own as one set, NaN where a person is missing.
+
+    Args:
+        people: id, frames (frames,) and joints (frames, 17, 3) [m] of each.
+        boxes: (frames, 4) [px] of each, in the same frames.
+
+    Raises:
+        InputError: nobody at all.
+    """
+    if not people:
+        raise InputError(
+            "results of a method",
+            expected="at least one person",
+            found="none",
+            todo="Run it again.",
+        )
+    frames = np.unique(np.concatenate([own for _, own, _ in people]))
+    joints = np.full((len(frames), len(people), len(COCO17), 3), np.nan)
+    around = np.full((len(frames), len(people), 4), np.nan)
+    for place, (_, own, points) in enumerate(people):
+        rows = np.searchsorted(frames, own)
+        joints[rows, place] = points
+        if boxes is not None and boxes[place] is not None:
+            around[rows, place] = boxes[place]
+    ids = np.array([person for person, _, _ in people], dtype=np.int64)
+    known = boxes is not None and bool(np.isfinite(around).any())
+    return JointTracks(frames, ids, joints), around if known else None
+
+
+def seen_boxes(joints: Floats, focal: Floats, center: Floats) -> Floats:
+    """Return boxes (frames, 4) x0 y0 x1 y1 [px] around one person's joints in a picture.
+
+    Args:
+        joints: (frames, 17, 3) [m], camera axes; those behind the camera do not count.
+        focal: (2,) or (frames, 2) [px].
+        center: (2,) or (frames, 2) principal point [px].
+    """
+    ahead = joints[..., 2:] > 0.0
+    depth = np.where(ahead, joints[..., 2:], np.nan)
+    focal, center = (np.broadcast_to(v, (len(joints), 2))[:, None] for v in (focal, center))
+    pixels = joints[..., :2] / depth * focal + center
+    return around_points(pixels)
+
+
+def around_points(pixels: Floats) -> Floats:
+    """Return boxes (..., 4) around points (..., n, 2) [px]; NaN without any."""
+    known = np.isfinite(pixels).all(-1, keepdims=True)
+    low = np.where(known, pixels, np.inf).min(-2)
+    high = np.where(known, pixels, -np.inf).max(-2)
+    found = np.concatenate([low, high], axis=-1)
+    return np.where(np.isfinite(found), found, np.nan)
+
+
+def rotation_vectors(matrices: Any) -> Floats:  # noqa: ANN401
+    """Return rotation vectors (..., 3) [rad] of matrices (..., 3, 3), as a file holds them."""
+    array = np.asarray(matrices, dtype=np.float64)
+    return Rigid(array, np.zeros(array.shape[:-1])).rotvec
