@@ -15,14 +15,21 @@ from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
 from data_contracts.cameras import CameraCalibration
 from data_contracts.conventions import CONVENTIONS, Conventions
 from data_contracts.detection import DETECTION
-from data_contracts.evaluation import Evaluation
+from data_contracts.evaluation import Evaluation, MethodScore
 from data_contracts.filtering import FILTERING
 from data_contracts.finetune import NetVersion
 from data_contracts.ingest import INGEST
 from data_contracts.match import MatchSpec, Registration
+from data_contracts.pin import Pin
 from data_contracts.pitch import PitchSpec
 from data_contracts.records import Record
 from data_contracts.refitting import REFITTING
+from data_contracts.release import (
+    BaselineSettings,
+    CheckReport,
+    DataSetStatistics,
+    ReleaseManifest,
+)
 from data_contracts.retriangulation import RETRIANGULATION
 from data_contracts.review import Correction, JournalEntry, ReviewDecision, ReviewRequest
 from data_contracts.run import Project, Reservation, ResultManifest, RunRecord
@@ -47,7 +54,13 @@ RECORDS: dict[str, type[Record]] = {
     "reservation": Reservation,
     "result_manifest": ResultManifest,
     "run": RunRecord,
+    "pin": Pin,
     "evaluation": Evaluation,
+    "method_score": MethodScore,
+    "release_manifest": ReleaseManifest,
+    "check_report": CheckReport,
+    "data_set_statistics": DataSetStatistics,
+    "baseline_settings": BaselineSettings,
     "net_version": NetVersion,
     "conventions": Conventions,
     "layout": GroupLayout,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import logging
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from prefect import Task, flow
@@ -86,12 +87,19 @@ def process_match(
             if open_questions and outlook.is_recorded_by(latest):
                 take_verdict(store, match_id, open_questions)
                 continue
-        record = _run_stages(store, match, stages, settings, policy, iteration)
+        with _shown(store, match_id) if is_deployed() else nullcontext():
+            record = _run_stages(store, match, stages, settings, policy, iteration)
         if record.failed or not (is_deployed() and undecided(record.waiting)):
             break
     if record.failed or record.waiting:
         raise IncompleteRunError(record)
     return record.run_id
+
+
+def _shown(store: Store, match_id: str) -> AbstractContextManager[None]:
+    from flows.operations.artifacts import shown_at_prefect  # late: only deployments show them
+
+    return shown_at_prefect(store, match_id)
 
 
 def _run_stages(

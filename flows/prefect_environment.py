@@ -19,6 +19,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
 
 from worldpose.errors import InputError, WorldposeError
 
@@ -36,6 +38,55 @@ UNLESS_GIVEN = {
     "PREFECT_LOGGING_EXTRA_LOGGERS": "worldpose",
     "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "CRITICAL",
 }
+SERVED = {
+    "PREFECT_FLOWS_HEARTBEAT_FREQUENCY": "30",  # a sign of life; none that is shorter is taken
+    "PREFECT_WORKER_QUERY_SECONDS": "2",
+    "PREFECT_SERVER_METRICS_ENABLED": "true",
+    "PREFECT_SERVER_DATABASE_TIMEOUT": "60",  # SQLite takes one writer at a time
+    "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",
+}
+"""Of processes that serve, unless given."""
+
+
+def served_environment(api: str, home: Path | None) -> dict[str, str]:
+    """The environment of the processes of `worldpose serve`.
+
+    Args:
+        api: address of Prefect's API.
+        home: where a Prefect server of our own keeps its database; None = the server is another's.
+    """
+    port = urlsplit(api).port or 80
+    own = {} if home is None else {"PREFECT_HOME": str(home), "PREFECT_SERVER_API_PORT": str(port)}
+    given = {
+        name: os.environ.get(name, value) for name, value in {**UNLESS_GIVEN, **SERVED}.items()
+    }
+    proxies = {name: os.environ.get(name) for name in ("NO_PROXY", "no_proxy")}
+    no_proxy = {name: ",".join(filter(None, [had, LOOPBACK])) for name, had in proxies.items()}
+    pages = {"PREFECT_API_URL": api, "PREFECT_UI_API_URL": api}
+    return {**os.environ, **ALWAYS, **given, **no_proxy, **own, **pages}
+
+
+def served_cluster() -> dict[str, Any]:
+    """What a deployment's `DaskTaskRunner` is made with: `worldpose serve` sets it for its worker.
+
+    WORLDPOSE_DASK is the address of a running scheduler; without it a run makes WORLDPOSE_WORKERS
+    worker processes on its machine, one a core by default.
+    """
+    address = os.environ.get("WORLDPOSE_DASK")
+    if address:
+        return {"address": address}
+    return {"cluster_kwargs": local_cluster(int(os.environ.get("WORLDPOSE_WORKERS") or 0))}
+
+
+def local_cluster(workers: int) -> dict[str, Any]:
+    """How Dask makes so many worker processes on this machine; 0 = one a core."""
+    return {
+        "n_workers": workers or os.cpu_count() or 1,
+        "threads_per_worker": 1,
+        "memory_limit": 0,  # a limit of one worker's share would kill a long clip's only task
+        "dashboard_address": "127.0.0.1:0",
+        "silence_logs": "CRITICAL",
+    }
 
 
 def has_server() -> bool:

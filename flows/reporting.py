@@ -69,7 +69,7 @@ def write_report(
         ],
         cameras=camera_summaries(run, match.folder.spec),
         camera_pictures=camera_pictures(store, run, match, cameras),
-        tables=[*adjustment_tables(run), *body_tables(run, clips), *broadcast_tables(run)],
+        tables=[*adjustment_tables(run), *body_tables(run, clips), *broadcast_tables(run, match)],
     )
     with whole_file(out) as draft:
         draft.write_text(page, encoding="utf-8")

@@ -10,7 +10,22 @@ import sys
 
 import typer
 
-from flows.cli import body, check, finetune, lineage, matches, project, results, review, run
+from flows.cli import (
+    body,
+    check,
+    finetune,
+    lineage,
+    matches,
+    pins,
+    programme,
+    project,
+    reprocess,
+    results,
+    review,
+    run,
+    serve,
+    statistics,
+)
 from flows.cli.console import errors, line
 from worldpose.errors import UsageError, WorldposeError
 
@@ -22,7 +37,22 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,  # help names units in brackets
 )
-for module in (project, matches, run, review, lineage, results, check, finetune, body):
+for module in (
+    project,
+    matches,
+    programme,
+    run,
+    reprocess,
+    serve,
+    review,
+    lineage,
+    pins,
+    results,
+    check,
+    statistics,
+    finetune,
+    body,
+):
     module.add_to(app)
 
 

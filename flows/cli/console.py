@@ -31,7 +31,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object 
 MatchArgument = Annotated[
     str, typer.Argument(metavar="MATCH", help="A match folder, or the id of a registered match.")
 ]
-RunOption = Annotated[str, typer.Option("--run", help="A run's number; latest by default.")]
+RunOption = Annotated[str, typer.Option("--run", help="A run's number or name; latest by default.")]
 
 DEFAULT_PROJECT = "worldpose-data"
 

@@ -24,7 +24,7 @@ from flows.registering import find_registration, open_match
 from flows.review import still_waiting
 from flows.run_record import latest_run
 from worldpose.errors import WorldposeError
-from worldpose.store import Store, collect, plan_gc, repair
+from worldpose.store import Store, collect, list_pins, plan_gc, repair
 from worldpose.store import verify as verify_store
 
 
@@ -89,6 +89,8 @@ def status(
     for row in rows:
         if row["waiting"]:
             line(f"{row['match']}: what waits: worldpose review list {row['match']}")
+        for name, run_id in row["pins"].items():
+            line(f"{row['match']}: run {run_id} is pinned as {name}")
         if row["settings"]:
             line(f"{row['match']}: judged with the settings of run {row['run']}: {row['settings']}")
 
@@ -121,6 +123,7 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
         "waiting": [unit.unit for unit in waiting],
         "settings": {} if latest is None else latest.overrides,
         "unfinished_runs": [run.run_id for run in store.unfinished_runs(match_id)],
+        "pins": {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)},
         "problem": problem,
     }
 
@@ -178,7 +181,7 @@ def gc(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """List, and with --delete remove, what no run reaches.
+    """List, and with --delete remove, what no run reaches; a pinned run is never forgotten.
 
     Example: worldpose gc --keep-last 3 --delete
     """

@@ -33,8 +33,8 @@ def export(
         list[str],
         typer.Option(
             "--format",
-            help="joints, coco, worldpose, trc, bvh, challenge or challenge-2025 "
-            "(docs/formats.md); more than one may be given.",
+            help="joints, coco, worldpose, trc, bvh, challenge, challenge-2025, tracks, "
+            "slahmr-cameras or rerun (docs/formats.md); more than one may be given.",
         ),
     ],
     out: Annotated[Path, typer.Option("--out", help="Folder to write into.")],
@@ -67,13 +67,14 @@ def export(
             found="one of them",
             todo="A release says under which licence its data may be used.",
         )
-    registration = find_registration(Store.open(project), match)
+    store = Store.open(project)
+    registration = find_registration(store, match)
     origin = Origin(open_run(project, registration.spec.match_id, run), registration, stage)
     if release is None or licence is None:
         written = export_formats(origin, forms, out)
     else:
         text = licence.read_text(encoding="utf-8").strip()
-        written = write_release(origin, forms, out, release, text)
+        written = write_release(store, origin, forms, out, release, text)
     if as_json:
         files = [str(path) for path in written]
         print_json({"match": registration.spec.match_id, "files": files})
@@ -93,7 +94,8 @@ def evaluate(
     reference: Annotated[
         str | None,
         typer.Option(
-            "--reference", help="A joints file, or a folder with joints.npz, cameras/ or both."
+            "--reference",
+            help="A joints file, a folder with joints.npz, cameras/ or both, or a .c3d or .trc.",
         ),
     ] = None,
     run: RunOption = "latest",
@@ -120,6 +122,30 @@ def evaluate(
             help="Simulate so many penalty-box trials and print the paper's ablation instead.",
         ),
     ] = 0,
+    method: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--method",
+            metavar="NAME=PATH",
+            help="Score another method's result (docs/methods.md) instead of --prediction; may be "
+            "given more than once for one table.",
+        ),
+    ] = None,
+    body: Annotated[
+        str | None,
+        typer.Option("--body", help="Body that methods' poses are put on; the open body."),
+    ] = None,
+    markers: Annotated[
+        Path | None,
+        typer.Option("--markers", help="YAML: which markers make which joints of a reference."),
+    ] = None,
+    first_frame: Annotated[
+        int | None,
+        typer.Option("--first-frame", help="Match frame of methods' first picture."),
+    ] = None,
+    table: Annotated[
+        str, typer.Option("--table", help="Table of methods: text, csv or latex.")
+    ] = "text",
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -130,22 +156,47 @@ def evaluate(
     if ablation:
         print_ablation(ablation, as_json=as_json)
         return
+    if method and reference is not None and prediction is None:
+        from flows.cli.methods import print_methods
+        from flows.methods import score_methods
+
+        found = score_methods(
+            method, reference, match_in=match_in, body=body, first_frame=first_frame, fps=fps
+        )
+        print_methods(found, table, as_json=as_json)
+        return
     if prediction is None or reference is None:
         raise UsageError(
             "worldpose evaluate",
-            expected="--prediction and --reference",
-            found="one of them or none",
+            expected="--prediction or --method, and --reference",
+            found="others",
             todo="Name what is scored and the truth, or ask for --ablation 10.",
         )
     from flows.evaluation import score
     from worldpose.release.meanings import score_rows
 
     scores = score(
-        prediction, reference, project, run_id=run, stage=stage, fps=fps, match_in=match_in
+        prediction,
+        reference,
+        project,
+        run_id=run,
+        stage=stage,
+        fps=fps,
+        match_in=match_in,
+        marker_map=markers,
     )
+    laid = scores.laid
     if as_json:
-        print_json(scores.evaluation.model_dump(exclude_none=True))
+        found = scores.evaluation.model_dump(exclude_none=True)
+        if laid is not None:
+            found |= {"reference_offset_s": laid.offset, "reference_residual_m": laid.residual}
+        print_json(found)
         return
+    if laid is not None:
+        line(
+            f"the reference's clock is {laid.offset:.4f} s at match frame 0; laid over rigidly, "
+            f"joints are {1000.0 * laid.residual:.1f} mm apart (root mean square)"
+        )
     rows = [
         (name, value, meaning)
         for name, _, value, meaning in score_rows(scores.evaluation)

@@ -110,12 +110,12 @@ def run(
                 "failures": [failure.model_dump() for failure in record.failed],
                 "gates": record.gates,
                 "reviews": [unit.model_dump() for unit in record.waiting],
-                **({} if passes is None else iterations_as_json(passes)),
+                **({} if passes is None else iterations_as_json(store, passes)),
             }
         )
     else:
         if passes is not None:
-            print_iterations(passes)
+            print_iterations(store, passes)
         _print(record, store.url, seconds)
     raise typer.Exit(EXIT_CODES[record.state])
 

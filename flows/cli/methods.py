@@ -1,0 +1,33 @@
+"""The table of other methods, printed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from data_contracts.evaluation import MethodScore
+from flows.cli.console import line, print_json, print_table
+from worldpose.errors import UsageError
+from worldpose.evaluation.method_table import COLUMNS, table_csv, table_latex, table_rows
+
+FORMS = ("text", "csv", "latex")
+
+
+def print_methods(scores: Sequence[MethodScore], form: str, *, as_json: bool) -> None:
+    """Prints scores of methods as text, CSV or LaTeX, or all that is known of them as JSON.
+
+    Raises:
+        UsageError: another form.
+    """
+    if form not in FORMS:
+        raise UsageError(
+            f"--table {form}", expected=", ".join(FORMS), found=repr(form), todo="Choose one."
+        )
+    if as_json:
+        rows = [score.model_dump(mode="json", exclude_none=True) for score in scores]
+        print_json({"methods": rows, "table": [list(row) for row in table_rows(scores)]})
+    elif form == "text":
+        # Brackets would be taken for markup.
+        titles = (f">{title.replace('[', '').replace(']', '')}" for title in COLUMNS.values())
+        print_table("", ("method", *titles), table_rows(scores))
+    else:
+        line((table_csv if form == "csv" else table_latex)(scores).rstrip())

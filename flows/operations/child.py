@@ -1,0 +1,90 @@
+"""One process of `worldpose serve`: `python -m flows.operations.child PART PLAN`.
+
+It ends with its standard input, and with it all that it started: killed in any way, the service
+leaves nothing behind.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import threading
+
+from flows.operations.plan import ServePlan
+
+
+def main() -> None:
+    """Do one part's work until standard input is closed."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    part, plan = sys.argv[1], ServePlan.model_validate_json(sys.argv[2])
+    logging.basicConfig(format="%(asctime)s  %(message)s", level=logging.WARNING)
+    for name in ("worldpose.operations", "worldpose.pages"):
+        logging.getLogger(name).setLevel(logging.INFO)
+    PARTS[part](plan)
+
+
+def prefect(plan: ServePlan) -> None:
+    """Prefect's server: its API, its services and its pages."""
+    from urllib.parse import urlsplit
+
+    import uvicorn
+    from prefect.server.api.server import create_app
+
+    address = urlsplit(plan.prefect)
+    uvicorn.run(
+        create_app(final=True),
+        host=address.hostname or "127.0.0.1",
+        port=address.port or 80,
+        log_level="error",
+        timeout_graceful_shutdown=2,
+    )
+
+
+def worker(plan: ServePlan) -> None:
+    """Deployments, and what runs them."""
+    import anyio
+
+    from flows.operations.deployments import install, work
+    from flows.operations.recovery import begin_again
+
+    async def serve() -> None:
+        await install(plan)
+        await begin_again(plan, at_start=True)
+        await work(plan)
+
+    anyio.run(serve)
+
+
+def watch(plan: ServePlan) -> None:
+    """The inbox, alerts, lost runs, and figures for Prometheus."""
+    from flows.operations.watching import watch as watch_all
+
+    watch_all(plan)
+
+
+def pages(plan: ServePlan) -> None:
+    """The review pages and the status page."""
+    from flows.operations.pages import serve_pages
+
+    serve_pages(plan)
+
+
+PARTS = {"prefect": prefect, "worker": worker, "watch": watch, "pages": pages}
+"""In the order in which they start."""
+
+
+def _end_with_parent() -> None:
+    sys.stdin.buffer.read()
+    import psutil
+
+    for process in psutil.Process().children(recursive=True):
+        try:
+            process.kill()
+        except psutil.NoSuchProcess:
+            continue
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

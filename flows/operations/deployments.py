@@ -1,0 +1,163 @@
+"""What the Prefect server is told: deployments, their queues and limits."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import timedelta
+from typing import Any, Final
+
+from prefect import Flow
+from prefect.client.orchestration import PrefectClient, get_client
+from prefect.client.schemas.actions import WorkPoolCreate, WorkPoolUpdate
+from prefect.exceptions import ObjectNotFound
+from prefect.schedules import Interval, Schedule
+from prefect.workers.process import ProcessWorker
+
+from flows.operations.layout import PRIORITIES
+from flows.operations.plan import ServePlan
+from worldpose.errors import InputError
+
+
+def _of_project(plan: ServePlan) -> dict[str, Any]:
+    return {"project": plan.project}
+
+
+@dataclass(frozen=True)
+class Deployed:
+    """One flow that the server offers.
+
+    Attributes:
+        flow: its name at the server, and in `flows.operations.deployed` unless it lies elsewhere.
+        about: shown with it.
+        queue: where its runs wait by default; None = in the pool of arrivals.
+        parameters: those that the plan decides.
+        schedule: when it runs by itself.
+        module: where the flow lies.
+    """
+
+    flow: str
+    about: str
+    queue: str | None
+    parameters: Callable[[ServePlan], dict[str, Any]] = field(default=_of_project)
+    schedule: Callable[[ServePlan], Schedule] | None = None
+    module: str = "flows.operations.deployed"
+
+
+DEPLOYED: Final = (
+    Deployed(
+        "match",
+        "Process a match; waits for people where a gate says so.",
+        "normal",
+        lambda plan: {"project": plan.project, "settings": {}},
+    ),
+    Deployed(
+        "ingest",
+        "Take in the matches that have arrived in the inbox.",
+        None,
+        lambda plan: {"plan": plan.model_dump(mode="json")},
+        lambda plan: Interval(timedelta(minutes=plan.sweep_minutes)),
+    ),
+    Deployed(
+        "reprocess",
+        "Make every match current that an edit has touched.",
+        "background",
+        lambda plan: {"project": plan.project, "dask": plan.dask, "workers": plan.workers},
+        module="flows.reprocess",
+    ),
+    Deployed("finetune", "Train the embedded nets on reviewed labels.", "background"),
+)
+"""Their names are also `flows.operations.plan.FLOWS`."""
+
+
+def pools(plan: ServePlan) -> tuple[str, str]:
+    """Names of the pool of matches and of that of arrivals."""
+    return plan.name, f"{plan.name}-arrivals"
+
+
+async def install(plan: ServePlan) -> None:
+    """Tell the server of all there is; done again it changes only what is different.
+
+    Raises:
+        InputError: another project has deployments of this name at the server.
+    """
+    async with get_client() as client:
+        await _refuse_other_project(client, plan)
+        matches, arrivals = pools(plan)
+        await _pool(client, matches, plan.at_once, "Matches, urgent ones first")
+        await _pool(client, arrivals, 1, "What arrives, while matches run")
+        for rank, queue in enumerate(PRIORITIES, 1):
+            await _queue(client, matches, queue, rank)
+    for deployed in DEPLOYED:
+        await _deploy(plan, deployed)
+
+
+async def work(plan: ServePlan) -> None:
+    """Run what is due, until this process ends."""
+    import anyio
+
+    matches, arrivals = pools(plan)
+    async with anyio.create_task_group() as group:
+        for pool in (matches, arrivals):
+            worker = ProcessWorker(pool, name=f"{pool} on this machine", limit=None)
+            group.start_soon(worker.start, False, False, lambda text: None)
+
+
+async def _deploy(plan: ServePlan, deployed: Deployed) -> None:
+    flow: Flow[..., Any] = getattr(importlib.import_module(deployed.module), deployed.flow)
+    matches, arrivals = pools(plan)
+    deployment = await flow.ato_deployment(
+        name=plan.name,
+        description=deployed.about,
+        parameters=deployed.parameters(plan),
+        schedule=None if deployed.schedule is None else deployed.schedule(plan),
+        work_pool_name=arrivals if deployed.queue is None else matches,
+        work_queue_name=deployed.queue,
+        enforce_parameter_schema=False,
+    )
+    # A module's name is found wherever worldpose is installed.
+    deployment.entrypoint = f"{deployed.module}.{deployed.flow}"
+    await deployment.aapply()
+
+
+async def _refuse_other_project(client: PrefectClient, plan: ServePlan) -> None:
+    try:
+        there = await client.read_deployment_by_name(plan.match_deployment)
+    except ObjectNotFound:
+        return
+    project = there.parameters.get("project")
+    if project != plan.project:
+        raise InputError(
+            f"deployment {plan.match_deployment} at {plan.prefect}",
+            expected=f"that of project {plan.project}",
+            found=f"that of {project}",
+            todo="Give this project's deployments another name with --name.",
+        )
+
+
+async def _pool(client: PrefectClient, name: str, limit: int, about: str) -> None:
+    try:
+        await client.read_work_pool(name)
+    except ObjectNotFound:
+        template = ProcessWorker.get_default_base_job_template()
+        await client.create_work_pool(
+            WorkPoolCreate(
+                name=name,
+                type=ProcessWorker.type,
+                base_job_template=template,
+                concurrency_limit=limit,
+                description=about,
+            )
+        )
+    else:
+        await client.update_work_pool(name, WorkPoolUpdate(concurrency_limit=limit))
+
+
+async def _queue(client: PrefectClient, pool: str, name: str, rank: int) -> None:
+    try:
+        queue = await client.read_work_queue_by_name(name, pool)
+    except ObjectNotFound:
+        await client.create_work_queue(name, work_pool_name=pool, priority=rank)
+    else:
+        await client.update_work_queue(queue.id, priority=rank)

@@ -1,0 +1,176 @@
+"""A project at a glance: matches by stages, with times, figures, and what waits or failed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Literal
+
+from data_contracts.review import ReviewRecord, ReviewRequest
+from data_contracts.run import ResultManifest, RunRecord
+from flows.method import GATES, METHOD
+from flows.run_record import latest_run
+from worldpose.errors import WorldposeError
+from worldpose.review import decision_on, read_journal, requests_by_id
+from worldpose.store import Store
+
+UnitState = Literal["done", "waiting", "failed", "blocked"]
+
+BODIES = "body_fitting"
+"""The stage whose bodies are the poses that a project makes."""
+
+
+@dataclass(frozen=True)
+class UnitGlance:
+    """One unit of a match's latest run.
+
+    Attributes:
+        unit: its name within the stage: a camera, a clip.
+        state: done; waiting for a person; failed; blocked by one that is not done.
+        seconds: how long it took to compute [s]; None where there is no result.
+        figures: its quality figures.
+        objections: figures beyond the gate's limits that nobody has approved.
+        waiting_since: when a person was asked; None where nobody is waited for.
+        why: what it failed of or waits for.
+    """
+
+    unit: str
+    state: UnitState
+    seconds: float | None = None
+    figures: Mapping[str, float] = field(default_factory=dict)
+    objections: tuple[str, ...] = ()
+    waiting_since: datetime | None = None
+    why: str = ""
+
+
+@dataclass(frozen=True)
+class MatchGlance:
+    """One match.
+
+    Attributes:
+        match_id: its id.
+        latest: its latest finished run.
+        at_work_since: when the run that has begun and not ended did begin.
+        stages: stage to its units, in the order of the method.
+        problem: why nothing can be said of it.
+    """
+
+    match_id: str
+    latest: RunRecord | None = None
+    at_work_since: datetime | None = None
+    stages: Mapping[str, tuple[UnitGlance, ...]] = field(default_factory=dict)
+    problem: str = ""
+
+    @property
+    def state(self) -> str:
+        """The latest run's state, or what comes before it."""
+        if self.problem:
+            return "unreadable"
+        if self.at_work_since is not None:
+            return "at work"
+        return "not run" if self.latest is None else self.latest.state
+
+    @property
+    def units(self) -> Iterable[tuple[str, UnitGlance]]:
+        """All units with their stage."""
+        return ((stage, unit) for stage, units in self.stages.items() for unit in units)
+
+
+class Overview:
+    """Looks at a project again and again; what never changes is read once."""
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        self._manifests: dict[tuple[str, str, str], ResultManifest] = {}
+        self._poses: dict[tuple[str, str], tuple[datetime, float]] = {}
+
+    def look(self) -> list[MatchGlance]:
+        """Every match as it is now; one that cannot be read hides no other."""
+        glances = []
+        for match_id in self.store.matches():
+            try:
+                glances.append(self._match(match_id))
+            except WorldposeError as error:
+                glances.append(MatchGlance(match_id, problem=str(error)))
+        return glances
+
+    def poses(self) -> list[tuple[datetime, float]]:
+        """When each run of any match ended, and how many bodies it fitted."""
+        found = {}
+        for match_id in self.store.matches():
+            for run_id in self.store.runs(match_id):
+                key = (match_id, run_id)
+                found[key] = self._poses.get(key) or _poses_of(self.store.run(match_id, run_id))
+        self._poses = found
+        return list(found.values())
+
+    def _match(self, match_id: str) -> MatchGlance:
+        latest = latest_run(self.store, match_id)
+        begun = self.store.unfinished_runs(match_id)
+        last = "" if latest is None else latest.run_id
+        at_work = [each.started_at for each in begun if each.run_id > last]
+        stages = {} if latest is None else self._stages(latest)
+        return MatchGlance(match_id, latest, at_work[-1] if at_work else None, stages)
+
+    def _stages(self, run: RunRecord) -> dict[str, tuple[UnitGlance, ...]]:
+        records = tuple(read_journal(self.store, run.match_id).records)
+        asked = requests_by_id(records)
+        units: dict[str, list[UnitGlance]] = {}
+        for name, glance in (
+            *((name, self._result(run, name, records, asked)) for name in sorted(run.results)),
+            *((each.unit, _failed(each.unit, each.message)) for each in run.failed),
+            *((name, UnitGlance(_unit(name), "blocked")) for name in run.blocked),
+        ):
+            units.setdefault(name.partition("/")[0], []).append(glance)
+        return {
+            stage.name: tuple(sorted(units[stage.name], key=lambda unit: unit.unit))
+            for stage in METHOD
+            if stage.name in units
+        }
+
+    def _result(
+        self,
+        run: RunRecord,
+        name: str,
+        records: tuple[ReviewRecord, ...],
+        asked: Mapping[str, ReviewRequest],
+    ) -> UnitGlance:
+        manifest = self._manifest(run.match_id, name, run.results[name])
+        decision = decision_on(records, name, manifest.content)
+        is_approved = decision is not None and decision.verdict == "approve"
+        gate = {each.stage: each for each in GATES}.get(name.partition("/")[0])
+        objections = () if gate is None or is_approved else gate.objections(manifest.figures)
+        waits = next((each for each in run.waiting if each.unit == name), None)
+        known = (manifest.seconds, manifest.figures, objections)
+        if waits is None or is_approved:
+            return UnitGlance(_unit(name), "done", *known)
+        request = asked.get(waits.request)
+        since = run.finished_at if request is None else request.created_at
+        return UnitGlance(_unit(name), "waiting", *known, since, "; ".join(waits.reasons))
+
+    def _manifest(self, match_id: str, name: str, key: str) -> ResultManifest:
+        stage, _, unit = name.partition("/")
+        known = self._manifests.get((match_id, name, key))
+        if known is None:
+            known = self.store.manifest(match_id, stage, unit, key)
+            self._manifests[match_id, name, key] = known
+        return known
+
+
+def age(since: datetime | None) -> float:
+    """How long ago that was [s]; never negative, whatever the clock did since."""
+    return 0.0 if since is None else max(0.0, (datetime.now(UTC) - since).total_seconds())
+
+
+def _failed(name: str, message: str) -> UnitGlance:
+    return UnitGlance(_unit(name), "failed", why=message)
+
+
+def _unit(name: str) -> str:
+    return name.partition("/")[2]
+
+
+def _poses_of(run: RunRecord) -> tuple[datetime, float]:
+    fitted = [name for name in run.executed if name.partition("/")[0] == BODIES]
+    return run.finished_at, sum(run.figures.get(name, {}).get("bodies", 0.0) for name in fitted)

@@ -1,0 +1,23 @@
+"""The pages of a served project: those of review, and its status."""
+
+from __future__ import annotations
+
+import os
+
+from flows.operations.plan import ServePlan
+from flows.pages.access import access_for
+from flows.pages.serving import serve
+
+
+def serve_pages(plan: ServePlan) -> None:
+    """Serve until this process ends."""
+    access = access_for(
+        plan.host,
+        token=os.environ["WORLDPOSE_REVIEW_TOKEN"],
+        names=plan.names,
+        secure=plan.certificate is not None,
+    )
+    tls = None
+    if plan.certificate is not None and plan.key is not None:
+        tls = (plan.certificate, plan.key)
+    serve(plan.project, access, host=plan.host, port=plan.pages_port, tls=tls)

@@ -1,0 +1,272 @@
+"""Serving a project: processes that start in order, begin again when they end, and end together."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from types import FrameType
+from typing import Final
+
+from data_contracts.operations import Service, Serving
+from flows.operations.health import at_prefect
+from flows.operations.layout import PRIORITIES
+from flows.operations.plan import ServePlan
+from flows.prefect_environment import served_environment
+from worldpose.errors import UsageError, WorldposeError
+from worldpose.store import Store
+
+LONGEST_PAUSE: Final = 60.0
+"""Between two beginnings of a process that keeps ending [s]."""
+STEADY_SECONDS: Final = 120.0
+"""A process that worked for so long begins again at once."""
+BEGIN_SECONDS: Final = 300.0
+"""What a process may take to begin: the first start makes a database, and machines are busy [s]."""
+END_SECONDS: Final = 15.0
+"""What a process may take to end before it is killed."""
+LOG_BYTES: Final = 10_000_000
+"""A longer log is set aside as `.1` when its process begins."""
+
+Tell = Callable[[str], None]
+
+
+@dataclass
+class _Part:
+    name: str
+    address: str | None
+    process: subprocess.Popen[bytes] | None = None
+    began: float = 0.0
+    pause: float = 0.0
+    due: float = 0.0
+
+
+@dataclass
+class _Supervisor:
+    """Keeps the parts at work.
+
+    Attributes:
+        plan: what is served.
+        token: what people log in to the pages with.
+        tell: takes lines for whoever started this.
+    """
+
+    plan: ServePlan
+    token: str
+    tell: Tell
+    parts: list[_Part] = field(default_factory=list)
+
+    def start(self, name: str, address: str | None = None) -> _Part:
+        part = _Part(name, address)
+        self.parts.append(part)
+        self._begin(part)
+        return part
+
+    def look(self) -> None:
+        """Begin again what has ended."""
+        now = time.monotonic()
+        for part in self.parts:
+            if part.process is not None and part.process.poll() is not None:
+                code = part.process.returncode
+                is_steady = now - part.began > STEADY_SECONDS
+                part.pause = 0.0 if is_steady else min(2.0 * part.pause + 1.0, LONGEST_PAUSE)
+                part.due, part.process = now + part.pause, None
+                log = self.plan.state_folder.logs / f"{part.name}.log"
+                self.tell(
+                    f"{part.name} ended ({code}), see {log}; it begins again in {part.pause:.0f} s"
+                )
+            elif part.process is None and now >= part.due:
+                self._begin(part)
+                self.write()
+
+    def write(self) -> None:
+        """Say in the state folder what is served."""
+        plan = self.plan
+        services = {
+            part.name: Service(pid=part.process.pid, address=part.address)
+            for part in self.parts
+            if part.process is not None
+        }
+        services["serve"] = Service(pid=os.getpid())
+        plan.state_folder.write_serving(
+            Serving(
+                project=plan.project,
+                inbox=str(plan.inbox),
+                name=plan.name,
+                prefect=plan.prefect,
+                owns_prefect=plan.owns_prefect,
+                services=services,
+                started_at=datetime.now(UTC),
+            )
+        )
+
+    def end(self) -> None:
+        """End everything, last first: what runs ends before the server that it reports to."""
+        for part in reversed(self.parts):
+            process, part.process = part.process, None
+            if process is None:
+                continue
+            if process.stdin is not None:
+                process.stdin.close()
+            try:
+                process.wait(END_SECONDS)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def _begin(self, part: _Part) -> None:
+        log = self.plan.state_folder.logs / f"{part.name}.log"
+        log.parent.mkdir(parents=True, exist_ok=True)
+        if log.exists() and log.stat().st_size > LOG_BYTES:
+            log.replace(log.with_suffix(".log.1"))
+        secrets = {"WORLDPOSE_REVIEW_TOKEN": self.token} if part.name == "pages" else {}
+        with log.open("ab") as output:
+            part.process = subprocess.Popen(
+                [
+                    *(sys.executable, "-m", "flows.operations.child"),
+                    *(part.name, self.plan.model_dump_json()),
+                ],
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=_environment(self.plan) | secrets,
+                start_new_session=True,  # Ctrl-C is for this process, which then ends its parts
+            )
+        part.began = time.monotonic()
+
+
+def serve(plan: ServePlan, token: str, ready: Callable[[], None], tell: Tell) -> None:
+    """Serve a project until SIGINT or SIGTERM.
+
+    Args:
+        plan: what is served, and how.
+        token: what people log in to the pages with.
+        ready: called when everything answers.
+        tell: takes lines for whoever started this.
+
+    Raises:
+        UsageError: the project is served already, or a port is taken.
+        WorldposeError: a part does not answer in time.
+    """
+    Store.create(plan.project)
+    for priority in PRIORITIES:
+        (plan.inbox / ("" if priority == "normal" else priority)).mkdir(parents=True, exist_ok=True)
+    state = plan.state_folder
+    with state.only_one("serve", wait=False) as is_alone:
+        if not is_alone:
+            raise UsageError(
+                f"worldpose serve --project {plan.project}",
+                expected="nothing that serves this project yet",
+                found=f"another process; see {state.serving}",
+                todo="See how it is with --check, or end it first.",
+            )
+        with _until_told() as told:
+            supervisor = _Supervisor(plan, token, tell)
+            try:
+                _bring_up(supervisor, told)
+                if not told.is_set():
+                    ready()
+                while not told.wait(0.5):
+                    supervisor.look()
+            finally:
+                supervisor.end()
+                state.serving.unlink(missing_ok=True)
+
+
+def answers(address: str) -> bool:
+    """Does a server of ours answer at `address` within seconds."""
+    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    try:
+        with opener.open(address, timeout=5) as answer:
+            return bool(answer.status == 200)
+    except (OSError, ValueError):
+        return False
+
+
+def health_addresses(plan: ServePlan) -> Mapping[str, str]:
+    """Part to the address at which it says that it is well."""
+    local = "127.0.0.1" if plan.host in ("0.0.0.0", "::") else plan.host
+    return {
+        "prefect": f"{plan.prefect}/health",
+        "pages": f"http://{local}:{plan.pages_port}/api/health",
+        "watch": f"http://{local}:{plan.metrics_port}/health",
+    }
+
+
+def _bring_up(supervisor: _Supervisor, told: threading.Event) -> None:
+    plan = supervisor.plan
+    addresses = health_addresses(plan)
+    if plan.owns_prefect:
+        part = supervisor.start("prefect", plan.prefect)
+        _wait_for(supervisor, part, lambda: answers(addresses["prefect"]), told)
+    elif not answers(addresses["prefect"]):
+        raise UsageError(
+            f"PREFECT_API_URL={plan.prefect}",
+            expected="a running Prefect server",
+            found="no answer",
+            todo="Start it, or unset PREFECT_API_URL to have one started.",
+        )
+    pages = supervisor.start("pages", plan.pages)
+    worker = supervisor.start("worker")
+    watch = supervisor.start("watch", f"http://{plan.host}:{plan.metrics_port}/metrics")
+    supervisor.write()
+    if plan.certificate is None:
+        _wait_for(supervisor, pages, lambda: answers(addresses["pages"]), told)
+    _wait_for(supervisor, watch, lambda: answers(addresses["watch"]), told)
+    serving = plan.state_folder.read_serving()
+    if serving is not None:
+        _wait_for(supervisor, worker, lambda: _is_at_work(serving), told)
+
+
+def _is_at_work(serving: Serving) -> bool:
+    """Whether runs are taken; that one of them hangs is another matter."""
+    return all(finding.is_well for finding in at_prefect(serving) if finding.part != "runs")
+
+
+def _wait_for(
+    supervisor: _Supervisor, part: _Part, is_well: Callable[[], bool], told: threading.Event
+) -> None:
+    deadline = time.monotonic() + BEGIN_SECONDS
+    while not told.wait(0.2):
+        process = part.process
+        if process is None or process.poll() is not None or time.monotonic() > deadline:
+            log = supervisor.plan.state_folder.logs / f"{part.name}.log"
+            raise WorldposeError(
+                f"{part.name} did not start. It said:\n{log.read_text(errors='replace')[-2000:]}"
+            )
+        if is_well():
+            return
+
+
+def _environment(plan: ServePlan) -> dict[str, str]:
+    home = plan.state / "prefect" if plan.owns_prefect else None
+    values = served_environment(plan.prefect, home)
+    workers = plan.workers or max(1, (os.cpu_count() or 1) // plan.at_once)
+    values["WORLDPOSE_STATE"] = str(plan.state)
+    values["WORLDPOSE_WORKERS"] = str(workers)
+    if plan.dask is not None:
+        values["WORLDPOSE_DASK"] = plan.dask
+    return values
+
+
+@contextmanager
+def _until_told() -> Iterator[threading.Event]:
+    """An event that is set by SIGINT and SIGTERM inside the block."""
+    told = threading.Event()
+
+    def end(number: int, frame: FrameType | None) -> None:
+        told.set()
+
+    before = {each: signal.signal(each, end) for each in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield told
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

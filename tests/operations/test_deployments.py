@@ -1,0 +1,144 @@
+"""What is installed at a Prefect server, and which runs begin again there."""
+
+import asyncio
+import importlib
+
+import pytest
+from prefect import Flow
+from prefect.client.orchestration import get_client
+from prefect.client.schemas.objects import StateType
+from prefect.settings import PREFECT_API_URL, temporary_settings
+from prefect.states import Cancelling, Completed, Crashed, Running, Suspended
+
+from flows.operations import recovery
+from flows.operations.deployments import DEPLOYED, install
+from flows.operations.plan import FLOWS, ServePlan
+from flows.operations.recovery import begin_again
+from flows.operations.watching import failed_runs
+from worldpose.errors import InputError
+
+
+@pytest.fixture(scope="module")
+def plan(server, tmp_path_factory):
+    """A plan whose deployments are installed."""
+    folder = tmp_path_factory.mktemp("served")
+    plan = ServePlan(
+        project=str(folder), inbox=folder, state=folder, prefect=server, name="ops", at_once=2
+    )
+    # Prefect has read its settings when this file imported it, before the server was there.
+    with temporary_settings({PREFECT_API_URL: server}):
+        asyncio.run(install(plan))
+        yield plan
+
+
+def test_deployments_have_queues_by_priority_and_limits(plan):
+    async def look():
+        async with get_client() as client:
+            pools = {name: await client.read_work_pool(name) for name in ("ops", "ops-arrivals")}
+            queues = await client.match_work_queues([""], "ops")
+            deployments = {
+                each.flow: await client.read_deployment_by_name(f"{each.flow}/ops")
+                for each in DEPLOYED
+            }
+        return pools, queues, deployments
+
+    assert tuple(each.flow for each in DEPLOYED) == FLOWS
+    pools, queues, deployments = asyncio.run(look())
+    assert {name: pool.concurrency_limit for name, pool in pools.items()} == {
+        "ops": 2,
+        "ops-arrivals": 1,
+    }
+    ranks = {queue.name: queue.priority for queue in queues}
+    assert ranks["urgent"] < ranks["normal"] < ranks["background"]
+    match = deployments["match"]
+    assert (match.work_pool_name, match.work_queue_name) == ("ops", "normal")
+    assert match.parameters == {"project": plan.project, "settings": {}}
+    assert match.entrypoint == "flows.operations.deployed.match"
+    for each in deployments.values():  # what the worker will load
+        module, _, name = each.entrypoint.rpartition(".")
+        assert isinstance(getattr(importlib.import_module(module), name), Flow)
+    ingest = deployments["ingest"]
+    assert ingest.work_pool_name == "ops-arrivals"
+    assert ServePlan.model_validate(ingest.parameters["plan"]) == plan
+    (schedule,) = ingest.schedules
+    assert schedule.schedule.interval.total_seconds() == 900.0
+
+
+def test_installed_again_changes_limits_and_another_project_is_refused(plan):
+    more = plan.model_copy(update={"at_once": 3})
+    asyncio.run(install(more))
+
+    async def limit():
+        async with get_client() as client:
+            return (await client.read_work_pool("ops")).concurrency_limit
+
+    assert asyncio.run(limit()) == 3
+    other = plan.model_copy(update={"project": "/another"})
+    with pytest.raises(InputError, match="--name"):
+        asyncio.run(install(other))
+
+
+def test_killed_runs_begin_again_and_no_others(plan, monkeypatch):
+    dead, alive = 2**22 + 1, 1  # beyond the largest process number; the first process
+
+    async def give_runs():
+        states = {
+            "crashed": (Crashed(), None),
+            "dead": (Running(), dead),
+            "alive": (Running(), alive),
+            "waits": (Suspended(), dead),
+            "done": (Completed(), dead),
+        }
+        async with get_client() as client:
+            deployment = await client.read_deployment_by_name("match/ops")
+            for name, (state, pid) in states.items():
+                run = await client.create_flow_run_from_deployment(deployment.id, name=name)
+                await client.set_flow_run_state(run.id, state, force=True)
+                if pid is not None:
+                    await client.update_flow_run(run.id, infrastructure_pid=str(pid))
+
+    async def states():
+        async with get_client() as client:
+            return {run.name: run.state_name for run in await client.read_flow_runs()}
+
+    asyncio.run(give_runs())
+    assert asyncio.run(begin_again(plan)) == ["crashed"]
+    # A run that has given a sign of life a moment ago is not looked after yet; later it is.
+    monkeypatch.setattr(recovery, "SILENT", recovery.SILENT * 0)
+    assert asyncio.run(begin_again(plan)) == ["dead"]
+    expected = {"crashed": "AwaitingRetry", "dead": "AwaitingRetry", "alive": "Running"}
+    expected |= {"waits": "Suspended", "done": "Completed"}
+    found = asyncio.run(states())
+    assert {name: found[name] for name in expected} == expected
+    # When the service starts, none of its runs is at work; on a server of others they may be.
+    others = plan.model_copy(update={"owns_prefect": False})
+    assert asyncio.run(begin_again(others, at_start=True)) == ["alive"]  # silent there
+    asyncio.run(set_state("alive", Running()))
+    assert asyncio.run(begin_again(plan, at_start=True)) == ["alive"]
+    asyncio.run(set_state("alive", Cancelling()))
+    assert asyncio.run(begin_again(plan, at_start=True)) == []
+    assert asyncio.run(states())["alive"] == "Cancelled"
+
+
+async def set_state(name, state):
+    async with get_client() as client:
+        for run in await client.read_flow_runs():
+            if run.name == name:
+                await client.set_flow_run_state(run.id, state, force=True)
+
+
+def test_a_run_that_keeps_being_killed_is_left_for_a_person(plan, monkeypatch):
+    async def kill_thrice():
+        async with get_client() as client:
+            deployment = await client.read_deployment_by_name("match/ops")
+            run = await client.create_flow_run_from_deployment(deployment.id, name="poison")
+            for _ in range(3):
+                await client.set_flow_run_state(run.id, Running(), force=True)
+                await client.set_flow_run_state(run.id, Crashed(message="killed"), force=True)
+            return await client.read_flow_run(run.id)
+
+    run = asyncio.run(kill_thrice())
+    assert (run.state_type, run.run_count) == (StateType.CRASHED, 3)
+    assert "poison" not in asyncio.run(begin_again(plan))
+    failed = {each.name: each for each in asyncio.run(failed_runs(plan))}
+    assert (failed["poison"].state, failed["poison"].message) == ("crashed", "killed")

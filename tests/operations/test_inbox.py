@@ -1,0 +1,332 @@
+"""A match in the inbox is taken in once, when complete; what can be none is refused and said so."""
+
+import contextlib
+import hashlib
+import os
+import shutil
+import socket
+from multiprocessing import get_context
+
+import pytest
+
+from flows.operations.arrivals import take_in, watch_once
+from flows.operations.inbox import MOST_FILES, RefusalError, entries, fingerprint_of, missing_of
+from flows.operations.layout import StateFolder, state_folder
+from worldpose.errors import UsageError
+from worldpose.store import Store
+
+
+class Desk:
+    """A project, its inbox, and the runs that were begun."""
+
+    def __init__(self, folder):
+        self.inbox = folder / "inbox"
+        self.store = Store.create(folder / "project")
+        self.state = StateFolder(folder / "project" / "operations")
+        self.begun = []
+
+    def look(self, quiet=0.0):
+        return len(watch_once(self.state, self.inbox, quiet))
+
+    def take_in(self, quiet=0.0):
+        return take_in(self.store, self.state, self.inbox, quiet, self.begin)
+
+    def begin(self, match, arrival):
+        self.begun.append((match.match_id, arrival.priority))
+        return f"run-{len(self.begun)}"
+
+    def known(self):
+        return {name: (each.state, each.reason) for name, each in self.state.arrivals().items()}
+
+
+@pytest.fixture
+def desk(drop, tmp_path):
+    return Desk(tmp_path)
+
+
+def content(folder):
+    return {
+        path.relative_to(folder): (path.read_bytes(), path.stat().st_mtime_ns)
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_a_complete_match_is_taken_once_and_stays_where_it_is(desk, drop):
+    folder = drop()
+    before = content(folder)
+    assert desk.look() == 0, "seen for the first time, it may still be arriving"
+    assert desk.look() == 1
+    (taken,) = desk.take_in()
+    assert (taken.state, taken.flow_run) == ("taken", "run-1")
+    assert taken.match_id == "tiny-0-0.2s-3cameras-2players"
+    assert desk.store.matches() == (taken.match_id,)
+    assert desk.begun == [(taken.match_id, "normal")]
+    assert (desk.look(), desk.take_in(), len(desk.begun)) == (0, [], 1)
+    (folder / "notes.txt").write_text("later")  # people may go on working in it
+    assert (desk.look(), desk.look(), desk.take_in()) == (0, 0, [])
+    (folder / "notes.txt").unlink()
+    assert content(folder) == before
+
+
+def test_a_growing_match_waits_until_nothing_has_changed(desk, drop):
+    folder = drop()
+    file = folder / "detections" / "cam01.npz"
+    whole = file.read_bytes()
+    for size in (10, 100, len(whole)):
+        file.write_bytes(whole[:size])
+        assert desk.look() == 0
+        assert desk.known()["small"][0] == "arriving"
+    assert desk.look(quiet=3600.0) == 0
+    assert desk.look() == 1
+
+
+def test_time_that_was_waited_before_a_reboot_does_not_count(desk, drop):
+    drop()
+    desk.look()
+    (before,) = desk.state.arrivals().values()
+    booted_later = before.model_copy(update={"unchanged_since": before.unchanged_since + 1e9})
+    desk.state.write_arrival(booted_later)
+    assert desk.look(quiet=1.0) == 0
+
+
+def test_a_cut_off_match_is_refused_and_taken_when_mended(desk, drop):
+    folder = drop()
+    file = folder / "detections" / "cam01.npz"
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    desk.look()
+    (refused,) = desk.take_in()
+    assert refused.state == "refused"
+    assert "cam01.npz" in refused.reason
+    assert (desk.look(), desk.look(), desk.store.matches()) == (0, 0, ())
+    file.write_bytes(whole)
+    assert (desk.look(), desk.look()) == (0, 1)
+    assert [each.state for each in desk.take_in()] == ["taken"]
+
+
+def test_a_match_without_its_description_is_incomplete(desk, drop):
+    folder = drop()
+    description = (folder / "match.yaml").read_bytes()
+    (folder / "match.yaml").unlink()
+    desk.look()
+    desk.take_in()
+    assert desk.known()["small"] == ("incomplete", "match.yaml is not there")
+    (folder / "match.yaml").write_bytes(description)
+    desk.look()
+    assert [each.state for each in desk.take_in()] == ["taken"]
+
+
+def test_a_list_of_sums_holds_a_stalled_copy_back(desk, drop):
+    folder = drop()
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    lines = [
+        f"{hashlib.sha256(file.read_bytes()).hexdigest()}  ./{file.relative_to(folder)}"
+        for file in files
+    ]
+    (folder / "SHA256SUMS").write_text("\n".join(lines) + "\n")
+    late = folder / "annotations" / "static_calibration" / "cam02.json"
+    clicks = late.read_bytes()
+    late.unlink()  # without the list, a match of which a camera is yet to be clicked
+    desk.look()
+    (incomplete,) = desk.take_in()
+    assert incomplete.state == "incomplete"
+    assert "cam02.json of SHA256SUMS is not there" in incomplete.reason
+    late.write_bytes(clicks + b" ")
+    desk.look()
+    assert "is not as SHA256SUMS says" in desk.take_in()[0].reason
+    late.write_bytes(clicks)
+    desk.look()
+    assert [each.state for each in desk.take_in()] == ["taken"]
+
+
+@pytest.mark.parametrize("line", ["../x", "/etc/passwd", "a/../../x"])
+def test_a_list_of_sums_names_nothing_outside(drop, line):
+    folder = drop()
+    (folder / "SHA256SUMS").write_text(f"{'0' * 64}  {line}\n")
+    with pytest.raises(RefusalError, match="inside the match folder"):
+        missing_of(folder)
+    (folder / "SHA256SUMS").write_text("not a sum\n")
+    with pytest.raises(RefusalError, match="line 1"):
+        missing_of(folder)
+
+
+def test_a_second_copy_is_refused_with_the_name_of_the_first(desk, drop):
+    drop("first")
+    drop("second")
+    desk.look()
+    desk.take_in()
+    known = desk.known()
+    assert known["first"][0] == "taken"
+    assert known["second"][0] == "refused"
+    assert "tiny-0-0.2s-3cameras-2players, registered from" in known["second"][1]
+    assert len(desk.begun) == 1
+
+
+def test_a_match_that_moves_to_another_queue_is_known(desk, drop):
+    folder = drop()
+    desk.look()
+    desk.take_in()
+    (desk.inbox / "urgent").mkdir()
+    shutil.move(folder, desk.inbox / "urgent" / "small")
+    desk.look()
+    desk.take_in()
+    assert desk.store.matches() == ("tiny-0-0.2s-3cameras-2players",)
+    # It asks for its run again, which is why beginning a run twice gives the same.
+    assert {match for match, _ in desk.begun} == {"tiny-0-0.2s-3cameras-2players"}
+
+
+def test_priorities_are_folders_unless_these_are_matches(desk, drop):
+    drop("background")  # holds a match.yaml
+    drop("urgent/b")
+    drop("a")
+    (desk.inbox / ".partial").mkdir()
+    found = [(each.name, each.priority) for each in entries(desk.inbox)]
+    assert found == [("urgent/b", "urgent"), ("a", "normal"), ("background", "normal")]
+
+
+def test_unclicked_cameras_are_said_and_no_run_is_begun(desk, drop):
+    folder = drop()
+    (folder / "annotations" / "static_calibration" / "cam02.json").unlink()
+    desk.look()
+    (taken,) = desk.take_in()
+    assert (taken.state, taken.flow_run) == ("taken", None)
+    assert "cam02" in taken.reason
+    assert (desk.store.matches(), desk.begun) == ((taken.match_id,), [])
+
+
+def hostile(folder, kind):
+    """Make an arrival that must not be taken in; gives what is said of it."""
+    if kind == "a link to a match":
+        outside = shutil.move(folder, folder.parent.parent / "outside")
+        folder.symlink_to(outside)
+        return "it is a link"
+    if kind == "a link to a file":
+        (folder / "reference" / "secrets").symlink_to("/etc/passwd")
+        return "reference/secrets is a link"
+    if kind == "a link to a folder":
+        (folder / "videos").symlink_to("/")
+        return "videos is a link"
+    if kind == "a pipe":
+        os.mkfifo(folder / "calibration.toml")
+        return "neither a file nor a folder"
+    if kind == "a socket":
+        with contextlib.chdir(folder):  # a socket's path has to be short
+            socket.socket(socket.AF_UNIX).bind("s")
+        return "neither a file nor a folder"
+    if kind == "a name with a line break":
+        (folder / "a\nb").write_text("")
+        return "characters"
+    if kind == "a name that is no text":
+        (folder / os.fsdecode(b"\xff\xfe")).write_text("")
+        return "characters"
+    if kind == "a file":
+        shutil.rmtree(folder)
+        folder.write_bytes(b"PK\x03\x04")
+        return "it is a file"
+    if kind == "a path out of it":
+        text = (folder / "match.yaml").read_text()
+        (folder / "match.yaml").write_text(f"pitch: ../../../etc/passwd\n{text}")
+        return "without .."
+    if kind == "an id that is a path":
+        (folder / "match.yaml").write_text("match_id: ../../evil\nfps: 25\ncameras: []\nclips: []")
+        return "match_id"
+    if kind == "code in the description":
+        (folder / "match.yaml").write_text("!!python/object/apply:os.system ['touch /tmp/evil']")
+        return "match.yaml"
+    if kind == "deep nesting":
+        (folder / "match.yaml").write_text("[" * 100_000)
+        return "match.yaml"
+    raise AssertionError(kind)
+
+
+KINDS = (
+    *("a link to a match", "a link to a file", "a link to a folder", "a pipe", "a socket"),
+    *("a name with a line break", "a name that is no text", "a file", "a path out of it"),
+    *("an id that is a path", "code in the description", "deep nesting"),
+)
+
+
+def test_hostile_arrivals_are_refused_and_harm_no_other(desk, drop):
+    said = {kind: hostile(drop(kind), kind) for kind in KINDS}
+    drop("good")
+    desk.look()
+    desk.take_in()
+    known = desk.known()
+    for kind, reason in said.items():
+        assert known[kind][0] == "refused", (kind, known[kind])
+        assert reason in known[kind][1], kind
+    assert known["good"][0] == "taken"
+    assert desk.store.matches() == ("tiny-0-0.2s-3cameras-2players",)
+
+
+def test_a_hostile_name_in_the_inbox_never_becomes_a_path(desk, drop):
+    folder = drop("good")
+    odd = os.fsdecode(b"\xff..\n") + "x" * 200
+    folder.rename(folder.with_name(odd))
+    desk.look()
+    ((name, (state, _)),) = desk.known().items()
+    assert (state, name.isascii(), "\n" in name) == ("refused", True, False)
+    (file,) = (desk.state.folder / "arrivals").iterdir()
+    assert len(file.name) == len("0123456789abcdef.json")
+
+
+def test_what_is_taken_out_of_the_inbox_is_forgotten_unless_it_was_taken_in(desk, drop):
+    drop("good")
+    desk.look()
+    desk.take_in()
+    shutil.rmtree(drop("half") / "detections")
+    desk.look()
+    desk.take_in()
+    assert set(desk.known()) == {"good", "half"}
+    shutil.rmtree(desk.inbox / "half")
+    shutil.rmtree(desk.inbox / "good")
+    desk.look()
+    assert set(desk.known()) == {"good"}
+
+
+def take_in_and_count(folder, queue, kill):
+    desk = Desk(folder)
+    if kill:
+
+        def begin(match, arrival):
+            os._exit(9)  # registered, and nothing is said of it yet
+
+        take_in(desk.store, desk.state, desk.inbox, 0.0, begin)
+    queue.put(len(desk.take_in()))
+
+
+def test_two_at_once_and_one_killed_between_take_a_match_in_once(desk, drop, tmp_path):
+    drop()
+    desk.look()
+    processes = get_context("fork")
+    queue = processes.Queue()
+    killed = processes.Process(target=take_in_and_count, args=[tmp_path, queue, True])
+    killed.start()
+    killed.join()
+    assert killed.exitcode == 9
+    both = [
+        processes.Process(target=take_in_and_count, args=[tmp_path, queue, False]) for _ in "ab"
+    ]
+    for each in both:
+        each.start()
+    assert sorted(queue.get(timeout=60) for _ in both) == [0, 1]
+    for each in both:
+        each.join()
+    assert desk.store.matches() == ("tiny-0-0.2s-3cameras-2players",)
+
+
+def test_more_files_than_any_match_has_are_refused(drop, monkeypatch):
+    folder = drop()
+    fingerprint_of(folder)
+    assert MOST_FILES > 1_000_000
+    monkeypatch.setattr("flows.operations.inbox.MOST_FILES", 3)
+    with pytest.raises(RefusalError, match="more than 3 files"):
+        fingerprint_of(folder)
+
+
+def test_a_project_on_object_storage_needs_a_folder_for_its_state(tmp_path):
+    assert state_folder(str(tmp_path), None).folder == tmp_path / "operations"
+    assert state_folder("s3://bucket/p", tmp_path).folder == tmp_path
+    with pytest.raises(UsageError, match="--state"):
+        state_folder("s3://bucket/p", None)

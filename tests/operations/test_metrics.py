@@ -1,0 +1,148 @@
+"""Prometheus is told what the store says, and the Grafana dashboard asks for nothing else."""
+
+import http.client
+import json
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+from threading import Thread
+
+import pytest
+from command_line import TINY
+from prometheus_client.parser import text_string_to_metric_families
+
+from data_contracts.operations import Arrival
+from flows.operations.alerts import Alert, Teller
+from flows.operations.layout import StateFolder
+from flows.operations.metrics import ProjectFigures, exposition, metrics_server
+from flows.operations.overview import Overview
+from flows.operations.plan import ServePlan
+from worldpose.store import Store
+
+INFRA = Path(__file__).parents[2] / "infra"
+DASHBOARD = INFRA / "grafana" / "worldpose.json"
+
+
+def scraped(text):
+    """Samples by name and labels, as Prometheus itself reads them."""
+    return {
+        (sample.name, *sorted(sample.labels.items())): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+@pytest.fixture
+def served(project_copy):
+    """A project that is served, and a function that asks its figures' server."""
+    state = StateFolder(project_copy / "operations")
+    now = datetime.now(UTC)
+    for name, known in (("a", "taken"), ("b", "refused"), ("c", "refused")):
+        state.write_arrival(Arrival(name=name, state=known, changed_at=now))
+    Teller(state, None).tell([Alert("disk_low", "disk_low", "little")])
+    plan = ServePlan(
+        project=str(project_copy),
+        inbox=project_copy / "inbox",
+        state=state.folder,
+        prefect="http://127.0.0.1:4200/api",
+        metrics_port=0,
+    )
+    server = metrics_server(plan, ProjectFigures(Store.open(str(project_copy)), state))
+    Thread(target=server.serve_forever, daemon=True).start()
+
+    def ask(path, host="127.0.0.1:8573"):
+        connection = http.client.HTTPConnection(*server.server_address, timeout=30)
+        connection.request("GET", path, headers={"host": host})
+        answer = connection.getresponse()
+        return answer.status, answer.read().decode(), answer.headers["content-type"]
+
+    yield ask
+    server.shutdown()
+    server.server_close()
+
+
+def test_a_scrape_says_what_the_store_says_and_all_that_the_dashboard_asks_for(
+    served, project_copy
+):
+    status, text, kind = served("/metrics")
+    assert status == 200
+    assert kind.startswith("text/plain")
+    found = scraped(text)
+    store = Store.open(str(project_copy))
+    run = store.run(TINY)
+    bodies = run.figures["body_fitting/clip"]["bodies"]
+    assert bodies > 0
+    assert found["worldpose_poses_total",] == bodies
+    assert found["worldpose_matches", ("state", "complete")] == 1
+    assert found["worldpose_matches", ("state", "failed")] == 0
+    done = ("worldpose_units", ("stage", "static_calibration"), ("state", "done"))
+    assert found[done] == 6
+    assert found["worldpose_run_seconds", ("match", TINY)] == run.seconds
+    offset = (("figure", "offset_rms_m"), ("match", TINY), ("stage", "body_fitting"))
+    assert found["worldpose_quality", *offset] == run.figures["body_fitting/clip"]["offset_rms_m"]
+    limit = (("figure", "offset_rms_m"), ("stage", "body_fitting"))
+    assert found["worldpose_quality_limit", *limit] == 0.03
+    files = [
+        path for top in ("matches", "results", "runs") for path in project_copy.rglob(f"{top}/**/*")
+    ]
+    assert found["worldpose_store_bytes",] == sum(p.stat().st_size for p in files if p.is_file())
+    assert found["worldpose_arrivals", ("state", "refused")] == 2
+    assert found["worldpose_alerts", ("alert", "disk_low")] == 1
+    # The dashboard and the rules name figures that are there, with labels that they have.
+    names = {name for name, *_ in found}
+    asked = [target["expr"] for panel in panels() for target in panel["targets"]]
+    rules = (INFRA / "prometheus" / "alerts.yml").read_text()
+    asked += re.findall(r"expr: (.*)", rules)
+    for expression in asked:
+        used = set(re.findall(r"worldpose_\w+", expression))
+        assert used
+        assert used <= names, expression
+        labels = {label for name, *pairs in found if name in used for label, _ in pairs}
+        braces = re.findall(r"\{([^}]*)\}", expression)
+        grouped = re.findall(r"(?:by|on) \(([^)]*)\)", expression)
+        wanted = re.findall(r"(\w+)\s*=", " ".join(braces)) + re.findall(r"\w+", " ".join(grouped))
+        assert set(wanted) <= labels, expression
+
+
+def panels():
+    return json.loads(DASHBOARD.read_text())["panels"]
+
+
+def test_the_dashboard_lays_its_panels_side_by_side():
+    taken = set()
+    for panel in panels():
+        place = panel["gridPos"]
+        cells = {
+            (place["x"] + across, place["y"] + down)
+            for across in range(place["w"])
+            for down in range(place["h"])
+        }
+        assert max(x for x, _ in cells) < 24
+        assert taken.isdisjoint(cells), panel["title"]
+        taken |= cells
+    assert len({panel["id"] for panel in panels()}) == len(panels())
+
+
+def test_the_figures_server_answers_to_its_own_name_alone(served):
+    assert served("/health")[0] == 200
+    assert served("/metrics", host="evil.example")[0] == 421
+    assert served("/metrics", host="")[0] == 421
+    assert served("/../etc/passwd")[0] == 404
+
+
+def test_what_is_scraped_again_is_looked_at_anew(project_copy):
+    store = Store.open(str(project_copy))
+    figures = ProjectFigures(store, StateFolder(project_copy / "operations"))
+    before = scraped(exposition(figures).decode())
+    run = store.run(TINY)
+    again = run.model_copy(update={"run_id": store.reserve_run(TINY), "executed": ()})
+    at_work = scraped(exposition(figures).decode())
+    store.finish_run(again.model_copy(update={"seconds": 1.5}))
+    after = scraped(exposition(figures).decode())
+    assert before["worldpose_matches", ("state", "complete")] == 1
+    assert at_work["worldpose_matches", ("state", "at work")] == 1
+    assert after["worldpose_run_seconds", ("match", TINY)] == 1.5
+    # A run that computed nothing made no poses.
+    assert after["worldpose_poses_total",] == before["worldpose_poses_total",]
+    (match,) = Overview(store).look()
+    assert {unit.state for _, unit in match.units} == {"done"}

@@ -1,0 +1,90 @@
+"""The status page shows every match, whatever its state, to those who have logged in."""
+
+import warnings
+from datetime import UTC, datetime
+
+import pytest
+from command_line import TINY
+
+from data_contracts.operations import Arrival
+from flows.operations.layout import StateFolder
+from flows.operations.overview import MatchGlance, Overview, UnitGlance
+from flows.operations.status_page import STYLE, status_html
+from flows.pages.access import access_for
+from flows.pages.app import create_app
+from worldpose.store import Store
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # of the web framework, about its own test client
+    from fastapi.testclient import TestClient
+
+TOKEN = "a token of twenty-four.."
+EVIL = '<script>alert(1)</script>"'
+
+
+def arrival(**more):
+    known = {"name": "m", "state": "taken", "changed_at": datetime.now(UTC)}
+    return Arrival(**{**known, **more})
+
+
+@pytest.fixture
+def app(project_copy):
+    return create_app(
+        str(project_copy), access_for("127.0.0.1", token=TOKEN, names=(), secure=False)
+    )
+
+
+def test_strangers_see_nothing_and_others_the_matches_by_stage(app, project_copy):
+    browser = TestClient(app, base_url="http://127.0.0.1:8571")
+    for path in ("/status", "/api/status", "/status/page.css"):
+        assert browser.get(path).status_code == 401
+    StateFolder(project_copy / "operations").write_arrival(
+        arrival(name=EVIL, state="refused", reason=EVIL)
+    )
+    assert browser.post("/api/login", json={"who": "Ada", "token": TOKEN}).status_code == 200
+    page = browser.get("/status")
+    assert "default-src 'none'" in page.headers["content-security-policy"]
+    text = page.text
+    assert f'<a href="/#/match/{TINY}">' in text
+    assert "6/6 done" in text
+    assert "<script" not in text
+    assert "&lt;script&gt;" in text
+    assert browser.get("/status/page.css").text == STYLE
+    answer = browser.get("/api/status").json()
+    (match,) = answer["matches"]
+    assert (match["match"], match["state"]) == (TINY, "complete")
+    cameras = match["stages"]["static_calibration"]
+    assert [each["unit"] for each in cameras] == [f"cam0{number}" for number in range(6)]
+    assert {each["state"] for each in cameras} == {"done"}
+    assert all(each["seconds"] > 0 for each in cameras)
+    assert [each["state"] for each in answer["arrivals"]] == ["refused"]
+
+
+def test_a_match_that_cannot_be_read_hides_no_other(project_copy):
+    store = Store.open(str(project_copy))
+    damaged = project_copy / "runs" / TINY / "0001.json"
+    damaged.write_bytes(damaged.read_bytes().replace(b"complete", b"complote"))
+    (match,) = Overview(store).look()
+    assert match.state == "unreadable"
+    text = status_html([match, MatchGlance("other")], [], "")
+    assert "other" in text
+    assert "0001.json" in text
+
+
+def test_the_worst_state_of_a_stage_is_what_is_seen():
+    units = (
+        UnitGlance("cam00", "done", 1.0),
+        UnitGlance("cam01", "waiting", 2.0, waiting_since=datetime.now(UTC)),
+        UnitGlance("cam02", "failed", why=EVIL),
+    )
+    match = MatchGlance("m", stages={"ingest": units[:1], "static_calibration": units})
+    run = "1f2e"
+    text = status_html([match], [arrival(match_id="m", flow_run=run)], "http://127.0.0.1:4200")
+    assert '<td class="failed">1/3 done<br>1 failed<br>1 waiting' in text
+    assert '<td class="done">1/1 done' in text
+    assert f'href="http://127.0.0.1:4200/runs/flow-run/{run}"' in text
+    assert "<script" not in text
+
+
+def test_an_empty_project_says_what_to_do():
+    assert "put one into the inbox" in status_html([], [], "")
