@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.detection.interfaces import People
+from worldpose.detection.interfaces import People, Poses
 
 Floats = NDArray[np.float64]
 
@@ -43,6 +43,20 @@ def suppress(people: People, overlap: float) -> People:
     for number in range(len(boxes)):
         kept[number] = not close[number, :number][kept[:number]].any()
     return People(boxes[kept], scores[kept])
+
+
+def seen_closer(people: People, poses: Poses) -> People:
+    """The same people with the boxes of who looked closer, where there are some.
+
+    Args:
+        people: as a detector found them.
+        poses: of each. A score becomes its geometric mean with the expected fit.
+    """
+    if poses.boxes is None or poses.fit is None:
+        return people
+    real = np.all(poses.boxes[:, 2:] - poses.boxes[:, :2] > 1.0, axis=1)
+    boxes = np.where(real[:, None], poses.boxes, people.boxes)
+    return People(boxes, np.sqrt(people.scores * poses.fit))
 
 
 def fuse(members: list[People], overlap: float) -> People:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.detection.boxes import suppress
+from worldpose.detection.boxes import overlaps, suppress
 from worldpose.detection.embedded_crops import crops_of_boxes, cut, picture_from_crop
 from worldpose.detection.embedded_weights import load_weights
 from worldpose.detection.interfaces import (
@@ -45,6 +45,8 @@ MOST_PEOPLE: Final = 300
 """In one picture."""
 OVERLAP: Final = 0.7
 """Two boxes of one person overlap by more [1, intersection over union]."""
+CLOSE: Final = 0.8
+"""Boxes are looked at again where the one that was seen and the one given share less [1]."""
 BATCH: Final = 16
 """Crops computed at once, always as many: kernels for other numbers round otherwise."""
 
@@ -120,14 +122,26 @@ class EmbeddedPose:
     def estimate(self, picture: Picture, boxes: NDArray[np.float64]) -> Poses:
         """The pose of each box; confidence is the chance that a keypoint is right.
 
-        Right is within a twentieth of the box's longer side, about a fifth of a torso.
+        Right is within a twentieth of the box's longer side, about a fifth of a torso. Whose box
+        turns out to be another than the one given is looked at once more, in that one.
         """
+        looked = self._look(picture, boxes)
+        seen = looked[2]
+        again = np.all(seen[:, 2:] - seen[:, :2] > 1.0, axis=1)
+        again &= np.diagonal(overlaps(seen, boxes)) < CLOSE
+        for first, second in zip(looked, self._look(picture, seen[again]), strict=True):
+            first[again] = second
+        return Poses(*looked)
+
+    def _look(self, picture: Picture, boxes: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Keypoints, confidence, box and fit of what a crop around each box shows."""
         import torch
 
         from worldpose.detection.embedded_nets import CROP, JOINTS, normalised, peaks
 
         keypoints = np.full((len(boxes), JOINTS, 2), np.nan)
         confidence = np.full((len(boxes), JOINTS), np.nan)
+        seen_boxes, fit = np.full((len(boxes), 4), np.nan), np.full(len(boxes), np.nan)
         maps = [picture_from_crop(crop, CROP) for crop in crops_of_boxes(boxes, CROP)]
         for start in range(0, len(maps), BATCH):
             part = maps[start : start + BATCH]
@@ -135,14 +149,22 @@ class EmbeddedPose:
             for index, mapping in enumerate(part):
                 crops[index] = cut(picture, mapping, CROP)
             with torch.inference_mode(), _precision(self._device, self._half):
-                logits, doubt = self._net(normalised(torch.from_numpy(crops).to(self._device)))
-                at, mass = peaks(logits)
-                sure = torch.sigmoid(self._net.sureness(doubt, mass))
-            pixels = at.double().cpu().numpy()
+                seen = self._net(normalised(torch.from_numpy(crops).to(self._device)))
+                at, mass = peaks(seen.maps)
+                sure = torch.sigmoid(self._net.sureness(seen.doubt, mass))
+            pixels, corners = at.double().cpu().numpy(), seen.boxes.double().cpu().numpy()
             for index, mapping in enumerate(part):
-                keypoints[start + index] = pixels[index] @ mapping[:, :2].T + mapping[:, 2]
-            confidence[start : start + BATCH] = sure.double().cpu().numpy()[: len(part)]
-        return Poses(keypoints, np.clip(confidence, 1e-3, 1.0))
+                scale, corner = mapping[:, :2], mapping[:, 2]
+                keypoints[start + index] = pixels[index] @ scale.T + corner
+                seen_boxes[start + index] = (
+                    corners[index].reshape(2, 2) @ scale.T + corner
+                ).ravel()
+            end = start + len(part)
+            confidence[start:end] = sure.double().cpu().numpy()[: len(part)]
+            fit[start:end] = torch.sigmoid(seen.fit).double().cpu().numpy()[: len(part)]
+        height, width = picture.shape[:2]
+        seen_boxes = np.clip(seen_boxes, -0.5, np.array([width, height, width, height]) - 0.5)
+        return keypoints, np.clip(confidence, 1e-3, 1.0), seen_boxes, fit
 
 
 def _nets() -> ModuleType:

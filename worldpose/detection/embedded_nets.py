@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Final, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -25,6 +25,8 @@ CROP: Final = (96, 128)
 """Width, height of the crops that the keypoint net takes [px]."""
 CELL: Final = 2
 """Pixels of the crop a cell of the keypoint maps [px]."""
+EDGE_CELL: Final = 4
+"""Pixels of the crop a cell of the maps of edges [px]."""
 JOINTS: Final = 17
 _SCALE: Final = 16.0
 """A box side of logarithm 0 lies this far from its cell [px]: that of a person of about 60 px."""
@@ -115,8 +117,25 @@ class PeopleNet(nn.Module):
         return maps[:, 0], _SCALE * torch.exp(maps[:, 1:].clamp(-4.0, 4.0))
 
 
+class Seen(NamedTuple):
+    """What the keypoint net says of crops.
+
+    Attributes:
+        maps: logits of where each joint is (batch, 17, rows, columns), to be compared over the
+            cells of a map.
+        doubt: what the crop as a whole says of each joint's certainty (batch, 17).
+        boxes: x0, y0, x1, y1 of the person (batch, 4) [px of the crop].
+        fit: logits of how much of their union these and the true boxes share (batch,).
+    """
+
+    maps: Tensor
+    doubt: Tensor
+    boxes: Tensor
+    fit: Tensor
+
+
 class KeypointNet(nn.Module):
-    """Where the 17 joints of the person in a crop are, and how sure that is."""
+    """Where the 17 joints and the box of the person in a crop are, and how sure that is."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -125,21 +144,18 @@ class KeypointNet(nn.Module):
         self.head = nn.Sequential(Block(32, 64), nn.Conv2d(64, 4 * JOINTS, 1))
         self.doubt = nn.Linear(128, JOINTS)
         self.trust = nn.Parameter(torch.ones(JOINTS))
+        self.outline = nn.Sequential(Block(32, 32), nn.Conv2d(32, 4, 1))
+        self.fit = nn.Sequential(nn.Linear(128 + 4, 32), nn.ReLU(), nn.Linear(32, 1))
 
-    def forward(self, crops: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the maps of crops.
-
-        Args:
-            crops: (batch, 3, height, width) `normalised`.
-
-        Returns:
-            Logits of where each joint is (batch, 17, rows, columns), to be compared over the cells
-            of a map; and what the crop as a whole says of each joint's certainty (batch, 17).
-        """
+    def forward(self, crops: Tensor) -> Seen:
+        """Return what is seen in crops (batch, 3, height, width) that are `normalised`."""
         features, coarsest = self.pyramid(crops)
         maps = functional.pixel_shuffle(self.head(features), CELL)
         # How sure a joint is must not bend the features that find it.
-        return maps.float(), self.doubt(coarsest.detach().float().mean(dim=(2, 3)))
+        whole = coarsest.float().mean(dim=(2, 3))
+        boxes, spread = edges(self.outline(features).float())
+        fit = self.fit(torch.cat([whole, spread], dim=1))[:, 0]
+        return Seen(maps.float(), self.doubt(whole.detach()), boxes, fit)
 
     def sureness(self, doubt: Tensor, mass: Tensor) -> Tensor:
         """Logits that joints are right (batch, 17), from `doubt` and their peaks' mass."""
@@ -175,6 +191,28 @@ def peaks(maps: Tensor) -> tuple[Tensor, Tensor]:
     mass = near.sum(dim=-1)
     at = torch.stack([(near * x.flatten(2)).sum(-1), (near * y.flatten(2)).sum(-1)], dim=-1)
     return CELL * (at / mass[..., None]) + 0.5 * (CELL - 1), mass
+
+
+def edges(maps: Tensor) -> tuple[Tensor, Tensor]:
+    """Where the edges of a box are, and how far their probability spreads.
+
+    Every map is read along one axis alone, as an edge's probability over columns or rows.
+
+    Args:
+        maps: (batch, 4, rows, columns) logits of left, top, right and bottom.
+
+    Returns:
+        Edges and their standard deviations, both (batch, 4) [px of the crop, cells].
+    """
+    places, spreads = [], []
+    for side in range(4):
+        logits = torch.logsumexp(maps[:, side], dim=1 + side % 2)
+        chance = functional.softmax(logits, dim=1)
+        cell = torch.arange(chance.shape[1], device=maps.device, dtype=maps.dtype)
+        place = chance @ cell
+        places.append(EDGE_CELL * place + 0.5 * (EDGE_CELL - 1))
+        spreads.append(((chance @ cell.square()) - place.square()).clamp(min=1e-6).sqrt())
+    return torch.stack(places, dim=1), torch.stack(spreads, dim=1)
 
 
 def folded(net: Net) -> Net:

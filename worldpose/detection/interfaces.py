@@ -36,10 +36,15 @@ class Poses:
     Attributes:
         keypoints: (people, 17, 2) COCO-17 [px]; NaN where not found.
         confidence: (people, 17) in (0, 1]; NaN where not found.
+        boxes: (people, 4) as the estimator sees them, who looks closer than a detector [px]; None
+            from one that sees joints alone.
+        fit: (people,) how much of their union these and the true boxes share, as expected [1].
     """
 
     keypoints: NDArray[np.float64]
     confidence: NDArray[np.float64]
+    boxes: NDArray[np.float64] | None = None
+    fit: NDArray[np.float64] | None = None
 
 
 class Detector(Protocol):

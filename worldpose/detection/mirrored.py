@@ -26,8 +26,9 @@ class Mirrored:
         """The pose of each box."""
         last = picture.shape[1] - 1
         seen = self._estimator.estimate(picture, boxes)
-        turned = boxes[:, [2, 1, 0, 3]] * [-1.0, 1.0, -1.0, 1.0] + [last, 0.0, last, 0.0]
-        mirror = self._estimator.estimate(np.ascontiguousarray(picture[:, ::-1]), turned)
+        mirror = self._estimator.estimate(
+            np.ascontiguousarray(picture[:, ::-1]), _turned(boxes, last)
+        )
         back = mirror.keypoints[:, SIDES] * [-1.0, 1.0] + [last, 0.0]
         both = np.stack([seen.keypoints, back])
         weights = np.nan_to_num(np.stack([seen.confidence, mirror.confidence[:, SIDES]]))
@@ -35,4 +36,14 @@ class Mirrored:
         found = total > 0.0
         mean = np.nansum(both * weights[..., None], axis=0) / np.where(found, total, 1.0)[..., None]
         confidence = total / np.maximum((weights > 0.0).sum(axis=0), 1)
-        return Poses(np.where(found[..., None], mean, np.nan), np.where(found, confidence, np.nan))
+        keypoints = np.where(found[..., None], mean, np.nan)
+        confidence = np.where(found, confidence, np.nan)
+        if seen.boxes is None or mirror.boxes is None or seen.fit is None or mirror.fit is None:
+            return Poses(keypoints, confidence)
+        middle = 0.5 * (seen.boxes + _turned(mirror.boxes, last))
+        return Poses(keypoints, confidence, middle, 0.5 * (seen.fit + mirror.fit))
+
+
+def _turned(boxes: NDArray[np.float64], last: int) -> NDArray[np.float64]:
+    """Boxes (people, 4) in the mirror of a picture whose last column is `last` [px]."""
+    return np.asarray(boxes[:, [2, 1, 0, 3]] * [-1.0, 1.0, -1.0, 1.0] + [last, 0.0, last, 0.0])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17_SIGMAS
 from worldpose.cameras import Camera
-from worldpose.detection.boxes import areas, fuse, suppress
+from worldpose.detection.boxes import areas, fuse, seen_closer, suppress
 from worldpose.detection.crowd import on_pitch
 from worldpose.detection.followed import Follower, looked_at
 from worldpose.detection.interfaces import Detector, People, Picture, PoseEstimator, Poses
@@ -177,6 +177,7 @@ class PeopleFinder:
     def _posed(self, picture: Picture, people: People) -> tuple[People, Poses]:
         """Keypoints of everybody; who has none, or the pose of somebody better, is not kept."""
         poses = self._estimator.estimate(picture, people.boxes)
+        people = seen_closer(people, poses)
         with np.errstate(invalid="ignore"):
             found = (poses.confidence >= self._settings.least_keypoint) & np.isfinite(
                 poses.keypoints

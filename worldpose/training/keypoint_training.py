@@ -16,6 +16,7 @@ from data_contracts.conventions import COCO17
 from data_contracts.records import Record
 from worldpose.detection.embedded_crops import crops_of_boxes, cut, picture_from_crop
 from worldpose.detection.embedded_nets import CELL, CROP, KeypointNet, normalised, peaks
+from worldpose.training.box_overlap import shared
 from worldpose.training.labels import LabelledPicture
 from worldpose.training.looks import LookSettings, changed_look
 from worldpose.training.pictures import PictureCache
@@ -33,6 +34,12 @@ SPREAD: Final = 2.0
 """Standard deviation of the target about a joint [px of the crop]."""
 HIDDEN: Final = 0.4
 """Weight of a joint that cannot be seen [1]: where it is can be told only by the rest."""
+BOXES: Final = 2.0
+"""Weight of the box beside that of the joints [1]."""
+MOST: Final = 24
+"""People that a crop's box may be of, the nearest."""
+HALF: Final = 0.5 * (np.array(CROP) - 1.0)
+"""The middle of a crop [px of the crop]."""
 RIGHT: Final = 0.05
 """A keypoint is right within this share of the box's longer side [1], a fifth of a torso."""
 
@@ -48,6 +55,12 @@ class KeypointCrops(Record):
     """Most that a box is off, as a share of its sides [1]: detectors err."""
     scale: float = 0.18
     """Most that a box is too large or too small [1]."""
+    astray: float = 0.3
+    """Share of boxes that are off by up to three times as much, and wrong in size by twice [1]."""
+    elsewhere: float = 0.12
+    """Share of crops put beside people, where a detector may see what is nobody [1]."""
+    turned: float = 0.5
+    """Share of crops that are turned [1]; of the others the box is learned."""
     turn: float = 0.45
     """Most that a crop is turned [rad]."""
     smaller: float = 0.35
@@ -66,12 +79,19 @@ class KeypointBatch:
         keypoints: (crops, 17, 2) [px of the crop]; NaN where not labelled.
         visible: (crops, 17): 2 seen, 1 hidden, 0 not labelled.
         tolerance: (crops,) error up to which a keypoint is right [px of the crop].
+        boxes: (crops, 4) of the person [px of the crop]; NaN in a turned crop and beside people.
+        people: (crops, most_people, 4) of everybody [px of the crop]; NaN in a turned crop and
+            where there is nobody more.
+        ignored: (crops, most_people)
     """
 
     crops: NDArray[np.uint8]
     keypoints: NDArray[np.float32]
     visible: NDArray[np.int8]
     tolerance: NDArray[np.float32]
+    boxes: NDArray[np.float32]
+    people: NDArray[np.float32]
+    ignored: NDArray[np.bool_]
 
 
 def people_of(
@@ -107,15 +127,24 @@ def keypoint_batch(
     keypoints = np.empty((count, 17, 2), dtype=np.float32)
     visible = np.empty((count, 17), dtype=np.int8)
     tolerance = np.empty(count, dtype=np.float32)
+    boxes = np.full((count, 4), np.nan, dtype=np.float32)
+    everybody = np.full((count, MOST, 4), np.nan, dtype=np.float32)
+    ignored = np.zeros((count, MOST), dtype=np.bool_)
     for index in range(count):
         labelled, person = people[int(rng.integers(len(people)))]
         box = labelled.boxes[person]
         sides = box[2:] - box[:2]
-        off = settings.shift * rng.uniform(-1, 1, 2) * sides
+        beside = rng.random() < settings.elsewhere
+        far = 1.0 + 2.0 * (rng.random() < settings.astray)
+        off = settings.shift * far * rng.uniform(-1, 1, 2) * sides
+        if beside:
+            off = rng.uniform(0.3, 1.6, 2) * rng.choice([-1.0, 1.0], 2) * sides
         crop = crops_of_boxes((box + np.tile(off, 2))[None], CROP)[0]
-        crop[2] *= np.exp(settings.scale * rng.uniform(-1, 1))
+        crop[2] *= np.exp(settings.scale * (0.5 + 0.5 * far) * rng.uniform(-1, 1))
         mirrored = bool(rng.random() < 0.5)
-        mapping = picture_from_crop(crop, CROP, settings.turn * rng.uniform(-1, 1) ** 3, mirrored)
+        turned = bool(rng.random() < settings.turned)
+        turn = settings.turn * rng.uniform(-1, 1) ** 3 if turned else 0.0
+        mapping = picture_from_crop(crop, CROP, turn, mirrored)
         tall = float(sides.max())
         farther = 1.0
         if rng.random() < settings.smaller and tall > settings.height[0]:
@@ -126,12 +155,27 @@ def keypoint_batch(
             mapping[:, :2]
         ).T
         sight = labelled.visible[person][order].copy()
+        if beside:
+            sight[:] = 0
+        if not turned:
+            there = boxes_in_crop(labelled.boxes, mapping)
+            near = np.argsort(np.abs(there.reshape(-1, 2, 2).mean(axis=1) - HALF).sum(axis=1))
+            near = near[:MOST]
+            everybody[index, : len(near)] = there[near]
+            ignored[index, : len(near)] = labelled.ignored[near]
+            boxes[index] = np.nan if beside else there[person]
         if index and rng.random() < settings.hidden:
             _cover(seen, crops[index - 1], pixels, sight, rng)
         crops[index] = changed_look(seen, settings.looks, rng)
         keypoints[index], visible[index] = pixels, sight
         tolerance[index] = RIGHT * tall / crop[2]
-    return KeypointBatch(crops, keypoints, visible, tolerance)
+    return KeypointBatch(crops, keypoints, visible, tolerance, boxes, everybody, ignored)
+
+
+def boxes_in_crop(boxes: Floats, mapping: Floats) -> Floats:
+    """Boxes of a picture (people, 4) in the pixels of an upright crop, mirrored or not."""
+    corners = (boxes.reshape(-1, 2, 2) - mapping[:, 2]) @ np.linalg.inv(mapping[:, :2]).T
+    return np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1)
 
 
 def _seen(picture: NDArray[np.uint8], mapping: Floats, scale: float) -> NDArray[np.uint8]:
@@ -171,14 +215,15 @@ def keypoint_loss(net: KeypointNet, batch: KeypointBatch) -> Tensor:
     """Return how far the net's maps and its sureness are from the batch's truth.
 
     Places by the cross-entropy of each map against a narrow bump, sureness by the cross-entropy of
-    whether the place that the map says is right.
+    whether the place that the map says is right; the box by generalised intersection over union
+    (Rezatofighi, 2019), its fit by the cross-entropy of what it shares with anybody's.
     """
     device = next(net.parameters()).device
     keypoints, visible, tolerance = (
         torch.from_numpy(each).to(device)
         for each in (batch.keypoints, batch.visible, batch.tolerance)
     )
-    maps, doubt = net(normalised(torch.from_numpy(batch.crops).to(device)))
+    maps, doubt, box, fit = net(normalised(torch.from_numpy(batch.crops).to(device)))
     rows, columns = maps.shape[-2:]
     labelled = (visible > 0) & torch.isfinite(keypoints).all(dim=-1)
     at = torch.where(labelled[..., None], keypoints, 0.0)
@@ -202,4 +247,30 @@ def keypoint_loss(net: KeypointNet, batch: KeypointBatch) -> Tensor:
         net.sureness(doubt, near), right.float(), reduction="none"
     )
     doubt_loss: Tensor = (sure * labelled).sum() / labelled.sum().clamp(min=1)
-    return place + doubt_loss
+    return place + doubt_loss + box_loss(batch, box, fit)
+
+
+def box_loss(batch: KeypointBatch, said: Tensor, fit: Tensor) -> Tensor:
+    """How far boxes are from the batch's, and their fit from what they share with anybody's.
+
+    Args:
+        batch: the truth.
+        said: (crops, 4) [px of the crop].
+        fit: (crops,) logits.
+    """
+    boxes, people, ignored = (
+        torch.from_numpy(each).to(said.device)
+        for each in (batch.boxes, batch.people, batch.ignored)
+    )
+    mine = torch.isfinite(boxes).all(dim=-1)
+    _, general = shared(said, torch.where(mine[:, None], boxes, said.detach()))
+    off = (mine * (1.0 - general)).sum() / mine.sum().clamp(min=1)
+    with torch.no_grad():
+        there = torch.isfinite(people).all(dim=-1)
+        overlap, _ = shared(said[:, None], torch.nan_to_num(people))
+        overlap = torch.where(there, overlap, 0.0)
+        best = overlap.argmax(dim=1, keepdim=True)
+        counted = there.any(dim=1) & ~ignored.gather(1, best)[:, 0]
+        share = overlap.gather(1, best)[:, 0].clamp(0.0, 1.0)
+    expected = functional.binary_cross_entropy_with_logits(fit, share, reduction="none")
+    return BOXES * off + (counted * expected).sum() / counted.sum().clamp(min=1)

@@ -16,6 +16,7 @@ from data_contracts.records import Record
 from worldpose.detection.embedded_crops import cut, picture_from_crop
 from worldpose.detection.embedded_nets import STRIDE, PeopleNet, normalised
 from worldpose.detection.embedded_peaks import cell_middles
+from worldpose.training.box_overlap import shared
 from worldpose.training.labels import LabelledPicture
 from worldpose.training.looks import LookSettings, changed_look
 from worldpose.training.pictures import PictureCache
@@ -179,25 +180,8 @@ def people_loss(net: PeopleNet, batch: PeopleBatch) -> Tensor:
     people = middle.sum().clamp(min=1)
     focal = -(weight * torch.where(middle, found, empty)).sum() / people
     near = torch.where(target >= NEAR, target, 0.0)
-    overlap = _overlap(sides, boxes)
-    return focal + BOXES * (near * (1.0 - overlap)).sum() / near.sum().clamp(min=1.0)
-
-
-def _overlap(sides: Tensor, boxes: Tensor) -> Tensor:
-    """Generalised intersection over union (batch, rows, columns) of boxes said and true."""
     x = cell_middles(sides.shape[3], sides.device)[None, None, :]
     y = cell_middles(sides.shape[2], sides.device)[None, :, None]
-    said = (x - sides[:, 0], y - sides[:, 1], x + sides[:, 2], y + sides[:, 3])
-    true = (boxes[:, 0], boxes[:, 1], boxes[:, 2], boxes[:, 3])
-
-    def span(most: bool, axis: int) -> Tensor:
-        outer, inner = torch.maximum, torch.minimum
-        if not most:
-            outer, inner = inner, outer
-        return (outer(said[axis + 2], true[axis + 2]) - inner(said[axis], true[axis])).clamp(min=0)
-
-    shared = span(False, 0) * span(False, 1)
-    hull = span(True, 0) * span(True, 1) + 1e-6
-    area = (said[2] - said[0]) * (said[3] - said[1])
-    union = area + (true[2] - true[0]) * (true[3] - true[1]) - shared + 1e-6
-    return shared / union - (hull - union) / hull
+    said = torch.stack([x - sides[:, 0], y - sides[:, 1], x + sides[:, 2], y + sides[:, 3]], dim=-1)
+    _, overlap = shared(said, boxes.movedim(1, -1))
+    return focal + BOXES * (near * (1.0 - overlap)).sum() / near.sum().clamp(min=1.0)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from worldpose.detection import DetectionSettings, Detector, People, PoseEstimator
-from worldpose.detection.boxes import fuse
+from worldpose.detection.boxes import fuse, seen_closer
 from worldpose.detection.interfaces import Picture
 from worldpose.training.labels import LabelledPicture, write_labels
 
@@ -45,6 +45,7 @@ def propose_labels(
         sure = people.scores >= settings.sure
         kept = People(people.boxes[sure], people.scores[sure])
         poses = pose.estimate(picture, kept.boxes)
+        kept = seen_closer(kept, poses)
         found = poses.confidence >= settings.least_keypoint
         path = folder / "pictures" / f"{name}.png"
         cv2.imwrite(str(path), picture[..., ::-1])

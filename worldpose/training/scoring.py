@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from worldpose.detection.boxes import overlaps, seen_closer
 from worldpose.detection.interfaces import Detector, PoseEstimator
 from worldpose.training.average_precision import average_precision
 from worldpose.training.keypoint_accuracy import calibration_error, correct_keypoints
@@ -45,11 +46,36 @@ def score_people(
     pictures: Sequence[LabelledPicture],
     cache: PictureCache,
     heights: Sequence[tuple[float, float]] = HEIGHTS,
+    estimator: PoseEstimator | None = None,
 ) -> tuple[float, ...]:
-    """Return AP50 of all people, and of those in each class of heights [px]."""
+    """Return AP50 of all people, and of those in each class of heights [px].
+
+    With an estimator it is that of the boxes which the estimator sees, as they are stored.
+    """
     found = [detector.detect([cache[picture.path]])[0] for picture in pictures]
+    if estimator is not None:
+        found = [
+            seen_closer(people, estimator.estimate(cache[picture.path], people.boxes))
+            for people, picture in zip(found, pictures, strict=True)
+        ]
     classes = [(0.0, np.inf), *heights]
     return tuple(average_precision(found, pictures, each) for each in classes)
+
+
+def apart(pictures: Sequence[LabelledPicture], share: float = 0.3) -> list[LabelledPicture]:
+    """Return the pictures with everybody ignored whose box has more in common with another's.
+
+    Args:
+        pictures: with the truth.
+        share: intersection over union of two people's boxes [1].
+    """
+    kept = []
+    for picture in pictures:
+        common = overlaps(picture.boxes, picture.boxes)
+        np.fill_diagonal(common, 0.0)
+        crowded = (common > share).any(axis=1)
+        kept.append(replace(picture, ignored=picture.ignored | crowded))
+    return kept
 
 
 def score_keypoints(

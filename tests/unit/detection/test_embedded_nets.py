@@ -5,7 +5,7 @@ from safetensors.torch import save
 
 from worldpose.detection.embedded import EmbeddedDetector, EmbeddedPose
 from worldpose.detection.embedded_crops import crops_of_boxes, cut, picture_from_crop
-from worldpose.detection.embedded_nets import CROP, KeypointNet, PeopleNet, peaks
+from worldpose.detection.embedded_nets import CROP, KeypointNet, PeopleNet, edges, peaks
 from worldpose.detection.embedded_peaks import boxes_at_peaks
 from worldpose.detection.embedded_weights import FORMAT, load_weights, save_weights
 from worldpose.errors import InputError
@@ -61,6 +61,18 @@ def test_the_peak_of_a_bump_is_found_within_a_cell():
     assert float(mass) > 0.97
 
 
+def test_edges_are_read_along_their_own_axis():
+    rows, columns = 32, 24
+    maps = torch.full((1, 4, rows, columns), -40.0)
+    # The left edge in column 3 of some rows, the right one between columns 20 and 21 of one row.
+    maps[0, 0, 5:9, 3] = maps[0, 2, 30, 20] = maps[0, 2, 30, 21] = 0.0
+    maps[0, 1, 2, :] = maps[0, 3, 28, 7] = 0.0
+    boxes, spread = edges(maps)
+    # Cells of 4 px whose first middle is at 1.5.
+    torch.testing.assert_close(boxes, torch.tensor([[13.5, 9.5, 83.5, 113.5]]))
+    torch.testing.assert_close(spread, torch.tensor([[1e-3, 1e-3, 0.5, 1e-3]]), atol=1e-3, rtol=0)
+
+
 def test_boxes_stand_at_peaks_best_first():
     logits, sides = torch.full((8, 10), -9.0), torch.full((4, 8, 10), 5.0)
     logits[2, 3], logits[2, 4], logits[6, 8] = 1.0, 0.5, 2.0
@@ -79,6 +91,9 @@ def test_people_and_poses_do_not_depend_on_their_company():
     together, alone = pose.estimate(picture, boxes), pose.estimate(picture, boxes[1:2])
     np.testing.assert_array_equal(together.keypoints[1:2], alone.keypoints)
     np.testing.assert_array_equal(together.confidence[1:2], alone.confidence)
+    np.testing.assert_array_equal(together.boxes[1:2], alone.boxes)
+    np.testing.assert_array_equal(together.fit[1:2], alone.fit)
+    assert np.all((together.fit > 0) & (together.fit < 1))
     assert np.all((together.confidence > 0) & (together.confidence <= 1))
     nobody = pose.estimate(picture, np.empty((0, 4)))
     assert nobody.keypoints.shape == (0, 17, 2) and nobody.confidence.shape == (0, 17)
@@ -89,6 +104,24 @@ def test_people_and_poses_do_not_depend_on_their_company():
     assert len(both[0].boxes) > 0
     inside = (both[0].boxes >= -0.5) & (both[0].boxes <= np.array([130, 90, 130, 90]) - 0.5)
     assert inside.all()
+
+
+def test_whose_box_is_another_than_the_one_given_is_looked_at_again(monkeypatch):
+    pose, asked = EmbeddedPose(shaken(KeypointNet())), []
+
+    def look(picture, boxes):
+        asked.append(boxes)
+        count = len(boxes)
+        # He fills the box from 40 px on; the keypoints tell how often it was looked at.
+        seen = np.concatenate([np.maximum(boxes[:, :1], 40.0), boxes[:, 1:]], axis=1)
+        return np.full((count, 17, 2), len(asked)), np.ones((count, 17)), seen, np.ones(count)
+
+    monkeypatch.setattr(pose, "_look", look)
+    boxes = np.array([[45.0, 5.0, 80.0, 80.0], [0.0, 5.0, 80.0, 80.0], [0.0, 5.0, 30.0, 80.0]])
+    poses = pose.estimate(np.zeros((90, 130, 3), dtype=np.uint8), boxes)
+    # The first is as given; of the third nothing is left in which to look.
+    np.testing.assert_array_equal(asked[1], [[40.0, 5.0, 80.0, 80.0]])
+    assert poses.keypoints[:, 0, 0].tolist() == [1.0, 2.0, 1.0]
 
 
 def test_weights_come_back_and_give_equal_bytes(tmp_path):

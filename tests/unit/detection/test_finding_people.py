@@ -126,6 +126,27 @@ def test_a_video_becomes_arrays_in_the_form_of_given_poses(camera):
     assert (report.crowd, report.unreadable, report.empty, report.flickers) == (69, 1, 0, 0)
 
 
+class LookingCloser(Knowing):
+    """The same, and boxes a tenth wider to each side, which fit by 0.4."""
+
+    def estimate(self, picture, boxes):
+        poses = super().estimate(picture, boxes)
+        wider = boxes + (boxes[:, 2:] - boxes[:, :2])[:, [0, 1, 0, 1]] * [-0.1, 0.0, 0.1, 0.0]
+        wider[1] = wider[1, [0, 1, 0, 1]]  # a box of no size is none
+        return Poses(poses.keypoints, poses.confidence, wider, np.full(len(boxes), 0.4))
+
+
+def test_boxes_are_those_of_who_looked_closer():
+    boxes = np.array([[10.0, 10.0, 30.0, 60.0], [100.0, 10.0, 120.0, 60.0]])
+    truth = LookingCloser([boxes] * 3, np.full((3, 2), 0.9))
+    finder = PeopleFinder([truth], truth, DetectionSettings())
+    blank = np.zeros((80, 160, 3), dtype=np.uint8)
+    (stretch,) = finder.find((n, blank) for n in range(3))
+    wanted = [[8.0, 10.0, 32.0, 60.0], [100.0, 10.0, 120.0, 60.0]]
+    np.testing.assert_allclose(stretch.boxes[1, :2], wanted)
+    np.testing.assert_allclose(stretch.score[1, :2], np.sqrt(0.9 * 0.4), rtol=1e-6)
+
+
 def test_two_poses_of_one_person_are_alike_and_those_of_two_are_not():
     person = np.stack([np.linspace(0, 30, 17), np.linspace(0, 80, 17)], axis=1)
     missing = np.full((17, 2), np.nan)

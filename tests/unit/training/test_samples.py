@@ -5,10 +5,13 @@ import numpy as np
 import pytest
 import torch
 
-from worldpose.detection.embedded_nets import CROP, STRIDE, KeypointNet, PeopleNet
+from worldpose.detection.boxes import overlaps
+from worldpose.detection.embedded_nets import CROP, KeypointNet, PeopleNet
 from worldpose.training import LabelledPicture, PictureCache
+from worldpose.training.box_overlap import shared
 from worldpose.training.keypoint_training import (
     KeypointCrops,
+    box_loss,
     keypoint_batch,
     keypoint_loss,
     people_of,
@@ -16,7 +19,6 @@ from worldpose.training.keypoint_training import (
 from worldpose.training.looks import LookSettings
 from worldpose.training.people_training import (
     PeopleWindows,
-    _overlap,
     boxes_in_window,
     draw_targets,
     people_batch,
@@ -44,7 +46,9 @@ def labelled(tmp_path_factory):
 
 
 def test_labels_lie_on_what_they_name_in_turned_mirrored_and_distant_crops(labelled):
-    settings = KeypointCrops(crops=24, hidden=0, smaller=0.5, looks=AS_IS)
+    settings = KeypointCrops(
+        crops=24, hidden=0, smaller=0.5, astray=0, elsewhere=0, turned=1, looks=AS_IS
+    )
     batch = keypoint_batch([(labelled, 0)], PictureCache(), settings, np.random.default_rng(0))
     sides = set()
     for crop, keypoints in zip(batch.crops.astype(int), batch.keypoints, strict=True):
@@ -93,19 +97,46 @@ def test_the_target_is_one_at_the_cell_of_the_middle():
     assert weight[10:, 10:].sum() == 0 and weight[:9].all()
 
 
-def test_the_true_sides_overlap_wholly():
-    boxes = torch.tensor([2.0, 3.0, 30.0, 41.0])[None, :, None, None].expand(1, 4, 8, 8)
-    x = torch.arange(8) * STRIDE + 1.5
-    sides = torch.stack(
-        [
-            (x[None, :] - 2.0).expand(8, 8),
-            (x[:, None] - 3.0).expand(8, 8),
-            (30.0 - x[None, :]).expand(8, 8),
-            (41.0 - x[:, None]).expand(8, 8),
-        ]
-    )[None]
-    inside = (sides > 0).all(dim=1)
-    torch.testing.assert_close(_overlap(sides, boxes)[inside], torch.ones(int(inside.sum())))
+def test_shared_area_is_that_of_the_detection_stage_and_falls_with_distance():
+    rng = np.random.default_rng(2)
+    corners = rng.uniform(0, 40, (2, 30, 2))
+    a, b = (np.concatenate([each, each + rng.uniform(5, 40, (30, 2))], axis=1) for each in corners)
+    share, general = shared(torch.from_numpy(a)[:, None], torch.from_numpy(b))
+    # Areas are 25 px^2 and more, to which a millionth is added.
+    np.testing.assert_allclose(share, overlaps(a, b), atol=1e-6)
+    # Nested boxes fill their hull: the two are equal but for rounding.
+    assert torch.all(general <= share + 1e-9) and torch.all(general >= -1.0)
+    # Two boxes of 10 x 10 px side by side, 10 px apart: none shared, a third of the hull empty.
+    pair = torch.tensor([[0.0, 0.0, 10.0, 10.0], [20.0, 0.0, 30.0, 10.0]])
+    torch.testing.assert_close(shared(pair[0], pair[1])[1], torch.tensor(-1.0 / 3.0))
+
+
+def test_the_box_is_learned_in_upright_crops_and_nothing_else_beside_people(labelled):
+    people, cache = people_of([labelled]), PictureCache()
+    for elsewhere in (0, 1):
+        crops = KeypointCrops(crops=8, elsewhere=elsewhere, turned=0, smaller=0, looks=AS_IS)
+        batch = keypoint_batch(people, cache, crops, np.random.default_rng(3))
+        assert np.isfinite(batch.people[:, 0]).all() and np.isnan(batch.people[:, 1:]).all()
+        # The person of 60 x 120 px keeps his shape, in a mirror too.
+        sides = batch.people[:, 0, 2:] - batch.people[:, 0, :2]
+        np.testing.assert_allclose(sides[:, 1] / sides[:, 0], 2.0, rtol=1e-5)
+        if elsewhere:
+            assert np.isnan(batch.boxes).all() and not batch.visible.any()
+        else:
+            np.testing.assert_array_equal(batch.boxes, batch.people[:, 0])
+    turned = keypoint_batch(
+        people, cache, KeypointCrops(crops=8, turned=1, looks=AS_IS), np.random.default_rng(3)
+    )
+    assert np.isnan(turned.boxes).all() and np.isnan(turned.people).all()
+
+
+def test_the_fit_is_what_the_box_shares_with_anybody(labelled):
+    crops = KeypointCrops(crops=2, elsewhere=0, turned=0, looks=AS_IS)
+    batch = keypoint_batch(people_of([labelled]), PictureCache(), crops, np.random.default_rng(3))
+    said = torch.from_numpy(batch.boxes)
+    sure, denied = (box_loss(batch, said, torch.full((2,), logit)) for logit in (12.0, -12.0))
+    # The true box: nothing is off, and a fit of all but 6e-6 costs as much.
+    assert float(sure) < 1e-4 < 11.0 < float(denied)
 
 
 def test_batches_depend_on_their_generator_alone(labelled):
@@ -122,7 +153,7 @@ def test_a_few_steps_on_one_batch_lower_both_losses(labelled):
     torch.manual_seed(0)
     rng, cache = np.random.default_rng(1), PictureCache()
     people = people_batch([labelled], cache, PeopleWindows(windows=2, side=64, looks=AS_IS), rng)
-    crops = KeypointCrops(crops=4, looks=AS_IS)
+    crops = KeypointCrops(crops=4, elsewhere=0, turned=0, looks=AS_IS)
     persons = people_of([labelled])
     assert [index for _, index in persons] == [0]
     keypoints = keypoint_batch(persons, cache, crops, rng)

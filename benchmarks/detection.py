@@ -1,0 +1,134 @@
+"""Prints what finding people in pictures costs on this computer, stage by stage.
+
+    python benchmarks/detection.py [--people 25] [--frames 8]
+
+A crowd of `--people` in pictures of 1920 x 1080 is rendered, coded and decoded, searched with the
+embedded detector, and everybody's pose is found with the embedded estimator. One thread; times are
+processor time, which holds beside other work. The last lines reckon what the reconstruction's share
+of it, without rendering, comes to for 90 minutes at 50 frames a second before 16 cameras.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+
+from worldpose.detection import People
+from worldpose.detection.embedded import embedded_detector, embedded_pose
+from worldpose.detection.interfaces import Picture
+from worldpose.pitch import PitchTemplate
+from worldpose.synthetic import SCENARIOS
+from worldpose.synthetic.casting import dress_people, roles_of
+from worldpose.synthetic.crowd import gather
+from worldpose.synthetic.filming import open_view, render_frame
+from worldpose.synthetic.looks import RenderingSettings
+from worldpose.synthetic.settings import RigSettings
+from worldpose.synthetic.stadium import place_camera
+from worldpose.video import open_video, write_video
+
+Result = TypeVar("Result")
+
+FPS = 50.0
+MATCH_FRAMES = 90 * 60 * 50 * 16
+"""Pictures of a match: 90 minutes, 50 frames a second, 16 cameras."""
+SURE = 0.4
+"""Boxes from this score on get a pose here: what the stage takes for people at once."""
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--people", type=int, default=25)
+    parser.add_argument("--frames", type=int, default=8)
+    asked = parser.parse_args()
+    torch.set_num_threads(1)
+    rendering, pictures = rendered(asked.people, asked.frames)
+    decoding = decoded(pictures)
+    detector, estimator = embedded_detector(), embedded_pose()
+    detector.detect(pictures[:1])
+    looking, found = timed(lambda: detector.detect(pictures))
+    people = [People(p.boxes[p.scores >= SURE], p.scores[p.scores >= SURE]) for p in found]
+    estimator.estimate(pictures[0], people[0].boxes)
+    posing, _ = timed(
+        lambda: [
+            estimator.estimate(picture, each.boxes)
+            for picture, each in zip(pictures, people, strict=True)
+        ]
+    )
+    count = len(pictures)
+    persons = sum(len(each.scores) for each in people)
+    print(f"{'':10}{'ms a picture':>14}{'pictures/s':>12}{'players/s':>12}")
+    rows = (
+        ("rendering", rendering),
+        ("decoding", decoding),
+        ("boxes", looking),
+        ("poses", posing),
+    )
+    for name, seconds in rows:
+        print(
+            f"{name:10}{1e3 * seconds / count:14.1f}"
+            f"{count / seconds:12.1f}{persons / seconds:12.0f}"
+        )
+    for stride in (1, 2, 5):
+        each = (decoding + looking / stride + posing) / count
+        hours = each * MATCH_FRAMES / 3600.0
+        print(
+            f"match, stride {stride}: {hours:.0f} core hours, {hours / 2:.0f} h on 2 cores, "
+            f"{hours / 16:.1f} h on 16, at {persons / count:.1f} people a picture"
+        )
+
+
+def rendered(people: int, frames: int) -> tuple[float, list[Picture]]:
+    """Seconds for the pictures of a moving crowd from one camera, and the pictures."""
+    scenario = SCENARIOS["match"]
+    pitch = PitchTemplate.from_spec(scenario.pitch)
+    crowd = gather(
+        scenario.model_copy(update={"crowd": scenario.crowd.model_copy(update={"people": people})}),
+        pitch,
+        np.random.SeedSequence(5),
+    )
+    times = 1.0 + np.arange(frames) / FPS
+    looks = RenderingSettings()
+    poses, later = crowd.poses(times), crowd.poses(times + looks.shutter)
+    cast = dress_people(
+        poses.betas[:, 0], roles_of(scenario.crowd, len(crowd.paths)), 5, looks.patterns
+    )
+    middle = np.median(crowd.joints(times[:1])[0, :, 11], axis=0)
+    rig = RigSettings(person_height=60.0, image_size=(1920, 1080))
+    camera = place_camera(rig, 3, middle, scenario.pitch, np.random.default_rng(5))
+    view = open_view(camera, pitch, 5, looks)
+
+    def film(frame: int) -> Picture:
+        moment = (cast.posed(poses[:, frame]), cast.posed(later[:, frame]))
+        return render_frame(view, cast, *moment, frame=frame).picture
+
+    film(0)
+    return timed(lambda: [film(frame) for frame in range(frames)])
+
+
+def decoded(pictures: list[Picture]) -> float:
+    """Seconds to decode as many pictures from a video."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "pictures.mp4"
+        write_video(path, pictures, FPS)
+        with open_video(path) as video:
+            seconds, _ = timed(lambda: list(video.frames(0, len(pictures))))
+    return seconds
+
+
+def timed(work: Callable[[], Result]) -> tuple[float, Result]:
+    """Processor seconds of some work, and what it came to."""
+    start = time.process_time()
+    result = work()
+    return time.process_time() - start, result
+
+
+if __name__ == "__main__":
+    main()
