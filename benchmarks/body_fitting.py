@@ -9,7 +9,8 @@ frame by frame. Gauss-Newton is on this project's keypoints and Jacobian, and be
 does, at limbs along their joints. LBFGS, with a strong-Wolfe search of 60 iterations in single
 precision, is on the same keypoints in torch and, where smplx is installed, on the vertices of its
 mesh. Times are scaled to all poses from `--compare` and `--mesh` of them. Each line has the cost it
-reached, and the mean distance to the true joints. One thread.
+reached, and the mean distance to the true joints. Torch has one thread; with OMP_NUM_THREADS=1 all
+sides have.
 """
 
 from __future__ import annotations
