@@ -60,15 +60,8 @@ def main() -> None:
 def filtered(scenario: Scenario, seed: int) -> tuple[int, int, int, int]:
     """Return planted keypoints found, others rejected, planted and others in all."""
     scene = simulate_scene(scenario, seed)
-    seen = [scene.observations[name] for name in scene.given]
-    who = [scene.identities[name] for name in scene.given]
-    shape = (len(scene.truth.frames), len(seen), max(each.keypoints.shape[1] for each in seen), 17)
-    keypoints, confidence = np.full((*shape, 2), np.nan), np.full(shape, np.nan)
-    displaced, person = np.zeros(shape, dtype=bool), np.full(shape[:3], -1)
-    for c, (each, truth) in enumerate(zip(seen, who, strict=True)):
-        rows, last = np.searchsorted(scene.truth.frames, each.frame), each.keypoints.shape[1]
-        keypoints[rows, c, :last], confidence[rows, c, :last] = each.keypoints, each.confidence
-        displaced[rows, c, :last], person[rows, c, :last] = truth.displaced, truth.person
+    seen = scene.static_views()
+    keypoints, confidence = seen.keypoints, seen.confidence
     cameras = Camera.stack(list(scene.given.values()))
     tracks = track_people(cameras, keypoints, confidence, scenario.fps, TrackingSettings())
     settings, how = TriangulationSettings(), BodyFittingSettings()
@@ -92,13 +85,13 @@ def filtered(scenario: Scenario, seed: int) -> tuple[int, int, int, int]:
         tracks.detection_index,
         placed.offsets,
         placed.exchanged,
-        np.zeros(shape[:3], dtype=bool),
+        np.zeros(seen.person.shape, dtype=bool),
         settings.noise,
     )
     spread = learn_from(views, suspects)
     rejected = judge_detections(views, suspects, spread, FilteringSettings()).rejected
-    there = np.isfinite(confidence) & (person >= 0)[..., None]
-    wrong, others = there & displaced, there & ~displaced
+    there = np.isfinite(confidence) & (seen.person >= 0)[..., None]
+    wrong, others = there & seen.displaced, there & ~seen.displaced
     found, lost = int(rejected[wrong].sum()), int(rejected[others].sum())
     return found, lost, int(wrong.sum()), int(others.sum())
 

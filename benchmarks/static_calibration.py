@@ -39,7 +39,7 @@ from worldpose.synthetic.stadium import place_camera
 
 PITCH = PitchTemplate.standard()
 SPREAD = np.array([1e-3, 1e-3, 1e-3, 0.1, 0.1, 0.1, 2e-3, 4.0, 4.0, 0.01, 0.01, 0.0])
-"""Of a start about 5 px off, in the order of `PARAMETERS`; all methods have it as their prior."""
+"""Proportions of what a start is off, in the order of `PARAMETERS`."""
 FREE = SPREAD > 0.0
 START_ERROR = 5.0
 FARTHEST = 30.0
@@ -65,12 +65,15 @@ def line_error(camera: Camera, true: Camera) -> float:
     return float(np.sqrt((off**2).sum(axis=-1).mean()))
 
 
-def some_pixels_off(true: Camera, rng: np.random.Generator) -> Camera:
-    """Return a camera whose markings are 5 px off."""
-    step = SPREAD * rng.standard_normal(12)
+def some_pixels_off(true: Camera, rng: np.random.Generator) -> tuple[Camera, Floats]:
+    """Return a camera whose markings are 5 px off, and the spread that it was drawn with.
+
+    All methods have that spread as their prior.
+    """
+    drawn, size = rng.standard_normal(12), 1.0
     for _ in range(4):
-        step *= START_ERROR / line_error(stepped(true, step), true)
-    return stepped(true, step)
+        size *= START_ERROR / line_error(stepped(true, size * SPREAD * drawn), true)
+    return stepped(true, size * SPREAD * drawn), size * SPREAD
 
 
 def distance_map(picture: NDArray[np.uint8], start: Camera) -> NDArray[np.float32]:
@@ -92,12 +95,12 @@ def looked_up(away: NDArray[np.float32], pixels: Floats) -> Floats:
     )
 
 
-def by_scipy(away: NDArray[np.float32], start: Camera, points: Floats) -> Camera:
+def by_scipy(away: NDArray[np.float32], start: Camera, points: Floats, spread: Floats) -> Camera:
     """Return SciPy's Levenberg-Marquardt on the map; steps are 0.01 of the prior's spread."""
 
     def whole(scaled: Floats) -> Floats:
         step = np.zeros(12)
-        step[FREE] = scaled * SPREAD[FREE]
+        step[FREE] = scaled * spread[FREE]
         return step
 
     def residuals(scaled: Floats) -> Floats:
@@ -110,11 +113,13 @@ def by_scipy(away: NDArray[np.float32], start: Camera, points: Floats) -> Camera
     return stepped(start, whole(found.x))
 
 
-def by_gauss_newton(away: NDArray[np.float32], start: Camera, points: Floats) -> Camera:
+def by_gauss_newton(
+    away: NDArray[np.float32], start: Camera, points: Floats, spread: Floats
+) -> Camera:
     """Return a damped Gauss-Newton on the map, with its gradient and our Jacobian."""
     gx = cv2.Sobel(away, cv2.CV_32F, 1, 0, ksize=3) / 8.0
     gy = cv2.Sobel(away, cv2.CV_32F, 0, 1, ksize=3) / 8.0
-    prior = 9.0 / SPREAD[FREE] ** 2
+    prior = 9.0 / spread[FREE] ** 2
     best, cost, damping = np.zeros(int(FREE.sum())), np.inf, 1e-2
     trial, camera = best, start
     normal, right = np.diag(prior), best
@@ -238,10 +243,10 @@ def main() -> None:
         rng = np.random.default_rng(index)
         true = place_camera(scenario.rig, index, np.zeros(3), scenario.pitch, rng)
         picture = render_pitch(true, PITCH, None, index)
-        start = some_pixels_off(true, rng)
+        start, spread = some_pixels_off(true, rng)
         points = line_points(start, 2000)
         away = distance_map(picture, start)
-        prior = CameraEstimate(start, np.diag(SPREAD**2))
+        prior = CameraEstimate(start, np.diag(spread**2))
         places = PITCH.positions(list(PITCH.points))
         seen = true.project(places)
         inside = ((seen > 4.0) & (seen < true.image_size - 5.0)).all(axis=-1)
@@ -253,10 +258,10 @@ def main() -> None:
             "lines: ours, from the picture": lambda p=prior, i=picture: (
                 refine_on_lines(p, PITCH, i, survey_error=0.0).estimate.camera
             ),
-            "lines: Gauss-Newton, from the map": lambda a=away, s=start, x=points: by_gauss_newton(
-                a, s, x
+            "lines: Gauss-Newton, from the map": lambda a=(away, start, points, spread): (
+                by_gauss_newton(*a)
             ),
-            "lines: SciPy LM, from the map": lambda a=away, s=start, x=points: by_scipy(a, s, x),
+            "lines: SciPy LM, from the map": lambda a=(away, start, points, spread): by_scipy(*a),
             "lines: making the map": lambda i=picture, s=start: (distance_map(i, s), None)[1],
             "clicks: calibrateCamera": lambda w=world, c=clicked, z=size: clicks_by_opencv(w, c, z),
             "clicks: solvePnP + SciPy": lambda w=world, c=clicked, z=size: clicks_by_scipy(w, c, z),

@@ -95,7 +95,7 @@ def main() -> None:
     index = np.broadcast_to(index, (options.frames, CAMERAS, PEOPLE)).copy()
 
     def ours(confidence: np.ndarray, settings: TriangulationSettings) -> np.ndarray:
-        result = triangulate_joints(cameras, keypoints, by_frame(confidence), index, settings)
+        result = triangulate_joints(cameras, keypoints, confidence, index, settings)
         return result.joints.reshape(-1, 3)
 
     def undistorted(count: int) -> np.ndarray:
@@ -175,12 +175,13 @@ def main() -> None:
             out[n] = vector[:3] / vector[3]
         return out
 
-    inliers = np.where(displaced, 0.0, sure)
+    # All sides have pixels and confidence in the order that they work in.
+    given, inliers = by_frame(sure), by_frame(np.where(displaced, 0.0, sure))
     sides: dict[str, Callable[[], np.ndarray]] = {
-        "ours, robust": lambda: ours(sure, STATED),
+        "ours, robust": lambda: ours(given, STATED),
         "ours, true inliers given": lambda: ours(inliers, STATED),
         "ours, robust, noise learned": lambda: ours(
-            sure, STATED.model_copy(update={"learn_noise": True})
+            given, STATED.model_copy(update={"learn_noise": True})
         ),
         "numpy normal equations": normal_equations,
         "numpy normal equations, matmul": matmul_normal_equations,

@@ -160,15 +160,8 @@ def _clip(
     scene: Scene, calibrations: Mapping[str, StaticCalibration], pitch: PitchTemplate
 ) -> Clip:
     """The trial as bundle adjustment takes it: tracked and triangulated with the base cameras."""
-    observations = [scene.observations[name] for name in calibrations]
-    frame = scene.truth.frames
-    detections = max(seen.keypoints.shape[1] for seen in observations)
-    keypoints = np.full((len(frame), len(observations), detections, 17, 2), np.nan)
-    confidence = np.full(keypoints.shape[:-1], np.nan)
-    for c, seen in enumerate(observations):
-        rows = np.searchsorted(seen.frame, frame)
-        keypoints[:, c, : seen.keypoints.shape[1]] = seen.keypoints[rows]
-        confidence[:, c, : seen.keypoints.shape[1]] = seen.confidence[rows]
+    seen = scene.static_views(list(calibrations))
+    keypoints, confidence = seen.keypoints, seen.confidence
     cameras = Camera.stack([known.estimate.camera for known in calibrations.values()])
     fps = SCENARIOS[SCENARIO].fps
     tracks = track_people(cameras, keypoints, confidence, fps, TrackingSettings())
@@ -180,7 +173,7 @@ def _clip(
             _clicks(known, scene.clicks[name].markings.points, pitch)
             for name, known in calibrations.items()
         ),
-        frame=frame,
+        frame=scene.truth.frames,
         fps=fps,
         keypoints=keypoints,
         confidence=confidence,

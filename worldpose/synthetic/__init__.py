@@ -8,7 +8,7 @@ from worldpose.synthetic.looks import RenderingSettings
 from worldpose.synthetic.matches import simulate_match
 from worldpose.synthetic.noise import ObservationNoise
 from worldpose.synthetic.scenarios import SCENARIOS
-from worldpose.synthetic.scene import Identities, Scene, simulate_scene
+from worldpose.synthetic.scene import Identities, Scene, StaticViews, simulate_scene
 from worldpose.synthetic.settings import (
     BroadcastSettings,
     CalibrationErrors,
@@ -31,6 +31,7 @@ __all__ = [
     "Scenario",
     "Scene",
     "Seat",
+    "StaticViews",
     "read_trajectories",
     "simulate_match",
     "simulate_scene",

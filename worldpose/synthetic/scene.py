@@ -53,6 +53,31 @@ class Identities:
 
 
 @dataclass(frozen=True, eq=False)
+class StaticViews:
+    """What the detectors of static cameras found in every frame, as tracking takes it.
+
+    Attributes:
+        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where there is none.
+        confidence: (frames, cameras, detections, 17); NaN likewise.
+        person: (frames, cameras, detections) index into the truth's `person_ids`; -1 for false
+            people and padding.
+        displaced: (frames, cameras, detections, 17) bool, keypoints put far off on purpose.
+    """
+
+    keypoints: NDArray[np.float64]
+    confidence: NDArray[np.float64]
+    person: NDArray[np.int16]
+    displaced: NDArray[np.bool_]
+
+    def index(self, persons: int) -> NDArray[np.int16]:
+        """Return the place of everybody's detection (frames, cameras, persons); -1 = not seen."""
+        index = np.full((*self.person.shape[:2], persons), -1, np.int16)
+        frame, camera, place = np.nonzero(self.person >= 0)
+        index[frame, camera, self.person[frame, camera, place]] = place
+        return index
+
+
+@dataclass(frozen=True, eq=False)
 class Scene:
     """What happened, and what detectors made of it.
 
@@ -82,6 +107,22 @@ class Scene:
     clocks: dict[str, float]
     clicks: dict[str, Clicks]
     surveyed: PitchSpec
+
+    def static_views(self, names: Sequence[str] | None = None) -> StaticViews:
+        """Return the detections of static cameras in one array, by default of all of them."""
+        names = list(self.cameras) if names is None else names
+        seen = [self.observations[name] for name in names]
+        frames = self.truth.frames
+        shape = (len(frames), len(seen), max(each.keypoints.shape[1] for each in seen), 17)
+        keypoints, confidence = np.full((*shape, 2), np.nan), np.full(shape, np.nan)
+        person, displaced = np.full(shape[:3], -1, np.int16), np.zeros(shape, np.bool_)
+        for c, (name, each) in enumerate(zip(names, seen, strict=True)):
+            rows, last = np.searchsorted(frames, each.frame), each.keypoints.shape[1]
+            keypoints[rows, c, :last] = each.keypoints
+            confidence[rows, c, :last] = each.confidence
+            person[rows, c, :last] = self.identities[name].person
+            displaced[rows, c, :last] = self.identities[name].displaced
+        return StaticViews(keypoints, confidence, person, displaced)
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,26 +40,8 @@ def plant(seed, scenario="tiny", duration=0.8, displaced=0.06):
     scene = simulate_scene(
         base.model_copy(update={"duration": duration, "noise": noise, "broadcast": None}), seed
     )
-    seen = [scene.observations[name] for name in scene.cameras]
-    who = [scene.identities[name] for name in scene.cameras]
-    most = max(each.keypoints.shape[1] for each in seen)
-
-    def together(arrays, missing):
-        padded = [
-            np.pad(
-                each,
-                [(0, 0), (0, most - each.shape[1])] + [(0, 0)] * (each.ndim - 2),
-                constant_values=missing,
-            )
-            for each in arrays
-        ]
-        return np.stack(padded, axis=1)
-
-    keypoints = together([each.keypoints.astype(float) for each in seen], np.nan)
-    person = together([each.person for each in who], -1)
-    index = np.full((*person.shape[:2], len(scene.truth.person_ids)), -1)
-    frame, camera, place = np.nonzero(person >= 0)
-    index[frame, camera, person[frame, camera, place]] = place
+    seen = scene.static_views()
+    index = seen.index(len(scene.truth.person_ids))
     rng = np.random.default_rng(seed)
     joints = scene.truth.joints + rng.normal(0.0, SPREAD, scene.truth.joints.shape)
     covariance = np.broadcast_to(SPREAD**2 * np.eye(3), (*joints.shape, 3))
@@ -68,14 +50,14 @@ def plant(seed, scenario="tiny", duration=0.8, displaced=0.06):
         cameras,
         view_bodies(cameras, perceived_joints(joints, np.zeros((17, 3))), covariance),
         Suspects(
-            keypoints,
-            together([each.confidence.astype(float) for each in seen], np.nan),
+            seen.keypoints,
+            seen.confidence,
             index,
             np.zeros((*index.shape, 2)),
             np.zeros((*index.shape, 3), dtype=bool),
-            np.zeros(person.shape, dtype=bool),
+            np.zeros(seen.person.shape, dtype=bool),
             (1.5, 0.04),
         ),
-        together([each.displaced for each in who], False),
-        person,
+        seen.displaced,
+        seen.person,
     )

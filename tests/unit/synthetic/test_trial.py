@@ -15,14 +15,8 @@ from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
 def reconstructed(scene, cameras, fps):
     """Scores of tracked and plainly triangulated joints: cameras are taken as exact."""
-    people = [scene.observations[name] for name in scene.cameras]
-    most = max(each.keypoints.shape[1] for each in people)
-    shape = (len(scene.truth.frames), len(people), most, 17)
-    keypoints, confidence = np.full((*shape, 2), np.nan), np.full(shape, np.nan)
-    for index, each in enumerate(people):
-        found = each.keypoints.shape[1]
-        keypoints[:, index, :found] = each.keypoints
-        confidence[:, index, :found] = each.confidence
+    seen = scene.static_views()
+    keypoints, confidence = seen.keypoints, seen.confidence
     tracks = track_people(cameras, keypoints, confidence, fps, TrackingSettings())
     index = tracks.detection_index
     plain = TriangulationSettings(learn_noise=False, offsets="none")

@@ -22,20 +22,9 @@ def simulated(seed, people=8):
 
 def arrays_of(scene, people):
     """Cameras, arrays as the tracker would match them, and the truth."""
-    truth = scene.truth.joints
-    seen = [(scene.observations[name], scene.identities[name].person) for name in scene.cameras]
-    most = max(found.keypoints.shape[1] for found, _ in seen)
-    keypoints = np.full((len(truth), len(seen), most, 17, 2), np.nan)
-    confidence = np.full(keypoints.shape[:-1], np.nan)
-    index = np.full((len(truth), len(seen), people), -1, np.int16)
-    for camera, (found, person) in enumerate(seen):
-        width = found.keypoints.shape[1]
-        keypoints[:, camera, :width] = found.keypoints
-        confidence[:, camera, :width] = found.confidence
-        frame, place = np.nonzero(person >= 0)
-        index[frame, camera, person[frame, place]] = place
+    seen = scene.static_views()
     cameras = Camera.stack(list(scene.cameras.values()))
-    return cameras, (keypoints, confidence, index), truth
+    return cameras, (seen.keypoints, seen.confidence, seen.index(people)), scene.truth.joints
 
 
 def squared_deviations(result, truth):

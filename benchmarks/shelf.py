@@ -1,0 +1,106 @@
+"""Prints PCP3D of the Shelf sequence through whole runs: all cameras, one less, and causally.
+
+    python benchmarks/shelf.py DATA
+
+DATA holds `shelf_dev`: `import/` (calibration.toml, detections), `gt.npz` and `pcp.py`, the
+sequence's own evaluator. Every line is an import and a run by the command line; scored are the
+joints of `retriangulation` and the fitted bodies, actors 1 and 3, alpha 0.5.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from worldpose.release import read_joints
+
+WORLDPOSE = Path(sys.executable).with_name("worldpose")
+
+
+def load_scorer(folder: Path) -> ModuleType:
+    """Return the sequence's evaluator."""
+    spec = importlib.util.spec_from_file_location("pcp", folder / "pcp.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def command(*words: object) -> None:
+    """Run `worldpose` quietly."""
+    done = subprocess.run(
+        [WORLDPOSE, *map(str, words)], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        sys.exit(f"worldpose {' '.join(map(str, words))}:\n{done.stdout}{done.stderr}")
+
+
+def without(given: Path, camera: str, folder: Path) -> Path:
+    """Return a copy of the import form that lacks a camera."""
+    out = folder / "import"
+    shutil.copytree(given, out)
+    (out / "detections" / f"{camera}.json").unlink()
+    parts = re.split(r"(?m)^(?=\[)", (given / "calibration.toml").read_text())
+    kept = [part for part in parts if f'name = "{camera}"' not in part]
+    assert len(kept) == len(parts) - 1
+    (out / "calibration.toml").write_text("".join(kept))
+    return out
+
+
+def scores(data: Path, given: Path, folder: Path, *settings: str) -> list[float]:
+    """Return PCP3D of retriangulated joints and of bodies [%]."""
+    scorer, truth = load_scorer(data), np.load(data / "gt.npz")
+    match, project = folder / "shelf", folder / "project"
+    calibration, detections = given / "calibration.toml", given / "detections"
+    command(
+        *("import", "--calibration", calibration, "--detections", detections),
+        *("--fps", 25, "--out", match),
+    )
+    command("run", match, "--project", project, *settings)
+    values = []
+    for stage in ("retriangulation", "body_fitting"):
+        out = folder / stage
+        command(
+            *("export", "shelf", "--format", "joints", "--stage", stage),
+            *("--out", out, "--project", project),
+        )
+        tracks = read_joints(out / "joints.npz")
+        poses = dict(zip(tracks.frames.tolist(), tracks.joints, strict=True))
+        score, _ = scorer.evaluate(truth["gt"], truth["frames"], poses, "shelf")
+        values.append(float(score["avg_pcp_actors_1_3"]))
+    return values
+
+
+def main() -> None:
+    """Print one line a run."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path)
+    data = parser.parse_args().data / "shelf_dev"
+    cameras = sorted(file.stem for file in (data / "import" / "detections").glob("*.json"))
+    runs: dict[str, tuple[str | None, tuple[str, ...]]] = {
+        "all cameras": (None, ()),
+        "causal": (None, ("--set", "tracking.causal=true")),
+        **{f"without {camera}": (camera, ()) for camera in cameras},
+    }
+    print("PCP3D: joints, bodies [%]")
+    for label, (left_out, settings) in runs.items():
+        with tempfile.TemporaryDirectory() as temporary:
+            folder, given = Path(temporary), data / "import"
+            if left_out is not None:
+                given = without(given, left_out, folder)
+            joints, bodies = scores(data, given, folder, *settings)
+        print(f"{label:16s} {joints:6.2f} {bodies:6.2f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
