@@ -39,7 +39,7 @@ def tell(name: str, scene: Scene, fps: float) -> None:
     print(
         f"{name}: {frames} frames, {persons} people: IDF1 {scores.idf1:.4f}, "
         f"{scores.switches} switches, coverage {scores.coverage:.4f}, "
-        f"{len(tracks.report.undecided)} joins undecided, {frames / spent:.0f} frames/s",
+        f"{tracks.report.undecided} joins undecided, {frames / spent:.0f} frames/s",
         flush=True,
     )
 

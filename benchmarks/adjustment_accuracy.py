@@ -1,0 +1,155 @@
+"""Prints how exactly static cameras are known before and after bundle adjustment, and how surely.
+
+    python benchmarks/adjustment_accuracy.py [--scenario match] [--seeds 601 602] [--duration 4]
+
+Cameras are calibrated from the scenario's clicks and one picture each, people are tracked and
+triangulated with them, and all cameras are adjusted together. Ground: the true pixel of a place
+where a player stands, back through the camera onto the pitch, median / 95 %. Regions: share of
+these places, seen by a camera, whose error in its picture lies within what the camera's covariance
+says.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+from static_accuracy import SHARES, ground_errors
+
+from worldpose.bundle_adjustment import Clicks, Clip, adjust_cameras
+from worldpose.cameras import Camera
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration import StaticCalibration, calibrate, project_with_jacobian
+from worldpose.synthetic import SCENARIOS, Scenario, Scene, simulate_scene
+from worldpose.synthetic.rendering import render_pitch
+from worldpose.tracking import TrackingSettings, track_people
+from worldpose.triangulation import TriangulationSettings, triangulate_joints
+
+Floats = NDArray[np.float64]
+MOMENTS = 6
+"""Frames of a clip whose players count."""
+
+
+def calibrated(scene: Scene, scenario: Scenario, seed: int) -> dict[str, StaticCalibration]:
+    """Return every static camera from clicks and the lines of one picture."""
+    surveyed = PitchTemplate.from_spec(scene.surveyed)
+    painted = PitchTemplate.from_spec(scenario.pitch)
+    found = {}
+    for name, camera in scene.cameras.items():
+        still = render_pitch(camera, painted, scene.truth.joints[0], seed)
+        grey = cv2.cvtColor(still, cv2.COLOR_RGB2GRAY)
+        size = (int(camera.image_size[0]), int(camera.image_size[1]))
+        found[name] = calibrate(surveyed, scene.clicks[name].markings, size, picture=grey)
+    return found
+
+
+def as_clip(scene: Scene, fps: float, known: dict[str, StaticCalibration]) -> Clip:
+    """Return the clip as bundle adjustment takes it."""
+    seen, settings = scene.static_views(list(known)), TriangulationSettings()
+    cameras = Camera.stack([each.estimate.camera for each in known.values()])
+    covariance = np.stack([each.estimate.covariance for each in known.values()])
+    arrays = (seen.keypoints, seen.confidence)
+    index = track_people(cameras, *arrays, fps, TrackingSettings()).detection_index
+    placed = triangulate_joints(cameras, *arrays, index, settings, covariance)
+    surveyed = PitchTemplate.from_spec(scene.surveyed)
+    clicks = []
+    for name, each in known.items():
+        agree = {point.name: point.inlier for point in each.report.points}
+        points = scene.clicks[name].markings.points
+        clicks.append(
+            Clicks(
+                names=tuple(point.name for point in points),
+                points_world=surveyed.positions([point.name for point in points]),
+                points_image=np.array([point.xy for point in points]).reshape(-1, 2),
+                inlier=np.array([agree[point.name] for point in points], dtype=np.bool_),
+            )
+        )
+    return Clip(
+        cameras=cameras,
+        covariance=covariance,
+        clicks=tuple(clicks),
+        frame=scene.truth.frames,
+        fps=fps,
+        keypoints=seen.keypoints,
+        confidence=seen.confidence,
+        detection_index=index.astype(np.int64),
+        joints=placed.joints,
+        views=placed.views.astype(np.int64),
+        triangulation=settings,
+        pitch=surveyed,
+        on_lines=np.array([each.report.stage == "lines" for each in known.values()]),
+    )
+
+
+def errors(
+    cameras: Camera, covariance: Floats, true: Camera, places: Floats, pitch: PitchTemplate
+) -> tuple[Floats, Floats]:
+    """Return errors on the ground [m], and squared ones in the picture over their covariance."""
+    ground, squared = [], []
+    for c in range(len(covariance)):
+        pixels = true[c].project(places)
+        inside = ((pixels > 0.0) & (pixels < true[c].image_size - 1.0)).all(axis=-1)
+        found, slope = project_with_jacobian(cameras[c], places[inside])
+        spread = np.einsum("nij,jk,nlk->nil", slope, covariance[c], slope)
+        off = found - pixels[inside]
+        squared.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off))
+        ground.append(ground_errors(cameras[c], true[c], places, pitch))
+    return np.concatenate(ground), np.concatenate(squared)
+
+
+def tell(label: str, found: list[tuple[Floats, Floats]]) -> None:
+    """Print a line of figures."""
+    ground, squared = (np.concatenate(part) for part in zip(*found, strict=True))
+    held = [100.0 * np.mean(squared < chi2.ppf(share, 2)) for share in SHARES]
+    print(
+        f"  {label}: ground {100.0 * np.median(ground):.2f} / "
+        f"{100.0 * np.percentile(ground, 95.0):.2f} cm, regions of "
+        + " / ".join(f"{100.0 * share:g}" for share in SHARES)
+        + " % hold "
+        + " / ".join(f"{each:.1f}" for each in held),
+        flush=True,
+    )
+
+
+def main() -> None:
+    """Print two lines a match, and two of all."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scenario", default="match")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[601, 602])
+    parser.add_argument("--duration", type=float, default=4.0)
+    options = parser.parse_args()
+    changes = {"duration": options.duration, "broadcast": None}
+    scenario = SCENARIOS[options.scenario].model_copy(update=changes)
+    painted = PitchTemplate.from_spec(scenario.pitch)
+    before: list[tuple[Floats, Floats]] = []
+    after: list[tuple[Floats, Floats]] = []
+    for seed in options.seeds:
+        scene = simulate_scene(scenario, seed)
+        known = calibrated(scene, scenario, seed)
+        clip = as_clip(scene, scenario.fps, known)
+        begin = time.process_time()
+        adjusted = adjust_cameras(clip)
+        spent = time.process_time() - begin
+        moments = np.linspace(0, len(clip.frame) - 1, MOMENTS).astype(int)
+        places = scene.truth.joints[moments][:, :, 15:17].mean(axis=2).reshape(-1, 3)
+        places[:, 2] = painted.height(places[:, 0], places[:, 1])
+        true = Camera.stack([scene.cameras[name] for name in known])
+        before.append(errors(clip.cameras, clip.covariance, true, places, painted))
+        after.append(errors(adjusted.cameras, adjusted.covariance, true, places, painted))
+        print(
+            f"{options.scenario} {seed}: {int(adjusted.accepted.sum())} of {len(known)} cameras "
+            f"changed in {spent:.1f} s"
+        )
+        tell("calibrated", before[-1:])
+        tell("adjusted", after[-1:])
+    print(f"all {len(options.seeds)}:")
+    tell("calibrated", before)
+    tell("adjusted", after)
+
+
+if __name__ == "__main__":
+    main()
