@@ -7,6 +7,9 @@ import pytest
 
 from worldpose.bundle_adjustment.survey import survey_response, with_shared_errors
 from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration import stepped
+from worldpose.static_calibration.line_adjustment import adjust
+from worldpose.static_calibration.line_samples import sample_markings, see_lines, thinned
 
 SURVEY_ERROR = 0.006
 
@@ -35,6 +38,36 @@ def test_what_cameras_share_is_never_more_than_they_state(lined):
         left = (known - moved @ moved.T)[np.ix_(free, free)] / np.outer(size, size)
         # Rounding of numbers of size one.
         assert np.linalg.eigvalsh(left).min() > -1e-9
+
+
+def test_a_survey_that_is_off_as_a_whole_takes_its_cameras_along(lined):
+    # Cameras that know nothing but the lines: what all points have in common goes into them whole.
+    pitch, free = lined.pitch, np.diag(lined.covariance[0]) > 0.0
+    samples = sample_markings(pitch, 0.25)
+    for c in range(3):
+        seen = see_lines(lined.cameras[c], samples, 0.12, SURVEY_ERROR, 0.05)
+        seen = seen[thinned(seen, samples, 8.0, 700)]
+        fitted = adjust(
+            np.zeros(len(seen.places)),
+            np.full(len(seen.places), 0.01),
+            np.ascontiguousarray(seen.by_camera[:, free]),
+            seen.by_paint,
+            seen.unknowns,
+            (np.zeros((free.sum(), free.sum())), np.zeros(free.sum())),
+            (np.inf,),
+        )
+        lined.covariance[c][np.ix_(free, free)] = np.linalg.inv(fitted.information)
+    response = survey_response(lined, SURVEY_ERROR)
+    spot = pitch.positions(["center_mark"])
+    for axis in np.eye(3):
+        common = np.tile(axis, len(pitch.points))
+        for camera, moved in zip(lined.cameras[:3], response[:3], strict=True):
+            # The paint is there, the survey says here: the camera has to make up for it.
+            seen = camera.project(spot + SURVEY_ERROR * axis)
+            # Of 0.3 px that the paint is off; linearised.
+            np.testing.assert_allclose(
+                stepped(camera, moved @ common).project(spot), seen, atol=1e-3
+            )
 
 
 def test_lines_that_are_off_together_move_the_camera_with_them():
