@@ -135,7 +135,8 @@ def _shown(person_ids: NDArray[np.int16], pixels: NDArray[np.float64]) -> NDArra
     """Whether a person fills a pixel about each of his joints (persons, 17)."""
     height, width = person_ids.shape
     shown = np.zeros(pixels.shape[:2], dtype=bool)
-    at = np.nan_to_num(np.round(pixels), nan=-9.0)
+    # Distorted points far outside may lie beyond what a whole number can hold.
+    at = np.clip(np.nan_to_num(np.round(pixels), nan=-9.0), -9.0, 2.0 * width + 2.0 * height)
     for down in (-1, 0, 1):
         for across in (-1, 0, 1):
             x, y = (at + np.array([across, down])).swapaxes(0, -1).swapaxes(1, -1).astype(int)

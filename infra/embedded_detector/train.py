@@ -22,7 +22,7 @@ from worldpose.detection.embedded_nets import KeypointNet, PeopleNet
 from worldpose.detection.embedded_weights import load_weights, save_weights
 from worldpose.training import LabelledPicture, PictureCache, TrainingSettings
 from worldpose.training.nets import LEAST_HEIGHT, train_keypoint_net, train_people_net
-from worldpose.training.scoring import HEIGHTS, apart, score_keypoints, score_people
+from worldpose.training.scoring import HEIGHTS, apart, found_people, score_keypoints, score_people
 
 SEED = 1
 SCENES = {
@@ -90,10 +90,10 @@ def score(
     detector = EmbeddedDetector(load_weights(folder / "embedded_people.safetensors", PeopleNet()))
     pose = EmbeddedPose(load_weights(folder / "embedded_keypoints.safetensors", KeypointNet()))
     classes = ["all", *(f"{low:g} to {high:g} px" for low, high in HEIGHTS)]
-    found = dict(zip(classes, score_people(detector, pictures, cache), strict=True))
-    stored, free = (
-        dict(zip(classes, score_people(detector, some, cache, estimator=pose), strict=True))
-        for some in (pictures, apart(pictures))
+    found, kept = (found_people(detector, pictures, cache, each) for each in (None, pose))
+    alone, stored, free = (
+        dict(zip(classes, score_people(people, labels), strict=True))
+        for people, labels in ((found, pictures), (kept, pictures), (kept, apart(pictures)))
     )
     limits = [(LEAST_HEIGHT, 1e9), *HEIGHTS]
     placed = {
@@ -102,7 +102,7 @@ def score(
     }
     return {
         "pictures": len(pictures),
-        "ap50_of_the_detector": found,
+        "ap50_of_the_detector": alone,
         "ap50": stored,
         "ap50_apart": free,
         "keypoints": placed,

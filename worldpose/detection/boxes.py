@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.detection.interfaces import People, Poses
 
 Floats = NDArray[np.float64]
+
+SUREST: Final = 12
+"""Keypoints that tell whether somebody is there: of many people some are hidden."""
 
 
 def overlaps(a: Floats, b: Floats) -> Floats:
@@ -50,13 +55,15 @@ def seen_closer(people: People, poses: Poses) -> People:
 
     Args:
         people: as a detector found them.
-        poses: of each. A score becomes its geometric mean with the expected fit.
+        poses: of each. A score becomes its geometric mean with the expected fit and the mean
+            confidence of the surest keypoints.
     """
     if poses.boxes is None or poses.fit is None:
         return people
     real = np.all(poses.boxes[:, 2:] - poses.boxes[:, :2] > 1.0, axis=1)
     boxes = np.where(real[:, None], poses.boxes, people.boxes)
-    return People(boxes, np.sqrt(people.scores * poses.fit))
+    sure = np.sort(np.nan_to_num(poses.confidence), axis=1)[:, -SUREST:].mean(axis=1)
+    return People(boxes, np.cbrt(people.scores * poses.fit * sure))
 
 
 def fuse(members: list[People], overlap: float) -> People:

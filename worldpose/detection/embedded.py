@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from worldpose.detection.boxes import overlaps, suppress
 from worldpose.detection.embedded_crops import crops_of_boxes, cut, picture_from_crop
 from worldpose.detection.embedded_weights import load_weights
+from worldpose.detection.groups import groups
 from worldpose.detection.interfaces import (
     LEAST_SCORE,
     Detector,
@@ -79,7 +80,10 @@ def embedded_pose(
 
 
 class EmbeddedDetector:
-    """A net that finds the middles of people and the sides of their boxes."""
+    """A net that finds the middles of people and the sides of their boxes.
+
+    Groups of people who hide one another are looked at again, from nearer.
+    """
 
     def __init__(self, net: PeopleNet, device: str = "cpu", half: bool = False) -> None:
         self._net, self._device, self._half = _placed(net, device), device, half
@@ -94,6 +98,20 @@ class EmbeddedDetector:
         return [self._people(picture) for picture in pictures]
 
     def _people(self, picture: Picture) -> People:
+        whole = self._look(picture)
+        looks = [
+            whole,
+            *(
+                group.in_picture(self._look(group.shown(picture)))
+                for group in groups(whole, picture.shape)
+            ),
+        ]
+        boxes = np.concatenate([people.boxes for people in looks])
+        scores = np.concatenate([people.scores for people in looks])
+        return suppress(People(boxes, scores), OVERLAP)
+
+    def _look(self, picture: Picture) -> People:
+        """Whose middles a picture shows; the same person may be there twice."""
         import torch
 
         from worldpose.detection.embedded_nets import COARSEST, normalised
@@ -110,7 +128,7 @@ class EmbeddedDetector:
         found = boxes.double().cpu().numpy()
         found = np.clip(found, -0.5, np.array([width, height, width, height]) - 0.5)
         real = np.all(found[:, 2:] - found[:, :2] > 1.0, axis=1)
-        return suppress(People(found[real], scores.double().cpu().numpy()[real]), OVERLAP)
+        return People(found[real], scores.double().cpu().numpy()[real])
 
 
 class EmbeddedPose:

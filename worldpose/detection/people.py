@@ -9,12 +9,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.conventions import COCO17_SIGMAS
 from worldpose.cameras import Camera
 from worldpose.detection.boxes import areas, fuse, seen_closer, suppress
 from worldpose.detection.crowd import on_pitch
 from worldpose.detection.followed import Follower, looked_at
 from worldpose.detection.interfaces import Detector, People, Picture, PoseEstimator, Poses
+from worldpose.detection.same_pose import told_apart
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.views import Tiled
 from worldpose.pitch import PitchTemplate
@@ -178,22 +178,14 @@ class PeopleFinder:
         """Keypoints of everybody; who has none, or the pose of somebody better, is not kept."""
         poses = self._estimator.estimate(picture, people.boxes)
         people = seen_closer(people, poses)
-        with np.errstate(invalid="ignore"):
-            found = (poses.confidence >= self._settings.least_keypoint) & np.isfinite(
-                poses.keypoints
-            ).all(axis=2)
-        confidence = np.where(found, poses.confidence, np.nan)
-        keypoints = np.where(found[..., None], poses.keypoints, np.nan)
-        alike = likeness(keypoints, areas(people.boxes)) > self._settings.same_pose
-        kept = np.zeros(len(people.scores), dtype=np.bool_)
-        order = np.argsort(-people.scores, kind="stable")
-        for row in order:
-            kept[row] = found[row].any() and not alike[row, kept].any()
-        self.report.unsure += int(np.count_nonzero(~kept))
-        best = np.sort(order[kept[order]][: self._settings.most_people])
+        known, own = told_apart(
+            people, poses, self._settings.least_keypoint, self._settings.same_pose
+        )
+        self.report.unsure += len(people.scores) - len(known.scores)
+        best = np.sort(np.argsort(-known.scores, kind="stable")[: self._settings.most_people])
         return (
-            People(people.boxes[best], people.scores[best]),
-            Poses(keypoints[best], confidence[best]),
+            People(known.boxes[best], known.scores[best]),
+            Poses(own.keypoints[best], own.confidence[best]),
         )
 
     def _stretch(self, rows: list[tuple[People, Poses]], unreadable: list[int]) -> Stretch:
@@ -218,22 +210,6 @@ class PeopleFinder:
         rows.clear()
         unreadable.clear()
         return stretch
-
-
-def likeness(keypoints: Floats, area: Floats) -> Floats:
-    """COCO's object keypoint similarity of every pair of poses (people, people) [1].
-
-    Args:
-        keypoints: (people, 17, 2) [px]; NaN where not found.
-        area: (people,) of their boxes [px^2]; the smaller of a pair counts.
-    """
-    apart = np.square(keypoints[:, None] - keypoints[None]).sum(axis=3)
-    scale = 2.0 * np.minimum(area[:, None], area[None])[..., None]
-    alike = np.exp(-apart / (scale * (2.0 * np.array(COCO17_SIGMAS)) ** 2))
-    both = np.isfinite(apart)
-    count = both.sum(axis=2)
-    total = np.where(both, alike, 0.0).sum(axis=2)
-    return np.asarray(np.divide(total, count, out=np.zeros_like(total), where=count > 0))
 
 
 def _nobody() -> People:

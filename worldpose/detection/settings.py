@@ -38,9 +38,9 @@ class DetectionSettings(Record):
     fusion: Literal["suppress", "weighted"] = "weighted"
     """How an ensemble's boxes of one person become one: the best alone, or their mean weighted by
     score. Both are of the paper's family; a single detector is always suppressed."""
-    overlap: float = Field(default=0.6, gt=0, lt=1)
-    """Two boxes with more of their union in common are of one person [1]. Players in a duel reach
-    0.5, two boxes of one person seldom less than 0.7."""
+    overlap: float = Field(default=0.7, gt=0, lt=1)
+    """Two boxes with more of their union in common are of one person [1]. Players in a group reach
+    0.6 and more; a second box of one person that is let through shows the same pose."""
     zooms: tuple[float, ...] = Field(default=(1.0,), max_length=4)
     """For a detector that looks at views of a fixed size: pictures are scaled by each and cut into
     overlapping views, beside one view of the whole picture [1]."""

@@ -21,7 +21,7 @@ from worldpose.training.labels import LabelledPicture
 from worldpose.training.loop import Check, Training, train
 from worldpose.training.people_training import PeopleWindows, people_batch, people_loss
 from worldpose.training.pictures import PictureCache
-from worldpose.training.scoring import score_keypoints, score_people
+from worldpose.training.scoring import found_people, score_keypoints, score_people
 from worldpose.training.settings import TrainingSettings
 
 Pictures = Sequence[LabelledPicture]
@@ -33,7 +33,8 @@ LEAST_HEIGHT: Final = 34.0
 
 def people_figure(net: PeopleNet, pictures: Pictures, cache: PictureCache) -> float:
     """Return AP50 [1] of a detector."""
-    return score_people(EmbeddedDetector(copy.deepcopy(net)), pictures, cache)[0]
+    found = found_people(EmbeddedDetector(copy.deepcopy(net)), pictures, cache)
+    return score_people(found, pictures)[0]
 
 
 def keypoint_figure(net: KeypointNet, pictures: Pictures, cache: PictureCache) -> float:

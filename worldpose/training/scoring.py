@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.detection.boxes import overlaps, seen_closer
-from worldpose.detection.interfaces import Detector, PoseEstimator
+from worldpose.detection.interfaces import Detector, People, Picture, PoseEstimator
+from worldpose.detection.same_pose import told_apart
+from worldpose.detection.settings import DetectionSettings
 from worldpose.training.average_precision import average_precision
 from worldpose.training.keypoint_accuracy import calibration_error, correct_keypoints
 from worldpose.training.keypoint_training import RIGHT
@@ -41,25 +43,40 @@ class KeypointFigures:
     calibration: float
 
 
-def score_people(
+def found_people(
     detector: Detector,
     pictures: Sequence[LabelledPicture],
     cache: PictureCache,
-    heights: Sequence[tuple[float, float]] = HEIGHTS,
     estimator: PoseEstimator | None = None,
-) -> tuple[float, ...]:
-    """Return AP50 of all people, and of those in each class of heights [px].
-
-    With an estimator it is that of the boxes which the estimator sees, as they are stored.
-    """
+) -> list[People]:
+    """Return the people of each picture; with an estimator as they are stored."""
     found = [detector.detect([cache[picture.path]])[0] for picture in pictures]
-    if estimator is not None:
-        found = [
-            seen_closer(people, estimator.estimate(cache[picture.path], people.boxes))
-            for people, picture in zip(found, pictures, strict=True)
-        ]
+    if estimator is None:
+        return found
+    return [
+        stored(people, cache[picture.path], estimator)
+        for people, picture in zip(found, pictures, strict=True)
+    ]
+
+
+def score_people(
+    found: Sequence[People],
+    pictures: Sequence[LabelledPicture],
+    heights: Sequence[tuple[float, float]] = HEIGHTS,
+) -> tuple[float, ...]:
+    """Return AP50 of all people found, and of those in each class of heights [px]."""
     classes = [(0.0, np.inf), *heights]
     return tuple(average_precision(found, pictures, each) for each in classes)
+
+
+def stored(people: People, picture: Picture, estimator: PoseEstimator) -> People:
+    """Return the people of a picture as the stage stores them by default, the crowd included."""
+    chosen = DetectionSettings()
+    kept = people.scores >= chosen.doubtful
+    people = People(people.boxes[kept], people.scores[kept])
+    poses = estimator.estimate(picture, people.boxes)
+    closer = seen_closer(people, poses)
+    return told_apart(closer, poses, chosen.least_keypoint, chosen.same_pose)[0]
 
 
 def apart(pictures: Sequence[LabelledPicture], share: float = 0.3) -> list[LabelledPicture]:

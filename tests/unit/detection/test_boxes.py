@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from worldpose.detection.boxes import fuse, overlaps, suppress
-from worldpose.detection.interfaces import People
+from worldpose.detection.boxes import fuse, overlaps, seen_closer, suppress
+from worldpose.detection.interfaces import People, Poses
 from worldpose.detection.views import Tiled
 
 
@@ -91,3 +91,14 @@ def test_a_person_in_a_scaled_view_lies_where_the_picture_has_them(zoom):
     found = Tiled(Blobs(), (zoom,), view_overlap=0.3, overlap=0.3).detect([picture])[0]
     # An edge pixel that is half white counts as white or not.
     np.testing.assert_allclose(found.boxes, [[60, 40, 69, 55]], atol=1.0)
+
+
+def test_a_closer_look_scores_by_detector_fit_and_the_surest_keypoints():
+    confidence = np.full((1, 17), 0.5)
+    confidence[0, :5] = np.nan, 0.1, 0.1, 0.1, 0.1  # a hidden head tells nothing
+    poses = Poses(
+        np.zeros((1, 17, 2)), confidence, np.array([[1.0, 1.0, 5.0, 9.0]]), np.array([0.8])
+    )
+    found = seen_closer(People(np.array([[0.0, 0.0, 6.0, 9.0]]), np.array([0.54])), poses)
+    np.testing.assert_array_equal(found.boxes, poses.boxes)
+    np.testing.assert_allclose(found.scores, [(0.54 * 0.8 * 0.5) ** (1 / 3)])

@@ -6,7 +6,7 @@ import pytest
 from worldpose.cameras import Camera
 from worldpose.detection import DetectionSettings, People, PeopleFinder, Place, Poses
 from worldpose.detection.crowd import on_pitch
-from worldpose.detection.people import likeness
+from worldpose.detection.same_pose import likeness, told_apart
 from worldpose.ingest.given_cameras import given_camera
 from worldpose.pitch import PitchTemplate
 
@@ -144,7 +144,7 @@ def test_boxes_are_those_of_who_looked_closer():
     (stretch,) = finder.find((n, blank) for n in range(3))
     wanted = [[8.0, 10.0, 32.0, 60.0], [100.0, 10.0, 120.0, 60.0]]
     np.testing.assert_allclose(stretch.boxes[1, :2], wanted)
-    np.testing.assert_allclose(stretch.score[1, :2], np.sqrt(0.9 * 0.4), rtol=1e-6)
+    np.testing.assert_allclose(stretch.score[1, :2], np.cbrt(0.9 * 0.4 * 0.8), rtol=1e-6)
 
 
 def test_two_poses_of_one_person_are_alike_and_those_of_two_are_not():
@@ -155,3 +155,17 @@ def test_two_poses_of_one_person_are_alike_and_those_of_two_are_not():
     assert alike[0, 1] > 0.9
     assert alike[0, 2] < 0.3
     assert alike[0, 3] == alike[3, 3] == 0.0
+
+
+def test_of_two_boxes_with_one_pose_the_better_stays_and_who_is_close_to_one_comes_last():
+    person = np.stack([np.linspace(0, 30, 17), np.linspace(0, 80, 17)], axis=1)
+    near, far = person + [6.0, 0.0], person + [200.0, 0.0]
+    keypoints = np.stack([person + 0.5, near, person, far])
+    poses = Poses(keypoints, np.full((4, 17), 0.9))
+    box = np.array([0.0, 0.0, 30.0, 80.0])
+    boxes = box + np.array([0.5, 6.0, 0.0, 200.0])[:, None] * [1.0, 0.0, 1.0, 0.0]
+    people, own = told_apart(People(boxes, np.array([0.6, 0.7, 0.8, 0.5])), poses, 0.05, 0.85)
+    np.testing.assert_array_equal(own.keypoints, keypoints[1:])
+    alike = likeness(keypoints[1:3], np.full(2, 2400.0))[0, 1]
+    assert 0.3 < alike < 0.85
+    np.testing.assert_allclose(people.scores, [0.7 * (1.0 - 0.5 * alike**2), 0.8, 0.5])

@@ -1,0 +1,61 @@
+"""Poses that are too much alike to be of two people."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17_SIGMAS
+from worldpose.detection.boxes import areas
+from worldpose.detection.interfaces import People, Poses
+
+Floats = NDArray[np.float64]
+
+DOUBT: Final = 0.5
+"""Share of its score that a box loses which has a better one's pose [1]."""
+
+
+def likeness(keypoints: Floats, area: Floats) -> Floats:
+    """COCO's object keypoint similarity of every pair of poses (people, people) [1].
+
+    Args:
+        keypoints: (people, 17, 2) [px]; NaN where not found.
+        area: (people,) of their boxes [px^2]; the smaller of a pair counts.
+    """
+    apart = np.square(keypoints[:, None] - keypoints[None]).sum(axis=3)
+    scale = 2.0 * np.minimum(area[:, None], area[None])[..., None]
+    alike = np.exp(-apart / (scale * (2.0 * np.array(COCO17_SIGMAS)) ** 2))
+    both = np.isfinite(apart)
+    count = both.sum(axis=2)
+    total = np.where(both, alike, 0.0).sum(axis=2)
+    return np.asarray(np.divide(total, count, out=np.zeros_like(total), where=count > 0))
+
+
+def told_apart(
+    people: People, poses: Poses, least_keypoint: float, same_pose: float
+) -> tuple[People, Poses]:
+    """Return who has a pose, and one of his own; of two boxes with one pose the better stays.
+
+    The more a pose is like that of a better box, the lower its score falls (soft suppression,
+    Bodla, 2017): who stands behind somebody is kept, who is somebody seen twice comes last.
+
+    Args:
+        people: with the boxes that are kept.
+        poses: of each.
+        least_keypoint: a keypoint below this confidence was not found [1].
+        same_pose: likeness of poses above which two boxes are of one person [1].
+    """
+    with np.errstate(invalid="ignore"):
+        found = (poses.confidence >= least_keypoint) & np.isfinite(poses.keypoints).all(axis=2)
+    confidence = np.where(found, poses.confidence, np.nan)
+    keypoints = np.where(found[..., None], poses.keypoints, np.nan)
+    alike = likeness(keypoints, areas(people.boxes))
+    kept = np.zeros(len(people.scores), dtype=np.bool_)
+    scores = people.scores.copy()
+    for row in np.argsort(-people.scores, kind="stable"):
+        most = alike[row, kept].max(initial=0.0)
+        kept[row] = found[row].any() and most <= same_pose
+        scores[row] *= 1.0 - DOUBT * most**2
+    return People(people.boxes[kept], scores[kept]), Poses(keypoints[kept], confidence[kept])
