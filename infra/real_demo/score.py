@@ -12,10 +12,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 import worldpose
 from data_contracts.conventions import COCO17_BONES
-from flows.release import joint_tracks, static_cameras
+from flows.release import bodies_unit, joint_tracks, placed_joints, static_cameras
 from worldpose.ingest import read_match
 from worldpose.video import VideoReader, write_video
 
@@ -28,23 +29,39 @@ LIMBS = {
 COLOURS = ((255, 200, 0), (0, 200, 255), (255, 80, 200), (120, 255, 120))
 
 
+def steadiness(joints: NDArray[np.float64]) -> str:
+    """Say how long limbs are, and how much that changes; joints (frames, 17, 3) [m]."""
+    parts = []
+    for limb, sides in LIMBS.items():
+        lengths = [np.linalg.norm(joints[:, a] - joints[:, b], axis=-1) for a, b in sides]
+        each = ", ".join(
+            f"{100 * np.nanmedian(one):.1f} +- {100 * np.nanstd(one):.1f} cm" for one in lengths
+        )
+        parts.append(f"{limb} {each}")
+    return "; ".join(parts)
+
+
 def score(folder: Path, project: str, video: Path) -> None:
     """Print the figures of the latest run and write the overlay video."""
     match = read_match(folder)
     run = worldpose.open_run(project, match.spec.match_id)
     clip = match.spec.clips[0].id
-    placed_joints = run[f"triangulation/{clip}"]
-    joints = placed_joints["joints"].values
-    inliers = placed_joints["inliers"].transpose("frame", "camera", "person", "joint").values
+    placed = placed_joints(run, clip)
+    joints, smoothed = placed["joints"].values, placed["smoothed"].values
+    inliers = placed["inliers"].transpose("frame", "camera", "person", "joint").values
     index = run[f"tracking/{clip}"]["detection_index"].values
     cameras = static_cameras(run, match.spec)
+    bodies = bodies_unit(run, clip)
+    kinds = {"placed frame by frame": joints, "smoothed": smoothed}
+    if bodies in run:
+        kinds["of the body"] = run[bodies]["joints"].values
     frames = len(joints)
     print(f"{frames} frames, {joints.shape[1]} people")
     every, used = [], []
     for person in range(joints.shape[1]):
         seen = (index[:, :, person] >= 0).sum(axis=1)
-        placed = np.isfinite(joints[:, person]).all(axis=-1).any(axis=-1)
-        print(f"person {person}: placed in {placed.sum()} frames, {seen.mean():.1f} views a frame")
+        there = np.isfinite(joints[:, person]).all(axis=-1).any(axis=-1)
+        print(f"person {person}: placed in {there.sum()} frames, {seen.mean():.1f} views a frame")
         for number, (name, camera) in enumerate(cameras.items()):
             keypoints = run[f"detection/{name}.{clip}"]["keypoints"].values
             rows = np.flatnonzero(index[:, number, person] >= 0)
@@ -52,16 +69,8 @@ def score(folder: Path, project: str, video: Path) -> None:
             error = np.linalg.norm(camera.project(joints[rows, person]) - found, axis=-1)
             every.append(error.ravel())
             used.append(error[inliers[rows, number, person]])
-        for limb, sides in LIMBS.items():
-            lengths = [
-                np.linalg.norm(joints[:, person, a] - joints[:, person, b], axis=-1)
-                for a, b in sides
-            ]
-            text = ", ".join(
-                f"{100 * np.nanmedian(one):.1f} cm, spread {100 * np.nanstd(one):.1f} cm"
-                for one in lengths
-            )
-            print(f"  {limb}: {text}")
+        for kind, placed_so in kinds.items():
+            print(f"  {kind}: {steadiness(placed_so[:, person])}")
     for name, errors in (("all keypoints", every), ("those that carry joints", used)):
         print(f"median reprojection error of {name}: {np.nanmedian(np.concatenate(errors)):.1f} px")
     tracks = joint_tracks(run, clip)
