@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 
 from data_contracts.broadcast_calibration import FRAME_STATUS
-from flows.release import broadcast_cameras, broadcast_unit, joint_tracks
+from flows.flow_reporting import flow_pictures
+from flows.release import broadcast_cameras, broadcast_unit, clip_title, joint_tracks
 from flows.stage import Match
 from worldpose.broadcast_calibration import camera_before
 from worldpose.cameras.stored import camera_from_arrays
@@ -43,15 +44,21 @@ def broadcast_pictures(run: Run, match: Match) -> list[Picture]:
         frame, expected = result["frame"].values, result["reprojection_error"].values
         pictures.append(
             Picture(
-                f"Clip {clip}: the broadcast camera over its frames, with bands of two standard "
-                "deviations.",
-                course_picture(frame, camera, run[broadcast_unit(run, clip)]["covariance"].values),
+                f"{clip_title(clip)}: the broadcast camera over its frames, smoothed (blue, with "
+                "bands of two standard deviations) and each frame on its own (orange).",
+                course_picture(
+                    frame,
+                    camera,
+                    run[broadcast_unit(run, clip)]["covariance"].values,
+                    camera_before(result.data_vars),
+                ),
             )
         )
         if not np.isfinite(expected).any():
             continue
         tracks = joint_tracks(run, clip)
         pictures += _before_and_after(run, match, clip, tracks)
+        pictures += flow_pictures(run, match, clip, camera)
         offset = unit_frames(match.folder.spec, clip).offset
         for video_number in result.attrs["pick_next"][:WORST]:
             number = video_number - offset
@@ -60,9 +67,9 @@ def broadcast_pictures(run: Run, match: Match) -> list[Picture]:
                 still = video.frame(video_number)
             pictures.append(
                 Picture(
-                    f"Clip {clip}, frame {number}, {video_number} of its video, among those where "
-                    f"the broadcast camera is known least ({expected[place]:.2g} px): markings and "
-                    "people as it projects them.",
+                    f"{clip_title(clip)}, frame {number}, {video_number} of its video, among those "
+                    f"where the broadcast camera is known least ({expected[place]:.2g} px): "
+                    "markings and people as it projects them.",
                     camera_picture(
                         camera[place],
                         f"broadcast camera, frame {number}",
@@ -98,8 +105,8 @@ def _before_and_after(run: Run, match: Match, clip: str, tracks: JointTracks) ->
     )
     return [
         Picture(
-            f"Clip {clip}, frame {number}: before and after players and all frames together. In "
-            f"the median, markings are {markings} px off, people {players} px.",
+            f"{clip_title(clip)}, frame {number}: before and after players and all frames "
+            f"together. In the median, markings are {markings} px off, people {players} px.",
             before_after_picture(
                 before[place],
                 after[place],
@@ -185,7 +192,7 @@ def broadcast_tables(run: Run, match: Match) -> list[Table]:
             *_pooled(run, clip),
             *(("look at it", reason) for reason in result.attrs["reasons"]),
         ]
-        tables.append(Table(f"Broadcast camera of clip {clip}", ("", ""), tuple(rows)))
+        tables.append(Table(clip_title(clip), ("", ""), tuple(rows)))
     return tables
 
 

@@ -13,6 +13,7 @@ from worldpose.cameras import Camera
 from worldpose.ingest.stills import read_still
 from worldpose.release import CameraSummary, Picture
 from worldpose.release.calibration_pictures import Click, ErrorMap, calibration_picture
+from worldpose.release.paint_pictures import NEAR, paint_picture
 from worldpose.store import Run, Store
 
 SHOWN = 2
@@ -63,6 +64,32 @@ def camera_pictures(
             camera_evidence(store, run, match, name, cameras[name]),
         )
         for name in shown
+    ]
+
+
+def paint_pictures(run: Run, match: Match, cameras: Mapping[str, Camera]) -> list[Picture]:
+    """Painted lines in the still of the camera that saw most of them, and the map of distances."""
+    if match.folder.pitch is None:
+        return []
+    counts = {
+        name: run.record.figures.get(f"static_calibration/{name}", {}).get("clicks_used", 0.0)
+        for name in cameras
+        if name in match.folder.stills
+    }
+    if not counts:
+        return []
+    name = max(counts, key=lambda each: counts[each])
+    still = still_of(match, name)
+    assert still is not None, "only cameras with a still are counted"
+    png, share = paint_picture(cameras[name], still, match.folder.pitch)
+    return [
+        Picture(
+            f"Camera {name}: paint in its picture, and how far every pixel is from it, with the "
+            "markings as the found camera projects them. Where any paint is within "
+            f"{NEAR:.0f} px, {share:.0%} of them lie on it. A check from outside: cameras are not "
+            "found this way.",
+            png,
+        )
     ]
 
 

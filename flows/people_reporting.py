@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from data_contracts.conventions import COCO17
-from flows.release import ADJUSTED, bodies_unit
+from flows.release import ADJUSTED, bodies_unit, clip_title
 from worldpose.release.meanings import shown_number
 from worldpose.release.report import Table
 from worldpose.store import Run
@@ -34,7 +34,7 @@ def adjustment_tables(run: Run) -> list[Table]:
             )
         )
     cameras = Table(
-        "Bundle adjustment: clicked markings and left-out people",
+        "Clicked markings and left-out people, before and after the adjustment",
         (
             "camera",
             ">markings before px",
@@ -108,7 +108,7 @@ def body_tables(run: Run, clips: tuple[str, ...]) -> list[Table]:
             for person in persons
         )
         titles = (f">{name.replace('_', ' ')}" for name in columns)
-        tables.append(Table(f"Bodies of clip {clip}", (">person", *titles), rows))
+        tables.append(Table(clip_title(clip), (">person", *titles), rows))
     return tables
 
 

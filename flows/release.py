@@ -41,6 +41,11 @@ def clips_of(record: RunRecord) -> tuple[str, ...]:
     return clips
 
 
+def clip_title(clip: str) -> str:
+    """What a reader is told of which clip something is."""
+    return "The clip" if clip == "clip" else f"Clip {clip}"
+
+
 def joint_tracks(run: Run, clip: str, stage: str | None = None) -> JointTracks:
     """The joints of one clip, of the best stage that has them or of the stage asked for.
 

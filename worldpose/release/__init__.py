@@ -10,13 +10,17 @@ from worldpose.release.camera_file import read_camera, write_moving_camera, writ
 from worldpose.release.coco import coco_dataset, write_coco
 from worldpose.release.files import whole_file
 from worldpose.release.joints_file import JointTracks, read_joints, write_joints
-from worldpose.release.report import CameraSummary, Picture, report_page
+from worldpose.release.report import CameraSummary, Picture, Section, Table, report_page
+from worldpose.release.scene import Scene
 
 __all__ = [
     "CameraSummary",
     "JointTracks",
     "Member",
     "Picture",
+    "Scene",
+    "Section",
+    "Table",
     "coco_dataset",
     "read_archive",
     "read_camera",

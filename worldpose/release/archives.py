@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -46,12 +46,15 @@ def write_archive(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
                 npy.write_array(member, little, version=(1, 0), allow_pickle=False)
 
 
-def read_archive(path: Path, members: Mapping[str, Member]) -> dict[str, NDArray[Any]]:
+def read_archive(
+    path: Path, members: Mapping[str, Member], only: Collection[str] | None = None
+) -> dict[str, NDArray[Any]]:
     """Read the arrays of an npz file after their types, shapes and sizes were checked.
 
     Args:
         path: the file.
         members: what it must hold; nothing else may be in it.
+        only: members that are wanted; None = all. The others do not come into memory.
 
     Returns:
         float64, int64 and str arrays by name; optional members that are absent are left out.
@@ -66,7 +69,11 @@ def read_archive(path: Path, members: Mapping[str, Member]) -> dict[str, NDArray
         with zipfile.ZipFile(path) as file:
             infos = _infos(path, file, members)
             _check_headers(path, file, infos, members)
-            return {name: _array(path, file, info, members[name]) for name, info in infos.items()}
+            return {
+                name: _array(path, file, info, members[name])
+                for name, info in infos.items()
+                if only is None or name in only
+            }
     except (zipfile.BadZipFile, OSError, NotImplementedError) as error:
         raise wrong(str(path), "a whole npz file", f"{error}") from error
 

@@ -28,7 +28,12 @@ _STEP: Final = {"rx": 0, "ry": 1, "rz": 2, "log_focal": 3, "k1": 4, "k2": 5}
 """Places in the covariance of a frame's step."""
 
 
-def course_picture(frame: NDArray[np.int64], camera: Camera, covariance: Floats) -> bytes:
+def course_picture(
+    frame: NDArray[np.int64],
+    camera: Camera,
+    covariance: Floats,
+    before: Camera | None = None,
+) -> bytes:
     """Return a PNG of focal length, pan, tilt, roll, k1 and k2 over a clip.
 
     Bands are two standard deviations to either side; frames without a camera are left open.
@@ -38,32 +43,50 @@ def course_picture(frame: NDArray[np.int64], camera: Camera, covariance: Floats)
         camera: a batch (frames,).
         covariance: (frames, 7, 7) of a step, in the order of
             `data_contracts.broadcast_calibration.FRAME_STEP`.
+        before: the same frames, each on its own, without smoothing; drawn beneath.
     """
-    pan, tilt, roll = angles_of(camera)
+    curves = _curves(camera)
+    rough = {} if before is None else _curves(before)
+    tilt = curves["tilt [deg]"]
     with np.errstate(invalid="ignore"):
         spread = {name: np.sqrt(covariance[:, k, k]) for name, k in _STEP.items()}
         turned = np.degrees(spread["ry"]) / np.cos(np.radians(tilt))
     focal = camera.focal[:, 0]
-    curves = (
-        ("focal length [px]", focal, focal * spread["log_focal"]),
-        ("pan [deg]", pan, turned),
-        ("tilt [deg]", tilt, np.degrees(spread["rx"])),
-        ("roll [deg]", roll, np.degrees(spread["rz"])),
-        ("k1", camera.distortion[:, 0], spread["k1"]),
-        ("k2", camera.distortion[:, 1], spread["k2"]),
+    deviations = (
+        focal * spread["log_focal"],
+        turned,
+        np.degrees(spread["rx"]),
+        np.degrees(spread["rz"]),
+        spread["k1"],
+        spread["k2"],
     )
     figure = Figure(figsize=(14.0, 6.4), dpi=110, layout="constrained", facecolor="white")
     panels = figure.subplots(2, 3, sharex=True).ravel()
-    for axes, (name, values, deviation) in zip(panels, curves, strict=True):
+    for axes, (name, values), deviation in zip(panels, curves.items(), deviations, strict=True):
+        if name in rough:
+            axes.plot(frame, rough[name], color=PALETTE[1], linewidth=1.0)
         low, high = values - 2.0 * deviation, values + 2.0 * deviation
         axes.fill_between(frame, low, high, color=PALETTE[0], alpha=0.25, linewidth=0)
-        axes.plot(frame, values, color=PALETTE[0], linewidth=1.4)
+        axes.plot(frame, values, color=PALETTE[0], linewidth=1.6)
         axes.set_title(name, color=INK, loc="left", fontsize=12)
         axes.margins(x=0.01)
+        axes.ticklabel_format(useOffset=False)
         style(axes)
     for axes in panels[3:]:
         axes.set_xlabel("frame", color=INK)
     return png(figure)
+
+
+def _curves(camera: Camera) -> dict[str, Floats]:
+    pan, tilt, roll = angles_of(camera)
+    return {
+        "focal length [px]": camera.focal[:, 0],
+        "pan [deg]": pan,
+        "tilt [deg]": tilt,
+        "roll [deg]": roll,
+        "k1": camera.distortion[:, 0],
+        "k2": camera.distortion[:, 1],
+    }
 
 
 def most_moved(before: Camera, after: Camera, tracks: JointTracks) -> tuple[int, int]:
@@ -147,3 +170,53 @@ def angles_of(camera: Camera) -> tuple[Floats, Floats, Floats]:
     tilt = np.degrees(np.arcsin(np.clip(ahead[:, 2], -1.0, 1.0)))
     roll = np.degrees(np.arctan2(-right[:, 2], -down[:, 2]))
     return pan, tilt, roll
+
+
+def flow_picture(
+    still: NDArray[np.uint8],
+    start: Floats,
+    end: Floats,
+    rejected: NDArray[np.bool_],
+    predicted: Floats,
+) -> bytes:
+    """Return a PNG of how points of a picture move on, and of those that no camera moves so.
+
+    Args:
+        still: the picture (height, width, 3), RGB.
+        start: (n, 2) points of it [px].
+        end: (n, 2) where they are found in the next one [px].
+        rejected: (n,) which ones do not move with the camera.
+        predicted: (n, 2) where the found camera says that they go [px].
+    """
+    height, width = still.shape[:2]
+    figure = Figure(figsize=(14.0, 14.0 * height / width + 0.5), dpi=110, facecolor="white")
+    figure.set_layout_engine("constrained")
+    axes = figure.subplots()
+    axes.imshow(still, zorder=0)
+    longest = float(np.linalg.norm(end - start, axis=-1).max(initial=1e-6))
+    # The longest arrow is 6 % of the picture's width: motion from one frame to the next is small.
+    stretch = max(1.0, 0.06 * width / longest)
+    for chosen, color, label in (
+        (~rejected, PALETTE[5], f"{int((~rejected).sum())} move with the camera"),
+        (rejected, PALETTE[1], f"{int(rejected.sum())} rejected"),
+    ):
+        away = (end - start)[chosen] * stretch
+        axes.quiver(
+            *start[chosen].T,
+            *away.T,
+            angles="xy",
+            scale_units="xy",
+            scale=1.0,
+            color=color,
+            width=0.0016,
+            headwidth=4.0,
+            label=label,
+            zorder=3,
+        )
+    goes = start + (predicted - start) * stretch
+    axes.plot(*goes.T, "o", color=TEMPLATE, markersize=2.6, label="found camera", zorder=2)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
+    style(axes)
+    axes.legend(loc="lower right", framealpha=0.85, fontsize=11)
+    axes.set_title(f"motion, {stretch:.0f} times as long", color=INK, loc="left", fontsize=12)
+    return png(figure)

@@ -10,7 +10,8 @@ from __future__ import annotations
 import io
 import tempfile
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -101,8 +102,12 @@ def write_pitch_points(path: Path, points: Floats) -> None:
         np.savetxt(draft, points, fmt="%.4f")
 
 
-def read_challenge(folder: Path) -> dict[str, ChallengeClip]:
+def read_challenge(folder: Path, only: str | None = None) -> dict[str, ChallengeClip]:
     """The clips of a challenge folder of either edition, by name.
+
+    Args:
+        folder: the folder.
+        only: the clip that is wanted, if it is there; None = all. No other comes into memory.
 
     Raises:
         InputError: naming file and place: absent, wrong types or shapes, kinds that disagree.
@@ -113,9 +118,11 @@ def read_challenge(folder: Path) -> dict[str, ChallengeClip]:
         files = sorted((folder / kind).glob("*.npy"))
         if together.is_file():
             dims = ("frames", "persons", *KINDS[kind])
-            kinds[kind] = _by_clip(together, dims)
+            kinds[kind] = _by_clip(together, dims, None if only is None else (only,))
         elif files:
-            kinds[kind] = {file.stem: _read_npy(file, kind) for file in files}
+            kinds[kind] = {
+                file.stem: _read_npy(file, kind) for file in files if only in (None, file.stem)
+            }
         else:
             raise wrong(
                 str(folder), f"{kind}/<clip>.npy or {kind}.npz", "neither", "Check the path."
@@ -136,37 +143,63 @@ def read_challenge(folder: Path) -> dict[str, ChallengeClip]:
     return clips
 
 
-def read_submission(path: Path) -> dict[str, Floats]:
+def submission_clips(path: Path) -> tuple[str, ...]:
+    """Names of the clips of a submission, zipped or bare; none of them comes into memory.
+
+    Raises:
+        InputError: no such file, or no submission in it.
+    """
+    with _npz_of(path) as file:
+        return _clips_of(file)
+
+
+def read_submission(path: Path, only: Collection[str] | None = None) -> dict[str, Floats]:
     """The joints (persons, frames, 15, 3) [m, world] of a submission by clip, zipped or bare.
+
+    Args:
+        path: the file.
+        only: clips that are wanted; None = all. The others do not come into memory.
 
     Raises:
         InputError: no such file, no submission in it, or arrays of another type or shape.
     """
-    dims = ("persons", "frames", 15, 3)
+    with _npz_of(path) as file:
+        return _by_clip(file, ("persons", "frames", 15, 3), only)
+
+
+@contextmanager
+def _npz_of(path: Path) -> Iterator[Path]:
+    """The npz file of a submission; that of a zipped one lies on the disk meanwhile."""
     if not path.is_file():
         raise wrong(str(path), "a submission", "nothing", "Check the path.")
     try:
         with zipfile.ZipFile(path) as file:
             if SUBMISSION not in file.namelist():
-                return _by_clip(path, dims)
+                yield path
+                return
             with tempfile.TemporaryDirectory() as workshop:
-                return _by_clip(Path(file.extract(SUBMISSION, workshop)), dims)
+                yield Path(file.extract(SUBMISSION, workshop))
     except (zipfile.BadZipFile, OSError, RuntimeError) as error:
         raise wrong(str(path), f"a zip with {SUBMISSION}", f"{error}") from error
 
 
-def _by_clip(path: Path, dims: tuple[str | int, ...]) -> dict[str, Floats]:
-    """Arrays of an npz file by clip; lengths that are named may differ between clips."""
+def _clips_of(path: Path) -> tuple[str, ...]:
     try:
         with zipfile.ZipFile(path) as file:
-            names = [name.removesuffix(".npy") for name in file.namelist()]
+            return tuple(name.removesuffix(".npy") for name in file.namelist())
     except zipfile.BadZipFile as error:
         raise wrong(str(path), "a whole npz file", f"{error}") from error
+
+
+def _by_clip(
+    path: Path, dims: tuple[str | int, ...], only: Collection[str] | None = None
+) -> dict[str, Floats]:
+    """Arrays of an npz file by clip; lengths that are named may differ between clips."""
     members = {
         name: Member(tuple(f"{d} of {name}" if isinstance(d, str) else d for d in dims), "float")
-        for name in names
+        for name in _clips_of(path)
     }
-    found: dict[str, Any] = read_archive(path, members)
+    found: dict[str, Any] = read_archive(path, members, only)
     return found
 
 

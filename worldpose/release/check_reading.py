@@ -17,7 +17,11 @@ from worldpose.cameras import Rigid
 from worldpose.errors import InputError
 from worldpose.release.archives import wrong
 from worldpose.release.camera_rows import read_camera_rows
-from worldpose.release.challenge_files import read_challenge, read_submission
+from worldpose.release.challenge_files import (
+    read_challenge,
+    read_submission,
+    submission_clips,
+)
 from worldpose.release.joints_file import read_joints
 from worldpose.release.pose_file import read_poses
 from worldpose.release.shipped import PointSource, ShippedClip, View, absent_rows
@@ -41,7 +45,7 @@ def clips_in(folder: Path) -> tuple[str, ...]:
     names |= {path.name.removesuffix(".joints.npz") for path in folder.glob("*.joints.npz")}
     for name in SUBMISSIONS:
         if (folder / name).is_file():
-            names |= set(read_submission(folder / name))
+            names |= set(submission_clips(folder / name))
     if not names and (folder / "joints.npz").is_file():
         names = {ONLY}
     if not names:
@@ -97,7 +101,7 @@ def read_clip(
         pixels = read_coco(file, ids, frames) if file.is_file() else None
         views.append(View(name, camera, pixels, COCO17))
     if _has_challenge(folder):
-        given = read_challenge(folder).get(clip)
+        given = read_challenge(folder, clip).get(clip)
         if given is not None:
             arrays = {"boxes": given.boxes, "skel_2d": given.skel_2d, "skel_3d": given.skel_3d}
             gone, more = absent_rows(f"boxes and skeletons of {clip}", arrays)
@@ -164,7 +168,7 @@ def _sources(
             sources.append(PointSource(name, COCO17, joints))
             ids = tuple(tracks.person_ids.tolist())
     for name in SUBMISSIONS:
-        if (folder / name).is_file() and clip in (found := read_submission(folder / name)):
+        if (folder / name).is_file() and clip in (found := read_submission(folder / name, (clip,))):
             gone, more = absent_rows(f"{name}: {clip}", {"joints": found[clip]})
             findings += [each for each in more if each.fault == "zeros_for_missing"]
             joints = np.where(gone[..., None, None], np.nan, found[clip]).swapaxes(0, 1)

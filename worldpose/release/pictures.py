@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,14 +12,11 @@ from numpy.typing import NDArray
 from data_contracts.pitch import PitchSpec
 from worldpose.cameras import Camera
 from worldpose.release.drawing import (
-    GRASS,
     HIPS,
     INK,
     PALE,
     draw_label,
     draw_pitch,
-    draw_skeleton,
-    markings,
     person_color,
     png,
     style,
@@ -90,53 +87,6 @@ def paths_picture(
     return png(figure)
 
 
-def view_picture(
-    camera: Camera,
-    title: str,
-    *,
-    detections: NDArray[np.floating],
-    joints: NDArray[np.float64],
-    person_ids: Sequence[int] | NDArray[np.int64],
-    pitch: PitchSpec | None = None,
-) -> bytes:
-    """Return a PNG of one frame as one camera has it: what was detected and what was found.
-
-    It shows the part of the picture with people in it, at least half as wide as the picture.
-
-    Args:
-        camera: a single camera.
-        title: says which camera and frame.
-        detections: (detections, 17, 2) [px], in grey.
-        joints: (persons, 17, 3) [m], world, reprojected, one colour a person.
-        person_ids: (persons,).
-        pitch: its markings are drawn; None where there is no pitch.
-    """
-    width, height = (int(n) for n in camera.image_size)
-    figure = Figure(figsize=(14.0, 14.0 * height / width + 0.7), dpi=110, facecolor="white")
-    figure.set_layout_engine("constrained")
-    axes = figure.subplots()
-    reprojected = [camera.project(person) for person in joints]
-    (left, top), (right, bottom) = _crop(np.array([width, height]), [*detections, *reprojected])
-    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
-    axes.set_facecolor(GRASS if pitch is not None else "#f6f6f6")
-    axes.set_xlabel("u [px]", color=INK)
-    axes.set_ylabel("v [px]", color=INK)
-    style(axes)
-    for line in markings(pitch) if pitch is not None else ():
-        axes.plot(*camera.project(line).T, color="white", linewidth=2.5, zorder=1)
-    for keypoints in detections:
-        draw_skeleton(axes, keypoints, "#8f8f8f", 4.0, zorder=2)
-    for person_id, keypoints in zip(person_ids, reprojected, strict=True):
-        color = person_color(int(person_id))
-        draw_skeleton(axes, keypoints, color, 1.8, zorder=3)
-        seen = keypoints[np.isfinite(keypoints[:, 0])]
-        if len(seen):
-            u, v = seen[np.argmin(seen[:, 1])]
-            draw_label(axes, f"{person_id}", (u, v), (0, 8), color)
-    axes.set_title(f"{title} (grey: detected, colour: reprojected 3D)", color=INK, loc="left")
-    return png(figure)
-
-
 def _ground(tracks: JointTracks) -> NDArray[np.float64]:
     """Mid-hips on the ground (frames, persons, 2) [m]."""
     middle: NDArray[np.float64] = tracks.joints[..., HIPS, :2].mean(axis=-2)
@@ -152,18 +102,3 @@ def _frame(
     half = np.maximum(half, [half[1] * 4.0 / 3.0, half[0] * 3.0 / 4.0])
     middle = 0.5 * (low + high)
     return middle - half, middle + half
-
-
-def _crop(
-    size: NDArray[np.int64], people: Sequence[NDArray[np.floating]]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Corners [px] of the part of the picture with everybody in it, cut to its proportions."""
-    whole = size.astype(np.float64)
-    points = np.concatenate([np.empty((0, 2)), *people])
-    points = points[np.all((points >= -0.5) & (points <= whole - 0.5), axis=-1)]
-    if not len(points):
-        return np.full(2, -0.5), whole - 0.5
-    low, high = points.min(axis=0), points.max(axis=0)
-    part = whole * np.clip(np.max((high - low + 160.0) / whole), 0.5, 1.0)
-    corner = np.clip(0.5 * (low + high - part), -0.5, whole - 0.5 - part)
-    return corner, corner + part

@@ -3,41 +3,18 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Final
+from importlib.resources import files
+from itertools import count
 
 from data_contracts.evaluation import Evaluation
 from data_contracts.run import RunRecord
 from worldpose.release.meanings import score_rows, shown_number
-
-_STYLE: Final = """
-:root { color-scheme: light; }
-body { font: 16px/1.5 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; color: #222;
-  background: #fff; max-width: 68rem; margin: 2.5rem auto; padding: 0 1.5rem; }
-h1 { font-size: 1.9rem; line-height: 1.2; margin: 0 0 .3rem; }
-h2 { font-size: 1.25rem; margin: 2.6rem 0 .6rem; }
-p.lead { color: #555; margin: 0 0 1.2rem; }
-div.table { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; font-size: .93rem; }
-th, td { text-align: left; padding: .38rem .8rem .38rem 0; border-bottom: 1px solid #e4e4e4;
-  vertical-align: top; overflow-wrap: break-word; }
-th { color: #555; font-weight: 600; border-bottom: 2px solid #c8c8c8; }
-td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; }
-td.number { white-space: nowrap; }
-td.bad { color: #a33b00; font-weight: 600; }
-figure { margin: 1.4rem 0 2rem; }
-figure img { width: 100%; height: auto; border: 1px solid #e4e4e4; }
-figcaption { color: #555; font-size: .93rem; margin-top: .3rem; }
-@media (max-width: 40rem) {
-  body { margin: 1.2rem auto; padding: 0 .9rem; }
-  h1 { font-size: 1.5rem; overflow-wrap: anywhere; }
-  table { font-size: .86rem; }
-  td:not(.number) { min-width: 4.5rem; }
-  td:last-child:not(.number) { min-width: 10rem; }
-}
-"""
+from worldpose.release.scene import Scene, scene_html
+from worldpose.release.web_pictures import small_enough
 
 
 @dataclass(frozen=True)
@@ -88,7 +65,22 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
 
 
-class _Failure(str):
+@dataclass(frozen=True)
+class Section:
+    """A part of the page that can be jumped to.
+
+    Attributes:
+        heading: also in the page's bar.
+        blocks: in this order.
+        lead: what a reader should know first.
+    """
+
+    heading: str
+    blocks: tuple[Picture | Table | Scene, ...]
+    lead: str = ""
+
+
+class Failure(str):
     """Text of a table's cell that is shown as a failure."""
 
 
@@ -98,10 +90,8 @@ def report_page(
     *,
     seconds: Mapping[str, float],
     scores: Evaluation | None = None,
-    pictures: Sequence[Picture] = (),
-    cameras: Sequence[CameraSummary] = (),
-    camera_pictures: Sequence[Picture] = (),
-    tables: Sequence[Table] = (),
+    sections: Sequence[Section] = (),
+    tiles: Sequence[tuple[str, str]] = (),
 ) -> str:
     """Return a whole HTML page that needs nothing beside itself and asks for nothing outside.
 
@@ -110,57 +100,88 @@ def report_page(
         run: what was run, with the quality figures of its units.
         seconds: how long each unit took when it was computed, by `stage/unit` [s].
         scores: figures against truth, where there is a reference.
-        pictures: shown in this order.
-        cameras: the static cameras, in the order of the match.
-        camera_pictures: shown below their table.
-        tables: shown below these.
+        sections: what there is to see; those without blocks are left out.
+        tiles: the few figures at the top, each with what it is.
     """
-    sections = [
-        f"<h1>{escape(title)}</h1>",
-        f'<p class="lead">Match {escape(run.match_id)}, run {escape(run.run_id)}: '
-        f"{escape(run.state)}</p>",
-        *_scores(scores),
-        *(_figure(picture) for picture in pictures),
-        *_cameras(cameras),
-        *(_figure(picture) for picture in camera_pictures),
-        *(
-            text
-            for table in tables
-            for text in (
-                f"<h2>{escape(table.heading)}</h2>",
-                _table(table.columns, table.rows),
-            )
-        ),
-        "<h2>What was run</h2>",
-        _table(("", ""), _about(run)),
-        "<h2>Units of work</h2>",
-        _table(("unit", "", ">seconds"), _units(run, seconds)),
-        "<h2>Quality figures</h2>",
-        _table(("unit", "figure", ">value"), _figures(run)),
-        *_settings(run),
-    ]
-    body = "\n".join(sections)
+    shown = [section for section in sections if section.blocks]
+    if scores is not None:
+        rows = tuple(row[1:] for row in score_rows(scores))
+        table = Table("", ("score", ">value", "what it says"), rows)
+        shown.append(Section("Against the truth", (table,)))
+    script = _part("scene.js") if any(map(_has_scene, shown)) else ""
+    allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+    policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+    policy += f"; script-src 'sha256-{allowed}'" if script else ""
+    numbers = count(1)
+    parts = "\n".join(_section(section, next(numbers)) for section in shown)
+    links = "".join(
+        f'<a href="#part{number}">{escape(section.heading)}</a>'
+        for number, section in enumerate(shown, 1)
+    )
+    marks = "".join(
+        f"<div><b>{escape(value)}</b><span>{escape(what)}</span></div>" for value, what in tiles
+    )
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta http-equiv="Content-Security-Policy" '
-        "content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'\">\n"
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n"
-        f"<body>\n{body}\n</body>\n</html>\n"
+        f"<title>{escape(title)}</title>\n<style>{_part('report.css')}</style>\n</head>\n<body>\n"
+        f"<header><div><h1>{escape(title)}</h1><p>Run {escape(run.run_id)} of match "
+        f"{escape(run.match_id)}, {run.started_at:%d %B %Y}: {escape(run.state)}</p>"
+        f'<div class="tiles">{marks}</div></div></header>\n'
+        f'<nav aria-label="Parts of this page"><div>{links}<a href="#record">Record</a></div>'
+        "</nav>\n"
+        f"<main>\n{parts}\n{_record(run, seconds)}\n</main>\n"
+        + (f"<script>{script}</script>\n" if script else "")
+        + "</body>\n</html>\n"
     )
 
 
-def _scores(scores: Evaluation | None) -> list[str]:
-    if scores is None:
-        return []
-    heading = "<h2>Against the truth</h2>"
-    rows = [row[1:] for row in score_rows(scores)]
-    return [heading, _table(("score", ">value", "what it says"), rows)]
+def _part(name: str) -> str:
+    """A file that pages are made of."""
+    return (files("worldpose.release") / "page" / name).read_text(encoding="utf-8")
 
 
-def _cameras(cameras: Sequence[CameraSummary]) -> list[str]:
-    if not cameras:
-        return []
+def _has_scene(section: Section) -> bool:
+    return any(isinstance(block, Scene) for block in section.blocks)
+
+
+def _section(section: Section, number: int) -> str:
+    lead = f'<p class="lead">{escape(section.lead)}</p>\n' if section.lead else ""
+    blocks = "\n".join(map(_block, section.blocks))
+    return (
+        f'<section id="part{number}"><h2>{escape(section.heading)}</h2>\n{lead}{blocks}</section>'
+    )
+
+
+def _block(block: Picture | Table | Scene) -> str:
+    if isinstance(block, Scene):
+        return scene_html(block)
+    if isinstance(block, Picture):
+        return _figure(block)
+    heading = f"<h3>{escape(block.heading)}</h3>\n" if block.heading else ""
+    return heading + _table(block.columns, block.rows)
+
+
+def _record(run: RunRecord, seconds: Mapping[str, float]) -> str:
+    """How it came about, for those who ask: folded."""
+    tables = (
+        ("What was run", ("", ""), _about(run)),
+        ("Settings other than the defaults", ("stage", "setting", "value"), _settings(run)),
+        ("Units of work", ("unit", "", ">seconds"), _units(run, seconds)),
+        ("Quality figures", ("unit", "figure", ">value"), _figures(run)),
+    )
+    folded = "\n".join(
+        f"<details{' open' if heading == 'What was run' else ''}><summary>{heading}</summary>"
+        f"{_table(columns, rows)}</details>"
+        for heading, columns, rows in tables
+        if rows
+    )
+    return f'<section id="record"><h2>Record</h2>\n{folded}</section>'
+
+
+def camera_table(cameras: Sequence[CameraSummary]) -> Table:
+    """Return a table of static cameras."""
     columns = (
         "camera",
         "from",
@@ -171,18 +192,18 @@ def _cameras(cameras: Sequence[CameraSummary]) -> list[str]:
         "wrong clicks",
         "weak because",
     )
-    rows = [
+    rows = tuple(
         (
             camera.camera_id,
             camera.origin,
             *_or_dash(camera.ground_error_median_m, camera.ground_error_p95_m),
             *_or_dash(camera.reprojection_rms_px, camera.clicks_used),
             ", ".join(camera.clicks_wrong),
-            _Failure("; ".join(camera.weak)),
+            Failure("; ".join(camera.weak)),
         )
         for camera in cameras
-    ]
-    return ["<h2>Static cameras</h2>", _table(columns, rows)]
+    )
+    return Table("", columns, rows)
 
 
 def _or_dash(*values: float | None) -> list[str]:
@@ -203,7 +224,7 @@ def _about(run: RunRecord) -> list[tuple[str, ...]]:
 
 
 def _units(run: RunRecord, seconds: Mapping[str, float]) -> list[tuple[str, ...]]:
-    failed = {failure.unit: _Failure(f"failed: {failure.message}") for failure in run.failed}
+    failed = {failure.unit: Failure(f"failed: {failure.message}") for failure in run.failed}
     states = {
         **dict.fromkeys(run.executed, "computed"),
         **dict.fromkeys(run.reused, "reused"),
@@ -223,25 +244,21 @@ def _figures(run: RunRecord) -> list[tuple[str, ...]]:
     ]
 
 
-def _settings(run: RunRecord) -> list[str]:
-    rows = [
+def _settings(run: RunRecord) -> list[tuple[str, ...]]:
+    return [
         (stage, name, f"{value}")
         for stage, values in run.overrides.items()
         for name, value in values.items()
     ]
-    if not rows:
-        return []
-    return [
-        "<h2>Settings other than the defaults</h2>",
-        _table(("stage", "setting", "value"), rows),
-    ]
 
 
 def _figure(picture: Picture) -> str:
-    data = base64.b64encode(picture.png).decode("ascii")
+    kind, content, (width, height) = small_enough(picture.png)
+    data = base64.b64encode(content).decode("ascii")
     caption = escape(picture.caption)
     return (
-        f'<figure><img alt="{caption}" src="data:image/png;base64,{data}">'
+        f'<figure><img alt="{caption}" width="{width}" height="{height}" decoding="async" '
+        f'src="data:image/{kind};base64,{data}">'
         f"<figcaption>{caption}</figcaption></figure>"
     )
 
@@ -259,7 +276,7 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     for row in rows:
         cells = (
             f'<td class="bad">{escape(cell)}</td>'
-            if isinstance(cell, _Failure)
+            if isinstance(cell, Failure)
             else f"<td{kind}>{escape(cell)}</td>"
             for kind, cell in zip(kinds, row, strict=True)
         )

@@ -53,9 +53,8 @@ def read_places(folder: Path, clip: str) -> Floats:
     for name in ("submission.zip", "submission.npz"):
         if (folder / name).is_file():
             # Of the challenge's 15 joints, 7 and 8 are the hips.
-            return np.asarray(read_submission(folder / name)[clip][:, :, 7:9].mean(2)).swapaxes(
-                0, 1
-            )
+            joints = read_submission(folder / name, (clip,))[clip]
+            return np.asarray(joints[:, :, 7:9].mean(2)).swapaxes(0, 1)
     raise InputError(
         f"{folder}: {clip}",
         expected="poses, joints or a submission",
@@ -118,11 +117,20 @@ def camera_kind(path: Path) -> CameraKind | None:
     if not path.is_file():
         return None
     rows = read_camera_rows(path)
-    focal = rows.intrinsics[:, (0, 1), (0, 1)].mean(-1)
+    return kind_of(rows.intrinsics[:, (0, 1), (0, 1)].mean(-1), rows.rotation)
+
+
+def kind_of(focal: Floats, rotation: Floats) -> CameraKind | None:
+    """Return what a camera does; None where its turns are not known.
+
+    Args:
+        focal: (frames,) [px].
+        rotation: (frames, 3, 3), or (1, 3, 3) where only the first one is known.
+    """
     known = np.isfinite(focal)
     if known.any() and np.ptp(focal[known]) > _ZOOM * focal[known].mean():
         return "M+Z"
-    turns = rows.rotation[np.isfinite(rows.rotation).all((-1, -2))]
+    turns = rotation[np.isfinite(rotation).all((-1, -2))]
     if len(turns) < 2 <= len(focal):
         return None
     # The angle of R1^T R2 is below a when the trace is above 1 + 2 cos a.

@@ -22,14 +22,15 @@ def statistics_picture(statistics: DataSetStatistics) -> bytes:
     """Return a PNG with the histograms of trajectory lengths and of clip lengths."""
     ways = [way for clip in statistics.clips.values() for way in clip.trajectories_m]
     lengths = [clip.seconds for clip in statistics.clips.values()]
-    figure = Figure(figsize=(8.0, 7.0), dpi=120, layout="constrained", facecolor="white")
-    above, below = figure.subplots(2, 1)
-    _histogram(above, ways, "length of a player's trajectory [m]", "trajectories")
-    _histogram(below, lengths, "length of a clip [s]", "clips")
+    figure = Figure(figsize=(14.0, 4.2), dpi=110, layout="constrained", facecolor="white")
+    left, right = figure.subplots(1, 2)
+    _histogram(left, ways, "length of a player's trajectory [m]", "trajectories")
+    _histogram(right, lengths, "length of a clip [s]", "clips")
     people = statistics.subjects_per_frame
     figure.suptitle(
-        f"{len(statistics.clips)} clips, {statistics.minutes:.1f} min, "
-        f"{statistics.frames:,} frames, {statistics.poses:,} poses\n{statistics.distance_km:.1f} km"
+        f"{len(statistics.clips)} {'clip' if len(statistics.clips) == 1 else 'clips'}, "
+        f"{statistics.minutes:.1f} min, {statistics.frames:,} frames, {statistics.poses:,} poses, "
+        f"{statistics.distance_km:.1f} km"
         + (f", {people:.1f} people in a frame" if people is not None else ""),
         color=INK,
         fontsize=12,

@@ -2,6 +2,7 @@
 
 import io
 
+import cv2
 import matplotlib.image
 import numpy as np
 import pytest
@@ -12,8 +13,10 @@ from worldpose.release.broadcast_pictures import (
     angles_of,
     before_after_picture,
     course_picture,
+    flow_picture,
     most_moved,
 )
+from worldpose.release.drawing import PALETTE
 
 LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Rows right, down and ahead of a camera that looks along y."""
@@ -90,3 +93,37 @@ def test_whom_a_refinement_moves_most_is_shown_before_and_after():
 def test_nobody_in_the_picture_is_moved_most():
     some = cameras(turned(), turned())
     assert most_moved(some, some, people((200.0, 80.0))) == (0, 0)
+
+
+def painted(png, color):
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    wanted = [int(color[k : k + 2], 16) for k in (1, 3, 5)]
+    return int((np.abs(image.astype(int) - wanted) < 12).all(-1).sum())
+
+
+def test_the_course_without_smoothing_lies_beneath_the_smoothed_one():
+    moving = cameras(*(turned(pan) for pan in range(5)))
+    rough = cameras(*(turned(pan + 0.3 * (-1) ** pan) for pan in range(5)))
+    covariance = np.tile(1e-6 * np.eye(7), (5, 1, 1))
+    alone, both = (
+        painted(course_picture(np.arange(5), moving, covariance, before), PALETTE[1])
+        for before in (None, rough)
+    )
+    assert alone == 0
+    assert both > 100
+
+
+def test_motion_is_drawn_with_what_was_rejected():
+    start = np.array([[20.0, 20.0], [60.0, 40.0], [100.0, 60.0]])
+    end = start + [4.0, 0.0]
+    still = np.full((90, 160, 3), 40, np.uint8)
+    counts = [
+        [
+            painted(flow_picture(still, start, end, np.array(rejected), end), color)
+            for color in (PALETTE[5], PALETTE[1])
+        ]
+        for rejected in ([False] * 3, [False, True, True])
+    ]
+    # The legend names both, whether or not there are any.
+    assert counts[0][0] > counts[1][0] > 0
+    assert counts[1][1] > counts[0][1] > 0

@@ -1,5 +1,6 @@
 """The challenge's layouts: what others would read, and what others have written."""
 
+import tracemalloc
 import zipfile
 
 import cv2
@@ -14,6 +15,7 @@ from worldpose.release.challenge import challenge_truth
 from worldpose.release.challenge_files import (
     read_challenge,
     read_submission,
+    submission_clips,
     write_challenge,
     write_challenge_camera,
     write_pitch_points,
@@ -176,6 +178,35 @@ def test_a_submission_is_a_zip_with_one_array_a_clip(truth, tmp_path):
     for path in (tmp_path / "submission.zip", _bare(tmp_path, truth.submission)):
         back = read_submission(path)
         np.testing.assert_array_equal(back["A_1"], truth.submission.astype(np.float32))
+
+
+def test_one_clip_of_a_submission_comes_into_memory_alone(tmp_path):
+    clip = np.ones((2, 1000, 15, 3))
+    write_submission(tmp_path / "submission.zip", {f"C_{n}": n * clip for n in range(12)})
+    assert submission_clips(tmp_path / "submission.zip") == tuple(f"C_{n}" for n in range(12))
+    tracemalloc.start()
+    back = read_submission(tmp_path / "submission.zip", ("C_7",))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert list(back) == ["C_7"]
+    np.testing.assert_array_equal(back["C_7"], 7 * clip)
+    # The clip as in the file, in half the width, and as it is given back; all are 12.
+    assert peak < 3 * clip.nbytes
+
+
+def test_one_clip_of_a_challenge_is_read_alone(tmp_path):
+    good = {kind: np.ones((4, 2, *tail)) for kind, tail in TAILS.items()}
+    for kind, array in good.items():
+        (tmp_path / kind).mkdir()
+        np.save(tmp_path / kind / "A_1.npy", array)
+        (tmp_path / kind / "B_1.npy").write_bytes(b"no array")
+    assert list(read_challenge(tmp_path, "A_1")) == ["A_1"]
+    assert read_challenge(tmp_path, "C_1") == {}
+    with pytest.raises(InputError, match="B_1"):
+        read_challenge(tmp_path)
+
+
+TAILS = {"boxes": (4,), "skel_2d": (25, 2), "skel_3d": (25, 3)}
 
 
 def _bare(folder, joints):

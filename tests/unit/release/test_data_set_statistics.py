@@ -104,7 +104,7 @@ def test_ten_made_clips_are_counted_as_plain_loops_count_them(tmp_path):
     assert found.camera == "M+Z"
     assert [found.clips[f"C_{n}"].camera for n in range(3)] == ["S", "M", "M+Z"]
     picture = imread(io.BytesIO(statistics_picture(found)))
-    assert picture.shape[:2] == (840, 960)
+    assert picture.shape[:2] == (462, 1540)
 
 
 def test_a_gap_adds_no_way_and_heights_do_not_count():

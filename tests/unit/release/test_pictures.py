@@ -6,7 +6,7 @@ from data_contracts.pitch import PitchSpec
 from worldpose.cameras import Camera, Rigid
 from worldpose.release import JointTracks
 from worldpose.release.drawing import PALETTE
-from worldpose.release.pictures import paths_picture, view_picture
+from worldpose.release.pictures import paths_picture
 
 
 def decoded(png):
@@ -73,42 +73,8 @@ def test_pictures_have_the_same_bytes_every_time(camera):
     assert paths_picture(tracks, truth=tracks) == paths_picture(tracks, truth=tracks)
 
 
-def person_at(x):
-    joints = np.zeros((17, 3))
-    joints[:, 0], joints[:, 2] = x, np.linspace(1.8, 0.1, 17)
-    return joints
-
-
-def test_a_view_shows_the_head_above_the_feet_and_right_on_the_right(camera):
-    joints = np.stack([person_at(-3.0), person_at(3.0)])
-    image = decoded(
-        view_picture(
-            camera,
-            "south, frame 3",
-            detections=np.full((0, 17, 2), np.nan),
-            joints=joints,
-            person_ids=[0, 1],
-            pitch=PitchSpec(),
-        )
-    )
-    left, right = (pixels_of(image, color) for color in PALETTE[:2])
-    assert np.median(left[:, 1]) < np.median(right[:, 1]) - 100
-    # The label is painted above the head: with y up it would be at the feet.
-    assert np.ptp(left[left[:, 0] < np.median(left[:, 0]), 1]) > np.ptp(
-        left[left[:, 0] > np.median(left[:, 0]), 1]
-    )
-
-
 def test_nobody_at_all_is_still_a_picture(camera):
     nobody = JointTracks(np.arange(0), np.arange(0), np.empty((0, 0, 17, 3)))
     assert decoded(paths_picture(nobody)).shape[2] == 3
     gone = JointTracks(np.arange(3), np.arange(1), np.full((3, 1, 17, 3), np.nan))
     assert decoded(paths_picture(gone, cameras={"south": camera})).shape[2] == 3
-    empty = view_picture(
-        camera,
-        "south",
-        detections=np.full((2, 17, 2), np.nan),
-        joints=np.full((1, 17, 3), np.nan),
-        person_ids=[4],
-    )
-    assert decoded(empty).shape[2] == 3

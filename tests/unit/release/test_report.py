@@ -1,14 +1,19 @@
 import base64
+import hashlib
 import re
 from datetime import UTC, datetime
 from html.parser import HTMLParser
 
+import cv2
+import numpy as np
 import pytest
 
 from data_contracts.evaluation import Evaluation
 from data_contracts.run import RunRecord, UnitFailure
-from worldpose.release import CameraSummary, Picture, report_page
+from worldpose.release import CameraSummary, JointTracks, Picture, Scene, Section, report_page
 from worldpose.release.meanings import MEANINGS
+from worldpose.release.report import camera_table
+from worldpose.release.web_pictures import small_enough
 
 PNG = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJg"
@@ -48,7 +53,7 @@ class Page(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag, attributes):
-        if tag not in ("meta", "img"):
+        if tag not in ("meta", "img", "input"):
             self.open.append(tag)
         if tag == "tr":
             self.rows.append([])
@@ -95,21 +100,50 @@ def test_without_truth_there_is_no_table_of_scores():
     assert "Against the truth" not in report_page("A run", run(), seconds={})
 
 
+def pictured(*pictures, heading="Seen"):
+    return [Section(heading, tuple(pictures))]
+
+
 def test_text_is_escaped():
-    text = report_page("<b>bold</b> & more", run(), seconds={}, pictures=[Picture('"><img', PNG)])
-    assert "<b>" not in text
-    assert "<script>" not in text
+    hostile = pictured(Picture('"><img', PNG), heading="<script>1</script>")
+    tiles = [("<i>3</i>", "<u>")]
+    text = report_page("<b>bold</b> & more", run(), seconds={}, sections=hostile, tiles=tiles)
+    for tag in ("<b>bold", "<script>", "<i>", "<u>"):
+        assert tag not in text
     assert "&lt;b&gt;bold&lt;/b&gt; &amp; more" in text
     assert Page(text).open == []
 
 
 def test_nothing_is_asked_from_outside():
-    text = report_page("A run", run(), seconds={}, pictures=[Picture("from above", PNG)])
+    text = report_page("A run", run(), seconds={}, sections=pictured(Picture("from above", PNG)))
     page = Page(text)
-    assert [address[:22] for address in page.addresses] == ["data:image/png;base64,"]
-    assert base64.b64decode(page.addresses[0][22:]) == PNG
+    jumps = [address for address in page.addresses if address.startswith("#")]
+    assert jumps == ["#part1", "#record"]
+    (data,) = [address for address in page.addresses if address not in jumps]
+    assert data[:22] == "data:image/png;base64,"
+    assert base64.b64decode(data[22:]) == PNG
     assert not re.search(r"https?:|url\(|@import", text)
     assert "default-src 'none'" in text
+    assert "<script" not in text
+    assert "script-src" not in text
+
+
+def test_a_scene_brings_the_one_script_that_the_page_may_run():
+    joints = np.full((2, 1, 17, 3), np.nan)
+    scene = Scene("</script>", JointTracks(np.arange(2), np.arange(1), joints), 50.0, {})
+    text = report_page("A run", run(), seconds={}, sections=[Section("In space", (scene,))])
+    (script,) = re.findall(r"<script>(.*?)</script>", text, re.S)
+    allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"script-src 'sha256-{allowed}'" in text
+    assert text.count("<script") == 2  # the other one is data
+    assert Page(text).open == []
+
+
+def test_parts_without_content_are_left_out():
+    empty = [Section("Nothing", ()), *pictured(Picture("from above", PNG))]
+    text = report_page("A run", run(), seconds={}, sections=empty)
+    assert "Nothing" not in text
+    assert '<a href="#part1">Seen</a>' in text
 
 
 @pytest.mark.parametrize("shown", [True, False])
@@ -124,11 +158,19 @@ def test_static_cameras_are_listed_with_what_is_wrong_with_them():
         CameraSummary("cam0", "given"),
         CameraSummary("cam1", "clicks", 0.0213, 0.35, 1.125, 9, ("corner_left_far",), ("few",)),
     ]
-    text = report_page(
-        "A run", run(), seconds={}, cameras=cameras, camera_pictures=[Picture("cam1", PNG)]
-    )
-    rows = Page(text).rows
+    shown = [Section("Static cameras", (camera_table(cameras),))]
+    rows = Page(report_page("A run", run(), seconds={}, sections=shown)).rows
     assert ["cam0", "given", "-", "-", "-", "-", "", ""] in rows
     assert ["cam1", "clicks", "0.0213", "0.35", "1.125", "9", "corner_left_far", "few"] in rows
-    assert text.index("Static cameras") < text.index("<figcaption>cam1") < text.index("was run")
-    assert "Static cameras" not in report_page("A run", run(), seconds={})
+
+
+def test_photographs_are_made_smaller_and_curves_stay_as_they_are():
+    rng = np.random.default_rng(0)
+    photograph = rng.integers(0, 255, (400, 300, 3)).astype(np.uint8)
+    large = cv2.imencode(".png", photograph)[1].tobytes()
+    kind, content, size = small_enough(large)
+    assert (kind, size) == ("webp", (300, 400))
+    assert len(content) < len(large) / 2
+    shown = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    assert shown.shape == photograph.shape
+    assert small_enough(PNG) == ("png", PNG, (1, 1))

@@ -1,0 +1,103 @@
+"""How much there is in a run, as the paper counts a data set, and its figures at a glance."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from data_contracts.evaluation import Evaluation
+from data_contracts.release import DataSetStatistics
+from flows.release import broadcast_cameras, clips_of, joint_tracks
+from flows.stage import Match
+from worldpose.release import Picture, Section, Table
+from worldpose.release.statistics import clip_statistics, data_set_statistics, kind_of
+from worldpose.release.statistics_pictures import statistics_picture
+from worldpose.store import Run
+
+
+def extent_of(run: Run, match: Match) -> DataSetStatistics:
+    """Clips, frames, poses and distances of a run: the middle of the hips is where people are."""
+    from worldpose.release.drawing import HIPS  # late: loads matplotlib
+
+    broadcast = broadcast_cameras(run)
+    clips = {}
+    for clip in clips_of(run.record):
+        places = joint_tracks(run, clip).joints[:, :, HIPS].mean(2)
+        camera = broadcast.get(clip)
+        kind = (
+            "S"
+            if camera is None
+            else kind_of(camera.focal.mean(-1), camera.cam_from_world.rotation)
+        )
+        clips[clip] = clip_statistics(places, match.folder.spec.fps, kind)
+    return data_set_statistics(clips)
+
+
+def extent_section(run: Run, match: Match) -> Section:
+    """The row of the paper's table of data sets, its histograms, and each clip's share."""
+    found = extent_of(run, match)
+    row = (
+        found.camera or "-",
+        _number(found.subjects_per_frame, ".1f"),
+        f"{found.frames:,}",
+        f"{found.poses:,}",
+        f"{found.minutes:.2f}",
+        f"{found.distance_km:.3f}",
+        _number(found.speed_m_s, ".2f"),
+        _number(found.longest_trajectory_m, ".1f"),
+    )
+    columns = (
+        "camera",
+        ">people in a frame",
+        ">frames",
+        ">poses",
+        ">minutes",
+        ">distance km",
+        ">mean speed m/s",
+        ">longest way m",
+    )
+    blocks: list[Table | Picture] = [Table("", columns, (row,))]
+    if len(found.clips) > 1:
+        rows = tuple(
+            (
+                name,
+                clip.camera or "-",
+                f"{clip.frames:,}",
+                f"{clip.seconds:.1f}",
+                f"{clip.persons}",
+                f"{clip.poses:,}",
+                f"{sum(clip.trajectories_m):,.0f}",
+            )
+            for name, clip in found.clips.items()
+        )
+        titles = ("clip", "camera", ">frames", ">seconds", ">people", ">poses", ">distance m")
+        blocks.append(Table("Clips", titles, rows))
+    blocks.append(Picture("How far people go, and how long clips are.", statistics_picture(found)))
+    lead = (
+        "Camera: S stands still, M turns, M+Z also zooms. A pose is one person in one frame. "
+        "Distances are those over the ground, from frame to frame."
+    )
+    return Section("How much there is", tuple(blocks), lead)
+
+
+def tiles_of(run: Run, match: Match, scores: Evaluation | None) -> list[tuple[str, str]]:
+    """The few figures that a reader wants first."""
+    found = extent_of(run, match)
+    people = sum(clip.persons for clip in found.clips.values())
+    tiles = [
+        (f"{60.0 * found.minutes:.1f} s", f"{found.frames:,} frames in {_counted(found)}"),
+        (f"{people}", "people"),
+        (f"{found.poses:,}", "3D poses"),
+        (f"{len(match.folder.spec.static_cameras)}", "static cameras"),
+        (f"{1000.0 * found.distance_km:,.0f} m", "run and walked by all"),
+    ]
+    if scores is not None and scores.mpjpe_mm is not None and np.isfinite(scores.mpjpe_mm):
+        tiles.append((f"{scores.mpjpe_mm:.0f} mm", "mean error of a joint, against the truth"))
+    return tiles
+
+
+def _counted(found: DataSetStatistics) -> str:
+    return "1 clip" if len(found.clips) == 1 else f"{len(found.clips)} clips"
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
