@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from worldpose.cameras import Camera
 from worldpose.errors import UsageError
 from worldpose.evaluation import EvaluationSettings, evaluate_joints
 from worldpose.evaluation.method_table import meaningful
-from worldpose.methods import MethodResult, find_method
+from worldpose.methods import MethodResult, find_method, resampled
 from worldpose.release import JointTracks
 from worldpose.release.camera_file import RELEASE_SIZE
 
@@ -27,6 +27,7 @@ def score_methods(
     body: str | None = None,
     first_frame: int | None = None,
     fps: float | None = None,
+    seen_fps: Mapping[str, float] | None = None,
     settings: EvaluationSettings | None = None,
 ) -> tuple[MethodScore, ...]:
     """The scores of methods' results, each with the settings under which it came about.
@@ -38,6 +39,8 @@ def score_methods(
         body: body that poses are put on; None = the open body.
         first_frame: match frame of the methods' first picture; None = the reference's first.
         fps: frames in a second; None = the match's, where there is one.
+        seen_fps: name of a method to the frames in a second of the video that it saw, where that is
+            not the clip's; its result is put on the clip's frames.
         settings: the defaults if None.
 
     Raises:
@@ -59,6 +62,8 @@ def score_methods(
     frames = truth.joints.frames
     first = first_frame if first_frame is not None else int(frames[0]) if len(frames) else 0
     model = find_body(body or OPEN_BODY)
+    rate = fps or (None if spec is None else spec.fps)
+    _require_scored(named, seen_fps or {})
     scores = []
     for item in named:
         name, found, path = item.partition("=")
@@ -71,6 +76,8 @@ def score_methods(
                 todo="Name the file or folder that the method wrote.",
             )
         result = method.read(Path(path), model, _picture(camera))
+        if name in (seen_fps or {}):
+            result = resampled(result, (seen_fps or {})[name], _clip_fps(rate, name))
         if result.world != "shared" and (camera is None or result.boxes is None):
             raise UsageError(
                 f"--method {item}",
@@ -85,7 +92,7 @@ def score_methods(
             joints,
             truth.joints,
             settings,
-            fps=fps or (None if spec is None else spec.fps),
+            fps=rate,
             camera=camera,
             boxes=_boxes(result, camera),
         )
@@ -104,6 +111,30 @@ def score_methods(
             )
         )
     return tuple(scores)
+
+
+def _require_scored(named: Sequence[str], seen_fps: Mapping[str, float]) -> None:
+    """Refuse a frame rate of a method that is not scored."""
+    names = [item.partition("=")[0] for item in named]
+    for name in seen_fps:
+        if name not in names:
+            raise UsageError(
+                f"--method-fps {name}",
+                expected=f"one of {', '.join(names)}",
+                found=repr(name),
+                todo="Name it as --method does.",
+            )
+
+
+def _clip_fps(fps: float | None, name: str) -> float:
+    if fps is None:
+        raise UsageError(
+            f"--method-fps {name}",
+            expected="--fps, the clip's own frames in a second",
+            found="neither that nor a match that says it",
+            todo="Give --fps.",
+        )
+    return fps
 
 
 def _picture(camera: Camera | None) -> tuple[int, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from data_contracts.evaluation import MethodScore
@@ -10,6 +11,29 @@ from worldpose.errors import UsageError
 from worldpose.evaluation.method_table import COLUMNS, table_csv, table_latex, table_rows
 
 FORMS = ("text", "csv", "latex")
+
+
+def named_rates(given: Sequence[str]) -> dict[str, float]:
+    """NAME=FPS as numbers by name.
+
+    Raises:
+        UsageError: it is not that.
+    """
+    rates = {}
+    for item in given:
+        name, _, text = item.partition("=")
+        try:
+            rates[name] = float(text)
+        except ValueError:
+            rates[name] = 0.0
+        if not 0.0 < rates[name] < math.inf:
+            raise UsageError(
+                f"--method-fps {item}",
+                expected="NAME=FPS, such as gvhmr=30",
+                found=repr(text),
+                todo="Give the frames in a second of the video that the method saw.",
+            )
+    return rates
 
 
 def print_methods(scores: Sequence[MethodScore], form: str, *, as_json: bool) -> None:

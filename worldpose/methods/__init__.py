@@ -6,6 +6,7 @@ Outputs: `MethodResult`: joints, the world they are in, boxes in the picture.
 
 from worldpose.methods.known import METHODS, Method, find_method
 from worldpose.methods.pickled import read_pickled
+from worldpose.methods.resampling import resampled
 from worldpose.methods.result import MethodResult
 
-__all__ = ["METHODS", "Method", "MethodResult", "find_method", "read_pickled"]
+__all__ = ["METHODS", "Method", "MethodResult", "find_method", "read_pickled", "resampled"]

@@ -15,7 +15,17 @@ from numpy.lib import format as npy
 
 from worldpose.errors import InputError
 from worldpose.methods import tensors
-from worldpose.methods.notes import ALLOWED, Dtype, Kind, Note, numbers, plain, type_of
+from worldpose.pickles import (
+    ALLOWED,
+    Dtype,
+    Kind,
+    Note,
+    Unpickler,
+    no_storage,
+    numbers,
+    plain,
+    type_of,
+)
 
 FILE_BYTES: Final = 8 << 30
 """Most that a file may hold, unpacked [byte]: whole results without surfaces are a hundredth."""
@@ -96,10 +106,10 @@ def _content(stream: io.BytesIO) -> object:
             raise ValueError("another version than npy 1.0")
         _, _, kind = npy.read_array_header_1_0(stream)
         if kind.hasobject:
-            return _item(_Unpickler(stream, tensors.no_storage).load())
+            return _item(_Unpickler(stream).load())
         stream.seek(0)
         return npy.read_array(stream, allow_pickle=False)
-    return _Unpickler(stream, tensors.no_storage).load()
+    return _Unpickler(stream).load()
 
 
 def _item(value: object) -> object:
@@ -108,41 +118,29 @@ def _item(value: object) -> object:
     return found["item"] if isinstance(found, dict) and set(found) == {"item"} else found
 
 
-class _Unpickler(pickle._Unpickler):
-    """Python's own unpickler, with notes for names and without anything to import."""
+class _Unpickler(Unpickler):
+    """With joblib's arrays, whose bytes follow where their note ends."""
 
-    def __init__(self, stream: io.BytesIO, storage: Callable[[object], object]) -> None:
-        # Python 2 wrote the bytes of arrays as text.
-        super().__init__(stream, encoding="latin1")
-        self._source, self._storage = stream, storage
-
-    def find_class(self, module: str, name: str) -> Any:  # noqa: ANN401
-        if (module, name) not in _NAMES:
-            raise pickle.UnpicklingError(f"the name {module}.{name}, which is not allowed")
-        return _NAMES[module, name]
-
-    def persistent_load(self, pid: Any) -> Any:  # noqa: ANN401
-        return self._storage(pid)
+    def __init__(
+        self, stream: io.BytesIO, storage: Callable[[object], object] = no_storage
+    ) -> None:
+        super().__init__(stream, _NAMES, storage)
+        self._source = stream
 
     def load_build(self) -> None:
         instance = cast("list[object]", self.stack)[-2]  # type: ignore[attr-defined]
-        if not hasattr(instance, "__setstate__") or isinstance(instance, type):
-            raise pickle.UnpicklingError("a state for what has none")
-        pickle._Unpickler.load_build(self)  # type: ignore[attr-defined]
+        super().load_build()
         if isinstance(instance, Wrapped):
             _read_wrapped(instance, self._source)
 
-    dispatch: ClassVar[dict[int, Any]] = {
-        **pickle._Unpickler.dispatch,
-        pickle.BUILD[0]: load_build,
-    }
+    dispatch: ClassVar[dict[int, Any]] = {**Unpickler.dispatch, pickle.BUILD[0]: load_build}
 
 
 def _read_wrapped(note: Wrapped, source: io.BytesIO) -> None:
     """Read the array whose bytes follow at this place of joblib's file."""
     state = note.state
     if isinstance(state["dtype"], Dtype) and state["dtype"].args[0] == "O8":
-        note.array = _Unpickler(source, tensors.no_storage).load()
+        note.array = _Unpickler(source).load()
         return
     if state.get("numpy_array_alignment_bytes") is not None:
         source.read(source.read(1)[0])

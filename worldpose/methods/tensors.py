@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.methods.notes import LARGEST, Note
+from worldpose.pickles import LARGEST, Note
 
 Storages = Callable[[object], object]
 """Gives the storage of what a file calls its persistent id."""
@@ -65,15 +65,6 @@ ALLOWED: Final[Mapping[tuple[str, str], type[Note]]] = {
     ("torch.storage", "_load_from_bytes"): Saved,
 }
 """Names of torch that a file may use."""
-
-
-def no_storage(_: object) -> object:
-    """Refuse a persistent id where a file has no storages of its own.
-
-    Raises:
-        UnpicklingError: always.
-    """
-    raise pickle.UnpicklingError("an object kept outside the file")
 
 
 def open_archive(file: zipfile.ZipFile, limit: int) -> tuple[io.BytesIO, Storages]:

@@ -19,7 +19,7 @@ from worldpose.body.pickled_arrays import read_pickled_arrays
 from worldpose.errors import InputError
 
 NUMBERS = np.arange(12.0).reshape(3, 4)
-_BENIGN_EVENTS = {"open", "object.__getattr__", "object.__setattr__"}
+_BENIGN_EVENTS = {"open", "builtins.id", "object.__getattr__", "object.__setattr__"}
 _events: list[str] | None = None
 
 

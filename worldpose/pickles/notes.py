@@ -1,10 +1,4 @@
-"""What a pickle names, as notes of this package, and what the notes mean once all is read.
-
-A pickle is a program whose instructions call whatever the file names. Here every name that results
-of published methods need leads to a class that only notes what it is given, and every other name
-ends the reading: nothing is imported, no foreign code runs. `plain` then checks the notes and turns
-them into arrays, lists and dictionaries.
-"""
+"""What a pickle names, as notes, and what the notes mean once all is read."""
 
 from __future__ import annotations
 
@@ -164,7 +158,7 @@ class _Plain:
             if isinstance(value, kind):
                 found = decoded(value)
                 return self.of(found) if isinstance(found, list | dict) else found
-        # What has no part in a result, such as a generator's state.
+        # What has no part in it, such as a generator's state.
         return None
 
 
