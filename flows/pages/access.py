@@ -111,8 +111,8 @@ def access_for(host: str, *, token: str | None, names: Iterable[str], secure: bo
         if hosts == LOOPBACK:
             raise UsageError(
                 f"--host {host}",
-                expected="--name, under which browsers find this machine",
+                expected="--host-name, under which browsers find this machine",
                 found="none",
-                todo="Give it as in --name review.example.org.",
+                todo="Give it as in --host-name review.example.org.",
             )
     return Access(token or secrets.token_urlsafe(24), frozenset(hosts), secure)

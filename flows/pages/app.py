@@ -100,9 +100,10 @@ def _sessions(desk: Desk) -> APIRouter:
         return {"state": "up"}
 
     @router.post("/api/login")
-    def login(given: Login) -> JSONResponse:
+    def login(given: Login, request: Request) -> JSONResponse:
         if not access.has_token(given.token):
             return JSONResponse({"error": "this is not the token"}, status_code=401)
+        request.state.who = given.who
         answer = JSONResponse({"who": given.who})
         answer.set_cookie(
             access.cookie,

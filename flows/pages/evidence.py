@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from data_contracts.review import ReviewRequest
 from flows.broadcast_reporting import broadcast_pictures, broadcast_tables
 from flows.camera_reporting import camera_evidence
+from flows.clip_reporting import clip_pictures, detection_pictures
 from flows.clip_video import clip_view, write_clip_video
 from flows.pages.desk import Desk
 from flows.people_reporting import adjustment_tables, body_tables
 from flows.release import placed_joints, static_cameras
-from flows.reporting import clip_pictures
 from flows.stage import Match
 from worldpose.release import JointTracks, Picture
 from worldpose.release.pictures import paths_picture
@@ -156,7 +156,11 @@ def _identities(store: Store, run: Run, match: Match, clip: str) -> Evidence:
 
 
 def _clip(store: Store, run: Run, match: Match, clip: str) -> Evidence:
-    return Evidence(tuple(clip_pictures(run, match, clip)), tuple(body_tables(run, (clip,))))
+    pictures = (
+        *clip_pictures(run, match, clip),
+        *detection_pictures(store, run, match, clip),
+    )
+    return Evidence(pictures, tuple(body_tables(run, (clip,))))
 
 
 def _acceptance(store: Store, run: Run, match: Match, clip: str) -> Evidence:

@@ -20,6 +20,8 @@ OPEN: Final = frozenset(
 BODY_BYTES: Final = 1 << 20
 """Most that a request may bring."""
 SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS"})
+ASKING: Final = "/preview"
+"""End of a path that is posted to with every move of a mouse, and changes nothing."""
 POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
     "media-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'self'; "
@@ -35,8 +37,8 @@ class Guard:
 
     Host: a name that leads here by somebody else's rebinding is refused. Session: all but `OPEN`
     needs one. Changes: need the session's form secret, and come from this origin where the browser
-    says from which. Size: no more than `BODY_BYTES`. Every change that was asked for is logged with
-    who, what and the answer.
+    says from which. Size: no more than `BODY_BYTES`. Every login and every change that was asked
+    for is logged with who, what and the answer.
     """
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
@@ -58,9 +60,11 @@ class Guard:
         async def sealed(message: Message) -> None:
             if message["type"] == "http.response.start":
                 _seal(MutableHeaders(scope=message), scope["path"])
-                if scope["method"] not in SAFE:
+                asked = scope["path"].endswith(ASKING) and message["status"] < 400
+                if scope["method"] not in SAFE and not asked:
                     place = f"{scope['method']} {scope['path']}"
-                    logger.info("%s: %r: %s", who or "nobody", place, message["status"])
+                    # Who logs in is somebody from then on.
+                    logger.info("%s: %r: %s", state["who"] or "nobody", place, message["status"])
             await send(message)
 
         refusal = self._refusal(scope, headers, who, session)

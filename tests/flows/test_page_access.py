@@ -198,7 +198,17 @@ def test_a_name_never_becomes_a_path(ada, name, project_copy, tiny):
 
 def test_every_change_is_logged_with_who_and_what_came_of_it(ada, caplog):
     name, was = a_click(ada)
+    preview = f"{MATCH}/pictures/cam03/preview"
     with caplog.at_level(logging.INFO, logger="worldpose.pages"):
         ada.post(f"{MATCH}/corrections", json=moved(name, was, [was[0] + 1.0, was[1]]))
         ada.get(MATCH)
-    assert caplog.messages == [f"Ada: 'POST {MATCH}/corrections': 200"]
+        ada.post(preview, json={"points": {}})  # changes nothing, with every move of a mouse
+        ada.post(preview, json={"points": {}}, headers={"x-form-secret": ""})
+        ada.post("/api/login", json={"who": "Eve", "token": TOKEN + "x"}, headers={"cookie": ""})
+        ada.post("/api/login", json={"who": "Bob", "token": TOKEN}, headers={"cookie": ""})
+    assert caplog.messages == [
+        f"Ada: 'POST {MATCH}/corrections': 200",
+        f"Ada: 'POST {preview}': 403",
+        "nobody: 'POST /api/login': 401",
+        "Bob: 'POST /api/login': 200",
+    ]

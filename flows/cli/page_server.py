@@ -1,0 +1,49 @@
+"""Options of the commands that serve the pages: where they listen, and who may."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from worldpose.errors import UsageError
+
+PAGES_PORT = 8571
+
+PortOption = Annotated[int, typer.Option(min=1, max=65535, help="Port of the pages.")]
+HostOption = Annotated[str, typer.Option(help="Address to listen at; by default, this machine.")]
+NamesOption = Annotated[
+    list[str] | None,
+    typer.Option("--host-name", help="Name of this machine in browsers elsewhere; repeatable."),
+]
+CertificateOption = Annotated[
+    Path | None, typer.Option("--certificate", help="PEM file; with --key: pages with TLS.")
+]
+KeyOption = Annotated[Path | None, typer.Option("--key", help="PEM file of its private key.")]
+TokenOption = Annotated[
+    str | None,
+    typer.Option(
+        envvar="WORLDPOSE_REVIEW_TOKEN",
+        show_envvar=True,
+        help="What people log in to the pages with; a new one by default.",
+    ),
+]
+
+
+def certificate_and_key(certificate: Path | None, key: Path | None) -> tuple[Path, Path] | None:
+    """Both files, or None where none is given.
+
+    Raises:
+        UsageError: only one of them is given.
+    """
+    if certificate is not None and key is not None:
+        return certificate, key
+    if certificate is None and key is None:
+        return None
+    raise UsageError(
+        "--certificate and --key",
+        expected="both or none",
+        found="one of them",
+        todo="Give the certificate's file and its private key's.",
+    )
