@@ -51,6 +51,8 @@ class Work(Record):
     recipe: Recipe
     key: Key
     run_id: Name
+    seconds: float | None = None
+    """How long it may be at work; None = as long as it takes [s]."""
 
 
 class StoredFile(Record):

@@ -31,12 +31,19 @@ def clip_view(run: Run, match: Match, clip: str) -> str | None:
     """
     if clip in broadcast_cameras(run) and clip in match.folder.videos:
         return clip
+    return static_view(run, match, clip)
+
+
+def static_view(run: Run, match: Match, clip: str) -> str | None:
+    """The static camera with a video that sees most people in a clip; None where none has any."""
     seen = placed_joints(run, clip)["inliers"].any("joint").sum(("frame", "person")).values
     order = [list(static_cameras(run, match.folder.spec))[c] for c in np.argsort(-seen)]
     return next((camera for camera in order if camera in match.folder.videos), None)
 
 
-def write_clip_video(store: Store, run: Run, match: Match, clip: str, file: Path) -> None:
+def write_clip_video(
+    store: Store, run: Run, match: Match, clip: str, file: Path, *, owner: str | None = None
+) -> None:
     """Write the video of a clip with markings and people over it.
 
     Args:
@@ -45,11 +52,12 @@ def write_clip_video(store: Store, run: Run, match: Match, clip: str, file: Path
         match: the match; `clip_view` has a camera for the clip.
         clip: which clip.
         file: an mp4, named after what it shows.
+        owner: whose video, as `static_view` gives it; None = that of `clip_view`.
 
     Raises:
         InputError: a picture is damaged.
     """
-    owner = clip_view(run, match, clip)
+    owner = owner or clip_view(run, match, clip)
     assert owner is not None  # asked for only where there is one
     if owner == clip:
         (made,) = write_broadcast_videos(run, match, file, clips=(clip,))

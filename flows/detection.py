@@ -90,4 +90,5 @@ STAGE = Stage(
     inputs=inputs,
     sources=sources,
     outside=outside,
+    prefers="GPU",
 )

@@ -6,26 +6,23 @@ no state that matters: killed anywhere, the next run finds in the store what was
 
 from __future__ import annotations
 
-import importlib
 import logging
-from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
 
-from prefect import Task, flow
-from prefect.futures import as_completed
+from prefect import flow
 from pydantic import JsonValue
 
 from data_contracts.run import GatePolicy, RunRecord
+from flows.fan_out import compute
 from flows.gatekeeping import Gatekeeper, undecided
 from flows.outlook import look_ahead
-from flows.planning import PlannedUnit
 from flows.progress import reporter
 from flows.registering import open_match
 from flows.run_record import RunLog, latest_run, standing_results
 from flows.settings import Overrides, selected_stages
 from flows.stage import Match, Stage
 from flows.suspension import is_deployed, take_verdict
+from flows.time_limits import TimeLimits, seconds_of
 from worldpose.errors import WorldposeError
 from worldpose.store import Store
 
@@ -50,6 +47,7 @@ def process_match(
     until_stage: str | None = None,
     gates: GatePolicy | None = None,
     iteration: int = 1,
+    time_limits: dict[str, float] | None = None,
 ) -> str:
     """Runs the method on one match, records the run and returns its number.
 
@@ -64,9 +62,11 @@ def process_match(
         until_stage: last stage to run.
         gates: when results wait for a person; None is `auto` for a deployment, else `never`.
         iteration: which pass over the method; the ones before it have their results.
+        time_limits: stage to the minutes that a unit may be at work, where not as long as all.
 
     Raises:
         IncompleteRunError: some units failed or wait; the others have their results.
+        LostMachinesError: the Prefect server or Dask scheduler is gone; run again goes on.
     """
     logging.getLogger("worldpose").setLevel(logging.INFO)
     store = Store.open(project)
@@ -88,7 +88,9 @@ def process_match(
                 take_verdict(store, match_id, open_questions)
                 continue
         with _shown(store, match_id) if is_deployed() else nullcontext():
-            record = _run_stages(store, match, stages, settings, policy, iteration)
+            record = _run_stages(
+                store, match, stages, settings, policy, iteration, time_limits or {}
+            )
         if record.failed or not (is_deployed() and undecided(record.waiting)):
             break
     if record.failed or record.waiting:
@@ -109,6 +111,7 @@ def _run_stages(
     settings: Overrides,
     policy: GatePolicy,
     iteration: int,
+    time_limits: TimeLimits,
 ) -> RunRecord:
     log = RunLog.begin(store, match, stages, settings, policy, iteration)
     for stage in stages:
@@ -119,28 +122,11 @@ def _run_stages(
         reporter().stage_started(
             stage.name, stage.about, units=len(plan.units), missing=len(missing)
         )
-        for unit, failure in _compute(store, match, stage, missing, log.run_id):
+        work = [
+            unit.work(store.url, match, log.run_id, seconds_of(stage.name, time_limits))
+            for unit in missing
+        ]
+        for unit, failure in compute(stage, missing, work):
             log.finished(unit, failure)
         log.hold(stage)
     return log.close()
-
-
-def _compute(
-    store: Store, match: Match, stage: Stage, units: list[PlannedUnit], run_id: str
-) -> Iterator[tuple[PlannedUnit, BaseException | None]]:
-    """Each unit as its task ends, with what it failed of."""
-    task = task_of(stage)
-    submitted = {task.submit(unit.work(store.url, match, run_id)): unit for unit in units}
-    for future in as_completed(list(submitted)):
-        try:
-            future.result()
-        except Exception as failure:  # recorded with the run: siblings go on
-            yield submitted[future], failure
-        else:
-            yield submitted[future], None
-
-
-def task_of(stage: Stage) -> Task[..., Any]:
-    """The task that computes one unit of a stage: the function of its name in `tasks`."""
-    task: Task[..., Any] = getattr(importlib.import_module(f"tasks.{stage.name}"), stage.name)
-    return task

@@ -30,14 +30,15 @@ class PlannedUnit:
         """As `stage/unit`."""
         return self.recipe.name
 
-    def work(self, project: str, match: Match, run_id: str) -> Work:
-        """This unit as a task takes it."""
+    def work(self, project: str, match: Match, run_id: str, seconds: float | None = None) -> Work:
+        """This unit as a task takes it, which may be at work for so long."""
         return Work(
             project=project,
             folder=match.registration.folder,
             recipe=self.recipe,
             key=self.key,
             run_id=run_id,
+            seconds=seconds,
         )
 
 

@@ -86,6 +86,8 @@ def local_cluster(workers: int) -> dict[str, Any]:
         "memory_limit": 0,  # a limit of one worker's share would kill a long clip's only task
         "dashboard_address": "127.0.0.1:0",
         "silence_logs": "CRITICAL",
+        # A unit that ends its worker gives itself up; those that waited beside it are not to blame.
+        "scheduler_kwargs": {"allowed_failures": 100},
     }
 
 
@@ -99,10 +101,13 @@ def prefect_server(project: str) -> Iterator[Callable[[], None]]:
     """Environment and server for Prefect; gives a function that returns when its API answers.
 
     So Prefect can be imported, which takes seconds, while its server starts. Waiting raises
-    InputError for a given server, WorldposeError for our own, that does not answer.
+    WorldposeError where our own does not answer.
 
     Args:
         project: folder or URL of the store; a local one also keeps Prefect's database.
+
+    Raises:
+        InputError: a given server does not answer.
     """
     no_proxy = {
         name: ",".join(filter(None, [os.environ.get(name), LOOPBACK]))
@@ -112,7 +117,8 @@ def prefect_server(project: str) -> Iterator[Callable[[], None]]:
     with _environment({**ALWAYS, **given, **no_proxy}):
         address = os.environ.get("PREFECT_API_URL")
         if address:
-            yield partial(_require_answer, address)
+            _require_answer(address)
+            yield lambda: None
             return
         with (
             tempfile.TemporaryDirectory(prefix="worldpose-prefect-") as scratch,

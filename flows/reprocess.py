@@ -23,6 +23,7 @@ def reprocess(
     retry: bool = False,
     dask: str | None = None,
     workers: int | None = None,
+    time_limits: dict[str, float] | None = None,
 ) -> dict[str, str]:
     """Runs every match of a project that an edit has touched; gives each match's state.
 
@@ -36,11 +37,12 @@ def reprocess(
         retry: try again what failed, though nothing was edited.
         dask: address of a running Dask scheduler; None starts workers on this machine.
         workers: number of worker processes on this machine; None = one a core.
+        time_limits: stage to the minutes that a unit may be at work, where not as long as all.
 
     Raises:
         UnprocessedError: some matches failed or are partial; the others are done.
     """
-    request = RunRequest(settings or {}, dask=dask, workers=workers)
+    request = RunRequest(settings or {}, dask=dask, workers=workers, time_limits=time_limits or {})
     found = reprocess_matches(Store.open(project), tuple(matches), request, retry=retry)
     unprocessed = [
         f"{each.match_id} is {each.state}" + (f": {each.problem}" if each.problem else "")

@@ -9,21 +9,26 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING
 
 from data_contracts.run import GatePolicy, RunRecord
 from flows.gatekeeping import Gatekeeper
+from flows.lost_machines import require_machines
 from flows.outlook import look_ahead
 from flows.planning import PlannedUnit
-from flows.prefect_environment import has_server, local_cluster, prefect_server
+from flows.prefect_environment import START_SECONDS, has_server, local_cluster, prefect_server
 from flows.progress import reporter
 from flows.run_record import RunLog, latest_run, standing_results
 from flows.settings import Overrides, selected_stages
 from flows.stage import Match, Stage
+from flows.time_limits import TimeLimits
 from worldpose.errors import InputError
 from worldpose.store import Store
+
+if TYPE_CHECKING:
+    from distributed import LocalCluster
 
 DASK_SECONDS = 10.0
 """How long a Dask scheduler may take to answer."""
@@ -44,6 +49,7 @@ class RunRequest:
             never.
         iteration: which pass over the method, unless `from_stage` goes on with the latest run's;
             the passes before it have their results.
+        time_limits: stage to the minutes that a unit may be at work, where not as long as all.
     """
 
     settings: Overrides
@@ -53,6 +59,7 @@ class RunRequest:
     workers: int | None = None
     gates: GatePolicy | None = None
     iteration: int = 1
+    time_limits: TimeLimits = field(default_factory=dict)
 
 
 def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
@@ -64,6 +71,7 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
     Raises:
         UsageError: no such stage, or no results to start `from_stage` from.
         InputError: the Dask scheduler or Prefect server that was named does not answer.
+        LostMachinesError: it did, and does no more.
     """
     stages = selected_stages(request.from_stage, request.until_stage)
     latest = latest_run(store, match.match_id)
@@ -107,17 +115,14 @@ def _without_work(
 def _with_prefect(
     store: Store, match: Match, request: RunRequest, missing: list[PlannedUnit]
 ) -> RunRecord:
-    if request.dask is None or not has_server():
-        reporter().say("starting Prefect and Dask")
-    with _ending_at_once(), prefect_server(store.url) as wait_until_ready:
-        # Late: they take seconds to import, which pass while the server starts.
+    with shared_machines(store, request) as machines_for:
+        request = machines_for(missing)
         from prefect.logging.handlers import APILogHandler
         from prefect_dask import DaskTaskRunner
 
         from flows.match import IncompleteRunError, process_match
 
-        runner = DaskTaskRunner(**_cluster(request, missing))
-        wait_until_ready()
+        runner = DaskTaskRunner(address=request.dask)
         try:
             run_id = process_match.with_options(task_runner=runner)(
                 project=store.url,
@@ -127,9 +132,13 @@ def _with_prefect(
                 until_stage=request.until_stage,
                 gates=request.gates,
                 iteration=request.iteration,
+                time_limits=dict(request.time_limits),
             )
         except IncompleteRunError as failure:
             run_id = failure.run_id
+        except Exception as failure:
+            require_machines(failure)
+            raise
         finally:
             APILogHandler().flush()  # while the server is there to take the last lines
     return store.run(match.match_id, run_id)
@@ -164,15 +173,21 @@ def shared_machines(
 def _machines(
     store: Store, request: RunRequest, missing: list[PlannedUnit]
 ) -> Iterator[RunRequest]:
-    reporter().say("starting Prefect and Dask")
+    if request.dask is None or not has_server():
+        reporter().say("starting Prefect and Dask")
     with _ending_at_once(), prefect_server(store.url) as wait_until_ready, ExitStack() as stack:
+        cluster = None
         if request.dask is None:
-            # Late: it takes a second to import, while the server starts.
-            from distributed import LocalCluster
-
-            cluster = stack.enter_context(LocalCluster(**_workers(request, missing)))
+            cluster = stack.enter_context(_starting_cluster(request, missing))
             request = replace(request, dask=cluster.scheduler_address)
+        else:
+            _require_scheduler(request.dask)
+        # Late: it takes seconds to import, which pass while server and workers start.
+        import flows.match  # noqa: F401
+
         wait_until_ready()
+        if cluster is not None:
+            cluster.wait_for_workers(1, START_SECONDS)
         yield request
 
 
@@ -200,18 +215,19 @@ def _ending_at_once() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _cluster(request: RunRequest, missing: list[PlannedUnit]) -> dict[str, object]:
-    """What `DaskTaskRunner` needs to use a running cluster, or to make one on this machine."""
-    if request.dask is not None:
-        _require_scheduler(request.dask)
-        return {"address": request.dask}
-    return {"cluster_kwargs": _workers(request, missing)}
+def _starting_cluster(request: RunRequest, missing: list[PlannedUnit]) -> LocalCluster:
+    """Workers on this machine that begin to start, and import at once what they will need."""
+    import dask
+    from distributed import LocalCluster
 
-
-def _workers(request: RunRequest, missing: list[PlannedUnit]) -> dict[str, Any]:
-    """Workers on this machine, as Dask starts them."""
-    widest = max(Counter(unit.recipe.stage for unit in missing).values())
-    return local_cluster(request.workers or min(os.cpu_count() or 1, widest))
+    stages = Counter(unit.recipe.stage for unit in missing)
+    workers = request.workers or min(os.cpu_count() or 1, max(stages.values()))
+    given = dask.config.get("distributed.worker.preload")
+    asked = [given] if isinstance(given, str) else given
+    preload = [*asked, "prefect_dask", *(f"tasks.{stage}" for stage in stages)]
+    cluster = LocalCluster(**{**local_cluster(workers), "n_workers": 0, "preload": preload})
+    cluster.scale(workers)
+    return cluster
 
 
 def _require_scheduler(address: str) -> None:

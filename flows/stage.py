@@ -60,6 +60,7 @@ class Stage:
         sources: for a unit, everything the match folder contributes to its result.
         again: for a unit, the results of the iteration before that it is made from too.
         outside: for its settings, what they name outside of the match: digests of those files.
+        prefers: tag of the workers that compute it, where the cluster has such.
     """
 
     name: str
@@ -70,3 +71,4 @@ class Stage:
     sources: Callable[[Match, str], dict[str, JsonValue]]
     again: Callable[[Match, str], tuple[str, ...]] = _no_results
     outside: Callable[[Any], dict[str, JsonValue]] = _nothing
+    prefers: str | None = None

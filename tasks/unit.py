@@ -6,7 +6,7 @@ import functools
 import platform
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import xarray as xr
 from prefect import Task, task
@@ -14,9 +14,14 @@ from prefect.client.schemas.objects import State, TaskRun
 
 from data_contracts.records import Record
 from data_contracts.run import Work
+from tasks.beginnings import survivable
 from worldpose.errors import CorruptionError, InputError, NondeterminismError, StoreError
 from worldpose.ingest.registration import digest_of_files
 from worldpose.store import Store, code_version, libraries
+
+RETRIES: Final = 2
+RETRY_SECONDS: Final = 1.0
+"""Of what may be gone next time."""
 
 
 def unit_task(compute: Callable[[Work], str]) -> Task[[Work], str]:
@@ -25,13 +30,14 @@ def unit_task(compute: Callable[[Work], str]) -> Task[[Work], str]:
     @functools.wraps(compute)
     def checked(work: Work) -> str:
         require_same_code(work)
-        return compute(work)
+        with survivable(work):
+            return compute(work)
 
     return task(
         task_run_name="{work.recipe.stage} {work.recipe.unit}",
-        retries=2,
-        retry_delay_seconds=1,
-        retry_condition_fn=_may_pass,
+        retries=RETRIES,
+        retry_delay_seconds=RETRY_SECONDS,
+        retry_condition_fn=_may_be_retried,
         persist_result=False,
     )(checked)
 
@@ -99,8 +105,12 @@ def figures_of(report: Record, camera_ids: Sequence[str]) -> dict[str, float]:
     return figures
 
 
-def _may_pass(task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
+def may_pass(failure: BaseException) -> bool:
     """Whether a failure may be gone next time: a disk's or network's, not an input's or a bug's."""
-    failure = state.result(raise_on_failure=False)
     lasting = isinstance(failure, CorruptionError | NondeterminismError)
     return isinstance(failure, StoreError | OSError) and not lasting
+
+
+def _may_be_retried(task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
+    failure = state.result(raise_on_failure=False)
+    return isinstance(failure, BaseException) and may_pass(failure)

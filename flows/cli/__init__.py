@@ -25,6 +25,7 @@ from flows.cli import (
     run,
     serve,
     statistics,
+    times,
 )
 from flows.cli.console import errors, line
 from worldpose.errors import UsageError, WorldposeError
@@ -46,6 +47,7 @@ for module in (
     serve,
     review,
     lineage,
+    times,
     pins,
     results,
     check,

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from pydantic import JsonValue
 
+from flows.cli.computing import DaskOption, TimeLimitOption, WorkersOption
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -22,6 +23,7 @@ from flows.registering import find_registration
 from flows.reprocessing import Reprocessed, reprocess_matches
 from flows.running import RunRequest
 from flows.settings import parse_overrides
+from flows.time_limits import parse_time_limits
 from flows.touched import Touched
 from worldpose.store import Store
 
@@ -48,12 +50,9 @@ def reprocess(
             help="A setting to ask for, beside those of each match's latest run; may be repeated.",
         ),
     ] = None,
-    dask: Annotated[
-        str | None, typer.Option(metavar="ADDR", help="A running Dask scheduler, tcp://host:port.")
-    ] = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Worker processes on this machine; one a core.")
-    ] = None,
+    dask: DaskOption = None,
+    workers: WorkersOption = None,
+    time_limits: TimeLimitOption = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -67,7 +66,8 @@ def reprocess(
     overrides = parse_overrides(assignments or [])
     store = Store.open(project)
     wanted = [find_registration(store, name).spec.match_id for name in matches or ()]
-    request = RunRequest(overrides, dask=dask, workers=workers)
+    limits = parse_time_limits(time_limits or ())
+    request = RunRequest(overrides, dask=dask, workers=workers, time_limits=limits)
     with progress():
         found = reprocess_matches(store, wanted, request, retry=retry, is_rehearsal=dry_run)
     if as_json:

@@ -143,6 +143,14 @@ def evaluate(
         int | None,
         typer.Option("--first-frame", help="Match frame of methods' first picture."),
     ] = None,
+    method_fps: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--method-fps",
+            metavar="NAME=FPS",
+            help="Frames in a second of the video that a method saw, where not the clip's.",
+        ),
+    ] = None,
     table: Annotated[
         str, typer.Option("--table", help="Table of methods: text, csv or latex.")
     ] = "text",
@@ -157,11 +165,17 @@ def evaluate(
         print_ablation(ablation, as_json=as_json)
         return
     if method and reference is not None and prediction is None:
-        from flows.cli.methods import print_methods
+        from flows.cli.methods import named_rates, print_methods
         from flows.methods import score_methods
 
         found = score_methods(
-            method, reference, match_in=match_in, body=body, first_frame=first_frame, fps=fps
+            method,
+            reference,
+            match_in=match_in,
+            body=body,
+            first_frame=first_frame,
+            fps=fps,
+            seen_fps=named_rates(method_fps or ()),
         )
         print_methods(found, table, as_json=as_json)
         return

@@ -9,6 +9,7 @@ from typing import Annotated, get_args
 import typer
 
 from data_contracts.run import GatePolicy, RunRecord
+from flows.cli.computing import DaskOption, TimeLimitOption, WorkersOption
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -28,6 +29,7 @@ from flows.registering import find_match
 from flows.review import warnings_of
 from flows.running import RunRequest, run_match
 from flows.settings import parse_overrides, selected_stages
+from flows.time_limits import parse_time_limits
 from worldpose.errors import UsageError
 from worldpose.store import Store
 
@@ -51,12 +53,9 @@ def run(
             help="A setting for this run; may be repeated; `list` shows them all.",
         ),
     ] = None,
-    dask: Annotated[
-        str | None, typer.Option(metavar="ADDR", help="A running Dask scheduler, tcp://host:port.")
-    ] = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Worker processes on this machine; one a core.")
-    ] = None,
+    dask: DaskOption = None,
+    workers: WorkersOption = None,
+    time_limits: TimeLimitOption = None,
     gates: Annotated[
         str | None,
         typer.Option(
@@ -89,7 +88,15 @@ def run(
     store = Store.open_or_new(project)
     policy = None if gates is None else _policy(gates)
     most = parse_iterations(iterations)
-    request = RunRequest(overrides, from_stage, until_stage, dask, workers, policy)
+    request = RunRequest(
+        overrides,
+        from_stage,
+        until_stage,
+        dask,
+        workers,
+        policy,
+        time_limits=parse_time_limits(time_limits or ()),
+    )
     with progress():
         opened = find_match(store, match)
         for text in warnings_of(opened):

@@ -8,13 +8,23 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from flows.cli.computing import DaskOption, TimeLimitOption, WorkersOption
 from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption, errors, line, print_json
+from flows.cli.page_server import (
+    PAGES_PORT,
+    CertificateOption,
+    HostOption,
+    KeyOption,
+    NamesOption,
+    PortOption,
+    TokenOption,
+    certificate_and_key,
+)
+from flows.time_limits import parse_time_limits
 from worldpose.errors import UsageError
 
 if TYPE_CHECKING:
     from flows.operations.layout import StateFolder
-
-PAGES = 8571
 
 
 def serve(
@@ -22,37 +32,31 @@ def serve(
         Path | None,
         typer.Option("--inbox", help="Folder in which matches arrive; PROJECT/inbox by default."),
     ] = None,
+    bucket: Annotated[
+        str | None,
+        typer.Option("--bucket", help="s3:// URL where matches arrive too; copied to the inbox."),
+    ] = None,
     check: Annotated[
         bool, typer.Option("--check", help="Say what is unhealthy and how to mend it, and end.")
     ] = False,
     at_once: Annotated[int, typer.Option(min=1, help="Matches that run at the same time.")] = 1,
-    dask: Annotated[
-        str | None, typer.Option(metavar="ADDR", help="A running Dask scheduler, tcp://host:port.")
-    ] = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Worker processes of a run; its share of the cores.")
-    ] = None,
+    dask: DaskOption = None,
+    workers: WorkersOption = None,
+    time_limits: TimeLimitOption = None,
     name: Annotated[
         str, typer.Option(help="Of the deployments; projects at one Prefect server need their own.")
     ] = "worldpose",
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Of the pages.")] = PAGES,
+    port: PortOption = PAGES_PORT,
     prefect_port: Annotated[
         int, typer.Option(min=1, max=65535, help="Of Prefect's dashboard, on this machine alone.")
     ] = 4200,
     metrics_port: Annotated[
         int, typer.Option(min=1, max=65535, help="Of the figures for Prometheus.")
     ] = 8573,
-    host: Annotated[str, typer.Option(help="Address that pages and figures listen at.")] = (
-        "127.0.0.1"
-    ),
-    names: Annotated[
-        list[str] | None,
-        typer.Option("--host-name", help="Name of this machine elsewhere; repeatable."),
-    ] = None,
-    certificate: Annotated[
-        Path | None, typer.Option("--certificate", help="PEM file; with --key: pages with TLS.")
-    ] = None,
-    key: Annotated[Path | None, typer.Option("--key", help="PEM file of its private key.")] = None,
+    host: HostOption = "127.0.0.1",
+    names: NamesOption = None,
+    certificate: CertificateOption = None,
+    key: KeyOption = None,
     quiet: Annotated[
         float, typer.Option(min=0, help="A match has arrived when unchanged for so long [s].")
     ] = 30.0,
@@ -69,21 +73,14 @@ def serve(
         Path | None,
         typer.Option(help="Folder of logs and Prefect's database; PROJECT/operations by default."),
     ] = None,
-    token: Annotated[
-        str | None,
-        typer.Option(
-            envvar="WORLDPOSE_REVIEW_TOKEN",
-            show_envvar=True,
-            help="What people log in to the pages with; a new one by default.",
-        ),
-    ] = None,
+    token: TokenOption = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
     """Serve a project until interrupted: dashboard, inbox, runs, pages, figures, alerts.
 
-    Alerts go to the webhook in WORLDPOSE_ALERT_URL. PREFECT_API_URL names a Prefect server that
-    runs already.
+    Alerts go to the webhook in WORLDPOSE_ALERT_URL and by mail as WORLDPOSE_ALERT_MAIL says.
+    PREFECT_API_URL names a Prefect server that runs already.
 
     Example: worldpose serve --inbox /data/arriving
     """
@@ -97,16 +94,12 @@ def serve(
     if check:
         _check(folder, as_json=as_json)
         return
+    from flows.operations.senders import senders_of
     from flows.operations.serving import serve as serve_all
     from flows.pages.access import access_for
 
-    if (certificate is None) != (key is None):
-        raise UsageError(
-            "--certificate and --key",
-            expected="both or none",
-            found="one of them",
-            todo="Give the certificate's file and its private key's.",
-        )
+    senders_of(os.environ)  # refused now, not where nobody looks
+    tls = certificate_and_key(certificate, key)
     if inbox is None and "://" in url:
         raise UsageError(
             "--inbox",
@@ -118,6 +111,7 @@ def serve(
     plan = ServePlan(
         project=url,
         inbox=(inbox or Path(url) / "inbox").resolve(),
+        bucket=bucket,
         state=folder.folder,
         name=name,
         prefect=(given or f"http://127.0.0.1:{prefect_port}/api").rstrip("/"),
@@ -125,6 +119,7 @@ def serve(
         at_once=at_once,
         dask=dask,
         workers=workers,
+        time_limits=dict(parse_time_limits(time_limits or ())),
         host=host,
         names=tuple(names or ()),
         pages_port=port,
@@ -136,7 +131,7 @@ def serve(
         gate_hours=gate_hours,
         disk_gb=disk_gb,
     )
-    access = access_for(host, token=token, names=names or (), secure=certificate is not None)
+    access = access_for(host, token=token, names=names or (), secure=tls is not None)
 
     def ready() -> None:
         line(f"serving {plan.project}")

@@ -1,24 +1,22 @@
-"""What somebody has to be told of, and telling it once: a POST of JSON to a webhook."""
+"""What somebody has to be told of, and telling it once, by webhook and mail."""
 
 from __future__ import annotations
 
 import json
 import logging
 import shutil
-import urllib.request
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Literal
 
 from data_contracts.operations import Arrival
 from flows.operations.layout import StateFolder
 from flows.operations.overview import MatchGlance, age
 from flows.operations.plan import ServePlan
+from flows.operations.senders import Sender
 from worldpose.release import whole_file
 
 AlertKind = Literal["run_failed", "gate_waiting", "quality", "disk_low", "arrival_refused"]
-ANSWER_SECONDS: Final = 10.0
-"""How long a webhook may take to answer."""
 
 LOG = logging.getLogger("worldpose.operations")
 
@@ -107,47 +105,49 @@ class Teller:
 
     Attributes:
         state: where it is kept what was told, so that a restart repeats nothing.
-        address: of the webhook; None tells the log alone.
+        senders: the ways to tell it; none tells the log alone.
     """
 
-    def __init__(self, state: StateFolder, address: str | None) -> None:
-        self.state, self.address = state, address
+    def __init__(self, state: StateFolder, senders: Sequence[Sender]) -> None:
+        self.state, self.senders = state, tuple(senders)
         kept = state.alerts.read_text() if state.alerts.exists() else "{}"
-        self._told: dict[str, dict[str, object]] = json.loads(kept)
+        self._told: dict[str, dict[str, Any]] = json.loads(kept)
 
     def tell(self, alerts: Iterable[Alert]) -> list[Alert]:
-        """Tell what is new; gives that."""
-        held = {alert.key: alert for alert in alerts}
-        before = self._told
-        told = {key: before[key] for key in held if key in before}
-        new = [alert for key, alert in held.items() if not before.get(key, {}).get("told")]
-        for alert in new:
+        """Tell what is new; gives that, where all ways took it."""
+        before, told = self._told, {}
+        new = []
+        for alert in {each.key: each for each in alerts}.values():
             if alert.key not in before:
                 LOG.warning("alert: %s", alert.text)
-            told[alert.key] = {**_content(alert), "told": self._post(alert)}
+            took = before.get(alert.key, {}).get("told_by")
+            now = self._send(alert, took or ())
+            told[alert.key] = {**_content(alert), "told_by": now}
+            if now != took and len(now) == len(self.senders):
+                new.append(alert)
         if told != before:
             self._told = told
             with whole_file(self.state.alerts) as draft:
                 draft.write_text(json.dumps(told, indent=2) + "\n")
-        return [alert for alert in new if told[alert.key]["told"]]
+        return new
 
-    def _post(self, alert: Alert) -> bool:
-        """Whether the webhook took it; where there is none, the log has."""
-        if self.address is None:
-            return True
-        body = json.dumps(_content(alert)).encode()
-        headers = {"content-type": "application/json", "user-agent": "worldpose"}
-        try:
-            request = urllib.request.Request(self.address, data=body, headers=headers)
-            with urllib.request.urlopen(request, timeout=ANSWER_SECONDS) as answer:
-                return bool(200 <= answer.status < 300)
-        except (OSError, ValueError) as error:
-            # Its address may hold a secret: it is not said.
-            LOG.warning("the webhook did not take an alert: %s", type(error).__name__)
-            return False
+    def _send(self, alert: Alert, took: Sequence[str]) -> list[str]:
+        """The names of all senders that have taken it, now or before."""
+        took = [sender.name for sender in self.senders if sender.name in took]
+        for sender in self.senders:
+            if sender.name in took:
+                continue
+            try:
+                sender.send(_content(alert))
+            except (OSError, ValueError) as error:
+                # What the error says may hold the address, and that a secret.
+                LOG.warning("%s did not take an alert: %s", sender.name, type(error).__name__)
+            else:
+                took.append(sender.name)
+        return took
 
 
-def _content(alert: Alert) -> Mapping[str, object]:
+def _content(alert: Alert) -> Mapping[str, str]:
     """`text` is what chat services show of a webhook's JSON."""
     return {
         "alert": alert.alert,

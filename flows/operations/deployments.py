@@ -50,7 +50,11 @@ DEPLOYED: Final = (
         "match",
         "Process a match; waits for people where a gate says so.",
         "normal",
-        lambda plan: {"project": plan.project, "settings": {}},
+        lambda plan: {
+            "project": plan.project,
+            "settings": {},
+            "time_limits": plan.time_limits,
+        },
     ),
     Deployed(
         "ingest",
@@ -63,7 +67,12 @@ DEPLOYED: Final = (
         "reprocess",
         "Make every match current that an edit has touched.",
         "background",
-        lambda plan: {"project": plan.project, "dask": plan.dask, "workers": plan.workers},
+        lambda plan: {
+            "project": plan.project,
+            "dask": plan.dask,
+            "workers": plan.workers,
+            "time_limits": plan.time_limits,
+        },
         module="flows.reprocess",
     ),
     Deployed("finetune", "Train the embedded nets on reviewed labels.", "background"),

@@ -22,6 +22,8 @@ class ServePlan(Record):
     """Folder or URL of the store."""
     inbox: Path
     """Folder in which matches arrive."""
+    bucket: str | None = None
+    """Where matches arrive in object storage, to be copied into the inbox."""
     state: Path
     """Folder of logs, alerts and what is known of arrivals."""
     name: Name = "worldpose"
@@ -36,6 +38,8 @@ class ServePlan(Record):
     """Address of a running Dask scheduler; None: workers on this machine for each run."""
     workers: int | None = Field(default=None, ge=1)
     """Worker processes of a run on this machine; None: the cores, shared by the matches at once."""
+    time_limits: dict[str, float] = Field(default_factory=dict)
+    """Stage to the minutes that a unit may be at work, where not as long as all."""
     host: str = "127.0.0.1"
     """Address that pages and figures listen at."""
     names: tuple[str, ...] = ()

@@ -27,6 +27,7 @@ from prefect.events.filters import (
 )
 from prefect.states import Cancelled, Crashed, Scheduled
 
+from flows.lost_machines import LostMachinesError
 from flows.operations.layout import is_alive
 from flows.operations.plan import ServePlan
 
@@ -41,7 +42,7 @@ LOG = logging.getLogger("worldpose.operations")
 
 
 async def begin_again(plan: ServePlan, *, at_start: bool = False) -> list[str]:
-    """Schedule crashed runs of this project's deployments once more; gives their names.
+    """Schedule runs that were killed or lost their machines once more; gives their names.
 
     Args:
         plan: what is served.
@@ -59,13 +60,22 @@ async def begin_again(plan: ServePlan, *, at_start: bool = False) -> list[str]:
             for run in await _runs(client, plan, StateType.RUNNING):
                 if await _is_dead(client, plan, run):
                     await client.set_flow_run_state(run.id, Crashed(message=KILLED), force=True)
-        for run in await _runs(client, plan, StateType.CRASHED):
-            if run.run_count < MOST_BEGINNINGS:
-                LOG.warning("%s: %s; it begins again", run.name, KILLED)
-                state = Scheduled(name="AwaitingRetry", message=KILLED)
+        for run in await _runs(client, plan, StateType.CRASHED, StateType.FAILED):
+            if may_begin_again(run):
+                why = KILLED if run.state_type == StateType.CRASHED else "its machines were lost"
+                LOG.warning("%s: %s; it begins again", run.name, why)
+                state = Scheduled(name="AwaitingRetry", message=why)
                 await client.set_flow_run_state(run.id, state, force=True)
                 again.append(run.name)
     return again
+
+
+def may_begin_again(run: FlowRun) -> bool:
+    """Whether a run ended by no fault of its own: it was killed, or its machines were lost."""
+    if run.state is None or run.run_count >= MOST_BEGINNINGS:
+        return False
+    was_lost = LostMachinesError.__name__ in (run.state.message or "")
+    return run.state_type == StateType.CRASHED or (run.state_type == StateType.FAILED and was_lost)
 
 
 async def _is_dead(client: PrefectClient, plan: ServePlan, run: FlowRun) -> bool:

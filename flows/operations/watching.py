@@ -28,11 +28,14 @@ from flows.operations.arrivals import watch_once
 from flows.operations.metrics import ProjectFigures, metrics_server
 from flows.operations.overview import Overview
 from flows.operations.plan import ServePlan
-from flows.operations.recovery import MOST_BEGINNINGS, begin_again
+from flows.operations.recovery import begin_again, may_begin_again
+from flows.operations.senders import senders_of
 from worldpose.store import Store
 
 INBOX_SECONDS: Final = 2.0
 """Between two looks at the inbox; longer where one look takes long."""
+BUCKET_SECONDS: Final = 10.0
+"""Between two looks at an inbox in object storage."""
 ALERT_SECONDS: Final = 30.0
 """Between two looks for alerts and lost runs."""
 FAILED_DAYS: Final = 7
@@ -51,7 +54,21 @@ def watch(plan: ServePlan) -> None:
 
 
 async def _watch(plan: ServePlan, store: Store) -> None:
-    await asyncio.gather(_watch_inbox(plan), _watch_runs(plan, store))
+    await asyncio.gather(_watch_bucket(plan), _watch_inbox(plan), _watch_runs(plan, store))
+
+
+async def _watch_bucket(plan: ServePlan) -> None:
+    if plan.bucket is None:
+        return
+    from flows.operations.bucket import BucketInbox  # late: object storage is an extra
+
+    bucket = BucketInbox(plan.bucket, plan.inbox, plan.state_folder)
+    while True:
+        try:
+            await asyncio.to_thread(bucket.fetch, time.monotonic(), plan.quiet_seconds)
+        except Exception:
+            LOG.exception("the bucket could not be looked at; it will be again")
+        await asyncio.sleep(BUCKET_SECONDS)
 
 
 async def _watch_inbox(plan: ServePlan) -> None:
@@ -79,7 +96,7 @@ async def _ingest(plan: ServePlan, ready: list[str]) -> None:
 
 async def _watch_runs(plan: ServePlan, store: Store) -> None:
     overview = Overview(store)
-    teller = Teller(plan.state_folder, os.environ.get("WORLDPOSE_ALERT_URL"))
+    teller = Teller(plan.state_folder, senders_of(os.environ))
     while True:
         await asyncio.sleep(ALERT_SECONDS)
         try:
@@ -105,7 +122,7 @@ async def failed_runs(plan: ServePlan) -> list[FailedRun]:
     return [
         FailedRun(str(run.id), run.name, str(run.state_name).lower(), _said(run.state))
         for run in runs
-        if run.state_type == StateType.FAILED or run.run_count >= MOST_BEGINNINGS
+        if not may_begin_again(run)
     ]
 
 

@@ -10,13 +10,17 @@ import time
 from contextlib import contextmanager
 
 import pytest
+from checker import differences
 from command_line import WORLDPOSE, succeed
 from test_killed_runs import assert_nothing_half_written, assert_same_store, files_of
 
+from data_contracts.review import DeletedDetection
 from flows import iteration
 from flows import match as match_flow
+from flows.fan_out import task_of
 from flows.iteration import iterate_match
-from flows.registering import register
+from flows.registering import open_match, register
+from flows.review import correct
 from flows.running import RunRequest
 from flows.settings import selected_stages
 from worldpose.store import Store
@@ -29,17 +33,18 @@ PASSES = 2
 LOOPED = ["--iterations", str(PASSES), "--workers", "2"]
 
 
-def compute_here(store, match, stage, units, run_id):
+def compute_here(stage, units, work):
     """Each unit in this process: what Prefect and Dask do for it, but for their start."""
-    task = match_flow.task_of(stage)
-    for unit in units:
-        task.fn(unit.work(store.url, match, run_id))
+    task = task_of(stage)
+    for unit, each in zip(units, work, strict=True):
+        task.fn(each)
         yield unit, None
 
 
 def run_here(store, match, request):
+    match = open_match(store, match.match_id)  # as the flow does: it may have been edited
     stages = selected_stages(request.from_stage, request.until_stage)
-    settings = (request.settings, "never", request.iteration)
+    settings = (request.settings, "never", request.iteration, request.time_limits)
     return match_flow._run_stages(store, match, stages, *settings)
 
 
@@ -51,7 +56,7 @@ def no_machines(store, request):
 def loop(project, folder, at_commit_point):
     """The loop over iterations in this process."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(match_flow, "_compute", compute_here)
+        patch.setattr(match_flow, "compute", compute_here)
         patch.setattr(iteration, "run_match", run_here)
         patch.setattr(iteration, "shared_machines", no_machines)
         install_fault_hook(at_commit_point)
@@ -140,7 +145,85 @@ def test_two_loops_over_one_match_at_once_end_with_one_result(server, short, tmp
         of_pass = [json.dumps(each.results) for each in records if each.iteration == number]
         assert len(of_pass) >= 2
         assert len(set(of_pass)) == 1
-    assert_same_store(project, undisturbed)
+    assert differences(project, undisturbed) == []
+
+
+def delete_a_box(project):
+    """What a person does on another machine meanwhile."""
+    store = Store.open(str(project))
+    (match_id,) = store.matches()
+    deleted = DeletedDetection(camera="cam01", frame=3, detection=0)
+    correct(store, open_match(store, match_id), [deleted], who="Ada", why="a shadow")
+
+
+def standing(project):
+    """The latest run's results."""
+    store = Store.open(str(project))
+    (match_id,) = store.matches()
+    return store.run(match_id).results
+
+
+def assert_every_run_is_of_one_piece(project):
+    """What is made from a result of a run is made from just that one, or that of the pass before.
+
+    A pass goes on with the one before it, whose runs are therefore asked too.
+    """
+    store = Store.open(str(project))
+    (match_id,) = store.matches()
+    records = [store.run(match_id, run) for run in store.runs(match_id)]
+    for record in records:
+        passes = [each.results for each in records if each.iteration == record.iteration - 1]
+        for name, key in record.results.items():
+            recipe = store.manifest(match_id, *name.split("/"), key).recipe
+            for source, made_from in recipe.inputs.items():
+                before = {results.get(source) for results in passes}
+                assert made_from == record.results.get(source) or made_from in before, name
+
+
+@pytest.fixture(scope="module")
+def edited(short, tmp_path_factory):
+    """A project in which the same was done after the edit."""
+    project = tmp_path_factory.mktemp("edited") / "project"
+    register(Store.create(str(project)), short)
+    delete_a_box(project)
+    loop(project, short, None)
+    return project
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_an_edit_at_a_random_moment_of_the_loop(seed, short, undisturbed, edited, tmp_path):
+    reference, visits = undisturbed
+    moment = random.Random(seed).randrange(len(visits))
+    project = tmp_path / "project"
+    seen = []
+
+    def strike(point):
+        seen.append(point)
+        if len(seen) == moment + 1:
+            delete_a_box(project)
+
+    loop(project, short, strike)
+    assert len(seen) > moment
+    assert_every_run_is_of_one_piece(project)
+    assert standing(project) in (standing(reference), standing(edited))
+    loop(project, short, None)
+    assert standing(project) == standing(edited)
+
+
+@pytest.mark.slow
+def test_an_edit_while_the_command_is_at_work(server, short, undisturbed, edited, tmp_path):
+    project = tmp_path / "project"
+    process = start(short, project)
+    while not list(project.glob("results/*/triangulation/*/*/manifest.json")):
+        assert process.poll() is None, "the run ended before the edit"
+        time.sleep(0.01)
+    delete_a_box(project)
+    assert process.wait() == 0
+    assert_every_run_is_of_one_piece(project)
+    assert standing(project) in (standing(undisturbed[0]), standing(edited))
+    succeed("run", short, "--project", project, *LOOPED)
+    assert standing(project) == standing(edited)
 
 
 def start(folder, project):

@@ -10,9 +10,9 @@ import time
 from pathlib import Path
 
 import pytest
+from checker import half_written, problems_of
 from command_line import WORLDPOSE, succeed
 
-from worldpose.store import Store, compare_stores, verify
 from worldpose.store.commit_points import COMMIT_POINTS
 
 pytestmark = [pytest.mark.usefixtures("server"), pytest.mark.faults]
@@ -29,8 +29,7 @@ def fault_environment(tmp_path, point, **plan):
 
 
 def assert_same_store(project, undisturbed):
-    assert compare_stores(Store.open(str(project)), Store.open(str(undisturbed))) == []
-    assert verify(Store.open(str(project))) == ()
+    assert problems_of(project, undisturbed) == []
 
 
 def quick(points, kept):
@@ -117,12 +116,7 @@ def files_of(project):
 
 
 def assert_nothing_half_written(project):
-    if (project / "project.json").exists():
-        store = Store.open(str(project))
-        for match in store.matches():
-            for run in store.runs(match):
-                assert store.run(match, run).state == "complete"
-        assert verify(store) == (), "something half-written can be read"
+    assert half_written(project) == [], "something half-written can be read"
 
 
 def test_workers_and_server_end_with_a_killed_run(tiny, tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from flows.match import task_of
+from flows.fan_out import task_of
 from flows.method import METHOD
 from flows.planning import plan_run
 from flows.refitting import STAGE

@@ -1,6 +1,14 @@
-"""A small match to put into inboxes."""
+"""A small match to put into inboxes, a Postgres server, a Dask cluster."""
 
+import os
 import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
 
 import pytest
 
@@ -26,3 +34,69 @@ def drop(small_match, tmp_path):
         return shutil.copytree(small_match, tmp_path / "inbox" / name)
 
     return copy
+
+
+@pytest.fixture
+def postgres():
+    """The address of a database in a Postgres server, and a function that asks it."""
+    programs = Path("/usr/lib/postgresql")
+    found = sorted(programs.glob("*/bin/postgres"))
+    if not found:
+        pytest.skip("no Postgres server is installed")
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    folder = Path(tempfile.mkdtemp(prefix="postgres-", dir="/tmp"))
+    who = {"user": "postgres", "group": "postgres"} if os.geteuid() == 0 else {}
+    if who:  # Postgres refuses to be run by root
+        shutil.chown(folder, **who)
+    initdb = found[-1].with_name("initdb")
+    making = [initdb, "-D", folder / "data", "-U", "prefect", "--auth", "trust", "--no-sync"]
+    subprocess.run(making, check=True, capture_output=True, cwd=folder, **who)
+    options = ["-p", str(port), "-k", str(folder), "-h", "127.0.0.1"]
+    server = subprocess.Popen(
+        [found[-1], "-D", folder / "data", *options],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        cwd=folder,
+        **who,
+    )
+
+    def ask(query):
+        psql = found[-1].with_name("psql")
+        connection = ["-h", "127.0.0.1", "-p", str(port), "-U", "prefect", "-d", "postgres"]
+        asked = [psql, *connection, "-A", "-t", "-c", query]
+        return subprocess.run(asked, capture_output=True, text=True).stdout.strip()
+
+    deadline = time.monotonic() + 120
+    while ask("select 1") != "1":
+        assert time.monotonic() < deadline, "Postgres does not answer"
+        time.sleep(0.5)
+    yield f"postgresql+asyncpg://prefect@127.0.0.1:{port}/postgres", ask
+    server.send_signal(signal.SIGINT)
+    server.wait(60)
+    shutil.rmtree(folder)
+
+
+@pytest.fixture
+def dask():
+    """The address of a Dask scheduler with two workers, each a process of its own; their ids."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    address = f"tcp://127.0.0.1:{port}"
+    python = [sys.executable, "-m"]
+    scheduler = ["distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(port)]
+    worker = ["distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard"]
+    commands = [[*python, *scheduler, "--no-dashboard"], *[[*python, *worker]] * 2]
+    processes = [subprocess.Popen(each, stderr=subprocess.DEVNULL) for each in commands]
+    deadline = time.monotonic() + 120
+    while True:
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                break
+        assert time.monotonic() < deadline, "Dask's scheduler does not answer"
+        time.sleep(0.2)
+    yield address, [process.pid for process in processes[1:]]
+    for process in processes:
+        process.terminate()
+    for process in processes:
+        process.wait(60)

@@ -12,6 +12,7 @@ from flows.operations.alerts import Alert, FailedRun, Teller, alerts_now
 from flows.operations.layout import StateFolder
 from flows.operations.overview import MatchGlance, UnitGlance
 from flows.operations.plan import ServePlan
+from flows.operations.senders import Webhook
 
 NOW = datetime.now(UTC)
 
@@ -20,7 +21,7 @@ NOW = datetime.now(UTC)
 def webhook():
     """A server: what was posted to it, and the codes that it answers next (204 after them)."""
 
-    class Webhook(HTTPServer):
+    class Server(HTTPServer):
         posted: list = []
         codes: list = []
 
@@ -34,7 +35,7 @@ def webhook():
         def log_message(self, *arguments):
             pass
 
-    server = Webhook(("127.0.0.1", 0), Handler)
+    server = Server(("127.0.0.1", 0), Handler)
     server.posted, server.codes = [], []
     server.address = f"http://127.0.0.1:{server.server_port}/hook?token=secret"
     Thread(target=server.serve_forever, daemon=True).start()
@@ -60,7 +61,7 @@ def kinds(alerts):
 
 
 def test_each_matter_is_posted_once_as_json_with_text(webhook, tmp_path):
-    teller = Teller(StateFolder(tmp_path), webhook.address)
+    teller = Teller(StateFolder(tmp_path), [Webhook(webhook.address)])
     alert = Alert("disk_low", "disk_low", "3.0 GB are free", "http://127.0.0.1:8571/status")
     assert teller.tell([alert]) == [alert]
     assert teller.tell([alert]) == []
@@ -70,7 +71,7 @@ def test_each_matter_is_posted_once_as_json_with_text(webhook, tmp_path):
         {"alert": "disk_low", "match": "", "text": "3.0 GB are free", "link": alert.link},
     )
     # A restart repeats nothing; what was over and is again is a new matter.
-    again = Teller(StateFolder(tmp_path), webhook.address)
+    again = Teller(StateFolder(tmp_path), [Webhook(webhook.address)])
     assert again.tell([alert]) == []
     assert again.tell([]) == []
     assert again.tell([alert]) == [alert]
@@ -80,11 +81,11 @@ def test_each_matter_is_posted_once_as_json_with_text(webhook, tmp_path):
 def test_what_the_webhook_did_not_take_is_posted_again(webhook, tmp_path, caplog):
     alert = Alert("disk_low", "disk_low", "little")
     webhook.codes += [500]
-    teller = Teller(StateFolder(tmp_path), webhook.address)
+    teller = Teller(StateFolder(tmp_path), [Webhook(webhook.address)])
     assert teller.tell([alert]) == []
-    assert Teller(StateFolder(tmp_path), "http://127.0.0.1:9/secret").tell([alert]) == []
-    assert Teller(StateFolder(tmp_path), "no address").tell([alert]) == []
-    assert Teller(StateFolder(tmp_path), webhook.address).tell([alert]) == [alert]
+    assert Teller(StateFolder(tmp_path), [Webhook("http://127.0.0.1:9/secret")]).tell([alert]) == []
+    assert Teller(StateFolder(tmp_path), [Webhook("no address")]).tell([alert]) == []
+    assert Teller(StateFolder(tmp_path), [Webhook(webhook.address)]).tell([alert]) == [alert]
     assert len(webhook.posted) == 2
     assert "secret" not in caplog.text
 

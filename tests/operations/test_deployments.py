@@ -52,7 +52,7 @@ def test_deployments_have_queues_by_priority_and_limits(plan):
     assert ranks["urgent"] < ranks["normal"] < ranks["background"]
     match = deployments["match"]
     assert (match.work_pool_name, match.work_queue_name) == ("ops", "normal")
-    assert match.parameters == {"project": plan.project, "settings": {}}
+    assert match.parameters == {"project": plan.project, "settings": {}, "time_limits": {}}
     assert match.entrypoint == "flows.operations.deployed.match"
     for each in deployments.values():  # what the worker will load
         module, _, name = each.entrypoint.rpartition(".")

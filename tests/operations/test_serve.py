@@ -6,13 +6,11 @@ import shutil
 import signal
 import socket
 import subprocess
-import tempfile
 import time
 import urllib.error
 import urllib.request
 from http.cookiejar import CookieJar
 from http.server import BaseHTTPRequestHandler, HTTPServer
-from pathlib import Path
 from threading import Thread
 
 import psutil
@@ -26,6 +24,10 @@ pytestmark = pytest.mark.slow  # a Prefect server, a worker, and a match from en
 TOKEN = "a token of twenty-four.."
 PATIENCE = 900.0
 """What a step may take on two busy cores [s]; it takes a tenth on idle ones."""
+SLOWEST = 30.0
+"""What one answer may take on two busy cores [s]."""
+MOST_TROUBLES = 2
+"""Answers of a wait that may be late or say that SQLite's one writer was busy."""
 
 
 def free_ports(count):
@@ -132,7 +134,7 @@ def fetch(address, body=None, headers=None, opener=None):
     data = None if body is None else json.dumps(body).encode()
     headers = {"content-type": "application/json", **(headers or {})}
     request = urllib.request.Request(address, data, headers)
-    with (opener or urllib.request.build_opener()).open(request, timeout=60) as answer:
+    with (opener or urllib.request.build_opener()).open(request, timeout=SLOWEST) as answer:
         content = answer.read()
     kind = answer.headers["content-type"]
     return json.loads(content) if kind.startswith("application/json") else content.decode()
@@ -140,12 +142,15 @@ def fetch(address, body=None, headers=None, opener=None):
 
 def wait_until(is_so, explain=str):
     deadline = time.monotonic() + PATIENCE
+    troubles = []
     while True:
         try:
             found = is_so()
-        except (TimeoutError, urllib.error.URLError) as error:  # busy, or just beginning
+        except (TimeoutError, urllib.error.URLError) as error:
             found = None
-            assert not isinstance(error, urllib.error.HTTPError) or error.code >= 500, explain()
+            troubles.append(error)
+            is_busy = not isinstance(error, urllib.error.HTTPError) or error.code >= 500
+            assert is_busy and len(troubles) <= MOST_TROUBLES, f"{troubles}\n{explain()}"
         if found:
             return found
         assert time.monotonic() < deadline, explain()
@@ -227,7 +232,8 @@ def test_a_match_in_the_inbox_becomes_a_result_with_one_command(served, webhook,
     def is_done():
         browser.approve_all(name)
         (run,) = served.runs(name)
-        assert run["state_name"] not in ("Failed", "Crashed"), run["state"]["message"]
+        # Between the two it is "Crashed" for a moment, until it begins again.
+        assert run["state_name"] != "Failed", run["state"]["message"]
         return run["state_name"] == "Completed"
 
     wait_until(is_done, served.explain)
@@ -261,43 +267,6 @@ def test_a_match_in_the_inbox_becomes_a_result_with_one_command(served, webhook,
     assert served.check().code == 1
     with capsys.disabled():
         print(f"\nseconds since the command: {times}")
-
-
-@pytest.fixture
-def postgres():
-    """The address of a database in a Postgres server, and a function that asks it."""
-    programs = Path("/usr/lib/postgresql")
-    found = sorted(programs.glob("*/bin/postgres"))
-    if not found:
-        pytest.skip("no Postgres server is installed")
-    (port,) = free_ports(1)
-    folder = Path(tempfile.mkdtemp(prefix="postgres-", dir="/tmp"))
-    who = {"user": "postgres", "group": "postgres"} if os.geteuid() == 0 else {}
-    if who:  # Postgres refuses to be run by root
-        shutil.chown(folder, **who)
-    initdb = found[-1].with_name("initdb")
-    making = [initdb, "-D", folder / "data", "-U", "prefect", "--auth", "trust", "--no-sync"]
-    subprocess.run(making, check=True, capture_output=True, cwd=folder, **who)
-    options = ["-p", str(port), "-k", str(folder), "-h", "127.0.0.1"]
-    server = subprocess.Popen(
-        [found[-1], "-D", folder / "data", *options],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        cwd=folder,
-        **who,
-    )
-
-    def ask(query):
-        psql = found[-1].with_name("psql")
-        connection = ["-h", "127.0.0.1", "-p", str(port), "-U", "prefect", "-d", "postgres"]
-        asked = [psql, *connection, "-A", "-t", "-c", query]
-        return subprocess.run(asked, capture_output=True, text=True).stdout.strip()
-
-    wait_until(lambda: ask("select 1") == "1")
-    yield f"postgresql+asyncpg://prefect@127.0.0.1:{port}/postgres", ask
-    server.send_signal(signal.SIGINT)
-    server.wait(60)
-    shutil.rmtree(folder)
 
 
 @pytest.mark.timeout(3600)

@@ -39,7 +39,7 @@ def served(project_copy):
     now = datetime.now(UTC)
     for name, known in (("a", "taken"), ("b", "refused"), ("c", "refused")):
         state.write_arrival(Arrival(name=name, state=known, changed_at=now))
-    Teller(state, None).tell([Alert("disk_low", "disk_low", "little")])
+    Teller(state, []).tell([Alert("disk_low", "disk_low", "little")])
     plan = ServePlan(
         project=str(project_copy),
         inbox=project_copy / "inbox",

@@ -11,7 +11,7 @@ from data_contracts.cameras import CameraCalibration
 from data_contracts.match import MatchSpec
 from data_contracts.review import Correction, DeletedDetection
 from data_contracts.run import Work
-from flows.match import task_of
+from flows.fan_out import task_of
 from flows.method import METHOD
 from flows.planning import plan_stage
 from flows.registering import register

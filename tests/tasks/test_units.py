@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from prefect.states import Failed
 
-from flows.match import task_of
+from flows.fan_out import task_of
 from flows.method import METHOD
 from flows.planning import plan_run, plan_stage
 from flows.registering import register

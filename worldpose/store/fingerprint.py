@@ -45,24 +45,31 @@ def code_version(root_module: str, roots: tuple[Path, ...] = _HOME) -> dict[str,
         StoreError: a module's source is not found or cannot be parsed.
     """
     versions: dict[str, str] = {}
+    seen = {root_module}
     waiting = [root_module]
     while waiting:
-        name = waiting.pop()
-        if name in versions:
-            continue
-        path = _source(name, roots)
-        if path is None:
-            raise StoreError(f"no source of module {name} below {', '.join(map(str, roots))}")
-        try:
-            tree = _parsed(path.read_bytes())
-        except (OSError, SyntaxError, ValueError) as error:
-            raise StoreError(f"{path}: cannot read module {name}: {error}") from error
-        code = _WithoutText().visit(tree)
-        versions[name] = digest(ast.unparse(code).encode())
-        versions |= {f"{name}:{data.name}": digest(data.read_bytes()) for data in _data(code, path)}
-        package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-        waiting.extend(found for found in _imported(tree, package, roots) if _is_followed(found))
+        of_module, imported = _read_module(waiting.pop(), roots)
+        versions |= of_module
+        waiting.extend(imported - seen)
+        seen |= imported
     return dict(sorted(versions.items()))
+
+
+@functools.cache
+def _read_module(name: str, roots: tuple[Path, ...]) -> tuple[dict[str, str], frozenset[str]]:
+    """Digests of one module and of the data files that it names, and the modules it imports."""
+    path = _source(name, roots)
+    if path is None:
+        raise StoreError(f"no source of module {name} below {', '.join(map(str, roots))}")
+    try:
+        tree = _parsed(path.read_bytes())
+    except (OSError, SyntaxError, ValueError) as error:
+        raise StoreError(f"{path}: cannot read module {name}: {error}") from error
+    nodes = _without_text(tree)
+    versions = {name: digest(ast.unparse(tree).encode())}
+    versions |= {f"{name}:{data.name}": digest(data.read_bytes()) for data in _data(nodes, path)}
+    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    return versions, frozenset(filter(_is_followed, _imported(nodes, package, roots)))
 
 
 @functools.cache
@@ -108,9 +115,9 @@ def _source(name: str, roots: tuple[Path, ...]) -> Path | None:
     return None
 
 
-def _data(code: ast.AST, path: Path) -> Iterator[Path]:
+def _data(nodes: list[ast.AST], path: Path) -> Iterator[Path]:
     """Files beside a module that a text in it names."""
-    texts = {node.value for node in ast.walk(code) if isinstance(node, ast.Constant)}
+    texts = {node.value for node in nodes if isinstance(node, ast.Constant)}
     yield from (
         file
         for file in sorted(path.parent.iterdir())
@@ -118,8 +125,8 @@ def _data(code: ast.AST, path: Path) -> Iterator[Path]:
     )
 
 
-def _imported(tree: ast.AST, package: str, roots: tuple[Path, ...]) -> Iterator[str]:
-    for node in ast.walk(tree):
+def _imported(nodes: list[ast.AST], package: str, roots: tuple[Path, ...]) -> Iterator[str]:
+    for node in nodes:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -133,15 +140,27 @@ def _imported(tree: ast.AST, package: str, roots: tuple[Path, ...]) -> Iterator[
                 yield inner if _source(inner, roots) else base
 
 
-class _WithoutText(ast.NodeTransformer):
-    """Removes docstrings and field strings: text that stands alone as a statement."""
+def _without_text(tree: ast.Module) -> list[ast.AST]:
+    """All nodes of a tree, after text that stands alone as a statement is taken out of it.
 
-    def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
-        is_text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
-        return None if is_text else node
+    Such are docstrings and field strings.
+    """
+    nodes: list[ast.AST] = [tree]
+    for node in nodes:  # it grows meanwhile
+        for name, value in ast.iter_fields(node):
+            if isinstance(value, ast.AST):
+                nodes.append(value)
+            elif isinstance(value, list):
+                kept = [each for each in value if not _is_text(each)]
+                if name == "body" and not kept:
+                    kept = [ast.Pass()]
+                value[:] = kept
+                nodes.extend(each for each in kept if isinstance(each, ast.AST))
+    return nodes
 
-    def generic_visit(self, node: ast.AST) -> ast.AST:
-        super().generic_visit(node)
-        if getattr(node, "body", None) == []:
-            node.body = [ast.Pass()]  # type: ignore[attr-defined]
-        return node
+
+def _is_text(node: object) -> bool:
+    """Whether this is a statement of nothing but text."""
+    if not isinstance(node, ast.Expr) or not isinstance(node.value, ast.Constant):
+        return False
+    return isinstance(node.value.value, str)

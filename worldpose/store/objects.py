@@ -110,11 +110,25 @@ class ObjectBlobs:
 
     def entries(self, prefix: str) -> list[Entry]:
         """See `Blobs`."""
-        with self._errors(prefix):
+        return self._listed(checked_path(prefix))
+
+    def all_entries(self) -> list[Entry]:
+        """All objects below the root, sorted by path; any program may have named them."""
+        return self._listed(None)
+
+    def download(self, path: str, file: Path) -> None:
+        """Writes the object at `path` to a new file, piece by piece: it may be a video."""
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with self._errors(path), file.open("xb") as content:
+            for piece in obstore.get(self._s3, checked_path(path)).stream():
+                content.write(piece)
+
+    def _listed(self, prefix: str | None) -> list[Entry]:
+        with self._errors(prefix or ""):
             return sorted(
                 (
                     Entry(item["path"], item["size"], item["last_modified"])
-                    for page in obstore.list(self._s3, checked_path(prefix))
+                    for page in obstore.list(self._s3, prefix)
                     for item in page
                 ),
                 key=lambda entry: entry.path,

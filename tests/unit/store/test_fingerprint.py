@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from worldpose.errors import StoreError
-from worldpose.store import code_version, libraries
+from worldpose.store import code_version, fingerprint, libraries
 
 TREE = {
     "tasks/__init__.py": "",
@@ -59,8 +59,14 @@ def tree(tmp_path: Path) -> Path:
 
 
 def version_of(tree: Path) -> dict[str, str]:
-    code_version.cache_clear()
+    forget()
     return code_version("tasks.tracking", (tree,))
+
+
+def forget() -> None:
+    """Read sources again, as a new process would."""
+    code_version.cache_clear()
+    fingerprint._read_module.cache_clear()
 
 
 def edited(tree: Path, name: str, old: str, new: str) -> set[str]:
@@ -156,7 +162,7 @@ def test_a_parser_that_gives_up_because_of_another_thread_is_asked_again(
     tree: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = version_of(tree)
-    code_version.cache_clear()
+    forget()
     parse, left = ast.parse, [3]
 
     def gives_up(source: bytes) -> ast.Module:
@@ -168,7 +174,7 @@ def test_a_parser_that_gives_up_because_of_another_thread_is_asked_again(
     monkeypatch.setattr(ast, "parse", gives_up)
     assert version_of(tree) == before
     assert left == [0]
-    code_version.cache_clear()
+    forget()
     left[0] = 1_000_000
     with pytest.raises(SystemError):
         version_of(tree)

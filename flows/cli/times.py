@@ -1,0 +1,61 @@
+"""Command times: where the time of a run went."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import typer
+
+from flows.cli.console import (
+    DEFAULT_PROJECT,
+    JsonOption,
+    MatchArgument,
+    ProjectOption,
+    RunOption,
+    line,
+    print_json,
+    print_table,
+)
+from flows.registering import find_registration
+from flows.times import run_time
+from worldpose.store import Store
+
+
+def times(
+    match: MatchArgument,
+    run: RunOption = "latest",
+    project: ProjectOption = DEFAULT_PROJECT,
+    as_json: JsonOption = False,
+) -> None:
+    """Say how long each stage of a run took, and how long none was at work.
+
+    Example: worldpose times matches/tiny
+    """
+    store = Store.open(project)
+    found = run_time(store, find_registration(store, match).spec.match_id, run)
+    if as_json:
+        print_json(asdict(found))
+        return
+    columns = ("stage", ">units", ">elapsed s", ">of the run %", ">work s", ">longest unit s")
+    whole = max(found.seconds, 1e-9)
+    rows = [
+        (
+            each.stage,
+            str(each.units),
+            f"{each.elapsed:.2f}",
+            f"{100.0 * each.elapsed / whole:.1f}",
+            f"{each.work:.2f}",
+            f"{each.longest:.2f}",
+        )
+        for each in found.stages
+    ]
+    for name, seconds in (("start", found.start), ("between units", found.between)):
+        rows.append((name, "", f"{seconds:.2f}", f"{100.0 * seconds / whole:.1f}", "", ""))
+    print_table(f"run {found.run_id}, {found.seconds:.1f} s", columns, rows)
+    if not found.stages:
+        line("nothing was computed by this run; --run names another")
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register this command."""
+    app.command()(times)

@@ -1,0 +1,99 @@
+"""A stage's units as Prefect tasks on Dask's workers."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, Final
+
+import dask
+from distributed import Client
+from prefect import Task
+from prefect.context import FlowRunContext
+from prefect.futures import as_completed
+
+from data_contracts.run import Work
+from flows.lost_machines import require_machines
+from flows.planning import PlannedUnit
+from flows.stage import Stage
+
+MOST_TASKS: Final = 200
+"""Of one stage: more units than these share tasks. Prefect takes 0.1 s of processor for a task."""
+
+
+def compute(
+    stage: Stage, units: list[PlannedUnit], work: list[Work]
+) -> Iterator[tuple[PlannedUnit, BaseException | None]]:
+    """Each unit as its task ends, with what it failed of.
+
+    Raises:
+        LostMachinesError: the Prefect server or Dask scheduler is gone.
+    """
+    size = math.ceil(len(units) / MOST_TASKS)
+    with _placed(stage) if units else nullcontext():
+        if size <= 1:
+            yield from _each_alone(stage, units, work)
+        else:
+            yield from _in_batches(units, work, size)
+
+
+def _each_alone(
+    stage: Stage, units: list[PlannedUnit], work: list[Work]
+) -> Iterator[tuple[PlannedUnit, BaseException | None]]:
+    task = task_of(stage)
+    submitted = {task.submit(each): unit for unit, each in zip(units, work, strict=True)}
+    for future in as_completed(list(submitted)):
+        try:
+            future.result()
+        except Exception as failure:  # recorded with the run: siblings go on
+            require_machines(failure)
+            yield submitted[future], failure
+        else:
+            yield submitted[future], None
+
+
+def _in_batches(
+    units: list[PlannedUnit], work: list[Work], size: int
+) -> Iterator[tuple[PlannedUnit, BaseException | None]]:
+    from tasks.batch import batch  # late, as all tasks are
+
+    submitted = {}
+    for first in range(0, len(units), size):
+        some = units[first : first + size]
+        name = f"{some[0].name} and {len(some) - 1} more"
+        texts = [each.model_dump_json() for each in work[first : first + size]]
+        submitted[batch.submit(name, texts)] = some
+    for future in as_completed(list(submitted)):
+        some = submitted[future]
+        failures: list[Exception | None]
+        try:
+            failures = future.result()
+        except Exception as failure:
+            failures = [failure] * len(some)
+        for unit, each in zip(some, failures, strict=True):
+            if each is not None:
+                require_machines(each)
+            yield unit, each
+
+
+def task_of(stage: Stage) -> Task[..., Any]:
+    """The task that computes one unit of a stage: the function of its name in `tasks`."""
+    task: Task[..., Any] = getattr(importlib.import_module(f"tasks.{stage.name}"), stage.name)
+    return task
+
+
+def _placed(stage: Stage) -> AbstractContextManager[Any]:
+    context = FlowRunContext.get()
+    client = getattr(context and context.task_runner, "client", None)
+    return nullcontext() if client is None else on_workers_with(stage.prefers, client)
+
+
+def on_workers_with(tag: str | None, client: Client) -> AbstractContextManager[Any]:
+    """A block whose tasks go to workers with a tag, where any has it now: `--resources TAG=1`."""
+    workers = client.scheduler_info(n_workers=-1)["workers"].values() if tag else ()
+    if any(worker["resources"].get(tag) for worker in workers):
+        block: AbstractContextManager[Any] = dask.annotate(resources={tag: 1})
+        return block
+    return nullcontext()

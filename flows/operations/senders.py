@@ -1,0 +1,137 @@
+"""Ways to tell somebody of an alert: a webhook and e-mail, each named by an address."""
+
+from __future__ import annotations
+
+import json
+import smtplib
+import ssl
+import urllib.request
+from collections.abc import Mapping
+from dataclasses import dataclass
+from email.message import EmailMessage
+from typing import Final, Protocol
+from urllib.parse import parse_qs, unquote, urlsplit
+
+from worldpose.errors import UsageError
+
+ANSWER_SECONDS: Final = 10.0
+"""How long a server may take to answer."""
+
+
+class Sender(Protocol):
+    """One way; its address may hold a secret, which is never said."""
+
+    @property
+    def name(self) -> str:
+        """As logs and the state call it."""
+
+    def send(self, content: Mapping[str, str]) -> None:
+        """Have it delivered.
+
+        Raises:
+            OSError, ValueError: it was not taken; errors of mail are OSErrors.
+        """
+
+
+@dataclass(frozen=True)
+class Webhook:
+    """A POST of JSON; chat services show its `text`."""
+
+    address: str
+    name: str = "webhook"
+
+    def send(self, content: Mapping[str, str]) -> None:
+        """See `Sender`."""
+        headers = {"content-type": "application/json", "user-agent": "worldpose"}
+        body = json.dumps(content).encode()
+        request = urllib.request.Request(self.address, data=body, headers=headers)
+        with urllib.request.urlopen(request, timeout=ANSWER_SECONDS) as answer:
+            if not 200 <= answer.status < 300:
+                raise ValueError(f"it answered {answer.status}")
+
+
+@dataclass(frozen=True)
+class Mail:
+    """A message by SMTP.
+
+    Attributes:
+        host: of the mail server.
+        port: of it.
+        is_secure: TLS from the start; else it is asked for where the server offers it.
+        user: to log in as, which is done under TLS alone; empty = no log-in.
+        password: of the user.
+        sender: who it is from.
+        receivers: whom it is for.
+    """
+
+    host: str
+    port: int
+    is_secure: bool
+    user: str
+    password: str
+    sender: str
+    receivers: tuple[str, ...]
+    name: str = "mail"
+
+    @classmethod
+    def at(cls, address: str) -> Mail:
+        """As `smtps://USER:PASSWORD@HOST/?to=A@B&to=C@D&from=E@F` says; `smtp:` without TLS first.
+
+        Raises:
+            UsageError: it does not say so.
+        """
+        try:
+            parts = urlsplit(address)
+            asked = parse_qs(parts.query)
+            is_secure = parts.scheme == "smtps"
+            port = parts.port or (465 if is_secure else 25)
+            host, receivers = parts.hostname, tuple(asked["to"])
+            sender = asked.get("from", [receivers[0]])[0]
+            if parts.scheme not in ("smtp", "smtps") or host is None:
+                raise ValueError
+        except (KeyError, ValueError):
+            raise UsageError(
+                "WORLDPOSE_ALERT_MAIL",
+                expected="smtps://USER:PASSWORD@HOST/?to=SOMEBODY@EXAMPLE.ORG",
+                found="something else, which may hold a secret",
+                todo="Set it so, or unset it to send no mail.",
+            ) from None
+        user, password = unquote(parts.username or ""), unquote(parts.password or "")
+        return cls(host, port, is_secure, user, password, sender, receivers)
+
+    def send(self, content: Mapping[str, str]) -> None:
+        """See `Sender`."""
+        message = EmailMessage()
+        # A header is one line, whatever a message of an error holds.
+        message["Subject"] = " ".join(f"worldpose: {content['text']}".split())[:150]
+        message["From"], message["To"] = self.sender, ", ".join(self.receivers)
+        message.set_content(f"{content['text']}\n\n{content['link']}\n")
+        context = ssl.create_default_context()
+        if self.is_secure:
+            server: smtplib.SMTP = smtplib.SMTP_SSL(
+                self.host, self.port, timeout=ANSWER_SECONDS, context=context
+            )
+        else:
+            server = smtplib.SMTP(self.host, self.port, timeout=ANSWER_SECONDS)
+        with server:
+            server.ehlo()
+            is_secret = self.is_secure
+            if not is_secret and server.has_extn("starttls"):
+                server.starttls(context=context)
+                is_secret = True
+            if self.user:
+                if not is_secret:
+                    raise ValueError("the server offers no TLS to log in under")
+                server.login(self.user, self.password)
+            server.send_message(message)
+
+
+def senders_of(environment: Mapping[str, str]) -> tuple[Sender, ...]:
+    """The ways that WORLDPOSE_ALERT_URL and WORLDPOSE_ALERT_MAIL name.
+
+    Raises:
+        UsageError: the latter is no address of mail.
+    """
+    webhook, mail = environment.get("WORLDPOSE_ALERT_URL"), environment.get("WORLDPOSE_ALERT_MAIL")
+    found: list[Sender] = [Webhook(webhook)] if webhook else []
+    return (*found, Mail.at(mail)) if mail else tuple(found)

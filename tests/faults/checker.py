@@ -1,0 +1,61 @@
+"""Whether a store is what it must be, whatever was killed on the way to it."""
+
+from collections import Counter
+from datetime import timedelta
+
+from worldpose.store import Store, compare_stores, verify
+from worldpose.store.garbage import collect, plan_gc
+
+
+def problems_of(project, undisturbed):
+    """One line for each way in which a project is not an undisturbed one; none if it is.
+
+    The same matches, results, bytes and latest records; nothing damaged; no unit computed for two
+    records; and all that dead writers left can be cleared away.
+    """
+    store = Store.open(str(project))
+    problems = [*differences(project, undisturbed), *doubled(store)]
+    for match in store.matches():
+        dead = [f"{match}/{each.run_id}" for each in store.unfinished_runs(match)]
+        collect(store, plan_gc(store, forget=dead, older_than=timedelta(0)))
+    problems += [f"{each.path}: cannot be cleared away" for each in store.blobs.staged()]
+    return problems + [f"cleared: {each}" for each in differences(project, undisturbed)]
+
+
+def differences(project, undisturbed):
+    """What is damaged, or not as in another project."""
+    store, reference = Store.open(str(project)), Store.open(str(undisturbed))
+    damage = [f"{each.path}: {each.problem}" for each in verify(store)]
+    return compare_stores(store, reference) + damage
+
+
+def doubled(store):
+    """Units that two runs of a match say they have computed."""
+    for match in store.matches():
+        records = [store.run(match, run) for run in store.runs(match)]
+        computed = Counter(
+            (unit, record.results[unit]) for record in records for unit in record.executed
+        )
+        for (unit, key), times in computed.items():
+            if times > 1:
+                yield f"{match}/{unit}: computed {times} times as {key[:12]}"
+
+
+def half_written(project):
+    """What can be read of a project though it is not whole, whatever is at work in it."""
+    if not (project / "project.json").exists():
+        return []
+    store = Store.open(str(project))
+    runs = [(match, run) for match in store.matches() for run in store.runs(match)]
+    return [
+        *(f"{each.path}: {each.problem}" for each in verify(store)),
+        *(
+            f"{match}/{run}: not complete"
+            for match, run in runs
+            if not is_complete(store, match, run)
+        ),
+    ]
+
+
+def is_complete(store, match, run):
+    return store.run(match, run).state == "complete"

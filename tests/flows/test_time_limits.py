@@ -1,0 +1,21 @@
+"""How long units may be at work, as people say it."""
+
+import pytest
+
+from flows.method import METHOD
+from flows.time_limits import LONGEST, parse_time_limits, seconds_of
+from worldpose.errors import UsageError
+
+
+def test_a_number_is_for_every_stage_and_one_with_a_name_for_that():
+    assert seconds_of("tracking", {}) == 60.0 * LONGEST
+    limits = parse_time_limits(["30", "detection=120"])
+    assert {stage.name for stage in METHOD} == limits.keys()
+    assert (seconds_of("tracking", limits), seconds_of("detection", limits)) == (1800.0, 7200.0)
+    assert parse_time_limits(["ingest=0.5"]) == {"ingest": 0.5}
+
+
+@pytest.mark.parametrize("text", ["0", "-3", "inf", "nan", "soon", "tracks=3", "=3", "tracking="])
+def test_what_is_no_limit_is_refused(text):
+    with pytest.raises(UsageError, match="--time-limit"):
+        parse_time_limits([text])

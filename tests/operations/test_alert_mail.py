@@ -1,0 +1,147 @@
+"""Alerts by mail: a real SMTP server takes them, with and without TLS."""
+
+import base64
+import socketserver
+import ssl
+import subprocess
+from email import message_from_bytes
+from threading import Thread
+
+import pytest
+
+from flows.operations.alerts import Alert, Teller
+from flows.operations.layout import StateFolder
+from flows.operations.senders import Mail, Webhook, senders_of
+from worldpose.errors import UsageError
+
+ALERT = Alert(
+    "run_failed/1", "run_failed", "run m failed: it\nhas two lines", "http://here/run", "m"
+)
+
+
+class Conversation(socketserver.StreamRequestHandler):
+    """One client's session as RFC 5321 has it, with PLAIN log-in."""
+
+    def setup(self):
+        if self.server.tls is not None:
+            self.request = self.server.tls.wrap_socket(self.request, server_side=True)
+        super().setup()
+
+    def handle(self):
+        self.say("220 test")
+        letter = {"to": []}
+        while line := self.rfile.readline():
+            verb, _, rest = line.decode().strip().partition(" ")
+            verb = verb.upper()
+            if verb == "EHLO":
+                self.say("250-test\r\n250 AUTH PLAIN")
+            elif verb == "AUTH":
+                _, user, password = base64.b64decode(rest.split()[1]).decode().split("\0")
+                self.server.logins.append((user, password))
+                self.say("235 yes")
+            elif verb == "MAIL":
+                letter["from"] = rest[6:-1].partition(">")[0]
+                self.say("250 ok")
+            elif verb == "RCPT":
+                letter["to"].append(rest[4:-1])
+                self.say(self.server.answers.pop(0) if self.server.answers else "250 ok")
+            elif verb == "DATA":
+                self.say("354 go on")
+                lines = iter(self.rfile.readline, b".\r\n")
+                letter["message"] = message_from_bytes(b"".join(lines))
+                self.server.letters.append(letter)
+                self.say("250 ok")
+            elif verb == "QUIT":
+                self.say("221 bye")
+                return
+            else:
+                self.say("250 ok")
+
+    def say(self, text):
+        self.wfile.write(f"{text}\r\n".encode())
+
+
+@pytest.fixture
+def post_office():
+    """A function that begins a mail server, which keeps letters and log-ins."""
+    servers = []
+
+    def begin(tls=None):
+        server = socketserver.ThreadingTCPServer(("127.0.0.1", 0), Conversation)
+        server.tls, server.letters, server.logins, server.answers = tls, [], [], []
+        server.port = server.server_address[1]
+        Thread(target=server.serve_forever, daemon=True).start()
+        servers.append(server)
+        return server
+
+    yield begin
+    for server in servers:
+        server.shutdown()
+        server.server_close()
+
+
+def test_an_alert_is_a_letter_to_all_who_are_named(post_office, tmp_path):
+    server = post_office()
+    mail = Mail.at(f"smtp://127.0.0.1:{server.port}/?to=ann@example.org&to=bo@example.org")
+    assert Teller(StateFolder(tmp_path), [mail]).tell([ALERT, ALERT]) == [ALERT]
+    assert Teller(StateFolder(tmp_path), [mail]).tell([ALERT]) == []
+    (letter,) = server.letters
+    assert letter["to"] == ["ann@example.org", "bo@example.org"]
+    assert letter["from"] == "ann@example.org"
+    message = letter["message"]
+    # An error's lines must not become headers.
+    assert message["Subject"] == "worldpose: run m failed: it has two lines"
+    assert message.get_payload() == "run m failed: it\r\nhas two lines\r\n\r\nhttp://here/run\r\n"
+
+
+def test_a_password_goes_under_tls_alone(post_office, tmp_path, monkeypatch, caplog):
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    make = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2"]
+    named = ["-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost"]
+    files = ["-keyout", str(key), "-out", str(certificate)]
+    subprocess.run([*make, *named, *files], check=True, capture_output=True)
+    tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    tls.load_cert_chain(certificate, key)
+    secure, plain = post_office(tls), post_office()
+    who = "ann:a%40secret@localhost"
+    mail = Mail.at(f"smtps://{who}:{secure.port}/?to=ann@example.org&from=worldpose@example.org")
+    teller = Teller(StateFolder(tmp_path / "one"), [mail])
+    assert teller.tell([ALERT]) == []
+    assert secure.logins == [], "a certificate that nobody vouches for was taken"
+    monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+    assert teller.tell([ALERT]) == [ALERT]
+    assert secure.logins == [("ann", "a@secret")]
+    assert secure.letters[0]["from"] == "worldpose@example.org"
+    bare = Mail.at(f"smtp://{who}:{plain.port}/?to=ann@example.org")
+    assert Teller(StateFolder(tmp_path / "two"), [bare]).tell([ALERT]) == []
+    assert (plain.logins, plain.letters) == ([], [])
+    assert "secret" not in caplog.text
+
+
+def test_each_way_is_told_once_though_another_fails(post_office, tmp_path):
+    server = post_office()
+    server.answers += ["451 later"]
+    mail = Mail.at(f"smtp://127.0.0.1:{server.port}/?to=ann@example.org")
+    teller = Teller(StateFolder(tmp_path), [Webhook("http://127.0.0.1:9/"), mail])
+    assert teller.tell([ALERT]) == []
+    assert server.letters == []
+    assert teller.tell([ALERT]) == []
+    assert teller.tell([ALERT]) == []
+    assert len(server.letters) == 1
+
+
+def test_ways_are_named_by_the_environment_and_a_bad_one_says_no_secret():
+    assert senders_of({}) == ()
+    mail = "smtps://a:b@mail.example.org/?to=c@example.org"
+    found = senders_of({"WORLDPOSE_ALERT_URL": "http://hook/", "WORLDPOSE_ALERT_MAIL": mail})
+    assert [each.name for each in found] == ["webhook", "mail"]
+    assert (found[1].host, found[1].port) == ("mail.example.org", 465)
+    for bad in (
+        "mail.example.org",
+        "smtp://ann:secret@mail/",
+        "http://secret/?to=a",
+        "smtp://x:y/",
+    ):
+        with pytest.raises(UsageError) as refused:
+            senders_of({"WORLDPOSE_ALERT_MAIL": bad})
+        assert "secret@" not in str(refused.value)

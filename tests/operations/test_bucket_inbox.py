@@ -1,0 +1,101 @@
+"""An inbox in object storage: what is whole is copied once, and nothing leads out of the folder."""
+
+import uuid
+from datetime import UTC, datetime
+
+import pytest
+
+from flows.operations.bucket import BucketInbox
+from flows.operations.layout import StateFolder
+from worldpose.errors import UsageError
+from worldpose.store.blobs import Entry
+from worldpose.store.objects import ObjectBlobs
+
+QUIET = 10.0
+
+
+@pytest.fixture
+def arriving(bucket, tmp_path):
+    """A prefix of a bucket, and a function that puts an object there."""
+    prefix = uuid.uuid4().hex
+    objects = ObjectBlobs.at(f"{bucket}/{prefix}")
+
+    def put(path, content=b"x"):
+        objects.put(path, content)
+
+    (tmp_path / "inbox").mkdir()
+    return f"{bucket}/{prefix}", put
+
+
+def watched(arriving, tmp_path):
+    return BucketInbox(arriving[0], tmp_path / "inbox", StateFolder(tmp_path / "operations"))
+
+
+def files_of(folder):
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_match_is_copied_once_when_it_is_whole_and_quiet(arriving, tmp_path, small_match):
+    _, put = arriving
+    inbox = watched(arriving, tmp_path)
+    for path in sorted(small_match.rglob("*.npz")):
+        put(f"urgent/small/{path.relative_to(small_match).as_posix()}", path.read_bytes())
+    assert inbox.fetch(0.0, QUIET) == inbox.fetch(20.0, QUIET) == []
+    for path in small_match.rglob("*"):
+        if path.is_file():
+            put(f"urgent/small/{path.relative_to(small_match).as_posix()}", path.read_bytes())
+    assert inbox.fetch(30.0, QUIET) == []
+    put("urgent/small/match.yaml", (small_match / "match.yaml").read_bytes() + b"\n# later\n")
+    assert inbox.fetch(40.0, QUIET) == [], "it was still changing"
+    assert inbox.fetch(50.0, QUIET) == ["urgent/small"]
+    copied = tmp_path / "inbox" / "urgent" / "small"
+    assert files_of(copied) == files_of(small_match)
+    assert copied.joinpath("match.yaml").read_text().endswith("# later\n")
+    # Once, also after a restart.
+    assert inbox.fetch(60.0, QUIET) == []
+    again = watched(arriving, tmp_path)
+    assert again.fetch(0.0, QUIET) == again.fetch(20.0, QUIET) == []
+
+
+def test_what_was_mended_in_the_bucket_takes_the_place_of_its_copy(arriving, tmp_path):
+    _, put = arriving
+    inbox = watched(arriving, tmp_path)
+    put("m/match.yaml", b"contract: 0")
+    put("m/old.npz")
+    inbox.fetch(0.0, QUIET)
+    assert inbox.fetch(10.0, QUIET) == ["m"]
+    put("m/match.yaml", b"contract: 1\n")
+    inbox.fetch(20.0, QUIET)
+    assert inbox.fetch(30.0, QUIET) == ["m"]
+    assert (tmp_path / "inbox" / "m" / "match.yaml").read_bytes() == b"contract: 1\n"
+    assert files_of(tmp_path / "inbox") == {"m/match.yaml", "m/old.npz"}
+
+
+def test_what_somebody_put_into_the_folder_is_left_alone(arriving, tmp_path, caplog):
+    _, put = arriving
+    (tmp_path / "inbox" / "m").mkdir()
+    (tmp_path / "inbox" / "m" / "mine").touch()
+    put("m/match.yaml")
+    inbox = watched(arriving, tmp_path)
+    inbox.fetch(0.0, QUIET)
+    assert inbox.fetch(10.0, QUIET) == []
+    assert files_of(tmp_path / "inbox") == {"m/mine"}
+    assert "is there already" in caplog.text
+
+
+@pytest.mark.parametrize("path", ["m/../../outside", "m/a\\b", "m/a\nb"])
+def test_names_that_lead_elsewhere_are_not_taken(path, arriving, tmp_path, caplog, monkeypatch):
+    inbox = watched(arriving, tmp_path)
+    now = datetime.now(UTC)
+    listed = [Entry(each, 1, now) for each in ("m/match.yaml", path)]
+    # Clients tidy such names up; other programs do not.
+    monkeypatch.setattr(ObjectBlobs, "all_entries", lambda objects: listed)
+    inbox.fetch(0.0, QUIET)
+    assert inbox.fetch(10.0, QUIET) == []
+    assert files_of(tmp_path) <= {"operations/bucket.json"}
+    assert "is not taken" in caplog.text
+
+
+def test_an_address_that_is_none_is_refused(tmp_path):
+    with pytest.raises(UsageError, match="--bucket"):
+        BucketInbox("gs://bucket", tmp_path, StateFolder(tmp_path))

@@ -1,0 +1,66 @@
+"""Prefect on Postgres, the store on S3, Dask as processes of their own: the bytes of any run."""
+
+import socket
+import subprocess
+import sys
+import time
+import uuid
+
+import pytest
+from command_line import TINY, succeed
+
+from flows.operations.plan import ServePlan
+from flows.operations.serving import answers
+from flows.prefect_environment import served_environment
+from worldpose.store import Store, compare_stores, verify
+
+START_SECONDS = 300
+"""What a server may take to begin on a busy machine."""
+
+
+@pytest.fixture
+def prefect_on_postgres(postgres, tmp_path):
+    """The address of a Prefect server whose database is Postgres."""
+    api = f"http://127.0.0.1:{free_port()}/api"
+    plan = ServePlan(project="none", inbox=tmp_path, state=tmp_path, prefect=api)
+    environment = served_environment(api, tmp_path / "prefect")
+    environment["PREFECT_API_DATABASE_CONNECTION_URL"] = postgres[0]
+    program = [sys.executable, "-m", "flows.operations.child", "prefect", plan.model_dump_json()]
+    server = subprocess.Popen(program, stdin=subprocess.PIPE, env=environment)
+    wait_until(lambda: answers(f"{api}/health"))
+    yield api
+    server.stdin.close()  # it ends with its standard input
+    server.wait(60)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_real_components_give_the_bytes_of_an_embedded_run(
+    bucket, prefect_on_postgres, dask, postgres, tiny, tiny_run
+):
+    project = f"{bucket}/{uuid.uuid4().hex}"
+    environment = {"PREFECT_API_URL": prefect_on_postgres}
+    done = succeed(
+        *("run", tiny, "--project", project, "--dask", dask[0], "--json"),
+        timeout=1500,
+        environment=environment,
+    ).json
+    assert compare_stores(Store.open(project), Store.open(str(tiny_run))) == []
+    assert verify(Store.open(project)) == ()
+    ask = postgres[1]
+    assert ask("select name, state_name from flow_run") == f"{TINY}|Completed"
+    # The server takes in the workers' events a moment later.
+    count = "select count(*) from task_run where state_name = 'Completed'"
+    wait_until(lambda: ask(count) == str(done["executed"]))
+
+
+def free_port():
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return probe.getsockname()[1]
+
+
+def wait_until(is_so):
+    deadline = time.monotonic() + START_SECONDS
+    while not is_so():
+        assert time.monotonic() < deadline
+        time.sleep(0.5)

@@ -1,0 +1,61 @@
+"""Marks of units that were begun: who ends its process too often is given up."""
+
+import os
+import time
+
+import pytest
+
+from data_contracts.run import Recipe, Work
+from tasks import beginnings
+from tasks.beginnings import DeadlyUnitError, OvertimeError, survivable
+from worldpose.store import key_of
+
+
+@pytest.fixture
+def work(tmp_path, monkeypatch):
+    monkeypatch.setattr(beginnings, "_worker_scratch", lambda: tmp_path)
+    nothing = {"sources": {}, "inputs": {}, "settings": {}, "code": {}, "libraries": {}}
+    recipe = Recipe(match_id="m", stage="tracking", unit="c", **nothing)
+    key = key_of(recipe)
+    return Work(project="p", folder="m", recipe=recipe, key=key, run_id="0001", seconds=60.0)
+
+
+def die(work):
+    """What is left of a process that ended while it was at work."""
+    pid = os.fork()
+    if pid == 0:
+        with survivable(work):
+            os._exit(9)
+    os.waitpid(pid, 0)
+
+
+def test_who_ends_three_processes_is_given_up_once(work, tmp_path):
+    for _ in range(3):
+        die(work)
+    with pytest.raises(DeadlyUnitError, match="tracking/c: its process ended 3 times"):
+        survivable(work).__enter__()
+    assert list(tmp_path.iterdir()) == []
+    with survivable(work):  # it may have been the machine: the next run tries again
+        pass
+
+
+def test_who_ends_or_fails_leaves_no_mark(work, tmp_path):
+    die(work)
+    with pytest.raises(ValueError, match="its own"), survivable(work):
+        raise ValueError("its own")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_who_takes_too_long_is_ended_and_given_up_the_second_time(work, tmp_path):
+    hasty = work.model_copy(update={"seconds": 0.2})
+    for _ in range(2):
+        pid = os.fork()
+        if pid == 0:
+            with survivable(hasty):
+                time.sleep(60)
+            os._exit(0)
+        _, status = os.waitpid(pid, 0)
+        assert os.WIFSIGNALED(status)
+    with pytest.raises(OvertimeError, match=r"stopped 2 times.*test_beginnings\.py"):
+        survivable(hasty).__enter__()
+    assert list(tmp_path.iterdir()) == []
