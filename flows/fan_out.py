@@ -14,7 +14,7 @@ from prefect import Task
 from prefect.context import FlowRunContext
 from prefect.futures import as_completed
 
-from data_contracts.run import Work
+from data_contracts.work import Work
 from flows.lost_machines import require_machines
 from flows.planning import PlannedUnit
 from flows.stage import Stage

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from data_contracts.run import Recipe, RunRecord
+from data_contracts.run import RunRecord
+from data_contracts.work import Recipe
 from flows.method import METHOD
 from flows.planning import PlannedUnit, plan_run
 from flows.registering import open_match

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from data_contracts.run import Recipe, Work
+from data_contracts.work import Recipe, Work
 from flows.method import METHOD
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from prefect import task
 
-from data_contracts.run import Work
+from data_contracts.work import Work
 from tasks.unit import RETRIES, RETRY_SECONDS, may_pass
 from worldpose.store import Store
 

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from data_contracts.run import Work
+from data_contracts.work import Work
 from worldpose.errors import WorldposeError
 
 MOST_STOPPED: Final = 2

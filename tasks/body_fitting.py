@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import GroupLayout
 from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.pitch import PitchSpec
-from data_contracts.run import Recipe, Work
+from data_contracts.work import Recipe, Work
 from tasks.clip_inputs import ClipInputs, open_clip
 from tasks.unit import figures_of, open_input, unit_task
 from worldpose.body import BodyModel, digest_of_body, find_body

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.broadcast_calibration import BROADCAST_CALIBRATION, KeyFrame
 from data_contracts.pitch import PitchSpec
-from data_contracts.run import Work
+from data_contracts.work import Work
 from tasks.static_calibration import clicked_markings
 from tasks.unit import open_input, require_registered, unit_task
 from worldpose.broadcast_calibration import (

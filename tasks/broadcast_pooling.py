@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from data_contracts.broadcast_pooling import BROADCAST_POOLING
-from data_contracts.run import Work
+from data_contracts.work import Work
 from tasks.unit import open_input, unit_task
 from worldpose.broadcast_calibration import (
     drawn_to,

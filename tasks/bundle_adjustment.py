@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
 from data_contracts.pitch import PitchSpec
-from data_contracts.run import Work
+from data_contracts.work import Work
 from tasks.clip_inputs import open_frames
 from tasks.triangulation import settings_before
 from tasks.unit import open_input, unit_task

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from data_contracts.run import Work
+from data_contracts.work import Work
 from tasks.unit import open_input
 from worldpose.cameras import Camera
 from worldpose.cameras.stored import camera_from_arrays

@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 
 from data_contracts.detection import DETECTION
 from data_contracts.pitch import PitchSpec
-from data_contracts.run import Work
+from data_contracts.work import Work
 from tasks.spool import Spool, spooling
 from tasks.unit import open_input, require_registered, unit_task
 from worldpose.cameras.stored import camera_from_arrays

@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from data_contracts.filtering import FILTERING
-from data_contracts.run import Work
+from data_contracts.work import Work
 from tasks.clip_inputs import ClipInputs, open_clip
 from tasks.spool import spooling
 from tasks.triangulation import settings_before

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from data_contracts.ingest import INGEST
-from data_contracts.run import Work
+from data_contracts.work import Work
 from tasks.unit import require_registered, unit_task
 from worldpose.ingest import Observations, UnitFrames, read_observations
 from worldpose.ingest.footage import Footage, read_footage

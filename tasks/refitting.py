@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.refitting import REFITTING
-from data_contracts.run import Work
+from data_contracts.work import Work
 from tasks.body_fitting import fit_people, open_people, publish_fit
 from tasks.unit import open_input, require_registered, unit_task
 from worldpose.body_fitting import (

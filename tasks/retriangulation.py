@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from data_contracts.retriangulation import RETRIANGULATION
-from data_contracts.run import Work
+from data_contracts.work import Work
 from tasks.triangulation import place_joints, settings_before
 from tasks.unit import unit_task
 from worldpose.store import Store

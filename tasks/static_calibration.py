@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from data_contracts.cameras import CameraCalibration
 from data_contracts.pitch import PitchSpec
-from data_contracts.run import Work
 from data_contracts.static_calibration import (
     STATIC_CALIBRATION,
     ClickedMarkings,
     ClickedPoint,
     DrawnMarking,
 )
+from data_contracts.work import Work
 from tasks.unit import require_registered, unit_task
 from worldpose.cameras import Camera
 from worldpose.cameras.stored import camera_arrays

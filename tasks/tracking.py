@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from pydantic import TypeAdapter
 
-from data_contracts.run import Work
 from data_contracts.tracking import TRACKING
+from data_contracts.work import Work
 from tasks.clip_inputs import open_clip
 from tasks.unit import figures_of, unit_task
 from worldpose.review.identities import (

@@ -9,8 +9,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 from data_contracts.arrays import GroupLayout
-from data_contracts.run import Work
 from data_contracts.triangulation import TRIANGULATION
+from data_contracts.work import Work
 from tasks.clip_inputs import open_clip
 from tasks.spool import spooling
 from tasks.unit import figures_of, open_input, unit_task

@@ -13,7 +13,7 @@ from prefect import Task, task
 from prefect.client.schemas.objects import State, TaskRun
 
 from data_contracts.records import Record
-from data_contracts.run import Work
+from data_contracts.work import Work
 from tasks.beginnings import survivable
 from worldpose.errors import CorruptionError, InputError, NondeterminismError, StoreError
 from worldpose.ingest.registration import digest_of_files

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from data_contracts.run import Recipe, Work
+from data_contracts.work import Recipe, Work
 from tasks import batch, tracking
 from worldpose.errors import DegenerateError, StoreError
 from worldpose.store import Store, key_of

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from data_contracts.run import Recipe, Work
+from data_contracts.work import Recipe, Work
 from tasks import beginnings
 from tasks.beginnings import DeadlyUnitError, OvertimeError, survivable
 from worldpose.store import key_of

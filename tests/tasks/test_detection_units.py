@@ -10,7 +10,7 @@ import tasks.detection
 from data_contracts.cameras import CameraCalibration
 from data_contracts.match import MatchSpec
 from data_contracts.review import Correction, DeletedDetection
-from data_contracts.run import Work
+from data_contracts.work import Work
 from flows.fan_out import task_of
 from flows.method import METHOD
 from flows.planning import plan_stage

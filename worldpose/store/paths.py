@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pydantic import TypeAdapter, ValidationError
 
 from data_contracts.records import Key, Name
-from data_contracts.run import Work
+from data_contracts.work import Work
 from worldpose.errors import InputError
 
 PROJECT = "project.json"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from data_contracts.run import Recipe
+from data_contracts.work import Recipe
 from worldpose.store.canonical import canonical_json, digest
 
 KEY_LENGTH = 32

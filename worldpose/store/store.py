@@ -10,7 +10,8 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from data_contracts.match import Registration
-from data_contracts.run import Project, Reservation, ResultManifest, RunRecord, Work
+from data_contracts.run import Project, Reservation, ResultManifest, RunRecord
+from data_contracts.work import Work
 from worldpose.errors import CorruptionError, InputError, NondeterminismError, StoreError
 from worldpose.store.blobs import Blobs, open_blobs
 from worldpose.store.commit_points import reached

@@ -11,7 +11,8 @@ from typing import Any
 
 from data_contracts.arrays import GroupLayout
 from data_contracts.records import CONTRACT_VERSION
-from data_contracts.run import ResultManifest, StoredFile, Work
+from data_contracts.run import ResultManifest, StoredFile
+from data_contracts.work import Work
 from worldpose.errors import InputError, StoreError
 from worldpose.store.blobs import storage_errors
 from worldpose.store.canonical import canonical_json, digest

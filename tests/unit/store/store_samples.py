@@ -14,7 +14,8 @@ import numpy as np
 import data_contracts.arrays
 from data_contracts.arrays import ArrayLayout, GroupLayout
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec, Registration, SourceFile
-from data_contracts.run import Recipe, RunRecord, Work
+from data_contracts.run import RunRecord
+from data_contracts.work import Recipe, Work
 from worldpose.store import ResultWriter, Store, key_of
 from worldpose.store.commit_points import install_fault_hook
 

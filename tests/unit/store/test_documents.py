@@ -5,7 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from store_samples import sample_recipe, sample_record, sample_registration
 
-from data_contracts.run import Recipe, RunRecord
+from data_contracts.run import RunRecord
+from data_contracts.work import Recipe
 from worldpose.errors import CorruptionError, InputError
 from worldpose.store.canonical import canonical_json, digest
 from worldpose.store.documents import seal, unseal

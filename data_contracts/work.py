@@ -1,0 +1,50 @@
+"""Work: what decides a result, and one unit as a task takes it.
+
+Apart from `run`, whose records tell of results and decide none: every task imports this module, so
+its code counts in every result's key.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import JsonValue
+
+from data_contracts.records import CONTRACT_VERSION, Key, Name, Record
+
+
+class Recipe(Record):
+    """Everything that decides a result; its digest is the result's key."""
+
+    contract: Literal[1] = CONTRACT_VERSION
+    match_id: Name
+    stage: Name
+    unit: Name
+    sources: dict[str, JsonValue]
+    """What the match folder gives: digests of files, and values such as the frame rate."""
+    inputs: dict[str, Key]
+    """Results it is made from: `stage/unit` to key."""
+    settings: dict[str, JsonValue]
+    code: dict[str, str]
+    """Source modules that compute it: module name to digest."""
+    libraries: dict[str, str]
+    """Numeric libraries that compute it: name to version."""
+
+    @property
+    def name(self) -> str:
+        """Stage and unit: `tracking/clip`."""
+        return f"{self.stage}/{self.unit}"
+
+
+class Work(Record):
+    """One unit of one stage, ready to be computed by a task."""
+
+    project: str
+    """Folder or URL of the store."""
+    folder: str
+    """The match folder; read by `ingest` and `static_calibration` alone."""
+    recipe: Recipe
+    key: Key
+    run_id: Name
+    seconds: float | None = None
+    """How long it may be at work; None = as long as it takes [s]."""
