@@ -65,7 +65,8 @@ def test_the_whole_process_killed_around_the_run_record(point, tiny, tiny_run, t
     assert_same_store(project, tiny_run)
 
 
-@pytest.mark.parametrize("point", quick(IN_WORKER, {"after_write"}))
+@pytest.mark.slow
+@pytest.mark.parametrize("point", IN_WORKER)
 def test_the_whole_process_group_killed_at_a_commit_point(point, tiny, tiny_run, tmp_path):
     environment, struck = fault_environment(tmp_path, point, skip=1, whole_group=True)
     project = tmp_path / "worldpose-data"

@@ -103,6 +103,7 @@ def test_an_edited_detection_file_is_another_match(tiny, project_copy, tmp_path)
     assert "id of its own" in answer.err
 
 
+@pytest.mark.slow
 def test_a_moved_camera_recomputes_all_that_sees_through_it(tiny, tmp_path, server):
     moved = shutil.copytree(tiny, tmp_path / "tiny")
     shutil.copy(moved / "reference" / "calibration.toml", moved)  # given cameras win over clicks
