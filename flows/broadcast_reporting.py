@@ -9,8 +9,15 @@ from typing import Final
 import numpy as np
 
 from data_contracts.broadcast_calibration import FRAME_STATUS
+from flows.detection import seen_in_broadcast
 from flows.flow_reporting import flow_pictures
-from flows.release import broadcast_cameras, broadcast_unit, clip_title, joint_tracks
+from flows.release import (
+    body_tracks,
+    broadcast_cameras,
+    broadcast_unit,
+    clip_title,
+    joint_tracks,
+)
 from flows.stage import Match
 from worldpose.broadcast_calibration import camera_before
 from worldpose.cameras.stored import camera_from_arrays
@@ -98,6 +105,7 @@ def _before_and_after(run: Run, match: Match, clip: str, tracks: JointTracks) ->
     shared = JointTracks(both, tracks.person_ids, joints)
     place, person = most_moved(before, after, shared)
     number = int(both[place])
+    (detected,) = seen_in_broadcast(match, clip)
     with open_video(match.folder.videos[clip]) as video:
         still = video.frame(number + unit_frames(match.folder.spec, clip).offset)
     markings, players = (
@@ -106,7 +114,8 @@ def _before_and_after(run: Run, match: Match, clip: str, tracks: JointTracks) ->
     return [
         Picture(
             f"{clip_title(clip)}, frame {number}: before and after players and all frames "
-            f"together. In the median, markings are {markings} px off, people {players} px.",
+            "together. Crosses: keypoints that were seen. In the median, markings are "
+            f"{markings} px off, people {players} px.",
             before_after_picture(
                 before[place],
                 after[place],
@@ -114,6 +123,7 @@ def _before_and_after(run: Run, match: Match, clip: str, tracks: JointTracks) ->
                 place,
                 person,
                 still=still,
+                seen=run[detected].sel(frame=number)["keypoints"].values,
                 pitch=match.folder.pitch,
             ),
         )
@@ -156,9 +166,14 @@ def write_broadcast_videos(
                 if (number - start) % every == 0
             )
             drawn = overlay_frames(
-                pictures, camera[chosen], joint_tracks(run, clip), frames, match.folder.pitch
+                pictures,
+                camera[chosen],
+                joint_tracks(run, clip),
+                frames,
+                match.folder.pitch,
+                body_tracks(run, clip),
             )
-            write_video(draft, drawn, fps / every, quality=26)
+            write_video(draft, drawn, fps / every, quality=23)
         files.append(file)
     return files
 

@@ -8,7 +8,7 @@ from flows.camera_reporting import still_of
 from flows.detection import seen_by
 from flows.match_pictures import frame_picture
 from flows.release import (
-    bodies_unit,
+    body_tracks,
     broadcast_cameras,
     clip_title,
     joint_tracks,
@@ -16,9 +16,9 @@ from flows.release import (
     static_cameras,
 )
 from flows.stage import Match
-from worldpose.body import BodyParameters, find_body
 from worldpose.cameras import Camera
 from worldpose.release import JointTracks, Picture, Scene
+from worldpose.release.body_paint import BodyTracks
 from worldpose.release.body_pictures import bodies_picture
 from worldpose.release.detection_pictures import detections_picture
 from worldpose.release.pictures import paths_picture
@@ -54,34 +54,29 @@ def clip_pictures(
                 stadium_picture(cameras, "", tracks, 0, pitch=pitch),
             ),
         ]
-        if bodies_unit(run, clip) in run:
-            pictures.append(_bodies(run, match, clip, widest, cameras[widest]))
+        bodies = body_tracks(run, clip)
+        if bodies is not None:
+            pictures.append(_bodies(bodies, match, clip, widest, cameras[widest]))
     above = paths_picture(tracks, truth=truth, cameras=cameras, pitch=pitch)
     pictures.append(Picture(f"{clip_title(clip)}: everybody's way.", above))
     return pictures
 
 
-def _bodies(run: Run, match: Match, clip: str, camera_id: str, camera: Camera) -> Picture:
+def _bodies(bodies: BodyTracks, match: Match, clip: str, camera_id: str, camera: Camera) -> Picture:
     """The bodies of a clip's first frame over a camera's still."""
-    fits = run[bodies_unit(run, clip)]
-    model = find_body(fits.attrs["body_model"])
-    poses = BodyParameters(
-        fits["betas"].values,
-        *(fits[name].values[0] for name in ("global_orient", "body_pose", "transl")),
-    )
-    frame, still = int(fits["frame"].values[0]), still_of(match, camera_id)
+    frame, still = int(bodies.frames[0]), still_of(match, camera_id)
     png = bodies_picture(
         camera,
         f"camera {camera_id}, frame {frame}",
-        model.vertices(poses),
-        model.faces,
-        fits["person"].values,
+        bodies.model.vertices(bodies.poses[0]),
+        bodies.model.faces,
+        bodies.person_ids,
         still=still,
         pitch=match.folder.pitch,
     )
     return Picture(
-        f"{clip_title(clip)}, frame {frame}: fitted bodies ({model.name}) where camera {camera_id} "
-        f"shows most people{'' if still is None else ', over its still'}.",
+        f"{clip_title(clip)}, frame {frame}: fitted bodies ({bodies.model.name}) where camera "
+        f"{camera_id} shows most people{'' if still is None else ', over its still'}.",
         png,
     )
 

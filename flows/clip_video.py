@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 
 from flows.broadcast_reporting import write_broadcast_videos
 from flows.match_pictures import frame_pictures
-from flows.release import broadcast_cameras, joint_tracks, placed_joints, static_cameras
+from flows.release import (
+    body_tracks,
+    broadcast_cameras,
+    joint_tracks,
+    placed_joints,
+    static_cameras,
+)
 from flows.stage import Match
 from worldpose.cameras import Camera
 from worldpose.release.overlay_video import overlay_frames
@@ -77,5 +83,6 @@ def write_clip_video(
             dark = np.zeros((height, width, 3), dtype=np.uint8)  # where the camera has no picture
             yield dark if picture is None else picture
 
-    drawn = overlay_frames(pictures(), cameras, tracks, frames, match.folder.pitch)
-    write_video(file, drawn, fps / every, quality=26)
+    bodies = body_tracks(run, clip)
+    drawn = overlay_frames(pictures(), cameras, tracks, frames, match.folder.pitch, bodies)
+    write_video(file, drawn, fps / every, quality=23)

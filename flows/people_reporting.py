@@ -14,6 +14,15 @@ from worldpose.store import Run
 MOST = 20
 """Rows of the lists of what disagrees: the worst."""
 
+_BODIES = {
+    "residual_m": ("body from joints mm", 1000.0, 1),
+    "reprojection_px": ("body from keypoints px", 1.0, 2),
+    "bone_spread_m": ("bones change by mm", 1000.0, 1),
+    "skating_m": ("standing feet slide mm a frame", 1000.0, 3),
+    "jerk_m_s3": ("jerk m/s³", 1.0, 0),
+}
+"""Title of each figure of a body, what it is multiplied with to be shown, and decimals."""
+
 
 def adjustment_tables(run: Run) -> list[Table]:
     """Markings and people side by side, camera by camera, and what disagrees after adjustment."""
@@ -85,7 +94,7 @@ def _people(result: xr.Dataset, names: list[str]) -> Table | None:
         for k in range(len(frame))
     )
     columns = (">frame", "camera", ">person", "joint", ">standard deviations")
-    return Table(f"Keypoints that disagree: the first of {count}", columns, rows)
+    return Table(f"Keypoints that disagree: the worst {len(rows)} of {count:,}", columns, rows)
 
 
 def body_tables(run: Run, clips: tuple[str, ...]) -> list[Table]:
@@ -96,20 +105,24 @@ def body_tables(run: Run, clips: tuple[str, ...]) -> list[Table]:
         if unit not in run:
             continue
         figures = run.record.figures.get(unit, {})
-        persons = [int(person) for person in run[unit]["person"].values]
-        columns = dict.fromkeys(
-            name.rpartition(".person")[0] for name in figures if ".person" in name
-        )
+        columns = [
+            name for name in _BODIES if any(key.startswith(f"{name}.person") for key in figures)
+        ]
         rows = tuple(
             (
                 str(person),
-                *(_number(figures.get(f"{name}.person{person}", np.nan)) for name in columns),
+                *(_of_body(name, figures.get(f"{name}.person{person}")) for name in columns),
             )
-            for person in persons
+            for person in run[unit]["person"].values.tolist()
         )
-        titles = (f">{name.replace('_', ' ')}" for name in columns)
+        titles = (f">{_BODIES[name][0]}" for name in columns)
         tables.append(Table(clip_title(clip), (">person", *titles), rows))
     return tables
+
+
+def _of_body(name: str, value: float | None) -> str:
+    _, scale, decimals = _BODIES[name]
+    return "-" if value is None else f"{scale * value:,.{decimals}f}"
 
 
 def _number(value: float) -> str:

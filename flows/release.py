@@ -8,10 +8,12 @@ import numpy as np
 
 from data_contracts.match import MatchSpec
 from data_contracts.run import RunRecord
+from worldpose.body import BodyParameters, find_body
 from worldpose.cameras import Camera
 from worldpose.cameras.stored import camera_from_arrays
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.release import JointTracks
+from worldpose.release.body_paint import BodyTracks
 from worldpose.store import Run
 
 if TYPE_CHECKING:
@@ -77,6 +79,21 @@ def bodies_unit(run: Run, clip: str) -> str:
     """The best fitted bodies of a clip, as `stage/unit`, whether or not the run has any."""
     first, again = (f"{stage}/{clip}" for stage in BODY_STAGES)
     return again if again in run else first
+
+
+def body_tracks(run: Run, clip: str) -> BodyTracks | None:
+    """The best fitted bodies of a clip; None where the run has none."""
+    if bodies_unit(run, clip) not in run:
+        return None
+    fits = run[bodies_unit(run, clip)]
+    return BodyTracks(
+        frames=fits["frame"].values,
+        person_ids=fits["person"].values.astype(np.int64),
+        poses=BodyParameters(
+            *(fits[name].values for name in ("betas", "global_orient", "body_pose", "transl"))
+        ),
+        model=find_body(fits.attrs["body_model"]),
+    )
 
 
 def placed_joints(run: Run, clip: str) -> xr.Dataset:

@@ -14,12 +14,14 @@ from flows.broadcast_reporting import (
 from flows.camera_reporting import camera_pictures, camera_summaries, paint_pictures
 from flows.clip_reporting import clip_pictures, clip_scene, detection_pictures
 from flows.clip_video import static_view, write_clip_video
+from flows.disagreement_reporting import disagreement_pictures
 from flows.evaluation import load_reference, score
 from flows.extent_reporting import extent_section, tiles_of
 from flows.people_reporting import adjustment_tables, body_tables
 from flows.release import clips_of, static_cameras
 from flows.review_reporting import review_table
 from flows.stage import Match
+from worldpose.errors import UsageError
 from worldpose.release import Section, report_page, whole_file
 from worldpose.release.report import camera_table
 from worldpose.store import Run, Store, open_run
@@ -33,6 +35,7 @@ def write_report(
     run_id: str = "latest",
     reference: str | None = None,
     videos: bool = True,
+    camera: str | None = None,
 ) -> list[Path]:
     """Writes the HTML page of one run, and returns the videos written beside it.
 
@@ -42,9 +45,15 @@ def write_report(
         out: the file to write.
         run_id: number of the run.
         reference: truth; None = `reference/` of the match folder, where there is one.
-        videos: write each clip's broadcast video, and that of the static camera that sees most
-            people, with what was found drawn over them.
+        videos: write each clip's broadcast video, and that of a static camera, with what was found
+            drawn over them.
+        camera: which static camera's; None = the one that sees most people.
+
+    Raises:
+        UsageError: no static camera of that name has a video.
     """
+    if camera is not None:
+        _check_film(match, camera)
     run = open_run(store.url, match.match_id, run_id)
     source = reference or _own_reference(match)
     scores: Evaluation | None = None
@@ -60,17 +69,30 @@ def write_report(
     )
     with whole_file(out) as draft:
         draft.write_text(page, encoding="utf-8")
-    return _write_videos(store, run, match, out) if videos else []
+    return _write_videos(store, run, match, out, camera) if videos else []
 
 
-def _write_videos(store: Store, run: Run, match: Match, out: Path) -> list[Path]:
+def _check_film(match: Match, camera: str) -> None:
+    names = {each.id for each in match.folder.spec.static_cameras} & set(match.folder.videos)
+    if camera not in names:
+        raise UsageError(
+            f"--camera {camera}",
+            expected="a static camera that has a video",
+            found=f"these have one: {', '.join(sorted(names)) or 'none'}",
+            todo="Name one of them, or leave --camera out.",
+        )
+
+
+def _write_videos(
+    store: Store, run: Run, match: Match, out: Path, camera: str | None
+) -> list[Path]:
     films = write_broadcast_videos(run, match, out)
     for clip in clips_of(run.record):
-        camera = static_view(run, match, clip)
-        if camera is not None:
-            films.append(out.with_name(f"{out.stem}-{clip}-{camera}.mp4"))
+        owner = camera or static_view(run, match, clip)
+        if owner is not None:
+            films.append(out.with_name(f"{out.stem}-{clip}-{owner}.mp4"))
             with whole_file(films[-1]) as draft:
-                write_clip_video(store, run, match, clip, draft, owner=camera)
+                write_clip_video(store, run, match, clip, draft, owner=owner)
     return films
 
 
@@ -108,7 +130,13 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
         Section(
             "Broadcast camera", (*broadcast_pictures(run, match), *broadcast_tables(run, match))
         ),
-        Section("Bodies", tuple(body_tables(run, clips))),
+        Section(
+            "Bodies",
+            (
+                *body_tables(run, clips),
+                *(p for clip in clips for p in disagreement_pictures(store, run, match, clip)),
+            ),
+        ),
         Section("Who reviewed what", tuple(review_table(match))),
     ]
 

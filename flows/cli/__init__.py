@@ -13,6 +13,7 @@ import typer
 from flows.cli import (
     body,
     check,
+    evaluate,
     finetune,
     lineage,
     matches,
@@ -50,6 +51,7 @@ for module in (
     times,
     pins,
     results,
+    evaluate,
     check,
     statistics,
     finetune,

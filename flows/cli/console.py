@@ -32,6 +32,9 @@ MatchArgument = Annotated[
     str, typer.Argument(metavar="MATCH", help="A match folder, or the id of a registered match.")
 ]
 RunOption = Annotated[str, typer.Option("--run", help="A run's number or name; latest by default.")]
+StageOption = Annotated[
+    str | None, typer.Option("--stage", help="Take this stage's joints; the latest by default.")
+]
 
 DEFAULT_PROJECT = "worldpose-data"
 

@@ -125,7 +125,7 @@ def test_report_is_one_page_that_asks_for_nothing(tiny, tiny_run, tmp_path):
     outside = Outside()
     outside.feed(page)
     assert outside.asked == []
-    assert page.count('src="data:image/') == 8
+    assert page.count('src="data:image/') == 10
     assert page.count('<div class="scene">') == 1
     assert "Mean joint error" in page
     assert "expected ground error" in page

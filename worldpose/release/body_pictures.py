@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Final
 
 import cv2
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from data_contracts.pitch import PitchSpec
 from worldpose.cameras import Camera
+from worldpose.release.body_paint import paint_bodies, zoomed
 from worldpose.release.drawing import INK, draw_label, markings, person_color, png, style
 
 Floats = NDArray[np.float64]
@@ -24,8 +24,8 @@ WIDTH: Final = 1540
 SHARE: Final = 0.3
 """Part of the camera's picture that is shown: players of 80 px are 210 px tall then."""
 _GROUND: Final = (206, 217, 202)
-_SUN: Final = np.array([0.35, -0.45, 0.82])
-"""Where light comes from, world: high, from the main camera's side."""
+_PALE: Final = 0.35
+"""Share of white in the colours of large bodies, on which shading is seen [1]."""
 _SUBPIXEL: Final = 4
 """Bits of a corner's place below the pixel."""
 
@@ -59,7 +59,7 @@ def bodies_picture(
     near = zoomed(camera, corner, scale, (WIDTH, round(side[1] * scale)))
     canvas = _background(near, corner, scale, still, pitch)
     colors = np.array([to_rgb(person_color(int(person))) for person in ids]).reshape(-1, 3)
-    paint_bodies(canvas, near, bodies, faces, colors)
+    paint_bodies(canvas, near, bodies, faces, _PALE + (1.0 - _PALE) * colors)
 
     height, width = canvas.shape[:2]
     figure = Figure(figsize=(14.0, 14.0 * height / width + 0.4), dpi=110, facecolor="white")
@@ -94,56 +94,6 @@ def crowded_part(camera: Camera, bodies: Floats) -> tuple[Floats, Floats]:
     together: NDArray[np.bool_] = np.all(apart < 0.45 * side, axis=-1)
     around = middles[together[np.argmax(together.sum(axis=1))]].mean(axis=0)
     return np.clip(around - 0.5 * side, -0.5, size - 0.5 - side), side
-
-
-def zoomed(camera: Camera, corner: Floats, scale: float, size: tuple[int, int]) -> Camera:
-    """Return the camera whose picture is a part of another's, enlarged.
-
-    Args:
-        camera: the other.
-        corner: top left of the part [px]; (-0.5, -0.5) is that of the picture.
-        scale: enlargement [1].
-        size: width and height of the new picture [px].
-    """
-    return replace(
-        camera,
-        focal=camera.focal * scale,
-        principal_point=(camera.principal_point - corner) * scale - 0.5,
-        image_size=np.array(size),
-    )
-
-
-def paint_bodies(
-    canvas: Picture, camera: Camera, bodies: Floats, faces: NDArray[np.int64], colors: Floats
-) -> None:
-    """Paint bodies over a picture, the farthest triangles first.
-
-    Args:
-        canvas: (height, width, 3), RGB, painted over.
-        camera: a single camera whose picture it is.
-        bodies: (persons, vertices, 3) [m], world, finite.
-        faces: (triangles, 3), counter-clockwise seen from outside.
-        colors: (persons, 3) in 0..1.
-    """
-    corners = bodies[:, faces]
-    normals = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
-    toward = camera.center - corners.mean(axis=2)
-    pixels = camera.project(bodies)[:, faces]
-    size = np.asarray(camera.image_size)
-    shown = (normals * toward).sum(axis=-1) > 0.0
-    shown &= np.isfinite(pixels).all(axis=(-1, -2))
-    shown &= ((pixels > -1.0) & (pixels < size)).all(axis=-1).any(axis=-1)
-    person, _ = np.nonzero(shown)
-    sun = np.clip(normals[shown] @ (_SUN / np.linalg.norm(_SUN)), 0.0, 1.0)
-    facing = (normals * toward).sum(axis=-1)[shown] / np.linalg.norm(toward[shown], axis=-1)
-    light = 0.45 + 0.3 * sun + 0.25 * facing
-    shades = np.rint(255.0 * light[:, None] * (0.35 + 0.65 * colors[person])).astype(int).tolist()
-    places = np.rint(pixels[shown] * 2**_SUBPIXEL).astype(np.int32)
-    for triangle in np.argsort(-np.linalg.norm(toward[shown], axis=-1), kind="stable").tolist():
-        cv2.fillConvexPoly(
-            canvas, places[triangle], shades[triangle], lineType=cv2.LINE_AA, shift=_SUBPIXEL
-        )
 
 
 def _background(

@@ -121,9 +121,12 @@ def before_after_picture(
     person: int,
     *,
     still: NDArray[np.uint8],
+    seen: Floats,
     pitch: PitchSpec | None = None,
 ) -> bytes:
     """Return a PNG of a person and who is about, as two cameras put them and the markings.
+
+    Crosses are where keypoints were seen, which neither camera moves.
 
     Args:
         before: a single camera.
@@ -132,12 +135,13 @@ def before_after_picture(
         frame: place in `tracks`.
         person: place in `tracks` of whom the picture is about.
         still: the picture (height, width, 3), RGB, beneath.
+        seen: keypoints of a detector in it (detections, 17, 2) [px].
         pitch: its markings are drawn; None where there is no pitch.
     """
-    seen = after.project(tracks.joints[frame, person])
-    middle = np.nan_to_num(seen[np.isfinite(seen).all(axis=-1)].mean(axis=0))
-    tall = max(float(np.ptp(seen[np.isfinite(seen[:, 1]), 1])), 30.0)
-    gone = seen - before.project(tracks.joints[frame, person])
+    shown = after.project(tracks.joints[frame, person])
+    middle = np.nan_to_num(shown[np.isfinite(shown).all(axis=-1)].mean(axis=0))
+    tall = max(float(np.ptp(shown[np.isfinite(shown[:, 1]), 1])), 30.0)
+    gone = shown - before.project(tracks.joints[frame, person])
     moved = float(np.nanmean(np.linalg.norm(gone, axis=-1)))
     titles = ("before", f"after, {moved:.1f} px beside")
     figure = Figure(figsize=(14.0, 5.6), dpi=110, layout="constrained", facecolor="white")
@@ -147,6 +151,7 @@ def before_after_picture(
             axes.plot(*camera.project(line).T, color=TEMPLATE, linewidth=1.3, zorder=1)
         for person_id, joints in zip(tracks.person_ids, tracks.joints[frame], strict=True):
             draw_skeleton(axes, camera.project(joints), person_color(int(person_id)), 1.6, zorder=3)
+        axes.plot(*seen.reshape(-1, 2).T, "x", color="white", markersize=5.0, zorder=4)
         axes.set(
             xlim=(middle[0] - 1.3 * tall, middle[0] + 1.3 * tall),
             ylim=(middle[1] + 0.85 * tall, middle[1] - 0.85 * tall),

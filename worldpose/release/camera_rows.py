@@ -48,6 +48,12 @@ class CameraRows:
             image_size=np.maximum(np.round(2.0 * usual), 1.0).astype(np.int64),
         )
 
+    def lens(self) -> Camera:
+        """Return the camera (rows,) at the origin, also where its pose is not known."""
+        count = len(self.intrinsics)
+        still = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
+        return CameraRows(self.intrinsics, self.distortion, *still).camera()
+
 
 def read_camera_rows(path: Path) -> CameraRows:
     """The rows of a camera file, unjudged; `read_camera` refuses what is no camera.

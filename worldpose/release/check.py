@@ -22,6 +22,8 @@ from worldpose.release.check_reprojection import (
 )
 from worldpose.release.check_settings import CheckSettings
 from worldpose.release.check_sight import is_blind, sight_findings
+from worldpose.release.check_skeletons import box_findings, skeleton_findings
+from worldpose.release.check_turning import turning_findings
 from worldpose.release.shipped import PointSource, ShippedClip, View
 
 
@@ -38,7 +40,21 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
         for view in clip.views
         if (found := agreement(source, view, settings)) is not None
     ]
-    findings += agreement_findings(agreements, settings)
+    named = {one.source for one in agreements if one.fault is not SOUND}
+    slips = [
+        found
+        for source in clip.sources
+        for view in clip.views
+        if source.name not in named
+        for found in turning_findings(source, view, settings)
+    ]
+    slipped = {slip.where[0] for slip in slips}
+    findings += [
+        found
+        for found in agreement_findings(agreements, settings)
+        if found.fault != "reprojection" or found.where[0] not in slipped
+    ]
+    findings += [*slips, *_challenge_findings(clip, settings)]
     faults = {one.view: one.fault for one in agreements if one.fault.camera is not None}
     shares = []
     for source in clip.sources:
@@ -81,6 +97,17 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
         plausible_share=min(shares) if shares else None,
     )
     return figures, list(_merged(findings))
+
+
+def _challenge_findings(clip: ShippedClip, settings: CheckSettings) -> Iterator[Finding]:
+    """What is wrong with boxes and skeletons about the mid-hip."""
+    if clip.given is None:
+        return
+    yield from box_findings(clip.given.boxes, clip.given.skel_2d, clip.name)
+    for view in clip.views:
+        if view.name == clip.name:
+            both = clip.given.skel_3d, clip.given.skel_2d
+            yield from skeleton_findings(*both, view.skeleton, view.rows, clip.name, settings)
 
 
 def _repaired(source: PointSource, agreements: Iterable[Agreement]) -> PointSource:

@@ -17,6 +17,7 @@ Floats = NDArray[np.float64]
 
 LATEST: Final = 3
 """Largest slip of frames that is looked for [frame]."""
+_LENS: Final = "k1 k2 p1 p2 k3"
 
 
 @dataclass(frozen=True)
@@ -81,13 +82,12 @@ def camera_faults() -> Iterator[Fault]:
         "t is in millimetres and not in metres",
         camera=lambda c: _posed(c, c.rotation, c.translation / 1000.0),
     )
-    yield Fault(
-        "distortion_order",
-        "k is k1 k2 k3 p1 p2 and not OpenCV's k1 k2 p1 p2 k3",
-        camera=lambda c: CameraRows(
-            c.intrinsics, c.distortion[:, [0, 1, 3, 4, 2]], c.rotation, c.translation
-        ),
-    )
+    for order in ("k1 k2 k3 p1 p2", "p1 p2 k1 k2 k3", "k1 k2 p2 p1 k3"):
+        yield Fault(
+            "distortion_order",
+            f"k is {order} and not OpenCV's {_LENS}",
+            camera=_lens_in(order),
+        )
 
 
 def frame_faults(moving: bool) -> Iterator[Fault]:
@@ -108,6 +108,15 @@ def frame_faults(moving: bool) -> Iterator[Fault]:
             )
 
 
+def axis_orders() -> Iterator[tuple[str, Floats]]:
+    """All other orders and signs of three axes: in words, and as shipped from right (3, 3)."""
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            axes = np.eye(3)[list(order)] * np.array(signs)[:, None]
+            if not np.array_equal(axes, np.eye(3)):
+                yield ", ".join(_axis_words(axes)), axes
+
+
 def _shrink(size: float) -> Callable[[PointSource], Floats]:
     def repaired(source: PointSource) -> Floats:
         if source.place is None:
@@ -119,16 +128,10 @@ def _shrink(size: float) -> Callable[[PointSource], Floats]:
 
 def _axis_faults() -> Iterator[Fault]:
     """All other orders and signs of the axes, first for whole points, then for `transl` alone."""
-    every = (
-        np.eye(3)[list(order)] * np.array(signs)[:, None]
-        for order in itertools.permutations(range(3))
-        for signs in itertools.product((1.0, -1.0), repeat=3)
-    )
-    signed = [axes for axes in every if not np.array_equal(axes, np.eye(3))]
-    for shipped_from_world in signed:
+    for _, shipped_from_world in axis_orders():
         name, says = _axis_name(shipped_from_world)
         yield Fault(name, says, _turn(shipped_from_world, whole=True))
-    for shipped_from_world in signed:
+    for _, shipped_from_world in axis_orders():
         name, says = _axis_name(shipped_from_world)
         yield Fault(name, f"{says}, in transl alone", _turn(shipped_from_world, whole=False))
 
@@ -147,10 +150,7 @@ def _turn(shipped_from_world: Floats, whole: bool) -> Callable[[PointSource], Fl
 
 def _axis_name(shipped_from_world: Floats) -> tuple[str, str]:
     """Name of the fault of having these axes, and what they are in words."""
-    axes = [
-        f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}"
-        for row in shipped_from_world
-    ]
+    axes = _axis_words(shipped_from_world)
     says = f"x, y, z are the world's {', '.join(axes)}"
     if axes == ["x", "-z", "y"]:
         return "y_down_world", f"the world is y down: {says}"
@@ -163,6 +163,22 @@ def _axis_name(shipped_from_world: Floats) -> tuple[str, str]:
             return "mirrored_world", f"the world is mirrored: {says}"
         return "turned_world", f"the world is turned by half a turn: {says}"
     return "other_axes", f"the world has other axes: {says}"
+
+
+def _axis_words(axes: Floats) -> list[str]:
+    """What each axis is, such as -y."""
+    return [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in axes]
+
+
+def _lens_in(order: str) -> Callable[[CameraRows], CameraRows]:
+    """Gives a camera whose coefficients were written in another order."""
+    place = [order.split().index(name) for name in _LENS.split()]
+
+    def repaired(camera: CameraRows) -> CameraRows:
+        lens = camera.distortion[:, place]
+        return CameraRows(camera.intrinsics, lens, camera.rotation, camera.translation)
+
+    return repaired
 
 
 def _posed(camera: CameraRows, rotation: Floats, translation: Floats) -> CameraRows:

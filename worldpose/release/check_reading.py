@@ -100,6 +100,7 @@ def read_clip(
         file = coco / f"{name}.json"
         pixels = read_coco(file, ids, frames) if file.is_file() else None
         views.append(View(name, camera, pixels, COCO17))
+    given = None
     if _has_challenge(folder):
         given = read_challenge(folder, clip).get(clip)
         if given is not None:
@@ -114,7 +115,7 @@ def read_clip(
             ]
             sources, swapped = _rows_of_boxes(sources, clip, pixels.shape[:2])
             findings += swapped
-    return ShippedClip(clip, fps, tuple(sources), tuple(views), pitch, tuple(findings))
+    return ShippedClip(clip, fps, tuple(sources), tuple(views), pitch, tuple(findings), given)
 
 
 def read_coco(path: Path, ids: tuple[int, ...], frames: int) -> Floats:

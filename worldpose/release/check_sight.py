@@ -67,11 +67,14 @@ def is_blind(source: PointSource, rows: CameraRows, settings: CheckSettings) -> 
 
     A camera that never moves may look at a part of the pitch where nobody comes: it is only
     expected to stand upright in the stadium and to have the pitch in the middle of its picture.
+    Of a camera that moves nothing is known without people in frames in which it has a pose.
     """
     if sight_share(source, source.points, rows) >= settings.least_seen:
         return False
     if len(rows.rotation) > 1:
-        return True
+        posed = np.all(np.isfinite(rows.rotation), axis=(-1, -2))[: len(source.points)]
+        there = source.points[: len(posed)][posed]
+        return not posed.any() or bool(np.isfinite(there).all(-1).any())
     center, forward, down = center_of(rows), rows.rotation[0, 2], rows.rotation[0, 1]
     if not STAND[0] < center[2] < STAND[1] or not forward[2] < 0.0 or not down[2] < 0.0:
         return True
@@ -87,6 +90,8 @@ def sight_findings(
     One writer makes one mistake: of the faults without which cameras show people, at least ten
     times `least_seen` of them, the one that explains most cameras is named first.
     """
+    if not views:
+        return
     faults = (*camera_faults(), *point_faults())
     share = np.zeros((len(faults), len(views)))
     for row, fault in enumerate(faults):

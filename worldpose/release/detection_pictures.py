@@ -44,8 +44,9 @@ def detections_picture(
     seen: NDArray[np.bool_],
     still: NDArray[np.uint8] | None = None,
     pitch: PitchSpec | None = None,
+    part: tuple[Floats, Floats] | None = None,
 ) -> bytes:
-    """Return a PNG of the part of a picture with most people: as detected, and as found.
+    """Return a PNG of a part of a picture: as detected, and as found.
 
     Args:
         camera: a single camera.
@@ -57,15 +58,19 @@ def detections_picture(
         seen: (persons,) whether this camera's own detections carry any joint of the person.
         still: the picture (height, width, 3), RGB, beneath; None = plain ground.
         pitch: its markings are drawn on the right; None where there is no pitch.
+        part: corner and side lengths (2,) [px] of the part; None = that with most people.
     """
-    corner, side = crowded_part(camera, joints[np.isfinite(joints).all((-1, -2))])
+    whole = joints[np.isfinite(joints).all((-1, -2))]
+    corner, side = crowded_part(camera, whole) if part is None else part
     shape = side[1] / side[0]
     figure = Figure(figsize=(14.0, 7.0 * shape + 0.5), dpi=110, facecolor="white")
     figure.set_layout_engine("constrained")
     before, after = figure.subplots(1, 2)
     there = np.isfinite(boxes).all(-1)
     found = np.isfinite(joints).any((-1, -2))
-    titles = (f"before: {int(there.sum())} detections", f"after: {int(found.sum())} people")
+    titles = ("before", "after")
+    if part is None:
+        titles = (f"before: {int(there.sum())} detections", f"after: {int(found.sum())} people")
     for axes, title in zip((before, after), titles, strict=True):
         axes.set(
             xlim=(corner[0], corner[0] + side[0]),

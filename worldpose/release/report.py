@@ -185,8 +185,8 @@ def camera_table(cameras: Sequence[CameraSummary]) -> Table:
     columns = (
         "camera",
         "from",
-        ">expected ground error m",
-        ">95 % m",
+        ">expected ground error mm",
+        ">95 % mm",
         ">clicks rms px",
         ">clicks",
         "wrong clicks",
@@ -196,8 +196,10 @@ def camera_table(cameras: Sequence[CameraSummary]) -> Table:
         (
             camera.camera_id,
             camera.origin,
-            *_or_dash(camera.ground_error_median_m, camera.ground_error_p95_m),
-            *_or_dash(camera.reprojection_rms_px, camera.clicks_used),
+            _or_dash(camera.ground_error_median_m, 1000.0, 1),
+            _or_dash(camera.ground_error_p95_m, 1000.0, 1),
+            _or_dash(camera.reprojection_rms_px, 1.0, 2),
+            _or_dash(camera.clicks_used, 1.0, 0),
             ", ".join(camera.clicks_wrong),
             Failure("; ".join(camera.weak)),
         )
@@ -206,8 +208,8 @@ def camera_table(cameras: Sequence[CameraSummary]) -> Table:
     return Table("", columns, rows)
 
 
-def _or_dash(*values: float | None) -> list[str]:
-    return ["-" if value is None else shown_number(value) for value in values]
+def _or_dash(value: float | None, scale: float, decimals: int) -> str:
+    return "-" if value is None else f"{scale * value:,.{decimals}f}"
 
 
 def _about(run: RunRecord) -> list[tuple[str, ...]]:

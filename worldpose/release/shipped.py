@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.release import Finding
 from worldpose.release.camera_rows import CameraRows
+from worldpose.release.challenge import ChallengeClip
 
 Floats = NDArray[np.float64]
 
@@ -60,6 +61,8 @@ class ShippedClip:
     """Whether the ground is z = 0; otherwise the world is that of the cameras' calibration."""
     findings: tuple[Finding, ...] = field(default=())
     """What reading alone has shown."""
+    given: ChallengeClip | None = None
+    """Boxes and skeletons of the challenge's layout."""
 
 
 def absent_rows(name: str, arrays: Mapping[str, NDArray[Any]]) -> tuple[Floats, list[Finding]]:

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.cameras import Camera
+from worldpose.cameras.outlines import Box, Outlines, outline_surfaces
+from worldpose.cameras.rasters import NOBODY, Samples, draw_triangles, resolve
 from worldpose.compiled import compiled
 from worldpose.synthetic.casting import Cast
 from worldpose.synthetic.looks import RenderingSettings
 from worldpose.synthetic.mannequins import Surfaces
-from worldpose.synthetic.outlines import Box, Outlines, outline_people
 from worldpose.synthetic.people_shadows import shade_ground
 from worldpose.synthetic.props import Prop
-from worldpose.synthetic.rasters import NOBODY, Samples, draw_triangles, resolve
 from worldpose.synthetic.venues import FOG_COLOR, Venue
 
 Floats = NDArray[np.float64]
@@ -150,10 +150,10 @@ def _outlined(
 ) -> tuple[list[_Drawn], list[Box | None], Floats]:
     """All surfaces, people first; the part of the picture each is in; people's boxes (n, 4)."""
     cast = moment.cast
-    opened = outline_people(camera, moment.opened.vertices)
+    opened = outline_surfaces(camera, moment.opened.vertices)
     closed = opened
     if moment.closed is not moment.opened:
-        closed = outline_people(camera, moment.closed.vertices)
+        closed = outline_surfaces(camera, moment.closed.vertices)
     light = _lit(venue, moment.opened)
     shape = cast.mannequin
     drawn = [
@@ -162,7 +162,7 @@ def _outlined(
     ]
     spans = [_span(opened, closed, person, width, height) for person in range(len(drawn))]
     for prop in moment.props:
-        outline = outline_people(camera, prop.surfaces.vertices)
+        outline = outline_surfaces(camera, prop.surfaces.vertices)
         pixels = outline.pixels[0]
         lit = _lit(venue, prop.surfaces)[0]
         drawn.append(_Drawn(prop.faces, prop.backs, prop.texels, prop.picture, pixels, pixels, lit))

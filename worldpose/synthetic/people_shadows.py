@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.cameras import Camera
+from worldpose.cameras.outlines import Box
+from worldpose.cameras.rasters import cover_triangles
 from worldpose.compiled import compiled
-from worldpose.synthetic.outlines import Box, outline_shadows
-from worldpose.synthetic.rasters import cover_triangles
+from worldpose.synthetic.outlines import outline_shadows
 from worldpose.synthetic.venues import Venue
 
 Singles = NDArray[np.float32]

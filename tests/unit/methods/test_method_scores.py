@@ -2,6 +2,7 @@
 
 import csv
 import io
+import json
 
 import numpy as np
 import pytest
@@ -17,7 +18,9 @@ from method_files import (
     wobbled,
     write_hybrik_one,
 )
+from typer.testing import CliRunner
 
+from flows.cli import app
 from flows.methods import score_methods
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation.method_table import table_csv, table_latex, table_rows
@@ -134,6 +137,23 @@ def test_table_has_the_papers_rows_and_says_where_a_figure_means_nothing(truth, 
         update={"evaluation": scores[2].evaluation.model_copy(update={"g_mpjpe_mm": 18888.9})}
     )
     assert "18\\,888.9" in table_latex([far])
+
+
+def test_the_command_prints_the_table_with_the_settings_that_gave_it(truth, tmp_path):
+    bodies, camera = scene()
+    path = WRITERS["glamr"](tmp_path, wobbled(bodies), camera)
+    asked = ("--method", f"glamr={path}", "--reference", str(truth), "--match-in", "clip")
+    table = CliRunner().invoke(app, ["evaluate", *asked, "--table", "csv"])
+    assert list(csv.reader(io.StringIO(table.stdout)))[1] == [
+        "GLAMR",
+        "10.0",
+        "0.0",
+        "0.1",
+        "100.0",
+    ]
+    told = json.loads(CliRunner().invoke(app, ["evaluate", *asked, "--json"]).stdout)
+    (score,) = told["methods"]
+    assert (score["match_in"], score["settings"]["min_overlap"]) == ("clip", 0.5)
 
 
 def test_method_without_a_common_world_needs_a_camera(truth, tmp_path):

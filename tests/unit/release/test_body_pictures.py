@@ -69,6 +69,21 @@ def test_the_nearer_body_hides_the_farther_whatever_their_order():
         assert red > blue
 
 
+def test_a_thin_body_has_a_solid_rim():
+    camera = camera_at()
+    canvas = np.full((720, 1280, 3), 100, dtype=np.uint8)
+    body = square(0.0, 0.0)
+    paint_bodies(canvas, camera, body[None], FACES, np.array([[1.0, 0.0, 0.0]]), opacity=0.5)
+    rim = (canvas == [255, 0, 0]).all(-1)
+    (x, y), (right, _) = np.rint(camera.project(body[[0, 1]])).astype(int)
+    side = right - x
+    # Four sides, one pixel wide.
+    assert rim.sum() == pytest.approx(4 * side, abs=12)
+    inside = canvas[y - side // 2, x + side // 2]
+    assert 100 < inside[0] < 255
+    assert inside[1] == inside[2] == 50
+
+
 def test_what_faces_away_is_not_painted():
     canvas = np.zeros((720, 1280, 3), dtype=np.uint8)
     paint_bodies(canvas, camera_at(), square(0, 0)[None], FACES[:, ::-1], np.ones((1, 3)))

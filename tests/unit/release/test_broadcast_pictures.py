@@ -81,13 +81,21 @@ def test_whom_a_refinement_moves_most_is_shown_before_and_after():
     tracks = people((0.0, 80.0), (9.0, 80.0), (18.2, 80.0))
     assert most_moved(before, after, tracks) == (1, 1)
     still = np.full((1080, 1920, 3), 90, np.uint8)
-    picture = before_after_picture(before[1], after[1], tracks, 1, 1, still=still)
+    seen = after[1].project(tracks.joints[1])
+    picture = before_after_picture(before[1], after[1], tracks, 1, 1, still=still, seen=seen)
     shown = matplotlib.image.imread(io.BytesIO(picture))[..., :3]
     # Skeletons are coloured on grey, and lie elsewhere in the two halves.
     colored = np.ptp(shown, axis=-1) > 0.3
     left, right = colored[:, :770], colored[:, 770:]
     assert left.any() and right.any()
     assert abs(np.nonzero(left)[0].mean() - np.nonzero(right)[0].mean()) > 50.0
+    unseen = np.full_like(seen, np.nan)
+    bare = before_after_picture(before[1], after[1], tracks, 1, 1, still=still, seen=unseen)
+    crosses = np.abs(shown - matplotlib.image.imread(io.BytesIO(bare))[..., :3]).max(axis=-1) > 0.1
+    # They are where the right half has its skeleton, and at the same place in the left one.
+    rows = [np.nonzero(half)[0].mean() for half in (crosses[:, :770], crosses[:, 770:], right)]
+    assert abs(rows[0] - rows[1]) < 5.0
+    assert abs(rows[1] - rows[2]) < 30.0
 
 
 def test_nobody_in_the_picture_is_moved_most():

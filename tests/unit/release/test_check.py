@@ -272,10 +272,19 @@ def test_the_one_camera_that_is_wrong_is_named(data_set, model):
     assert {p for f in found for p in f.where if p.startswith("cameras/")} == {"cameras/east"}
 
 
-def test_a_lens_in_the_wrong_order_is_named(data_set, model):
+@pytest.mark.parametrize("order", [[0, 1, 4, 2, 3], [2, 3, 0, 1, 4]])
+def test_a_lens_in_the_wrong_order_is_named(data_set, model, order):
     folder = data_set("static")
-    edit_cameras(folder, lambda a: a.update(k=a["k"][:, [0, 1, 4, 2, 3]]))
+    edit_cameras(folder, lambda a: a.update(k=a["k"][:, order]))
     assert {each.fault for each in findings(folder, model)[1]} == {"distortion_order"}
+
+
+def test_a_lens_of_two_coefficients_in_the_place_of_others_is_named(data_set, model):
+    folder = data_set("challenge")
+    edit_cameras(folder, lambda a: a.update(k=a["k"][:, [2, 3, 0, 1, 4]]))
+    found = findings(folder, model)[1]
+    assert {each.fault for each in found} == {"distortion_order"}
+    assert {each.says[:19] for each in found} == {"k is p1 p2 k1 k2 k3"}
 
 
 POSES = {
@@ -306,6 +315,24 @@ def test_a_slip_of_one_frame_is_named(data_set, model, kind):
     _, found = findings(folder, model)
     assert {each.fault for each in found} == {"frame_offset"}
     assert "3D is 1 frame late" in found[0].says
+
+
+@pytest.mark.parametrize("late", [-2, 0, 1])
+def test_a_slip_is_named_where_the_camera_has_the_pose_of_the_first_frame_alone(
+    data_set, model, late
+):
+    folder = data_set("challenge")
+    edit_cameras(folder, lambda a: a.update(R=a["R"][:1], t=a["t"][:1]))
+    (folder / "poses" / "A_1.npz").unlink()
+    joints = np.roll(read_submission(folder / "submission.zip")["A_1"], late, axis=1)
+    gone = slice(0, late) if late > 0 else slice(FRAMES + late, FRAMES)
+    joints[:, gone] = np.nan
+    write_submission(folder / "submission.zip", {"A_1": joints})
+    found = findings(folder, model)[1]
+    expected = {1: "the 3D is 1 frame late", -2: "the 3D is 2 frames early"}
+    assert [each.says[: len(expected[late])] for each in found] == (
+        [expected[late]] if late else []
+    )
 
 
 def test_a_slip_of_the_moving_camera_is_named(data_set, model):
@@ -426,6 +453,47 @@ def test_a_submission_with_frames_first_is_named(data_set, model):
     joints = read_submission(folder / "submission.zip")
     write_submission(folder / "submission.zip", {"A_1": joints["A_1"].swapaxes(0, 1)})
     assert {each.fault for each in findings(folder, model)[1]} == {"frames_before_persons"}
+
+
+def opengl(array):
+    return array * [1.0, -1.0, -1.0]
+
+
+def box_sides(boxes):
+    return np.concatenate([boxes[..., :2], boxes[..., 2:] - boxes[..., :2]], axis=-1)
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "fault", "words"),
+    [
+        ("skel_3d", opengl, "skeleton_axes", "are the camera's x, -y, -z"),
+        ("skel_3d", lambda a: a[..., [0, 2, 1]], "skeleton_axes", "are the camera's x, z, y"),
+        ("skel_3d", lambda a: 1000.0 * a, "millimetres", "skeletons"),
+        ("boxes", box_sides, "box_format", "x y width height"),
+        ("boxes", lambda a: a + 80.0, "boxes", "not around"),
+    ],
+)
+def test_boxes_and_skeletons_in_other_conventions_are_named(
+    data_set, model, kind, change, fault, words
+):
+    folder = data_set("challenge")
+    # As the layout has it: the pose of the first frame alone.
+    edit_cameras(folder, lambda a: a.update(R=a["R"][:1], t=a["t"][:1]))
+    path = folder / kind / "A_1.npy"
+    np.save(path, change(np.load(path)))
+    (found,) = findings(folder, model)[1]
+    assert (found.fault, found.where) == (fault, (f"{kind} of A_1",))
+    assert words in found.says
+
+
+def test_skeletons_that_were_not_turned_into_the_camera_are_named(data_set, model, main_camera):
+    folder = data_set("challenge")
+    path = folder / "skel_3d" / "A_1.npy"
+    # r' = r R for rows r turns back into the world.
+    turned = np.einsum("fpjb,fba->fpja", np.load(path), main_camera.cam_from_world.rotation)
+    np.save(path, turned)
+    (found,) = findings(folder, model)[1]
+    assert (found.fault, "the world's x, y, z" in found.says) == ("skeleton_axes", True)
 
 
 DAMAGE = {

@@ -2,13 +2,16 @@
 
 import io
 import itertools
+import json
 import math
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from typer.testing import CliRunner
 
 from data_contracts.release import ClipStatistics
+from flows.cli import app
 from flows.statistics import count
 from worldpose.body import BodyParameters
 from worldpose.cameras import Camera, Rigid
@@ -105,6 +108,19 @@ def test_ten_made_clips_are_counted_as_plain_loops_count_them(tmp_path):
     assert [found.clips[f"C_{n}"].camera for n in range(3)] == ["S", "M", "M+Z"]
     picture = imread(io.BytesIO(statistics_picture(found)))
     assert picture.shape[:2] == (462, 1540)
+
+
+def test_the_command_counts_as_the_library_does(tmp_path):
+    places = made(np.random.default_rng(2), 50, 4)
+    bodies = BodyParameters(np.zeros(10), np.zeros(3), np.zeros(69), places.astype(np.float64))
+    write_poses(tmp_path / "poses" / "C.npz", bodies, "open-neutral/2")
+    picture = tmp_path / "lengths.png"
+    asked = ["statistics", str(tmp_path), "--fps", "25", "--picture", str(picture), "--json"]
+    answer = CliRunner().invoke(app, asked)
+    assert answer.exit_code == 0
+    found = count([tmp_path], fps=25.0)
+    assert json.loads(answer.stdout) == found.model_dump(mode="json")
+    assert imread(picture).shape[:2] == (462, 1540)
 
 
 def test_a_gap_adds_no_way_and_heights_do_not_count():

@@ -156,12 +156,12 @@ def test_only_settings_that_were_asked_for_are_listed(shown):
 def test_static_cameras_are_listed_with_what_is_wrong_with_them():
     cameras = [
         CameraSummary("cam0", "given"),
-        CameraSummary("cam1", "clicks", 0.0213, 0.35, 1.125, 9, ("corner_left_far",), ("few",)),
+        CameraSummary("cam1", "clicks", 0.0213, 0.35, 1.128, 9, ("corner_left_far",), ("few",)),
     ]
     shown = [Section("Static cameras", (camera_table(cameras),))]
     rows = Page(report_page("A run", run(), seconds={}, sections=shown)).rows
     assert ["cam0", "given", "-", "-", "-", "-", "", ""] in rows
-    assert ["cam1", "clicks", "0.0213", "0.35", "1.125", "9", "corner_left_far", "few"] in rows
+    assert ["cam1", "clicks", "21.3", "350.0", "1.13", "9", "corner_left_far", "few"] in rows
 
 
 def test_photographs_are_made_smaller_and_curves_stay_as_they_are():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from worldpose.synthetic.rasters import Samples, cover_triangles, draw_triangles, resolve
+from worldpose.cameras.rasters import Samples, cover_triangles, draw_triangles, resolve
 
 FACES = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
 """Of a rectangle whose corners go down first, as a camera has what faces it."""

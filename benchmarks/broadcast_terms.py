@@ -1,0 +1,132 @@
+"""Prints what each term of the broadcast camera's fit brings: markings, players, motion.
+
+    python benchmarks/broadcast_terms.py broadcast-pan --seeds 61 62 63 --survey-error 0.03
+
+Rows: every frame turned and zoomed onto its painted lines; all frames by painted lines; those and
+players; those and even, followed motion; all; and the true camera. Columns: by how much painted
+lines and people are missed in the median [px], people by the mean over their keypoints; true feet
+in the picture, median and 95 % [px]. What the true camera misses is the survey's and the detector's
+error: who misses lines by less than it bends to them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from broadcast_accuracy import Floats, feet_in_picture, people_of, true_camera
+from numpy.typing import NDArray
+
+from worldpose.broadcast_calibration import BroadcastCalibrationSettings
+from worldpose.broadcast_calibration.calibrating import refine, track
+from worldpose.broadcast_calibration.evidence import together
+from worldpose.broadcast_calibration.fit import misses
+from worldpose.broadcast_calibration.line_evidence import FieldSamples, follow_lines
+from worldpose.broadcast_calibration.players import match as match_players
+from worldpose.broadcast_calibration.players import player_evidence
+from worldpose.ingest import read_match
+from worldpose.pitch import PitchTemplate
+from worldpose.release import JointTracks, read_joints
+from worldpose.release.broadcast_pictures import before_after_picture, most_moved
+from worldpose.synthetic import SCENARIOS, simulate_match
+from worldpose.video import VideoReader
+
+STILL = {"smooth": False, "flow_weight": 0.0}
+TERMS: dict[str, dict[str, float]] = {
+    "lines": {"player_weight": 0.0, **STILL},
+    "lines, players": STILL,
+    "lines, motion": {"player_weight": 0.0},
+    "all": {},
+}
+
+
+def rows_of(
+    folder: Path, whole: BroadcastCalibrationSettings, picture: Path | None
+) -> dict[str, Floats]:
+    """Return lines, people and feet, median and 95 % (4,) [px], of every way to fit a clip.
+
+    The picture is of the person whom players move most, before and after.
+    """
+    match = read_match(folder)
+    (clip,) = match.key_frames
+    camera = match.spec.camera(match.spec.clip(clip).broadcast or "")
+    true = true_camera(folder, (camera.width, camera.height), clip)
+    joints = read_joints(folder / "reference" / "joints.npz").joints
+    people = people_of(match, joints, clip)
+    pitch = PitchTemplate.from_spec(match.pitch)
+
+    def pictures(file: Path = match.videos[clip]) -> Iterator[NDArray[np.uint8]]:
+        with VideoReader(file) as video:
+            yield from (picture for _, picture in video.frames(grey=True))
+
+    keys = match.key_frames[clip].key_frames
+    tracked = track(pitch, keys, pictures, people.boxes, whole, str(folder))
+    fits = {}
+    for name, changes in TERMS.items():
+        settings = whole.model_copy(update=changes)
+        fits[name] = refine(
+            pitch, tracked, pictures, match.spec.fps, people, people.boxes, settings
+        )
+    found = {
+        "frame by frame": fits["all"].before,
+        **{name: fit.camera for name, fit in fits.items()},
+        "true camera": true,
+    }
+    # The same lines and people for all, looked for about the true camera.
+    lines = follow_lines(true, FieldSamples.of(pitch), pictures(), people.boxes, whole)
+    players, _ = player_evidence(true, people, match_players(true, people), whole)
+    evidence = together([lines.evidence, players])
+    feet, inside = feet_in_picture(true, joints)
+    at = true.camera.project(feet)
+    rows = {}
+    for name, each in found.items():
+        off = np.linalg.norm(each.camera.project(feet) - at, axis=-1)[inside]
+        rows[name] = np.array([*misses(each, evidence), np.median(off), np.percentile(off, 95.0)])
+    if picture is not None:
+        before, after = fits["all"].before.camera, fits["all"].camera.camera
+        number = np.arange(joints.shape[1])
+        tracks = JointTracks(np.arange(len(joints)), number, joints)
+        frame, person = most_moved(before, after, tracks)
+        with VideoReader(match.videos[clip]) as video:
+            still = video.frame(frame)
+        seen = people.keypoints[frame, :, :, :2]
+        drawn = before_after_picture(
+            before[frame], after[frame], tracks, frame, person,
+            still=still, seen=seen, pitch=match.pitch,
+        )  # fmt: skip
+        picture.write_bytes(drawn)
+    return rows
+
+
+def main() -> None:
+    """Print a table for each clip and one of the means of all."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scenario", help="with clicked key frames, filmed for 3 s")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[61, 62, 63])
+    parser.add_argument("--survey-error", type=float, default=0.006, help="which is stated [m]")
+    parser.add_argument("--picture", type=Path, help="PNG to write, of the first seed")
+    options = parser.parse_args()
+    settings = BroadcastCalibrationSettings(survey_error=options.survey_error)
+    scenario = SCENARIOS[options.scenario].model_copy(update={"survey_error": options.survey_error})
+    tables = {}
+    for seed in options.seeds:
+        picture = options.picture if seed == options.seeds[0] else None
+        with tempfile.TemporaryDirectory() as place:
+            folder = Path(place) / "clip"
+            simulate_match(scenario, seed, folder, duration=3.0, cameras=1, stills=False)
+            tables[f"seed {seed}"] = rows_of(folder, settings, picture)
+    names = list(next(iter(tables.values())))
+    tables["mean"] = {
+        name: np.mean([each[name] for each in tables.values()], axis=0) for name in names
+    }
+    for title, rows in tables.items():
+        print(f"{title:20s}  lines  people  feet, 95 % [px]")
+        for name, row in rows.items():
+            print("  {:18s}  {:5.3f}  {:5.2f}   {:5.2f}  {:5.2f}".format(name, *row), flush=True)
+
+
+if __name__ == "__main__":
+    main()
