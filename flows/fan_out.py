@@ -21,6 +21,8 @@ from flows.stage import Stage
 
 MOST_TASKS: Final = 200
 """Of one stage: more units than these share tasks. Prefect takes 0.1 s of processor for a task."""
+TASKS_EACH: Final = 20
+"""For a worker, where units share tasks: then none waits long for the last one [1]."""
 
 
 def compute(
@@ -31,12 +33,16 @@ def compute(
     Raises:
         LostMachinesError: the Prefect server or Dask scheduler is gone.
     """
-    size = math.ceil(len(units) / MOST_TASKS)
     with _placed(stage) if units else nullcontext():
-        if size <= 1:
+        if len(units) <= MOST_TASKS:
             yield from _each_alone(stage, units, work)
         else:
-            yield from _in_batches(units, work, size)
+            yield from _in_batches(units, work, task_count(len(_workers(_client()))))
+
+
+def task_count(workers: int) -> int:
+    """How many tasks the units of a stage share where they are more than MOST_TASKS."""
+    return min(max(1, workers) * TASKS_EACH, MOST_TASKS)
 
 
 def _each_alone(
@@ -55,10 +61,11 @@ def _each_alone(
 
 
 def _in_batches(
-    units: list[PlannedUnit], work: list[Work], size: int
+    units: list[PlannedUnit], work: list[Work], count: int
 ) -> Iterator[tuple[PlannedUnit, BaseException | None]]:
     from tasks.batch import batch  # late, as all tasks are
 
+    size = math.ceil(len(units) / count)
     submitted = {}
     for first in range(0, len(units), size):
         some = units[first : first + size]
@@ -85,15 +92,24 @@ def task_of(stage: Stage) -> Task[..., Any]:
 
 
 def _placed(stage: Stage) -> AbstractContextManager[Any]:
-    context = FlowRunContext.get()
-    client = getattr(context and context.task_runner, "client", None)
+    client = _client()
     return nullcontext() if client is None else on_workers_with(stage.prefers, client)
+
+
+def _client() -> Client | None:
+    """The flow's client of its Dask scheduler; None where its tasks go to no scheduler."""
+    context = FlowRunContext.get()
+    return getattr(context and context.task_runner, "client", None)
+
+
+def _workers(client: Client | None) -> dict[str, Any]:
+    """Workers that are there now, by address."""
+    return {} if client is None else dict(client.scheduler_info(n_workers=-1)["workers"])
 
 
 def on_workers_with(tag: str | None, client: Client) -> AbstractContextManager[Any]:
     """A block whose tasks go to workers with a tag, where any has it now: `--resources TAG=1`."""
-    workers = client.scheduler_info(n_workers=-1)["workers"].values() if tag else ()
-    if any(worker["resources"].get(tag) for worker in workers):
+    if tag and any(worker["resources"].get(tag) for worker in _workers(client).values()):
         block: AbstractContextManager[Any] = dask.annotate(resources={tag: 1})
         return block
     return nullcontext()

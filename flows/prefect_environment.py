@@ -22,6 +22,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import certifi
+
 from worldpose.errors import InputError, WorldposeError
 
 START_SECONDS = 120.0
@@ -31,6 +33,7 @@ ALWAYS = {
     "DO_NOT_TRACK": "1",
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
 }
+AUTHORITIES = "PREFECT_API_SSL_CERT_FILE"
 LOOPBACK = "127.0.0.1,localhost"
 """Never asked for through a proxy."""
 UNLESS_GIVEN = {
@@ -46,6 +49,12 @@ SERVED = {
     "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",
 }
 """Of processes that serve, unless given."""
+EMBEDDED = {
+    # For automations and blocks, of which a run's own server has none.
+    "PREFECT_API_BLOCKS_REGISTER_ON_START": "false",
+    "PREFECT_SERVER_SERVICES_TRIGGERS_ENABLED": "false",
+}
+"""Of a server that lasts as long as its run, unless given."""
 
 
 def served_environment(api: str, home: Path | None) -> dict[str, str]:
@@ -64,6 +73,22 @@ def served_environment(api: str, home: Path | None) -> dict[str, str]:
     no_proxy = {name: ",".join(filter(None, [had, LOOPBACK])) for name, had in proxies.items()}
     pages = {"PREFECT_API_URL": api, "PREFECT_UI_API_URL": api}
     return {**os.environ, **ALWAYS, **given, **no_proxy, **own, **pages}
+
+
+def one_authority(folder: Path) -> dict[str, str]:
+    """The environment of those who talk to Prefect over plain HTTP alone: they check nobody.
+
+    Prefect reads every certificate authority twice for each task, which takes 34 ms of processor;
+    of a file with one of them it reads one.
+
+    Args:
+        folder: where the file is put; workers must see it too.
+    """
+    end = b"-----END CERTIFICATE-----\n"
+    first = Path(certifi.where()).read_bytes().partition(end)
+    file = folder / "authority.pem"
+    file.write_bytes(first[0] + first[1])
+    return {AUTHORITIES: os.environ.get(AUTHORITIES, str(file))}
 
 
 def served_cluster() -> dict[str, Any]:
@@ -97,7 +122,7 @@ def has_server() -> bool:
 
 
 @contextmanager
-def prefect_server(project: str) -> Iterator[Callable[[], None]]:
+def prefect_server(project: str, *, is_local: bool = False) -> Iterator[Callable[[], None]]:
     """Environment and server for Prefect; gives a function that returns when its API answers.
 
     So Prefect can be imported, which takes seconds, while its server starts. Waiting raises
@@ -105,6 +130,7 @@ def prefect_server(project: str) -> Iterator[Callable[[], None]]:
 
     Args:
         project: folder or URL of the store; a local one also keeps Prefect's database.
+        is_local: whether all who will talk to it see this machine's files.
 
     Raises:
         InputError: a given server does not answer.
@@ -124,6 +150,7 @@ def prefect_server(project: str) -> Iterator[Callable[[], None]]:
             tempfile.TemporaryDirectory(prefix="worldpose-prefect-") as scratch,
             _home(project, Path(scratch)) as home,
             _environment({"PREFECT_HOME": str(home)}),
+            _environment(one_authority(Path(scratch)) if is_local else {}),
             _embedded_server(Path(scratch) / "server.log") as (address, wait_until_ready),
             _environment({"PREFECT_API_URL": address}),
         ):
@@ -176,6 +203,7 @@ def _embedded_server(log: Path) -> Iterator[tuple[str, Callable[[], None]]]:
             stdout=output,
             stderr=subprocess.STDOUT,
             pass_fds=[listening.fileno()],
+            env={**EMBEDDED, **os.environ},
             start_new_session=True,  # Ctrl-C is for the run, which then ends its server
         )
     try:

@@ -8,10 +8,10 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from data_contracts.run import GatePolicy, RunRecord
 from flows.gatekeeping import Gatekeeper
@@ -173,9 +173,11 @@ def shared_machines(
 def _machines(
     store: Store, request: RunRequest, missing: list[PlannedUnit]
 ) -> Iterator[RunRequest]:
-    if request.dask is None or not has_server():
+    is_watched = has_server()
+    if request.dask is None or not is_watched:
         reporter().say("starting Prefect and Dask")
-    with _ending_at_once(), prefect_server(store.url) as wait_until_ready, ExitStack() as stack:
+    server = prefect_server(store.url, is_local=request.dask is None)
+    with _ending_at_once(), server as wait_until_ready, ExitStack() as stack:
         cluster = None
         if request.dask is None:
             cluster = stack.enter_context(_starting_cluster(request, missing))
@@ -185,6 +187,8 @@ def _machines(
         # Late: it takes seconds to import, which pass while server and workers start.
         import flows.match  # noqa: F401
 
+        if not is_watched:
+            stack.enter_context(_without_heartbeats())
         wait_until_ready()
         if cluster is not None:
             cluster.wait_for_workers(1, START_SECONDS)
@@ -228,6 +232,13 @@ def _starting_cluster(request: RunRequest, missing: list[PlannedUnit]) -> LocalC
     cluster = LocalCluster(**{**local_cluster(workers), "n_workers": 0, "preload": preload})
     cluster.scale(workers)
     return cluster
+
+
+def _without_heartbeats() -> AbstractContextManager[Any]:
+    """A block whose runs give no sign of life, for which each would wait a second at its end."""
+    from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
+
+    return temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None})
 
 
 def _require_scheduler(address: str) -> None:

@@ -17,7 +17,8 @@ from flows.prefect_environment import prefect_server
 def server(tmp_path_factory):
     """The address of one Prefect API for all tests that do not test starting one."""
     before = dict(os.environ)
-    with prefect_server(str(tmp_path_factory.mktemp("prefect"))) as wait_until_ready:
+    home = str(tmp_path_factory.mktemp("prefect"))
+    with prefect_server(home, is_local=True) as wait_until_ready:
         wait_until_ready()
         yield os.environ["PREFECT_API_URL"]
     os.environ.clear()

@@ -5,22 +5,27 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from prefect import flow
-from prefect.artifacts import create_table_artifact
+from prefect.artifacts import create_markdown_artifact, create_table_artifact
 from prefect.deployments import run_deployment
 from prefect_dask import DaskTaskRunner
+from pydantic import TypeAdapter, ValidationError
 
 from data_contracts.finetune import NetKind
 from data_contracts.operations import Arrival
+from data_contracts.records import Name
 from flows.match import process_match
 from flows.operations.arrivals import take_in
 from flows.operations.plan import ServePlan
 from flows.prefect_environment import served_cluster
+from flows.registering import open_match
 from flows.stage import Match
-from worldpose.store import Store
+from worldpose.errors import UsageError, WorldposeError
+from worldpose.store import Store, open_run
 
+NAME: Final = TypeAdapter(Name)
 LOG = logging.getLogger("worldpose.operations")
 
 match = process_match.with_options(task_runner=DaskTaskRunner(**served_cluster()))
@@ -79,6 +84,80 @@ def _begin(plan: ServePlan, opened: Match, arrival: Arrival) -> str:
         work_queue_name=arrival.priority,
     )
     return str(run.id)
+
+
+@flow(name="release", flow_run_name="release {name} of {match_id}", validate_parameters=False)
+def release(
+    project: str,
+    match_id: str,
+    name: str,
+    licence: str,
+    formats: Sequence[str] = ("worldpose",),
+    out: str | None = None,
+) -> str:
+    """Freeze the latest run of a match under a name, with a report; returns the folder.
+
+    Args:
+        project: folder or URL of the store.
+        match_id: a match whose latest run is complete.
+        name: of the release.
+        licence: text under which its data may be used.
+        formats: of its files.
+        out: folder to write into; `releases/<match>/<name>` of the project if None.
+
+    Raises:
+        WorldposeError: the latest run is not complete.
+    """
+    from flows.formats import Origin  # late, as all that only few runs need
+    from flows.releasing import release as write_release
+    from flows.reporting import write_report
+
+    store = Store.open(project)
+    opened = open_match(store, match_id)
+    run = open_run(project, opened.match_id)
+    if run.record.state != "complete":
+        raise WorldposeError(
+            f"run {run.record.run_id} of {match_id}: expected a complete one, found "
+            f"{run.record.state}. Run the match to the end, and approve what waits, first."
+        )
+    folder = release_folder(store, opened.match_id, name, out)
+    origin = Origin(run, opened.registration, None)
+    write_release(store, origin, list(formats), folder, name, licence)
+    report = folder.with_name(f"{folder.name}-report.html")
+    write_report(store, opened, report, run_id=run.record.run_id, videos=False)
+    create_markdown_artifact(
+        f"Run {run.record.run_id} of {match_id}\n\n- files: `{folder}`\n- report: `{report}`",
+        key="release",
+        description=f"Release {name} of {match_id}",
+    )
+    return str(folder)
+
+
+def release_folder(store: Store, match_id: str, name: str, out: str | None) -> Path:
+    """Where a release is written.
+
+    Raises:
+        UsageError: the name is none for a folder, or the project is in no folder of this machine.
+    """
+    if out is not None:
+        return Path(out)
+    try:
+        NAME.validate_python(name)
+    except ValidationError:
+        raise UsageError(
+            f"release {name!r}",
+            expected="a name of letters, digits, `.`, `_` and `-`",
+            found=repr(name),
+            todo="Choose such a name.",
+        ) from None
+    if "://" in store.url:
+        raise UsageError(
+            f"release {name} of {match_id}",
+            expected="`out`, a folder on this machine: the project is in object storage",
+            found="none",
+            todo="Name one.",
+        )
+    return Path(store.url) / "releases" / match_id / name
 
 
 @flow(name="finetune", validate_parameters=False)

@@ -75,6 +75,7 @@ DEPLOYED: Final = (
         },
         module="flows.reprocess",
     ),
+    Deployed("release", "Freeze a match's complete run under a name, with a report.", None),
     Deployed("finetune", "Train the embedded nets on reviewed labels.", "background"),
 )
 """Their names are also `flows.operations.plan.FLOWS`."""

@@ -11,7 +11,7 @@ from flows.operations.layout import StateFolder
 
 PREFECT_PORT = 4200
 METRICS_PORT = 8573
-FLOWS = ("match", "ingest", "reprocess", "finetune")
+FLOWS = ("match", "ingest", "reprocess", "release", "finetune")
 """What the Prefect server offers, known without importing Prefect."""
 
 

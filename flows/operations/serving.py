@@ -20,7 +20,7 @@ from data_contracts.operations import Service, Serving
 from flows.operations.health import at_prefect
 from flows.operations.layout import PRIORITIES
 from flows.operations.plan import ServePlan
-from flows.prefect_environment import served_environment
+from flows.prefect_environment import one_authority, served_environment
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.store import Store
 
@@ -253,6 +253,9 @@ def _environment(plan: ServePlan) -> dict[str, str]:
     values["WORLDPOSE_WORKERS"] = str(workers)
     if plan.dask is not None:
         values["WORLDPOSE_DASK"] = plan.dask
+    elif home is not None:
+        home.mkdir(parents=True, exist_ok=True)
+        values |= one_authority(home)
     return values
 
 

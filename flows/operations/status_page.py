@@ -141,7 +141,8 @@ def _cell(units: Sequence[UnitGlance]) -> str:
     words = "<br>".join([f"{counts['done']}/{len(units)} done", *others])
     since = [age(unit.waiting_since) for unit in units if unit.state == "waiting"]
     waits = f", for {_time(max(since))}" if since else ""
-    return f'<td class="{worst}">{words}{waits}<br><small>{_time(seconds)}</small></td>'
+    took = f"<br><small>{_time(seconds)}</small>" if seconds else ""
+    return f'<td class="{worst}">{words}{waits}{took}</td>'
 
 
 def _details(match: MatchGlance) -> str:

@@ -3,7 +3,7 @@
 import pytest
 from distributed import Client, LocalCluster, Worker, get_worker
 
-from flows.fan_out import on_workers_with
+from flows.fan_out import on_workers_with, task_count
 
 
 def where(number):
@@ -34,3 +34,8 @@ def test_work_goes_to_workers_with_the_tag_where_there_are_any(tag, places, clus
         with on_workers_with(tag, client):
             asked = [client.submit(where, number, pure=False) for number in range(8)]
         assert set(client.gather(asked)) == places
+
+
+@pytest.mark.parametrize(("workers", "tasks"), [(0, 20), (1, 20), (2, 40), (64, 200)])
+def test_many_units_share_as_many_tasks_as_keep_all_workers_busy(workers, tasks):
+    assert task_count(workers) == tasks

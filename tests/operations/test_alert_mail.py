@@ -20,10 +20,10 @@ ALERT = Alert(
 
 
 class Conversation(socketserver.StreamRequestHandler):
-    """One client's session as RFC 5321 has it, with PLAIN log-in."""
+    """One client's session as RFC 5321 has it, with PLAIN log-in and the STARTTLS of RFC 3207."""
 
     def setup(self):
-        if self.server.tls is not None:
+        if self.server.tls is not None and not self.server.is_asked_for_tls:
             self.request = self.server.tls.wrap_socket(self.request, server_side=True)
         super().setup()
 
@@ -33,8 +33,15 @@ class Conversation(socketserver.StreamRequestHandler):
         while line := self.rfile.readline():
             verb, _, rest = line.decode().strip().partition(" ")
             verb = verb.upper()
+            self.server.verbs.append(verb)
             if verb == "EHLO":
-                self.say("250-test\r\n250 AUTH PLAIN")
+                is_bare = not isinstance(self.request, ssl.SSLSocket)
+                offered = "250-STARTTLS\r\n" * (is_bare and self.server.is_asked_for_tls)
+                self.say(f"250-test\r\n{offered}250 AUTH PLAIN")
+            elif verb == "STARTTLS":
+                self.say("220 go on")
+                self.request = self.server.tls.wrap_socket(self.request, server_side=True)
+                super().setup()
             elif verb == "AUTH":
                 _, user, password = base64.b64decode(rest.split()[1]).decode().split("\0")
                 self.server.logins.append((user, password))
@@ -66,11 +73,12 @@ def post_office():
     """A function that begins a mail server, which keeps letters and log-ins."""
     servers = []
 
-    def begin(tls=None):
+    def begin(tls=None, is_asked_for_tls=False):
         server = socketserver.ThreadingTCPServer(("127.0.0.1", 0), Conversation)
-        server.tls, server.letters, server.logins, server.answers = tls, [], [], []
+        server.tls, server.is_asked_for_tls = tls, is_asked_for_tls
+        server.letters, server.logins, server.answers, server.verbs = [], [], [], []
         server.port = server.server_address[1]
-        Thread(target=server.serve_forever, daemon=True).start()
+        Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
         servers.append(server)
         return server
 
@@ -94,14 +102,22 @@ def test_an_alert_is_a_letter_to_all_who_are_named(post_office, tmp_path):
     assert message.get_payload() == "run m failed: it\r\nhas two lines\r\n\r\nhttp://here/run\r\n"
 
 
-def test_a_password_goes_under_tls_alone(post_office, tmp_path, monkeypatch, caplog):
+@pytest.fixture
+def localhost_tls(tmp_path):
+    """A server's TLS as `localhost`, and the file of its certificate, which nobody vouches for."""
     key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
-    make = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2"]
+    curve = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1"]
+    make = ["openssl", "req", "-x509", *curve, "-nodes", "-days", "2"]
     named = ["-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost"]
     files = ["-keyout", str(key), "-out", str(certificate)]
     subprocess.run([*make, *named, *files], check=True, capture_output=True)
     tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     tls.load_cert_chain(certificate, key)
+    return tls, certificate
+
+
+def test_a_password_goes_under_tls_alone(post_office, localhost_tls, tmp_path, monkeypatch, caplog):
+    tls, certificate = localhost_tls
     secure, plain = post_office(tls), post_office()
     who = "ann:a%40secret@localhost"
     mail = Mail.at(f"smtps://{who}:{secure.port}/?to=ann@example.org&from=worldpose@example.org")
@@ -115,6 +131,25 @@ def test_a_password_goes_under_tls_alone(post_office, tmp_path, monkeypatch, cap
     bare = Mail.at(f"smtp://{who}:{plain.port}/?to=ann@example.org")
     assert Teller(StateFolder(tmp_path / "two"), [bare]).tell([ALERT]) == []
     assert (plain.logins, plain.letters) == ([], [])
+    assert "secret" not in caplog.text
+
+
+def test_a_server_that_offers_starttls_gets_log_in_and_letter_under_it(
+    post_office, localhost_tls, tmp_path, monkeypatch, caplog
+):
+    tls, certificate = localhost_tls
+    server = post_office(tls, is_asked_for_tls=True)
+    mail = Mail.at(f"smtp://ann:a%40secret@localhost:{server.port}/?to=ann@example.org")
+    teller = Teller(StateFolder(tmp_path), [mail])
+    assert teller.tell([ALERT]) == []
+    # A certificate that nobody vouches for was refused: nothing was said after it.
+    assert server.verbs == ["EHLO", "STARTTLS"]
+    monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+    server.verbs.clear()
+    assert teller.tell([ALERT]) == [ALERT]
+    assert server.verbs[:4] == ["EHLO", "STARTTLS", "EHLO", "AUTH"]
+    assert server.logins == [("ann", "a@secret")]
+    assert server.letters[0]["to"] == ["ann@example.org"]
     assert "secret" not in caplog.text
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import importlib
+from pathlib import Path
 
 import pytest
 from prefect import Flow
@@ -11,11 +12,13 @@ from prefect.settings import PREFECT_API_URL, temporary_settings
 from prefect.states import Cancelling, Completed, Crashed, Running, Suspended
 
 from flows.operations import recovery
+from flows.operations.deployed import release_folder
 from flows.operations.deployments import DEPLOYED, install
 from flows.operations.plan import FLOWS, ServePlan
 from flows.operations.recovery import begin_again
 from flows.operations.watching import failed_runs
-from worldpose.errors import InputError
+from worldpose.errors import InputError, UsageError
+from worldpose.store import Store
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +65,15 @@ def test_deployments_have_queues_by_priority_and_limits(plan):
     assert ServePlan.model_validate(ingest.parameters["plan"]) == plan
     (schedule,) = ingest.schedules
     assert schedule.schedule.interval.total_seconds() == 900.0
+
+
+def test_a_release_lies_in_the_project_under_a_name_that_leads_nowhere_else(tmp_path):
+    store = Store.create(tmp_path)
+    assert release_folder(store, "m", "v1.0", None) == tmp_path / "releases" / "m" / "v1.0"
+    assert release_folder(store, "m", "v1.0", "/elsewhere") == Path("/elsewhere")
+    for bad in ("", "../x", "/x", "a/b", ".hidden"):
+        with pytest.raises(UsageError, match="name"):
+            release_folder(store, "m", bad, None)
 
 
 def test_installed_again_changes_limits_and_another_project_is_refused(plan):

@@ -12,6 +12,7 @@ import yaml
 from flows.cli.serve import add_to
 
 INFRA = Path(__file__).parents[2] / "infra"
+KUSTOMIZATION = INFRA / "kubernetes" / "kustomization.yaml"
 COMPOSE = yaml.safe_load((INFRA / "compose" / "compose.yaml").read_text())
 SERVICES = COMPOSE["services"]
 
@@ -79,7 +80,7 @@ def test_prometheus_scrapes_services_that_are_there():
 
 
 def manifests():
-    files = yaml.safe_load((INFRA / "kubernetes" / "kustomization.yaml").read_text())["resources"]
+    files = yaml.safe_load(KUSTOMIZATION.read_text())["resources"]
     return [
         document
         for file in files
@@ -93,7 +94,7 @@ def named(manifest):
 
 def test_kubernetes_manifests_refer_to_what_is_there():
     known = {named(each): each for each in manifests()}
-    kustomization = (INFRA / "kubernetes" / "kustomization.yaml").read_text()
+    kustomization = KUSTOMIZATION.read_text()
     secrets = set(re.findall(r"--from-literal=([\w-]+)=", kustomization))
     for (kind, name), each in known.items():
         if kind == "Service":
@@ -124,7 +125,12 @@ def test_kubernetes_manifests_refer_to_what_is_there():
                 assert ("Service", host) in known, host
 
 
-@pytest.mark.skipif(shutil.which("kubectl") is None, reason="kubectl is not installed")
+def needs(tool):
+    """A mark: set-ups are looked at by their own tools where these are installed."""
+    return pytest.mark.skipif(shutil.which(tool) is None, reason=f"{tool} is not installed")
+
+
+@needs("kubectl")
 def test_kubectl_builds_the_kubernetes_set_up():
     built = subprocess.run(
         ["kubectl", "kustomize", INFRA / "kubernetes"], capture_output=True, text=True, check=True
@@ -133,6 +139,40 @@ def test_kubectl_builds_the_kubernetes_set_up():
     assert {each["metadata"]["namespace"] for each in documents} == {"worldpose"}
     assert "image: worldpose\n" not in built.stdout
     assert len(documents) == len(manifests()) + 1  # the settings that are made of literals
+
+
+@needs("kubernetes-validate")
+@pytest.mark.parametrize("version", ["1.28", "1.37"])
+def test_the_kubernetes_set_up_is_as_the_api_has_it(version):
+    files = sorted(set((INFRA / "kubernetes").glob("*.yaml")) - {KUSTOMIZATION})
+    command = ["kubernetes-validate", "--strict", "-k", version, *files]
+    said = subprocess.run(command, capture_output=True, text=True)
+    lines = (said.stdout + said.stderr).splitlines()
+    # It ends with 0 whatever it finds.
+    assert [line for line in lines if "passed for resource" not in line] == []
+    assert len(lines) == len(manifests())
+
+
+@needs("docker-compose")
+def test_compose_takes_its_set_up_and_refuses_one_without_secrets():
+    tool = shutil.which("docker-compose")
+    command = [tool, "-f", INFRA / "compose" / "compose.yaml", "--profile", "gpu"]
+    secrets = ["WORLDPOSE_REVIEW_TOKEN", "POSTGRES_PASSWORD", "S3_SECRET", "GRAFANA_PASSWORD"]
+    given = {"PATH": "/bin", **dict.fromkeys(secrets, "secret")}
+    built = subprocess.run([*command, "config"], capture_output=True, text=True, env=given)
+    assert built.returncode == 0, built.stderr
+    assert yaml.safe_load(built.stdout)["services"].keys() == SERVICES.keys()
+    for missing in secrets:
+        fewer = {name: value for name, value in given.items() if name != missing}
+        refused = subprocess.run([*command, "config"], capture_output=True, text=True, env=fewer)
+        assert refused.returncode != 0
+        assert missing in refused.stderr
+
+
+@needs("promtool")
+def test_promtool_takes_scrapes_and_rules():
+    for kind, name in (("config", "prometheus.yml"), ("rules", "alerts.yml")):
+        subprocess.run(["promtool", "check", kind, INFRA / "prometheus" / name], check=True)
 
 
 def test_the_batch_script_is_a_shell_script_that_asks_for_its_arguments():

@@ -253,6 +253,19 @@ def test_a_match_in_the_inbox_becomes_a_result_with_one_command(served, webhook,
     assert 'worldpose_matches{state="complete"} 1.0' in figures
     assert fetch(f"http://127.0.0.1:{served.ports['prefect']}/").startswith("<!")
 
+    # A release is begun in Prefect's dashboard, as this call of it does.
+    deployment = served.ask("/deployments/name/release/worldpose")["id"]
+    given = {"match_id": name, "name": "v1", "licence": "for tests"}
+    begun = served.ask(f"/deployments/{deployment}/create_flow_run", {"parameters": given})
+    wait_until(
+        lambda: served.ask(f"/flow_runs/{begun['id']}")["state_name"] == "Completed",
+        served.explain,
+    )
+    released = served.project / "releases" / name
+    assert json.loads((released / "v1" / "manifest.json").read_text())["release"] == "v1"
+    assert "body_fitting" in (released / "v1-report.html").read_text()
+    note("release")
+
     # The inbox is also gone through on schedule, and the webhook was told, each matter once.
     scheduled = {"flow_runs": {"tags": {"any_": ["auto-scheduled"]}, "name": {"any_": ["inbox"]}}}
     wait_until(lambda: served.ask("/flow_runs/filter", scheduled), served.explain)

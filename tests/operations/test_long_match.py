@@ -1,0 +1,112 @@
+"""A finished match of ninety minutes is found again at once."""
+
+import shutil
+import time
+from datetime import UTC, datetime
+
+import pytest
+import yaml
+from command_line import succeed
+
+from data_contracts.records import CONTRACT_VERSION
+from data_contracts.run import ResultManifest
+from flows.planning import plan_run
+from flows.registering import register
+from worldpose.store import Store
+from worldpose.store.canonical import digest
+from worldpose.store.documents import checksum_of, seal
+from worldpose.store.paths import MANIFEST, ResultId
+from worldpose.store.writer import content_of, stored_files
+from worldpose.synthetic import SCENARIOS, simulate_match
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
+
+CLIPS = 90
+"""Of a minute each."""
+FRAMES = 3000
+CAMERAS = 16
+FILES = {
+    "ingest": 21,
+    "static_calibration": 30,
+    "tracking": 31,
+    "triangulation": 300,
+    "bundle_adjustment": 45,
+    "retriangulation": 300,
+    "body_fitting": 180,
+    "broadcast_calibration": 100,
+    "broadcast_pooling": 20,
+    "refitting": 180,
+    "filtering": 107,
+}
+"""Of one unit of a minute, as a run of `match` left them."""
+
+
+def long_match(folder):
+    """A match folder of so many clips and cameras; what was seen in them is next to nothing."""
+    small = folder.with_name("small")
+    seen = {"duration": 0.2, "cameras": CAMERAS, "players": 1}
+    bare = {"calibrated": True, "stills": False, "video": False}
+    simulate_match(SCENARIOS["match"], 0, small, **seen, **bare)
+    shutil.copytree(small, folder)
+    spec = yaml.safe_load((small / "match.yaml").read_text())
+    (clip,) = spec["clips"]
+    spec["clips"] = [
+        {
+            **clip,
+            "id": f"clip{number:02d}",
+            "first_frame": number * FRAMES,
+            "frame_count": FRAMES,
+        }
+        for number in range(CLIPS)
+    ]
+    (folder / "match.yaml").write_text(yaml.safe_dump(spec))
+    of_clip = folder / "detections" / "clip.npz"
+    for clip in spec["clips"]:
+        shutil.copy(of_clip, of_clip.with_name(f"{clip['id']}.npz"))
+    of_clip.unlink()
+
+
+def publish(store, match, unit):
+    """The result of a planned unit, of as many files as it would have."""
+    minutes = CLIPS if unit.recipe.stage == "ingest" and unit.recipe.unit.startswith("cam") else 1
+    folder = store.blobs.staging()
+    for number in range(FILES[unit.recipe.stage] * minutes):
+        chunk = folder / f"array{number % 10}" / "c" / str(number // 10)
+        chunk.parent.mkdir(parents=True, exist_ok=True)
+        chunk.write_text(f"{unit.name} {number}")
+    files = stored_files(folder)
+    manifest = ResultManifest(
+        contract=CONTRACT_VERSION,
+        key=unit.key,
+        recipe=unit.recipe,
+        files=files,
+        content=content_of(files),
+        figures={"figure": 1.0},
+        created_at=datetime.now(UTC),
+        seconds=1.0,
+        run_id="0001",
+        checksum=digest(b""),
+    )
+    manifest = manifest.model_copy(update={"checksum": checksum_of(manifest)})
+    path = ResultId.of(unit.work(store.url, match, "0001")).path
+    assert store.blobs.publish_tree(folder, path, MANIFEST, seal(manifest))
+    return len(files)
+
+
+def test_a_finished_match_of_ninety_minutes_is_found_again_at_once(tmp_path, capsys):
+    long_match(tmp_path / "long")
+    store = Store.create(tmp_path / "project")
+    match, _ = register(store, tmp_path / "long")
+    planned = plan_run(store, match, {})
+    files = sum(publish(store, match, unit) for unit in planned)
+    assert files > 100_000
+    asked = ("run", tmp_path / "long", "--project", tmp_path / "project", "--json")
+    first = succeed(*asked).json  # its record is made
+    assert (first["executed"], first["reused"], first["failed"]) == (0, len(planned), 0)
+    began = time.monotonic()
+    again = succeed(*asked).json
+    seconds = time.monotonic() - began
+    assert (again["executed"], again["reused"], again["run"]) == (0, len(planned), first["run"])
+    with capsys.disabled():
+        print(f"\n{len(planned)} units of {files} files: {seconds:.1f} s")
+    assert seconds < 30.0
