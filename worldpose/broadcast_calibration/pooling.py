@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
@@ -49,7 +49,7 @@ def pool_centers(centers: Sequence[Floats], covariances: Sequence[Floats]) -> Po
         [(c - middle) @ i @ (c - middle) for c, i in zip(centers, information, strict=True)]
     )
     freedom = 3 * (len(centers) - 1)
-    agree = freedom == 0 or bool(squared.sum() < chi2.isf(_UNLIKELY, freedom))
+    agree = freedom == 0 or bool(squared.sum() < chdtri(freedom, _UNLIKELY))
     nothing = np.full(3, np.nan)
     return PooledCenter(middle if agree else nothing, np.asarray(whole), agree, np.sqrt(squared))
 

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from worldpose.cameras import Camera
 from worldpose.errors import InputError
@@ -124,7 +124,7 @@ def refine_on_lines(
     # Neighbours tell partly the same: their variances grow until together they tell what they do.
     found = search.reweighed(found, inliers, excess / independent)
     distance = search.distance(found.camera)
-    if chi2.sf(distance**2, search.free.sum()) < settings.contradiction:
+    if chdtrc(search.free.sum(), distance**2) < settings.contradiction:
         return _kept(
             start,
             "the lines contradict the clicks: the camera would move by "
