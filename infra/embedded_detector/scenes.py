@@ -38,6 +38,7 @@ class SceneKind:
         person_height: of people in the middle of the pictures [px].
         hazy: share of scenes with fog [1].
         fog: thickest [1/m].
+        movements: chances of a match, a corner, people who wander, and people whose ways cross [1].
     """
 
     first_seed: int
@@ -46,6 +47,7 @@ class SceneKind:
     person_height: tuple[float, float] = (36.0, 140.0)
     hazy: float = 0.15
     fog: float = 0.006
+    movements: tuple[float, float, float, float] = (0.3, 0.2, 0.35, 0.15)
 
 
 TRAINING = SceneKind(
@@ -53,6 +55,8 @@ TRAINING = SceneKind(
 )
 VARIETY = replace(TRAINING, first_seed=50_000)
 """More stadiums, kits and people, in fewer pictures each."""
+CROWDS = replace(TRAINING, first_seed=60_000, movements=(0.1, 0.7, 0.1, 0.1))
+"""Mostly corners: people who hide one another."""
 CHECKING = SceneKind(20_000, TRAINING.patterns, TRAINING.heights)
 HELD_OUT = SceneKind(30_000, PATTERNS, (1.60, 2.02))
 """Kits with patterns that training has not seen, and shorter and taller people."""
@@ -147,9 +151,7 @@ def _shown(person_ids: NDArray[np.int16], pixels: NDArray[np.float64]) -> NDArra
 
 
 def _scenario(kind: SceneKind, rng: np.random.Generator) -> Scenario:
-    movement = str(
-        rng.choice(["football", "corner", "wander", "crossing"], p=[0.3, 0.2, 0.35, 0.15])
-    )
+    movement = str(rng.choice(["football", "corner", "wander", "crossing"], p=kind.movements))
     people = {"football": 25, "corner": 18}.get(movement, int(rng.integers(6, 17)))
     side = float(rng.uniform(10.0, 26.0))
     center = (

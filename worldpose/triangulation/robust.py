@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -13,6 +13,7 @@ from worldpose.cameras import Camera
 from worldpose.triangulation.array_checks import check_arrays
 from worldpose.triangulation.calibration_errors import stated_errors
 from worldpose.triangulation.exchanges import find_exchanges, undo_exchanges
+from worldpose.triangulation.limbs import limb_lengths, mend_limbs
 from worldpose.triangulation.midhip import midhip_shift
 from worldpose.triangulation.noise_model import NoiseModel, learn_noise
 from worldpose.triangulation.observations import Rig
@@ -37,10 +38,16 @@ class DetectorModel:
         noise: what the detector's errors are taken to be in each pass: without calibration's
             share, with it, and without the offsets.
         factor: on the variance that calibration is stated to have.
+        lengths: (persons, limbs) [m] of everybody's limbs; NaN where nothing tells.
     """
 
     noise: tuple[NoiseModel, ...]
     factor: float
+    lengths: Floats
+
+    def of_person(self, person: int) -> DetectorModel:
+        """Return the model for one person alone."""
+        return replace(self, lengths=self.lengths[person : person + 1])
 
 
 @dataclass(frozen=True)
@@ -121,7 +128,9 @@ def triangulate_joints(
     """
     check_arrays(cameras, keypoints, confidence, detection_index, camera_covariance)
     arrays = (keypoints, confidence, detection_index)
-    if model is None and (settings.learn_noise or settings.offsets == "body"):
+    if model is None and (
+        settings.learn_noise or settings.offsets == "body" or settings.mend_limbs
+    ):
         chosen = sample_frames(detection_index.shape, confidence.shape[-1])
         some = (keypoints[chosen], confidence[chosen], detection_index[chosen])
         model = learn_detector(cameras, *some, settings, camera_covariance)
@@ -232,7 +241,11 @@ def _passes(
         shift, further = found.shift, found.covariance
         misplaced = stated.misplaced(factor)
         solution = solved(shift)
-    model = DetectorModel(tuple(models), factor)
+    lengths = limb_lengths(solution) if known is None else known.lengths
+    if settings.mend_limbs:
+        seen = (rig, keypoints, models[-1].precision(confidence), index, shift)
+        mend_limbs(*seen, settings, solution, lengths)
+    model = DetectorModel(tuple(models), factor, lengths)
     return _Passes(solution, exchanged, shift, further, model, misplaced)
 
 

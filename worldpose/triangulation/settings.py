@@ -40,6 +40,9 @@ class TriangulationSettings(Record):
     joint ten times as far along the rays as across them."""
     undo_exchanges: bool = True
     """Put right detections whose left and right the other views show to be exchanged."""
+    mend_limbs: bool = True
+    """Where few views carry the end of a limb of strange length, choose those that keep its length,
+    or leave it out."""
     offsets: Literal["none", "midhip", "body"] = "body"
     """How calibration errors are kept from a person's pose (T4): "none" takes the cameras as
     exact; "midhip" moves every picture of a person so that the mid-hips meet, as the paper does;

@@ -147,7 +147,8 @@ def learn_clip(
     def stretch(person: int, frames: slice) -> tuple[Floats, Floats, Floats]:
         keypoints, confidence, index = detections.between(frames.start, frames.stop)
         alone = (keypoints, confidence, index[:, :, person : person + 1])
-        raw = triangulate_joints(cameras, *alone, settings, camera_covariance, detector)
+        known = detector.of_person(person)
+        raw = triangulate_joints(cameras, *alone, settings, camera_covariance, known)
         keypoints, confidence = undo_exchanges(*alone, raw.exchanged)
         arrays = (keypoints, raw.noise.precision(confidence), alone[2], raw.offsets)
         return (*person_observations(arrays, 0), raw.joints[:, 0])

@@ -13,6 +13,10 @@ MIRRORED = [
 """The same joint on the other side."""
 
 
+SWINGING = np.array([0, 0, 0, 0, 0, 1, 2, 1, 2, 1, 2, 3, 4, 3, 4, 3, 4])
+"""Which part of the body a joint swings with: head, arms, legs. Limbs stay as long as they are."""
+
+
 def runner(frames: int, persons: int = 2, seed: int = 0) -> np.ndarray:
     """Joints (frames, persons, 17, 3) [m] on circles, limbs swinging at 2 Hz."""
     rng = np.random.default_rng(seed)
@@ -22,7 +26,7 @@ def runner(frames: int, persons: int = 2, seed: int = 0) -> np.ndarray:
     radius = np.linspace(2.0, 3.0, persons)
     turn = 1.5 * time + phase
     way = np.stack([radius * np.cos(turn), radius * np.sin(turn), 0 * turn], axis=-1)
-    swing = 0.15 * np.sin(4 * np.pi * time[..., None] + np.arange(17))
+    swing = 0.15 * np.sin(4 * np.pi * time[..., None] + SWINGING)
     return body + way[:, :, None] + swing[..., None] * [1.0, 0.5, 0.2]
 
 

@@ -1,0 +1,115 @@
+import numpy as np
+import pytest
+
+from data_contracts.conventions import COCO17
+from worldpose.triangulation import TriangulationSettings, triangulate_joints
+from worldpose.triangulation.limbs import FEWEST, LIMBS, limb_lengths
+from worldpose.triangulation.observations import Rig
+from worldpose.triangulation.solving import no_shift, solve
+
+# Noise as stated: exact views do not make the least disagreement count.
+SETTINGS = TriangulationSettings(learn_noise=False, offsets="none")
+AS_THEY_AGREE = SETTINGS.model_copy(update={"mend_limbs": False})
+ANKLE, WRIST, ELBOW = (COCO17.index(f"left_{name}") for name in ("ankle", "wrist", "elbow"))
+SHANK = 0.4
+BAD = 7
+
+
+def walker(frames=12):
+    """Joints (frames, 1, 17, 3) of somebody who walks 2 cm a frame and keeps his pose."""
+    body = np.zeros((17, 3))
+    body[:5] = [0.1, 0.0, 1.7]
+    for side, (shoulder, elbow, wrist, hip, knee, ankle) in (
+        (1.0, (5, 7, 9, 11, 13, 15)),
+        (-1.0, (6, 8, 10, 12, 14, 16)),
+    ):
+        body[shoulder] = [0.0, 0.2 * side, 1.45]
+        body[elbow] = [0.0, 0.25 * side, 1.16]
+        body[wrist] = [0.12, 0.25 * side, 0.95]
+        body[hip] = [0.0, 0.15 * side, 0.9]
+        body[knee] = [0.05, 0.15 * side, 0.1 + SHANK]
+        body[ankle] = [0.05, 0.15 * side, 0.1]
+    body[1:5, 1] = [0.03, -0.03, 0.07, -0.07]
+    return (body + 0.02 * np.arange(frames)[:, None, None] * [1.0, 0.0, 0.0])[:, None]
+
+
+def misled(camera, arrays, joints, joint, one, two, ahead=0.8):
+    """Let one view see a joint of one frame as a point on its way to another camera looks."""
+    keypoints, confidence, index = (array.copy() for array in arrays)
+    true = joints[BAD, 0, joint]
+    way = camera.center[two] - true
+    wrong = true + ahead * way / np.linalg.norm(way)
+    keypoints[BAD, one, 0, joint] = camera[np.array([one])].project(wrong[None, None])[0, 0]
+    return (keypoints, confidence, index), wrong
+
+
+def test_of_pairs_that_agree_as_well_the_one_that_keeps_the_limb_decides(ring, seen):
+    camera, joints = ring(3), walker()
+    arrays, wrong = misled(camera, seen(camera, joints), joints, ANKLE, 0, 1)
+    # The true pair agrees to 3 px, the wrong one exactly: looked at alone, that is the better one.
+    arrays[0][BAD, 2, 0, ANKLE] += [0.0, 3.0]
+    alone = triangulate_joints(camera, *arrays, AS_THEY_AGREE)
+    assert np.linalg.norm(alone.joints[BAD, 0, ANKLE] - wrong) < 0.01
+    mended = triangulate_joints(camera, *arrays, SETTINGS)
+    # 3 px are 6 cm at 30 m.
+    assert np.linalg.norm(mended.joints[BAD, 0, ANKLE] - joints[BAD, 0, ANKLE]) < 0.06
+    assert mended.inliers[BAD, :, 0, ANKLE].tolist() == [False, True, True]
+    assert mended.views[BAD, 0, ANKLE] == 2
+    others = np.delete(np.arange(17), ANKLE)
+    np.testing.assert_array_equal(mended.joints[:, :, others], alone.joints[:, :, others])
+
+
+def test_end_that_two_views_alone_place_far_from_its_limb_is_missing(ring, seen):
+    camera, joints = ring(4)[np.array([0, 1])], walker()
+    arrays, wrong = misled(camera, seen(camera, joints), joints, WRIST, 0, 1)
+    alone = triangulate_joints(camera, *arrays, AS_THEY_AGREE)
+    assert np.linalg.norm(alone.joints[BAD, 0, WRIST] - wrong) < 0.01
+    mended = triangulate_joints(camera, *arrays, SETTINGS)
+    for name in ("joints", "covariance", "reprojection_error", "spread"):
+        assert np.isnan(getattr(mended, name)[BAD, 0, WRIST]).all()
+    assert mended.views[BAD, 0, WRIST] == 0
+    assert not mended.inliers[BAD, :, 0, WRIST].any()
+    assert np.isfinite(mended.joints).all(axis=-1).sum() == joints[..., 0].size - 1
+
+
+def test_upper_limb_and_sure_wrist_place_an_elbow(ring, seen):
+    camera, joints = ring(4), walker()
+    arrays, _ = misled(camera, seen(camera, joints), joints, ELBOW, 0, 1)
+    arrays[0][BAD, 2, 0, ELBOW] += [0.0, 3.0]
+    arrays[0][BAD, 3, 0, ELBOW] = np.nan
+    mended = triangulate_joints(camera, *arrays, SETTINGS)
+    assert np.linalg.norm(mended.joints[BAD, 0, ELBOW] - joints[BAD, 0, ELBOW]) < 0.06
+
+
+def test_what_three_views_agree_on_stays_however_long_the_limb(ring, seen):
+    camera, joints = ring(4), walker()
+    joints[BAD, 0, ANKLE] += [0.0, 0.0, 1.0]
+    arrays = seen(camera, joints)
+    result = triangulate_joints(camera, *arrays, SETTINGS)
+    np.testing.assert_array_equal(
+        result.joints, triangulate_joints(camera, *arrays, AS_THEY_AGREE).joints
+    )
+
+
+@pytest.mark.parametrize("frames", [FEWEST - 1, FEWEST])
+def test_lengths_need_five_frames(ring, seen, frames):
+    camera, joints = ring(3), walker(frames)
+    keypoints, confidence, index = seen(camera, joints)
+    found = solve(Rig.of(camera), keypoints, confidence, index, no_shift(), SETTINGS)
+    lengths = limb_lengths(found)
+    assert lengths.shape == (1, len(LIMBS))
+    if frames < FEWEST:
+        assert np.isnan(lengths).all()
+    else:
+        # Exact views: rounding of single precision is not involved.
+        np.testing.assert_allclose(lengths[0, -2:], SHANK, atol=1e-6)
+        np.testing.assert_allclose(lengths[0, 2:4], np.hypot(0.12, 0.21), atol=1e-6)
+
+
+def test_limb_that_is_hardly_ever_as_long_tells_nothing(ring, seen):
+    camera, joints = ring(3), walker()
+    joints[:, 0, ANKLE, 2] -= np.linspace(0.0, 0.3, len(joints))
+    keypoints, confidence, index = seen(camera, joints)
+    found = solve(Rig.of(camera), keypoints, confidence, index, no_shift(), SETTINGS)
+    known = np.isfinite(limb_lengths(found)[0])
+    assert known.tolist() == [end[1] != ANKLE for end in LIMBS]

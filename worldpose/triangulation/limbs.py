@@ -1,0 +1,299 @@
+"""Limbs that change their length: ends that the wrong two views have placed (T3).
+
+Where one of three views is wrong, any two may agree about as well. The pair that leaves the
+person's limbs as long as they are is the right one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17
+from worldpose.cameras import projection
+from worldpose.triangulation.observations import Rig
+from worldpose.triangulation.settings import TriangulationSettings
+from worldpose.triangulation.solving import Solution, solve
+
+Floats = NDArray[np.float64]
+
+LIMBS: Final = tuple(
+    (COCO17.index(f"{side}_{upper}"), COCO17.index(f"{side}_{lower}"))
+    for upper, lower in (
+        ("shoulder", "elbow"),
+        ("elbow", "wrist"),
+        ("hip", "knee"),
+        ("knee", "ankle"),
+    )
+    for side in ("left", "right")
+)
+"""Upper and lower ends, left before right."""
+SURE: Final = 3
+"""Agreeing views that tell how long a limb is; with no more an end may be placed by chance."""
+FEWEST: Final = 5
+"""Frames that tell how long a limb is."""
+SLACK: Final = 0.03
+"""Standard deviation of a limb's length from frame to frame [m]: what is labelled as a hip from
+behind is another point than from the side."""
+STRANGE: Final = 4.0
+"""Square of a length's deviation from which on other pairs are tried [variances]."""
+RARE: Final = 6.6
+"""The same, from which on an end that two views alone carry is missing: one honest in a hundred."""
+
+
+def limb_lengths(found: Solution) -> Floats:
+    """Return how long everybody's limbs are (persons, limbs) [m]; NaN where nothing tells.
+
+    A length is the median over the frames in which three views agree on both ends; over all
+    frames where those are too few. A limb whose length is hardly ever the same tells nothing.
+
+    Args:
+        found: joints of frames all over a clip.
+    """
+    persons, joints = found.joints.shape[1:3]
+    lengths = np.full((persons, len(LIMBS)), np.nan)
+    if joints != len(COCO17):
+        return lengths
+    for number, (upper, lower) in enumerate(LIMBS):
+        there = np.linalg.norm(found.joints[:, :, upper] - found.joints[:, :, lower], axis=-1)
+        sure = np.minimum(found.views[:, :, upper], found.views[:, :, lower]) >= SURE
+        for person in range(persons):
+            known = there[:, person][sure[:, person]]
+            if len(known) < FEWEST:
+                known = there[:, person][np.isfinite(there[:, person])]
+            if len(known) < FEWEST:
+                continue
+            usual = np.median(known)
+            if np.median(np.abs(known - usual)) <= SLACK:
+                lengths[person, number] = usual
+    return lengths
+
+
+def mend_limbs(
+    rig: Rig,
+    keypoints: NDArray[np.floating],
+    precision: Floats,
+    index: NDArray[np.integer],
+    shift: Floats,
+    settings: TriangulationSettings,
+    found: Solution,
+    lengths: Floats,
+) -> None:
+    """Place anew, in place, ends that few views carry of limbs whose length is strange.
+
+    Of all pairs of views those decide, for the two limbs of an arm or leg together, which the
+    other views and the limbs' lengths contradict least. Where even that leaves a limb of another
+    length, its end is missing.
+
+    Args:
+        rig: the cameras.
+        keypoints: (frames, cameras, detections, joints, 2) [px].
+        precision: (frames, cameras, detections, joints), as in `solve`.
+        index: (frames, cameras, persons), place among the detections; -1 = not seen.
+        shift: (frames, cameras, persons, 3), as in `solve`.
+        settings: noise, agreement and least views.
+        found: joints from the same arrays; changed.
+        lengths: (persons, limbs) of `limb_lengths`.
+    """
+    if found.joints.shape[2] != len(COCO17):
+        return
+    for number, (upper, middle) in enumerate(LIMBS):
+        if number % 4 > 1:
+            continue
+        chain = (upper, middle, LIMBS[number + 2][1])
+        long = lengths[:, number : number + 4 : 2]
+        views = found.views[:, :, chain[1:]]
+        seen = found.seen[..., chain[1:]].sum(axis=1)
+        few = (views > 0) & ((views <= SURE) | (2 * views <= seen))
+        ends = [(found.joints[:, :, joint], found.covariance[:, :, joint]) for joint in chain]
+        first, second = (_deviation(*ends[n], *ends[n + 1], long[:, n])[0] for n in (0, 1))
+        strange = few[..., 0] & ((first > STRANGE) | (second > STRANGE))
+        strange |= few[..., 1] & (second > STRANGE)
+        for frame, person in np.argwhere(strange):
+            choices = []
+            for joint, doubtful in zip(chain[1:], few[frame, person], strict=True):
+                who = np.maximum(index[frame, :, person], 0)
+                place = (frame, np.arange(len(who)), who, joint)
+                there = found.seen[frame, :, person, joint] & doubtful
+                weights = np.where(there, precision[place], 0.0)
+                moved = shift[frame : frame + 1, :, person : person + 1] if len(shift) else shift
+                observed = (keypoints[place], weights, moved)
+                choices.append(_choices(rig, observed, settings, found, (frame, person, joint)))
+            root = (ends[0][0][frame, person], ends[0][1][frame, person])
+            limit = settings.max_deviation**2
+            _choose(root, choices, long[person], limit, found, (frame, person, *chain[1:]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Choices:
+    """Where an end may be.
+
+    Attributes:
+        points: (choices, 3) [m], world.
+        covariance: (choices, 3, 3) [m^2].
+        cost: (choices,) by which its views contradict each.
+        tried: what is known of each; None of an end that stays.
+    """
+
+    points: Floats
+    covariance: Floats
+    cost: Floats
+    tried: Solution | None
+
+
+def _choices(
+    rig: Rig,
+    observed: tuple[NDArray[np.floating], Floats, Floats],
+    settings: TriangulationSettings,
+    found: Solution,
+    end: tuple[int, int, int],
+) -> _Choices:
+    """Return where pairs of views, and those that agree with them, put an end.
+
+    Args:
+        rig: the cameras.
+        observed: pixels (cameras, 2), precision (cameras,), 0 = not seen, and shift of one person;
+            an end that nobody sees stays.
+        settings: noise, agreement and least views.
+        found: joints.
+        end: frame, person, joint.
+    """
+    pixels, weights, shift = observed
+    pairs = np.array(list(combinations(np.flatnonzero(weights > 0.0), 2)))
+    if not len(pairs):
+        here = (found.joints[end][None], found.covariance[end][None])
+        return _Choices(*here, np.zeros(1), None)
+    used = np.zeros((len(pairs), len(weights)), np.bool_)
+    np.put_along_axis(used, pairs, values=True, axis=1)
+    seen = np.repeat(pixels[None, :, None, None], len(pairs), axis=0)
+    moved = np.repeat(shift, len(pairs), axis=0)
+    nobody_else = np.zeros((*used.shape, 1), np.int64)
+
+    def placed(views: NDArray[np.bool_]) -> tuple[Solution, Floats]:
+        some = np.where(views, weights, 0.0)[:, :, None, None]
+        points = solve(rig, seen, some, nobody_else, moved, settings)
+        at = points.joints[:, 0, 0]
+        return points, _misfit(rig, pixels, weights, shift, settings.noise, at)
+
+    limit = settings.max_deviation**2
+    _, misfit = placed(used)
+    tried, misfit = placed(misfit <= limit)
+    # To leave out a view that is hardly known costs less.
+    some = np.where(weights > 0.0, weights, 1.0)
+    most = np.maximum(limit + 2.0 * np.log(some / weights.max()), 0.0)
+    cost = np.where(misfit <= limit, np.minimum(misfit, most), most)
+    total = np.where(tried.views[:, 0, 0] > 0, cost[:, weights > 0.0].sum(axis=1), np.inf)
+    return _Choices(tried.joints[:, 0, 0], tried.covariance[:, 0, 0], total, tried)
+
+
+def _choose(
+    root: tuple[Floats, Floats],
+    choices: list[_Choices],
+    long: Floats,
+    limit: float,
+    found: Solution,
+    chain: tuple[int, int, int, int],
+) -> None:
+    """Place the two ends of an arm or a leg, in place.
+
+    Args:
+        root: where it begins (3,) and covariance (3, 3).
+        choices: of its middle and its end.
+        long: (2,) its limbs [m].
+        limit: largest squared deviation of a length that is right [variances].
+        found: joints; changed.
+        chain: frame, person, middle and end.
+    """
+    middle, end = choices
+    first, sure = _deviation(*root, middle.points, middle.covariance, long[0])
+    second, known = _deviation(
+        *(middle.points[:, None], middle.covariance[:, None], end.points, end.covariance),
+        long[1],
+    )
+    cost = (middle.cost + np.minimum(first, limit) + sure)[:, None] + end.cost
+    cost = cost + np.minimum(second, limit) + known
+    if not np.isfinite(cost).any():
+        return
+    one, other = np.unravel_index(int(cost.argmin()), cost.shape)
+    frame, person, *joints = chain
+    for joint, choice, best, off in (
+        (joints[0], middle, one, first[one]),
+        (joints[1], end, other, second[one, other]),
+    ):
+        here = (frame, person, joint)
+        views = (frame, slice(None), person, joint)
+        if choice.tried is None:
+            continue
+        alone = choice.tried.views[best, 0, 0] < SURE
+        if off > (RARE if alone else limit):
+            found.joints[here], found.covariance[here] = np.nan, np.nan
+            found.views[here], found.inliers[views] = 0, False
+            found.spread[here] = found.reprojection_error[here] = np.nan
+        else:
+            there = (best, 0, 0)
+            found.joints[here] = choice.points[best]
+            found.covariance[here] = choice.covariance[best]
+            found.views[here] = choice.tried.views[there]
+            found.spread[here] = choice.tried.spread[there]
+            found.reprojection_error[here] = choice.tried.reprojection_error[there]
+            found.inliers[views] = choice.tried.inliers[best, :, 0, 0]
+
+
+def _deviation(
+    upper: Floats,
+    covariance: Floats,
+    lower: Floats,
+    other_covariance: Floats,
+    long: Floats | float,
+) -> tuple[Floats, Floats]:
+    """How far limbs are from their lengths, and how sure that is.
+
+    Args:
+        upper: (..., 3) one end [m], world.
+        covariance: (..., 3, 3) of it [m^2].
+        lower: (..., 3) the other end.
+        other_covariance: (..., 3, 3) of it.
+        long: length [m].
+
+    Returns:
+        Squares (...) [variances] and logarithms of variances over the least one (...); both 0
+        where nothing tells.
+    """
+    limb = lower - upper
+    now = np.linalg.norm(limb, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        along = limb / now[..., None]
+        both = covariance + other_covariance
+        variance = SLACK**2 + np.einsum("...i,...ij,...j", along, both, along)
+        square = (now - long) ** 2 / variance
+    known = np.isfinite(square)
+    spread = np.log(np.where(known, variance, SLACK**2) / SLACK**2)
+    return np.where(known, square, 0.0), spread
+
+
+def _misfit(
+    rig: Rig,
+    pixels: NDArray[np.floating],
+    weights: Floats,
+    shift: Floats,
+    noise: tuple[float, float],
+    points: Floats,
+) -> Floats:
+    """Squared errors of views (points, cameras) [variances]; 0 of who does not see the joint."""
+    at = np.broadcast_to(points, (len(weights), *points.shape))
+    image = np.empty((*at.shape[:-1], 2))
+    projection.project(rig.cameras, np.ascontiguousarray(at), image)
+    depth = at @ rig.depths[:, :3, None] + rig.depths[:, 3, None, None]
+    size = np.prod(rig.cameras[:, :2], axis=1)[:, None] / depth[..., 0] ** 2
+    moved = shift[0, :, 0] if len(shift) else np.zeros((len(weights), 3))
+    error = image - (pixels - moved[:, :2])[:, None]
+    seen = weights > 0.0
+    variance = (noise[0] ** 2 + size * noise[1] ** 2) / np.where(seen, weights, 1.0)[:, None]
+    square = np.square(error).sum(axis=-1) / (variance + moved[:, 2:])
+    square = np.where(depth[..., 0] > 0.0, square, np.inf)
+    square = np.where(np.isfinite(points[:, 0]), square, np.inf)
+    return np.asarray(np.where(seen[:, None], square, 0.0).T)
