@@ -29,8 +29,8 @@ from worldpose.release.broadcast_pictures import (
     course_picture,
     most_moved,
 )
+from worldpose.release.html_page import Table
 from worldpose.release.overlay_video import overlay_frames
-from worldpose.release.report import Table
 from worldpose.release.stadium_pictures import camera_picture
 from worldpose.store import Run
 from worldpose.video import open_video, write_video

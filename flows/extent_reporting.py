@@ -8,9 +8,9 @@ from data_contracts.evaluation import Evaluation
 from data_contracts.release import DataSetStatistics
 from flows.release import broadcast_cameras, clips_of, joint_tracks
 from flows.stage import Match
-from worldpose.release import Picture, Section, Table
+from worldpose.release import Section
+from worldpose.release.data_set_page import counted_section
 from worldpose.release.statistics import clip_statistics, data_set_statistics, kind_of
-from worldpose.release.statistics_pictures import statistics_picture
 from worldpose.store import Run
 
 
@@ -34,49 +34,7 @@ def extent_of(run: Run, match: Match) -> DataSetStatistics:
 
 def extent_section(run: Run, match: Match) -> Section:
     """The row of the paper's table of data sets, its histograms, and each clip's share."""
-    found = extent_of(run, match)
-    row = (
-        found.camera or "-",
-        _number(found.subjects_per_frame, ".1f"),
-        f"{found.frames:,}",
-        f"{found.poses:,}",
-        f"{found.minutes:.2f}",
-        f"{found.distance_km:.3f}",
-        _number(found.speed_m_s, ".2f"),
-        _number(found.longest_trajectory_m, ".1f"),
-    )
-    columns = (
-        "camera",
-        ">people in a frame",
-        ">frames",
-        ">poses",
-        ">minutes",
-        ">distance km",
-        ">mean speed m/s",
-        ">longest way m",
-    )
-    blocks: list[Table | Picture] = [Table("", columns, (row,))]
-    if len(found.clips) > 1:
-        rows = tuple(
-            (
-                name,
-                clip.camera or "-",
-                f"{clip.frames:,}",
-                f"{clip.seconds:.1f}",
-                f"{clip.persons}",
-                f"{clip.poses:,}",
-                f"{sum(clip.trajectories_m):,.0f}",
-            )
-            for name, clip in found.clips.items()
-        )
-        titles = ("clip", "camera", ">frames", ">seconds", ">people", ">poses", ">distance m")
-        blocks.append(Table("Clips", titles, rows))
-    blocks.append(Picture("How far people go, and how long clips are.", statistics_picture(found)))
-    lead = (
-        "Camera: S stands still, M turns, M+Z also zooms. A pose is one person in one frame. "
-        "Distances are those over the ground, from frame to frame."
-    )
-    return Section("How much there is", tuple(blocks), lead)
+    return counted_section(extent_of(run, match))
 
 
 def tiles_of(run: Run, match: Match, scores: Evaluation | None) -> list[tuple[str, str]]:
@@ -97,7 +55,3 @@ def tiles_of(run: Run, match: Match, scores: Evaluation | None) -> list[tuple[st
 
 def _counted(found: DataSetStatistics) -> str:
     return "1 clip" if len(found.clips) == 1 else f"{len(found.clips)} clips"
-
-
-def _number(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)

@@ -18,6 +18,10 @@ def statistics(
         Path | None,
         typer.Option("--picture", help="Histograms of trajectory and clip lengths, as a PNG."),
     ] = None,
+    page: Annotated[
+        Path | None,
+        typer.Option("--page", help="One HTML page: what there is, and what `check` finds."),
+    ] = None,
     fps: Annotated[
         float | None,
         typer.Option("--fps", min=0.001, help="Frames in a second; the manifest's, or 50."),
@@ -37,6 +41,15 @@ def statistics(
 
         with whole_file(picture) as draft:
             draft.write_bytes(statistics_picture(found))
+    if page is not None:
+        from flows.checking import check
+        from worldpose.release.data_set_page import data_set_page
+        from worldpose.release.files import whole_file
+
+        checks = {str(folder): check(folder, fps=fps) for folder in folders}
+        title = ", ".join(folder.resolve().name for folder in folders)
+        with whole_file(page) as draft:
+            draft.write_text(data_set_page(title, found, checks), encoding="utf-8")
     if as_json:
         print_json(found.model_dump(mode="json"))
         return
@@ -63,8 +76,9 @@ def statistics(
             f"{found.subjects_per_frame:.1f} people in a frame, {found.speed_m_s:.1f} m/s, "
             f"trajectories up to {found.longest_trajectory_m or 0.0:.0f} m"
         )
-    if picture is not None:
-        line(f"wrote {picture}")
+    for written in (picture, page):
+        if written is not None:
+            line(f"wrote {written}")
 
 
 def add_to(app: typer.Typer) -> None:

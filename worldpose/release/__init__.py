@@ -9,8 +9,9 @@ from worldpose.release.archives import Member, read_archive, write_archive
 from worldpose.release.camera_file import read_camera, write_moving_camera, write_static_camera
 from worldpose.release.coco import coco_dataset, write_coco
 from worldpose.release.files import whole_file
+from worldpose.release.html_page import Picture, Section, Table
 from worldpose.release.joints_file import JointTracks, read_joints, write_joints
-from worldpose.release.report import CameraSummary, Picture, Section, Table, report_page
+from worldpose.release.report import CameraSummary, report_page
 from worldpose.release.scene import Scene
 
 __all__ = [

@@ -2,27 +2,13 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
-from importlib.resources import files
-from itertools import count
 
 from data_contracts.evaluation import Evaluation
 from data_contracts.run import RunRecord
+from worldpose.release.html_page import Failure, Folded, Section, Table, whole_page
 from worldpose.release.meanings import score_rows, shown_number
-from worldpose.release.scene import Scene, scene_html
-from worldpose.release.web_pictures import small_enough
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A PNG and what it shows."""
-
-    caption: str
-    png: bytes
 
 
 @dataclass(frozen=True)
@@ -50,40 +36,6 @@ class CameraSummary:
     weak: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class Table:
-    """A table with a heading.
-
-    Attributes:
-        heading: what it is about.
-        columns: their titles; ">" before one aligns numbers.
-        rows: of text.
-    """
-
-    heading: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-
-@dataclass(frozen=True)
-class Section:
-    """A part of the page that can be jumped to.
-
-    Attributes:
-        heading: also in the page's bar.
-        blocks: in this order.
-        lead: what a reader should know first.
-    """
-
-    heading: str
-    blocks: tuple[Picture | Table | Scene, ...]
-    lead: str = ""
-
-
-class Failure(str):
-    """Text of a table's cell that is shown as a failure."""
-
-
 def report_page(
     title: str,
     run: RunRecord,
@@ -103,81 +55,29 @@ def report_page(
         sections: what there is to see; those without blocks are left out.
         tiles: the few figures at the top, each with what it is.
     """
-    shown = [section for section in sections if section.blocks]
+    shown = list(sections)
     if scores is not None:
         rows = tuple(row[1:] for row in score_rows(scores))
         table = Table("", ("score", ">value", "what it says"), rows)
         shown.append(Section("Against the truth", (table,)))
-    script = _part("scene.js") if any(map(_has_scene, shown)) else ""
-    allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
-    policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-    policy += f"; script-src 'sha256-{allowed}'" if script else ""
-    numbers = count(1)
-    parts = "\n".join(_section(section, next(numbers)) for section in shown)
-    links = "".join(
-        f'<a href="#part{number}">{escape(section.heading)}</a>'
-        for number, section in enumerate(shown, 1)
+    return whole_page(
+        title,
+        f"Run {run.run_id} of match {run.match_id}, {run.started_at:%d %B %Y}: {run.state}",
+        shown,
+        tiles=tiles,
+        last=Folded("Record", _record(run, seconds)),
     )
-    marks = "".join(
-        f"<div><b>{escape(value)}</b><span>{escape(what)}</span></div>" for value, what in tiles
-    )
+
+
+def _record(run: RunRecord, seconds: Mapping[str, float]) -> tuple[Table, ...]:
+    """How it came about, for those who ask."""
+    settings = ("stage", "setting", "value")
     return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{_part('report.css')}</style>\n</head>\n<body>\n"
-        f"<header><div><h1>{escape(title)}</h1><p>Run {escape(run.run_id)} of match "
-        f"{escape(run.match_id)}, {run.started_at:%d %B %Y}: {escape(run.state)}</p>"
-        f'<div class="tiles">{marks}</div></div></header>\n'
-        f'<nav aria-label="Parts of this page"><div>{links}<a href="#record">Record</a></div>'
-        "</nav>\n"
-        f"<main>\n{parts}\n{_record(run, seconds)}\n</main>\n"
-        + (f"<script>{script}</script>\n" if script else "")
-        + "</body>\n</html>\n"
+        Table("What was run", ("", ""), tuple(_about(run))),
+        Table("Settings other than the defaults", settings, tuple(_settings(run))),
+        Table("Units of work", ("unit", "", ">seconds"), tuple(_units(run, seconds))),
+        Table("Quality figures", ("unit", "figure", ">value"), tuple(_figures(run))),
     )
-
-
-def _part(name: str) -> str:
-    """A file that pages are made of."""
-    return (files("worldpose.release") / "page" / name).read_text(encoding="utf-8")
-
-
-def _has_scene(section: Section) -> bool:
-    return any(isinstance(block, Scene) for block in section.blocks)
-
-
-def _section(section: Section, number: int) -> str:
-    lead = f'<p class="lead">{escape(section.lead)}</p>\n' if section.lead else ""
-    blocks = "\n".join(map(_block, section.blocks))
-    return (
-        f'<section id="part{number}"><h2>{escape(section.heading)}</h2>\n{lead}{blocks}</section>'
-    )
-
-
-def _block(block: Picture | Table | Scene) -> str:
-    if isinstance(block, Scene):
-        return scene_html(block)
-    if isinstance(block, Picture):
-        return _figure(block)
-    heading = f"<h3>{escape(block.heading)}</h3>\n" if block.heading else ""
-    return heading + _table(block.columns, block.rows)
-
-
-def _record(run: RunRecord, seconds: Mapping[str, float]) -> str:
-    """How it came about, for those who ask: folded."""
-    tables = (
-        ("What was run", ("", ""), _about(run)),
-        ("Settings other than the defaults", ("stage", "setting", "value"), _settings(run)),
-        ("Units of work", ("unit", "", ">seconds"), _units(run, seconds)),
-        ("Quality figures", ("unit", "figure", ">value"), _figures(run)),
-    )
-    folded = "\n".join(
-        f"<details{' open' if heading == 'What was run' else ''}><summary>{heading}</summary>"
-        f"{_table(columns, rows)}</details>"
-        for heading, columns, rows in tables
-        if rows
-    )
-    return f'<section id="record"><h2>Record</h2>\n{folded}</section>'
 
 
 def camera_table(cameras: Sequence[CameraSummary]) -> Table:
@@ -252,35 +152,3 @@ def _settings(run: RunRecord) -> list[tuple[str, ...]]:
         for stage, values in run.overrides.items()
         for name, value in values.items()
     ]
-
-
-def _figure(picture: Picture) -> str:
-    kind, content, (width, height) = small_enough(picture.png)
-    data = base64.b64encode(content).decode("ascii")
-    caption = escape(picture.caption)
-    return (
-        f'<figure><img alt="{caption}" width="{width}" height="{height}" decoding="async" '
-        f'src="data:image/{kind};base64,{data}">'
-        f"<figcaption>{caption}</figcaption></figure>"
-    )
-
-
-def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of plain text; columns from ">" on hold numbers."""
-    kinds = [' class="number"' if column.startswith(">") else "" for column in columns]
-    lines = []
-    if any(columns):
-        cells = (
-            f"<th{kind}>{escape(column.removeprefix('>'))}</th>"
-            for kind, column in zip(kinds, columns, strict=True)
-        )
-        lines.append(f"<tr>{''.join(cells)}</tr>")
-    for row in rows:
-        cells = (
-            f'<td class="bad">{escape(cell)}</td>'
-            if isinstance(cell, Failure)
-            else f"<td{kind}>{escape(cell)}</td>"
-            for kind, cell in zip(kinds, row, strict=True)
-        )
-        lines.append(f"<tr>{''.join(cells)}</tr>")
-    return '<div class="table"><table>\n' + "\n".join(lines) + "\n</table></div>"

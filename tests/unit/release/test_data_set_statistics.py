@@ -4,6 +4,7 @@ import io
 import itertools
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from matplotlib.image import imread
 from typer.testing import CliRunner
 
 from data_contracts.release import ClipStatistics
+from flows.checking import check
 from flows.cli import app
 from flows.statistics import count
 from worldpose.body import BodyParameters
@@ -115,12 +117,21 @@ def test_the_command_counts_as_the_library_does(tmp_path):
     bodies = BodyParameters(np.zeros(10), np.zeros(3), np.zeros(69), places.astype(np.float64))
     write_poses(tmp_path / "poses" / "C.npz", bodies, "open-neutral/2")
     picture = tmp_path / "lengths.png"
+    page = tmp_path / "page.html"
     asked = ["statistics", str(tmp_path), "--fps", "25", "--picture", str(picture), "--json"]
+    asked += ["--page", str(page)]
     answer = CliRunner().invoke(app, asked)
     assert answer.exit_code == 0
     found = count([tmp_path], fps=25.0)
     assert json.loads(answer.stdout) == found.model_dump(mode="json")
     assert imread(picture).shape[:2] == (462, 1540)
+    text = page.read_text()
+    assert f"<b>{found.poses:,}</b><span>3D poses</span>" in text
+    assert text.count('src="data:image/') == 1
+    # These people lie about in the air.
+    faults = re.findall('<td class="bad">([a-z_]+)</td>', text)
+    assert faults == [finding.fault for finding in check(tmp_path, fps=25.0).findings]
+    assert faults
 
 
 def test_a_gap_adds_no_way_and_heights_do_not_count():

@@ -118,7 +118,7 @@ def test_nothing_is_asked_from_outside():
     text = report_page("A run", run(), seconds={}, sections=pictured(Picture("from above", PNG)))
     page = Page(text)
     jumps = [address for address in page.addresses if address.startswith("#")]
-    assert jumps == ["#part1", "#record"]
+    assert jumps == ["#part1", "#last"]
     (data,) = [address for address in page.addresses if address not in jumps]
     assert data[:22] == "data:image/png;base64,"
     assert base64.b64decode(data[22:]) == PNG
