@@ -228,7 +228,7 @@ def _starting_cluster(request: RunRequest, missing: list[PlannedUnit]) -> LocalC
     workers = request.workers or min(os.cpu_count() or 1, max(stages.values()))
     given = dask.config.get("distributed.worker.preload")
     asked = [given] if isinstance(given, str) else given
-    preload = [*asked, "prefect_dask", *(f"tasks.{stage}" for stage in stages)]
+    preload = ["tasks.preload", *asked, "prefect_dask", *(f"tasks.{stage}" for stage in stages)]
     cluster = LocalCluster(**{**local_cluster(workers), "n_workers": 0, "preload": preload})
     cluster.scale(workers)
     return cluster

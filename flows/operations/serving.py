@@ -136,7 +136,7 @@ class _Supervisor:
                 stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                env=_environment(self.plan) | secrets,
+                env=environment_of(self.plan) | secrets,
                 start_new_session=True,  # Ctrl-C is for this process, which then ends its parts
             )
         part.began = time.monotonic()
@@ -245,7 +245,8 @@ def _wait_for(
             return
 
 
-def _environment(plan: ServePlan) -> dict[str, str]:
+def environment_of(plan: ServePlan) -> dict[str, str]:
+    """What every part of a served project has in its environment; secrets are not among it."""
     home = plan.state / "prefect" if plan.owns_prefect else None
     values = served_environment(plan.prefect, home)
     workers = plan.workers or max(1, (os.cpu_count() or 1) // plan.at_once)

@@ -102,7 +102,7 @@ def status_html(matches: Sequence[MatchGlance], arrivals: Iterable[Arrival], das
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>worldpose status</title>'
         f'<meta http-equiv="refresh" content="{REFRESH_SECONDS}">'
-        '<meta name="viewport" content="width=device-width">'
+        '<meta name="viewport" content="width=device-width"><link rel="icon" href="data:,">'
         '<link rel="stylesheet" href="/status/page.css"></head><body>'
         f'<header><h1>worldpose status</h1><span class="dim">{escape(said)}</span>'
         f'<a href="/">What waits for review</a>{link}</header>'
