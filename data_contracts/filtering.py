@@ -32,7 +32,7 @@ def _array(
 
 FILTERING = GroupLayout(
     stage="filtering",
-    about="Keypoints and boxes that fitted bodies contradict; the next iteration leaves them out.",
+    about="What fitted bodies say of detections: what the next iteration leaves out or takes off.",
     coordinates=(FRAME, PERSON),
     arrays=(
         _array(
@@ -71,8 +71,39 @@ FILTERING = GroupLayout(
             "nan",
             "mean cosine between the bones of a box and of the body it is judged by",
         ),
+        ArrayLayout(
+            name="shift",
+            dims=(*_DETECTION, "joint", "axis"),
+            dtype="float32",
+            unit="px",
+            missing="0",
+            about="by how far a keypoint is beside its joint for lasting reasons, the side that "
+            "the body is seen from and the camera's clock; the next iteration takes it off",
+            chunk_dim="frame",
+        ),
+        ArrayLayout(
+            name="view_bias",
+            dims=("joint", "axis", "wave"),
+            dtype="float64",
+            unit="m",
+            missing="none",
+            about="the part of `shift` that goes with the azimuth of the camera seen from the body",
+        ),
+        ArrayLayout(
+            name="clock_late",
+            dims=("camera",),
+            dtype="float64",
+            unit="frame",
+            missing="none",
+            about="frame t shows the time t + clock_late of the cameras' mean clock; told apart "
+            "from the cameras' places, unlike that of `triangulation`",
+        ),
     ),
-    labels={"joint": COCO17},
+    labels={
+        "joint": COCO17,
+        "axis": ("x", "y"),
+        "wave": ("cos2", "cos3", "sin2", "sin3"),
+    },
     attributes={"camera": "camera ids in the order of the camera dimension"},
 )
 """The detection dimension is the largest among the cameras; the order is that of `ingest` or

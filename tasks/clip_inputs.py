@@ -33,7 +33,11 @@ class StoredClip:
     """
 
     def __init__(
-        self, clips: Sequence[xr.Dataset], name: str, rejected: xr.DataArray | None = None
+        self,
+        clips: Sequence[xr.Dataset],
+        name: str,
+        rejected: xr.DataArray | None = None,
+        shift: xr.DataArray | None = None,
     ) -> None:
         arrays = [clip[name] for clip in clips]
         detections = max(1, *(array.sizes["detection"] for array in arrays))
@@ -41,6 +45,7 @@ class StoredClip:
         self.shape: tuple[int, ...] = (frames, len(arrays), detections, *rest)
         self._arrays = arrays
         self._rejected = rejected
+        self._shift = shift
         self._page = lru_cache(PAGES)(self._read)
 
     def __getitem__(self, frames: slice) -> NDArray[np.float64]:
@@ -58,6 +63,8 @@ class StoredClip:
         page = np.full((stop - start, *self.shape[1:]), np.nan, dtype=np.float32)
         for camera, array in enumerate(self._arrays):
             page[:, camera, : array.sizes["detection"]] = array[start:stop].values
+        if self._shift is not None:
+            page -= self._shift[start:stop].values
         if self._rejected is not None:
             page[self._rejected[start:stop].values] = np.nan
         return page
@@ -90,19 +97,23 @@ ADJUSTED = "bundle_adjustment/cameras"
 """All static cameras, where they are adjusted to people."""
 
 
-def open_clip(store: Store, work: Work, *, filtered: bool = True) -> ClipInputs:
+def open_clip(
+    store: Store, work: Work, *, filtered: bool = True, shifted: bool = True
+) -> ClipInputs:
     """The clip of `work`; its detections are read when they are used.
 
     Args:
         store: the store.
         work: the work under way.
         filtered: without what the bodies of the iteration before contradicted.
+        shifted: without what keypoints were beside those bodies by for lasting reasons.
     """
     first, count = work.recipe.sources["first_frame"], work.recipe.sources["frame_count"]
     where = slice(first, first + count - 1)
     seen = [open_input(store, work, name).sel(frame=where) for name in work.recipe.sources["seen"]]
-    rejected = _rejected(store, work, {work.recipe.unit: where}) if filtered else None
-    return _open(store, work, np.arange(first, first + count), seen, rejected)
+    said = _said_before(store, work, {work.recipe.unit: where})
+    rejected, shift = said["rejected"] if filtered else None, said["shift"] if shifted else None
+    return _open(store, work, np.arange(first, first + count), seen, rejected, shift)
 
 
 def open_frames(store: Store, work: Work, frames: Mapping[str, NDArray[np.int64]]) -> ClipInputs:
@@ -115,7 +126,7 @@ def open_frames(store: Store, work: Work, frames: Mapping[str, NDArray[np.int64]
         for c in range(len(work.recipe.sources["cameras"]))
     ]
     frame = np.concatenate(list(frames.values()))
-    some = _open(store, work, frame, seen, _rejected(store, work, frames))
+    some = _open(store, work, frame, seen, **_said_before(store, work, frames))
     keypoints, confidence = some.keypoints[: len(frame)], some.confidence[: len(frame)]
     return replace(some, keypoints=keypoints, confidence=confidence)
 
@@ -130,23 +141,27 @@ def _together(clips: Sequence[xr.Dataset]) -> xr.Dataset:
     return xr.concat(padded, dim="frame")
 
 
-def _rejected(
+def _said_before(
     store: Store, work: Work, frames: Mapping[str, NDArray[np.int64] | slice]
-) -> xr.DataArray | None:
-    """What the iteration before rejected, frames of each clip together; None in the first."""
+) -> dict[str, xr.DataArray | None]:
+    """What the iteration before said of keypoints, frame by frame; None in the first."""
     clips = [
-        open_input(store, work, name)["rejected"].sel(frame=where)
+        open_input(store, work, name)[["rejected", "shift"]].sel(frame=where)
         for clip, where in frames.items()
         if (name := f"filtering/{clip}") in work.recipe.inputs
     ]
-    if len(clips) < 2:
-        return clips[0] if clips else None
-    most = max(clip.sizes["detection"] for clip in clips)
-    padded = [
-        clip.pad(detection=(0, most - clip.sizes["detection"]), constant_values=False)
-        for clip in clips
-    ]
-    return xr.concat(padded, dim="frame")
+    if not clips:
+        return {"rejected": None, "shift": None}
+    together = clips[0]
+    if len(clips) > 1:
+        most = max(clip.sizes["detection"] for clip in clips)
+        nothing = {"rejected": False, "shift": 0.0}
+        padded = [
+            clip.pad(detection=(0, most - clip.sizes["detection"]), constant_values=nothing)
+            for clip in clips
+        ]
+        together = xr.concat(padded, dim="frame")
+    return {"rejected": together["rejected"], "shift": together["shift"]}
 
 
 def _open(
@@ -155,6 +170,7 @@ def _open(
     frame: NDArray[np.int64],
     seen: Sequence[xr.Dataset],
     rejected: xr.DataArray | None,
+    shift: xr.DataArray | None,
 ) -> ClipInputs:
     """Match frames, with whom each camera saw in them.
 
@@ -168,7 +184,7 @@ def _open(
         cameras=cameras,
         camera_covariance=covariance,
         frame=frame,
-        keypoints=StoredClip(seen, "keypoints", rejected),
+        keypoints=StoredClip(seen, "keypoints", rejected, shift),
         confidence=StoredClip(seen, "confidence", rejected),
         fps=float(sources["fps"]),
     )

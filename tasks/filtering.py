@@ -15,15 +15,18 @@ from tasks.spool import spooling
 from tasks.triangulation import settings_before
 from tasks.unit import open_input, unit_task
 from worldpose.filtering import (
+    BodyMotion,
     BodyViews,
     FilteringSettings,
     Judgement,
     Suspects,
     judge_detections,
     learn_from,
+    learn_habits,
     measure_held_out,
     perceived_joints,
     view_bodies,
+    watch_motion,
 )
 from worldpose.store import Store
 from worldpose.triangulation import TriangulationSettings
@@ -40,12 +43,24 @@ def filtering(work: Work) -> str:
     with store.publishing(work) as result, spooling(store) as spool:
         case = _open(store, work)
         chosen = _evenly(len(case.clip.frame), settings.held_out_frames)
-        spread = learn_from(*case.at(chosen))
+        views, motion, suspects = case.at(chosen)
+        habits = learn_habits(
+            case.clip.cameras,
+            case.joints[chosen],
+            views,
+            motion,
+            suspects,
+            settings,
+            case.clip.fps * len(chosen) / len(case.clip.frame),
+        )
+        spread = learn_from(views, suspects.without(habits.shift(motion, views)))
         counts = np.zeros(5)
         rejected = np.zeros((2, len(case.clip.camera_ids)))
         for first in range(0, len(case.clip.frame), PART):
-            views, suspects = case.at(np.arange(first, min(first + PART, len(case.clip.frame))))
-            judged = judge_detections(views, suspects, spread, settings)
+            frames = np.arange(first, min(first + PART, len(case.clip.frame)))
+            views, motion, suspects = case.at(frames)
+            shift = habits.shift(motion, views)
+            judged = judge_detections(views, suspects.without(shift), spread, settings)
             counts += _counts(judged, suspects)
             rejected += [
                 judged.rejected.sum(axis=(0, 2, 3)),
@@ -58,11 +73,13 @@ def filtering(work: Work) -> str:
                     "dropped": judged.dropped,
                     "fits": judged.fits,
                     "similarity": judged.similarity,
+                    "shift": suspects.by_detection(shift).astype(np.float32),
                 }
             )
         result.write(
             FILTERING,
-            arrays=spool.arrays(),
+            arrays=spool.arrays()
+            | {"view_bias": habits.view_bias.coefficient, "clock_late": habits.late},
             coordinates={"frame": case.clip.frame, "person": case.person},
             attributes={"camera": list(case.clip.camera_ids)},
         )
@@ -70,6 +87,8 @@ def filtering(work: Work) -> str:
         figures = {name: float(count) for name, count in zip(names, counts, strict=True)}
         for c, camera in enumerate(case.clip.camera_ids):
             figures[f"rejected_share.{camera}"] = float(rejected[0, c] / max(rejected[1, c], 1.0))
+            figures[f"clock_late_frames.{camera}"] = float(habits.late[c])
+        figures["view_bias_m"] = float(np.sqrt((habits.view_bias.coefficient**2).mean()))
         result.figures.update(figures | _held_out(store, work, case, chosen))
     return work.key
 
@@ -83,6 +102,7 @@ class _Case:
         person: (persons,) ids.
         index: (frames, cameras, persons).
         joints: (frames, persons, 17, 3) [m], world, where the detector sees the bodies' joints.
+        step: (frames, persons, 17, 3) [m], their way in a frame; NaN where not known.
         covariance: (frames, persons, 17, 3, 3) [m^2].
         placed: the result of `retriangulation`.
         dropped: (frames, cameras, detections), boxes that the iteration before dropped; None in
@@ -94,13 +114,15 @@ class _Case:
     person: NDArray[np.integer]
     index: NDArray[np.integer]
     joints: NDArray[np.float64]
+    step: NDArray[np.float64]
     covariance: NDArray[np.float64]
     placed: xr.Dataset
     dropped: NDArray[np.bool_] | None
     triangulation: TriangulationSettings
 
-    def at(self, frames: NDArray[np.int64]) -> tuple[BodyViews, Suspects]:
-        """The bodies in all pictures, and what was detected there."""
+    def at(self, frames: NDArray[np.int64]) -> tuple[BodyViews, BodyMotion, Suspects]:
+        """The bodies in all pictures, how they move there, and what was detected."""
+        motion = watch_motion(self.clip.cameras, self.joints[frames], self.step[frames])
         views = view_bodies(self.clip.cameras, self.joints[frames], self.covariance[frames])
         keypoints, confidence = _taken(self.clip, frames)
         placed = self.placed.isel(frame=frames)
@@ -115,7 +137,7 @@ class _Case:
             before,
             self.triangulation.noise,
         )
-        return views, suspects
+        return views, motion, suspects
 
 
 def _open(store: Store, work: Work) -> _Case:
@@ -128,11 +150,13 @@ def _open(store: Store, work: Work) -> _Case:
         for name in (f"refitting/{unit}", f"body_fitting/{unit}")
         if name in work.recipe.inputs
     )
+    joints = perceived_joints(bodies["joints"].values, bodies["joint_offsets"].values)
     return _Case(
-        clip=open_clip(store, work, filtered=False),
+        clip=open_clip(store, work, filtered=False, shifted=False),
         person=tracks["person"].values,
         index=tracks["detection_index"].values,
-        joints=perceived_joints(bodies["joints"].values, bodies["joint_offsets"].values),
+        joints=joints,
+        step=np.gradient(joints, axis=0) if len(joints) > 1 else np.zeros_like(joints),
         covariance=bodies["covariance"].values,
         placed=open_input(store, work, f"retriangulation/{unit}"),
         dropped=open_input(store, work, before)["dropped"].values if known else None,
@@ -156,15 +180,17 @@ def _counts(judged: Judgement, suspects: Suspects) -> list[float]:
 
 
 def _held_out(store: Store, work: Work, case: _Case, frames: NDArray[np.int64]) -> dict[str, float]:
-    """How well left-out cameras are foreseen from the keypoints that this iteration rests on."""
-    clip = open_clip(store, work)
+    """How well left-out cameras are foreseen from the keypoints that this iteration rests on.
+
+    How far cameras misplace people is learned in every iteration, so that all compare.
+    """
+    clip, whole = open_clip(store, work), open_clip(store, work, filtered=False)
     found = measure_held_out(
         clip.cameras,
         _taken(clip, frames),
-        _taken(case.clip, frames)[0],
+        _taken(whole, frames)[0],
         case.index[frames].astype(np.int16),
         case.triangulation,
-        clip.camera_covariance,
     )
     if found is None:
         return {}

@@ -6,12 +6,13 @@ from functools import reduce
 from operator import add
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import GroupLayout
 from data_contracts.triangulation import TRIANGULATION
 from data_contracts.work import Work
-from tasks.clip_inputs import open_clip
+from tasks.clip_inputs import ClipInputs, open_clip
 from tasks.spool import spooling
 from tasks.unit import figures_of, open_input, unit_task
 from worldpose.store import ResultWriter, Store
@@ -55,7 +56,7 @@ def place_joints(
     tracks = open_input(store, work, f"tracking/{work.recipe.unit}")
     index = tracks["detection_index"].values
     detections = ClipDetections(clip.keypoints, clip.confidence, index)
-    given = (clip.fps, settings, clip.camera_covariance)
+    given = (clip.fps, settings, _covariance(work, clip))
     model, detections = learn_clip(clip.cameras, detections, *given)
     agreements, changes = [], []
     with spooling(store) as spool:
@@ -75,6 +76,17 @@ def place_joints(
         model.clocks.report,
     ):
         result.figures.update(figures_of(report, clip.camera_ids))
+
+
+def _covariance(work: Work, clip: ClipInputs) -> NDArray[np.float64] | None:
+    """How well each camera is known; None from the second iteration on.
+
+    Cameras that were adjusted to people know where they are towards each other much better than
+    each knows its own place, which all have in common: taken for errors of single cameras, that
+    moves people. How far these misplace people is then learned from how they disagree.
+    """
+    is_again = f"filtering/{work.recipe.unit}" in work.recipe.inputs
+    return None if is_again else clip.camera_covariance
 
 
 def part_arrays(joints: Triangulation, smooth: Smoothing) -> dict[str, NDArray[Any]]:

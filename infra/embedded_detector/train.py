@@ -2,8 +2,9 @@
 
     python infra/embedded_detector/train.py FOLDER
 
-Every part goes on where it was interrupted. Weights and figures.json end in FOLDER; weights with
-another seed or torch differ in their bytes, not in their figures' size.
+Every part goes on where it was interrupted. The detector is trained from nothing, then on with more
+crowds. Weights and figures.json end in FOLDER; weights with another seed or torch differ in their
+bytes, not in their figures' size.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from scenes import CHECKING, HELD_OUT, TRAINING, VARIETY, read_set, render_set
+from scenes import CHECKING, CROWDS, HELD_OUT, TRAINING, VARIETY, read_set, render_set
 
 from worldpose.detection.embedded import EmbeddedDetector, EmbeddedPose
 from worldpose.detection.embedded_nets import KeypointNet, PeopleNet
@@ -28,12 +29,22 @@ SEED = 1
 SCENES = {
     "training": (TRAINING, 50, 4, 2),
     "variety": (VARIETY, 200, 2, 1),
-    "checking": (CHECKING, 4, 4, 2),
+    "crowds": (CROWDS, 60, 2, 2),
+    "checking": (CHECKING, 10, 4, 2),
     "held_out": (HELD_OUT, 10, 4, 2),
 }
 """Kind, scenes, views of each and moments of each view."""
-PEOPLE = TrainingSettings(steps=6000, check_every=500, rate=1.5e-3, seed=SEED, bfloat16=True)
-KEYPOINTS = TrainingSettings(steps=8000, check_every=500, rate=1.5e-3, seed=SEED, bfloat16=True)
+LEARNED = (("training", "variety"), ("training", "variety", "crowds"))
+"""What each part of a training learns from."""
+
+
+def part(steps: int, rate: float, seed: int) -> TrainingSettings:
+    """Return how a part of a training goes."""
+    return TrainingSettings(steps=steps, check_every=500, rate=rate, seed=seed, bfloat16=True)
+
+
+PEOPLE = (part(6000, 1.5e-3, SEED), part(5000, 1e-3, 3))
+KEYPOINTS = part(8000, 1.5e-3, SEED)
 ABOUT = {"trained-on": "rendered scenes", "seed": str(SEED)}
 
 
@@ -45,12 +56,12 @@ def main(folder: Path, parts: Sequence[str]) -> None:
             for line in render_set(folder / name, kind, count, views=views, frames=frames):
                 say(line)
     cache = PictureCache()
-    learned = [*read_set(folder / "training"), *read_set(folder / "variety")]
+    learned = [[q for name in names for q in read_set(folder / name)] for names in LEARNED]
     checked = read_set(folder / "checking")[::2]
     if "people" in parts:
         train_people(folder, learned, checked, cache)
     if "keypoints" in parts:
-        train_keypoints(folder, learned, checked, cache)
+        train_keypoints(folder, learned[0], checked, cache)
     if "figures" in parts:
         figures = score(folder, read_set(folder / "held_out"), cache)
         (folder / "figures.json").write_text(json.dumps(figures, indent=2) + "\n")
@@ -59,14 +70,16 @@ def main(folder: Path, parts: Sequence[str]) -> None:
 
 def train_people(
     folder: Path,
-    learned: Sequence[LabelledPicture],
+    learned: Sequence[Sequence[LabelledPicture]],
     checked: Sequence[LabelledPicture],
     cache: PictureCache,
 ) -> None:
     """Train the detector; its weights are those of the best check."""
     torch.manual_seed(SEED)
-    net, checkpoint = PeopleNet(), folder / "people.checkpoint"
-    train_people_net(net, learned, checked, cache, PEOPLE, checkpoint=checkpoint, progress=say)
+    net = PeopleNet()
+    for number, (pictures, how) in enumerate(zip(learned, PEOPLE, strict=True)):
+        checkpoint = folder / f"people{number}.checkpoint"
+        train_people_net(net, pictures, checked, cache, how, checkpoint=checkpoint, progress=say)
     save_weights(folder / "embedded_people.safetensors", net, ABOUT)
 
 
@@ -78,7 +91,8 @@ def train_keypoints(
 ) -> None:
     """Train the pose estimator; its weights are those of the best check."""
     torch.manual_seed(SEED)
-    net, checkpoint = KeypointNet(), folder / "keypoints.checkpoint"
+    net = KeypointNet()
+    checkpoint = folder / "keypoints.checkpoint"
     train_keypoint_net(net, learned, checked, cache, KEYPOINTS, checkpoint=checkpoint, progress=say)
     save_weights(folder / "embedded_keypoints.safetensors", net, ABOUT)
 

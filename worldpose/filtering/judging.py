@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17, COCO17_BONES
 from data_contracts.triangulation import EXCHANGED_PARTS
+from worldpose.filtering.misses import Misses
 from worldpose.filtering.settings import FilteringSettings
 from worldpose.filtering.spread import Spread, learn_spread
 from worldpose.filtering.views import BodyViews
@@ -44,6 +45,27 @@ class Suspects:
     exchanged: Flags
     dropped: Flags
     noise: tuple[float, float]
+
+    def without(self, shift: Floats) -> Suspects:
+        """Return the same with the keypoints of people less what they are beside their bodies by.
+
+        Args:
+            shift: (frames, cameras, persons, 17, 2) [px], of the bodies' joints; NaN = unknown.
+        """
+        return replace(self, keypoints=self.keypoints - self.by_detection(shift))
+
+    def by_detection(self, shift: Floats) -> Floats:
+        """Return the same shift (frames, cameras, detections, 17, 2) [px]; 0 = of nobody, unknown.
+
+        Where sides are exchanged, that of the joint which the keypoint is.
+        """
+        frame, camera, person = np.nonzero(self.index >= 0)
+        order = _order(self.exchanged[frame, camera, person])
+        own = np.zeros((len(frame), *shift.shape[3:]))
+        np.put_along_axis(own, order[..., None], shift[frame, camera, person], axis=1)
+        out = np.zeros(self.keypoints.shape)
+        out[frame, camera, self.index[frame, camera, person]] = np.nan_to_num(own)
+        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +131,30 @@ def learn_from(views: BodyViews, suspects: Suspects) -> Spread:
     """Return the spread of keypoints about the bodies of those they were taken for."""
     rows, _, _ = _own(views, suspects)
     return learn_spread(rows.squared, rows.stated, rows.known, rows.confidence)
+
+
+def misses_of(
+    views: BodyViews, suspects: Suspects, judged: Judgement, spread: Spread, repeated: float
+) -> Misses:
+    """Return by how much keypoints miss the bodies of those they were taken for, if these fit.
+
+    What a camera sees people beside of is not taken off: clocks are in it.
+
+    Args:
+        views: the bodies in all pictures.
+        suspects: what was detected there.
+        judged: the same, judged; what is rejected does not count.
+        spread: of keypoints about bodies.
+        repeated: detections of a person that err alike, so that they count as one.
+    """
+    whole = replace(suspects, offsets=np.zeros_like(suspects.offsets))
+    rows, (frame, camera, person), order = _own(views, whole)
+    place = suspects.index[frame, camera, person]
+    wrong = np.take_along_axis(judged.rejected[frame, camera, place], order, axis=1)
+    wrong |= (judged.fits[frame, camera, place] != person)[:, None]
+    missed = np.where(wrong[..., None], np.nan, rows.pixels - rows.image)
+    variance = spread.factor(rows.confidence) * rows.stated + rows.known
+    return Misses(frame, camera, person, missed, variance, repeated)
 
 
 def judge_detections(

@@ -15,7 +15,9 @@ from worldpose.detection.embedded import EMBEDDED
 from worldpose.detection.embedded_nets import KeypointNet, PeopleNet
 from worldpose.detection.embedded_weights import load_weights, save_weights
 from worldpose.errors import InputError
+from worldpose.training.keypoint_training import KeypointCrops
 from worldpose.training.labels import LabelledPicture
+from worldpose.training.looks import LookSettings
 from worldpose.training.nets import (
     keypoint_figure,
     people_figure,
@@ -30,6 +32,9 @@ Net = TypeVar("Net", PeopleNet, KeypointNet)
 
 FIGURES: dict[NetKind, str] = {"people": "ap50", "keypoints": "pck"}
 """What each net is judged by: boxes at an overlap of a half, keypoints within 0.2 torsos."""
+MILD = LookSettings(strength=0.4, recoloured=0.1, grey=0.0, fog=0.0, soft=0.1, coded=0.1, grain=0.3)
+"""Looks of the crops that the pose estimator learns from: these show the footage it is wanted for,
+and the air, light and kits of others are not asked for."""
 BLOCKS = 20
 """Runs of consecutive pictures that stay together: neighbours in a video are almost the same."""
 
@@ -94,7 +99,10 @@ def fine_tune(
         keypoints = load_weights(start or EMBEDDED[1], KeypointNet())
         before = keypoint_figure(keypoints, held_out, cache)
         checks = train_keypoint_net(
-            keypoints, learned, checked, cache, training, checkpoint=checkpoint, progress=progress
+            *(keypoints, learned, checked, cache, training),
+            crops=KeypointCrops(looks=MILD),
+            checkpoint=checkpoint,
+            progress=progress,
         )
         after = keypoint_figure(keypoints, held_out, cache)
         save_weights(weights, keypoints)

@@ -19,6 +19,7 @@ class Planted:
 
     Attributes:
         cameras: batch (cameras,).
+        joints: (frames, persons, 17, 3) [m], world, the true ones.
         views: the bodies.
         suspects: the detections, taken for the people that they are.
         displaced: (frames, cameras, detections, 17) keypoints put far off.
@@ -26,6 +27,7 @@ class Planted:
     """
 
     cameras: Camera
+    joints: np.ndarray
     views: object
     suspects: Suspects
     displaced: np.ndarray
@@ -48,6 +50,7 @@ def plant(seed, scenario="tiny", duration=0.8, displaced=0.06):
     cameras = Camera.stack(list(scene.cameras.values()))
     return Planted(
         cameras,
+        scene.truth.joints,
         view_bodies(cameras, perceived_joints(joints, np.zeros((17, 3))), covariance),
         Suspects(
             seen.keypoints,

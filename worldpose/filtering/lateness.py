@@ -1,0 +1,86 @@
+"""Clocks of the cameras, told apart from where they stand.
+
+Cameras that were adjusted to people have taken in much of what their clocks are late: people who
+all run one way look shifted. So clocks and cameras are estimated together here, with every joint
+free to follow both.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.cameras import Camera
+from worldpose.filtering.misses import Misses
+from worldpose.static_calibration.parameters import by_step
+
+Floats = NDArray[np.float64]
+
+STEP: Final = 7
+"""Rotation, shift and focal length, of a camera's step."""
+EXPECTED: Final = np.array([*(0.003,) * 3, *(0.5,) * 3, 0.005])
+"""Standard deviation of a camera's turns [rad], shift [m] and focal length [1]: ten times what
+careful calibration leaves."""
+LEAST: Final = 1e-6
+"""Added to the information of a point [1/m^2]."""
+ROUNDS: Final = 40
+"""Of learning how far clocks are apart: exact ones then come out 0.02 frames apart."""
+LEAST_SPREAD: Final = 0.005
+"""Of clocks [frame]."""
+
+
+def learn_lateness(cameras: Camera, joints: Floats, way: Floats, misses: Misses) -> Floats:
+    """Return by how many frames each camera shows people later than the cameras' mean (cameras,).
+
+    Args:
+        cameras: batch (cameras,).
+        joints: (frames, persons, 17, 3) [m], world, of bodies.
+        way: (n, 17, 2) [px], of each row's joints in its picture within a frame; NaN = unknown.
+        misses: of these joints, whose `frame` are theirs.
+    """
+    persons, joint_count = joints.shape[1:3]
+    count, width = cameras.batch_shape[0], 1 + STEP
+    points = joints.reshape(-1, 3)
+    weight = misses.weight * np.isfinite(way).all(axis=-1)
+    normal = np.tile(LEAST * np.eye(3), (len(points), 1, 1))
+    pulled = np.zeros((len(points), 3))
+    mixed = np.zeros((len(points), 3, count, width))
+    matrix, right = np.zeros((count, width, count, width)), np.zeros((count, width))
+    for camera in range(count):
+        row, joint = np.nonzero((weight > 0.0) & (misses.camera == camera)[:, None])
+        place = (misses.frame[row] * persons + misses.person[row]) * joint_count + joint
+        seen = cameras[camera].project_with_jacobians(points[place])
+        by_camera = by_step(cameras[camera], seen)[..., :STEP]
+        by_all = np.concatenate([way[row, joint][..., None], by_camera], axis=-1)
+        held = weight[row, joint, None, None] * by_all
+        missed = misses.missed[row, joint]
+        matrix[camera, :, camera] = np.einsum("nak,nal->kl", held, by_all)
+        right[camera] = np.einsum("nak,na->k", held, missed)
+        held_points = weight[row, joint, None, None] * seen.d_points
+        # A camera sees a joint of a person at most once in a frame.
+        normal[place] += np.einsum("nai,naj->nij", held_points, seen.d_points)
+        pulled[place] += np.einsum("nai,na->ni", held_points, missed)
+        mixed[place, :, camera] = np.einsum("nai,nak->nik", held_points, by_all)
+    used = normal[:, 0, 0] > LEAST
+    flat = mixed[used].reshape(-1, 3, count * width)
+    follow = np.linalg.solve(normal[used], flat).reshape(-1, count * width)
+    whole = matrix.reshape(count * width, -1) - flat.reshape(-1, count * width).T @ follow
+    side = right.reshape(-1) - follow.T @ pulled[used].reshape(-1)
+    return _late(whole, side, count)
+
+
+def _late(matrix: Floats, right: Floats, count: int) -> Floats:
+    """The first unknown of every camera; how far these differ is learnt (expectation-maximisation).
+
+    Where nothing tells clocks from cameras, or all agree, they come out equal.
+    """
+    spread = 1.0
+    for _ in range(ROUNDS):
+        prior = np.tile(np.concatenate([[spread**-2], EXPECTED**-2]), count)
+        inverse = np.linalg.inv(matrix + np.diag(prior))
+        late = (inverse @ right).reshape(count, -1)[:, 0]
+        variance = np.diagonal(inverse).reshape(count, -1)[:, 0]
+        spread = max(LEAST_SPREAD, float(np.sqrt(np.mean(late**2 + variance))))
+    return np.asarray(late - late.mean())
