@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,5 +141,5 @@ def _clicked_places(store: Store, run: Run, camera_id: str) -> dict[str, NDArray
     record = run.record
     key = record.results[f"static_calibration/{camera_id}"]
     recipe = store.manifest(record.match_id, "static_calibration", camera_id, key).recipe
-    ((_, clicked),) = recipe.sources["clicked"].items()  # type: ignore[union-attr]
+    (clicked,) = cast("dict[str, Any]", recipe.sources["clicked"]).values()
     return {name: np.array(place) for name, place in clicked["points"].items()}

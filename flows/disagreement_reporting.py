@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.camera_reporting import still_of
-from flows.detection import seen_by
 from flows.match_pictures import frame_picture
+from flows.redetection import seen_in
 from flows.release import clip_title, joint_tracks, static_cameras
 from flows.stage import Match
 from worldpose.release import JointTracks, Picture
@@ -43,14 +43,14 @@ def worst_views(run: Run, match: Match, clip: str, tracks: JointTracks) -> list[
     place = tracked.reindex(person=tracks.person_ids, fill_value=-1).values
     away = np.full(place.shape, np.nan)
     for c, (name, camera) in enumerate(static_cameras(run, match.folder.spec).items()):
-        seen = run[seen_by(match, name, clip)]["keypoints"].reindex(frame=numbers).values
+        seen = run[seen_in(run, match, name, clip)]["keypoints"].reindex(frame=numbers).values
         own = np.take_along_axis(seen, np.maximum(place[:, c], 0)[..., None, None], axis=1)
         found = camera.project(tracks.joints[rows].reshape(-1, 3)).reshape(own.shape)
         off = np.linalg.norm(own - found, axis=-1)
         height = np.ptp(found[..., 1], axis=-1)
         enough = (np.isfinite(off).sum(-1) >= KNOWN) & (place[:, c] >= 0)
         away[:, c][enough] = np.nanmedian(off[enough], axis=-1) / height[enough]
-    worst = []
+    worst: list[tuple[int, ...]] = []
     for _ in range(SHOWN):
         if not np.isfinite(away).any():
             break
@@ -68,7 +68,7 @@ def disagreement_pictures(store: Store, run: Run, match: Match, clip: str) -> li
     pictures = []
     for row, place, person, percent in worst_views(run, match, clip, tracks):
         name, number = list(cameras)[place], int(tracks.frames[row])
-        camera, detected = cameras[name], run[seen_by(match, name, clip)].sel(frame=number)
+        camera, detected = cameras[name], run[seen_in(run, match, name, clip)].sel(frame=number)
         index = run[f"tracking/{clip}"].sel(frame=number)["detection_index"].values[place]
         still = frame_picture(store, match, name, number)
         if still is None and number == int(tracks.frames[0]):

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data_contracts.evaluation import MethodScore
 from flows.evaluation import cameras_of, reference_side
@@ -145,9 +146,9 @@ def _picture(camera: Camera | None) -> tuple[int, int]:
     return width, height
 
 
-def _boxes(result: MethodResult, camera: Camera | None) -> np.ndarray | None:
+def _boxes(result: MethodResult, camera: Camera | None) -> NDArray[np.float64] | None:
     """The method's boxes in the picture of the camera [px]."""
     if result.boxes is None or camera is None or result.picture is None:
         return result.boxes
-    scale = np.array(_picture(camera)) / np.array(result.picture)
-    return result.boxes * np.tile(scale, 2)
+    width, height = np.array(_picture(camera)) / np.array(result.picture)
+    return np.asarray(result.boxes * np.array([width, height, width, height]))

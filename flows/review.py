@@ -134,8 +134,8 @@ def decide(
                 found="no such question" if unknown else "nothing that waits",
                 todo=f"List them: worldpose review list {match.match_id}.",
             )
-        for name in ids if seen is not None else ():
-            if current[name].state != seen.get(name):
+        for name in ids:
+            if seen is not None and current[name].state != seen.get(name):
                 raise _decided_meanwhile(name, current[name], seen.get(name))
         results = {} if latest is None else latest.results
         corrections[:] = new_corrections(match, journal, edits, who=who, note=why, results=results)

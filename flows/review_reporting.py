@@ -15,7 +15,7 @@ def review_table(match: Match) -> list[Table]:
     """Verdicts, corrections and withdrawals, first to last; none where nobody said anything."""
     units: dict[str, str] = {}
     corrections: dict[str, str] = {}
-    rows = []
+    rows: list[tuple[str, str, str, str, str]] = []
     for said in match.journal.records:
         if isinstance(said, ReviewRequest):
             units[said.id] = ", ".join(said.keys)
@@ -26,7 +26,7 @@ def review_table(match: Match) -> list[Table]:
         elif isinstance(said, Correction):
             corrections[said.id] = in_words(said)
             rows.append(
-                (when(said.made_at), said.who, "corrected", in_words(said), said.note or "")
+                (when(said.made_at), said.who, "corrected", in_words(said), str(said.note or ""))
             )
         elif isinstance(said, Withdrawal):
             what = corrections.get(said.correction, said.correction)

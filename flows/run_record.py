@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Self
+from typing import Any, Self
 
 from data_contracts.run import GatePolicy, RunRecord, RunState, UnitFailure, WaitingUnit
 from flows import body_fitting
@@ -56,6 +56,7 @@ class RunLog:
     failed: list[UnitFailure] = field(default_factory=list)
     blocked: list[str] = field(default_factory=list)
     waiting: list[WaitingUnit] = field(default_factory=list)
+    figures: dict[str, dict[str, float]] = field(default_factory=dict)
 
     @classmethod
     def begin(
@@ -118,6 +119,7 @@ class RunLog:
             self.executed.append(unit.name)
             recipe = unit.recipe
             manifest = self.store.manifest(recipe.match_id, recipe.stage, recipe.unit, unit.key)
+            self.figures[unit.name] = manifest.figures
             reporter().unit_done(unit.name, manifest.seconds, manifest.figures)
         else:
             self.failed.append(
@@ -133,10 +135,10 @@ class RunLog:
     def close(self) -> RunRecord:
         """Store the record: from here on the run counts, and people are asked what it waits for."""
         self._carry_over()
-        figures = {}
-        for name, key in sorted(self.results.items()):
+        for name in self.results.keys() - self.figures.keys():
             stage, _, unit = name.partition("/")
-            figures[name] = self.store.manifest(self.match.match_id, stage, unit, key).figures
+            manifest = self.store.manifest(self.match.match_id, stage, unit, self.results[name])
+            self.figures[name] = manifest.figures
         settings, overrides = self._settings()
         record = RunRecord(
             run_id=self.run_id,
@@ -153,7 +155,7 @@ class RunLog:
             blocked=tuple(sorted(self.blocked)),
             gates=self.gatekeeper.policy,
             waiting=tuple(self.waiting),
-            figures=figures,
+            figures=dict(sorted(self.figures.items())),
             versions=libraries(),
             started_at=self.started_at,
             finished_at=datetime.now(UTC),
@@ -172,7 +174,7 @@ class RunLog:
             let_pass = passed(keys, self.gatekeeper.held(stage.name, keys))
             self.reuse(current[name] for name in let_pass)
 
-    def _settings(self) -> tuple[dict[str, dict[str, object]], dict[str, dict[str, object]]]:
+    def _settings(self) -> tuple[dict[str, dict[str, Any]], dict[str, dict[str, Any]]]:
         """All settings and the asked-for ones, by stage; a standing stage keeps its own."""
         first = METHOD.index(self.stages[0])
         settings = {
@@ -180,11 +182,12 @@ class RunLog:
             for stage in METHOD
         }
         overrides = {name: dict(values) for name, values in self.overrides.items()}
-        for stage in METHOD[:first] if self.latest is not None else ():
-            settings[stage.name] = self.latest.settings[stage.name]
-            overrides |= {
-                name: values for name, values in self.latest.overrides.items() if name == stage.name
-            }
+        if self.latest is not None:
+            for stage in METHOD[:first]:
+                if stage.name in self.latest.settings:  # else the run is of before it
+                    settings[stage.name] = self.latest.settings[stage.name]
+                if stage.name in self.latest.overrides:
+                    overrides[stage.name] = self.latest.overrides[stage.name]
         return settings, overrides
 
     def _state(self) -> RunState:
@@ -204,11 +207,11 @@ def _require_there(
     used = {
         name for each in stages for unit in each.units(match) for name in each.again(match, unit)
     }
-    lost = [
-        name
-        for name in sorted(used & before.keys())
-        if not store.has(match.match_id, *name.split("/", 1), before[name])
-    ]
+    lost = []
+    for name in sorted(used & before.keys()):
+        stage, _, unit = name.partition("/")
+        if not store.has(match.match_id, stage, unit, before[name]):
+            lost.append(name)
     if lost:
         raise EditedMeanwhileError(
             f"another iteration of {match.match_id}",

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from data_contracts.run import GatePolicy, RunRecord
 from flows.gatekeeping import Gatekeeper
@@ -29,6 +29,7 @@ from worldpose.store import Store
 
 if TYPE_CHECKING:
     from distributed import LocalCluster
+    from prefect.task_runners import TaskRunner
 
 DASK_SECONDS = 10.0
 """How long a Dask scheduler may take to answer."""
@@ -122,12 +123,12 @@ def _with_prefect(
 
         from flows.match import IncompleteRunError, process_match
 
-        runner = DaskTaskRunner(address=request.dask)
+        runner = cast("TaskRunner[Any]", DaskTaskRunner(address=request.dask))
         try:
             run_id = process_match.with_options(task_runner=runner)(
                 project=store.url,
                 match_id=match.match_id,
-                settings=request.settings,
+                settings={stage: dict(values) for stage, values in request.settings.items()},
                 from_stage=request.from_stage,
                 until_stage=request.until_stage,
                 gates=request.gates,

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-
-from pydantic import JsonValue
+from typing import Any
 
 from worldpose.errors import InputError
 
@@ -16,7 +15,7 @@ class StaleEditError(InputError):
         difference: what it was to the editor, what it is now, and who made it that.
     """
 
-    difference: Mapping[str, JsonValue] = {}
+    difference: Mapping[str, Any] = {}
 
 
 class EditedMeanwhileError(InputError):

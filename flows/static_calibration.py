@@ -40,7 +40,9 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
         "clicked": {
             clicked_file(unit): {
                 "points": {point.name: list(point.xy) for point in clicked.points},
-                "drawn": {marking.name: [*map(list, marking.xy)] for marking in clicked.drawn},
+                "drawn": {
+                    marking.name: [list(xy) for xy in marking.xy] for marking in clicked.drawn
+                },
             }
         },
         "pitch": None if folder.pitch is None else folder.pitch.model_dump(mode="json"),

@@ -140,10 +140,10 @@ def evaluate(
     )
     laid = scores.laid
     if as_json:
-        found = scores.evaluation.model_dump(exclude_none=True)
+        figures = scores.evaluation.model_dump(exclude_none=True)
         if laid is not None:
-            found |= {"reference_offset_s": laid.offset, "reference_residual_m": laid.residual}
-        print_json(found)
+            figures |= {"reference_offset_s": laid.offset, "reference_residual_m": laid.residual}
+        print_json(figures)
         return
     if laid is not None:
         line(

@@ -78,7 +78,7 @@ def as_json(store: Store, found: Iterations) -> dict[str, JsonValue]:
                 "iteration": each.number,
                 "run": each.record.run_id,
                 **figures_of(each),
-                "better_worse_mixed_unchanged": marks,
+                "better_worse_mixed_unchanged": dict(marks),
             }
             for each, marks in zip(found.passes, marks_of(store, found), strict=True)
         ],

@@ -43,9 +43,12 @@ def diff(
     compared = compare_runs(store, a, b) if is_one_match else []
     pictures = most_moved(store, a, b) if is_one_match else []
     if as_json:
-        found = {"units": changes, "compared": compared, "moved": pictures}
-        rows_of = {name: [asdict(each) for each in rows] for name, rows in found.items()}
-        print_json({"a": run_a, "b": run_b, **rows_of})
+        found = {
+            "units": [asdict(each) for each in changes],
+            "compared": [asdict(each) for each in compared],
+            "moved": [asdict(each) for each in pictures],
+        }
+        print_json({"a": run_a, "b": run_b, **found})
         return
     rows = [
         (

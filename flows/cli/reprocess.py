@@ -123,12 +123,12 @@ def _print_units(touched: Touched) -> None:
 
 def _as_json(each: Reprocessed) -> dict[str, JsonValue]:
     touched = each.touched
-    has_run = each.record is not None and each.state not in ("untouched", "touched")
+    ran = None if each.state in ("untouched", "touched") else each.record
     return {
         "match": each.match_id,
         "state": each.state,
         "run": None if each.record is None else each.record.run_id,
-        "executed": list(each.record.executed) if has_run else [],
+        "executed": [] if ran is None else list(ran.executed),
         "problem": each.problem,
         "to_compute": 0 if touched is None else len(touched.to_compute),
         "units": [

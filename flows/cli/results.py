@@ -63,7 +63,9 @@ def export(
         )
     store = Store.open(project)
     registration = find_registration(store, match)
-    origin = Origin(open_run(project, registration.spec.match_id, run), registration, stage)
+    origin = Origin(
+        open_run(project, registration.spec.match_id, run, complete=True), registration, stage
+    )
     if release is None or licence is None:
         written = export_formats(origin, forms, out)
     else:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from prefect import flow
 from prefect.artifacts import create_markdown_artifact, create_table_artifact
+from prefect.client.schemas.objects import FlowRun
 from prefect.deployments import run_deployment
+from prefect.task_runners import TaskRunner
 from prefect_dask import DaskTaskRunner
 from pydantic import TypeAdapter, ValidationError
 
@@ -28,7 +30,9 @@ from worldpose.store import Store, open_run
 NAME: Final = TypeAdapter(Name)
 LOG = logging.getLogger("worldpose.operations")
 
-match = process_match.with_options(task_runner=DaskTaskRunner(**served_cluster()))
+RUNNER: Final = cast("TaskRunner[Any]", DaskTaskRunner(**served_cluster()))
+
+match = process_match.with_options(task_runner=RUNNER)
 """Process one match; suspended while its results wait for people."""
 
 
@@ -72,7 +76,7 @@ def ingest(plan: dict[str, Any]) -> list[str]:
 
 
 def _begin(plan: ServePlan, opened: Match, arrival: Arrival) -> str:
-    run = run_deployment(
+    begun = run_deployment(
         plan.match_deployment,
         parameters={"match_id": opened.match_id},
         flow_run_name=opened.match_id,
@@ -83,7 +87,7 @@ def _begin(plan: ServePlan, opened: Match, arrival: Arrival) -> str:
         idempotency_key=f"arrival-{opened.registration.identity}",
         work_queue_name=arrival.priority,
     )
-    return str(run.id)
+    return str(cast("FlowRun", begun).id)  # outside of an event loop it is awaited
 
 
 @flow(name="release", flow_run_name="release {name} of {match_id}", validate_parameters=False)
@@ -114,7 +118,7 @@ def release(
 
     store = Store.open(project)
     opened = open_match(store, match_id)
-    run = open_run(project, opened.match_id)
+    run = open_run(project, opened.match_id, complete=True)
     if run.record.state != "complete":
         raise WorldposeError(
             f"run {run.record.run_id} of {match_id}: expected a complete one, found "

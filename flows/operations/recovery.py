@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from datetime import UTC, datetime, timedelta
-from typing import Final
+from typing import Any, Final
 
 from prefect.client.orchestration import PrefectClient, get_client
 from prefect.client.schemas.filters import (
@@ -18,7 +18,7 @@ from prefect.client.schemas.filters import (
     FlowRunFilterState,
     FlowRunFilterStateType,
 )
-from prefect.client.schemas.objects import FlowRun, StateType
+from prefect.client.schemas.objects import FlowRun, State, StateType
 from prefect.events.filters import (
     EventFilter,
     EventNameFilter,
@@ -54,7 +54,7 @@ async def begin_again(plan: ServePlan, *, at_start: bool = False) -> list[str]:
         if at_start and plan.owns_prefect:
             for run in await _runs(client, plan, *AT_WORK):
                 was_cancelled = run.state_type == StateType.CANCELLING
-                state = Cancelled() if was_cancelled else Crashed(message=KILLED)
+                state: State[Any] = Cancelled() if was_cancelled else Crashed(message=KILLED)
                 await client.set_flow_run_state(run.id, state, force=True)
         else:
             for run in await _runs(client, plan, StateType.RUNNING):

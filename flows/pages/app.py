@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from importlib.resources import files
 from threading import Thread
@@ -147,7 +147,7 @@ def _files() -> APIRouter:
     return router
 
 
-def _answer(name: str, content: bytes):  # noqa: ANN202 - a route
+def _answer(name: str, content: bytes) -> Callable[[], Response]:
     kind = TYPES[name.rpartition(".")[2]]
 
     def answer() -> Response:

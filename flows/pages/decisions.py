@@ -78,8 +78,8 @@ def routes(desk: Desk) -> APIRouter:
     def take_verdict(match_id: str, given: Verdict, who: Person) -> dict[str, Any]:
         match = desk.match(match_id)
         latest = latest_run(desk.store, match_id)
-        said = {"who": who, "why": given.why, "seen": given.seen}
-        decide(desk.store, match, given.reviews, given.verdict, **said)
+        why, seen = given.why, given.seen
+        decide(desk.store, match, given.reviews, given.verdict, who=who, why=why, seen=seen)
         waiting = still_waiting(desk.match(match_id), latest)
         run = desk.continuing.go_on(match_id) if given.go_on and not waiting else None
         return {"waiting": len(waiting), "run": run}

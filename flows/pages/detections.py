@@ -83,8 +83,8 @@ def routes(desk: Desk) -> APIRouter:
     @router.post("/acceptances")
     def take(match_id: str, owner: str, given: Accepting, who: Person) -> dict[str, Any]:
         match = desk.match(match_id)
-        said = {"at_least": given.at_least, "people": given.people, "who": who}
-        accept(desk.store, match, owner, **said)
+        people, at_least = given.people, given.at_least
+        accept(desk.store, match, owner, at_least=at_least, people=people, who=who)
         return _queue(desk.store, desk.match(match_id), owner)
 
     return router

@@ -99,7 +99,7 @@ def routes(desk: Desk) -> APIRouter:
         file = Path(videos.name) / f"{name}.mp4"
         with filming:
             if not file.is_file():
-                run = open_run(desk.store.url, match_id, asked.run_id)
+                run = open_run(desk.store.url, match_id, asked.run_id, complete=True)
                 (unit,) = asked.keys
                 draft = file.with_suffix(".draft.mp4")
                 write_clip_video(desk.store, run, match, unit.partition("/")[2], draft)
@@ -115,7 +115,7 @@ def _numbers(values: NDArray[np.float64]) -> list[float | None]:
 
 def draw_evidence(store: Store, match: Match, request: ReviewRequest) -> Evidence:
     """What a person should see before deciding on a question: of the run that asked it."""
-    run = open_run(store.url, match.match_id, request.run_id)
+    run = open_run(store.url, match.match_id, request.run_id, complete=True)
     (unit,) = request.keys
     return _DRAWN.get(request.gate, _nothing)(store, run, match, unit.partition("/")[2])
 

@@ -98,7 +98,7 @@ def _person(found: Identities, person: int, step: int) -> dict[str, Any]:
 def _ways(joints: NDArray[np.float32]) -> NDArray[np.float64]:
     """Where a person is on the ground (frames, 2) [m], NaN where that is not known."""
     hips = joints[:, HIPS, :2].astype(np.float64)
-    known = np.isfinite(hips).all(axis=2)
+    known = np.asarray(np.isfinite(hips).all(axis=2))
     total = np.where(known[..., None], hips, 0.0).sum(axis=1)
     count = known.sum(axis=1)[:, None]
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -33,7 +33,7 @@ def routes(desk: Desk) -> APIRouter:
         asked = requests_by_id(match.journal.records).get(request)
         if asked is None:
             raise HTTPException(404, "no such review")
-        run = open_run(desk.store.url, match_id, asked.run_id)
+        run = open_run(desk.store.url, match_id, asked.run_id, complete=True)
         if ADJUSTED not in asked.keys or ADJUSTED not in run:
             return []
         return [
@@ -81,15 +81,17 @@ def _keypoints(run: Run, match: Match) -> Iterator[Outlier]:
         )
         tracks = run[f"tracking/{clip}"].sel(frame=frame, person=person)
         detection = int(tracks["detection_index"].values[c])
-        if detection < 0:
+        seen = run[seen_by(match, names[c], clip)]
+        # Whom an iteration found again the next one looks for anew: there is nothing to correct.
+        if not 0 <= detection < seen.sizes["detection"]:
             continue
         place = {"camera": names[c], "frame": frame, "detection": detection}
         edit: MovedKeypoint | DeletedDetection
         if joint < 0:
             edit = DeletedDetection(**place)
         else:
-            seen = run[seen_by(match, names[c], clip)]["keypoints"].sel(frame=frame)
-            x, y = (float(value) for value in seen.values[detection, joint])
+            pixel = seen["keypoints"].sel(frame=frame).values[detection, joint]
+            x, y = (float(value) for value in pixel)
             edit = MovedKeypoint(**place, joint=COCO17[joint], was=(x, y), xy=None)
         surprise = float(result["outlier_surprise"].values[k])
         yield surprise, f"person {person}", edit, _place(edit) in said

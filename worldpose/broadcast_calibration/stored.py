@@ -53,7 +53,7 @@ def moving_arrays(moving: MovingCamera, uncertainty: Uncertainty) -> dict[str, N
     }
 
 
-def camera_before(arrays: Mapping[str, ArrayLike]) -> Camera:
+def camera_before(arrays: Mapping[Any, ArrayLike]) -> Camera:
     """The stored camera (frames,) before players and all frames together."""
     names = ("focal", "principal_point", "distortion", "rotation", "translation")
     stored = {name: arrays[f"{name}_before"] for name in names}

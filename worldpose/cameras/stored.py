@@ -24,7 +24,7 @@ def camera_arrays(camera: Camera) -> dict[str, NDArray[Any]]:
     }
 
 
-def camera_from_arrays(arrays: Mapping[str, ArrayLike]) -> Camera:
+def camera_from_arrays(arrays: Mapping[Any, ArrayLike]) -> Camera:
     """The camera of stored arrays, bit for bit the one that was stored."""
     stored = {name: np.asarray(arrays[name]) for name in _NAMES}
     return Camera(

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from data_contracts.run import RunRecord
+from worldpose.errors import UsageError
 from worldpose.store.runs import LATEST
 from worldpose.store.store import Store
 
@@ -20,10 +21,11 @@ class Run(Mapping[str, "xr.Dataset"]):
     Each is opened when it is first asked for, and its values are read when they are used.
     """
 
-    def __init__(self, store: Store, record: RunRecord) -> None:
+    def __init__(self, store: Store, record: RunRecord, *, complete: bool = False) -> None:
         self.record = record
         """What the run did: results, settings, figures, versions, times."""
         self._store = store
+        self._complete = complete
         self._opened: dict[str, xr.Dataset] = {}
 
     def __getitem__(self, name: str) -> xr.Dataset:
@@ -38,9 +40,12 @@ class Run(Mapping[str, "xr.Dataset"]):
             raise KeyError(f"run {self.record.run_id} has no result of {name!r}: {why}")
         if name not in self._opened:
             stage, _, unit = name.partition("/")
-            self._opened[name] = self._store.open_result(
+            result = self._store.open_result(
                 self.record.match_id, stage, unit, self.record.results[name]
             )
+            if self._complete:
+                self._require_all_arrays(name, stage, result)
+            self._opened[name] = result
         return self._opened[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -51,6 +56,20 @@ class Run(Mapping[str, "xr.Dataset"]):
 
     def __contains__(self, name: object) -> bool:
         return name in self.record.results
+
+    def _require_all_arrays(self, name: str, stage: str, result: xr.Dataset) -> None:
+        from data_contracts.schemas import LAYOUTS  # late: it has every record there is
+
+        (layout,) = (each for each in LAYOUTS if each.stage == stage)
+        written = {*(array.name for array in layout.arrays), *layout.attributes}
+        absent = sorted(written - set(layout.optional) - {*result.variables, *result.attrs})
+        if absent:
+            raise UsageError(
+                f"run {self.record.run_id} of match {self.record.match_id}: {name}",
+                expected="a result of this version of worldpose",
+                found=f"one of an earlier version, without {', '.join(absent)}",
+                todo=f"Compute it anew: worldpose run {self.record.match_id}.",
+            )
 
     def __repr__(self) -> str:
         record = self.record
@@ -64,17 +83,21 @@ class Run(Mapping[str, "xr.Dataset"]):
         )
 
 
-def open_run(project: str | os.PathLike[str], match: str, run: str = LATEST) -> Run:
+def open_run(
+    project: str | os.PathLike[str], match: str, run: str = LATEST, *, complete: bool = False
+) -> Run:
     """The results of a match's run as labelled arrays (xarray), metres and pixels, world frame.
 
     Args:
         project: the project's folder or `s3://bucket/prefix`.
         match: the match's id.
         run: the run's number, such as `0003`, or `latest`.
+        complete: refuse, when it is opened, a result that an earlier version of worldpose made
+            without some array that this one writes.
 
     Raises:
         InputError: no such project, match or run.
         CorruptionError: stored bytes are not the bytes that were published.
     """
     store = Store.open(project)
-    return Run(store, store.run(match, run))
+    return Run(store, store.run(match, run), complete=complete)
