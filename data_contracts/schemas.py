@@ -23,6 +23,7 @@ from data_contracts.match import MatchSpec, Registration
 from data_contracts.pin import Pin
 from data_contracts.pitch import PitchSpec
 from data_contracts.records import Record
+from data_contracts.redetection import REDETECTION
 from data_contracts.refitting import REFITTING
 from data_contracts.release import (
     BaselineSettings,
@@ -70,6 +71,7 @@ LAYOUTS: tuple[GroupLayout, ...] = (
     INGEST,
     STATIC_CALIBRATION,
     DETECTION,
+    REDETECTION,
     TRACKING,
     TRIANGULATION,
     BUNDLE_ADJUSTMENT,

@@ -27,7 +27,8 @@ TRACKING = GroupLayout(
             dtype="int16",
             unit="1",
             missing="-1",
-            about="place among this camera's detections of the frame, in `ingest` or `detection`",
+            about="place among this camera's detections of the frame, in `ingest`, `detection` or, "
+            "from the second iteration on, `redetection`",
             chunk_dim="frame",
         ),
         ArrayLayout(

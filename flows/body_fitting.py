@@ -40,5 +40,6 @@ STAGE = Stage(
     inputs=inputs,
     sources=sources,
     again=tracking.filtered,
+    later=tracking.found_again,
     outside=outside,
 )

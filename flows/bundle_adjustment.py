@@ -27,6 +27,13 @@ def again(match: Match, unit: str) -> tuple[str, ...]:
     return tuple(name for clip in tracking.units(match) for name in tracking.filtered(match, clip))
 
 
+def later(match: Match, unit: str) -> tuple[str, ...]:
+    """Whom all cameras show besides those who were detected, in every clip."""
+    return tuple(
+        name for clip in tracking.units(match) for name in tracking.found_again(match, clip)
+    )
+
+
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     """The clips, the clock, the order of the cameras, and the pitch that clicked points are of."""
     spec, pitch = match.folder.spec, match.folder.pitch
@@ -47,4 +54,5 @@ STAGE = Stage(
     inputs=inputs,
     sources=sources,
     again=again,
+    later=later,
 )

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from flows.camera_reporting import still_of
-from flows.detection import seen_by
 from flows.match_pictures import frame_picture
+from flows.redetection import seen_in
 from flows.release import (
     body_tracks,
     broadcast_cameras,
@@ -92,7 +92,7 @@ def detection_pictures(store: Store, run: Run, match: Match, clip: str) -> list[
     frame, index = (int(n) for n in np.unravel_index(int(seen.argmax()), seen.shape))
     name = list(cameras)[index]
     number = int(tracks.frames[frame])
-    detected = run[seen_by(match, name, clip)].sel(frame=number)
+    detected = run[seen_in(run, match, name, clip)].sel(frame=number)
     tracked = run[f"tracking/{clip}"].sel(frame=number)["detection_index"].values[index]
     still = frame_picture(store, match, name, number)
     if still is None and frame == 0:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import JsonValue
 
 from data_contracts.detection import detection_unit
+from data_contracts.redetection import again_of
 from flows import ingest
 from flows.stage import Match, Stage
 from worldpose.detection import DetectionSettings, weights_of
@@ -21,6 +22,18 @@ def seen_by_cameras(match: Match, clip_id: str) -> tuple[str, ...]:
     """The same of every static camera, in order."""
     cameras = match.folder.spec.static_cameras
     return tuple(seen_by(match, camera.id, clip_id) for camera in cameras)
+
+
+def again(match: Match, camera_id: str, clip_id: str) -> tuple[str, ...]:
+    """The result with those whom a camera's video shows when they are looked for again, if any."""
+    name = again_of(seen_by(match, camera_id, clip_id))
+    return (name,) if name else ()
+
+
+def again_by_cameras(match: Match, clip_id: str) -> tuple[str, ...]:
+    """The same of every static camera, in order."""
+    cameras = match.folder.spec.static_cameras
+    return tuple(name for camera in cameras for name in again(match, camera.id, clip_id))
 
 
 def seen_in_broadcast(match: Match, clip_id: str) -> tuple[str, ...]:

@@ -23,4 +23,5 @@ STAGE = Stage(
     inputs=inputs,
     sources=tracking.clip_sources,
     again=tracking.filtered,
+    later=tracking.found_again,
 )

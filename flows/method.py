@@ -15,6 +15,7 @@ from flows import (
     filtering,
     gates,
     ingest,
+    redetection,
     refitting,
     retriangulation,
     static_calibration,
@@ -28,6 +29,7 @@ METHOD: tuple[Stage, ...] = (
     ingest.STAGE,  # [camera]
     static_calibration.STAGE,  # [camera]  C1-C5; then gate CAMERAS, C7
     detection.STAGE,  # [camera, clip]  D1-D5; then gate PEOPLE, D6
+    redetection.STAGE,  # [camera, clip]  R2, from the second iteration on
     tracking.STAGE,  # [clip]           T1, T2; then gate IDENTITIES
     triangulation.STAGE,  # [clip]      T3, T4; then gate JOINTS
     bundle_adjustment.STAGE,  #         B1-B3; then gate ADJUSTMENT

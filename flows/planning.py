@@ -73,12 +73,15 @@ def plan_stage(
         results: `stage/unit` to key of what earlier stages have, or will have, computed.
         before: the same of the iteration before; None in the first.
     """
+    if before is None and stage.since > 1:
+        return StagePlan((), ())
     settings = settings_of(stage, overrides)
     outside = stage.outside(settings)
     units, blocked = [], []
     for unit in stage.units(match):
         inputs = {name: results.get(name) for name in stage.inputs(match, unit)}
         if before is not None:
+            inputs |= {name: results.get(name) for name in stage.later(match, unit)}
             inputs |= {name: before.get(name) for name in stage.again(match, unit)}
         known = {name: key for name, key in inputs.items() if key is not None}
         if known.keys() != inputs.keys():

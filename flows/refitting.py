@@ -77,4 +77,5 @@ STAGE = Stage(
     inputs=inputs,
     sources=sources,
     again=tracking.filtered,
+    later=tracking.found_again,
 )

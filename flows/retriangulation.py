@@ -25,4 +25,5 @@ STAGE = Stage(
     inputs=inputs,
     sources=tracking.clip_sources,
     again=tracking.filtered,
+    later=tracking.found_again,
 )

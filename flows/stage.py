@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import JsonValue
 
@@ -59,6 +59,9 @@ class Stage:
         inputs: for a unit, the `stage/unit` names of the results it is made from.
         sources: for a unit, everything the match folder contributes to its result.
         again: for a unit, the results of the iteration before that it is made from too.
+        later: for a unit, the results of its own iteration that it is made from too, from the
+            second on.
+        since: the first iteration that it is a part of.
         outside: for its settings, what they name outside of the match: digests of those files.
         prefers: tag of the workers that compute it, where the cluster has such.
     """
@@ -70,5 +73,7 @@ class Stage:
     inputs: Callable[[Match, str], tuple[str, ...]]
     sources: Callable[[Match, str], dict[str, JsonValue]]
     again: Callable[[Match, str], tuple[str, ...]] = _no_results
+    later: Callable[[Match, str], tuple[str, ...]] = _no_results
+    since: Literal[1, 2] = 1
     outside: Callable[[Any], dict[str, JsonValue]] = _nothing
     prefers: str | None = None

@@ -30,6 +30,11 @@ def filtered(match: Match, unit: str) -> tuple[str, ...]:
     return (f"filtering/{unit}",)
 
 
+def found_again(match: Match, unit: str) -> tuple[str, ...]:
+    """Whom the clip's cameras show besides those who were detected."""
+    return detection.again_by_cameras(match, unit)
+
+
 def camera_inputs(match: Match, clip_id: str) -> tuple[str, ...]:
     """Every static camera, and whom it saw in a clip."""
     cameras = [camera.id for camera in match.folder.spec.static_cameras]
@@ -42,7 +47,7 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
 
     Without such corrections the key is the tracker's alone.
     """
-    said = [
+    said: list[JsonValue] = [
         correction.edit.model_dump(mode="json")
         for correction in match.corrections
         if isinstance(correction.edit, IDENTITY_EDITS) and correction.edit.clip == unit
@@ -76,4 +81,5 @@ STAGE = Stage(
     inputs=inputs,
     sources=sources,
     again=again,
+    later=found_again,
 )

@@ -20,4 +20,5 @@ STAGE = Stage(
     inputs=inputs,
     sources=tracking.clip_sources,
     again=tracking.again,
+    later=tracking.found_again,
 )

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from data_contracts.redetection import again_of
 from data_contracts.work import Work
 from tasks.unit import open_input
 from worldpose.cameras import Camera
@@ -26,7 +28,8 @@ PAGES = 4
 class StoredClip:
     """One array of every camera's detections, padded to the same number, read when it is used.
 
-    Rejected keypoints are as if they had not been found.
+    Rejected keypoints are as if they had not been found. What was said of a place among the
+    detections is not said of whom was found again there since.
 
     Attributes:
         shape: (frames, cameras, detections, ...).
@@ -38,12 +41,25 @@ class StoredClip:
         name: str,
         rejected: xr.DataArray | None = None,
         shift: xr.DataArray | None = None,
+        *,
+        found_again: bool = True,
     ) -> None:
+        """Open it.
+
+        Args:
+            clips: whom each camera saw.
+            name: of the array.
+            rejected: (frames, cameras, detections, 17), to be left out.
+            shift: (frames, cameras, detections, 17, 2) [px], to be taken off.
+            found_again: with those who were looked for again.
+        """
         arrays = [clip[name] for clip in clips]
         detections = max(1, *(array.sizes["detection"] for array in arrays))
         frames, _, *rest = arrays[0].shape
         self.shape: tuple[int, ...] = (frames, len(arrays), detections, *rest)
         self._arrays = arrays
+        self._clips = clips
+        self._found_again = found_again
         self._rejected = rejected
         self._shift = shift
         self._page = lru_cache(PAGES)(self._read)
@@ -63,11 +79,47 @@ class StoredClip:
         page = np.full((stop - start, *self.shape[1:]), np.nan, dtype=np.float32)
         for camera, array in enumerate(self._arrays):
             page[:, camera, : array.sizes["detection"]] = array[start:stop].values
+        rows = slice(start, stop)
         if self._shift is not None:
-            page -= self._shift[start:stop].values
+            page -= said_of(self._clips, self._shift, page.shape, rows)
+            for camera, clip in enumerate(self._clips):
+                if "shift" in clip:
+                    page[:, camera, : clip.sizes["detection"]] -= clip["shift"][rows].values
         if self._rejected is not None:
-            page[self._rejected[start:stop].values] = np.nan
+            page[said_of(self._clips, self._rejected, page.shape[:4], rows)] = np.nan
+        if not self._found_again:
+            page[_found_again(self._clips, page.shape[:3], rows)] = np.nan
         return page
+
+
+def said_of(
+    clips: Sequence[xr.Dataset], said: xr.DataArray, shape: tuple[int, ...], rows: slice
+) -> NDArray[Any]:
+    """What the iteration before said of detections, in their places now; nothing of those since.
+
+    Args:
+        clips: whom each camera saw.
+        said: (frames, cameras, detections of then, ...).
+        shape: (rows, cameras, detections, ...) of the answer.
+        rows: of the frames.
+    """
+    before = said[rows].values
+    out = np.zeros(shape, dtype=before.dtype)
+    both = min(shape[2], before.shape[2])
+    out[:, :, :both] = before[:, :, :both]
+    out[_found_again(clips, shape[:3], rows)] = 0
+    return out
+
+
+def _found_again(
+    clips: Sequence[xr.Dataset], shape: tuple[int, ...], rows: slice
+) -> NDArray[np.bool_]:
+    """Which places (rows, cameras, detections) hold somebody who was looked for again."""
+    found = np.zeros(shape, dtype=np.bool_)
+    for camera, clip in enumerate(clips):
+        if "found_again" in clip:
+            found[:, camera, : clip.sizes["detection"]] = clip["found_again"][rows].values >= 0
+    return found
 
 
 @dataclass(frozen=True)
@@ -93,12 +145,19 @@ class ClipInputs:
     fps: float
 
 
+NOTHING = {"keypoints": np.nan, "confidence": np.nan, "found_again": -1, "shift": 0.0}
+"""What is said of places without anybody."""
 ADJUSTED = "bundle_adjustment/cameras"
 """All static cameras, where they are adjusted to people."""
 
 
 def open_clip(
-    store: Store, work: Work, *, filtered: bool = True, shifted: bool = True
+    store: Store,
+    work: Work,
+    *,
+    filtered: bool = True,
+    shifted: bool = True,
+    found_again: bool = True,
 ) -> ClipInputs:
     """The clip of `work`; its detections are read when they are used.
 
@@ -107,22 +166,33 @@ def open_clip(
         work: the work under way.
         filtered: without what the bodies of the iteration before contradicted.
         shifted: without what keypoints were beside those bodies by for lasting reasons.
+        found_again: with those who were looked for again.
     """
     first, count = work.recipe.sources["first_frame"], work.recipe.sources["frame_count"]
     where = slice(first, first + count - 1)
-    seen = [open_input(store, work, name).sel(frame=where) for name in work.recipe.sources["seen"]]
+    seen = _seen(store, work, where)
     said = _said_before(store, work, {work.recipe.unit: where})
     rejected, shift = said["rejected"] if filtered else None, said["shift"] if shifted else None
-    return _open(store, work, np.arange(first, first + count), seen, rejected, shift)
+    frame = np.arange(first, first + count)
+    return _open(store, work, frame, seen, rejected, shift, found_again=found_again)
+
+
+def dropped_before(store: Store, work: Work) -> NDArray[np.bool_] | None:
+    """Boxes that the iteration before dropped (frames, cameras, detections); None in the first."""
+    before = f"filtering/{work.recipe.unit}"
+    if before not in work.recipe.inputs:
+        return None
+    dropped = open_input(store, work, before)["dropped"]
+    seen = _seen(store, work, slice(dropped["frame"].values[0], dropped["frame"].values[-1]))
+    detections = max(1, *(clip.sizes["detection"] for clip in seen))
+    return said_of(seen, dropped, (*dropped.shape[:2], detections), slice(None))
 
 
 def open_frames(store: Store, work: Work, frames: Mapping[str, NDArray[np.int64]]) -> ClipInputs:
     """Match frames of each clip, clip by clip, with every camera's detections in memory."""
     names = work.recipe.sources["seen"]
     seen = [
-        _together(
-            [open_input(store, work, names[clip][c]).sel(frame=frames[clip]) for clip in frames]
-        )
+        _together([_people(store, work, names[clip][c]).sel(frame=frames[clip]) for clip in frames])
         for c in range(len(work.recipe.sources["cameras"]))
     ]
     frame = np.concatenate(list(frames.values()))
@@ -131,13 +201,25 @@ def open_frames(store: Store, work: Work, frames: Mapping[str, NDArray[np.int64]
     return replace(some, keypoints=keypoints, confidence=confidence)
 
 
+def _seen(store: Store, work: Work, where: slice) -> list[xr.Dataset]:
+    """Whom each camera saw in the clip of `work`."""
+    return [_people(store, work, name).sel(frame=where) for name in work.recipe.sources["seen"]]
+
+
+def _people(store: Store, work: Work, name: str) -> xr.Dataset:
+    """Whom a camera saw, with those found again where `work` is made from them."""
+    again = again_of(name)
+    return open_input(store, work, again if again in work.recipe.inputs else name)
+
+
 def _together(clips: Sequence[xr.Dataset]) -> xr.Dataset:
     """Whom one camera saw, clip by clip, padded to the same number."""
     most = max(clip.sizes["detection"] for clip in clips)
-    padded = [
-        clip[["keypoints", "confidence"]].pad(detection=(0, most - clip.sizes["detection"]))
-        for clip in clips
-    ]
+    padded = []
+    for clip in clips:
+        names = [each for each in NOTHING if each in clip]
+        more = (0, most - clip.sizes["detection"])
+        padded.append(clip[names].pad(detection=more, constant_values=NOTHING))
     return xr.concat(padded, dim="frame")
 
 
@@ -171,6 +253,8 @@ def _open(
     seen: Sequence[xr.Dataset],
     rejected: xr.DataArray | None,
     shift: xr.DataArray | None,
+    *,
+    found_again: bool = True,
 ) -> ClipInputs:
     """Match frames, with whom each camera saw in them.
 
@@ -184,8 +268,8 @@ def _open(
         cameras=cameras,
         camera_covariance=covariance,
         frame=frame,
-        keypoints=StoredClip(seen, "keypoints", rejected, shift),
-        confidence=StoredClip(seen, "confidence", rejected),
+        keypoints=StoredClip(seen, "keypoints", rejected, shift, found_again=found_again),
+        confidence=StoredClip(seen, "confidence", rejected, found_again=found_again),
         fps=float(sources["fps"]),
     )
 

@@ -107,7 +107,7 @@ def _detected(store: Store, work: Work, spool: Spool) -> _Found:
     sources: dict[str, Any] = work.recipe.sources
     settings = DetectionSettings.model_validate(work.recipe.settings)
     finder = PeopleFinder(load_detectors(settings), load_pose(settings), settings)
-    _require_weights(settings, sources["weights"])
+    require_weights(settings, sources["weights"])
     unreadable: list[int] = []
     most = 0
     for stretch in finder.find(_pictures(store, work), _place(store, work)):
@@ -146,7 +146,7 @@ def _pictures(store: Store, work: Work) -> Iterator[tuple[int, Picture | None]]:
     numbers = footage["picture_of_frame"].sel(frame=slice(first, first + count - 1)).values
     there = numbers[numbers >= 0]
     frame = first
-    with open_video(Path(work.folder) / sources["video"], _index(footage)) as video:
+    with open_video(Path(work.folder) / sources["video"], footage_index(footage)) as video:
         shown = video.readable(int(there[0]), int(there[-1]) + 1) if len(there) else iter(())
         for number in numbers:
             picture = None
@@ -158,7 +158,8 @@ def _pictures(store: Store, work: Work) -> Iterator[tuple[int, Picture | None]]:
             frame += 1
 
 
-def _index(footage: xr.Dataset) -> FrameIndex:
+def footage_index(footage: xr.Dataset) -> FrameIndex:
+    """Which pictures a video has, as `ingest` found them."""
     video = footage.attrs["video"]
     width, height = video["size"]
     base = video["time_base"]
@@ -180,7 +181,7 @@ def _place(store: Store, work: Work) -> Place | None:
     return Place(camera_from_arrays(known.data_vars), pitch)
 
 
-def _require_weights(settings: DetectionSettings, planned: dict[str, str | None]) -> None:
+def require_weights(settings: DetectionSettings, planned: dict[str, str | None]) -> None:
     """Refuse other weights or libraries than the run was planned with.
 
     Raises:

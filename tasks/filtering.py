@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from data_contracts.filtering import FILTERING
 from data_contracts.work import Work
-from tasks.clip_inputs import ClipInputs, open_clip
+from tasks.clip_inputs import ClipInputs, dropped_before, open_clip
 from tasks.spool import spooling
 from tasks.triangulation import settings_before
 from tasks.unit import open_input, unit_task
@@ -142,8 +142,6 @@ class _Case:
 
 def _open(store: Store, work: Work) -> _Case:
     unit = work.recipe.unit
-    before = f"filtering/{unit}"
-    known = before in work.recipe.inputs
     tracks = open_input(store, work, f"tracking/{unit}")
     (bodies,) = (
         open_input(store, work, name)
@@ -159,7 +157,7 @@ def _open(store: Store, work: Work) -> _Case:
         step=np.gradient(joints, axis=0) if len(joints) > 1 else np.zeros_like(joints),
         covariance=bodies["covariance"].values,
         placed=open_input(store, work, f"retriangulation/{unit}"),
-        dropped=open_input(store, work, before)["dropped"].values if known else None,
+        dropped=dropped_before(store, work),
         triangulation=settings_before(store, work, unit),
     )
 
@@ -182,9 +180,11 @@ def _counts(judged: Judgement, suspects: Suspects) -> list[float]:
 def _held_out(store: Store, work: Work, case: _Case, frames: NDArray[np.int64]) -> dict[str, float]:
     """How well left-out cameras are foreseen from the keypoints that this iteration rests on.
 
-    How far cameras misplace people is learned in every iteration, so that all compare.
+    How far cameras misplace people is learned in every iteration, and nobody who was looked for
+    again is to be foreseen, so that all compare.
     """
-    clip, whole = open_clip(store, work), open_clip(store, work, filtered=False)
+    clip = open_clip(store, work)
+    whole = open_clip(store, work, filtered=False, found_again=False)
     found = measure_held_out(
         clip.cameras,
         _taken(clip, frames),

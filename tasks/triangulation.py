@@ -56,7 +56,7 @@ def place_joints(
     tracks = open_input(store, work, f"tracking/{work.recipe.unit}")
     index = tracks["detection_index"].values
     detections = ClipDetections(clip.keypoints, clip.confidence, index)
-    given = (clip.fps, settings, _covariance(work, clip))
+    given = (clip.fps, settings, camera_errors(work, clip))
     model, detections = learn_clip(clip.cameras, detections, *given)
     agreements, changes = [], []
     with spooling(store) as spool:
@@ -78,8 +78,8 @@ def place_joints(
         result.figures.update(figures_of(report, clip.camera_ids))
 
 
-def _covariance(work: Work, clip: ClipInputs) -> NDArray[np.float64] | None:
-    """How well each camera is known; None from the second iteration on.
+def camera_errors(work: Work, clip: ClipInputs) -> NDArray[np.float64] | None:
+    """How well each camera is known, (cameras, 12, 12); None from the second iteration on.
 
     Cameras that were adjusted to people know where they are towards each other much better than
     each knows its own place, which all have in common: taken for errors of single cameras, that

@@ -33,6 +33,7 @@ STAGES_IN_WORLDPOSE = (
     "body_fitting",
     "broadcast_calibration",
     "filtering",
+    "redetection",
     "release",
     "evaluation",
     "synthetic",

@@ -12,8 +12,10 @@ from flows.method import METHOD
 from flows.planning import plan_run, plan_stage
 from flows.registering import register
 from flows.run_record import RunLog
+from tasks.clip_inputs import ClipInputs
 from tasks.ingest import ingest
 from tasks.static_calibration import static_calibration
+from tasks.triangulation import camera_errors
 from tasks.unit import unit_task
 from worldpose.cameras.stored import camera_from_arrays
 from worldpose.errors import CorruptionError, InputError, StoreError
@@ -75,6 +77,22 @@ def test_a_clicked_camera_says_how_well_it_is_known(clicked, tiny):
     found = camera_from_arrays(stored.data_vars)
     # Clicked at 1 px from 60 m and more: metres would be a wrong camera, not an uncertain one.
     assert np.linalg.norm(found.center - true.center) < 3.0
+
+
+def test_how_far_cameras_misplace_people_is_learned_from_the_second_iteration_on(clicked):
+    store, match, _ = clicked
+    stated = np.ones((3, 12, 12))
+    clip = ClipInputs(("a", "b", "c"), None, stated, np.arange(5), None, None, 50.0)
+    told = {
+        (iteration, unit.recipe.stage): camera_errors(unit.work(store.url, match, "0001"), clip)
+        for iteration in (1, 2)
+        for unit in plan_run(store, match, {}, iteration=iteration)
+        if unit.recipe.stage in ("triangulation", "retriangulation")
+    }
+    assert told[1, "triangulation"] is stated
+    assert told[1, "retriangulation"] is stated
+    assert told[2, "triangulation"] is None
+    assert told[2, "retriangulation"] is None
 
 
 def test_a_moved_click_reaches_its_camera_and_what_sees_through_it_alone(clicked, tmp_path):

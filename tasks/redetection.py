@@ -1,0 +1,255 @@
+"""Task of stage `redetection`: who is looked for again in one clip of one camera's video."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17
+from data_contracts.pitch import PitchSpec
+from data_contracts.redetection import REDETECTION
+from data_contracts.work import Recipe, Work
+from tasks.clip_inputs import ADJUSTED
+from tasks.detection import footage_index, require_weights
+from tasks.triangulation import settings_before
+from tasks.unit import open_input, require_registered, unit_task
+from worldpose.cameras import Camera
+from worldpose.cameras.stored import camera_from_arrays
+from worldpose.detection import DetectionSettings, Place, load_pose
+from worldpose.detection.interfaces import Picture
+from worldpose.filtering import (
+    BodyViews,
+    Habits,
+    Spread,
+    Suspects,
+    ViewBias,
+    learn_from,
+    perceived_joints,
+    view_bodies,
+    watch_motion,
+)
+from worldpose.pitch import PitchTemplate
+from worldpose.redetection import (
+    Answers,
+    Expected,
+    RedetectionSettings,
+    Sought,
+    Verdicts,
+    judge_answers,
+    look_again,
+    who_is_seen,
+    whom_to_seek,
+)
+from worldpose.store import Store
+from worldpose.video import open_video
+from worldpose.video.some import some_pictures
+
+FEW: Final = 500
+"""Keypoints below which a camera's own spread is not learned, and the stated one counts [1]."""
+
+
+@unit_task
+def redetection(work: Work) -> str:
+    """Publishes whom the camera shows, those found again included; returns the key."""
+    store = Store.open(work.project)
+    settings = RedetectionSettings.model_validate(work.recipe.settings)
+    with store.publishing(work) as result:
+        case = _open(store, work)
+        sought = case.sought(settings)
+        answers = _answers(store, work, case, sought)
+        verdicts = judge_answers(
+            answers,
+            sought,
+            case.expected,
+            (case.detected["keypoints"].values, case.detected["boxes"].values),
+            case.spread,
+            case.noise,
+            settings,
+        )
+        result.write(
+            REDETECTION,
+            arrays=_arrays(case, sought, answers, verdicts),
+            coordinates={"frame": case.detected["frame"].values},
+            attributes={"camera_id": work.recipe.sources["camera"]},
+        )
+        for name in ("found", "unsure", "elsewhere", "another"):
+            result.figures[name] = float(np.count_nonzero(getattr(verdicts, name)))
+        result.figures |= {"sought": float(len(sought.frame)), "hidden": float(sought.hidden)}
+    return work.key
+
+
+@dataclass(frozen=True, eq=False)
+class _Case:
+    """A clip before one camera, and the bodies of the iteration before.
+
+    Attributes:
+        camera: as adjusted to people.
+        detection: the recipe by which people were detected.
+        detected: the result of `detection`.
+        person: (persons,) ids.
+        expected: the bodies in the camera's pictures.
+        shift: (frames, persons, 17, 2) [px], by how much keypoints are beside joints for lasting
+            reasons.
+        seen: (frames, persons), who was detected; everybody in frames that people corrected.
+        spread: of the camera's keypoints about the bodies.
+        noise: what keypoints are stated to err by, [px] and [m].
+    """
+
+    camera: Camera
+    detection: Recipe
+    detected: xr.Dataset
+    person: NDArray[np.integer]
+    expected: Expected
+    shift: NDArray[np.float64]
+    seen: NDArray[np.bool_]
+    spread: Spread
+    noise: tuple[float, float]
+
+    def sought(self, settings: RedetectionSettings) -> Sought:
+        """Who should be seen well and is not; nobody where that is not wanted."""
+        pitch = self.detection.sources["pitch"]
+        place = None
+        if pitch is not None:
+            place = Place(self.camera, PitchTemplate.from_spec(PitchSpec.model_validate(pitch)))
+        width, height = (int(side) for side in self.camera.image_size)
+        return whom_to_seek(
+            self.expected,
+            self.seen | (not settings.enabled),
+            (width, height),
+            settings,
+            place,
+            DetectionSettings.model_validate(self.detection.settings).pitch_margin_m,
+        )
+
+
+def _open(store: Store, work: Work) -> _Case:
+    sources: dict[str, Any] = work.recipe.sources
+    name, clip = sources["camera"], sources["clip"]
+    unit, inputs = work.recipe.unit, work.recipe.inputs
+    detected = open_input(store, work, f"detection/{unit}")
+    manifest = store.manifest(work.recipe.match_id, "detection", unit, inputs[f"detection/{unit}"])
+    tracks = open_input(store, work, f"tracking/{clip}")
+    place = tracks["camera"].values.tolist().index(name)
+    camera = camera_from_arrays(open_input(store, work, ADJUSTED).data_vars)[place]
+    one = Camera.stack([camera])
+    (bodies,) = (
+        open_input(store, work, f"{stage}/{clip}")
+        for stage in ("refitting", "body_fitting")
+        if f"{stage}/{clip}" in inputs
+    )
+    placed = open_input(store, work, f"retriangulation/{clip}").isel(camera=[place])
+    said = open_input(store, work, f"filtering/{clip}")
+    joints = perceived_joints(bodies["joints"].values, bodies["joint_offsets"].values)
+    views = view_bodies(one, joints, bodies["covariance"].values)
+    step = np.gradient(joints, axis=0) if len(joints) > 1 else np.zeros_like(joints)
+    habits = Habits(ViewBias(said["view_bias"].values), said["clock_late"].values[[place]])
+    shift = habits.shift(watch_motion(one, joints, step), views)
+    offsets = placed["offsets"].values.astype(np.float64)
+    beside = shift[:, 0] + offsets[:, 0, :, None]
+
+    count = detected.sizes["detection"]  # after these, the iteration before had found some again
+    index = tracks["detection_index"].values[:, place]
+    fits, dropped = (said[name].values[:, place, :count] for name in ("fits", "dropped"))
+    seen = who_is_seen(index, fits, dropped)
+    edits: Any = manifest.recipe.sources.get("edits", [])
+    seen[np.isin(detected["frame"].values, [edit["frame"] for edit in edits])] = True
+    noise = settings_before(store, work, clip).noise
+    confidence = detected["confidence"].values.astype(np.float64)
+    suspects = Suspects(
+        detected["keypoints"].values[:, None].astype(np.float64),
+        confidence[:, None],
+        np.where(index < count, index, -1)[:, None],
+        offsets,
+        placed["exchanged"].values,
+        dropped[:, None],
+        noise,
+    )
+    return _Case(
+        camera=camera,
+        detection=manifest.recipe,
+        detected=detected,
+        person=tracks["person"].values,
+        expected=Expected.of(views, beside, float(camera.focal.mean())),
+        shift=np.nan_to_num(shift[:, 0]),
+        seen=seen,
+        spread=_spread(views, suspects.without(shift)),
+        noise=noise,
+    )
+
+
+def _spread(views: BodyViews, suspects: Suspects) -> Spread:
+    """How keypoints lie about bodies before this camera; as stated where too few tell."""
+    if np.count_nonzero(suspects.index >= 0) * len(COCO17) < FEW:
+        return Spread(np.ones(len(COCO17)), np.empty(0), np.ones(1))
+    return learn_from(views, suspects)
+
+
+def _answers(store: Store, work: Work, case: _Case, sought: Sought) -> Answers:
+    """What the pose net of `detection` sees where people are sought."""
+    settings = DetectionSettings.model_validate(case.detection.settings)
+    sources: dict[str, Any] = case.detection.sources
+    if not len(sought.frame):
+        return Answers.none(0)
+    require_weights(settings, sources["weights"])
+    shown = _pictures(store, work, case, np.unique(sought.frame))
+    boxes = case.detected["boxes"].values
+    answers = look_again(shown, sought, load_pose(settings), settings.least_keypoint, boxes)
+    require_registered(Path(work.folder) / sources["video"], sources["video_sha256"])
+    return answers
+
+
+def _pictures(
+    store: Store, work: Work, case: _Case, places: NDArray[np.int64]
+) -> Iterator[tuple[int, Picture | None]]:
+    """The pictures at some places among the frames, in order; those that the video lacks are not.
+
+    Decoding jumps over what nobody is sought in.
+    """
+    sources: dict[str, Any] = case.detection.sources
+    footage = open_input(store, work, f"ingest/{work.recipe.sources['camera']}")
+    numbers = footage["picture_of_frame"].sel(frame=case.detected["frame"].values[places]).values
+    there = numbers >= 0
+    place_of = dict(zip(numbers[there].tolist(), places[there].tolist(), strict=True))
+    with open_video(Path(work.folder) / sources["video"], footage_index(footage)) as video:
+        for number, picture in some_pictures(video, numbers[there]):
+            yield place_of[number], picture
+
+
+def _arrays(
+    case: _Case, sought: Sought, answers: Answers, verdicts: Verdicts
+) -> dict[str, NDArray[Any]]:
+    """All that were detected in their places, and behind them those found again."""
+    before = {
+        name: case.detected[name].values for name in ("keypoints", "confidence", "boxes", "score")
+    }
+    frames, count = before["score"].shape
+    (found,) = np.nonzero(verdicts.found)
+    frame = sought.frame[found]
+    behind = np.arange(len(found)) - np.searchsorted(frame, frame)
+    more = int(behind.max(initial=-1)) + 1
+    arrays = {
+        name: np.pad(
+            values,
+            [(0, 0), (0, more)] + [(0, 0)] * (values.ndim - 2),
+            constant_values=np.nan,
+        )
+        for name, values in before.items()
+    }
+    shape = (frames, count + more)
+    arrays["found_again"] = np.full(shape, -1, dtype=np.int32)
+    arrays["shift"] = np.zeros((*shape, len(COCO17), 2), dtype=np.float32)
+    at = frame, count + behind
+    wrong = verdicts.rejected[found]
+    arrays["keypoints"][at] = np.where(wrong[..., None], np.nan, answers.keypoints[found])
+    arrays["confidence"][at] = np.where(wrong, np.nan, answers.confidence[found])
+    arrays["boxes"][at] = answers.boxes[found]
+    arrays["score"][at] = answers.score[found]
+    arrays["found_again"][at] = case.person[sought.person[found]]
+    arrays["shift"][at] = case.shift[frame, sought.person[found]]
+    return arrays

@@ -1,0 +1,100 @@
+"""Who is looked for again is made from the iteration before, and of given 2D poses nobody is."""
+
+import numpy as np
+import pytest
+from test_iteration import LATER, keys, reached
+from test_refitting import halves
+
+from data_contracts.cameras import CameraCalibration
+from data_contracts.match import MatchSpec
+from flows.redetection import STAGE
+from flows.registering import register
+from worldpose.ingest import write_match
+from worldpose.store import Store
+from worldpose.video import write_video
+
+SIZE = (64, 48)
+
+
+@pytest.fixture
+def filmed(tmp_path):
+    """A folder with two clips of two cameras' videos."""
+    cameras = ("left", "right")
+    spec = {
+        "match_id": "filmed",
+        "fps": 25,
+        "cameras": [{"id": name, "width": SIZE[0], "height": SIZE[1]} for name in cameras],
+        "clips": [
+            {"id": clip, "first_frame": first, "frame_count": 5}
+            for clip, first in (("first", 0), ("second", 6))
+        ],
+        "pitch": "none",
+    }
+    calibrations = {
+        name: CameraCalibration(
+            id=name,
+            image_size=SIZE,
+            focal_px=(50.0, 50.0),
+            principal_point_px=(31.5, 23.5),
+            rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+            translation=(0.0, 0.0, 5.0),
+        )
+        for name in cameras
+    }
+
+    def film(folder):
+        (folder / "videos").mkdir()
+        for n, name in enumerate(cameras):
+            pictures = [np.full((SIZE[1], SIZE[0], 3), 10 * n, np.uint8)] * 12
+            write_video(folder / "videos" / f"{name}.mp4", pictures, 25.0)
+
+    folder = tmp_path / "match"
+    spec = MatchSpec.model_validate(spec)
+    write_match(folder, spec, calibrations=calibrations, observations={}, further=film)
+    return Store.create(tmp_path / "project"), folder
+
+
+def test_detections_stay_and_all_later_stages_are_made_from_those_found_again(filmed):
+    store, folder = filmed
+    units = keys(store, folder, 3)
+    assert not any(name.startswith("redetection") for number, name in units if number == 1)
+    for (number, name), unit in units.items():
+        if number == 1:
+            continue
+        stage, _, which = name.partition("/")
+        if stage == "detection":
+            assert unit.key == units[1, name].key
+        if stage == "redetection":
+            clip = which.partition(".")[2]
+            assert unit.recipe.inputs[f"detection/{which}"] == units[1, f"detection/{which}"].key
+            for before in (f"filtering/{clip}", f"body_fitting/{clip}", f"tracking/{clip}"):
+                assert unit.recipe.inputs[before] == units[number - 1, before].key
+        if stage in (*LATER, "filtering"):
+            mine = {each for each in unit.recipe.inputs if each.startswith("redetection/")}
+            clips = ("first", "second") if which == "cameras" else (which,)
+            wanted = {f"redetection/{cam}.{clip}" for cam in ("left", "right") for clip in clips}
+            assert mine == wanted
+            assert all(unit.recipe.inputs[each] == units[number, each].key for each in mine)
+
+
+@pytest.mark.parametrize("stage", ["detection", "redetection", "body_fitting"])
+def test_a_setting_reaches_its_dependency_set(filmed, stage):
+    store, folder = filmed
+    value = {
+        "detection": {"sure": 0.3},
+        "redetection": {"least_confidence": 0.6},
+        "body_fitting": {"tail": 3.0},
+    }[stage]
+    before = keys(store, folder, 3)
+    after = keys(store, folder, 3, {stage: value})
+    match, _ = register(store, folder)
+    starts = {name for _, name in before if name.startswith(f"{stage}/")}
+    changed = {name for name in after if after[name].key != before[name].key}
+    assert changed == reached(match, 3, *starts)
+    assert (2, "redetection/left.first") in changed
+    assert ((1, "filtering/first") in changed) == (stage != "redetection")
+
+
+def test_of_given_poses_nobody_is_looked_for(tiny, tmp_path):
+    match, _ = register(Store.create(tmp_path / "project"), halves(tiny, tmp_path / "match"))
+    assert STAGE.units(match) == ()

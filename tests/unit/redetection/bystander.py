@@ -1,0 +1,56 @@
+"""People who stand before one camera, by hand: where everything must be is arithmetic."""
+
+import numpy as np
+
+from worldpose.cameras import Camera, Rigid
+from worldpose.filtering import BodyViews, Spread, view_bodies
+from worldpose.redetection import Expected
+
+FOCAL, SIZE = 1000.0, (1000, 600)
+AWAY = 20.0
+"""Of the place (0, 0) from the camera [m]: a metre is 50 px there."""
+NOISE = (1.0, 0.02)
+
+STANDING = np.array(
+    [
+        *([0.0, 1.60], [0.03, 1.63], [-0.03, 1.63], [0.07, 1.62], [-0.07, 1.62]),
+        *([0.20, 1.40], [-0.20, 1.40], [0.30, 1.15], [-0.30, 1.15], [0.33, 0.90], [-0.33, 0.90]),
+        *([0.12, 0.95], [-0.12, 0.95], [0.14, 0.50], [-0.14, 0.50], [0.15, 0.10], [-0.15, 0.10]),
+    ]
+)
+"""To the left and up [m], of who faces the camera."""
+
+
+def camera():
+    """At (0, -20, 1), level, looking along y."""
+    rotation = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    return Camera(
+        focal=np.array([FOCAL, FOCAL]),
+        principal_point=np.array([499.5, 299.5]),
+        distortion=np.zeros(5),
+        cam_from_world=Rigid(rotation, np.array([0.0, 1.0, AWAY])),
+        image_size=np.array(SIZE),
+    )
+
+
+def standing(*places):
+    """Joints (1, persons, 17, 3) of people who stand at (x, y) [m]."""
+    joints = np.empty((1, len(places), 17, 3))
+    for joint, (x, y) in zip(joints[0], places, strict=True):
+        joint[:, 0] = x + STANDING[:, 0]
+        joint[:, 1] = y
+        joint[:, 2] = STANDING[:, 1]
+    return joints
+
+
+def expected(*places, deviation=0.02):
+    """What the camera should see of them in one frame."""
+    joints = standing(*places)
+    covariance = np.broadcast_to(np.eye(3) * deviation**2, (*joints.shape[:3], 3, 3))
+    views: BodyViews = view_bodies(Camera.stack([camera()]), joints, covariance)
+    return Expected.of(views, np.zeros((*joints.shape[:3], 2)), FOCAL)
+
+
+def as_stated():
+    """Keypoints that err as their detector says."""
+    return Spread(np.ones(17), np.empty(0), np.ones(1))

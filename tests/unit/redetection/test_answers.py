@@ -1,0 +1,155 @@
+"""Whose the answers are: the person's, nobody's, or somebody else's."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bystander import NOISE, SIZE, as_stated, expected
+from hypothesis import given
+from hypothesis import strategies as st
+
+from worldpose.detection import Poses
+from worldpose.redetection import (
+    Answers,
+    RedetectionSettings,
+    Sought,
+    judge_answers,
+    look_again,
+    whom_to_seek,
+)
+
+SETTINGS = RedetectionSettings()
+KINDS = ("found", "unsure", "elsewhere", "another")
+
+
+def seek(bodies, *persons):
+    """Look for these persons of the only frame."""
+    return Sought(np.zeros(len(persons), int), np.array(persons), bodies.boxes[0, persons], 0)
+
+
+def answer(bodies, *persons, off=(0.0, 0.0), confidence=0.9):
+    """As if the net saw these bodies, so far off."""
+    keypoints = bodies.image[0, list(persons)] + off
+    count = len(persons)
+    return Answers(
+        keypoints, np.full((count, 17), confidence), bodies.boxes[0, persons] + 0.0, np.ones(count)
+    )
+
+
+def judge(bodies, answers, sought, detected=()):
+    pose = bodies.image[:, list(detected)] if len(detected) else np.empty((1, 0, 17, 2))
+    boxes = bodies.boxes[:, list(detected)] if len(detected) else np.empty((1, 0, 4))
+    given_ = (pose, boxes)
+    return judge_answers(answers, sought, bodies, given_, as_stated(), NOISE, SETTINGS)
+
+
+def kinds(verdicts):
+    return [next(k for k in KINDS if getattr(verdicts, k)[n]) for n in range(len(verdicts.found))]
+
+
+def test_an_answer_where_the_body_is_is_the_person_s():
+    bodies = expected((0.0, 0.0), (3.0, 0.0))
+    verdicts = judge(bodies, answer(bodies, 0, off=(1.0, -1.0)), seek(bodies, 0), detected=[1])
+    assert kinds(verdicts) == ["found"]
+    assert not verdicts.rejected.any()
+
+
+def test_an_answer_beside_the_body_is_not():
+    # Keypoints err by 1.4 px and bodies by 1 px here: 15 px are eight standard deviations.
+    bodies = expected((0.0, 0.0))
+    assert kinds(judge(bodies, answer(bodies, 0, off=(15.0, 0.0)), seek(bodies, 0))) == [
+        "elsewhere"
+    ]
+
+
+def test_how_far_it_may_be_off_goes_with_how_well_the_body_is_known():
+    sure, unsure = expected((0.0, 0.0)), expected((0.0, 0.0), deviation=0.1)
+    off = (6.0, 0.0)  # 3.4 standard deviations of the one, 1.2 of the other
+    assert kinds(judge(sure, answer(sure, 0, off=off), seek(sure, 0))) == ["elsewhere"]
+    assert kinds(judge(unsure, answer(unsure, 0, off=off), seek(unsure, 0))) == ["found"]
+
+
+def test_an_answer_that_the_net_doubts_is_nothing():
+    bodies = expected((0.0, 0.0))
+    doubted = answer(bodies, 0, confidence=SETTINGS.least_confidence - 0.01)
+    assert kinds(judge(bodies, doubted, seek(bodies, 0))) == ["unsure"]
+    assert kinds(judge(bodies, Answers.none(1), seek(bodies, 0))) == ["unsure"]
+
+
+def test_the_neighbour_s_pose_is_the_neighbour_s():
+    # A hand's breadth apart, and so unsure that either pose would do for both.
+    bodies = expected((0.0, 0.0), (0.2, 0.0), deviation=0.14)
+    assert kinds(judge(bodies, answer(bodies, 1), seek(bodies, 0))) == ["another"]
+
+
+def test_who_is_detected_there_already_is_not_found_again():
+    bodies = expected((0.0, 0.0))
+    verdicts = judge(bodies, answer(bodies, 0), seek(bodies, 0), detected=[0])
+    assert kinds(verdicts) == ["another"]
+
+
+def test_of_two_who_are_given_one_pose_the_nearer_has_it():
+    bodies = expected((0.0, 0.0), (0.08, 0.0), deviation=0.1)
+    both = answer(bodies, 0, 0)
+    assert kinds(judge(bodies, both, seek(bodies, 0, 1))) == ["found", "another"]
+
+
+def test_a_wrist_that_is_not_the_body_s_is_left_out():
+    bodies = expected((0.0, 0.0))
+    seen = answer(bodies, 0)
+    seen.keypoints[0, 9] += 25.0
+    verdicts = judge(bodies, seen, seek(bodies, 0))
+    assert kinds(verdicts) == ["found"]
+    assert np.flatnonzero(verdicts.rejected[0]).tolist() == [9]
+
+
+def test_half_a_body_is_too_little():
+    bodies = expected((0.0, 0.0))
+    seen = answer(bodies, 0)
+    seen.keypoints[0, 7:] = np.nan
+    seen.confidence[0, 7:] = np.nan
+    # Seven keypoints; twelve of confidence 1 would be needed to be sure of five missing ones.
+    sure = replace(seen, confidence=np.where(np.isnan(seen.confidence), np.nan, 1.0))
+    assert kinds(judge(bodies, sure, seek(bodies, 0))) == ["elsewhere"]
+
+
+@given(
+    st.lists(st.tuples(st.floats(-30, 30), st.floats(-30, 30), st.floats(0, 1)), min_size=2,
+             max_size=2),
+    st.sampled_from([(), (0,), (1,), (0, 1)]),
+)  # fmt: skip
+def test_every_answer_is_of_one_kind(answers, detected):
+    bodies = expected((0.0, 0.0), (0.4, 0.5))
+    seen = [answer(bodies, n, off=off, confidence=c) for n, (*off, c) in enumerate(answers)]
+    together = Answers(
+        *(
+            np.concatenate([getattr(each, name) for each in seen])
+            for name in ("keypoints", "confidence", "boxes", "score")
+        )
+    )
+    verdicts = judge(bodies, together, seek(bodies, 0, 1), detected)
+    assert (np.sum([getattr(verdicts, kind) for kind in KINDS], axis=0) == 1).all()
+
+
+class Seeing:
+    """Sees everybody in the middle of the box, an arm's keypoints hardly."""
+
+    def estimate(self, picture, boxes):
+        middle = 0.5 * (boxes[:, None, :2] + boxes[:, None, 2:])
+        confidence = np.full((len(boxes), 17), 0.8)
+        confidence[:, 9] = 0.01
+        return Poses(np.repeat(middle, 17, axis=1), confidence)
+
+
+def test_pictures_are_asked_for_everybody_who_is_sought_in_them():
+    bodies = expected((0.0, 0.0), (3.0, 0.0))
+    sought = whom_to_seek(bodies, np.zeros((1, 2), dtype=bool), SIZE, SETTINGS)
+    sought = replace(sought, frame=np.array([2, 5]))
+    picture = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    answers = look_again([(2, picture), (3, picture), (5, None)], sought, Seeing(), 0.05)
+    assert np.isnan(answers.keypoints[1]).all()  # a picture that could not be decoded
+    assert np.flatnonzero(np.isnan(answers.confidence[0])).tolist() == [9]
+    middle = 0.5 * (sought.boxes[0, :2] + sought.boxes[0, 2:])
+    np.testing.assert_allclose(answers.keypoints[0, 0], middle, atol=1e-12)
+    # The score of a net that tells nothing else is the mean of twelve: rounded.
+    assert answers.score[0] == pytest.approx(0.8, abs=1e-12)

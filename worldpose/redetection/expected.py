@@ -1,0 +1,96 @@
+"""Bodies as one camera's pictures should show them: where, how large, and behind whom."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17, COCO17_BONES
+from worldpose.filtering import BodyViews
+
+Floats = NDArray[np.float64]
+
+AROUND: Final = (0.12, 0.20, 0.12, 0.10)
+"""How far a person reaches beyond the joints: left, up to the top of the head, right, and down to
+the soles [m]."""
+BEHIND: Final = 0.2
+"""A body hides what is farther away than it is by more than this [m]."""
+_TRUNK: Final = tuple(
+    COCO17.index(f"{side}_{part}") for part in ("shoulder", "hip") for side in ("left", "right")
+)
+
+
+def _capsules() -> tuple[NDArray[np.int64], Floats]:
+    """Pairs of joints that a body is solid between, and its radius there [m]."""
+    trunk = set(_TRUNK)
+    ends = [*COCO17_BONES, (_TRUNK[0], _TRUNK[3]), (_TRUNK[1], _TRUNK[2]), (3, 4)]
+    radius = [0.12 if a < 5 and b < 5 else 0.11 if {a, b} <= trunk else 0.06 for a, b in ends]
+    return np.array(ends), np.array(radius)
+
+
+_ENDS, _RADIUS = _capsules()
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """Bodies before one camera, (frames, persons, 17) each; NaN without a body.
+
+    Attributes:
+        image: (..., 2) where a detector is expected to see joints [px].
+        variance: of `image` per axis [px^2], as far as the bodies are unsure.
+        scale: how large a metre is there [px/m].
+        depth: along the camera's axis of view [m].
+    """
+
+    image: Floats
+    variance: Floats
+    scale: Floats
+    depth: Floats
+
+    @classmethod
+    def of(cls, views: BodyViews, beside: Floats, focal: float) -> Expected:
+        """Return what the only camera of `views` should see.
+
+        Args:
+            views: bodies in the pictures of one camera.
+            beside: (frames, persons, 17, 2) [px] by which keypoints are expected beside them.
+            focal: of the camera [px].
+        """
+        scale = views.scale[:, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = np.where(scale > 0.0, focal / scale, np.nan)
+        return cls(views.image[:, 0] + np.nan_to_num(beside), views.variance[:, 0], scale, depth)
+
+    @property
+    def boxes(self) -> Floats:
+        """Whole bodies (frames, persons, 4) x0, y0, x1, y1 [px]; NaN where a joint is missing."""
+        left, up, right, down = (side * self.scale for side in AROUND)
+        x, y = self.image[..., 0], self.image[..., 1]
+        sides = [(x - left).min(-1), (y - up).min(-1), (x + right).max(-1), (y + down).max(-1)]
+        return np.stack(sides, axis=-1)
+
+    @property
+    def unsure(self) -> Floats:
+        """Median standard deviation of a body's joints across the view (frames, persons) [m]."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.median(np.sqrt(self.variance) / self.scale, axis=-1))
+
+    def hidden(self, frame: int) -> NDArray[np.bool_]:
+        """Which joints (persons, 17) of a frame lie behind somebody else's body."""
+        image, scale, depth = self.image[frame], self.scale[frame], self.depth[frame]
+        begin, end = image[:, _ENDS[:, 0]], image[:, _ENDS[:, 1]]
+        along = end - begin
+        radius = _RADIUS * scale[:, _ENDS].mean(-1)
+        near = depth[:, _ENDS].mean(-1)
+        off = image[:, :, None, None] - begin  # (persons, joints, others, capsules, 2)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            part = (off * along).sum(-1) / np.square(along).sum(-1)
+            away = off - np.clip(np.nan_to_num(part), 0.0, 1.0)[..., None] * along
+            covered = np.square(away).sum(-1) < radius**2
+            covered &= near + BEHIND < depth[:, :, None, None]
+        persons = np.arange(len(image))
+        covered[persons, :, persons] = False
+        return np.asarray(covered.any(axis=(2, 3)))
