@@ -38,6 +38,9 @@ class SceneKind:
         person_height: of people in the middle of the pictures [px].
         hazy: share of scenes with fog [1].
         fog: thickest [1/m].
+        exposure: logarithm of the pictures' brightness [1].
+        blur: of the lens [px].
+        noise: of the sensor [levels of 255].
         movements: chances of a match, a corner, people who wander, and people whose ways cross [1].
     """
 
@@ -47,6 +50,9 @@ class SceneKind:
     person_height: tuple[float, float] = (36.0, 140.0)
     hazy: float = 0.15
     fog: float = 0.006
+    exposure: tuple[float, float] = (-0.35, 0.3)
+    blur: tuple[float, float] = (0.4, 1.3)
+    noise: tuple[float, float] = (0.5, 5.0)
     movements: tuple[float, float, float, float] = (0.3, 0.2, 0.35, 0.15)
 
 
@@ -64,6 +70,10 @@ SHIFTED = SceneKind(
     40_000, ("chequers", "sash"), (1.60, 2.02), person_height=(34.0, 48.0), hazy=1.0, fog=0.02
 )
 """A change of domain: other kits, fog, lower zoom."""
+DUSK = replace(
+    SHIFTED, first_seed=45_000, hazy=0.0, exposure=(-1.5, -1.1), blur=(1.0, 1.8), noise=(5.0, 10.0)
+)
+"""Another, by which the settings of fine-tuning are chosen: dark, soft and noisy."""
 
 
 def render_set(
@@ -179,10 +189,10 @@ def _rendering(kind: SceneKind, rng: np.random.Generator) -> RenderingSettings:
         light="sun" if rng.random() < 0.55 else "floodlights",
         stand_shadow=float(rng.choice([0.0, 0.3, 0.45, 0.6])),
         fog=float(rng.uniform(0.4, 1.0) * kind.fog) if rng.random() < kind.hazy else 0.0,
-        exposure=float(np.exp(rng.uniform(-0.35, 0.3))),
+        exposure=float(np.exp(rng.uniform(*kind.exposure))),
         patterns=kind.patterns,
-        blur=float(rng.uniform(0.4, 1.3)),
-        noise=float(rng.uniform(0.5, 5.0)),
+        blur=float(rng.uniform(*kind.blur)),
+        noise=float(rng.uniform(*kind.noise)),
     )
 
 

@@ -1,19 +1,21 @@
 """Makes the weights that ship with the project: renders scenes, trains both nets, scores them.
 
-    python infra/embedded_detector/train.py FOLDER
+    python infra/embedded_detector/train.py FOLDER [--share 1.0] [scenes people keypoints figures]
 
-Every part goes on where it was interrupted. The detector is trained from nothing, then on with more
-crowds. Weights and figures.json end in FOLDER; weights with another seed or torch differ in their
-bytes, not in their figures' size.
+A training has phases, each of which begins with the weights of the one before. Every phase goes on
+where it was interrupted, and ends with the weights of an undisturbed one. Weights and figures.json
+end in FOLDER; with another seed or torch they differ in their bytes, not in their figures' size.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Final, TypeVar
 
 import torch
 from scenes import CHECKING, CROWDS, HELD_OUT, TRAINING, VARIETY, read_set, render_set
@@ -25,76 +27,116 @@ from worldpose.training import LabelledPicture, PictureCache, TrainingSettings
 from worldpose.training.nets import LEAST_HEIGHT, train_keypoint_net, train_people_net
 from worldpose.training.scoring import HEIGHTS, apart, found_people, score_keypoints, score_people
 
-SEED = 1
-SCENES = {
+Net = TypeVar("Net", PeopleNet, KeypointNet)
+
+SCENES: Final = {
     "training": (TRAINING, 50, 4, 2),
-    "variety": (VARIETY, 200, 2, 1),
-    "crowds": (CROWDS, 60, 2, 2),
+    "variety": (VARIETY, 139, 2, 1),
+    "crowds": (CROWDS, 88, 2, 2),
     "checking": (CHECKING, 10, 4, 2),
     "held_out": (HELD_OUT, 10, 4, 2),
 }
 """Kind, scenes, views of each and moments of each view."""
-LEARNED = (("training", "variety"), ("training", "variety", "crowds"))
-"""What each part of a training learns from."""
 
 
-def part(steps: int, rate: float, seed: int) -> TrainingSettings:
-    """Return how a part of a training goes."""
-    return TrainingSettings(steps=steps, check_every=500, rate=rate, seed=seed, bfloat16=True)
+@dataclass(frozen=True)
+class Phase:
+    """A part of a training.
+
+    Attributes:
+        steps: batches.
+        planned: batches over which the rate would have fallen to its end.
+        rate: highest learning rate [1].
+        seed: of its batches.
+        learned: sets of scenes that it learns from.
+    """
+
+    steps: int
+    planned: int
+    rate: float
+    seed: int
+    learned: tuple[str, ...]
+
+    def settings(self, share: float) -> TrainingSettings:
+        """How a share of the phase is trained."""
+        steps, planned = (max(round(share * each), 2) for each in (self.steps, self.planned))
+        return TrainingSettings(
+            steps=steps,
+            planned=planned,
+            check_every=max(round(share * 1000), 1),
+            rate=self.rate,
+            seed=self.seed,
+            bfloat16=True,
+        )
 
 
-PEOPLE = (part(6000, 1.5e-3, SEED), part(5000, 1e-3, 3))
-KEYPOINTS = part(8000, 1.5e-3, SEED)
-ABOUT = {"trained-on": "rendered scenes", "seed": str(SEED)}
+FEW: Final = ("training", "variety")
+ALL: Final = (*FEW, "crowds")
+PHASES: Final = {
+    "people": (
+        Phase(6000, 6000, 1.5e-3, 1, FEW),
+        Phase(3000, 8000, 1e-3, 3, ALL),
+        Phase(2000, 2000, 6e-4, 4, ALL),
+    ),
+    "keypoints": (
+        Phase(8000, 8000, 1.5e-3, 1, FEW),
+        Phase(6000, 6000, 1e-3, 2, FEW),
+        Phase(3750, 5000, 1e-3, 11, ALL),
+    ),
+}
+"""How the shipped weights came about, but for what the model card says."""
 
 
-def main(folder: Path, parts: Sequence[str]) -> None:
-    """Render, train and score what is named: `scenes`, `people`, `keypoints`, `figures`."""
+def main(folder: Path, parts: Sequence[str], share: float) -> None:
+    """Render, train and score what is named: `scenes`, `people`, `keypoints`, `figures`.
+
+    Args:
+        folder: of everything that is made.
+        parts: what to do.
+        share: of scenes and steps [1]; less than 1 shows that it works, and no more.
+    """
     torch.set_num_threads(1)
     if "scenes" in parts:
         for name, (kind, count, views, frames) in SCENES.items():
-            for line in render_set(folder / name, kind, count, views=views, frames=frames):
+            scenes = max(round(share * count), 1)
+            for line in render_set(folder / name, kind, scenes, views=views, frames=frames):
                 say(line)
     cache = PictureCache()
-    learned = [[q for name in names for q in read_set(folder / name)] for names in LEARNED]
-    checked = read_set(folder / "checking")[::2]
     if "people" in parts:
-        train_people(folder, learned, checked, cache)
+        train(folder, "people", PeopleNet(), train_people_net, cache, share)
     if "keypoints" in parts:
-        train_keypoints(folder, learned[0], checked, cache)
+        train(folder, "keypoints", KeypointNet(), train_keypoint_net, cache, share)
     if "figures" in parts:
         figures = score(folder, read_set(folder / "held_out"), cache)
         (folder / "figures.json").write_text(json.dumps(figures, indent=2) + "\n")
         say(json.dumps(figures))
 
 
-def train_people(
+def train(
     folder: Path,
-    learned: Sequence[Sequence[LabelledPicture]],
-    checked: Sequence[LabelledPicture],
+    name: str,
+    net: Net,
+    how: Callable[..., object],
     cache: PictureCache,
+    share: float,
 ) -> None:
-    """Train the detector; its weights are those of the best check."""
-    torch.manual_seed(SEED)
-    net = PeopleNet()
-    for number, (pictures, how) in enumerate(zip(learned, PEOPLE, strict=True)):
-        checkpoint = folder / f"people{number}.checkpoint"
-        train_people_net(net, pictures, checked, cache, how, checkpoint=checkpoint, progress=say)
-    save_weights(folder / "embedded_people.safetensors", net, ABOUT)
-
-
-def train_keypoints(
-    folder: Path,
-    learned: Sequence[LabelledPicture],
-    checked: Sequence[LabelledPicture],
-    cache: PictureCache,
-) -> None:
-    """Train the pose estimator; its weights are those of the best check."""
-    torch.manual_seed(SEED)
-    net = KeypointNet()
-    checkpoint = folder / "keypoints.checkpoint"
-    train_keypoint_net(net, learned, checked, cache, KEYPOINTS, checkpoint=checkpoint, progress=say)
-    save_weights(folder / "embedded_keypoints.safetensors", net, ABOUT)
+    """Train a net through its phases; the weights of each are those of its best check."""
+    checked = read_set(folder / "checking")[::2]
+    for number, phase in enumerate(PHASES[name]):
+        done = folder / f"{name}-{number}.safetensors"
+        if not done.exists():
+            say(f"{name}: phase {number + 1} of {len(PHASES[name])}")
+            torch.manual_seed(phase.seed)
+            net = type(net)() if number == 0 else net
+            how(
+                *(net, [q for each in phase.learned for q in read_set(folder / each)]),
+                *(checked, cache, phase.settings(share)),
+                checkpoint=folder / f"{name}-{number}.checkpoint",
+                progress=say,
+            )
+            save_weights(done, net, {"trained-on": "rendered scenes", "seed": str(phase.seed)})
+        net = load_weights(done, type(net)())
+    (folder / f"embedded_{name}.safetensors").write_bytes(done.read_bytes())
 
 
 def score(
@@ -129,4 +171,9 @@ def say(line: str) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2:] or ["scenes", "people", "keypoints", "figures"])
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("parts", nargs="*", default=["scenes", "people", "keypoints", "figures"])
+    parser.add_argument("--share", type=float, default=1.0)
+    given = parser.parse_args()
+    main(given.folder, given.parts, given.share)

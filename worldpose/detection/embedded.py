@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass, fields
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -15,8 +16,9 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.detection.boxes import overlaps, suppress
+from worldpose.detection.boxes import SUREST, overlaps, suppress
 from worldpose.detection.embedded_crops import crops_of_boxes, cut, picture_from_crop
+from worldpose.detection.embedded_surroundings import CELL, MAPS, SAME, surroundings
 from worldpose.detection.embedded_weights import load_weights
 from worldpose.detection.groups import groups
 from worldpose.detection.interfaces import (
@@ -27,6 +29,7 @@ from worldpose.detection.interfaces import (
     PoseEstimator,
     Poses,
 )
+from worldpose.detection.rival_joints import shared_out
 from worldpose.errors import InputError
 
 if TYPE_CHECKING:
@@ -48,6 +51,14 @@ OVERLAP: Final = 0.7
 """Two boxes of one person overlap by more [1, intersection over union]."""
 CLOSE: Final = 0.8
 """Boxes are looked at again where the one that was seen and the one given share less [1]."""
+KNOWN: Final = 0.25
+"""From this product of fit and surest keypoints on, somebody is there for sure [1]."""
+WORTH: Final = 0.1
+"""Below this product nobody is looked at again [1]."""
+NEIGHBOUR: Final = 0.05
+"""Who shares more with somebody is looked at again [1, intersection over union]."""
+PLACES: Final = 4
+"""Where each joint may be [1]."""
 BATCH: Final = 16
 """Crops computed at once, always as many: kernels for other numbers round otherwise."""
 
@@ -131,6 +142,30 @@ class EmbeddedDetector:
         return People(found[real], scores.double().cpu().numpy()[real])
 
 
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What crops around boxes show.
+
+    Attributes:
+        places: (people, 17, count, 2) where each joint may be, the likeliest first [px].
+        mass: (people, 17, count) probability about each place.
+        sure: (people, 17, count) chance that a place is right.
+        boxes: (people, 4) [px].
+        fit: (people,) how much of their union these and the true boxes share, as expected [1].
+    """
+
+    places: Floats
+    mass: Floats
+    sure: Floats
+    boxes: Floats
+    fit: Floats
+
+    def replace(self, which: NDArray[np.bool_], other: Look) -> None:
+        """Put what another look shows in the place of some people, in place."""
+        for field in fields(self):
+            getattr(self, field.name)[which] = getattr(other, field.name)
+
+
 class EmbeddedPose:
     """A net that finds the joints of the person in a crop."""
 
@@ -141,48 +176,80 @@ class EmbeddedPose:
         """The pose of each box; confidence is the chance that a keypoint is right.
 
         Right is within a twentieth of the box's longer side, about a fifth of a torso. Whose box
-        turns out to be another than the one given is looked at once more, in that one.
+        turns out to be another than the one given is looked at once more, in that one; so is who
+        has neighbours, now that it is known where they stand. Joints that two people's maps put
+        in one place are shared out.
         """
-        looked = self._look(picture, boxes)
-        seen = looked[2]
-        again = np.all(seen[:, 2:] - seen[:, :2] > 1.0, axis=1)
-        again &= np.diagonal(overlaps(seen, boxes)) < CLOSE
-        for first, second in zip(looked, self._look(picture, seen[again]), strict=True):
-            first[again] = second
-        return Poses(*looked)
+        looked = self._look(picture, boxes, [np.empty((0, 4))] * len(boxes))
+        seen = looked.boxes
+        another = np.all(seen[:, 2:] - seen[:, :2] > 1.0, axis=1)
+        another &= np.diagonal(overlaps(seen, boxes)) < CLOSE
+        asked = np.where(another[:, None], seen, boxes)
+        score = looked.fit * np.sort(looked.sure[..., 0], axis=1)[:, -SUREST:].mean(axis=1)
+        known = suppress(People(seen[score >= KNOWN], score[score >= KNOWN]), SAME).boxes
+        shares = overlaps(asked, known)
+        others = [known[row <= SAME] for row in shares]
+        again = ((shares > NEIGHBOUR) & (shares <= SAME)).any(axis=1) & (score >= WORTH)
+        again |= another
+        around = [others[index] for index in np.flatnonzero(again)]
+        looked.replace(again, self._look(picture, asked[again], around))
+        taken = shared_out(looked.places, looked.mass, looked.boxes)[..., None]
+        return Poses(
+            np.take_along_axis(looked.places, taken[..., None], axis=2)[:, :, 0],
+            np.take_along_axis(looked.sure, taken, axis=2)[:, :, 0],
+            looked.boxes,
+            looked.fit,
+        )
 
-    def _look(self, picture: Picture, boxes: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Keypoints, confidence, box and fit of what a crop around each box shows."""
+    def _look(self, picture: Picture, boxes: Floats, others: Sequence[Floats]) -> Look:
+        """What a crop around each box shows.
+
+        Args:
+            picture: the whole.
+            boxes: (people, 4) [px].
+            others: of each person, the boxes (others, 4) of those about him [px].
+        """
         import torch
 
-        from worldpose.detection.embedded_nets import CROP, JOINTS, normalised, peaks
+        from worldpose.detection.embedded_nets import CROP, JOINTS, normalised
+        from worldpose.detection.embedded_places import likely_places
 
-        keypoints = np.full((len(boxes), JOINTS, 2), np.nan)
-        confidence = np.full((len(boxes), JOINTS), np.nan)
-        seen_boxes, fit = np.full((len(boxes), 4), np.nan), np.full(len(boxes), np.nan)
+        shape = (len(boxes), JOINTS, PLACES)
+        looked = Look(
+            places=np.full((*shape, 2), np.nan),
+            mass=np.full(shape, np.nan),
+            sure=np.full(shape, np.nan),
+            boxes=np.full((len(boxes), 4), np.nan),
+            fit=np.full(len(boxes), np.nan),
+        )
         maps = [picture_from_crop(crop, CROP) for crop in crops_of_boxes(boxes, CROP)]
         for start in range(0, len(maps), BATCH):
             part = maps[start : start + BATCH]
+            end = start + len(part)
             crops = np.zeros((BATCH, CROP[1], CROP[0], 3), dtype=np.uint8)
+            around = np.zeros((BATCH, MAPS, CROP[1] // CELL, CROP[0] // CELL), dtype=np.float32)
             for index, mapping in enumerate(part):
                 crops[index] = cut(picture, mapping, CROP)
+                who = start + index
+                around[index] = surroundings(boxes[who], others[who], mapping, CROP)
             with torch.inference_mode(), _precision(self._device, self._half):
-                seen = self._net(normalised(torch.from_numpy(crops).to(self._device)))
-                at, mass = peaks(seen.maps)
+                given = normalised(torch.from_numpy(crops).to(self._device))
+                seen = self._net(given, torch.from_numpy(around).to(self._device))
+                at, mass = likely_places(seen.maps, PLACES)
                 sure = torch.sigmoid(self._net.sureness(seen.doubt, mass))
             pixels, corners = at.double().cpu().numpy(), seen.boxes.double().cpu().numpy()
             for index, mapping in enumerate(part):
                 scale, corner = mapping[:, :2], mapping[:, 2]
-                keypoints[start + index] = pixels[index] @ scale.T + corner
-                seen_boxes[start + index] = (
-                    corners[index].reshape(2, 2) @ scale.T + corner
-                ).ravel()
-            end = start + len(part)
-            confidence[start:end] = sure.double().cpu().numpy()[: len(part)]
-            fit[start:end] = torch.sigmoid(seen.fit).double().cpu().numpy()[: len(part)]
+                looked.places[start + index] = pixels[index] @ scale.T + corner
+                sides = corners[index].reshape(2, 2) @ scale.T + corner
+                looked.boxes[start + index] = sides.ravel()
+            looked.mass[start:end] = mass.double().cpu().numpy()[: len(part)]
+            looked.sure[start:end] = np.clip(sure.double().cpu().numpy()[: len(part)], 1e-3, 1.0)
+            looked.fit[start:end] = torch.sigmoid(seen.fit).double().cpu().numpy()[: len(part)]
         height, width = picture.shape[:2]
-        seen_boxes = np.clip(seen_boxes, -0.5, np.array([width, height, width, height]) - 0.5)
-        return keypoints, np.clip(confidence, 1e-3, 1.0), seen_boxes, fit
+        limits = np.array([width, height, width, height]) - 0.5
+        np.clip(looked.boxes, -0.5, limits, out=looked.boxes)
+        return looked
 
 
 def _nets() -> ModuleType:

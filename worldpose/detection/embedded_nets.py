@@ -15,6 +15,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from worldpose.detection.embedded_surroundings import MAPS
+
 Net = TypeVar("Net", bound=nn.Module)
 
 STRIDE: Final = 4
@@ -79,9 +81,10 @@ class Pyramid(nn.Module):
         self.stages, self.laterals = nn.ModuleList(stages), nn.ModuleList(laterals)
         self.merged = nn.ModuleList(merged)
 
-    def forward(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """The finest map, and the coarsest."""
-        maps = [self.stages[0](self.stem(picture))]
+    def forward(self, picture: Tensor, added: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """The finest map, and the coarsest; `added` to what the stem makes of the picture."""
+        stem = self.stem(picture)
+        maps = [self.stages[0](stem if added is None else stem + added)]
         for stage in self.stages[1:]:
             maps.append(stage(maps[-1]))
         features = maps[-1]
@@ -141,15 +144,22 @@ class KeypointNet(nn.Module):
         super().__init__()
         stem = nn.Sequential(Block(3, 16, stride=2), Block(16, 32, stride=2))
         self.pyramid = Pyramid(stem, (32, 64, 128), (2, 2, 2))
+        self.around = nn.Conv2d(MAPS, 32, 3, padding=1, bias=False)
+        nn.init.zeros_(self.around.weight)
         self.head = nn.Sequential(Block(32, 64), nn.Conv2d(64, 4 * JOINTS, 1))
         self.doubt = nn.Linear(128, JOINTS)
         self.trust = nn.Parameter(torch.ones(JOINTS))
         self.outline = nn.Sequential(Block(32, 32), nn.Conv2d(32, 4, 1))
         self.fit = nn.Sequential(nn.Linear(128 + 4, 32), nn.ReLU(), nn.Linear(32, 1))
 
-    def forward(self, crops: Tensor) -> Seen:
-        """Return what is seen in crops (batch, 3, height, width) that are `normalised`."""
-        features, coarsest = self.pyramid(crops)
+    def forward(self, crops: Tensor, surroundings: Tensor) -> Seen:
+        """Return what is seen in crops.
+
+        Args:
+            crops: (batch, 3, height, width) `normalised`.
+            surroundings: (batch, 3, rows, columns) who is asked for and who is about.
+        """
+        features, coarsest = self.pyramid(crops, self.around(surroundings))
         maps = functional.pixel_shuffle(self.head(features), CELL)
         # How sure a joint is must not bend the features that find it.
         whole = coarsest.float().mean(dim=(2, 3))
@@ -158,8 +168,15 @@ class KeypointNet(nn.Module):
         return Seen(maps.float(), self.doubt(whole.detach()), boxes, fit)
 
     def sureness(self, doubt: Tensor, mass: Tensor) -> Tensor:
-        """Logits that joints are right (batch, 17), from `doubt` and their peaks' mass."""
-        return doubt + self.trust * torch.logit(mass, eps=1e-4)
+        """Logits that joints are right, from `doubt` and their peaks' mass.
+
+        Args:
+            doubt: (batch, 17)
+            mass: (batch, 17) or, of several places each, (batch, 17, places).
+        """
+        places = (1,) * (mass.ndim - 2)
+        trusted = self.trust.view(-1, *places) * torch.logit(mass, eps=1e-4)
+        return doubt.view(*doubt.shape, *places) + trusted
 
 
 def normalised(pictures: Tensor) -> Tensor:

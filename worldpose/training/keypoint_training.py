@@ -14,8 +14,11 @@ from torch.nn import functional
 
 from data_contracts.conventions import COCO17
 from data_contracts.records import Record
+from worldpose.detection.boxes import overlaps
 from worldpose.detection.embedded_crops import crops_of_boxes, cut, picture_from_crop
 from worldpose.detection.embedded_nets import CELL, CROP, KeypointNet, normalised, peaks
+from worldpose.detection.embedded_surroundings import CELL as AROUND
+from worldpose.detection.embedded_surroundings import MAPS, SAME, surroundings
 from worldpose.training.box_overlap import shared
 from worldpose.training.labels import LabelledPicture
 from worldpose.training.looks import LookSettings, changed_look
@@ -67,6 +70,14 @@ class KeypointCrops(Record):
     """Share of people shown as if they were farther away, down to the least height [1]."""
     hidden: float = 0.25
     """Share of crops with a part of another person before them [1]."""
+    untold: float = 0.4
+    """Share of crops of which is not said where others stand [1]: at first nobody knows."""
+    overlooked: float = 0.12
+    """Share of others who are not told of all the same [1]."""
+    misplaced: float = 0.06
+    """Most that a side of another's box is off, as a share of the box's [1]."""
+    imagined: float = 0.1
+    """Share of crops with somebody told of who is not there [1]."""
     looks: LookSettings = LookSettings()
 
 
@@ -76,6 +87,7 @@ class KeypointBatch:
 
     Attributes:
         crops: (crops, height, width, 3) bytes.
+        surroundings: (crops, 3, rows, columns) who is asked for and who is about.
         keypoints: (crops, 17, 2) [px of the crop]; NaN where not labelled.
         visible: (crops, 17): 2 seen, 1 hidden, 0 not labelled.
         tolerance: (crops,) error up to which a keypoint is right [px of the crop].
@@ -86,6 +98,7 @@ class KeypointBatch:
     """
 
     crops: NDArray[np.uint8]
+    surroundings: NDArray[np.float32]
     keypoints: NDArray[np.float32]
     visible: NDArray[np.int8]
     tolerance: NDArray[np.float32]
@@ -124,6 +137,7 @@ def keypoint_batch(
     """
     count = settings.crops
     crops = np.empty((count, CROP[1], CROP[0], 3), dtype=np.uint8)
+    around = np.empty((count, MAPS, *(side // AROUND for side in reversed(CROP))), np.float32)
     keypoints = np.empty((count, 17, 2), dtype=np.float32)
     visible = np.empty((count, 17), dtype=np.int8)
     tolerance = np.empty(count, dtype=np.float32)
@@ -139,12 +153,16 @@ def keypoint_batch(
         off = settings.shift * far * rng.uniform(-1, 1, 2) * sides
         if beside:
             off = rng.uniform(0.3, 1.6, 2) * rng.choice([-1.0, 1.0], 2) * sides
-        crop = crops_of_boxes((box + np.tile(off, 2))[None], CROP)[0]
-        crop[2] *= np.exp(settings.scale * (0.5 + 0.5 * far) * rng.uniform(-1, 1))
+        middle = 0.5 * (box[:2] + box[2:]) + off
+        half = 0.5 * sides * np.exp(settings.scale * (0.5 + 0.5 * far) * rng.uniform(-1, 1))
+        given = np.concatenate([middle - half, middle + half])
+        crop = crops_of_boxes(given[None], CROP)[0]
         mirrored = bool(rng.random() < 0.5)
         turned = bool(rng.random() < settings.turned)
         turn = settings.turn * rng.uniform(-1, 1) ** 3 if turned else 0.0
         mapping = picture_from_crop(crop, CROP, turn, mirrored)
+        others = _told(labelled, -1 if beside else person, given, settings, rng)
+        around[index] = surroundings(given, others, mapping, CROP)
         tall = float(sides.max())
         farther = 1.0
         if rng.random() < settings.smaller and tall > settings.height[0]:
@@ -169,7 +187,29 @@ def keypoint_batch(
         crops[index] = changed_look(seen, settings.looks, rng)
         keypoints[index], visible[index] = pixels, sight
         tolerance[index] = RIGHT * tall / crop[2]
-    return KeypointBatch(crops, keypoints, visible, tolerance, boxes, everybody, ignored)
+    return KeypointBatch(crops, around, keypoints, visible, tolerance, boxes, everybody, ignored)
+
+
+def _told(
+    labelled: LabelledPicture,
+    person: int,
+    given: Floats,
+    settings: KeypointCrops,
+    rng: np.random.Generator,
+) -> Floats:
+    """Boxes of others (people, 4) that the net is told of, as a detector might have them [px]."""
+    untold = rng.random() < settings.untold
+    boxes = np.delete(labelled.boxes, [person] if person >= 0 else [], axis=0)
+    ignored = np.delete(labelled.ignored, [person] if person >= 0 else [])
+    # Who is hardly to be seen is found now and then.
+    missing = np.where(ignored, 0.5, settings.overlooked)
+    sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
+    boxes = boxes + settings.misplaced * rng.uniform(-1, 1, boxes.shape) * sides
+    told = boxes[(rng.random(len(boxes)) >= missing) & (overlaps(boxes, given[None])[:, 0] <= SAME)]
+    nobody = given + np.tile(rng.uniform(-1, 1, 2) * (given[2:] - given[:2]), 2)
+    if rng.random() < settings.imagined and overlaps(nobody[None], given[None])[0, 0] <= SAME:
+        told = np.concatenate([told, nobody[None]])
+    return np.empty((0, 4)) if untold else told
 
 
 def boxes_in_crop(boxes: Floats, mapping: Floats) -> Floats:
@@ -223,7 +263,8 @@ def keypoint_loss(net: KeypointNet, batch: KeypointBatch) -> Tensor:
         torch.from_numpy(each).to(device)
         for each in (batch.keypoints, batch.visible, batch.tolerance)
     )
-    maps, doubt, box, fit = net(normalised(torch.from_numpy(batch.crops).to(device)))
+    around = torch.from_numpy(batch.surroundings).to(device)
+    maps, doubt, box, fit = net(normalised(torch.from_numpy(batch.crops).to(device)), around)
     rows, columns = maps.shape[-2:]
     labelled = (visible > 0) & torch.isfinite(keypoints).all(dim=-1)
     at = torch.where(labelled[..., None], keypoints, 0.0)

@@ -127,8 +127,9 @@ def train(
 
 def _step(training: Training[Net, Batch], optimizer: torch.optim.Optimizer, step: int) -> float:
     settings = training.settings
-    done = step / settings.steps
-    rising = min((step + 1) / max(WARM_UP * settings.steps, 1.0), 1.0)
+    planned = settings.planned or settings.steps
+    rising = min((step + 1) / max(WARM_UP * planned, 1.0), 1.0)
+    done = min(step / planned, 1.0)
     falling = LAST_RATE + (1.0 - LAST_RATE) * 0.5 * (1.0 + math.cos(math.pi * done))
     for group in optimizer.param_groups:
         group["lr"] = settings.rate * rising * falling

@@ -12,6 +12,8 @@ class TrainingSettings(Record):
 
     steps: int = Field(default=1500, ge=1)
     """Batches."""
+    planned: int | None = Field(default=None, ge=1)
+    """Batches over which the rate rises and falls; `steps` if None. A training may end earlier."""
     rate: float = Field(default=1e-3, gt=0)
     """Highest learning rate of AdamW [1]; it falls as a cosine."""
     decay: float = Field(default=0.02, ge=0)

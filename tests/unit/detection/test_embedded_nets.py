@@ -3,7 +3,7 @@ import pytest
 import torch
 from safetensors.torch import save
 
-from worldpose.detection.embedded import EmbeddedDetector, EmbeddedPose
+from worldpose.detection.embedded import EmbeddedDetector, EmbeddedPose, Look
 from worldpose.detection.embedded_crops import crops_of_boxes, cut, picture_from_crop
 from worldpose.detection.embedded_nets import CROP, KeypointNet, PeopleNet, edges, peaks
 from worldpose.detection.embedded_peaks import boxes_at_peaks
@@ -83,10 +83,13 @@ def test_boxes_stand_at_peaks_best_first():
     assert len(boxes_at_peaks(logits, sides, 0.05, 1)[0]) == 1
 
 
-def test_people_and_poses_do_not_depend_on_their_company():
+def test_people_and_poses_do_not_depend_on_the_batch():
     rng = np.random.default_rng(0)
     picture = rng.integers(0, 255, (90, 130, 3), dtype=np.uint8)
-    boxes = np.array([[5.0, 5.0, 30.0, 80.0], [-8.0, 20.0, 40.0, 120.0], [60.0, 1.0, 80.0, 60.0]])
+    # The second has no neighbour: whoever else is asked for, his pose is the same.
+    boxes = np.array(
+        [[85.0, 5.0, 110.0, 80.0], [-8.0, 20.0, 40.0, 120.0], [90.0, 1.0, 112.0, 60.0]]
+    )
     pose = EmbeddedPose(shaken(KeypointNet()))
     together, alone = pose.estimate(picture, boxes), pose.estimate(picture, boxes[1:2])
     np.testing.assert_array_equal(together.keypoints[1:2], alone.keypoints)
@@ -106,22 +109,44 @@ def test_people_and_poses_do_not_depend_on_their_company():
     assert inside.all()
 
 
-def test_whose_box_is_another_than_the_one_given_is_looked_at_again(monkeypatch):
+def looks(monkeypatch, seen_of):
+    """A pose estimator that sees what `seen_of` makes of boxes, and what it was asked."""
     pose, asked = EmbeddedPose(shaken(KeypointNet())), []
 
-    def look(picture, boxes):
-        asked.append(boxes)
-        count = len(boxes)
-        # He fills the box from 40 px on; the keypoints tell how often it was looked at.
-        seen = np.concatenate([np.maximum(boxes[:, :1], 40.0), boxes[:, 1:]], axis=1)
-        return np.full((count, 17, 2), len(asked)), np.ones((count, 17)), seen, np.ones(count)
+    def look(picture, boxes, others):
+        asked.append((boxes, others))
+        places = np.full((len(boxes), 17, 4, 2), float(len(asked)))
+        mass = np.tile([0.9, 0.0, 0.0, 0.0], (len(boxes), 17, 1))
+        return Look(places, mass, np.full(mass.shape, 0.9), seen_of(boxes), np.ones(len(boxes)))
 
     monkeypatch.setattr(pose, "_look", look)
-    boxes = np.array([[45.0, 5.0, 80.0, 80.0], [0.0, 5.0, 80.0, 80.0], [0.0, 5.0, 30.0, 80.0]])
-    poses = pose.estimate(np.zeros((90, 130, 3), dtype=np.uint8), boxes)
+    return pose, asked
+
+
+def test_whose_box_is_another_than_the_one_given_is_looked_at_again(monkeypatch):
+    # Everybody fills his box from 40 px on; the keypoints tell how often it was looked at.
+    pose, asked = looks(
+        monkeypatch, lambda b: np.concatenate([np.maximum(b[:, :1], 40.0), b[:, 1:]], axis=1)
+    )
+    boxes = np.array([[45.0, 5.0, 80.0, 80.0], [0.0, 100.0, 80.0, 180.0], [0.0, 5.0, 30.0, 80.0]])
+    poses = pose.estimate(np.zeros((190, 130, 3), dtype=np.uint8), boxes)
     # The first is as given; of the third nothing is left in which to look.
-    np.testing.assert_array_equal(asked[1], [[40.0, 5.0, 80.0, 80.0]])
+    np.testing.assert_array_equal(asked[1][0], [[40.0, 100.0, 80.0, 180.0]])
     assert poses.keypoints[:, 0, 0].tolist() == [1.0, 2.0, 1.0]
+
+
+def test_who_has_a_neighbour_is_looked_at_again_and_told_of_him(monkeypatch):
+    pose, asked = looks(monkeypatch, lambda boxes: boxes)
+    # Two who share a third, a second box of the first, and somebody apart.
+    boxes = np.array(
+        [[0.0, 0.0, 40.0, 80.0], [20.0, 0.0, 60.0, 80.0], [2.0, 0.0, 42.0, 80.0], [90, 0, 130, 80]]
+    )
+    pose.estimate(np.zeros((90, 130, 3), dtype=np.uint8), boxes)
+    np.testing.assert_array_equal(asked[1][0], boxes[:3])
+    first, second, double = (others.tolist() for others in asked[1][1])
+    assert boxes[1].tolist() in first and boxes[0].tolist() not in first
+    assert boxes[0].tolist() in second and boxes[1].tolist() not in second
+    assert double == first
 
 
 def test_weights_come_back_and_give_equal_bytes(tmp_path):

@@ -56,6 +56,23 @@ def test_a_resumed_training_gives_the_weights_of_an_undisturbed_one(tmp_path):
         assert torch.equal(value, theirs[name]), name
 
 
+def test_a_training_that_ends_early_has_the_weights_of_the_whole_at_that_step():
+    # Without memory the mean is the weights of the step; the last check is the best.
+    settings = SETTINGS.model_copy(update={"memory": 0.0})
+    whole, then = line_fit(settings, figures=[0.0, 1.0, 2.0, 3.0]), {}
+
+    def say(line):
+        if line.startswith("step 4 "):
+            then.update({k: v.clone() for k, v in whole.net.state_dict().items()})
+
+    train(whole, progress=say)
+    settings = settings.model_copy(update={"steps": 4, "planned": 12})
+    early = line_fit(settings, figures=[0.0, 1.0])
+    train(early)
+    for name, value in early.net.state_dict().items():
+        assert torch.equal(value, then[name]), name
+
+
 def test_the_best_weights_are_kept_and_training_stops_early():
     # Without memory the mean is the weights of the step.
     changes = {"steps": 100, "check_every": 1, "patience": 2, "memory": 0.0}
