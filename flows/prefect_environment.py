@@ -113,6 +113,8 @@ def local_cluster(workers: int) -> dict[str, Any]:
         "silence_logs": "CRITICAL",
         # A unit that ends its worker gives itself up; those that waited beside it are not to blame.
         "scheduler_kwargs": {"allowed_failures": 100},
+        # A worker would look at its own stack a hundred times a second.
+        "config": {"distributed.worker.profile.enabled": False},
     }
 
 

@@ -230,6 +230,7 @@ def _starting_cluster(request: RunRequest, missing: list[PlannedUnit]) -> LocalC
     given = dask.config.get("distributed.worker.preload")
     asked = [given] if isinstance(given, str) else given
     preload = ["tasks.preload", *asked, "prefect_dask", *(f"tasks.{stage}" for stage in stages)]
+    preload.append("flows.match")  # with each task Prefect sends the flow that it is of
     cluster = LocalCluster(**{**local_cluster(workers), "n_workers": 0, "preload": preload})
     cluster.scale(workers)
     return cluster

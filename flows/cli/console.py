@@ -65,7 +65,6 @@ class ConsoleReporter(Reporter):
 
     def __init__(self) -> None:
         self._started = time.monotonic()
-        self._left = 0
         self._tenths = 0
 
     def say(self, text: str) -> None:
@@ -84,15 +83,13 @@ class ConsoleReporter(Reporter):
         """Names the stage and how much of it is already there."""
         super().stage_started(stage, about, units=units, missing=missing)
         reused = f", {units - missing} already there" if missing < units else ""
-        self._left = missing
         self.say(f"[bold]{stage}[/]: {about} ({missing} of {units} to compute{reused})")
 
-    def unit_done(self, unit: str, seconds: float, figures: Mapping[str, float]) -> None:
+    def tell_of(self, unit: str, seconds: float, figures: Mapping[str, float]) -> None:
         """Names the unit, its time and its figures."""
-        super().unit_done(unit, seconds, figures)
-        self._left -= 1
+        super().tell_of(unit, seconds, figures)
         self.say(
-            f"  {escape(unit)}  {seconds:.2f} s  [dim]{in_short(figures)}[/]  ({self._left} left)"
+            f"  {escape(unit)}  {seconds:.2f} s  [dim]{in_short(figures)}[/]  ({self.left} left)"
         )
 
     def unit_waits(self, unit: str, reasons: Sequence[str]) -> None:
@@ -103,8 +100,7 @@ class ConsoleReporter(Reporter):
     def unit_failed(self, unit: str, message: str) -> None:
         """Names the unit and why it failed."""
         super().unit_failed(unit, message)
-        self._left -= 1
-        self.say(f"  [bold red]{escape(unit)} failed[/]: {escape(message)}  ({self._left} left)")
+        self.say(f"  [bold red]{escape(unit)} failed[/]: {escape(message)}  ({self.left} left)")
 
 
 @contextmanager

@@ -36,33 +36,29 @@ class ArtifactReporter(Reporter):
     def __init__(self, artifact: UUID | None) -> None:
         self.artifact = artifact
         self._at = 0
-        self._done, self._missing = 0, 0
+        self._missing = 0
 
     def stage_started(self, stage: str, about: str, *, units: int, missing: int) -> None:
         """All stages before are done."""
         super().stage_started(stage, about, units=units, missing=missing)
         self._at = [each.name for each in METHOD].index(stage)
-        self._done, self._missing = 0, missing
+        self._missing = missing
         self._tell(f"{stage}: {about}")
 
-    def unit_done(self, unit: str, seconds: float, figures: Mapping[str, float]) -> None:
-        """One more unit of the stage is done."""
-        super().unit_done(unit, seconds, figures)
-        self._count(unit)
+    def tell_of(self, unit: str, seconds: float, figures: Mapping[str, float]) -> None:
+        """More of the stage is done."""
+        super().tell_of(unit, seconds, figures)
+        self._tell(unit)
 
     def unit_failed(self, unit: str, message: str) -> None:
         """It is not waited for any more."""
         super().unit_failed(unit, message)
-        self._count(f"{unit} failed")
-
-    def _count(self, text: str) -> None:
-        self._done += 1
-        self._tell(text)
+        self._tell(f"{unit} failed")
 
     def _tell(self, text: str) -> None:
         artifact = self.artifact
         if artifact is not None:
-            within = self._done / self._missing if self._missing else 0.0
+            within = 1.0 - self.left / self._missing if self._missing else 0.0
             percent = 100.0 * (self._at + min(within, 1.0)) / len(METHOD)
             _shown(lambda: update_progress_artifact(artifact, percent, description=text))
 

@@ -73,13 +73,13 @@ class Disk:
 
     def fill(self):
         """Nothing fits any more, not even what ends meanwhile would leave free."""
-        with (self.folder / "ballast").open("wb") as ballast:
-            try:
+        try:
+            with (self.folder / "ballast").open("wb") as ballast:
                 while True:
                     ballast.write(bytes(1 << 16))
                     ballast.flush()
-            except OSError:
-                pass
+        except OSError:
+            pass
 
     def free(self):
         (self.folder / "ballast").unlink(missing_ok=True)

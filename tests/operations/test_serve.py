@@ -289,7 +289,7 @@ def test_prefect_keeps_runs_that_wait_in_postgres(served, postgres, tmp_path):
     served.begin()
     assert served.check().json["healthy"], served.explain()
     names = ask("select name from flow order by name").split()
-    assert names == ["finetune", "ingest", "match", "reprocess"]
+    assert names == ["finetune", "ingest", "match", "release", "reprocess"]
     small = ("--duration", 0.2, "--cameras", 3, "--players", 2, "--no-stills", "--no-video")
     folder = tmp_path / "small"
     succeed("simulate", "--scenario", "tiny", *small, "--out", folder)

@@ -69,7 +69,7 @@ def test_a_flood_of_entries_is_refused_before_it_is_built(refused, monkeypatch):
 
 @pytest.mark.parametrize("read", [read_yaml, read_json, read_toml])
 def test_a_file_beyond_the_limit_is_refused_unread(refused, read):
-    refused(read, b"#" * (text_files.SETTINGS_BYTES + 1), "1048577 bytes")
+    refused(read, b"#" * (text_files.SETTINGS_BYTES + 1), "2097153 bytes")
 
 
 @pytest.mark.parametrize("read", [read_yaml, read_json, read_toml])
