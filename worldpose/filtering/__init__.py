@@ -9,6 +9,7 @@ from worldpose.filtering.held_out import HeldOut, measure_held_out
 from worldpose.filtering.judging import Judgement, Suspects, judge_detections, learn_from
 from worldpose.filtering.settings import FilteringSettings
 from worldpose.filtering.spread import Spread
+from worldpose.filtering.view_bias import ViewBias
 from worldpose.filtering.views import BodyViews, perceived_joints, view_bodies
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "Judgement",
     "Spread",
     "Suspects",
+    "ViewBias",
     "judge_detections",
     "learn_from",
     "learn_habits",
