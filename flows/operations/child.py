@@ -12,6 +12,7 @@ import sys
 import threading
 
 from flows.operations.plan import ServePlan
+from worldpose.errors import WorldposeError
 
 
 def main() -> None:
@@ -21,7 +22,12 @@ def main() -> None:
     logging.basicConfig(format="%(asctime)s  %(message)s", level=logging.WARNING)
     for name in ("worldpose.operations", "worldpose.pages"):
         logging.getLogger(name).setLevel(logging.INFO)
-    PARTS[part](plan)
+    try:
+        PARTS[part](plan)
+    except WorldposeError as error:
+        sys.stderr.write(f"error: {error}\n")
+        sys.stderr.flush()
+        os._exit(1)  # the thread that reads standard input would not let the interpreter end
 
 
 def prefect(plan: ServePlan) -> None:

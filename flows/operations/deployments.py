@@ -142,7 +142,12 @@ async def _refuse_other_project(client: PrefectClient, plan: ServePlan) -> None:
             f"deployment {plan.match_deployment} at {plan.prefect}",
             expected=f"that of project {plan.project}",
             found=f"that of {project}",
-            todo="Give this project's deployments another name with --name.",
+            todo=(
+                f"Was the project moved? Move it back, or remove {plan.state}: nothing is lost "
+                "but Prefect's history, and what lies in the inbox is taken in once more."
+                if plan.owns_prefect
+                else "Give this project's deployments another name with --name."
+            ),
         )
 
 

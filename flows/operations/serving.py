@@ -40,9 +40,22 @@ Tell = Callable[[str], None]
 
 @dataclass
 class _Part:
+    """A process that is kept at work.
+
+    Attributes:
+        name: of the part.
+        address: at which it answers.
+        process: None until it is due again.
+        said: how long its log was before it began [byte].
+        began: on the clock that only goes forward [s].
+        pause: before it began the last time [s].
+        due: when it is begun again [s].
+    """
+
     name: str
     address: str | None
     process: subprocess.Popen[bytes] | None = None
+    said: int = 0
     began: float = 0.0
     pause: float = 0.0
     due: float = 0.0
@@ -128,6 +141,7 @@ class _Supervisor:
             log.replace(log.with_suffix(".log.1"))
         secrets = {"WORLDPOSE_REVIEW_TOKEN": self.token} if part.name == "pages" else {}
         with log.open("ab") as output:
+            part.said = output.tell()
             part.process = subprocess.Popen(
                 [
                     *(sys.executable, "-m", "flows.operations.child"),
@@ -238,9 +252,8 @@ def _wait_for(
         process = part.process
         if process is None or process.poll() is not None or time.monotonic() > deadline:
             log = supervisor.plan.state_folder.logs / f"{part.name}.log"
-            raise WorldposeError(
-                f"{part.name} did not start. It said:\n{log.read_text(errors='replace')[-2000:]}"
-            )
+            said = log.read_bytes()[part.said :].decode(errors="replace")
+            raise WorldposeError(f"{part.name} did not start. It said:\n{said[-2000:]}")
         if is_well():
             return
 

@@ -1,38 +1,17 @@
 // Mends people on the review pages as a person would; prints what it saw as one JSON object.
 
-import { readFileSync } from "node:fs";
-import { createRequire } from "node:module";
+import { logIn, open, shoot, task, tell } from "../chromium.mjs";
 
-const task = JSON.parse(readFileSync(process.argv[2], "utf8"));
-const { chromium } = createRequire(task.modules)("playwright-core");
-const browser = await chromium.launch({
-  executablePath: task.chromium,
-  args: ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
-    "--disable-background-networking", "--disable-component-update"],
-});
-const page = await browser.newPage({ viewport: { width: 1366, height: 768 } });
-page.setDefaultTimeout(120000);
 const seen = { errors: [], outside: [], states: [] };
-page.on("pageerror", (error) => seen.errors.push(error.message));
-page.on("console", (message) => {
-  // The log-in page asks whether it is needed, and is told so with a 401.
-  if (message.type() === "error" && !message.text().includes("401")) seen.errors.push(message.text());
-});
-page.on("request", (request) => {
-  if (!/^(http:\/\/127\.0\.0\.1|data:|blob:)/.test(request.url())) seen.outside.push(request.url());
-});
-const shot = (name) => task.shots && page.screenshot({ path: `${task.shots}/${name}.png` });
+const page = await open(seen);
+const shot = (name) => shoot(page, name);
 const match = encodeURIComponent(task.match);
 
-await page.goto(`${task.base}/login#token=${task.token}`);
-await page.fill("#who", "Ada");
-await page.click("button");
-await page.waitForSelector("li.panel");
+await logIn(page, task.base, "Ada");
 
 if (task.mends) await mend();
 else await approve();
-console.log(JSON.stringify(seen));
-await browser.close();
+await tell(seen);
 
 async function mend() {
   // Two people who change places: split where they do, then each is joined with their own end.

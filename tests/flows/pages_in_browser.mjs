@@ -1,33 +1,13 @@
 // Drives the review pages as a person would; prints what it saw as one JSON object.
 
-import { readFileSync } from "node:fs";
-import { createRequire } from "node:module";
+import { logIn, open, shoot, task, tell } from "../chromium.mjs";
 
-const task = JSON.parse(readFileSync(process.argv[2], "utf8"));
-const { chromium } = createRequire(task.modules)("playwright-core");
-const browser = await chromium.launch({
-  executablePath: task.chromium,
-  args: ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
-    "--disable-background-networking", "--disable-component-update"],
-});
-const page = await browser.newPage({ viewport: { width: 1366, height: 768 } });
 const seen = { errors: [], outside: [], states: [] };
-page.on("pageerror", (error) => seen.errors.push(error.message));
-page.on("console", (message) => {
-  // The log-in page asks whether it is needed, and is told so with a 401.
-  if (message.type() === "error" && !message.text().includes("401")) seen.errors.push(message.text());
-});
-page.on("request", (request) => {
-  if (!/^(http:\/\/127\.0\.0\.1|data:|blob:)/.test(request.url())) seen.outside.push(request.url());
-});
-let shots = 0;
-const shot = (name) => task.shots && page.screenshot({ path: `${task.shots}/${++shots}_${name}.png` });
+const page = await open(seen);
+const shot = (name) => shoot(page, name);
 const match = encodeURIComponent(task.match);
 
-await page.goto(`${task.base}/login#token=${task.token}`);
-await page.fill("#who", task.who);
-await page.click("button");
-await page.waitForSelector("li.panel");
+await logIn(page, task.base, task.who);
 await shot("queue");
 
 // The camera that nobody clicked, from the queue by the way a person takes.
@@ -152,5 +132,4 @@ if (task.run) {
   }
   await shot("detections");
 }
-console.log(JSON.stringify(seen));
-await browser.close();
+await tell(seen);

@@ -1,14 +1,12 @@
 """A person calibrates a rendered camera from nothing, and the run goes on: in a real browser."""
 
 import json
-import os
-import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import page_client
 import pytest
+from chromium import IN_BROWSER, drive
 from command_line import succeed
 
 from data_contracts.pitch import PitchSpec
@@ -19,18 +17,11 @@ from worldpose.ingest import read_calibration
 from worldpose.pitch import PitchTemplate
 from worldpose.store import Store, open_run
 
-MODULES = Path(__file__).parents[2] / "infra" / "review_pages" / "node_modules"
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-
 pytestmark = [
-    pytest.mark.slow,
+    *IN_BROWSER,
     pytest.mark.timeout(1200),  # the run is done four times, each after somebody's answer
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
-    pytest.mark.skipif(
-        not (MODULES / "playwright-core").is_dir() or shutil.which("node") is None,
-        reason="no playwright-core: npm ci in infra/review_pages",
-    ),
 ]
+SCRIPT = Path(__file__).with_name("pages_in_browser.mjs")
 
 
 @pytest.fixture
@@ -113,22 +104,10 @@ def calibrate_in_browser(rendered, base, tmp_path, *, then_run):
         "points": {name: place.tolist() for name, place in points.items()},
         "lines": {name: places.tolist() for name, places in lines.items()},
         "dragged": next(iter(points)),
-        "modules": str(MODULES / "package.json"),
-        "chromium": CHROMIUM,
         "run": then_run,
         "patience": 840,
-        "shots": os.environ.get("WORLDPOSE_PAGE_SHOTS"),
     }
-    file = tmp_path / "task.json"
-    file.write_text(json.dumps(task))
-    script = Path(__file__).with_name("pages_in_browser.mjs")
-    done = subprocess.run(
-        ["node", script, file], capture_output=True, text=True, timeout=1000, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    seen = json.loads(done.stdout)
-    assert seen["errors"] == []
-    assert seen["outside"] == []
+    seen = drive(SCRIPT, task, tmp_path, 1000)
     figures = {
         "points": len(points),
         "lines": len(lines),

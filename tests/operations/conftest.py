@@ -1,5 +1,6 @@
-"""A small match to put into inboxes, a Postgres server, a Dask cluster."""
+"""A small match to put into inboxes, a served project, a Postgres server, a Dask cluster."""
 
+import json
 import os
 import shutil
 import signal
@@ -8,9 +9,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from threading import Thread
 
 import pytest
+from service import Served
 
 from worldpose.synthetic import SCENARIOS, simulate_match
 
@@ -100,3 +104,38 @@ def dask():
         process.terminate()
     for process in processes:
         process.wait(60)
+
+
+@pytest.fixture
+def webhook():
+    """A server: what was posted to it, and the codes that it answers next (204 after them)."""
+
+    class Server(HTTPServer):
+        posted: list = []
+        codes: list = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self):
+            body = self.rfile.read(int(self.headers["content-length"]))
+            self.server.posted.append((self.headers["content-type"], json.loads(body)))
+            self.send_response(self.server.codes.pop(0) if self.server.codes else 204)
+            self.end_headers()
+
+        def log_message(self, *arguments):
+            pass
+
+    server = Server(("127.0.0.1", 0), Handler)
+    server.posted, server.codes = [], []
+    server.address = f"http://127.0.0.1:{server.server_port}/hook?token=secret"
+    Thread(target=server.serve_forever, daemon=True).start()
+    yield server
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.fixture
+def served(tmp_path, webhook):
+    service = Served(tmp_path, webhook.address)
+    yield service
+    if service.process is not None and service.process.poll() is None:
+        service.end(signal.SIGKILL)

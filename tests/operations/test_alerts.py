@@ -1,9 +1,6 @@
 """Somebody is told of each matter once: a real server takes what is posted."""
 
-import json
 from datetime import UTC, datetime, timedelta
-from http.server import BaseHTTPRequestHandler, HTTPServer
-from threading import Thread
 
 import pytest
 
@@ -15,33 +12,6 @@ from flows.operations.plan import ServePlan
 from flows.operations.senders import Webhook
 
 NOW = datetime.now(UTC)
-
-
-@pytest.fixture
-def webhook():
-    """A server: what was posted to it, and the codes that it answers next (204 after them)."""
-
-    class Server(HTTPServer):
-        posted: list = []
-        codes: list = []
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_POST(self):
-            body = self.rfile.read(int(self.headers["content-length"]))
-            self.server.posted.append((self.headers["content-type"], json.loads(body)))
-            self.send_response(self.server.codes.pop(0) if self.server.codes else 204)
-            self.end_headers()
-
-        def log_message(self, *arguments):
-            pass
-
-    server = Server(("127.0.0.1", 0), Handler)
-    server.posted, server.codes = [], []
-    server.address = f"http://127.0.0.1:{server.server_port}/hook?token=secret"
-    Thread(target=server.serve_forever, daemon=True).start()
-    yield server
-    server.shutdown()
-    server.server_close()
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import asyncio
 import importlib
+import re
 from pathlib import Path
 
 import pytest
@@ -85,9 +86,11 @@ def test_installed_again_changes_limits_and_another_project_is_refused(plan):
             return (await client.read_work_pool("ops")).concurrency_limit
 
     assert asyncio.run(limit()) == 3
-    other = plan.model_copy(update={"project": "/another"})
-    with pytest.raises(InputError, match="--name"):
-        asyncio.run(install(other))
+    # Whose server is its own has nobody else's deployments there: it was moved.
+    for owns_prefect, advice in ((False, "--name"), (True, "Was the project moved?")):
+        changes = {"project": "/another", "owns_prefect": owns_prefect}
+        with pytest.raises(InputError, match=re.escape(advice)):
+            asyncio.run(install(plan.model_copy(update=changes)))
 
 
 def test_killed_runs_begin_again_and_no_others(plan, monkeypatch):
