@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -37,10 +38,8 @@ def bundle_adjustment(work: Work) -> str:
         people = _open_people(store, work, settings)
         adjusted = adjust_cameras(_open_clip(store, work, people), settings)
         arrays, attributes = adjustment_arrays(adjusted, settings, people.person)
-        camera_ids = list(work.recipe.sources["cameras"])
-        result.write(
-            BUNDLE_ADJUSTMENT, arrays=arrays, attributes={"camera": camera_ids, **attributes}
-        )
+        attributes |= {"camera": work.recipe.sources["cameras"]}
+        result.write(BUNDLE_ADJUSTMENT, arrays=arrays, attributes=attributes)
         result.figures.update(_figures(adjusted))
     return work.key
 
@@ -71,7 +70,7 @@ class _People:
 
 def _open_people(store: Store, work: Work, settings: BundleAdjustmentSettings) -> _People:
     """Tracked and placed people in evenly spread frames, and in those a person chose."""
-    sources = work.recipe.sources
+    sources: dict[str, Any] = work.recipe.sources
     whole = {
         clip: np.arange(first, first + count) for clip, (first, count) in sources["clips"].items()
     }
@@ -114,7 +113,7 @@ def _open_people(store: Store, work: Work, settings: BundleAdjustmentSettings) -
 
 def _open_clip(store: Store, work: Work, people: _People) -> Clip:
     """The cameras as calibrated, what was clicked in them, and what they saw of `people`."""
-    sources = work.recipe.sources
+    sources: dict[str, Any] = work.recipe.sources
     opened = open_frames(store, work, people.clip_frames)
     pitch = sources["pitch"]
     template = None if pitch is None else PitchTemplate.from_spec(PitchSpec.model_validate(pitch))
@@ -129,8 +128,8 @@ def _open_clip(store: Store, work: Work, people: _People) -> Clip:
         ),
         frame=people.frame,
         fps=people.fps,
-        keypoints=opened.keypoints,
-        confidence=opened.confidence,
+        keypoints=opened.keypoints[:],
+        confidence=opened.confidence[:],
         detection_index=people.detection_index,
         joints=people.joints,
         views=people.views,

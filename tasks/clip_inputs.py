@@ -168,7 +168,8 @@ def open_clip(
         shifted: without what keypoints were beside those bodies by for lasting reasons.
         found_again: with those who were looked for again.
     """
-    first, count = work.recipe.sources["first_frame"], work.recipe.sources["frame_count"]
+    sources: dict[str, Any] = work.recipe.sources
+    first, count = sources["first_frame"], sources["frame_count"]
     where = slice(first, first + count - 1)
     seen = _seen(store, work, where)
     said = _said_before(store, work, {work.recipe.unit: where})
@@ -190,20 +191,23 @@ def dropped_before(store: Store, work: Work) -> NDArray[np.bool_] | None:
 
 def open_frames(store: Store, work: Work, frames: Mapping[str, NDArray[np.int64]]) -> ClipInputs:
     """Match frames of each clip, clip by clip, with every camera's detections in memory."""
-    names = work.recipe.sources["seen"]
+    sources: dict[str, Any] = work.recipe.sources
+    names = sources["seen"]
     seen = [
         _together([_people(store, work, names[clip][c]).sel(frame=frames[clip]) for clip in frames])
-        for c in range(len(work.recipe.sources["cameras"]))
+        for c in range(len(sources["cameras"]))
     ]
     frame = np.concatenate(list(frames.values()))
-    some = _open(store, work, frame, seen, **_said_before(store, work, frames))
+    said = _said_before(store, work, frames)
+    some = _open(store, work, frame, seen, said["rejected"], said["shift"])
     keypoints, confidence = some.keypoints[: len(frame)], some.confidence[: len(frame)]
     return replace(some, keypoints=keypoints, confidence=confidence)
 
 
 def _seen(store: Store, work: Work, where: slice) -> list[xr.Dataset]:
     """Whom each camera saw in the clip of `work`."""
-    return [_people(store, work, name).sel(frame=where) for name in work.recipe.sources["seen"]]
+    sources: dict[str, Any] = work.recipe.sources
+    return [_people(store, work, name).sel(frame=where) for name in sources["seen"]]
 
 
 def _people(store: Store, work: Work, name: str) -> xr.Dataset:
@@ -260,7 +264,7 @@ def _open(
 
     The cameras are the adjusted ones where `work` is made from them.
     """
-    sources = work.recipe.sources
+    sources: dict[str, Any] = work.recipe.sources
     camera_ids = tuple(sources["cameras"])
     cameras, covariance = _cameras(store, work, camera_ids)
     return ClipInputs(

@@ -93,8 +93,9 @@ def _pictures(store: Store, work: Work, frame: NDArray[np.int64]) -> _Pictures:
     known = found["reprojection_error"].values <= KNOWN
     offset = float(sources["broadcast_offset_frames"])
     late = round(offset) - offset
-    ids = work.recipe.match_id, *name.split("/")
-    calibrated = store.manifest(*ids, work.recipe.inputs[name]).recipe
+    stage, unit = name.split("/")
+    key = work.recipe.inputs[name]
+    calibrated = store.manifest(work.recipe.match_id, stage, unit, key).recipe
     measured = (found.attrs["feed_offset"] or {}).get("frames")
     if calibrated.settings["feed_offset"] == "correct" and measured is not None:
         late += measured

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from pydantic import TypeAdapter
 
@@ -66,6 +68,7 @@ def _automatic(store: Store, work: Work) -> tuple[Identities, dict[str, float]]:
 
 
 def _tracked(store: Store, work: Work) -> tuple[Identities, dict[str, float]]:
+    sources: dict[str, Any] = work.recipe.sources
     clip = open_clip(store, work)
     tracks = track_people(
         clip.cameras,
@@ -73,8 +76,8 @@ def _tracked(store: Store, work: Work) -> tuple[Identities, dict[str, float]]:
         clip.confidence,
         clip.fps,
         TrackingSettings.model_validate(work.recipe.settings),
-        ground=bool(work.recipe.sources["ground"]),
-        people=work.recipe.sources["people"],
+        ground=sources["ground"],
+        people=sources["people"],
     )
     found = Identities(
         frame=np.asarray(clip.frame),
