@@ -19,7 +19,7 @@ from worldpose.body_fitting.bones import Shape
 from worldpose.body_fitting.evidence import Evidence
 from worldpose.body_fitting.feet import Ground
 from worldpose.body_fitting.glimpses import Glimpses
-from worldpose.body_fitting.guidance import Guidance, learn_precision
+from worldpose.body_fitting.guidance import Guidance, carry_errors, deviations, learn_precision
 from worldpose.body_fitting.objective import Pose
 from worldpose.body_fitting.pose_space import GATHER, SPREAD, load_pose_prior
 from worldpose.body_fitting.settings import BodyFittingSettings
@@ -166,18 +166,18 @@ def _guide(
     witnesses = 1.0 + GLIMPSE_TIME * fps
     angles = result.body_pose @ GATHER.T
     precision = learn_precision(glimpses, result.orient, angles, sure, witnesses)
-    there = np.isfinite(glimpses.angles[..., 0]) & ~sure
-    return {
-        person: Guidance(
-            glimpses.orient[span, person],
-            glimpses.angles[span, person],
-            there[span, person],
-            precision,
-            witnesses,
-        )
-        for person, span in spans.items()
-        if there[span, person].any()
-    }
+    there = np.isfinite(glimpses.angles[..., 0])
+    guided = {}
+    for person, span in spans.items():
+        used = (there & ~sure)[span, person]
+        if not used.any():
+            continue
+        estimated = glimpses.orient[span, person], glimpses.angles[span, person]
+        off = deviations(*estimated, result.orient[span, person], angles[span, person])
+        off[~(there & sure)[span, person]] = np.nan
+        turn, bent, left = carry_errors(*estimated, off, used, GLIMPSE_TIME * fps)
+        guided[person] = Guidance(turn, bent, used, precision, witnesses, left)
+    return guided
 
 
 def _too_long(seen: NDArray[np.bool_], most: float) -> NDArray[np.bool_]:

@@ -49,7 +49,9 @@ class Solver:
     ) -> tuple[Pose, BandedFactor]:
         """Return one person's poses in all frames, and the factor that tells how sure they are.
 
-        Poses of `guidance` are where the search begins if the objective is lower there.
+        With `guidance` there are two searches, of which one begins where it puts the poses, and
+        the one that ends lower counts: a body that turned unseen is beyond where steps from the
+        way between its ends arrive, and how high a start lies says little of where it ends.
         """
         settings, model = self.settings, self.chained.model
         track = Track(
@@ -68,30 +70,31 @@ class Solver:
         moved = target - np.einsum("fab,jb->fja", axes, offsets)
         target = np.where(np.isfinite(moved), moved, target)
         pose = Pose(*start_poses(model, shape.betas, target, self.prior), shape.betas)
+        searched = self.search(track, pose, offsets)
         if guidance is not None:
-            used = guidance.used[:, None]
-            orient = Rigid(
-                np.where(used[..., None], guidance.orient, np.eye(3)), np.zeros(3)
-            ).rotvec
-            guided = replace(
-                pose,
-                orient=np.where(used, orient, pose.orient),
-                angles=np.where(used, guidance.angles, pose.angles),
-            )
-            costs = [track.equations(p, offsets, bordered=False).cost for p in (pose, guided)]
-            pose = guided if costs[1] < costs[0] else pose
-        for step in range(settings.steps):
-            if self.ground is not None and step == settings.steps // 2:
-                track = self.standing(track, pose)
-            equations = track.equations(pose, offsets, bordered=False)
-            step_of = factor(equations.blocks).solve(equations.gradient[..., None])
-            pose = pose.moved(-step_of[..., 0])
+            guided = self.search(track, led(pose, guidance), offsets)
+            # Of the same terms: which ankles stand is each search's own.
+            costs = [
+                track.equations(p, offsets, bordered=False).cost for p, _ in (searched, guided)
+            ]
+            searched = guided if costs[1] < costs[0] else searched
+        pose, track = searched
         doubtful = replace(
             track,
             acceleration=track.acceleration * ALIKE**0.5,
             contacts=None if track.contacts is None else track.contacts.of(evidence.known),
         )
         return pose, factor(doubtful.equations(pose, offsets, bordered=False).blocks)
+
+    def search(self, track: Track, pose: Pose, offsets: Floats) -> tuple[Pose, Track]:
+        """Return where Gauss-Newton steps from a pose arrive, and the track with who stands."""
+        for step in range(self.settings.steps):
+            if self.ground is not None and step == self.settings.steps // 2:
+                track = self.standing(track, pose)
+            equations = track.equations(pose, offsets, bordered=False)
+            step_of = factor(equations.blocks).solve(equations.gradient[..., None])
+            pose = pose.moved(-step_of[..., 0])
+        return pose, track
 
     def standing(self, track: Track, pose: Pose) -> Track:
         """Return the track with the ankles that stand in a pose."""
@@ -116,6 +119,25 @@ class Solver:
             turned = level_feet(body.rotations[:, shank], np.maximum(clear, 0.0))
             angles[:, foot - 1] = Rigid(turned, np.zeros(3)).rotvec
         return replace(parameters, body_pose=angles.reshape(-1, BODY_POSE))
+
+
+def led(pose: Pose, guidance: Guidance) -> Pose:
+    """Return a pose as pictures of one camera have it where they count.
+
+    Where they miss a person for no longer than their errors last, it is that of the nearest frame:
+    between poses of two searches would be a jump, which no step takes back.
+    """
+    frames, used = np.arange(len(guidance.used)), np.flatnonzero(guidance.used)
+    before = used[(np.searchsorted(used, frames, side="right") - 1).clip(min=0)]
+    after = used[np.searchsorted(used, frames).clip(max=len(used) - 1)]
+    inside = (before <= frames) & (frames <= after) & (after - before <= guidance.witnesses)
+    nearest = np.where(frames - before <= after - frames, before, after)
+    known = Rigid(guidance.orient[nearest], np.zeros(3)).rotvec
+    return replace(
+        pose,
+        orient=np.where(inside[:, None], known, pose.orient),
+        angles=np.where(inside[:, None], guidance.angles[nearest], pose.angles),
+    )
 
 
 def factor(blocks: Floats) -> BandedFactor:
