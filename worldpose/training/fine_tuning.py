@@ -24,6 +24,7 @@ from worldpose.training.nets import (
     train_keypoint_net,
     train_people_net,
 )
+from worldpose.training.people_training import PeopleWindows
 from worldpose.training.pictures import PictureCache
 from worldpose.training.settings import FineTuningSettings
 
@@ -33,7 +34,7 @@ Net = TypeVar("Net", PeopleNet, KeypointNet)
 FIGURES: dict[NetKind, str] = {"people": "ap50", "keypoints": "pck"}
 """What each net is judged by: boxes at an overlap of a half, keypoints within 0.2 torsos."""
 MILD = LookSettings(strength=0.4, recoloured=0.1, grey=0.0, fog=0.0, soft=0.1, coded=0.1, grain=0.3)
-"""Looks of the crops that the pose estimator learns from: these show the footage it is wanted for,
+"""Looks of the pictures that nets are fine-tuned on: these show the footage that a version is for,
 and the air, light and kits of others are not asked for."""
 BLOCKS = 20
 """Runs of consecutive pictures that stay together: neighbours in a video are almost the same."""
@@ -91,7 +92,10 @@ def fine_tune(
         people = load_weights(start or EMBEDDED[0], PeopleNet())
         before = people_figure(people, held_out, cache)
         checks = train_people_net(
-            people, learned, checked, cache, training, checkpoint=checkpoint, progress=progress
+            *(people, learned, checked, cache, training),
+            windows=PeopleWindows(looks=MILD),
+            checkpoint=checkpoint,
+            progress=progress,
         )
         after = people_figure(people, held_out, cache)
         save_weights(weights, people)
