@@ -1,10 +1,10 @@
-# Verbs: install, demo, demo-quick, demo-pixels, real-demo, check, format, test, test-all, schemas, pages, clean. All work from a
+# Verbs: install, demo, demo-quick, demo-match, real-demo, check, format, test, test-all, schemas, pages, clean. All work from a
 # fresh clone; real-demo and pages need npm.
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
 
-.PHONY: install demo demo-quick demo-pixels real-demo check format test test-all schemas pages benchmarks clean
+.PHONY: install demo demo-quick demo-match real-demo check format test test-all schemas pages benchmarks clean
 
 install: $(INSTALLED)
 
@@ -20,13 +20,13 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@rm -rf .venv/first
 	@touch $(INSTALLED)
 
-# What the demo reconstructs: a match of 25 people; demo-quick takes 5 people and 6 cameras; demo-pixels 5 people and
-# 5 cameras, all from rendered videos.
-demo: MATCH := --scenario match --seed 1 --duration 4
+# What the demo reconstructs: 5 people before 5 cameras and the broadcast camera, from their rendered videos. demo-quick
+# and demo-match begin with keypoints: 5 people and 6 cameras, 25 people and 16 cameras.
+demo: MATCH := --scenario tiny-broadcast --seed 1 --duration 2 --cameras 5 --render
+demo: RUN := --set detection.stride=2
 demo-quick: MATCH := --scenario tiny --seed 1 --duration 1
-demo-pixels: MATCH := --scenario tiny-broadcast --seed 1 --duration 2 --cameras 5 --render
-demo-pixels: RUN := --set detection.stride=2
-demo demo-quick demo-pixels: install
+demo-match: MATCH := --scenario match --seed 1 --duration 4
+demo demo-quick demo-match: install
 	@rm -rf demo
 	@echo "1/4  a synthetic match with known truth"
 	@$(BIN)/worldpose simulate $(MATCH) --out demo/match
