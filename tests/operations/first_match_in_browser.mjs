@@ -83,7 +83,7 @@ for (const [name, value] of Object.entries(task.release)) {
 }
 await shot(prefect, "custom_run");
 await prefect.getByRole("button", { name: "Submit" }).click();
-await prefect.getByRole("button", { name: "View run" }).click();
+await prefect.getByRole("button", { name: "View run" }).first().click();
 await prefect.waitForSelector("text=Completed", { timeout: 1000 * task.patience });
 note("release");
 await shot(prefect, "released");
