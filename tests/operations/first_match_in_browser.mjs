@@ -83,7 +83,9 @@ for (const [name, value] of Object.entries(task.release)) {
 }
 await shot(prefect, "custom_run");
 await prefect.getByRole("button", { name: "Submit" }).click();
-await prefect.getByRole("button", { name: "View run" }).first().click();
+await prefect.waitForURL(/deployment\/[-0-9a-f]+\?/);
+await prefect.locator('a[href*="flow-run/"]').first().click();
+await prefect.waitForURL(/flow-run\//);
 await prefect.waitForSelector("text=Completed", { timeout: 1000 * task.patience });
 note("release");
 await shot(prefect, "released");
