@@ -56,7 +56,9 @@ class BodyModel:
     def __post_init__(self) -> None:
         floats = ("template", "shape_directions", "pose_directions", "joint_regressor", "weights")
         for name in floats:
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+            # Files keep either order of memory; sums over one are other bits than over the other.
+            array = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
+            object.__setattr__(self, name, array)
         for name in ("parents", "faces"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.int64))
         count = self.template.shape[0] if self.template.ndim else 0
