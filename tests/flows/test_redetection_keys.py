@@ -1,56 +1,21 @@
 """Who is looked for again is made from the iteration before, and of given 2D poses nobody is."""
 
-import numpy as np
 import pytest
+from filmed import write_filmed
 from test_iteration import LATER, keys, reached
 from test_refitting import halves
 
-from data_contracts.cameras import CameraCalibration
-from data_contracts.match import MatchSpec
 from flows.redetection import STAGE
 from flows.registering import register
-from worldpose.ingest import write_match
 from worldpose.store import Store
-from worldpose.video import write_video
-
-SIZE = (64, 48)
 
 
 @pytest.fixture
 def filmed(tmp_path):
     """A folder with two clips of two cameras' videos."""
-    cameras = ("left", "right")
-    spec = {
-        "match_id": "filmed",
-        "fps": 25,
-        "cameras": [{"id": name, "width": SIZE[0], "height": SIZE[1]} for name in cameras],
-        "clips": [
-            {"id": clip, "first_frame": first, "frame_count": 5}
-            for clip, first in (("first", 0), ("second", 6))
-        ],
-        "pitch": "none",
-    }
-    calibrations = {
-        name: CameraCalibration(
-            id=name,
-            image_size=SIZE,
-            focal_px=(50.0, 50.0),
-            principal_point_px=(31.5, 23.5),
-            rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-            translation=(0.0, 0.0, 5.0),
-        )
-        for name in cameras
-    }
-
-    def film(folder):
-        (folder / "videos").mkdir()
-        for n, name in enumerate(cameras):
-            pictures = [np.full((SIZE[1], SIZE[0], 3), 10 * n, np.uint8)] * 12
-            write_video(folder / "videos" / f"{name}.mp4", pictures, 25.0)
-
     folder = tmp_path / "match"
-    spec = MatchSpec.model_validate(spec)
-    write_match(folder, spec, calibrations=calibrations, observations={}, further=film)
+    greys = {"left": [0] * 12, "right": [10] * 12}
+    write_filmed(folder, greys, [("first", 0, 5), ("second", 6, 5)])
     return Store.create(tmp_path / "project"), folder
 
 

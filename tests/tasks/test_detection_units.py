@@ -5,10 +5,9 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
+from filmed import write_filmed
 
 import tasks.detection
-from data_contracts.cameras import CameraCalibration
-from data_contracts.match import MatchSpec
 from data_contracts.review import Correction, DeletedDetection
 from data_contracts.work import Work
 from flows.fan_out import task_of
@@ -18,16 +17,10 @@ from flows.registering import register
 from tasks.clip_inputs import open_clip, open_frames
 from worldpose.detection import People, Poses
 from worldpose.errors import InputError
-from worldpose.ingest import write_match
 from worldpose.store import Store
-from worldpose.video import write_video
 
-SIZE = (64, 48)
 OFFSETS = {"left": 0, "right": 3}
-CLIPS = [
-    {"id": "early", "first_frame": 2, "frame_count": 12},
-    {"id": "late", "first_frame": 20, "frame_count": 10},
-]
+CLIPS = [("early", 2, 12), ("late", 20, 10)]
 
 
 class Reading:
@@ -55,39 +48,10 @@ def reading(monkeypatch):
 @pytest.fixture
 def filmed(tmp_path):
     """A match of two cameras with videos alone; `right` was switched off before the end."""
-    spec = MatchSpec.model_validate(
-        {
-            "match_id": "filmed",
-            "fps": 25,
-            "cameras": [
-                {"id": name, "width": SIZE[0], "height": SIZE[1], "offset_frames": offset}
-                for name, offset in OFFSETS.items()
-            ],
-            "clips": CLIPS,
-            "pitch": "none",
-        }
-    )
-    calibrations = {
-        name: CameraCalibration(
-            id=name,
-            image_size=SIZE,
-            focal_px=(50.0, 50.0),
-            principal_point_px=(31.5, 23.5),
-            rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-            translation=(0.0, 0.0, 5.0),
-        )
-        for name in OFFSETS
-    }
-
-    def film(folder):
-        (folder / "videos").mkdir()
-        for name, count in (("left", 40), ("right", 31)):
-            pictures = [np.full((SIZE[1], SIZE[0], 3), 10 + 4 * n, np.uint8) for n in range(count)]
-            write_video(folder / "videos" / f"{name}.mp4", pictures, 25.0, quality=5)
-
-    folder = tmp_path / "match"
-    write_match(folder, spec, calibrations=calibrations, observations={}, further=film)
-    return folder
+    counts = {"left": 40, "right": 31}
+    greys = {name: [10 + 4 * n for n in range(count)] for name, count in counts.items()}
+    write_filmed(tmp_path / "match", greys, CLIPS, offsets=OFFSETS)
+    return tmp_path / "match"
 
 
 def computed(store, match, stages):

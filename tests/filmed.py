@@ -1,0 +1,58 @@
+"""Matches of which there is nothing but small videos."""
+
+import numpy as np
+
+from data_contracts.cameras import CameraCalibration
+from data_contracts.match import MatchSpec
+from worldpose.ingest import write_match
+from worldpose.video import write_video
+
+SIZE = (64, 48)
+
+
+def write_filmed(folder, greys, clips, *, offsets=None):
+    """Write the match folder of a match called filmed, at 25 frames a second.
+
+    Args:
+        folder: to be made.
+        greys: of each camera, how bright each picture of its video is.
+        clips: name, first frame and number of frames of each.
+        offsets: of cameras whose clocks differ [frame].
+    """
+    spec = {
+        "match_id": "filmed",
+        "fps": 25,
+        "cameras": [
+            {
+                "id": name,
+                "width": SIZE[0],
+                "height": SIZE[1],
+                "offset_frames": (offsets or {}).get(name, 0),
+            }
+            for name in greys
+        ],
+        "clips": [
+            {"id": clip, "first_frame": first, "frame_count": count} for clip, first, count in clips
+        ],
+        "pitch": "none",
+    }
+    calibrations = {
+        name: CameraCalibration(
+            id=name,
+            image_size=SIZE,
+            focal_px=(50.0, 50.0),
+            principal_point_px=(31.5, 23.5),
+            rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+            translation=(0.0, 0.0, 5.0),
+        )
+        for name in greys
+    }
+
+    def film(folder):
+        (folder / "videos").mkdir()
+        for name, bright in greys.items():
+            pictures = [np.full((SIZE[1], SIZE[0], 3), grey, np.uint8) for grey in bright]
+            write_video(folder / "videos" / f"{name}.mp4", pictures, 25.0, quality=5)
+
+    spec = MatchSpec.model_validate(spec)
+    write_match(folder, spec, calibrations=calibrations, observations={}, further=film)
