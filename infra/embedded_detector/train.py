@@ -20,6 +20,7 @@ from typing import Final, TypeVar
 import torch
 from scenes import CHECKING, CROWDS, HELD_OUT, TRAINING, VARIETY, read_set, render_set
 
+from worldpose.detection import DetectionSettings
 from worldpose.detection.embedded import EmbeddedDetector, EmbeddedPose
 from worldpose.detection.embedded_nets import KeypointNet, PeopleNet
 from worldpose.detection.embedded_weights import load_weights, save_weights
@@ -147,9 +148,15 @@ def score(
     pose = EmbeddedPose(load_weights(folder / "embedded_keypoints.safetensors", KeypointNet()))
     classes = ["all", *(f"{low:g} to {high:g} px" for low, high in HEIGHTS)]
     found, kept = (found_people(detector, pictures, cache, each) for each in (None, pose))
-    alone, stored, free = (
+    beside = found_people(detector, pictures, cache, pose, DetectionSettings(beside=True))
+    alone, stored, free, more = (
         dict(zip(classes, score_people(people, labels), strict=True))
-        for people, labels in ((found, pictures), (kept, pictures), (kept, apart(pictures)))
+        for people, labels in (
+            (found, pictures),
+            (kept, pictures),
+            (kept, apart(pictures)),
+            (beside, pictures),
+        )
     )
     limits = [(LEAST_HEIGHT, 1e9), *HEIGHTS]
     placed = {
@@ -161,6 +168,7 @@ def score(
         "ap50_of_the_detector": alone,
         "ap50": stored,
         "ap50_apart": free,
+        "ap50_looking_beside": more,
         "keypoints": placed,
     }
 

@@ -34,20 +34,26 @@ def areas(boxes: Floats) -> Floats:
     return np.asarray(np.prod(np.maximum(boxes[:, 2:] - boxes[:, :2], 0.0), axis=1))
 
 
-def suppress(people: People, overlap: float) -> People:
-    """The people without boxes that overlap a better one by more than `overlap`, best first.
+def best_of(people: People, overlap: float) -> NDArray[np.intp]:
+    """Places of the people whose boxes overlap no better one by more than `overlap`, best first.
 
     Args:
         people: of one picture.
         overlap: [1].
     """
     order = _best_first(people)
-    boxes, scores = people.boxes[order], people.scores[order]
+    boxes = people.boxes[order]
     close = overlaps(boxes, boxes) > overlap
     kept = np.zeros(len(boxes), dtype=np.bool_)
     for number in range(len(boxes)):
         kept[number] = not close[number, :number][kept[:number]].any()
-    return People(boxes[kept], scores[kept])
+    return order[kept]
+
+
+def suppress(people: People, overlap: float) -> People:
+    """The people without boxes that overlap a better one by more than `overlap`, best first."""
+    best = best_of(people, overlap)
+    return People(people.boxes[best], people.scores[best])
 
 
 def seen_closer(people: People, poses: Poses) -> People:

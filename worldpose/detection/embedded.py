@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -16,8 +15,10 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.detection.boxes import SUREST, overlaps, suppress
+from worldpose.detection.beside import look_beside
+from worldpose.detection.boxes import overlaps, suppress
 from worldpose.detection.embedded_crops import crops_of_boxes, cut, picture_from_crop
+from worldpose.detection.embedded_looks import Look
 from worldpose.detection.embedded_surroundings import CELL, MAPS, SAME, surroundings
 from worldpose.detection.embedded_weights import load_weights
 from worldpose.detection.groups import groups
@@ -142,30 +143,6 @@ class EmbeddedDetector:
         return People(found[real], scores.double().cpu().numpy()[real])
 
 
-@dataclass(frozen=True, eq=False)
-class Look:
-    """What crops around boxes show.
-
-    Attributes:
-        places: (people, 17, count, 2) where each joint may be, the likeliest first [px].
-        mass: (people, 17, count) probability about each place.
-        sure: (people, 17, count) chance that a place is right.
-        boxes: (people, 4) [px].
-        fit: (people,) how much of their union these and the true boxes share, as expected [1].
-    """
-
-    places: Floats
-    mass: Floats
-    sure: Floats
-    boxes: Floats
-    fit: Floats
-
-    def replace(self, which: NDArray[np.bool_], other: Look) -> None:
-        """Put what another look shows in the place of some people, in place."""
-        for field in fields(self):
-            getattr(self, field.name)[which] = getattr(other, field.name)
-
-
 class EmbeddedPose:
     """A net that finds the joints of the person in a crop."""
 
@@ -185,7 +162,7 @@ class EmbeddedPose:
         another = np.all(seen[:, 2:] - seen[:, :2] > 1.0, axis=1)
         another &= np.diagonal(overlaps(seen, boxes)) < CLOSE
         asked = np.where(another[:, None], seen, boxes)
-        score = looked.fit * np.sort(looked.sure[..., 0], axis=1)[:, -SUREST:].mean(axis=1)
+        score = looked.score
         known = suppress(People(seen[score >= KNOWN], score[score >= KNOWN]), SAME).boxes
         shares = overlaps(asked, known)
         others = [known[row <= SAME] for row in shares]
@@ -193,13 +170,11 @@ class EmbeddedPose:
         again |= another
         around = [others[index] for index in np.flatnonzero(again)]
         looked.replace(again, self._look(picture, asked[again], around))
-        taken = shared_out(looked.places, looked.mass, looked.boxes)[..., None]
-        return Poses(
-            np.take_along_axis(looked.places, taken[..., None], axis=2)[:, :, 0],
-            np.take_along_axis(looked.sure, taken, axis=2)[:, :, 0],
-            looked.boxes,
-            looked.fit,
-        )
+        return looked.poses(shared_out(looked.places, looked.mass, looked.boxes))
+
+    def beside(self, picture: Picture, people: People) -> tuple[People, Poses]:
+        """Those beside the people who were found, whom these hide in part, with their poses."""
+        return look_beside(lambda boxes, others: self._look(picture, boxes, others), people)
 
     def _look(self, picture: Picture, boxes: Floats, others: Sequence[Floats]) -> Look:
         """What a crop around each box shows.

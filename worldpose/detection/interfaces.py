@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,4 +76,17 @@ class PoseEstimator(Protocol):
             picture: the whole picture.
             boxes: (people, 4) x0, y0, x1, y1 [px]; may reach over the picture's border. Nobody
                 is a legal request.
+        """
+
+
+@runtime_checkable
+class LooksBeside(PoseEstimator, Protocol):
+    """An estimator that also finds whom others hide from a detector."""
+
+    def beside(self, picture: Picture, people: People) -> tuple[People, Poses]:
+        """Who stands beside people of a picture and is none of them, with boxes seen from near.
+
+        Args:
+            picture: the whole picture.
+            people: who was found in it.
         """

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.cameras import Camera
-from worldpose.detection.boxes import areas, fuse, seen_closer, suppress
+from worldpose.detection.boxes import areas, fuse, suppress
 from worldpose.detection.crowd import on_pitch
 from worldpose.detection.followed import Follower, looked_at
 from worldpose.detection.interfaces import Detector, People, Picture, PoseEstimator, Poses
+from worldpose.detection.posed import find_poses
 from worldpose.detection.same_pose import told_apart
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.views import Tiled
@@ -66,6 +67,7 @@ class DetectionReport:
         bridged: boxes that were filled in.
         flickers: boxes of tracks seen too seldom.
         unsure: people without a single keypoint, or the second of one pose.
+        beside: found beside others, of whom some are not kept.
     """
 
     frames: int = 0
@@ -76,6 +78,7 @@ class DetectionReport:
     bridged: int = 0
     flickers: int = 0
     unsure: int = 0
+    beside: int = 0
 
 
 @dataclass(frozen=True)
@@ -141,7 +144,7 @@ class PeopleFinder:
                 unreadable.append(number)
                 rows.append((_nobody(), Poses(np.empty((0, 17, 2)), np.empty((0, 17)))))
             else:
-                rows.append(self._posed(picture, people))
+                rows.append(self._posed(picture, people, place))
             if len(rows) == STRETCH:
                 yield self._stretch(rows, unreadable)
         if rows:
@@ -165,19 +168,28 @@ class PeopleFinder:
             kept = (people.scores >= settings.doubtful) & (areas(people.boxes) > 0.0)
             people = People(people.boxes[kept], people.scores[kept])
             if place is not None:
-                size = (pictures[0].shape[1], pictures[0].shape[0])
-                inside = on_pitch(
-                    people.boxes, place.camera, size, place.pitch, settings.pitch_margin_m
-                )
+                inside = self._inside(people, pictures[0], place)
                 self.report.crowd += int(np.count_nonzero(~inside))
                 people = People(people.boxes[inside], people.scores[inside])
             everybody.append(people)
         return everybody
 
-    def _posed(self, picture: Picture, people: People) -> tuple[People, Poses]:
+    def _inside(self, people: People, picture: Picture, place: Place) -> NDArray[np.bool_]:
+        """Whose feet are on the pitch or near it (people,)."""
+        size = (picture.shape[1], picture.shape[0])
+        margin = self._settings.pitch_margin_m
+        return on_pitch(people.boxes, place.camera, size, place.pitch, margin)
+
+    def _posed(self, picture: Picture, people: People, place: Place | None) -> tuple[People, Poses]:
         """Keypoints of everybody; who has none, or the pose of somebody better, is not kept."""
-        poses = self._estimator.estimate(picture, people.boxes)
-        people = seen_closer(people, poses)
+        found = len(people.scores)
+        people, poses = find_poses(self._estimator, picture, people, self._settings)
+        self.report.beside += len(people.scores) - found
+        if place is not None:
+            # Those found are on the pitch; whom they hide may be a bystander.
+            kept = self._inside(people, picture, place) | (np.arange(len(people.scores)) < found)
+            people = People(people.boxes[kept], people.scores[kept])
+            poses = Poses(poses.keypoints[kept], poses.confidence[kept])
         known, own = told_apart(
             people, poses, self._settings.least_keypoint, self._settings.same_pose
         )

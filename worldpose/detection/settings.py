@@ -61,6 +61,10 @@ class DetectionSettings(Record):
     """People whose feet are farther outside of the pitch than this are crowd (D2) [m]. Throw-ins,
     sprints over the line and assistants, 1.5 m out, stay: a far foot is known to 1 m. Who waits
     behind the lines goes from 2.5 m on, boards stand 3 to 6 m out."""
+    beside: bool = False
+    """The embedded pose net is asked, too, about places half beside everybody found, where a
+    detector sees the one in front alone: more people are found, and more who are half of two;
+    poses take twice as long. Not with `mirrored`."""
     least_keypoint: float = Field(default=0.05, ge=0, lt=1)
     """A keypoint below this confidence was not found [1]."""
     same_pose: float = Field(default=0.85, gt=0, le=1)

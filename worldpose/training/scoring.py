@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.detection.boxes import overlaps, seen_closer
+from worldpose.detection.boxes import overlaps
 from worldpose.detection.interfaces import Detector, People, Picture, PoseEstimator
+from worldpose.detection.posed import find_poses
 from worldpose.detection.same_pose import told_apart
 from worldpose.detection.settings import DetectionSettings
 from worldpose.training.average_precision import average_precision
@@ -48,13 +49,14 @@ def found_people(
     pictures: Sequence[LabelledPicture],
     cache: PictureCache,
     estimator: PoseEstimator | None = None,
+    settings: DetectionSettings | None = None,
 ) -> list[People]:
-    """Return the people of each picture; with an estimator as they are stored."""
+    """Return the people of each picture; with an estimator as they are stored by settings."""
     found = [detector.detect([cache[picture.path]])[0] for picture in pictures]
     if estimator is None:
         return found
     return [
-        stored(people, cache[picture.path], estimator)
+        stored(people, cache[picture.path], estimator, settings)
         for people, picture in zip(found, pictures, strict=True)
     ]
 
@@ -69,14 +71,18 @@ def score_people(
     return tuple(average_precision(found, pictures, each) for each in classes)
 
 
-def stored(people: People, picture: Picture, estimator: PoseEstimator) -> People:
-    """Return the people of a picture as the stage stores them by default, the crowd included."""
-    chosen = DetectionSettings()
+def stored(
+    people: People,
+    picture: Picture,
+    estimator: PoseEstimator,
+    settings: DetectionSettings | None = None,
+) -> People:
+    """Return the people of a picture as the stage stores them, the crowd included."""
+    chosen = settings or DetectionSettings()
     kept = people.scores >= chosen.doubtful
     people = People(people.boxes[kept], people.scores[kept])
-    poses = estimator.estimate(picture, people.boxes)
-    closer = seen_closer(people, poses)
-    return told_apart(closer, poses, chosen.least_keypoint, chosen.same_pose)[0]
+    people, poses = find_poses(estimator, picture, people, chosen)
+    return told_apart(people, poses, chosen.least_keypoint, chosen.same_pose)[0]
 
 
 def apart(pictures: Sequence[LabelledPicture], share: float = 0.3) -> list[LabelledPicture]:

@@ -3,8 +3,9 @@ import pytest
 import torch
 from safetensors.torch import save
 
-from worldpose.detection.embedded import EmbeddedDetector, EmbeddedPose, Look
+from worldpose.detection.embedded import EmbeddedDetector, EmbeddedPose
 from worldpose.detection.embedded_crops import crops_of_boxes, cut, picture_from_crop
+from worldpose.detection.embedded_looks import Look
 from worldpose.detection.embedded_nets import CROP, KeypointNet, PeopleNet, edges, peaks
 from worldpose.detection.embedded_peaks import boxes_at_peaks
 from worldpose.detection.embedded_weights import FORMAT, load_weights, save_weights

@@ -1,0 +1,37 @@
+"""Keypoints of people in boxes, and who else these looks find."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from worldpose.detection.boxes import seen_closer
+from worldpose.detection.interfaces import LooksBeside, People, Picture, PoseEstimator, Poses
+from worldpose.detection.settings import DetectionSettings
+
+
+def find_poses(
+    estimator: PoseEstimator, picture: Picture, people: People, settings: DetectionSettings
+) -> tuple[People, Poses]:
+    """Return people with boxes as seen from near and poses, then those found beside them.
+
+    Args:
+        estimator: of poses.
+        picture: the whole picture.
+        people: as a detector found them.
+        settings: of the stage.
+    """
+    poses = estimator.estimate(picture, people.boxes)
+    people = seen_closer(people, poses)
+    if not (settings.beside and isinstance(estimator, LooksBeside)):
+        return people, poses
+    others, theirs = estimator.beside(picture, people)
+    return (
+        People(
+            np.concatenate([people.boxes, others.boxes]),
+            np.concatenate([people.scores, others.scores]),
+        ),
+        Poses(
+            np.concatenate([poses.keypoints, theirs.keypoints]),
+            np.concatenate([poses.confidence, theirs.confidence]),
+        ),
+    )
