@@ -58,6 +58,10 @@ class TrackingSettings(Record):
     """Two tracks with mean joint distance below this are on one person [m]: bodies cannot."""
     merge_time: float = Field(default=0.2, gt=0)
     """Time for which they must be so near to be merged [s]."""
+    shadow_distance: float = Field(default=0.5, ge=0)
+    """A track whose body is nearer than this to somebody seen by two and a half times as many
+    cameras, for seven tenths of its frames, is no person [m]; 0 keeps it. Not where every frame is
+    decided from it and those before it."""
     end_time: float = Field(default=0.3, gt=0)
     """Time over which place and velocity at either end of a track are fitted [s]."""
     max_gap: float = Field(default=60.0, gt=0)

@@ -20,6 +20,7 @@ from worldpose.tracking.joining import Candidate
 from worldpose.tracking.person import Person
 from worldpose.tracking.rosters import within_limit
 from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.shadows import without_shadows
 from worldpose.tracking.stitching import join_tracks
 
 JOINTS = len(COCO17)
@@ -33,7 +34,7 @@ class TrackingReport(Record):
     births: int
     """Tracks started [1]."""
     dropped: int
-    """Of these, dropped for being too short or more than the roster allows [1]: ghosts."""
+    """Of these, dropped for being too short, shadows or more than the roster allows [1]: ghosts."""
     merged: int
     """Of these, ended because another was on the same person [1]."""
     joined: int
@@ -151,6 +152,7 @@ def _result(follower: Follower, frames: int) -> Tracking:
     else:
         needed = min(max(1, follower.confirmed_after), frames)
         lasting = [person for person in everyone if person.evidence >= needed - 1e-9]
+        lasting = without_shadows(lasting, follower.settings.shadow_distance)
         lasting = within_limit(lasting, follower.people)
         candidates, chains = join_tracks(lasting, follower)
     chains.sort(key=lambda chain: (min(chain[0].sightings), chain[0].number))

@@ -1,0 +1,78 @@
+"""Shadows: tracks that follow somebody about in a few of the cameras that see him.
+
+Where a detector takes halves of two people for a third, in two cameras at once, rays may meet. A
+person so near to another is seen by most of the cameras that see him; a shadow is not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.tracking.person import Person
+
+VIEWS: Final = 0.4
+"""A shadow is seen by at most this share of the cameras that see the other [1]."""
+LASTING: Final = 0.7
+"""Share of its frames in which a shadow has somebody so near [1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A track in the frames that determine its place.
+
+    Attributes:
+        frame: (frames,) rising.
+        joints: (frames, 17, 3) [m], world; NaN where not determined.
+        views: (frames,) cameras that see it.
+    """
+
+    frame: NDArray[np.int64]
+    joints: NDArray[np.float64]
+    views: NDArray[np.int64]
+
+
+def without_shadows(people: list[Person], distance: float) -> list[Person]:
+    """Return the people without those who are nearly always beside somebody far better seen.
+
+    Args:
+        people: tracks of a clip.
+        distance: between bodies, below which one may be the other's shadow [m]; 0 keeps all.
+    """
+    if distance <= 0.0:
+        return people
+    seen = [_seen(person) for person in people]
+    return [
+        person
+        for n, person in enumerate(people)
+        if not _is_shadow(seen[n], seen[:n] + seen[n + 1 :], distance)
+    ]
+
+
+def _is_shadow(track: Seen, others: list[Seen], distance: float) -> bool:
+    beside = np.zeros(len(track.frame), dtype=np.bool_)
+    for other in others:
+        _, mine, theirs = np.intersect1d(
+            track.frame, other.frame, assume_unique=True, return_indices=True
+        )
+        fewer = track.views[mine] <= VIEWS * other.views[theirs]
+        mine, theirs = mine[fewer], theirs[fewer]
+        apart = track.joints[mine] - other.joints[theirs]
+        known = np.isfinite(apart[..., 0])
+        total = np.where(known[..., None], apart, 0.0).sum(axis=1)
+        count = known.sum(axis=1)
+        # Of bodies, not of joints: a shadow's joints are another's, or between two people's.
+        beside[mine] |= np.linalg.norm(total, axis=1) < distance * count
+    return bool(len(beside)) and float(beside.mean()) >= LASTING
+
+
+def _seen(person: Person) -> Seen:
+    frames = sorted(person.sightings)
+    sightings = [person.sightings[frame] for frame in frames]
+    joints = np.array([each.joints for each in sightings])
+    views = np.array([np.count_nonzero(each.index >= 0) for each in sightings])
+    placed = np.isfinite(joints[..., 0]).any(axis=1)
+    return Seen(np.array(frames)[placed], joints[placed], views[placed])
