@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 DASK_SECONDS = 10.0
 """How long a Dask scheduler may take to answer."""
+KEEP_SECONDS = 5.0
+"""How often workers that are gone are begun anew."""
 
 
 @dataclass(frozen=True)
@@ -182,6 +184,7 @@ def _machines(
         cluster = None
         if request.dask is None:
             cluster = stack.enter_context(_starting_cluster(request, missing))
+            stack.enter_context(kept_complete(cluster))
             request = replace(request, dask=cluster.scheduler_address)
         else:
             _require_scheduler(request.dask)
@@ -231,9 +234,34 @@ def _starting_cluster(request: RunRequest, missing: list[PlannedUnit]) -> LocalC
     asked = [given] if isinstance(given, str) else given
     preload = ["tasks.preload", *asked, "prefect_dask", *(f"tasks.{stage}" for stage in stages)]
     preload.append("flows.match")  # with each task Prefect sends the flow that it is of
+    # Dask closes what begins a lost worker anew if that takes longer: 15 s, as long as a start on a
+    # slow machine.
+    dask.config.set({"distributed.deploy.lost-worker-timeout": START_SECONDS})
     cluster = LocalCluster(**{**local_cluster(workers), "n_workers": 0, "preload": preload})
     cluster.scale(workers)
     return cluster
+
+
+@contextmanager
+def kept_complete(cluster: LocalCluster) -> Iterator[None]:
+    """Begin workers anew that are gone for good, as are those that end while they start.
+
+    Dask notices that they are gone, but begins others only when it is asked for workers.
+    """
+    workers = len(cluster.worker_spec)
+    is_over = threading.Event()
+
+    def keep() -> None:
+        while not is_over.wait(KEEP_SECONDS):
+            cluster.scale(workers)
+
+    keeper = threading.Thread(target=keep, daemon=True)
+    keeper.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        keeper.join()
 
 
 def _without_heartbeats() -> AbstractContextManager[Any]:

@@ -1,11 +1,17 @@
 """A lost Prefect server or Dask scheduler is no failure of a unit."""
 
+import time
+
+import dask
 import httpx
 import pytest
+from distributed import Client, LocalCluster
 from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError
 
+from flows import running
 from flows.lost_machines import LostMachinesError, require_machines
+from flows.prefect_environment import local_cluster
 from worldpose.errors import InputError, StoreError
 
 
@@ -28,3 +34,22 @@ def test_a_units_own_failure_is_its_own():
     for failure in (StoreError("no space"), OSError(28, "no space"), ValueError("of a bug")):
         require_machines(failure)
     require_machines(InputError("a", expected="b", found="c", todo="d"))
+
+
+def test_a_worker_that_is_gone_for_good_is_begun_anew(monkeypatch):
+    monkeypatch.setattr(running, "KEEP_SECONDS", 0.1)
+    soon = {"distributed.deploy.lost-worker-timeout": 0.1}
+    with (
+        dask.config.set(soon),
+        LocalCluster(**local_cluster(1)) as cluster,
+        running.kept_complete(cluster),
+        Client(cluster, set_as_default=False) as client,
+    ):
+        client.wait_for_workers(1, 60)
+        ((first, nanny),) = cluster.workers.items()
+        cluster.sync(nanny.close)  # as one does whose worker ends while it starts
+        end = time.monotonic() + 60
+        while cluster.workers.get(first) in (nanny, None):
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        assert client.submit(sum, (1, 2)).result(60) == 3
