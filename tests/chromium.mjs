@@ -18,7 +18,8 @@ export async function open(seen, height = 768) {
   page.on("pageerror", (error) => seen.errors.push(error.message));
   page.on("console", (message) => {
     // The log-in page asks whether it is needed, and is told so with a 401.
-    if (message.type() === "error" && !message.text().includes("401")) seen.errors.push(message.text());
+    if (message.type() !== "error" || message.text().includes("401")) return;
+    seen.errors.push(`${message.text()} ${message.location().url}`);
   });
   page.on("request", (request) => {
     if (!/^(http:\/\/127\.0\.0\.1|file:|data:|blob:)/.test(request.url())) seen.outside.push(request.url());

@@ -36,6 +36,6 @@ def drive(script, task, folder, seconds):
     )
     assert done.returncode == 0, done.stderr
     seen = json.loads(done.stdout)
-    assert seen["errors"] == []
-    assert seen["outside"] == []
+    assert seen["errors"] == [], seen["errors"]
+    assert seen["outside"] == [], seen["outside"]
     return seen
