@@ -28,7 +28,7 @@ WORTH: Final = 0.15
 """Below this product of fit and surest keypoints an answer is not asked for its own [1]."""
 THERE: Final = 0.4
 """From this product on somebody is there [1]. Of those stored on scenes of training's kind one in
-five is a new person's, as of boxes that a detector finds with that score."""
+five is a new person's; of boxes that a detector finds, with such scores, one in four is."""
 ONE: Final = 0.5
 """Two who are found beside others and share more are one [1, intersection over union]."""
 UNSEEN: Final = 0.3
