@@ -17,17 +17,17 @@ import time
 import urllib.request
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import certifi
 
+from flows.prefect_database import begin_database, keep_database
 from worldpose.errors import InputError, WorldposeError
 
 START_SECONDS = 120.0
-"""A first start creates Prefect's database, which took 15 s on two busy cores."""
+"""The first start of all creates Prefect's database, which took 15 s on two busy cores."""
 
 ALWAYS = {
     "DO_NOT_TRACK": "1",
@@ -155,7 +155,7 @@ def prefect_server(project: str, *, is_local: bool = False) -> Iterator[Callable
             _home(project, Path(scratch)) as home,
             _environment({"PREFECT_HOME": str(home)}),
             _environment(one_authority(Path(scratch)) if is_local else {}),
-            _embedded_server(Path(scratch) / "server.log") as (address, wait_until_ready),
+            _embedded_server(home, Path(scratch) / "server.log") as (address, wait_until_ready),
             _environment({"PREFECT_API_URL": address}),
         ):
             yield wait_until_ready
@@ -196,7 +196,8 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
 
 
 @contextmanager
-def _embedded_server(log: Path) -> Iterator[tuple[str, Callable[[], None]]]:
+def _embedded_server(home: Path, log: Path) -> Iterator[tuple[str, Callable[[], None]]]:
+    is_first = begin_database(home)
     with socket.create_server(("127.0.0.1", 0)) as listening, log.open("wb") as output:
         address = f"http://127.0.0.1:{listening.getsockname()[1]}/api"
         # The server ends when its standard input does, so a killed run leaves none behind. It is
@@ -210,8 +211,14 @@ def _embedded_server(log: Path) -> Iterator[tuple[str, Callable[[], None]]]:
             env={**EMBEDDED, **os.environ},
             start_new_session=True,  # Ctrl-C is for the run, which then ends its server
         )
+
+    def wait_until_ready() -> None:
+        _wait_until_healthy(server, address, log)
+        if is_first:
+            keep_database(home)
+
     try:
-        yield address, partial(_wait_until_healthy, server, address, log)
+        yield address, wait_until_ready
     finally:
         server.kill()
         server.communicate()

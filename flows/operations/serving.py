@@ -20,6 +20,7 @@ from data_contracts.operations import Service, Serving
 from flows.operations.health import at_prefect
 from flows.operations.layout import PRIORITIES
 from flows.operations.plan import ServePlan
+from flows.prefect_database import begin_database, keep_database
 from flows.prefect_environment import one_authority, served_environment
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.store import Store
@@ -218,8 +219,11 @@ def _bring_up(supervisor: _Supervisor, told: threading.Event) -> None:
     plan = supervisor.plan
     addresses = health_addresses(plan)
     if plan.owns_prefect:
+        is_first = begin_database(plan.state / "prefect")
         part = supervisor.start("prefect", plan.prefect)
         _wait_for(supervisor, part, lambda: answers(addresses["prefect"]), told)
+        if is_first and not told.is_set():
+            keep_database(plan.state / "prefect")
     elif not answers(addresses["prefect"]):
         raise UsageError(
             f"PREFECT_API_URL={plan.prefect}",

@@ -2,11 +2,66 @@
 
 import gc
 import importlib
+import sqlite3
 import ssl
+from contextlib import closing
 
+import pytest
+
+from flows import prefect_database
 from flows.operations.plan import ServePlan
 from flows.operations.serving import environment_of
-from flows.prefect_environment import AUTHORITIES, one_authority
+from flows.prefect_database import DATABASE, begin_database, keep_database
+from flows.prefect_environment import AUTHORITIES, one_authority, prefect_server
+
+
+@pytest.fixture
+def kept(tmp_path, monkeypatch):
+    """Where the empty database is kept, of which there is none yet."""
+    file = tmp_path / "installation" / "prefect.db"
+    monkeypatch.setattr(prefect_database, "kept_database", lambda: file)
+    monkeypatch.delenv("PREFECT_API_URL", raising=False)
+    return file
+
+
+def tables(database):
+    with closing(sqlite3.connect(database)) as opened:
+        assert opened.execute("pragma integrity_check").fetchone() == ("ok",)
+        return set(opened.execute("select type, name, sql from sqlite_master"))
+
+
+def test_what_the_first_server_makes_all_later_ones_begin_with(tmp_path, kept):
+    first, second = tmp_path / "first", tmp_path / "second"
+    with prefect_server(str(first), is_local=True) as wait_until_ready:
+        wait_until_ready()
+        made = tables(first / "prefect" / DATABASE)
+    assert len(made) > 50
+    assert [file.name for file in kept.parent.iterdir()] == [kept.name]
+    with prefect_server(str(second), is_local=True) as wait_until_ready:
+        assert tables(second / "prefect" / DATABASE) == made  # before the server is up
+        wait_until_ready()
+    assert tables(kept) == made
+
+
+def test_a_database_that_is_there_stays(tmp_path, kept):
+    kept.parent.mkdir()
+    kept.write_bytes(b"empty")
+    (tmp_path / DATABASE).write_bytes(b"full")
+    assert not begin_database(tmp_path)
+    assert (tmp_path / DATABASE).read_bytes() == b"full"
+
+
+def test_without_a_place_to_keep_it_every_server_makes_its_own(tmp_path, kept):
+    kept.parent.touch()  # a file where the folder should be
+    assert begin_database(tmp_path)
+    (tmp_path / DATABASE).touch()
+    keep_database(tmp_path)
+    assert begin_database(tmp_path / "another")
+
+
+def test_a_database_elsewhere_is_not_kept(tmp_path, kept):
+    keep_database(tmp_path)
+    assert not kept.exists()
 
 
 def test_one_authority_is_read_instead_of_all(tmp_path, monkeypatch):

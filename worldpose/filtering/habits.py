@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from worldpose.cameras import Camera
 from worldpose.filtering.judging import Suspects, judge_detections, learn_from, misses_of
-from worldpose.filtering.lateness import learn_lateness
+from worldpose.filtering.lateness import ClockEquations
 from worldpose.filtering.settings import FilteringSettings
 from worldpose.filtering.view_bias import ViewBias, find_azimuths, learn_view_bias
 from worldpose.filtering.views import BodyViews
@@ -110,11 +110,12 @@ def learn_habits(
         misses = misses_of(views, suspects, judged, spread, repeated)
         at = misses.frame, misses.camera, misses.person
         azimuth, way, scale = motion.azimuth[at], motion.way[at], _scale(views)[at]
+        clocks = ClockEquations.of(cameras, joints, way, misses)
         for _ in range(TURNS):
             late = habits.late[misses.camera, None, None]
             bias = learn_view_bias(misses.less(late * np.nan_to_num(way)), azimuth, scale)
             sides = np.nan_to_num(bias.shift(azimuth, scale))
-            habits = Habits(bias, learn_lateness(cameras, joints, way, misses.less(sides)))
+            habits = Habits(bias, clocks.learn_lateness(misses.less(sides)))
     return habits
 
 

@@ -7,13 +7,14 @@ free to follow both.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.cameras import Camera
-from worldpose.filtering.misses import Misses
+from worldpose.filtering.misses import Misses, Places
 from worldpose.static_calibration.parameters import by_step
 
 Floats = NDArray[np.float64]
@@ -31,44 +32,85 @@ LEAST_SPREAD: Final = 0.005
 """Of clocks [frame]."""
 
 
-def learn_lateness(cameras: Camera, joints: Floats, way: Floats, misses: Misses) -> Floats:
-    """Return by how many frames each camera shows people later than the cameras' mean (cameras,).
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What one camera saw, an entry for each joint of each row that counts."""
 
-    Args:
-        cameras: batch (cameras,).
-        joints: (frames, persons, 17, 3) [m], world, of bodies.
-        way: (n, 17, 2) [px], of each row's joints in its picture within a frame; NaN = unknown.
-        misses: of these joints, whose `frame` are theirs.
-    """
-    persons, joint_count = joints.shape[1:3]
-    count, width = cameras.batch_shape[0], 1 + STEP
-    points = joints.reshape(-1, 3)
-    weight = misses.weight * np.isfinite(way).all(axis=-1)
-    normal = np.tile(LEAST * np.eye(3), (len(points), 1, 1))
-    pulled = np.zeros((len(points), 3))
-    mixed = np.zeros((len(points), 3, count, width))
-    matrix, right = np.zeros((count, width, count, width)), np.zeros((count, width))
-    for camera in range(count):
-        row, joint = np.nonzero((weight > 0.0) & (misses.camera == camera)[:, None])
-        place = (misses.frame[row] * persons + misses.person[row]) * joint_count + joint
-        seen = cameras[camera].project_with_jacobians(points[place])
-        by_camera = by_step(cameras[camera], seen)[..., :STEP]
-        by_all = np.concatenate([way[row, joint][..., None], by_camera], axis=-1)
-        held = weight[row, joint, None, None] * by_all
-        missed = misses.missed[row, joint]
-        matrix[camera, :, camera] = np.einsum("nak,nal->kl", held, by_all)
-        right[camera] = np.einsum("nak,na->k", held, missed)
-        held_points = weight[row, joint, None, None] * seen.d_points
-        # A camera sees a joint of a person at most once in a frame.
-        normal[place] += np.einsum("nai,naj->nij", held_points, seen.d_points)
-        pulled[place] += np.einsum("nai,na->ni", held_points, missed)
-        mixed[place, :, camera] = np.einsum("nai,nak->nik", held_points, by_all)
-    used = normal[:, 0, 0] > LEAST
-    flat = mixed[used].reshape(-1, 3, count * width)
-    follow = np.linalg.solve(normal[used], flat).reshape(-1, count * width)
-    whole = matrix.reshape(count * width, -1) - flat.reshape(-1, count * width).T @ follow
-    side = right.reshape(-1) - follow.T @ pulled[used].reshape(-1)
-    return _late(whole, side, count)
+    row: Places
+    joint: Places
+    place: Places
+    """Which point it is."""
+    held: Floats
+    """(n, 2, 1 + STEP) how its unknowns move the keypoint, weighted."""
+    held_points: Floats
+    """(n, 2, 3) how the point does."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClockEquations:
+    """Normal equations of clocks and cameras, with every joint solved for (Schur complement)."""
+
+    seen: tuple[_Seen, ...]
+    """By camera."""
+    used: NDArray[np.bool_]
+    """(points,) that anybody saw."""
+    follow: Floats
+    """(3 used, cameras (1 + STEP)) how these go along with the unknowns."""
+    matrix: Floats
+    """(cameras (1 + STEP),) twice."""
+
+    @classmethod
+    def of(cls, cameras: Camera, joints: Floats, way: Floats, misses: Misses) -> ClockEquations:
+        """Return the equations; which keypoints count is all that they take from `misses`.
+
+        Args:
+            cameras: batch (cameras,).
+            joints: (frames, persons, 17, 3) [m], world, of bodies.
+            way: (n, 17, 2) [px], of each row's joints in its picture within a frame; NaN = unknown.
+            misses: of these joints, whose `frame` are theirs.
+        """
+        persons, joint_count = joints.shape[1:3]
+        count, width = cameras.batch_shape[0], 1 + STEP
+        points = joints.reshape(-1, 3)
+        weight = misses.weight * np.isfinite(way).all(axis=-1)
+        normal = np.tile(LEAST * np.eye(3), (len(points), 1, 1))
+        mixed = np.zeros((len(points), 3, count, width))
+        matrix = np.zeros((count, width, count, width))
+        seen = []
+        for camera in range(count):
+            row, joint = np.nonzero((weight > 0.0) & (misses.camera == camera)[:, None])
+            place = (misses.frame[row] * persons + misses.person[row]) * joint_count + joint
+            by_points = cameras[camera].project_with_jacobians(points[place])
+            by_camera = by_step(cameras[camera], by_points)[..., :STEP]
+            by_all = np.concatenate([way[row, joint][..., None], by_camera], axis=-1)
+            held = weight[row, joint, None, None] * by_all
+            held_points = weight[row, joint, None, None] * by_points.d_points
+            matrix[camera, :, camera] = np.einsum("nak,nal->kl", held, by_all)
+            # A camera sees a joint of a person at most once in a frame.
+            normal[place] += np.einsum("nai,naj->nij", held_points, by_points.d_points)
+            mixed[place, :, camera] = np.einsum("nai,nak->nik", held_points, by_all)
+            seen.append(_Seen(row, joint, place, held, held_points))
+        used = normal[:, 0, 0] > LEAST
+        flat = mixed[used].reshape(-1, 3, count * width)
+        follow = np.asarray(np.linalg.solve(normal[used], flat), np.float64)
+        follow = follow.reshape(-1, count * width)
+        whole = matrix.reshape(count * width, -1) - flat.reshape(-1, count * width).T @ follow
+        return cls(tuple(seen), used, follow, whole)
+
+    def learn_lateness(self, misses: Misses) -> Floats:
+        """Return by how many frames each camera shows people later than the mean (cameras,).
+
+        Args:
+            misses: with the keypoints that count in the equations, as far as they still miss.
+        """
+        right = np.zeros((len(self.seen), 1 + STEP))
+        pulled = np.zeros((len(self.used), 3))
+        for camera, seen in enumerate(self.seen):
+            missed = misses.missed[seen.row, seen.joint]
+            right[camera] = np.einsum("nak,na->k", seen.held, missed)
+            pulled[seen.place] += np.einsum("nai,na->ni", seen.held_points, missed)
+        side = right.reshape(-1) - self.follow.T @ pulled[self.used].reshape(-1)
+        return _late(self.matrix, side, len(self.seen))
 
 
 def _late(matrix: Floats, right: Floats, count: int) -> Floats:

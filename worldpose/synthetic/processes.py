@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 
 def drift(
@@ -19,9 +18,11 @@ def drift(
         rng: draws `shape` normal numbers.
     """
     keep = float(np.exp(-1.0 / (time * fps)))
-    shocks = rng.standard_normal(shape)
-    shocks[1:] *= np.sqrt(1.0 - keep**2)
-    process: NDArray[np.float64] = lfilter([1.0], [1.0, -keep], shocks, axis=0)
+    process = rng.standard_normal(shape)
+    process[1:] *= np.sqrt(1.0 - keep**2)
+    # Not scipy's lfilter: all of scipy.signal takes a second to import.
+    for frame in range(1, len(process)):
+        process[frame] += keep * process[frame - 1]
     return process
 
 

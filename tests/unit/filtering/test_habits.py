@@ -9,7 +9,7 @@ from planted_errors import plant
 from data_contracts.conventions import COCO17
 from worldpose.cameras import Rigid
 from worldpose.filtering.habits import watch_motion
-from worldpose.filtering.lateness import learn_lateness
+from worldpose.filtering.lateness import ClockEquations
 from worldpose.filtering.misses import Misses
 from worldpose.filtering.view_bias import TERMS, ViewBias, find_azimuths, learn_view_bias
 from worldpose.synthetic.sight import facing
@@ -91,13 +91,22 @@ def missed_by(scene, late, noise=0.5):
 
 def test_clocks_are_told_from_the_places_of_cameras(scene):
     late = np.array([0.4, -0.3, 0.1, -0.5, 0.3, 0.0])
-    found = learn_lateness(*missed_by(scene, late))
+    *bodies, misses = missed_by(scene, late)
+    found = ClockEquations.of(*bodies, misses).learn_lateness(misses)
     # Six cameras over 0.6 s, five people: some hundredths of a frame.
     np.testing.assert_allclose(found, late - late.mean(), atol=0.06)
 
 
 def test_exact_clocks_come_out_equal(scene):
-    assert np.abs(learn_lateness(*missed_by(scene, np.zeros(6)))).max() < 0.03
+    *bodies, misses = missed_by(scene, np.zeros(6))
+    assert np.abs(ClockEquations.of(*bodies, misses).learn_lateness(misses)).max() < 0.03
+
+
+def test_equations_of_clocks_hold_for_what_is_left_of_the_misses(scene):
+    *bodies, misses = missed_by(scene, np.array([0.4, -0.3, 0.1, -0.5, 0.3, 0.0]))
+    left = misses.less(0.3 * bodies[-1])
+    found = ClockEquations.of(*bodies, misses).learn_lateness(left)
+    np.testing.assert_array_equal(found, ClockEquations.of(*bodies, left).learn_lateness(left))
 
 
 def test_shifts_go_with_the_joint_that_a_keypoint_is(scene):
