@@ -9,60 +9,14 @@ import gc
 import json
 import sys
 
-import typer
-
-from flows.cli import (
-    body,
-    check,
-    evaluate,
-    finetune,
-    lineage,
-    matches,
-    pins,
-    programme,
-    project,
-    reprocess,
-    results,
-    review,
-    run,
-    serve,
-    statistics,
-    times,
-)
-from flows.cli.console import errors, line
-from worldpose.errors import UsageError, WorldposeError
-
-app = typer.Typer(
-    name="worldpose",
-    help="Metric 3D poses of every player from many cameras: a data factory.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    add_completion=False,
-    rich_markup_mode=None,  # help names units in brackets
-)
-for module in (
-    project,
-    matches,
-    programme,
-    run,
-    reprocess,
-    serve,
-    review,
-    lineage,
-    times,
-    pins,
-    results,
-    evaluate,
-    check,
-    statistics,
-    finetune,
-    body,
-):
-    module.add_to(app)
-
 
 def main() -> None:
     """Run the command line; user errors become one message and an exit code."""
+    # Late: every process that a run starts imports this module once more, and no command.
+    from flows.cli.app import app
+    from flows.cli.console import errors, line
+    from worldpose.errors import UsageError, WorldposeError
+
     try:
         app()
     except OSError as error:

@@ -113,8 +113,18 @@ def test_the_library_imports_without_orchestrators(package):
 def test_deciding_what_to_run_imports_neither_prefect_nor_dask():
     script = (
         "import sys\n"
-        "import flows.running, flows.planning, flows.cli\n"
+        "import flows.running, flows.planning, flows.cli.app\n"
         "loaded = {'prefect', 'dask', 'distributed'} & set(sys.modules)\n"
+        "assert not loaded, loaded\n"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT)
+
+
+def test_processes_that_a_run_starts_import_no_command():
+    script = (
+        "import sys\n"
+        "import flows.cli\n"  # as each of them does, for the module of `main`
+        "loaded = {'typer', 'numpy', 'flows.cli.app'} & set(sys.modules)\n"
         "assert not loaded, loaded\n"
     )
     subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT)

@@ -8,7 +8,7 @@ from command_line import TINY, worldpose
 from typer.testing import CliRunner
 
 from data_contracts.review import MovedPoint, ReviewDecision
-from flows.cli import app
+from flows.cli.app import app
 from flows.gatekeeping import Gatekeeper
 from flows.method import GATES, METHOD
 from flows.planning import plan_run

@@ -6,7 +6,7 @@ import pytest
 from command_line import TINY
 from typer.testing import CliRunner
 
-from flows.cli import app
+from flows.cli.app import app
 from worldpose.errors import InputError
 from worldpose.store import Store
 

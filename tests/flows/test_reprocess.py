@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from data_contracts.review import DeletedDetection, MergedTracks, MovedPoint
 from data_contracts.run import UnitFailure
 from flows import planning, reprocessing
-from flows.cli import app
+from flows.cli.app import app
 from flows.cli.reprocess import exit_code
 from flows.method import METHOD
 from flows.registering import open_match, register

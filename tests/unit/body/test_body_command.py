@@ -5,7 +5,7 @@ import pytest
 from smpl_pickles import pickled, smpl_like
 from typer.testing import CliRunner
 
-from flows.cli import app
+from flows.cli.app import app
 from worldpose.body import find_body
 from worldpose.errors import InputError
 

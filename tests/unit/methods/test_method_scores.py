@@ -20,7 +20,7 @@ from method_files import (
 )
 from typer.testing import CliRunner
 
-from flows.cli import app
+from flows.cli.app import app
 from flows.methods import score_methods
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation.method_table import table_csv, table_latex, table_rows

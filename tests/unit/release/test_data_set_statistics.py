@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from data_contracts.release import ClipStatistics
 from flows.checking import check
-from flows.cli import app
+from flows.cli.app import app
 from flows.statistics import count
 from worldpose.body import BodyParameters
 from worldpose.cameras import Camera, Rigid
