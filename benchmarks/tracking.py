@@ -214,7 +214,7 @@ def main() -> None:
             print(line)
     confidence = np.full(keypoints.shape[:-1], 0.9)
     start = time.perf_counter()
-    result = track_people(cameras, keypoints, confidence, FPS, SETTINGS, ground=True)
+    result = track_people(cameras, keypoints, confidence, FPS, SETTINGS, pitch_size=(105.0, 68.0))
     seconds = time.perf_counter() - start
     print(
         f"whole stage  {len(frames) / seconds:.0f} frames/s, {len(result.person)} people found, "

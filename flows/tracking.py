@@ -43,7 +43,7 @@ def camera_inputs(match: Match, clip_id: str) -> tuple[str, ...]:
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The clip, its ground, how many people the roster allows, and what people said of who is who.
+    """The clip, its pitch, how many people the roster allows, and what people said of who is who.
 
     Without such corrections the key is the tracker's alone.
     """
@@ -52,10 +52,11 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
         for correction in match.corrections
         if isinstance(correction.edit, IDENTITY_EDITS) and correction.edit.clip == unit
     ]
+    pitch = match.folder.pitch
     return {
         **({"identities": said} if said else {}),
         **clip_sources(match, unit),
-        "ground": match.folder.pitch is not None,
+        "pitch_size": None if pitch is None else [pitch.length, pitch.width],
         "people": people_allowed(match.folder.spec.roster),
     }
 

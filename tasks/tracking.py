@@ -76,7 +76,7 @@ def _tracked(store: Store, work: Work) -> tuple[Identities, dict[str, float]]:
         clip.confidence,
         clip.fps,
         TrackingSettings.model_validate(work.recipe.settings),
-        ground=sources["ground"],
+        pitch_size=sources["pitch_size"],
         people=sources["people"],
     )
     found = Identities(

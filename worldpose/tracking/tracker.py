@@ -14,6 +14,7 @@ from data_contracts.records import Record
 from data_contracts.tracking import Join, Track
 from worldpose.cameras import Camera
 from worldpose.errors import InputError
+from worldpose.tracking.bystanders import without_bystanders
 from worldpose.tracking.clip_arrays import ClipArray
 from worldpose.tracking.following import Follower
 from worldpose.tracking.joining import Candidate
@@ -34,7 +35,7 @@ class TrackingReport(Record):
     births: int
     """Tracks started [1]."""
     dropped: int
-    """Of these, dropped for being too short, shadows or more than the roster allows [1]: ghosts."""
+    """Of these, dropped: too short, shadows, bystanders, more than the roster allows [1]."""
     merged: int
     """Of these, ended because another was on the same person [1]."""
     joined: int
@@ -86,7 +87,7 @@ def track_people(
     settings: TrackingSettings,
     progress: Callable[[int, int], None] | None = None,
     *,
-    ground: bool = False,
+    pitch_size: tuple[float, float] | None = None,
     people: int | None = None,
 ) -> Tracking:
     """Return which detection of every camera is which person, over a clip.
@@ -105,14 +106,15 @@ def track_people(
         fps: frames per second [1/s].
         settings: gates, least views and times.
         progress: called with frames done and frames in all.
-        ground: whether people stand on z = 0.
+        pitch_size: length and width of the pitch around the origin [m], on which people stand at
+            z = 0; None = they may be anywhere.
         people: how many there can be at once; None = any number.
 
     Raises:
         InputError: the shapes do not fit together.
 
     Note:
-        T1, T2. Constant velocity between frames departs from the paper (`predict_motion`).
+        T1, T2, D2. Constant velocity between frames departs from the paper (`predict_motion`).
     """
     if keypoints.shape != (*confidence.shape, 2) or cameras.batch_shape != confidence.shape[1:2]:
         raise InputError(
@@ -123,7 +125,7 @@ def track_people(
             todo="Give arrays of the same clip and cameras.",
         )
     centers = np.ascontiguousarray(cameras.center)
-    follower = Follower(centers, fps, ground, people, settings)
+    follower = Follower(centers, fps, pitch_size is not None, people, settings)
     frames = confidence.shape[0]
     for start in range(0, frames, BLOCK):
         image = np.asarray(keypoints[start : start + BLOCK], dtype=np.float64)
@@ -139,10 +141,10 @@ def track_people(
             follower.step(start + offset, directions[offset], weights[offset])
             if progress is not None:
                 progress(start + offset + 1, frames)
-    return _result(follower, frames)
+    return _result(follower, frames, pitch_size)
 
 
-def _result(follower: Follower, frames: int) -> Tracking:
+def _result(follower: Follower, frames: int, pitch_size: tuple[float, float] | None) -> Tracking:
     """Return the people who lasted, over `frames` frames."""
     causal = follower.settings.causal
     everyone = follower.everyone()
@@ -153,6 +155,7 @@ def _result(follower: Follower, frames: int) -> Tracking:
         needed = min(max(1, follower.confirmed_after), frames)
         lasting = [person for person in everyone if person.evidence >= needed - 1e-9]
         lasting = without_shadows(lasting, follower.settings.shadow_distance)
+        lasting = without_bystanders(lasting, pitch_size, follower.settings.pitch_margin_m)
         lasting = within_limit(lasting, follower.people)
         candidates, chains = join_tracks(lasting, follower)
     chains.sort(key=lambda chain: (min(chain[0].sightings), chain[0].number))

@@ -83,9 +83,11 @@ def test_causal_mode_knows_nothing_of_later_frames(ring, people, seen):
 def test_person_whom_two_cameras_see_is_found_but_slowly(ring, people, seen):
     keypoints, confidence = seen(ring(5), still(people, 60))
     keypoints[:, 2:, 2] = np.nan
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS, ground=True)
+    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS, pitch_size=(105.0, 68.0))
     assert sorted(owners(result)) == [0, 1, 2, 3]
-    short = track_people(ring(5), keypoints[:40], confidence[:40], FPS, SETTINGS, ground=True)
+    short = track_people(
+        ring(5), keypoints[:40], confidence[:40], FPS, SETTINGS, pitch_size=(105.0, 68.0)
+    )
     assert sorted(owners(short)) == [0, 1, 3]
 
 
@@ -116,7 +118,7 @@ def test_both_matchings_keep_people_apart(ring, people, seen, hungarian):
 
 def test_one_camera_alone_invents_nobody(ring, people, seen):
     keypoints, confidence = seen(ring(1), still(people, 40))
-    result = track_people(ring(1), keypoints, confidence, FPS, SETTINGS, ground=True)
+    result = track_people(ring(1), keypoints, confidence, FPS, SETTINGS, pitch_size=(105.0, 68.0))
     assert result.detection_index.shape == (40, 1, 0)
     assert result.report.births == 0
     assert result.report.unmatched_share == 1.0
@@ -126,7 +128,7 @@ def test_every_detection_twice_makes_nobody_twice(ring, people, seen):
     keypoints, confidence = seen(ring(5), still(people, 40))
     keypoints = np.concatenate([keypoints, keypoints], axis=2)
     confidence = np.concatenate([confidence, confidence], axis=2)
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS, ground=True)
+    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS, pitch_size=(105.0, 68.0))
     assert len(result.tracks) == 4
     assert ((result.detection_index >= 0).sum(axis=2) == 4).all()
 
@@ -139,7 +141,7 @@ def test_two_seconds_without_anybody_hold_nobody(ring, people, seen):
     keypoints[50:150] = np.nan
     for causal in (False, True):
         chosen = SETTINGS.model_copy(update={"causal": causal})
-        result = track_people(ring(6), keypoints, confidence, FPS, chosen, ground=True)
+        result = track_people(ring(6), keypoints, confidence, FPS, chosen, pitch_size=(105.0, 68.0))
         assert (result.detection_index[50:150] == -1).all()
         assert np.isnan(result.joints[50:150]).all()
         for frame in (20, 180):

@@ -1,0 +1,142 @@
+"""Prints whom the pitch filter (D2) takes for crowd, in rendered pictures of a match.
+
+    python benchmarks/pitch_filter.py [--scenario match] [--seeds 3] [--pictures FOLDER]
+
+One picture of every static camera, true cameras, embedded nets; doubtful boxes count, too. Stage
+`detection` looks for people twice: wherever they are, and on the pitch and close beside it.
+Players, referees and assistants are those of whom at least half is seen; a box is of whom it shares
+0.3 with. Bystanders stand 2.5 to 3.3 m behind the lines. Of whatever else was taken for somebody,
+that is in the stands whose middle shows no ground up to 8 m behind the lines; the rest is goals,
+shadows and parts of people.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.cameras import Camera
+from worldpose.detection import DetectionSettings, PeopleFinder, Place
+from worldpose.detection.boxes import overlaps
+from worldpose.detection.embedded import embedded_detector, embedded_pose
+from worldpose.detection.interfaces import Picture
+from worldpose.pitch import PitchTemplate
+from worldpose.synthetic import SCENARIOS
+from worldpose.synthetic.casting import dress_people, roles_of, stand_by
+from worldpose.synthetic.exposing import RenderedFrame
+from worldpose.synthetic.filming import open_view, render_frame
+from worldpose.synthetic.scene import simulate_scene
+from worldpose.synthetic.settings import Scenario
+
+Floats = NDArray[np.float64]
+
+SEEN = 0.5
+"""Least share of a person that counts as to be found."""
+SHARED = 0.3
+"""Of a box with a person's outline."""
+STANDS = 8.0
+"""Behind the lines [m]; the middle of whoever stands before the boards shows nearer ground."""
+KEPT, TAKEN = (0, 200, 0), (220, 0, 0)
+
+
+def main() -> None:
+    """Print a line a seed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scenario", default="match")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[3])
+    parser.add_argument("--pictures", type=Path, help="draw what was kept and what taken")
+    asked = parser.parse_args()
+    scenario = SCENARIOS[asked.scenario].model_copy(update={"duration": 0.2, "broadcast": None})
+    pitch = PitchTemplate.from_spec(scenario.pitch)
+    settings = DetectionSettings(sure=DetectionSettings().doubtful)
+    finder = PeopleFinder([embedded_detector()], embedded_pose(), settings)
+    for seed in asked.seeds:
+        counts = np.zeros((5, 2), int)
+        for name, camera, frame, bystanders in filmed(scenario, pitch, seed):
+            found = boxes_of(finder, frame.picture, None)
+            on_pitch = boxes_of(finder, frame.picture, Place(camera, pitch))
+            players = frame.boxes[frame.visible >= SEEN]
+            counts[0] += len(players), np.count_nonzero(shared(players, found))
+            kept = shared(found, on_pitch, 0.99)
+            is_player = shared(found, frame.boxes[frame.visible > 0.0])
+            is_bystander = ~is_player & shared(found, bystanders)
+            is_other = ~(is_player | is_bystander)
+            is_stand = is_other & in_stands(found, camera, pitch)
+            kinds = (is_player, is_bystander, is_stand, is_other & ~is_stand)
+            for row, chosen in enumerate(kinds, 1):
+                counts[row] += np.count_nonzero(chosen), np.count_nonzero(chosen & ~kept)
+            if asked.pictures is not None:
+                draw(asked.pictures / f"{seed}-{name}.png", frame.picture, found, kept)
+        (players, seen), *boxes = counts.tolist()
+        words = ("players", "bystanders", "the stands", "other things")
+        taken = ", ".join(
+            f"{out} of {all_} boxes of {word}"
+            for word, (all_, out) in zip(words, boxes, strict=True)
+        )
+        print(
+            f"{scenario.name} {seed}: {seen} of {players} players found; crowd: {taken}", flush=True
+        )
+
+
+def filmed(
+    scenario: Scenario, pitch: PitchTemplate, seed: int
+) -> Iterator[tuple[str, Camera, RenderedFrame, Floats]]:
+    """Yield every static camera, its first picture and the boxes of bystanders (n, 4) [px]."""
+    scene = simulate_scene(scenario, seed)
+    poses = scene.crowd.poses(np.zeros(1))
+    roles = roles_of(scenario.crowd, len(scene.crowd.paths))
+    cast = dress_people(poses.betas[:, 0], roles, seed, scenario.look.patterns)
+    surfaces = cast.posed(poses[:, 0])
+    bystanders = stand_by(pitch, scenario.look.bystanders, seed)
+    for name, camera in scene.cameras.items():
+        view = open_view(camera, pitch, seed, scenario.look)
+        outlines = [camera.project(prop.surfaces.vertices[0].astype(float)) for prop in bystanders]
+        boxes = np.array([[*points.min(axis=0), *points.max(axis=0)] for points in outlines])
+        yield (
+            name,
+            camera,
+            render_frame(view, cast, surfaces, props=bystanders),
+            boxes[np.isfinite(boxes).all(axis=1)],
+        )
+
+
+def boxes_of(finder: PeopleFinder, picture: Picture, place: Place | None) -> Floats:
+    """Return the boxes (n, 4) [px] that stage `detection` would store of a picture."""
+    (stretch,) = finder.find([(0, picture)], place)
+    boxes = stretch.boxes[0].astype(float)
+    return np.asarray(boxes[np.isfinite(boxes).all(axis=1)])
+
+
+def in_stands(boxes: Floats, camera: Camera, pitch: PitchTemplate) -> NDArray[np.bool_]:
+    """Whether the middle of each box shows what is far behind the lines, or no ground (n,)."""
+    rays = camera.unproject(0.5 * (boxes[:, :2] + boxes[:, 2:]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = -rays.origins[:, 2] / rays.directions[:, 2]
+        ground = np.abs(rays.origins + along[:, None] * rays.directions)
+    near = (ground[:, 0] <= pitch.length / 2 + STANDS) & (ground[:, 1] <= pitch.width / 2 + STANDS)
+    return ~(near & (along > 0.0))
+
+
+def shared(boxes: Floats, others: Floats, share: float = SHARED) -> NDArray[np.bool_]:
+    """Whether each box overlaps any of the others by so much (n,)."""
+    if not len(others):
+        return np.zeros(len(boxes), bool)
+    return np.asarray(overlaps(boxes, others).max(axis=1) >= share)
+
+
+def draw(file: Path, picture: Picture, boxes: Floats, kept: NDArray[np.bool_]) -> None:
+    """Write the picture with who was kept in green and who was taken for crowd in red."""
+    drawn = picture.copy()
+    for box, is_kept in zip(boxes.round().astype(int), kept, strict=True):
+        cv2.rectangle(drawn, box[:2].tolist(), box[2:].tolist(), KEPT if is_kept else TAKEN, 2)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(file), drawn[..., ::-1])
+
+
+if __name__ == "__main__":
+    main()
