@@ -7,10 +7,15 @@ from pathlib import Path
 
 import pytest
 from command_line import succeed
+from hypothesis import settings
 from moto.server import ThreadedMotoServer
 from werkzeug.serving import WSGIRequestHandler
 
 from flows.prefect_environment import prefect_server
+
+# How long a case takes says how busy a machine is.
+settings.register_profile("untimed", deadline=None)
+settings.load_profile("untimed")
 
 
 @pytest.fixture(scope="session")

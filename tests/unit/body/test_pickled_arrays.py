@@ -257,7 +257,6 @@ def test_a_missing_file_is_refused(tmp_path):
 
 @settings(
     max_examples=150,
-    deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(st.data())

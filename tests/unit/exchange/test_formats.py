@@ -58,7 +58,7 @@ def assert_same(one, other):
 
 @pytest.mark.parametrize("form", FORMATS)
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_every_bit_comes_back(tmp_path_factory, form, seed):
     file = tmp_path_factory.mktemp("out") / f"labels{suffix_of(form)}"
     write_annotations(file, pictures(seed), form)

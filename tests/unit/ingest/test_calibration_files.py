@@ -283,7 +283,7 @@ VALUES = st.recursive(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     st.sampled_from(
         ["size", "matrix", "distortions", "rotation", "translation", "name", "fisheye"]
@@ -310,7 +310,7 @@ def _toml(value):
     return repr(value) if isinstance(value, int | float) else f"'{str(value).encode().hex()}'"
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.integers(0, len(QUALISYS) - 1), st.integers(0, 40), st.text(max_size=6))
 def test_a_spoilt_qualisys_file_is_read_or_refused(tmp_path_factory, start, length, insert):
     path = tmp_path_factory.getbasetemp() / "fuzzed.qca.txt"

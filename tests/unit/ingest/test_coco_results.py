@@ -182,7 +182,7 @@ JSON = st.recursive(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.sampled_from(["image_id", "keypoints", "bbox", "score", "annotations", "[5]"]), JSON)
 def test_any_value_anywhere_is_read_or_refused(tmp_path_factory, key, value):
     path = tmp_path_factory.getbasetemp() / "fuzzed.json"

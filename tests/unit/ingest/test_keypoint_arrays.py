@@ -212,7 +212,7 @@ def test_a_header_of_gigabytes_is_refused_unread(path, make_people, refusal):
     assert "npy 1.0" in refusal().found
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.integers(0, 10**6), st.integers(0, 30), st.binary(max_size=12))
 def test_a_spoilt_file_is_read_or_refused(tmp_path_factory, start, length, insert):
     base = tmp_path_factory.getbasetemp()

@@ -236,7 +236,7 @@ pitch: none
 """
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     st.integers(0, len(MATCH_YAML) - 1),
     st.integers(0, 12),

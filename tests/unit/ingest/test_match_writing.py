@@ -225,7 +225,7 @@ NAMES = st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,8}\Z")
 TEXT = st.text(st.characters(exclude_categories=["Cs", "Cc"]), max_size=8)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     match_id=NAMES,
     cameras=st.lists(NAMES, min_size=1, max_size=3, unique=True),

@@ -103,7 +103,7 @@ def test_broken_toml_is_refused(refused, content):
 YAML_SIGNS = st.text(alphabet="{}[]:,-?&*!|>'\"% \n#ab1.~<=", max_size=40)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.one_of(st.binary(max_size=60), YAML_SIGNS))
 def test_any_content_is_read_or_refused_with_an_input_error(tmp_path_factory, content):
     path = tmp_path_factory.getbasetemp() / "fuzzed"

@@ -49,7 +49,7 @@ def distance_to_polylines(place, lines):
 @given(
     x=st.floats(-20, 20), y=st.floats(-15, 15), z=st.floats(0, 2.5), pair=st.permutations(range(4))
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_what_a_pixel_may_show_lies_on_its_curve_in_the_other_picture(x, y, z, pair):
     source, target = CAMERAS[pair[0]], CAMERAS[pair[1]]
     point = np.array([x, y, z])

@@ -182,7 +182,7 @@ def test_attribute_that_breaks_the_layout_is_refused(
         write_group(tmp_path, LAYOUT, all_sample_arrays(), sample_coordinates(), attributes)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(
     st.sampled_from(["float64", "float32", "int64", "int32", "int16", "uint8", "bool"]),
     st.data(),

@@ -54,7 +54,7 @@ def test_no_people_and_no_detections_give_empty_affinity():
     assert affinity_of(np.zeros((3, 2, 3)), ORIGIN, np.empty((1, 0, 2, 3)), 1).shape == (1, 3, 0)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 10_000))
 def test_affinity_agrees_with_the_cameras_package(seed):
     rng = np.random.default_rng(seed)
@@ -91,7 +91,7 @@ def test_one_of_two_stays_unmatched_rather_than_beyond_the_gate():
 
 
 @given(seed=st.integers(0, 10_000))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_optimal_matching_has_the_largest_gain_of_all(seed):
     rng = np.random.default_rng(seed)
     affinity = -rng.uniform(0, 1, (1, 3, 4))
@@ -116,7 +116,7 @@ def test_gate_is_the_largest_accepted_distance():
     assert affinity[0, :, 0].tolist() == [-0.5, -np.inf]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 10_000))
 def test_pairs_given_up_early_are_those_beyond_the_gate(seed):
     rng = np.random.default_rng(seed)

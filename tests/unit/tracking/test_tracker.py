@@ -225,9 +225,7 @@ def test_detection_with_too_few_joints_is_not_matched(ring, people, seen):
     assert result.report.detections == 380
 
 
-@settings(
-    max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 10_000))
 def test_order_of_detections_does_not_matter(ring, people, seen, seed):
     keypoints, confidence = seen(ring(5), still(people, 5))

@@ -229,9 +229,7 @@ def test_confidence_weighs_like_variance(ring, seen):
     np.testing.assert_allclose(quarter.covariance, 4 * full.covariance, rtol=1e-9)
 
 
-@settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 10_000))
 def test_camera_order_does_not_matter(ring, seen, seed):
     rng = np.random.default_rng(seed)
