@@ -10,11 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.body_fitting.banded import BandedFactor
-from worldpose.broadcast_calibration.evidence import (
-    FlowEvidence,
-    PointEvidence,
-    bounds,
-)
+from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence, bounds
 from worldpose.broadcast_calibration.flow_equations import add_flow
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.normal_equations import add_points
@@ -82,6 +78,11 @@ class Problem:
     free_frame: NDArray[np.bool_] = field(default_factory=lambda: np.ones(FRAME_SIZE, np.bool_))
     free_clip: NDArray[np.bool_] = field(default_factory=lambda: np.ones(CLIP_SIZE, np.bool_))
     known: NDArray[np.bool_] | None = None
+
+    def held(self, frames: int) -> NDArray[np.bool_]:
+        """Which of every frame's numbers are not solved for (frames, 7)."""
+        held = np.broadcast_to(~self.free_frame, (frames, FRAME_SIZE))
+        return held if self.known is None else held | self.known
 
     @cached_property
     def painted(self) -> Integers:
@@ -279,10 +280,7 @@ def _fix(
     right_corner: Floats,
 ) -> None:
     """Take what is not solved for out of the system, in place."""
-    frames = len(right)
-    fixed = np.broadcast_to(~problem.free_frame, (frames, FRAME_SIZE))
-    if problem.known is not None:
-        fixed = fixed | problem.known
+    fixed = problem.held(len(right))
     if fixed.any():
         for below in range(3):
             rows = np.concatenate([fixed[below:], np.zeros((below, FRAME_SIZE), np.bool_)])

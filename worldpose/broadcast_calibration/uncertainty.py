@@ -33,7 +33,7 @@ class Uncertainty:
     """Covariance of a moving camera.
 
     Attributes:
-        frame: (frames, 12, 12) of a frame's step and the clip's, together.
+        frame: (frames, 12, 12) of a frame's step and the clip's, together; 0 for what was held.
     """
 
     frame: Floats
@@ -60,6 +60,7 @@ def uncertainty_of(
     the picture, or of all keypoints of all people, leaves no pull, since the camera goes along with
     it: these are carried by their size. So is what makes a lens bend more evenly than chance does:
     an operator who zooms in does so for many frames, and second differences err alike in these.
+    What the problem holds is taken for exact.
 
     Args:
         solution: the camera, and where its markings lie.
@@ -100,6 +101,10 @@ def uncertainty_of(
     whole[:, FRAME_SIZE:, :FRAME_SIZE] = np.swapaxes(across, -1, -2)
     whole[:, FRAME_SIZE:, FRAME_SIZE:] = shared[:CLIP_SIZE, :CLIP_SIZE]
     whole += moved @ np.swapaxes(moved, -1, -2)
+    # The system has ones for what is held, lest it be singular; that is known exactly.
+    clip = np.broadcast_to(~problem.free_clip, (len(whole), CLIP_SIZE))
+    held = np.concatenate([problem.held(len(whole)), clip], axis=1)
+    whole[held[:, :, None] | held[:, None, :]] = 0.0
     return Uncertainty(0.5 * (whole + np.swapaxes(whole, -1, -2)))
 
 
@@ -148,11 +153,8 @@ def _left_pulls(
         np.concatenate([each, each[..., together].sum(axis=-1, keepdims=True)], axis=-1)
         for each in (by_frame, by_shared)
     )
-    fixed = ~problem.free_frame
-    by_frame[:, fixed] = 0.0
+    by_frame[problem.held(len(camera))] = 0.0
     by_shared[:CLIP_SIZE][~problem.free_clip] = 0.0
-    if problem.known is not None:
-        by_frame[problem.known] = 0.0
     return by_frame, by_shared
 
 

@@ -60,11 +60,12 @@ class TrackingSettings(Record):
     """Time for which they must be so near to be merged [s]."""
     shadow_distance: float = Field(default=0.5, ge=0)
     """A track whose body is nearer than this to somebody seen by two and a half times as many
-    cameras, for seven tenths of its frames, is no person [m]; 0 keeps it. Not where every frame is
-    decided from it and those before it."""
+    cameras, for seven tenths of its frames, is no person [m]; 0 keeps it. A stretch of somebody is
+    judged by the whole of him. Not where every frame is decided from it and those before it."""
     pitch_margin_m: float = Field(default=2.0, ge=0)
-    """Who is always farther outside of the pitch than this is a bystander [m]: assistants keep
-    within 1.5. Not where every frame is decided from it and those before it."""
+    """Who is always farther outside of the pitch than this is a bystander [m], by all tracks that
+    are joined: assistants keep within 1.5. Not where every frame is decided from it and those
+    before it."""
     end_time: float = Field(default=0.3, gt=0)
     """Time over which place and velocity at either end of a track are fitted [s]."""
     max_gap: float = Field(default=60.0, gt=0)

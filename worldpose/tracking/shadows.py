@@ -44,15 +44,28 @@ def without_shadows(people: list[Person], distance: float) -> list[Person]:
     """
     if distance <= 0.0:
         return people
-    seen = [_seen(person) for person in people]
+    seen = [seen_of(person) for person in people]
     return [
         person
         for n, person in enumerate(people)
-        if not _is_shadow(seen[n], seen[:n] + seen[n + 1 :], distance)
+        if not are_shadow(seen[n : n + 1], seen[:n] + seen[n + 1 :], distance)
     ]
 
 
-def _is_shadow(track: Seen, others: list[Seen], distance: float) -> bool:
+def are_shadow(chain: list[Seen], others: list[Seen], distance: float) -> bool:
+    """Tell whether tracks of one person are nearly always beside somebody far better seen.
+
+    Args:
+        chain: the person's tracks.
+        others: everybody else's.
+        distance: between bodies, below which one may be the other's shadow [m].
+    """
+    beside = np.concatenate([_beside(track, others, distance) for track in chain])
+    return bool(len(beside)) and float(beside.mean()) >= LASTING
+
+
+def _beside(track: Seen, others: list[Seen], distance: float) -> NDArray[np.bool_]:
+    """In which of its frames (frames,) a track has somebody far better seen so near."""
     beside = np.zeros(len(track.frame), dtype=np.bool_)
     for other in others:
         _, mine, theirs = np.intersect1d(
@@ -66,10 +79,11 @@ def _is_shadow(track: Seen, others: list[Seen], distance: float) -> bool:
         count = known.sum(axis=1)
         # Of bodies, not of joints: a shadow's joints are another's, or between two people's.
         beside[mine] |= np.linalg.norm(total, axis=1) < distance * count
-    return bool(len(beside)) and float(beside.mean()) >= LASTING
+    return beside
 
 
-def _seen(person: Person) -> Seen:
+def seen_of(person: Person) -> Seen:
+    """Return a track in the frames that determine its place."""
     frames = sorted(person.sightings)
     sightings = [person.sightings[frame] for frame in frames]
     joints = np.array([each.joints for each in sightings])

@@ -14,15 +14,12 @@ from data_contracts.records import Record
 from data_contracts.tracking import Join, Track
 from worldpose.cameras import Camera
 from worldpose.errors import InputError
-from worldpose.tracking.bystanders import without_bystanders
 from worldpose.tracking.clip_arrays import ClipArray
 from worldpose.tracking.following import Follower
 from worldpose.tracking.joining import Candidate
 from worldpose.tracking.person import Person
-from worldpose.tracking.rosters import within_limit
 from worldpose.tracking.settings import TrackingSettings
-from worldpose.tracking.shadows import without_shadows
-from worldpose.tracking.stitching import join_tracks
+from worldpose.tracking.whole_people import join_people
 
 JOINTS = len(COCO17)
 BLOCK = 64
@@ -154,10 +151,7 @@ def _result(follower: Follower, frames: int, pitch_size: tuple[float, float] | N
     else:
         needed = min(max(1, follower.confirmed_after), frames)
         lasting = [person for person in everyone if person.evidence >= needed - 1e-9]
-        lasting = without_shadows(lasting, follower.settings.shadow_distance)
-        lasting = without_bystanders(lasting, pitch_size, follower.settings.pitch_margin_m)
-        lasting = within_limit(lasting, follower.people)
-        candidates, chains = join_tracks(lasting, follower)
+        candidates, chains = join_people(lasting, follower, pitch_size)
     chains.sort(key=lambda chain: (min(chain[0].sightings), chain[0].number))
     cameras = len(follower.centers)
     index = np.full((frames, cameras, len(chains)), -1, dtype=np.int16)
@@ -179,7 +173,7 @@ def _result(follower: Follower, frames: int, pitch_size: tuple[float, float] | N
     joins = _joins(candidates, chains, everyone)
     report = TrackingReport(
         births=len(everyone),
-        dropped=len(everyone) - len(lasting),
+        dropped=len(everyone) - sum(map(len, chains)),
         merged=follower.merged,
         joined=sum(join.decided for join in joins),
         undecided=sum(not join.decided for join in joins),

@@ -244,6 +244,38 @@ def test_what_is_not_solved_for_stays():
     assert bearing_error(found, true).mean() < bearing_error(start, true).mean() / 5.0
 
 
+def test_what_is_held_is_known_exactly_and_the_rest_within_its_covariance():
+    true = clip.moving(12)
+    known = np.zeros((12, 7), dtype=np.bool_)
+    known[0] = True
+    held = known | (np.arange(7) >= 3)
+    place, ratios = np.array([1.0, -3.0, 0.0]), []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        problem = replace(
+            problem_of(true, rng, smooth=np.full(7, np.inf)),
+            free_frame=np.arange(7) < 3,
+            free_clip=np.zeros(5, dtype=np.bool_),
+            known=known,
+        )
+        solution = solve(
+            true.stepped(1e-3 * rng.standard_normal((12, 7)) * ~held, np.zeros(5)), problem, 30
+        )
+        uncertainty = uncertainty_of(solution, problem)
+        variance = np.diagonal(uncertainty.frame, axis1=1, axis2=2)
+        np.testing.assert_array_equal(
+            variance == 0.0, np.pad(held, ((0, 0), (0, 5)), constant_values=True)
+        )
+        assert not place_covariance(solution.camera, uncertainty, place, 0).any()
+        covariance = place_covariance(solution.camera, uncertainty, place)
+        gone = solution.camera.camera[10].project(place[None]) - true.camera[10].project(
+            place[None]
+        )
+        ratios.append(float(gone[0] @ np.linalg.solve(covariance, gone[0])) / 2.0)
+    # Chi-square of 12 over 12 lies below 2.75 in all but a thousandth; at most twice too wide.
+    assert 0.05 < np.mean(ratios) < 2.75
+
+
 def test_adam_goes_down_the_same_cost_and_stays_above():
     rng = np.random.default_rng(8)
     true = clip.moving(10)

@@ -289,6 +289,8 @@ def test_a_known_lens_needs_one_rotation(true, pictures, lines):
     assert np.percentile(place_errors(found, true), 95.0) < (0.3 if lines else 1.5)
     spread = np.sqrt(np.trace(uncertainty.frame[:, :3, :3], axis1=1, axis2=2))
     assert spread[1] > 0.0 and np.isfinite(spread).all()
+    # What was given is exact.
+    assert not uncertainty.frame[0].any() and not uncertainty.frame[:, 3:].any()
 
 
 def test_a_lens_of_other_frames_is_refused(true, pictures):
