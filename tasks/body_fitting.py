@@ -30,6 +30,7 @@ from worldpose.body_fitting import (
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.store import ResultWriter, Store
+from worldpose.triangulation import put_right
 
 Floats = NDArray[np.float64]
 
@@ -50,7 +51,8 @@ class ClipPeople:
 
     Attributes:
         clip: cameras, frames and clock.
-        keypoints: (frames, cameras, detections, 17, 2) [px].
+        keypoints: (frames, cameras, detections, 17, 2) [px], as triangulated: where sides were
+            exchanged, put right.
         index: (frames, cameras, persons), place among the detections; -1 = not seen.
         person: (persons,) ids.
         joints: (frames, persons, 17, 3) [m], world, triangulated.
@@ -58,7 +60,7 @@ class ClipPeople:
     """
 
     clip: ClipInputs
-    keypoints: Floats
+    keypoints: NDArray[np.floating]
     index: NDArray[np.integer]
     person: NDArray[np.integer]
     joints: Floats
@@ -69,10 +71,11 @@ def open_people(store: Store, work: Work) -> ClipPeople:
     """The tracked and triangulated people of the clip of `work`."""
     clip = open_clip(store, work)
     placed = open_input(store, work, f"retriangulation/{work.recipe.unit}")
+    index = open_input(store, work, f"tracking/{work.recipe.unit}")["detection_index"].values
     return ClipPeople(
         clip,
-        clip.keypoints[:],
-        open_input(store, work, f"tracking/{work.recipe.unit}")["detection_index"].values,
+        put_right(clip.keypoints[:], index, placed["exchanged"].values),
+        index,
         placed["person"].values,
         placed["joints"].values,
         placed["covariance"].values,

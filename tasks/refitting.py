@@ -14,6 +14,7 @@ from data_contracts.work import Work
 from tasks.body_fitting import fit_people, open_people, publish_fit
 from tasks.unit import open_input, require_registered, unit_task
 from worldpose.body_fitting import (
+    BodyFittingSettings,
     Glimpses,
     Shape,
     Sightings,
@@ -52,7 +53,8 @@ def refitting(work: Work) -> str:
             pictures = _pictures(store, work, people.clip.frame)
             views = [_view(store, work, pictures, joints)]
             glimpses = _glimpses(work, pictures, joints)
-        known = _known(store, work, people.person)
+        weight = BodyFittingSettings.model_validate(before.settings).shape_weight
+        known = _known(store, work, people.person, weight)
         model, fit = fit_people(people, before, views=views, glimpses=glimpses, known=known)
         recognised = views[0].seen if views else np.zeros(joints.shape[:2], dtype=bool)
         pooled = np.isin(np.arange(len(people.person)), list(known))
@@ -136,8 +138,17 @@ def _glimpses(work: Work, pictures: _Pictures, joints: Floats) -> Glimpses | Non
     return Glimpses(between_frames(seen.orient, whole), between_frames(seen.angles, whole))
 
 
-def _known(store: Store, work: Work, persons: NDArray[np.integer]) -> dict[int, Shape]:
-    """The shapes that other clips found, by the place of their people among the persons."""
+def _known(
+    store: Store, work: Work, persons: NDArray[np.integer], weight: float
+) -> dict[int, Shape]:
+    """The shapes that other clips found, by the place of their people among the persons.
+
+    Args:
+        store: the store.
+        work: the work under way.
+        persons: ids of this clip's people.
+        weight: of betas' normal distribution, with which bodies of all clips were fitted [1].
+    """
     sources: dict[str, Any] = work.recipe.sources
     named: dict[str, dict[str, str]] = dict(sources["people"])
     here = named.pop(work.recipe.unit)
@@ -150,7 +161,7 @@ def _known(store: Store, work: Work, persons: NDArray[np.integer]) -> dict[int, 
                 shape = Shape(betas, found["betas_covariance"].values[place])
                 shapes.setdefault(people[str(person)], []).append(shape)
     return {
-        place: pool_shapes(shapes[here[str(person)]])
+        place: pool_shapes(shapes[here[str(person)]], weight)
         for place, person in enumerate(persons)
         if here.get(str(person)) in shapes
     }

@@ -136,7 +136,7 @@ def fit_shape(model: BodyModel, bones: BoneLengths) -> Shape:
     return Shape(betas, np.linalg.inv(precision).astype(np.float64))
 
 
-def pool_shapes(shapes: Sequence[Shape]) -> Shape:
+def pool_shapes(shapes: Sequence[Shape], weight: float) -> Shape:
     """Return one person's shape from several clips: means weighted by what each of them says (S1).
 
     Every covariance holds that betas of people are normal; that counts once. What the clips say is
@@ -144,8 +144,10 @@ def pool_shapes(shapes: Sequence[Shape]) -> Shape:
 
     Args:
         shapes: of one person and body model, at least one.
+        weight: of that normal distribution in every one of them [1], `shape_weight` of the
+            settings.
     """
-    anybody = np.eye(len(shapes[0].betas))
+    anybody = weight * np.eye(len(shapes[0].betas))
     precisions = [np.linalg.inv(shape.covariance) for shape in shapes]
     precision = sum(precisions, start=-(len(shapes) - 1.0) * anybody)
     pulls = [own @ shape.betas for own, shape in zip(precisions, shapes, strict=True)]

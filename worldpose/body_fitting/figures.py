@@ -48,7 +48,7 @@ class Pictures:
     cameras: Camera
     """Batch (cameras,)."""
     keypoints: NDArray[np.floating]
-    """(frames, cameras, detections, 17, 2) [px]; NaN where not found."""
+    """(frames, cameras, detections, 17, 2) [px], sides put right; NaN where not found."""
     detection_index: NDArray[np.integer]
     """(frames, cameras, persons), place among the detections; -1 = not seen."""
 

@@ -47,7 +47,7 @@ def find_sightings(
 
     Args:
         cameras: batch (cameras,).
-        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
+        keypoints: (frames, cameras, detections, 17, 2) [px], sides put right; NaN where not found.
         detection_index: (frames, cameras, persons), place among the detections; -1 = not seen.
         joints: (frames, persons, 17, 3) [m], world, triangulated.
     """

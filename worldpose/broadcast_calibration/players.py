@@ -154,9 +154,9 @@ def similarity(projected: Floats, detected: Floats) -> Floats:
 
 def match(camera: MovingCamera, people: People) -> Matches:
     """Return the best pairs of every frame, by weighted bipartite matching."""
-    frames, persons = people.joints.shape[:2]
+    frames, persons, count = people.joints.shape[:3]
     projected = camera.camera.project(people.joints.reshape(frames, -1, 3))
-    projected = projected.reshape(frames, persons, -1, 2)
+    projected = projected.reshape(frames, persons, count, 2)
     rows: list[tuple[int, int, int, float]] = []
     for frame in range(frames):
         alike = similarity(projected[frame], people.keypoints[frame])

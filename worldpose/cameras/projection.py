@@ -63,7 +63,7 @@ def project_with_jacobians(
     """
     for row in range(points.shape[0]):
         c = cameras[row]
-        finite = _is_finite(c)
+        finite = is_finite(c)
         for i in range(points.shape[1]):
             code, xd, yd, a, b, z, dxx, dxy, dyy = project_point(
                 c, points[row, i, 0], points[row, i, 1], points[row, i, 2]
@@ -112,7 +112,7 @@ def normalize(cameras: Floats, image: Floats, plane: Floats, status: Bytes) -> N
     """
     for row in range(image.shape[0]):
         c = cameras[row]
-        finite = _is_finite(c)
+        finite = is_finite(c)
         for i in range(image.shape[1]):
             xd, yd = (image[row, i, 0] - c[2]) / c[0], (image[row, i, 1] - c[3]) / c[1]
             x, y, code = _undistort(c, xd, yd) if finite else (np.nan, np.nan, _MISSING)
@@ -140,7 +140,7 @@ def point_rays(cameras: Floats, plane: Floats, directions: Floats) -> None:
 
 
 @compiled
-def _is_finite(c: Floats) -> bool:
+def is_finite(c: Floats) -> bool:
     """Return whether the camera is there; its fold may be infinite all the same."""
     total = 0.0
     for value in c[:-1]:

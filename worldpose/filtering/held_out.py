@@ -43,11 +43,12 @@ def measure_held_out(
     settings: TriangulationSettings,
     camera_covariance: Floats | None = None,
 ) -> HeldOut | None:
-    """Return how well left-out cameras are foreseen; None without keypoints.
+    """Return how well left-out cameras are foreseen; None where nothing tells.
 
     A quarter of the cameras after the other is left out; the others place everybody, and every
     keypoint that was detected in it is compared with them. What is compared is the same whoever was
-    followed and whatever was rejected: nothing gets better by being left away.
+    followed and whatever was rejected: nothing gets better by being left away. Nothing tells
+    without keypoints, nor where the others are too few to place anybody, as one of two is.
 
     Args:
         cameras: batch (cameras,).
@@ -59,6 +60,8 @@ def measure_held_out(
         camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
     """
     count = cameras.batch_shape[0]
+    if count - max(1, count // FOLDS) < settings.min_views:
+        return None
     fold = np.arange(count) % FOLDS
     total, keypoints = 0.0, 0
     for left_out in range(min(FOLDS, count)):
@@ -76,12 +79,12 @@ def measure_held_out(
 
 def _distances(camera: Camera, seen: Floats, joints: Floats) -> Floats:
     """Distances (frames, detections, 17) [box height] to the nearest person, 0 where not seen."""
-    frames, persons = joints.shape[:2]
+    frames, persons, count = joints.shape[:3]
     there = np.isfinite(seen).all(-1)
     high = np.where(there, seen[..., 1], -np.inf).max(-1, initial=-np.inf)
     low = np.where(there, seen[..., 1], np.inf).min(-1, initial=np.inf)
     height = np.where(there.any(-1), np.maximum(high - low, SMALLEST), SMALLEST)
-    image = camera.project(joints.reshape(frames, -1, 3)).reshape(frames, persons, -1, 2)
+    image = camera.project(joints.reshape(frames, -1, 3)).reshape(frames, persons, count, 2)
     nearest = np.where(there, FARTHEST, 0.0)
     best = nearest.sum(-1)
     for person in range(persons):

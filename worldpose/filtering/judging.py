@@ -276,6 +276,8 @@ def _look_for_others(
     """Give a frame's open detections (cameras, detections) to the bodies that they fit best."""
     camera, place = np.nonzero(open_)
     persons = views.image.shape[2]
+    if not persons:
+        return
     cameras, people = np.repeat(camera, persons), np.tile(np.arange(persons), len(camera))
     places = np.repeat(place, persons)
     rows = _rows(

@@ -5,6 +5,7 @@ every frame and of whole tracks, with covariance and agreeing views; by how much
 """
 
 from worldpose.triangulation.clocks import CameraClocks, estimate_clocks, moved_in_time
+from worldpose.triangulation.exchanges import put_right
 from worldpose.triangulation.reconstruction import Reconstruction, reconstruct_joints
 from worldpose.triangulation.reports import TriangulationReport
 from worldpose.triangulation.robust import Triangulation, triangulate_joints
@@ -31,6 +32,7 @@ __all__ = [
     "estimate_clocks",
     "learn_clip",
     "moved_in_time",
+    "put_right",
     "reconstruct_joints",
     "reconstruct_parts",
     "smooth_joints",

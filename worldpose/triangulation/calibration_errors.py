@@ -60,7 +60,8 @@ def stated_errors(
     variance, scale = np.zeros(shape), np.zeros(shape)
     for camera in range(shape[1]):
         depth = places @ pose.rotation[camera, 2] + pose.translation[camera, 2]
-        before = known & (depth > 0.0)
+        # Nobody is before a missing camera.
+        before = known & (depth > 0.0) & bool(np.isfinite(cameras.focal[camera]).all())
         size = np.sqrt(cameras.focal[camera].prod()) / np.where(before, depth, 1.0)
         scale[:, camera] = np.where(before, size, 0.0)
         if camera_covariance is None:

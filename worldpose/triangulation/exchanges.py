@@ -88,17 +88,28 @@ def undo_exchanges(
         index: (frames, cameras, persons).
         exchanged: (frames, cameras, persons, parts).
     """
+    return put_right(keypoints, index, exchanged), put_right(confidence, index, exchanged)
+
+
+def put_right(
+    seen: NDArray[np.floating], index: NDArray[np.integer], exchanged: Flags
+) -> NDArray[np.floating]:
+    """Return what was seen of joints with the sides of exchanged parts put right.
+
+    Args:
+        seen: (frames, cameras, detections, 17, ...); not changed.
+        index: (frames, cameras, persons).
+        exchanged: (frames, cameras, persons, parts).
+    """
     if not exchanged.any():
-        return keypoints, confidence
-    right, sure = keypoints.copy(), confidence.copy()
+        return seen
+    right = seen.copy()
     for part in range(exchanged.shape[-1]):
         frame, camera, person = np.nonzero(exchanged[..., part])
         place = tuple(each[:, None] for each in (frame, camera, index[frame, camera, person]))
         of_part = PAIRS[part == PART_OF]
-        here, there = of_part.ravel(), of_part[:, ::-1].ravel()
-        right[(*place, here)] = keypoints[(*place, there)]
-        sure[(*place, here)] = confidence[(*place, there)]
-    return right, sure
+        right[(*place, of_part.ravel())] = seen[(*place, of_part[:, ::-1].ravel())]
+    return right
 
 
 @compiled

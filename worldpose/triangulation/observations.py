@@ -36,7 +36,7 @@ class Rig:
 
     Attributes:
         cameras: (cameras, 22) as in `worldpose.cameras.projection`.
-        depths: (cameras, 4), depth of (x, y, z, 1) [m].
+        depths: (cameras, 4), depth of (x, y, z, 1) [m]; 1 where a camera is missing.
         centers: (cameras, 3) [m], world.
     """
 
@@ -56,8 +56,12 @@ class Rig:
             pose.translation,
             fold_radius(cameras.distortion)[:, None],
         )
+        rows = np.concatenate(parts, axis=-1)
         depths = np.concatenate([pose.rotation[:, 2], pose.translation[:, 2:]], axis=-1)
-        return cls(np.concatenate(parts, axis=-1), depths, np.ascontiguousarray(cameras.center))
+        # Nought times NaN is NaN: what counts for nothing needs a depth all the same.
+        missing = ~np.isfinite(rows[:, :-1]).all(axis=-1)
+        depths[missing] = [0.0, 0.0, 0.0, 1.0]
+        return cls(rows, depths, np.ascontiguousarray(cameras.center))
 
 
 def person_observations(
@@ -146,7 +150,13 @@ def gather(
 
 @compiled
 def linearize(tile: Floats, c: Floats) -> None:
-    """Turn one camera's pixels into equations; no observation where the lens has no inverse."""
+    """Turn one camera's pixels into equations.
+
+    No observation where the lens has no inverse, and none of a missing camera.
+    """
+    if not projection.is_finite(c):
+        tile[:] = 0.0
+        return
     over_u, over_v = 1.0 / c[0], 1.0 / c[1]
     for j in range(LANES):
         xd, yd = (tile[A + j] - c[2]) * over_u, (tile[B + j] - c[3]) * over_v

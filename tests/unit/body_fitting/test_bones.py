@@ -97,7 +97,7 @@ def test_a_person_of_several_clips_is_what_they_say_together_with_anybody_counte
     # Each clip knows the first component to 0.5 besides the prior: 1 / (1 + 4) of variance.
     covariance = np.diag([0.2, 1.0])
     clips = [Shape(np.array([0.8 * seen, 0.0]), covariance) for seen in (1.0, 2.0)]
-    pooled = pool_shapes(clips)
+    pooled = pool_shapes(clips, 1.0)
     # Two witnesses of precision 4 and the prior's 1: (4 x 1 + 4 x 2) / 9.
     np.testing.assert_allclose(pooled.betas, [12.0 / 9.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(pooled.covariance, np.diag([1.0 / 9.0, 1.0]), atol=1e-12)
@@ -107,6 +107,19 @@ def test_one_clip_alone_stays_what_it_is():
     rng = np.random.default_rng(1)
     root = rng.standard_normal((10, 10))
     shape = Shape(rng.standard_normal(10), np.linalg.inv(np.eye(10) + root @ root.T))
-    pooled = pool_shapes([shape])
+    pooled = pool_shapes([shape], 1.0)
     np.testing.assert_allclose(pooled.betas, shape.betas, atol=1e-9)
     np.testing.assert_allclose(pooled.covariance, shape.covariance, atol=1e-9)
+
+
+@pytest.mark.parametrize("weight", [0.25, 1.0, 4.0])
+def test_clips_that_say_nothing_leave_the_betas_of_anybody_whatever_these_weigh(weight):
+    silent = Shape(np.zeros(3), np.eye(3) / weight)
+    # What one clip knows of the first component besides: precision 4, at 2.
+    told = Shape(
+        np.array([8.0 / (weight + 4.0), 0.0, 0.0]), np.diag(1.0 / (weight + np.r_[4.0, 0.0, 0.0]))
+    )
+    for clips in ([silent] * 3, [told, silent, silent]):
+        pooled = pool_shapes(clips, weight)
+        np.testing.assert_allclose(pooled.betas, clips[0].betas, atol=1e-12)
+        np.testing.assert_allclose(pooled.covariance, clips[0].covariance, atol=1e-12)

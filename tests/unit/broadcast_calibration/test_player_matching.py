@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import turning_clip as clip
 
+from worldpose.broadcast_calibration.feed_offset import estimate_feed_offset
 from worldpose.broadcast_calibration.players import (
     BONES,
     People,
@@ -118,3 +119,14 @@ def test_errors_that_last_are_noticed():
 def test_joints_and_keypoints_of_other_frames_are_refused():
     with pytest.raises(InputError, match="same frames"):
         People(np.zeros((3, 1, 17, 3)), np.zeros((2, 1, 17, 2)), 50.0)
+
+
+def test_nobody_is_matched_with_nobody():
+    camera, people = crowd(5, np.random.default_rng(4), 0.5)
+    nobody = People(people.joints[:, :0], people.keypoints, 50.0)
+    pairs = match(camera, nobody)
+    assert len(pairs.frame) == 0
+    evidence, noise = player_evidence(camera, nobody, pairs, BroadcastCalibrationSettings())
+    assert len(evidence) == 0
+    assert noise.frames == 1.0
+    assert not estimate_feed_offset(camera, nobody, reach=2.0).determined

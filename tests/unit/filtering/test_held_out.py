@@ -54,3 +54,20 @@ def test_without_keypoints_there_is_nothing_to_foresee(scene):
     index = scene.suspects.index.astype(np.int16)
     used = (nothing, nothing[..., 0])
     assert measure_held_out(scene.cameras, used, nothing, index, SETTINGS) is None
+
+
+def test_a_clip_without_anybody_is_as_badly_foreseen_as_can_be(scene):
+    assert measured(scene, scene.suspects.index[:, :, :0]).error == pytest.approx(FARTHEST)
+
+
+@pytest.mark.parametrize(("count", "least", "judges"), [(2, 2, False), (3, 2, True), (3, 3, False)])
+def test_left_out_cameras_judge_only_where_enough_others_are_left(scene, count, least, judges):
+    suspects, some = scene.suspects, slice(count)
+    found = measure_held_out(
+        scene.cameras[some],
+        (suspects.keypoints[:, some], suspects.confidence[:, some]),
+        suspects.keypoints[:, some],
+        suspects.index[:, some].astype(np.int16),
+        TriangulationSettings(min_views=least),
+    )
+    assert (found is not None) == judges

@@ -134,3 +134,20 @@ def test_nothing_to_judge_is_no_error(scene):
     found = judged(scene, index=index, keypoints=keypoints)
     assert not found.rejected.any()
     assert (found.fits == -1).all()
+
+
+def test_without_anybody_boxes_are_nobody_s_and_none_is_rejected(scene):
+    suspects = scene.suspects
+    nobody = replace(
+        suspects,
+        index=suspects.index[:, :, :0],
+        offsets=suspects.offsets[:, :, :0],
+        exchanged=suspects.exchanged[:, :, :0],
+    )
+    views = replace(
+        scene.views,
+        **{name: getattr(scene.views, name)[:, :, :0] for name in ("image", "variance", "scale")},
+    )
+    found = judge_detections(views, nobody, learn_from(views, nobody), SETTINGS)
+    assert (found.fits == -1).all()
+    assert not found.rejected.any() and not found.dropped.any()

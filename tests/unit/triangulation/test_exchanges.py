@@ -4,7 +4,12 @@ from running_samples import FPS, MIRRORED, detections, runner
 
 from data_contracts.conventions import COCO17
 from data_contracts.triangulation import EXCHANGED_PARTS
-from worldpose.triangulation import TriangulationSettings, reconstruct_joints, triangulate_joints
+from worldpose.triangulation import (
+    TriangulationSettings,
+    put_right,
+    reconstruct_joints,
+    triangulate_joints,
+)
 
 SETTINGS = TriangulationSettings(learn_noise=False, offsets="none")
 FACE, ARMS, LEGS = range(len(EXCHANGED_PARTS))
@@ -72,3 +77,13 @@ def test_smoothing_sees_the_sides_put_right(clip):
     found = reconstruct_joints(camera, wrong, confidence, index, FPS, SETTINGS)
     # The iteration ends at steps of 0.1 mm.
     np.testing.assert_allclose(found.smoothing.joints, expected.smoothing.joints, atol=2e-4)
+
+
+def test_what_was_seen_is_put_right_as_triangulation_did(clip):
+    camera, (keypoints, confidence, index) = clip
+    wrong = keypoints.copy()
+    wrong[3:7, 1, 0] = exchanged(keypoints[3:7, 1, 0])
+    found = triangulate_joints(camera, wrong, confidence, index, SETTINGS)
+    np.testing.assert_array_equal(put_right(wrong, index, found.exchanged), keypoints)
+    nothing = np.zeros_like(found.exchanged)
+    np.testing.assert_array_equal(put_right(wrong, index, nothing), wrong)
