@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import threading
 import urllib.request
 from pathlib import Path
 
@@ -61,6 +62,17 @@ def project_copy(tiny_run, tmp_path):
     return Path(shutil.copytree(tiny_run, tmp_path / "worldpose-data"))
 
 
+def one_at_a_time(application):
+    """S3 decides which of two writers of a new file was first; moto may let both be."""
+    deciding = threading.Lock()
+
+    def answer(environment, start):
+        with deciding:
+            return list(application(environment, start))
+
+    return answer
+
+
 @pytest.fixture(scope="session")
 def bucket():
     """The URL of a bucket in an S3 server on loopback."""
@@ -68,6 +80,7 @@ def bucket():
     WSGIRequestHandler.protocol_version = "HTTP/1.1"
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
+    server._server.app = one_at_a_time(server._server.app)
     host, port = server.get_host_and_port()
     endpoint = f"http://{host}:{port}"
     make = urllib.request.Request(f"{endpoint}/projects", method="PUT")

@@ -86,14 +86,12 @@ class LocalBlobs:
         """See `Blobs`."""
         top = self._at(prefix)
         with storage_errors(str(top)):
-            return sorted(
-                (
-                    self._entry(Path(folder, name))
-                    for folder, _, names in os.walk(top, onerror=_raise_unless_absent)
-                    for name in names
-                ),
-                key=lambda entry: entry.path,
+            files = (
+                Path(folder, name)
+                for folder, _, names in os.walk(top, onerror=_raise_unless_absent)
+                for name in names
             )
+            return sorted(filter(None, map(self._entry, files)), key=lambda entry: entry.path)
 
     def staging(self) -> Path:
         """See `Blobs`. On the project's own file system, so that a rename can publish it."""
@@ -108,10 +106,12 @@ class LocalBlobs:
         with storage_errors(str(top)):
             found = []
             for item in sorted(top.iterdir()) if top.is_dir() else ():
-                inside = [(path, self._entry(path)) for path in (item, *item.rglob("*"))]
-                size = sum(entry.size for path, entry in inside if path.is_file())
-                modified = max(entry.modified for _, entry in inside)
-                found.append(Entry(inside[0][1].path, size, modified))
+                there = self._entry(item)
+                if there is None:
+                    continue
+                inside = self.entries(there.path) if item.is_dir() else [there]
+                modified = max(entry.modified for entry in (there, *inside))
+                found.append(Entry(there.path, sum(entry.size for entry in inside), modified))
             return found
 
     def publish_tree(self, folder: Path, prefix: str, manifest_name: str, manifest: bytes) -> bool:
@@ -137,8 +137,12 @@ class LocalBlobs:
     def _at(self, path: str) -> Path:
         return self.root / checked_path(path)
 
-    def _entry(self, path: Path) -> Entry:
-        status = path.lstat()
+    def _entry(self, path: Path) -> Entry | None:
+        """None where somebody has removed it since it was listed."""
+        try:
+            status = path.lstat()
+        except (FileNotFoundError, NotADirectoryError):
+            return None
         return Entry(
             path.relative_to(self.root).as_posix(),
             status.st_size,

@@ -52,10 +52,10 @@ def plan_gc(
     """What can go: results that no kept run reaches, leftovers and reservations of dead runs.
 
     A result is reached when a kept run's record names it or something made from it. A pinned run
-    is kept, however old. Results and
-    leftovers are spared while young, and while a run of their match may be at work: it may be
-    about to name them. Reservations stay while they hold the highest number, so that no number
-    is given twice unless `forget` frees it. Nothing is removed by planning.
+    is kept, however old. Results and leftovers are spared while young; results also while a run of
+    their match may be at work, which may be about to name them, and leftovers while any run may.
+    Reservations stay while they hold the highest number, so that no number is given twice unless
+    `forget` frees it. Nothing is removed by planning.
 
     Args:
         store: the project.
@@ -80,7 +80,7 @@ def plan_gc(
             path = record_path(match_id, run_id)
             garbage.append(Garbage(path, "run forgotten", sizes[path]))
         for run_id in kept:
-            reached |= _reached(store, store.run(match_id, run_id))
+            _reach(store, store.run(match_id, run_id), reached)
         for path, reservation in _reservations(store, match_id, sizes):
             if reservation is None or f"{match_id}/{reservation.run_id}" in forget:
                 garbage.append(Garbage(path, "reservation of a dead run", sizes[path]))
@@ -91,7 +91,7 @@ def plan_gc(
     garbage.extend(
         Garbage(entry.path, "staging of a dead writer", entry.size)
         for entry in store.blobs.staged()
-        if entry.modified <= before
+        if entry.modified <= before and not at_work  # staging does not tell whose it is
     )
     held = tuple(
         f"{run.match_id} is left alone: run {run.run_id}, process {run.pid} on {run.host}, may "
@@ -193,10 +193,9 @@ def _reservations(
         yield reservation_path(match_id, run.run_id), None if is_spent else run
 
 
-def _reached(store: Store, record: RunRecord) -> set[ResultId]:
-    """The results a run names, and all they were made from."""
+def _reach(store: Store, record: RunRecord, reached: set[ResultId]) -> None:
+    """Add to `reached` the results a run names, and all they were made from."""
     waiting = [ResultId.named(record.match_id, name, key) for name, key in record.results.items()]
-    reached: set[ResultId] = set()
     while waiting:
         result = waiting.pop()
         if result in reached:
@@ -208,7 +207,6 @@ def _reached(store: Store, record: RunRecord) -> set[ResultId]:
             waiting.extend(
                 ResultId.named(result.match_id, name, key) for name, key in recipe.inputs.items()
             )
-    return reached
 
 
 def _unreached(

@@ -30,7 +30,7 @@ def write_group(
     arrays: Arrays,
     coordinates: Arrays,
     attributes: Mapping[str, Any],
-) -> None:
+) -> int:
     """Writes the group into `folder`; equal arrays and attributes give equal files.
 
     Chunks are lz4 with a CRC-32C of the compressed bytes, so that any Zarr reader refuses a
@@ -42,6 +42,9 @@ def write_group(
         arrays: by name; those in `layout.optional` may be absent.
         coordinates: one-dimensional arrays by name.
         attributes: what `layout.attributes` asks for.
+
+    Returns:
+        How many files that is.
 
     Raises:
         InputError: the arrays or attributes are not what the layout says.
@@ -60,6 +63,7 @@ def write_group(
             "attributes": given,
         },
     )
+    files = 1
     for name, values in checked.items():
         array = layout.layout(name)
         stored = group.create_array(
@@ -75,6 +79,8 @@ def write_group(
         )
         for part in array_parts(array, values.shape):
             stored[part] = with_one_nan(values[part])
+        files += 1 + stored.nchunks
+    return files
 
 
 def read_group(files: Store) -> xr.Dataset:

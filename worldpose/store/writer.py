@@ -35,7 +35,7 @@ class ResultWriter:
         self.manifest: ResultManifest | None = None
         self._work, self._folder = work, folder
         self._started = time.monotonic()
-        self._is_written = False
+        self._files = 0
 
     def write(
         self,
@@ -54,7 +54,7 @@ class ResultWriter:
         from worldpose.store.groups import write_group
 
         name = self._work.recipe.name
-        if self._is_written:
+        if self._files:
             raise StoreError(f"{name}: a result is written once; it has been written")
         if layout.stage != self._work.recipe.stage:
             raise InputError(
@@ -65,8 +65,8 @@ class ResultWriter:
             )
         reached("before_write")
         with storage_errors(str(self._folder)):
-            write_group(self._folder, layout, arrays, coordinates or {}, attributes or {})
-        self._is_written = True
+            given = (arrays, coordinates or {}, attributes or {})
+            self._files = write_group(self._folder, layout, *given)
         reached("after_write")
 
     def sealed_manifest(self) -> ResultManifest:
@@ -74,10 +74,10 @@ class ResultWriter:
 
         Raises:
             InputError: a figure is not finite.
-            StoreError: nothing has been written.
+            StoreError: nothing has been written, or not all of it is there.
         """
         name = self._work.recipe.name
-        if not self._is_written:
+        if not self._files:
             raise StoreError(f"{name}: nothing was written, so there is nothing to publish")
         for figure, value in self.figures.items():
             if not math.isfinite(value):
@@ -89,6 +89,11 @@ class ResultWriter:
                 )
         with storage_errors(str(self._folder)):
             files = stored_files(self._folder)
+        if len(files) != self._files:
+            raise StoreError(
+                f"{self._folder}: of {self._files} files of {name} {len(files)} are there, so that "
+                "nothing was published: something removed them. Run again."
+            )
         manifest = ResultManifest(
             contract=CONTRACT_VERSION,
             key=self._work.key,

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 from datetime import timedelta
+from typing import Any
 
 import pytest
 from store_samples import (
@@ -9,12 +10,15 @@ from store_samples import (
     publish,
     run_once,
     run_process,
+    sample_arrays,
+    sample_coordinates,
     sample_recipe,
     sample_record,
 )
 
 from worldpose.errors import CorruptionError, InputError, StoreError
-from worldpose.store import ResultId, Store, collect, key_of, plan_gc, verify
+from worldpose.store import ResultId, Store, collect, groups, key_of, plan_gc, verify
+from worldpose.store.layout_checks import array_parts
 
 NOW = timedelta(0)
 
@@ -96,6 +100,39 @@ def test_match_with_a_run_at_work_is_left_alone(store: Store) -> None:
     collect(store, plan)
     assert store.results() == ()
     assert store.unfinished_runs("final") == ()
+
+
+def test_nothing_is_taken_from_a_result_that_is_being_written(
+    folder_store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder_store.reserve_run("final")
+    written = []
+
+    def collected(*given: Any) -> Any:
+        written.append(given)
+        collect(folder_store, plan_gc(folder_store, older_than=NOW))
+        return array_parts(*given)
+
+    monkeypatch.setattr(groups, "array_parts", collected)
+    publish(folder_store)
+    assert len(written) == len(sample_arrays()) + len(sample_coordinates())
+    data = folder_store.open_result(*place(), verify=True)
+    assert (data["views"].values == 0).all()
+
+
+def test_result_of_which_something_was_removed_is_not_published(
+    folder_store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def removed(*given: Any) -> Any:
+        for staged in folder_store.blobs.staged():
+            folder_store.blobs.delete_tree(staged.path, "manifest.json")
+        return array_parts(*given)
+
+    monkeypatch.setattr(groups, "array_parts", removed)
+    with pytest.raises(StoreError, match="so that nothing was published"):
+        publish(folder_store)
+    assert not folder_store.has(*place())
+    assert folder_store.blobs.staged() == []
 
 
 def test_run_that_begins_after_planning_stops_the_collection(folder_store: Store) -> None:

@@ -38,6 +38,21 @@ def test_whole_project_has_no_findings(full: Store) -> None:
     assert verify(full, "final") == ()
 
 
+def test_what_ends_while_all_is_checked_is_no_damage(full: Store) -> None:
+    (run,) = full.unfinished_runs("final")
+    is_over: list[bool] = []
+
+    def end_the_run(done: int, total: int) -> None:
+        if not is_over:
+            is_over.append(True)
+            publish(full, sample_recipe("later"))
+            full.finish_run(sample_record(run.run_id, sample_recipe("later")))
+
+    assert verify(full, progress=end_the_run) == ()
+    assert is_over
+    assert full.unfinished_runs("final") == ()
+
+
 def flip(store: Store, path: str, number: int) -> bytes:
     """Flips one bit of a file and returns what it was."""
     data = store.blobs.read(path)
