@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
 
-.PHONY: install demo demo-quick demo-match real-demo check format test test-all schemas pages benchmarks clean
+.PHONY: install demo demo-quick demo-match real-demo check format test test-all schemas pages clean
 
 install: $(INSTALLED)
 
@@ -75,9 +75,6 @@ schemas: install
 # The review pages as they ship, from their sources.
 pages:
 	cd infra/review_pages && npm ci && npm run build
-
-benchmarks: install
-	@for script in benchmarks/*.py; do echo "$$script"; $(BIN)/python $$script || exit 1; done
 
 clean:
 	rm -rf .venv demo real-demo build dist *.egg-info

@@ -5,12 +5,13 @@ from __future__ import annotations
 from pydantic import JsonValue
 
 from flows import detection
-from flows.stage import Match, Stage
+from flows.stage import Match, Stage, once_a_match
 from worldpose.broadcast_calibration import BroadcastCalibrationSettings
 from worldpose.ingest import unit_frames
 from worldpose.ingest.annotations import key_frames_file
 
 
+@once_a_match
 def units(match: Match) -> tuple[str, ...]:
     """Clips with a broadcast video in which somebody clicked key frames."""
     folder = match.folder

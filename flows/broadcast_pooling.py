@@ -6,13 +6,14 @@ from pydantic import JsonValue
 
 from data_contracts.records import Record
 from flows import broadcast_calibration
-from flows.stage import Match, Stage
+from flows.stage import Match, Stage, once_a_match
 
 
 class BroadcastPoolingSettings(Record):
     """None: whether the clips agree is a test of their own covariances."""
 
 
+@once_a_match
 def units(match: Match) -> tuple[str, ...]:
     """Clips whose camera is calibrated in another clip too."""
     clips = broadcast_calibration.units(match)
@@ -31,10 +32,17 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
 
 def _same_camera(match: Match, unit: str) -> tuple[str, ...]:
     """Calibrated clips of a clip's broadcast camera, itself among them."""
-    spec = match.folder.spec
-    camera = spec.clip(unit).broadcast
-    clips = broadcast_calibration.units(match)
-    return tuple(clip for clip in clips if spec.clip(clip).broadcast == camera)
+    return _clips_of_cameras(match)[match.folder.spec.clip(unit).broadcast]
+
+
+@once_a_match
+def _clips_of_cameras(match: Match) -> dict[str | None, tuple[str, ...]]:
+    """The calibrated clips of every broadcast camera."""
+    found: dict[str | None, tuple[str, ...]] = {}
+    for clip in broadcast_calibration.units(match):
+        camera = match.folder.spec.clip(clip).broadcast
+        found[camera] = (*found.get(camera, ()), clip)
+    return found
 
 
 STAGE = Stage(

@@ -9,10 +9,23 @@ from worldpose.body import OPEN_BODY, find_body
 from worldpose.release.check import check_clip
 from worldpose.release.check_reading import clips_in, read_clip
 from worldpose.release.check_settings import CheckSettings
+from worldpose.release.frame_rates import frame_rate_of, read_frame_rates
 from worldpose.release.manifest import changed_files, read_manifest
 
 USUAL_FPS = 50.0
-"""Frames in a second where neither a manifest nor a person says it: the released clips'."""
+"""Frames in a second where neither an export nor a person says it: the released clips'."""
+
+
+def stated_rates(folder: Path, fps: float | None = None) -> dict[str, float | None]:
+    """Frames in a second of a data set's clips; None where neither it nor a person says it.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    clips, manifest = clips_in(folder), read_manifest(folder)
+    said = fps or (None if manifest is None else manifest.fps)
+    rates = read_frame_rates(folder)
+    return {clip: said or frame_rate_of(rates, clip) for clip in clips}
 
 
 def check(
@@ -27,7 +40,7 @@ def check(
 
     Args:
         folder: what `worldpose export` wrote, or another of the same layout.
-        fps: frames in a second; None = the manifest's, or 50.
+        fps: frames in a second; None = what the data set says, or 50.
         body: body model of pose files that name none; None = the open body.
         pitch: whether the ground is z = 0; a manifest may say that it is not.
         settings: what counts as wrong.
@@ -47,17 +60,17 @@ def check(
                 says=f"files of release {manifest.release} are gone or have other bytes",
             )
         )
-    rate = fps or (USUAL_FPS if manifest is None else manifest.fps)
-    clips = clips_in(folder)
+    rates = stated_rates(folder, fps)
+    clips = tuple(rates)
     figures = {}
-    for name in clips:
+    for name, rate in rates.items():
         shipped = read_clip(
             folder,
             name,
             clips,
             lambda model: find_body(model or body or OPEN_BODY),
             manifest,
-            rate,
+            rate or USUAL_FPS,
             pitch and (manifest is None or manifest.pitch),
         )
         figures[name], found = check_clip(shipped, settings)

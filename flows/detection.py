@@ -7,7 +7,7 @@ from pydantic import JsonValue
 from data_contracts.detection import detection_unit
 from data_contracts.redetection import again_of
 from flows import ingest
-from flows.stage import Match, Stage
+from flows.stage import Match, Stage, once_a_match
 from worldpose.detection import DetectionSettings, weights_of
 
 
@@ -40,7 +40,7 @@ def seen_in_broadcast(match: Match, clip_id: str) -> tuple[str, ...]:
     """The result with the people whom a clip's broadcast camera sees, where there is one."""
     if clip_id in match.folder.detections:
         return (f"ingest/{clip_id}",)
-    return (f"detection/{clip_id}",) if clip_id in units(match) else ()
+    return (f"detection/{clip_id}",) if clip_id in _units(match) else ()
 
 
 def units(match: Match) -> tuple[str, ...]:
@@ -48,6 +48,7 @@ def units(match: Match) -> tuple[str, ...]:
     return tuple(_units(match))
 
 
+@once_a_match
 def _units(match: Match) -> dict[str, tuple[str, str]]:
     """The unit of `ingest` and the clip of each unit."""
     folder = match.folder

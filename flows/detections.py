@@ -11,7 +11,7 @@ from pydantic import JsonValue
 from data_contracts.review import Edit
 from flows.detection import seen_by, seen_in_broadcast
 from flows.stage import Match
-from flows.stale import StaleEditError
+from flows.stale import StaleEditError, edits_since
 from worldpose.errors import InputError
 from worldpose.ingest import Observations
 from worldpose.review.detections import (
@@ -36,7 +36,8 @@ def detections_now(store: Store, match: Match, camera: str, frame: int) -> Obser
         frame: match frame.
 
     Raises:
-        InputError: the latest run has nobody seen by this camera in this frame.
+        InputError: the latest run has nobody seen by this camera in this frame, or only with a
+            correction that was withdrawn since.
     """
     stored, taken_in = _stored(store, match, camera, frame)
     row = stored.sel(frame=slice(frame, frame))
@@ -53,7 +54,8 @@ def detections_now(store: Store, match: Match, camera: str, frame: int) -> Obser
         if isinstance(correction.edit, DETECTION_EDITS)
         and (correction.edit.camera, correction.edit.frame) == (camera, frame)
     ]
-    return replay_detections(found, said[taken_in:]).observations
+    later = edits_since(said, taken_in, f"{camera}, frame {frame}", match.match_id)
+    return replay_detections(found, later).observations
 
 
 def require_seen(store: Store, match: Match, edits: Sequence[Edit]) -> None:
@@ -130,11 +132,13 @@ def stored_people(store: Store, match: Match, name: str) -> tuple[xr.Dataset, st
     return stored.result, stored.plain
 
 
-def _stored(store: Store, match: Match, camera: str, frame: int) -> tuple[xr.Dataset, int]:
-    """The result that has a frame of a camera, and how many of that frame's edits it holds."""
+def _stored(
+    store: Store, match: Match, camera: str, frame: int
+) -> tuple[xr.Dataset, list[JsonValue]]:
+    """The result that has a frame of a camera, and the edits of that frame it holds."""
     stored = _result(store, match, results_of(store, match, camera, frame)[0])
     here = [each for each in stored.edits if isinstance(each, dict) and each["frame"] == frame]
-    return stored.result, len(here)
+    return stored.result, list(here)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from pydantic import JsonValue
+
 from data_contracts.review import Edit
 from flows.stage import Match
-from flows.stale import StaleEditError
+from flows.stale import StaleEditError, edits_since
 from worldpose.errors import InputError
 from worldpose.review.identities import (
     IDENTITY_EDITS,
@@ -23,7 +25,8 @@ def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
     """The tracks of a clip with people's corrections, whether or not a run has taken them in.
 
     Raises:
-        InputError: the match's latest run has no tracks of this clip.
+        InputError: the match's latest run has no tracks of this clip, or only some with a
+            correction that was withdrawn since.
     """
     said = [
         correction.edit
@@ -31,7 +34,8 @@ def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
         if isinstance(correction.edit, IDENTITY_EDITS) and correction.edit.clip == clip
     ]
     found, taken_in = _found(store, match, clip)
-    return replay_identities(found, said[taken_in:])
+    later = edits_since(said, taken_in, f"clip {clip}", match.match_id)
+    return replay_identities(found, later)
 
 
 def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> None:
@@ -59,8 +63,8 @@ def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> None:
         found[edit.clip] = replay_identities(found[edit.clip], [edit]).identities
 
 
-def _found(store: Store, match: Match, clip: str) -> tuple[Identities, int]:
-    """What the tracker found in the latest run, and how many corrections it holds already."""
+def _found(store: Store, match: Match, clip: str) -> tuple[Identities, list[JsonValue]]:
+    """What the tracker found in the latest run, and the corrections it holds already."""
     runs = store.runs(match.match_id)
     key = store.run(match.match_id).results.get(f"tracking/{clip}") if runs else None
     if key is None:
@@ -73,9 +77,9 @@ def _found(store: Store, match: Match, clip: str) -> tuple[Identities, int]:
     unit = (match.match_id, "tracking", clip)
     recipe = store.manifest(*unit, key).recipe
     sources = dict(recipe.sources)
-    taken_in = sources.pop("identities", None)
+    taken_in = sources.pop("identities", None) or []
+    assert isinstance(taken_in, list)
     plain = key_of(recipe.model_copy(update={"sources": sources}))
     if taken_in and not store.has(*unit, plain):
-        assert isinstance(taken_in, list)
-        return stored_identities(store.open_result(*unit, key)), len(taken_in)
-    return stored_identities(store.open_result(*unit, plain)), 0
+        return stored_identities(store.open_result(*unit, key)), taken_in
+    return stored_identities(store.open_result(*unit, plain)), []

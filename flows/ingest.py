@@ -8,7 +8,7 @@ from __future__ import annotations
 from pydantic import JsonValue
 
 from data_contracts.records import Record
-from flows.stage import Match, Stage
+from flows.stage import Match, Stage, once_a_match
 from worldpose.ingest import unit_frames
 from worldpose.ingest.footage import footage_clips, footage_size
 from worldpose.review.detections import DETECTION_EDITS
@@ -18,6 +18,7 @@ class IngestSettings(Record):
     """`ingest` takes what it is given; it has no settings."""
 
 
+@once_a_match
 def units(match: Match) -> tuple[str, ...]:
     """Static cameras in order, then broadcast clips with 2D poses, or with a video and clicks.
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from data_contracts.run import RunRecord
+from flows.basis import basis_of
 from flows.gatekeeping import Gatekeeper
 from flows.method import METHOD
 from flows.outlook import Outlook, look_ahead
@@ -39,7 +40,8 @@ class Iteration:
         number: from 1.
         record: of its run.
         held_out_error: mean distance of keypoints in cameras that were left out to where the
-            others put people, all clips [box height]; None where nothing could be left out.
+            others put people, all clips [box height]; None where left-out cameras cannot judge: two
+            cameras alone, or nobody detected.
     """
 
     number: int
@@ -114,6 +116,8 @@ def _iterate(store: Store, match: Match, request: RunRequest, most: int | None) 
             if most is None and _best(passes) is not iteration:
                 ended = f"iteration {number} is no better"
                 break
+        if len(passes) > 1 and passes[-1].held_out_error is None:
+            ended = "left-out cameras cannot judge which iteration is better"
         kept = _best(passes)
         latest = latest_run(store, match.match_id)
         record = kept.record
@@ -143,7 +147,8 @@ def _outlook(store: Store, match: Match, request: RunRequest) -> Outlook:
     waits = latest is not None and latest.state == "waiting"
     policy = request.gates or (latest.gates if latest is not None and waits else "never")
     gatekeeper = Gatekeeper(store, match, policy)
-    return look_ahead(gatekeeper, request.settings, METHOD, {}, request.iteration)
+    basis = basis_of(store, match, METHOD, request.settings, latest, request.iteration)
+    return look_ahead(gatekeeper, request.settings, METHOD, basis)
 
 
 def _recorded(store: Store, match: Match, outlook: Outlook) -> RunRecord | None:

@@ -73,16 +73,14 @@ def run_difference(store: Store, a: RunRecord, b: RunRecord) -> list[UnitChange]
         elif a.results[unit] == b.results[unit]:
             changes.append(UnitChange(unit, "same", (), ()))
         else:
-            before, after = (_recipe(store, run, unit) for run in (a, b))
+            reasons = _why_differs(store, a, unit, _recipe(store, b, unit))
             old, new = (run.figures.get(unit, {}) for run in (a, b))
             figures = tuple(
                 (name, old[name], new[name])
                 for name in old
                 if name in new and old[name] != new[name]
             )
-            changes.append(
-                UnitChange(unit, "changed", tuple(explain_difference(before, after)), figures)
-            )
+            changes.append(UnitChange(unit, "changed", reasons, figures))
     return changes
 
 
@@ -133,13 +131,23 @@ def unit_reasons(store: Store, unit: PlannedUnit, latest: RunRecord | None) -> t
     if latest.results[unit.name] == unit.key:
         lost = () if unit.published else ("its result was withdrawn or removed",)
         return (f"run {latest.run_id} has it", *lost)
-    reasons = explain_difference(_recipe(store, latest, unit.name), unit.recipe)
+    reasons = _why_differs(store, latest, unit.name, unit.recipe)
     return (f"since run {latest.run_id}:", *reasons)
 
 
-def _recipe(store: Store, run: RunRecord, unit: str) -> Recipe:
+def _why_differs(store: Store, run: RunRecord, unit: str, recipe: Recipe | None) -> tuple[str, ...]:
+    """What is another in a recipe than in that of a run's result."""
+    before = _recipe(store, run, unit)
+    if before is None or recipe is None:
+        return ("its result was withdrawn or removed, and with it what it was made from",)
+    return tuple(explain_difference(before, recipe))
+
+
+def _recipe(store: Store, run: RunRecord, unit: str) -> Recipe | None:
+    """How a run's result was made; None where that was withdrawn or removed."""
     stage, _, name = unit.partition("/")
-    return store.manifest(run.match_id, stage, name, run.results[unit]).recipe
+    place = (run.match_id, stage, name, run.results[unit])
+    return store.manifest(*place).recipe if store.has(*place) else None
 
 
 def _method_order(unit: str) -> tuple[int, str]:

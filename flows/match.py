@@ -13,12 +13,13 @@ from prefect import flow
 from pydantic import JsonValue
 
 from data_contracts.run import GatePolicy, RunRecord
+from flows.basis import basis_of
 from flows.fan_out import compute
 from flows.gatekeeping import Gatekeeper, undecided
 from flows.outlook import look_ahead
 from flows.progress import reporter
 from flows.registering import open_match
-from flows.run_record import RunLog, latest_run, standing_results
+from flows.run_record import RunLog, latest_run
 from flows.settings import Overrides, selected_stages
 from flows.stage import Match, Stage
 from flows.suspension import is_deployed, take_verdict
@@ -80,8 +81,7 @@ def process_match(
                 Gatekeeper(store, match, policy),
                 settings,
                 stages,
-                standing_results(latest, stages),
-                iteration,
+                basis_of(store, match, stages, settings, latest, iteration),
             )
             open_questions = undecided(outlook.waiting)
             if open_questions and outlook.is_recorded_by(latest):

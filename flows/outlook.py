@@ -6,11 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from data_contracts.run import RunRecord, WaitingUnit
+from flows.basis import Basis
 from flows.gatekeeping import Gatekeeper, passed
 from flows.method import METHOD
-from flows.planning import PlannedUnit, plan_run, plan_stage, results_before
+from flows.planning import PlannedUnit, plan_stage
 from flows.settings import Overrides
 from flows.stage import Stage
+from worldpose.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -49,8 +51,7 @@ def look_ahead(
     gatekeeper: Gatekeeper,
     overrides: Overrides,
     stages: tuple[Stage, ...],
-    standing: Mapping[str, str],
-    iteration: int = 1,
+    basis: Basis,
 ) -> Outlook:
     """What a run of `stages` would do.
 
@@ -58,27 +59,30 @@ def look_ahead(
         gatekeeper: with the store and the match.
         overrides: settings that differ from their defaults.
         stages: the stages to run.
-        standing: results of the stages before them, as `stage/unit` to key.
-        iteration: which, from 1.
+        basis: what it goes on from.
 
     Raises:
-        UsageError: `standing` lacks what the stages are made from.
+        UsageError: that lacks what the stages are made from.
     """
     store, match = gatekeeper.store, gatekeeper.match
-    results = dict(standing)
+    results = dict(basis.results)
     waiting = [
         unit
         for stage in METHOD[: METHOD.index(stages[0])]
-        for unit in gatekeeper.held(stage.name, standing)
+        for unit in gatekeeper.held(stage.name, basis.results)
     ]
-    before = results_before(store, match, overrides, iteration)
     units: list[PlannedUnit] = []
     for stage in stages:
-        plan = plan_stage(store, match, stage, overrides, passed(results, waiting), before)
+        plan = plan_stage(store, match, stage, overrides, passed(results, waiting), basis.before)
         if plan.blocked and not waiting:
-            plan_run(store, match, overrides, stages, standing, iteration)  # says what is not there
+            raise UsageError(
+                f"--from {stages[0].name}",
+                expected=f"a latest run with all that {plan.blocked[0]} is made from",
+                found=", ".join(sorted(results)) or "no result of an earlier stage",
+                todo="Run without --from first.",
+            )
         units += plan.units
         results |= {unit.name: unit.key for unit in plan.units}
         there = {unit.name: unit.key for unit in plan.units if unit.published}
         waiting += gatekeeper.held(stage.name, there)
-    return Outlook(tuple(units), standing, tuple(waiting))
+    return Outlook(tuple(units), basis.results, tuple(waiting))

@@ -13,7 +13,6 @@ from data_contracts.work import Recipe, Work
 from flows.method import METHOD
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
-from worldpose.errors import UsageError
 from worldpose.store import Store, code_version, key_of, libraries
 
 
@@ -108,34 +107,22 @@ def plan_run(
     match: Match,
     overrides: Overrides,
     stages: tuple[Stage, ...] = METHOD,
-    standing: Mapping[str, str] | None = None,
     iteration: int = 1,
 ) -> list[PlannedUnit]:
-    """All units of `stages` in order, as they would be if every one succeeded.
+    """All units of the method's first `stages`, as they would be if every one succeeded.
 
     Args:
         store: where results are looked for.
         match: the match.
         overrides: settings that differ from their defaults.
-        stages: the stages to plan.
-        standing: results of the stages before them, as `stage/unit` to key.
+        stages: the stages to plan, from the first.
         iteration: which, from 1.
-
-    Raises:
-        UsageError: `standing` lacks what the stages are made from.
     """
     planned: list[PlannedUnit] = []
-    results = dict(standing or {})
+    results: dict[str, str] = {}
     before = results_before(store, match, overrides, iteration)
     for stage in stages:
         plan = plan_stage(store, match, stage, overrides, results, before)
-        if plan.blocked:
-            raise UsageError(
-                f"--from {stages[0].name}",
-                expected=f"a latest run with all that {plan.blocked[0]} is made from",
-                found=", ".join(sorted(results)) or "no result of an earlier stage",
-                todo="Run without --from first.",
-            )
         results |= {unit.name: unit.key for unit in plan.units}
         planned += plan.units
     return planned

@@ -8,10 +8,11 @@ from pydantic import JsonValue
 
 from data_contracts.detection import detection_unit
 from flows import detection, refitting
-from flows.stage import Match, Stage
+from flows.stage import Match, Stage, once_a_match
 from worldpose.redetection import RedetectionSettings
 
 
+@once_a_match
 def _units(match: Match) -> dict[str, tuple[str, str]]:
     """The static camera and the clip of each unit: those with people found in a video."""
     spec = match.folder.spec

@@ -6,7 +6,7 @@ from pydantic import JsonValue
 
 from data_contracts.records import Record
 from flows import body_fitting, broadcast_calibration, broadcast_pooling, detection, tracking
-from flows.stage import Match, Stage
+from flows.stage import Match, Stage, once_a_match
 from worldpose.ingest import unit_frames
 
 
@@ -14,6 +14,7 @@ class RefittingSettings(Record):
     """None of its own: bodies are fitted again as `body_fitting` fitted them."""
 
 
+@once_a_match
 def units(match: Match) -> tuple[str, ...]:
     """Clips whose calibrated broadcast camera saw people, and those with people of other clips."""
     clips = (clip.id for clip in match.folder.spec.clips)

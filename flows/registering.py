@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from data_contracts.match import Registration, SourceFile
+from data_contracts.match import MatchSpec, Registration, SourceFile
 from flows.corrections import corrected_match
 from flows.stage import Match
 from worldpose.body_fitting import read_monocular
@@ -122,8 +122,13 @@ def _refuse_duplicate(store: Store, registration: Registration) -> None:
 def _read_new_files(
     match: MatchFolder, registration: Registration, previous: Registration | None
 ) -> None:
-    """Refuse broken 2D poses, videos and stills now, not in the middle of a run."""
-    known = {source.sha256 for source in previous.files} if previous is not None else set()
+    """Refuse broken 2D poses, videos and stills now, not in the middle of a run.
+
+    All are read again where match.yaml says something else of them: they may not bear it out.
+    """
+    known: set[str] = set()
+    if previous is not None and _of_footage(previous.spec) == _of_footage(match.spec):
+        known = {source.sha256 for source in previous.files}
 
     def is_new(path: Path) -> bool:
         return registration.digest_of(path.relative_to(match.folder).as_posix()) not in known
@@ -140,6 +145,12 @@ def _read_new_files(
         camera = match.spec.camera(name)
         if is_new(path):
             read_still(path, (camera.width, camera.height))
+
+
+def _of_footage(spec: MatchSpec) -> MatchSpec:
+    """What match.yaml says of cameras and clips: who is who has no say in what files must be."""
+    clips = tuple(clip.model_copy(update={"people": {}}) for clip in spec.clips)
+    return spec.model_copy(update={"clips": clips, "roster": ()})
 
 
 def _changes(before: tuple[SourceFile, ...], after: tuple[SourceFile, ...]) -> str:

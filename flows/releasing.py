@@ -13,7 +13,8 @@ from data_contracts.release import ReleasedClip, ReleaseManifest
 from flows.formats import EXPORTS, Origin
 from flows.release import bodies_unit, joint_tracks, static_cameras
 from worldpose.errors import UsageError
-from worldpose.ingest.match_folder import NO_PITCH
+from worldpose.ingest.pitch_file import NO_PITCH
+from worldpose.release.frame_rates import write_frame_rates
 from worldpose.release.manifest import (
     read_manifest,
     released_files,
@@ -27,11 +28,18 @@ CLASHING = {"worldpose", "challenge", "challenge-2025"}
 
 
 def export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
-    """Writes a run in several formats into one folder; returns the files.
+    """Writes a run in several formats, and frame_rates.json, into one folder; returns the files.
 
     Raises:
         UsageError: an unknown format, or two that want the same files.
     """
+    written = _export(origin, forms, out)
+    rates = dict.fromkeys(origin.clips, origin.spec.fps)
+    return [*written, write_frame_rates(out, rates)]
+
+
+def _export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
+    """As `export`, for a release too, whose manifest says the frame rate."""
     for form in forms:
         if form not in EXPORTS:
             raise UsageError(
@@ -95,7 +103,7 @@ def release(
         )
     # First, so that the run cannot be collected while its files are written.
     _keep(store, origin, name)
-    written = export(origin, forms, out)
+    written = _export(origin, forms, out)
     clips = {}
     for clip in origin.clips:
         tracks = joint_tracks(origin.run, clip, origin.stage)

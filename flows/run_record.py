@@ -10,9 +10,10 @@ from typing import Any, Self
 
 from data_contracts.run import GatePolicy, RunRecord, RunState, UnitFailure, WaitingUnit
 from flows import body_fitting
+from flows.basis import basis_of
 from flows.gatekeeping import Gatekeeper, passed
 from flows.method import METHOD
-from flows.planning import PlannedUnit, StagePlan, plan_stage, results_before
+from flows.planning import PlannedUnit, StagePlan, plan_stage
 from flows.progress import reporter
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
@@ -23,13 +24,6 @@ from worldpose.store import Store, libraries
 def latest_run(store: Store, match_id: str) -> RunRecord | None:
     """The match's latest finished run, None before the first."""
     return store.run(match_id) if store.runs(match_id) else None
-
-
-def standing_results(latest: RunRecord | None, stages: tuple[Stage, ...]) -> dict[str, str]:
-    """Results of the stages before `stages` as the latest run has them, stale or not."""
-    earlier = [stage.name for stage in METHOD[: METHOD.index(stages[0])]]
-    found: Mapping[str, str] = {} if latest is None else latest.results
-    return {name: key for name, key in found.items() if name.partition("/")[0] in earlier}
 
 
 @dataclass
@@ -73,16 +67,17 @@ class RunLog:
         Raises:
             EditedMeanwhileError: the iteration before has not the results that this one is made of.
         """
-        before = results_before(store, match, overrides, iteration)
-        if before is not None:
-            _require_there(store, match, stages, before)
         latest = latest_run(store, match.match_id)
-        standing = standing_results(latest, stages)
+        basis = basis_of(store, match, stages, overrides, latest, iteration)
+        if basis.before is not None:
+            _require_there(store, match, stages, basis.before)
+        standing = dict(basis.results)
         run_id = store.reserve_run(match.match_id)
         gatekeeper = Gatekeeper(store, match, gates)
         log = cls(
-            *(store, match, stages, overrides, run_id, latest, standing, gatekeeper, iteration),
-            before=before,
+            *(store, match, stages, overrides, run_id, latest, standing, gatekeeper),
+            iteration=basis.iteration,
+            before=basis.before,
             reused=list(standing),
         )
         for stage in METHOD[: METHOD.index(stages[0])]:
@@ -215,7 +210,7 @@ def _require_there(
     if lost:
         raise EditedMeanwhileError(
             f"another iteration of {match.match_id}",
-            expected="the results of the one before as the match is now",
+            expected="the results of the one before",
             found=f"none of {', '.join(lost)}",
             todo=f"Run: worldpose run {match.match_id} --iterations N.",
         )

@@ -6,7 +6,6 @@ import os
 import signal
 import sys
 import threading
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -14,13 +13,15 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, cast
 
 from data_contracts.run import GatePolicy, RunRecord
+from flows.basis import basis_of
 from flows.gatekeeping import Gatekeeper
 from flows.lost_machines import require_machines
 from flows.outlook import look_ahead
+from flows.own_workers import kept_complete, starting_cluster, workers_for
 from flows.planning import PlannedUnit
-from flows.prefect_environment import START_SECONDS, has_server, local_cluster, prefect_server
+from flows.prefect_environment import START_SECONDS, has_server, prefect_server
 from flows.progress import reporter
-from flows.run_record import RunLog, latest_run, standing_results
+from flows.run_record import RunLog, latest_run
 from flows.settings import Overrides, selected_stages
 from flows.stage import Match, Stage
 from flows.time_limits import TimeLimits
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
 
 DASK_SECONDS = 10.0
 """How long a Dask scheduler may take to answer."""
-KEEP_SECONDS = 5.0
-"""How often workers that are gone are begun anew."""
 
 
 @dataclass(frozen=True)
@@ -78,14 +77,12 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
     """
     stages = selected_stages(request.from_stage, request.until_stage)
     latest = latest_run(store, match.match_id)
-    standing = standing_results(latest, stages)
-    if request.from_stage is not None and latest is not None:
-        request = replace(request, iteration=latest.iteration)  # what stands is of that pass
+    basis = basis_of(store, match, stages, request.settings, latest, request.iteration)
     policy: GatePolicy = request.gates or "never"
     if request.gates is None and latest is not None and latest.state == "waiting":
         policy = latest.gates
     gatekeeper = Gatekeeper(store, match, policy)
-    outlook = look_ahead(gatekeeper, request.settings, stages, standing, request.iteration)
+    outlook = look_ahead(gatekeeper, request.settings, stages, basis)
     if outlook.missing:
         return _with_prefect(store, match, replace(request, gates=policy), outlook.missing)
     if latest is not None and outlook.is_recorded_by(latest):
@@ -154,20 +151,24 @@ def shared_machines(
     """A function that gives the request a server and workers, which all runs inside then use.
 
     Starting them takes seconds, and Prefect keeps to the first server that it was shown. They start
-    when the function is first given units to compute, as many as those need.
+    when the function is first given units to compute, as many as those need; more join them where
+    later ones need more.
 
     Args:
         store: the store.
         request: what is asked of every run.
     """
     with ExitStack() as stack:
-        started: list[RunRequest] = []
+        started: list[tuple[RunRequest, Callable[[int], None]]] = []
 
         def machines_for(missing: Iterable[PlannedUnit]) -> RunRequest:
             units = list(missing)
             if units and not started:
                 started.append(stack.enter_context(_machines(store, request, units)))
-            return started[0] if started else request
+            elif units:
+                _, ask_for = started[0]
+                ask_for(workers_for(request.workers, units))
+            return started[0][0] if started else request
 
         yield machines_for
 
@@ -175,16 +176,18 @@ def shared_machines(
 @contextmanager
 def _machines(
     store: Store, request: RunRequest, missing: list[PlannedUnit]
-) -> Iterator[RunRequest]:
+) -> Iterator[tuple[RunRequest, Callable[[int], None]]]:
+    """The request with a server and workers, and a function that asks for so many of those."""
     is_watched = has_server()
     if request.dask is None or not is_watched:
         reporter().say("starting Prefect and Dask")
     server = prefect_server(store.url, is_local=request.dask is None)
     with _ending_at_once(), server as wait_until_ready, ExitStack() as stack:
-        cluster = None
+        cluster: LocalCluster | None = None
+        ask_for: Callable[[int], None] = _no_more
         if request.dask is None:
-            cluster = stack.enter_context(_starting_cluster(request, missing))
-            stack.enter_context(kept_complete(cluster))
+            cluster = stack.enter_context(starting_cluster(request.workers, missing))
+            ask_for = stack.enter_context(kept_complete(cluster))
             request = replace(request, dask=cluster.scheduler_address)
         else:
             _require_scheduler(request.dask)
@@ -196,7 +199,11 @@ def _machines(
         wait_until_ready()
         if cluster is not None:
             cluster.wait_for_workers(1, START_SECONDS)
-        yield request
+        yield request, ask_for
+
+
+def _no_more(workers: int) -> None:
+    """A cluster of somebody else's has the workers that it has."""
 
 
 @contextmanager
@@ -221,47 +228,6 @@ def _ending_at_once() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _starting_cluster(request: RunRequest, missing: list[PlannedUnit]) -> LocalCluster:
-    """Workers on this machine that begin to start, and import at once what they will need."""
-    import dask
-    from distributed import LocalCluster
-
-    stages = Counter(unit.recipe.stage for unit in missing)
-    workers = request.workers or min(os.cpu_count() or 1, max(stages.values()))
-    given = dask.config.get("distributed.worker.preload")
-    asked = [given] if isinstance(given, str) else given
-    preload = ["tasks.preload", *asked, "prefect_dask", *(f"tasks.{stage}" for stage in stages)]
-    preload.append("flows.match")  # with each task Prefect sends the flow that it is of
-    # Dask closes what begins a lost worker anew if that takes longer: 15 s, as long as a start on a
-    # slow machine.
-    dask.config.set({"distributed.deploy.lost-worker-timeout": START_SECONDS})
-    cluster = LocalCluster(**{**local_cluster(workers), "n_workers": 0, "preload": preload})
-    cluster.scale(workers)
-    return cluster
-
-
-@contextmanager
-def kept_complete(cluster: LocalCluster) -> Iterator[None]:
-    """Begin workers anew that are gone for good, as are those that end while they start.
-
-    Dask notices that they are gone, but begins others only when it is asked for workers.
-    """
-    workers = len(cluster.worker_spec)
-    is_over = threading.Event()
-
-    def keep() -> None:
-        while not is_over.wait(KEEP_SECONDS):
-            cluster.scale(workers)
-
-    keeper = threading.Thread(target=keep, daemon=True)
-    keeper.start()
-    try:
-        yield
-    finally:
-        is_over.set()
-        keeper.join()
 
 
 def _without_heartbeats() -> AbstractContextManager[Any]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Literal
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+from functools import wraps
+from typing import Any, Literal, TypeVar, cast
 
 from pydantic import JsonValue
 
@@ -13,6 +14,8 @@ from data_contracts.records import Record
 from data_contracts.review import Correction
 from worldpose.ingest import MatchFolder
 from worldpose.review import Journal
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -32,11 +35,29 @@ class Match:
     journal: Journal
     corrections: tuple[Correction, ...] = ()
     stale: tuple[tuple[Correction, str], ...] = ()
+    _kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """What `once_a_match` has found out of it."""
 
     @property
     def match_id(self) -> str:
         """The match's id."""
         return self.registration.spec.match_id
+
+
+def once_a_match(table: Callable[[Match], T]) -> Callable[[Match], T]:
+    """Work out a table of a match once, though planning asks for it at every unit.
+
+    Hundreds of clips of many cameras are thousands of units: what looks through all of them for
+    each one would take an hour.
+    """
+
+    @wraps(table)
+    def kept(match: Match) -> T:
+        if table not in match._kept:
+            match._kept[table] = table(match)
+        return cast("T", match._kept[table])
+
+    return kept
 
 
 def _nothing(settings: Record) -> dict[str, JsonValue]:

@@ -6,10 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from data_contracts.release import DataSetStatistics
-from flows.checking import USUAL_FPS
+from flows.checking import USUAL_FPS, stated_rates
 from worldpose.errors import UsageError
-from worldpose.release.check_reading import clips_in
-from worldpose.release.manifest import read_manifest
 from worldpose.release.statistics import (
     camera_kind,
     clip_statistics,
@@ -25,7 +23,7 @@ def count(folders: Sequence[Path], *, fps: float | None = None) -> DataSetStatis
 
     Args:
         folders: what `worldpose export` wrote, or others of the same layouts.
-        fps: frames in a second; None = the manifests', or 50.
+        fps: frames in a second; None = what the data sets say, or 50.
 
     Raises:
         InputError: a file cannot be read.
@@ -33,14 +31,12 @@ def count(folders: Sequence[Path], *, fps: float | None = None) -> DataSetStatis
     """
     clips = {}
     for folder in folders:
-        manifest = read_manifest(folder)
-        rate = fps or (USUAL_FPS if manifest is None else manifest.fps)
-        names = clips_in(folder)
+        rates = stated_rates(folder, fps)
         cameras = sorted((folder / "cameras").glob("*.npz"))
-        for name in names:
+        for name, rate in rates.items():
             own = folder / "cameras" / f"{name}.npz"
             kind = camera_kind(own)
-            if not own.is_file() and any(file.stem not in names for file in cameras):
+            if not own.is_file() and any(file.stem not in rates for file in cameras):
                 kind = "S"
             label = name if len(folders) == 1 else f"{folder.resolve().name}/{name}"
             if label in clips:
@@ -50,5 +46,5 @@ def count(folders: Sequence[Path], *, fps: float | None = None) -> DataSetStatis
                     found=f"{label} twice",
                     todo="Name each folder once, or rename one.",
                 )
-            clips[label] = clip_statistics(read_places(folder, name), rate, kind)
+            clips[label] = clip_statistics(read_places(folder, name), rate or USUAL_FPS, kind)
     return data_set_statistics(clips)

@@ -6,13 +6,15 @@ weights, the code. All of them are in the units' recipes, so that nobody has to 
 
 from __future__ import annotations
 
+import builtins
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
 from pydantic import JsonValue
 
-from data_contracts.run import RunRecord
+from data_contracts.run import RunRecord, UnitFailure
+from flows.basis import basis_of
 from flows.gatekeeping import Gatekeeper
 from flows.lineage import unit_reasons, unit_state
 from flows.method import METHOD
@@ -22,12 +24,8 @@ from flows.registering import open_match
 from flows.run_record import latest_run
 from flows.settings import Overrides, selected_stages
 from flows.stage import Match
-from worldpose.errors import InputError
+from worldpose.errors import InputError, StoreError
 from worldpose.store import Store
-
-PASSING: Final = ("StoreError", "OSError")
-"""Errors of a disk or a network, which may be gone next time."""
-
 
 _INPUT: Final = "input "
 """How a line about an input begins (`explain_difference`)."""
@@ -119,11 +117,15 @@ def find_touched(
     stages = selected_stages(None, until)
     gatekeeper = Gatekeeper(store, match, latest.gates)
     units: list[TouchedUnit] = []
-    hopeless = {} if retry else {f.unit: f.key for f in latest.failed if f.error not in PASSING}
+    hopeless = {} if retry else {f.unit: f.key for f in latest.failed if not _may_pass(f)}
     for number in range(1, latest.iteration + 1):
-        outlook = look_ahead(gatekeeper, asked, stages, {}, number)
-        standing = latest if number == latest.iteration else _pass(store, latest, number)
-        units += _units(store, outlook, standing, hopeless, number)
+        basis = basis_of(store, match, stages, asked, latest, number)
+        outlook = look_ahead(gatekeeper, asked, stages, basis)
+        is_last = number == latest.iteration
+        standing = latest if is_last else _pass(store, latest, number)
+        found = _units(store, outlook, standing, hopeless, number)
+        # Of the passes before, only their results count: their records may be of other settings.
+        units += [unit for unit in found if is_last or unit.state != "ready"]
     settled = latest.state in ("complete", "waiting")
     return Touched(
         match=match,
@@ -180,9 +182,15 @@ def _is_of(unit: str, stage: str) -> bool:
 
 
 def _pass(store: Store, latest: RunRecord, number: int) -> RunRecord | None:
-    """The newest run of an earlier pass over the method."""
-    for run_id in reversed(store.runs(latest.match_id)):
-        record = store.run(latest.match_id, run_id)
-        if record.iteration == number:
-            return record
-    return None
+    """The newest run of an earlier pass over the method, of the latest run's settings if any is."""
+    records = [store.run(latest.match_id, run_id) for run_id in store.runs(latest.match_id)]
+    passes = [record for record in reversed(records) if record.iteration == number]
+    same = (record for record in passes if record.overrides == latest.overrides)
+    return next(same, passes[0] if passes else None)
+
+
+def _may_pass(failure: UnitFailure) -> bool:
+    """Whether a recorded failure was a disk's or a network's, and may be gone next time."""
+    kind = getattr(builtins, failure.error, None)
+    is_system = isinstance(kind, type) and issubclass(kind, OSError)
+    return is_system or failure.error == StoreError.__name__

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.console import JsonOption, line, print_json, print_table
+from flows.cli.console import JsonOption, errors, line, print_json, print_table
 
 FAULTY = 1
 """Exit code where something is wrong with the data set."""
@@ -19,7 +19,7 @@ def check(
     ],
     fps: Annotated[
         float | None,
-        typer.Option("--fps", min=0.001, help="Frames in a second; the manifest's, or 50."),
+        typer.Option("--fps", min=0.001, help="Frames in a second; the data set's, or 50."),
     ] = None,
     body: Annotated[
         str | None,
@@ -36,6 +36,7 @@ def check(
     """
     from flows.checking import check as check_data_set
 
+    tell_unstated_rate(folder, fps)
     report = check_data_set(folder, fps=fps, body=body, pitch=pitch)
     if as_json:
         print_json({**report.model_dump(mode="json"), "passed": not report.findings})
@@ -60,6 +61,14 @@ def check(
         line(f"{len(report.findings)} findings" if report.findings else "nothing is wrong")
     if report.findings:
         raise typer.Exit(FAULTY)
+
+
+def tell_unstated_rate(folder: Path, fps: float | None) -> None:
+    """Says which frame rate is assumed, since seconds and speeds hang on it."""
+    from flows.checking import USUAL_FPS, stated_rates
+
+    if None in stated_rates(folder, fps).values():
+        line(f"{folder}: frames a second not stated: taken as {USUAL_FPS:g} (--fps)", to=errors)
 
 
 def _shown(value: float | None) -> str:

@@ -37,6 +37,8 @@ StageOption = Annotated[
 ]
 
 DEFAULT_PROJECT = "worldpose-data"
+NO_WIDTH = 100_000
+"""Characters of a line where no terminal bounds it."""
 
 
 def print_json(value: Mapping[str, Any]) -> None:
@@ -50,14 +52,19 @@ def line(text: str, *, to: Console = output) -> None:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """A plain table; columns that start with ">" are right-aligned."""
+    """A plain table; columns that start with ">" are right-aligned.
+
+    Nothing is ever cut off: a cell too wide for the terminal goes on in its next line, and a file
+    or pipe, in which people search, gets whole lines.
+    """
     table = Table(title=title, title_justify="left", box=None, pad_edge=False, title_style="bold")
     for column in columns:
         justify: Literal["left", "right"] = "right" if column.startswith(">") else "left"
-        table.add_column(column.lstrip(">"), justify=justify)
+        table.add_column(column.lstrip(">"), justify=justify, overflow="fold")
     for row in rows:
         table.add_row(*map(Text, row))
-    output.print(table)
+    to = output if output.is_terminal else Console(width=NO_WIDTH)
+    to.print(table, soft_wrap=False)
 
 
 class ConsoleReporter(Reporter):

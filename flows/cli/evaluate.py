@@ -98,7 +98,7 @@ def evaluate(
 ) -> None:
     """Score joints and cameras against a reference; definitions in docs/metrics.md.
 
-    Example: worldpose evaluate --prediction tiny --reference matches/tiny/reference
+    Example: worldpose evaluate --prediction tiny-1 --reference matches/tiny/reference
     """
     if ablation:
         print_ablation(ablation, as_json=as_json)

@@ -85,7 +85,7 @@ def finetune(
 ) -> None:
     """Train on labels; a version that is not better on held-out frames is not adopted.
 
-    Example: worldpose finetune labels/person_keypoints.json --project worldpose-data
+    Example: worldpose finetune labels/labels.json --project worldpose-data
     """
     from flows.prefect_environment import prefect_server
 

@@ -190,6 +190,7 @@ def import_command(
 
 def import_pitch(survey: Path, out: Path, *, left_handed: bool, as_json: bool) -> None:
     """Lay a survey onto the world frame, write pitch.json and say how it fits."""
+    from worldpose.ingest.pitch_file import refuse_unread_pitch
     from worldpose.pitch.survey import fit_survey
     from worldpose.pitch.survey_file import read_survey
     from worldpose.pitch.survey_settings import SurveySettings
@@ -203,6 +204,7 @@ def import_pitch(survey: Path, out: Path, *, left_handed: bool, as_json: bool) -
             found="one",
             todo="Move it away first; another pitch makes another match.",
         )
+    refuse_unread_pitch(out)
     fit = fit_survey(read_survey(survey), SurveySettings(left_handed=left_handed))
     with whole_file(file) as draft:
         draft.write_text(fit.pitch.model_dump_json(indent=2) + "\n", encoding="utf-8")
@@ -272,7 +274,12 @@ def _tell_unclicked(match: Match) -> None:
     """What has to be done before the match can be run."""
     known = {**match.folder.calibrations, **match.folder.clicked}
     missing = [each.id for each in match.folder.spec.static_cameras if each.id not in known]
-    if missing:
+    if missing and match.folder.pitch is None:
+        line(
+            f"no calibration of {', '.join(missing)}: add them to calibration.toml (a match "
+            "without a pitch cannot be clicked)"
+        )
+    elif missing:
         line(f"to be clicked first: {', '.join(missing)}; worldpose review serve shows the pages")
 
 

@@ -50,7 +50,7 @@ def status(
 ) -> None:
     """Show which results are there, stale or missing, match by match.
 
-    Example: worldpose status tiny
+    Example: worldpose status tiny-1
     """
     store = Store.open(project)
     wanted = [find_registration(store, match).spec.match_id] if match else store.matches()
@@ -82,11 +82,13 @@ def status(
                 *counts,
                 str(len(row["failed"])),
                 str(len(row["waiting"])),
-                row["problem"] or ", ".join(unsettled[:3]) + (" ..." * (len(unsettled) > 3)),
+                ", ".join(unsettled[:3]) + (" ..." * (len(unsettled) > 3)),
             )
         )
     print_table("matches", columns, shown)
     for row in rows:
+        if row["problem"]:
+            line(f"{row['match']}: {row['problem']}")
         if row["waiting"]:
             line(f"{row['match']}: what waits: worldpose review list {row['match']}")
         for name, run_id in row["pins"].items():
@@ -105,14 +107,15 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
     units: dict[str, list[str]] = {state: [] for state in STATES}
     problem = None
     waiting: list[WaitingUnit] = []
+    asked, iteration = ({}, 1) if latest is None else (latest.overrides, latest.iteration)
     try:
         match = open_match(store, match_id)
-    except WorldposeError as failure:
+        planned = plan_run(store, match, asked, iteration=iteration)
+    except WorldposeError as failure:  # a setting, too, may name what is gone
         problem = str(failure)
     else:
         waiting = still_waiting(match, latest)
-        asked, iteration = ({}, 1) if latest is None else (latest.overrides, latest.iteration)
-        for unit in plan_run(store, match, asked, iteration=iteration):
+        for unit in planned:
             units[unit_state(unit, latest)].append(unit.name)
     return {
         "match": match_id,

@@ -47,7 +47,7 @@ def export(
 ) -> None:
     """Write a run's results as files that other tools read.
 
-    Example: worldpose export tiny --format joints --out exported
+    Example: worldpose export tiny-1 --format joints --out exported
     """
     from flows.formats import Origin
     from flows.registering import find_registration
@@ -105,7 +105,7 @@ def report(
 ) -> None:
     """Write one HTML page on a run: what was done, how good it is, what it looks like.
 
-    Example: worldpose report tiny --out report.html
+    Example: worldpose report tiny-1 --out report.html
     """
     from flows.registering import find_match
     from flows.reporting import write_report

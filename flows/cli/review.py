@@ -10,7 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from data_contracts.review import Edit
 from flows import review
-from flows.cli import review_exchange
+from flows.cli import review_exchange, review_text
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -22,11 +22,11 @@ from flows.cli.console import (
 from flows.cli.review_serve import serve
 from flows.cli.review_text import correction_json, in_words, print_review, review_json, when
 from flows.prefect_environment import has_server
-from flows.registering import find_registration, open_match
+from flows.registering import find_registration, open_for_review, open_match
 from flows.review import Review, reviews_of
 from flows.run_record import latest_run
 from flows.stage import Match
-from worldpose.errors import InputError
+from worldpose.errors import InputError, WorldposeError
 from worldpose.store import Store
 
 commands = typer.Typer(
@@ -63,29 +63,30 @@ def list_reviews(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """List what waits for a person, in one match or in all.
+    """List what waits for a person, in one match or in all; one unreadable match hides no other.
 
     Example: worldpose review list tiny-1
     """
     store = Store.open(project)
     names = [find_registration(store, match).spec.match_id] if match else store.matches()
     found: list[Review] = []
+    problems: dict[str, str] = {}
     for name in names:
-        opened = open_match(store, name)
-        _tell_damage(opened)
-        found += reviews_of(opened, latest_run(store, name))
+        try:
+            opened = open_for_review(store, name)
+            found += reviews_of(opened, latest_run(store, name))
+        except WorldposeError as failure:
+            problems[name] = str(failure)
+            line(f"{name}: {failure}", to=errors)
+        else:
+            _tell_damage(opened)
     shown = [each for each in found if everything or each.state == "waits"]
     if as_json:
-        print_json({"reviews": [review_json(each) for each in shown]})
-        return
-    if not shown:
-        line("nothing waits for review")
-        return
-    for each in shown:
-        request = each.request
-        line(f"{request.id}  {each.state}, {request.match_id}, {when(request.created_at)}")
-        for reason in request.reasons:
-            line(f"  {reason}")
+        print_json({"reviews": [review_json(each) for each in shown], "problems": problems})
+    else:
+        review_text.print_list(shown)
+    if match and problems:
+        raise typer.Exit(1)
 
 
 @commands.command()

@@ -18,6 +18,17 @@ from flows.cli.console import line, print_json, print_table
 from flows.review import Review
 
 
+def print_list(shown: list[Review]) -> None:
+    """Questions, each with its state and reasons."""
+    if not shown:
+        line("nothing waits for review")
+    for each in shown:
+        request = each.request
+        line(f"{request.id}  {each.state}, {request.match_id}, {when(request.created_at)}")
+        for reason in request.reasons:
+            line(f"  {reason}")
+
+
 def print_review(shown: Review, as_json: bool) -> None:
     """One question, what was said, and all figures."""
     if as_json:

@@ -23,6 +23,7 @@ from flows.cli.console import (
 )
 from flows.cli.iterations import as_json as iterations_as_json
 from flows.cli.iterations import parse_iterations, print_iterations
+from flows.clock_advice import clock_advice
 from flows.iteration import iterate_match
 from flows.method import METHOD
 from flows.registering import find_match
@@ -124,6 +125,8 @@ def run(
         if passes is not None:
             print_iterations(store, passes)
         _print(record, store.url, seconds)
+    for text in clock_advice(record.figures, opened.folder.spec):
+        line(f"warning: {text}", to=errors)
     raise typer.Exit(EXIT_CODES[record.state])
 
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from flows.cli.check import tell_unstated_rate
 from flows.cli.console import JsonOption, line, print_json, print_table
 
 
@@ -24,7 +25,7 @@ def statistics(
     ] = None,
     fps: Annotated[
         float | None,
-        typer.Option("--fps", min=0.001, help="Frames in a second; the manifest's, or 50."),
+        typer.Option("--fps", min=0.001, help="Frames in a second; the data set's, or 50."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -34,6 +35,8 @@ def statistics(
     """
     from flows.statistics import count
 
+    for folder in folders:
+        tell_unstated_rate(folder, fps)
     found = count(folders, fps=fps)
     if picture is not None:
         from worldpose.release.files import whole_file

@@ -196,6 +196,13 @@ def test_without_a_held_out_error_no_iteration_is_better():
     assert not second.is_better_than(first)
 
 
+@pytest.mark.parametrize(("most", "ran"), [(None, [1, 2, 1]), (3, [1, 2, 3, 1])])
+def test_a_loop_whose_left_out_cameras_cannot_judge_keeps_the_first_and_says_so(looped, most, ran):
+    found, runs = looped([None, None, None], most)
+    assert (found.kept.number, runs) == (1, ran)
+    assert found.ended == "left-out cameras cannot judge which iteration is better"
+
+
 def test_clips_count_by_their_keypoints():
     both = {
         "filtering/a": {"held_out_error": 0.02, "held_out_keypoints": 300.0},

@@ -43,6 +43,14 @@ def test_a_folder_of_images_is_labelled_as_a_video_is(tmp_path):
     assert [picture.keypoints[0, 0, 0] for picture in found] == [0.0, 20.0, 40.0] * 2
 
 
+def test_a_failed_labelling_leaves_nothing_that_blocks_its_repetition(tmp_path):
+    videos = [images(tmp_path / "cam00"), images(tmp_path / "cam01", (30, 24))]
+    with pytest.raises(InputError):
+        labelling.propose(videos, 2, tmp_path / "labels", DetectionSettings())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cam00", "cam01"]
+    assert labelling.propose(videos[:1], 2, tmp_path / "labels", DetectionSettings()) == 3
+
+
 def test_pictures_of_another_size_are_refused(tmp_path):
     videos = [images(tmp_path / "cam00"), images(tmp_path / "cam01", (30, 24))]
     with pytest.raises(InputError, match="24 x 30"):

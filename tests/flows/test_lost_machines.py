@@ -9,7 +9,7 @@ from distributed import Client, LocalCluster
 from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError
 
-from flows import running
+from flows import own_workers
 from flows.lost_machines import LostMachinesError, require_machines
 from flows.prefect_environment import local_cluster
 from worldpose.errors import InputError, StoreError
@@ -37,12 +37,12 @@ def test_a_units_own_failure_is_its_own():
 
 
 def test_a_worker_that_is_gone_for_good_is_begun_anew(monkeypatch):
-    monkeypatch.setattr(running, "KEEP_SECONDS", 0.1)
+    monkeypatch.setattr(own_workers, "KEEP_SECONDS", 0.1)
     soon = {"distributed.deploy.lost-worker-timeout": 0.1}
     with (
         dask.config.set(soon),
         LocalCluster(**local_cluster(1)) as cluster,
-        running.kept_complete(cluster),
+        own_workers.kept_complete(cluster) as ask_for,
         Client(cluster, set_as_default=False) as client,
     ):
         client.wait_for_workers(1, 60)
@@ -53,3 +53,7 @@ def test_a_worker_that_is_gone_for_good_is_begun_anew(monkeypatch):
             assert time.monotonic() < end
             time.sleep(0.05)
         assert client.submit(sum, (1, 2)).result(60) == 3
+        ask_for(2)
+        client.wait_for_workers(2, 60)
+        time.sleep(0.3)  # the next looks after them keep both
+        assert len(cluster.worker_spec) == 2

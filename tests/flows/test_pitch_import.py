@@ -53,6 +53,18 @@ def test_a_survey_in_feet_is_refused_and_nothing_is_written(survey, tmp_path):
     assert not (tmp_path / "match").exists()
 
 
+@pytest.mark.parametrize("named", ["none", "survey.json"])
+def test_a_survey_that_no_run_would_read_is_refused_and_nothing_is_written(survey, tmp_path, named):
+    match = tmp_path / "lab"
+    match.mkdir()
+    (match / "match.yaml").write_text(f"match_id: lab\npitch: {named}\n")
+    answer = worldpose("import", "--pitch", survey, "--out", match)
+    assert answer.code == 1
+    told = f"match.yaml: pitch: expected no `pitch: {named}` where pitch.json lies, found both"
+    assert told in answer.err
+    assert [path.name for path in match.iterdir()] == ["match.yaml"]
+
+
 @pytest.mark.parametrize("more", [["--fps", 25], ["--detections", "x"]])
 def test_a_pitch_is_imported_on_its_own(survey, tmp_path, more):
     answer = worldpose("import", "--pitch", survey, "--out", tmp_path / "match", *more)

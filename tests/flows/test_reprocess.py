@@ -22,6 +22,7 @@ from flows.running import RunRequest
 from flows.touched import find_touched
 from flows.tracking import STAGE
 from worldpose.store import ResultId, Store
+from worldpose.store.paths import record_path
 
 FLOW = [
     sys.executable,
@@ -122,7 +123,15 @@ def test_a_run_that_ended_earlier_is_made_current_as_far_as_it_went(store):
     assert [unit.unit for unit in found.units] == ["tracking/clip", "triangulation/clip"]
 
 
-@pytest.mark.parametrize(("error", "again"), [("ValueError", False), ("StoreError", True)])
+@pytest.mark.parametrize(
+    ("error", "again"),
+    [
+        ("ValueError", False),
+        ("CorruptionError", False),
+        ("StoreError", True),
+        ("ConnectionResetError", True),
+    ],
+)
 def test_what_failed_is_tried_again_when_something_is_another(store, error, again):
     tracking = store.run(TINY).results["tracking/clip"]
     store.withdraw(ResultId(TINY, "tracking", "clip", tracking))
@@ -148,6 +157,31 @@ def test_a_later_iteration_is_touched_in_every_pass(store):
     found = find_touched(store, TINY)
     assert {unit.iteration for unit in found.units} == {1, 2}
     assert len({unit.key for unit in found.to_compute}) == len(found.to_compute)
+
+
+def test_the_pass_before_stands_though_another_run_came_between_or_its_record_went(store):
+    first = store.run(TINY)
+    finish(store, iteration=2)
+    second = find_touched(store, TINY).units
+    assert second
+    for overrides in ({"tracking": {"min_joints": 6}}, {}):
+        # Another run of a first pass, that has not all of its results.
+        results = without(store.run(TINY), "filtering")
+        finish(store, iteration=1, results=results, overrides=overrides)
+        finish(store, iteration=2, results=first.results, overrides={})
+        assert [unit.unit for unit in find_touched(store, TINY).units] == [
+            unit.unit for unit in second
+        ]
+    for run_id in store.runs(TINY)[:-1]:
+        store.blobs.delete(record_path(TINY, run_id))
+    assert {unit.iteration for unit in find_touched(store, TINY).units} == {2}
+
+
+def test_a_result_that_was_withdrawn_is_a_reason_and_no_failure(store):
+    edit_identity(store)
+    store.withdraw(ResultId(TINY, "tracking", "clip", store.run(TINY).results["tracking/clip"]))
+    found = {unit.unit: unit for unit in find_touched(store, TINY).units}
+    assert any("withdrawn" in reason for reason in found["tracking/clip"].own_reasons)
 
 
 def test_a_match_that_fails_stops_no_other(store, tiny, tmp_path, monkeypatch):

@@ -2,21 +2,15 @@
 
 import shutil
 import time
-from datetime import UTC, datetime
 
 import pytest
 import yaml
 from command_line import succeed
+from stand_ins import publish_stand_in
 
-from data_contracts.records import CONTRACT_VERSION
-from data_contracts.run import ResultManifest
 from flows.planning import plan_run
 from flows.registering import register
 from worldpose.store import Store
-from worldpose.store.canonical import digest
-from worldpose.store.documents import checksum_of, seal
-from worldpose.store.paths import MANIFEST, ResultId
-from worldpose.store.writer import content_of, stored_files
 from worldpose.synthetic import SCENARIOS, simulate_match
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
@@ -69,28 +63,9 @@ def long_match(folder):
 def publish(store, match, unit):
     """The result of a planned unit, of as many files as it would have."""
     minutes = CLIPS if unit.recipe.stage == "ingest" and unit.recipe.unit.startswith("cam") else 1
-    folder = store.blobs.staging()
-    for number in range(FILES[unit.recipe.stage] * minutes):
-        chunk = folder / f"array{number % 10}" / "c" / str(number // 10)
-        chunk.parent.mkdir(parents=True, exist_ok=True)
-        chunk.write_text(f"{unit.name} {number}")
-    files = stored_files(folder)
-    manifest = ResultManifest(
-        contract=CONTRACT_VERSION,
-        key=unit.key,
-        recipe=unit.recipe,
-        files=files,
-        content=content_of(files),
-        figures={"figure": 1.0},
-        created_at=datetime.now(UTC),
-        seconds=1.0,
-        run_id="0001",
-        checksum=digest(b""),
-    )
-    manifest = manifest.model_copy(update={"checksum": checksum_of(manifest)})
-    path = ResultId.of(unit.work(store.url, match, "0001")).path
-    assert store.blobs.publish_tree(folder, path, MANIFEST, seal(manifest))
-    return len(files)
+    count = FILES[unit.recipe.stage] * minutes
+    publish_stand_in(store, match, unit, [f"array{k % 10}/c/{k // 10}" for k in range(count)])
+    return count
 
 
 def test_a_finished_match_of_ninety_minutes_is_found_again_at_once(tmp_path, capsys):

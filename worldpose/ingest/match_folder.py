@@ -15,12 +15,10 @@ from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.ingest.annotations import clicked_file, read_clicked, read_key_frames
 from worldpose.ingest.calibration_files import read_calibration
+from worldpose.ingest.pitch_file import read_pitch
 from worldpose.ingest.places import existing_file
-from worldpose.ingest.text_files import read_json, read_yaml
+from worldpose.ingest.text_files import read_yaml
 from worldpose.ingest.validation import validate_record
-
-NO_PITCH: Final = "none"
-"""Value of `pitch` in match.yaml for footage without a pitch."""
 
 CLICKS_NEEDED: Final = "at least four points of the pitch, better 8 to 12 all over the picture,"
 """What a person is asked for where a camera has no calibration."""
@@ -68,6 +66,14 @@ def read_match(folder: Path) -> MatchFolder:
             folder; a static camera has neither video nor detections.
     """
     file = folder / "match.yaml"
+    if folder.is_dir() and not file.exists():
+        raise InputError(
+            str(file),
+            expected="a file",
+            found="nothing",
+            todo="docs/match_folder.md describes a match folder; worldpose import makes one from a "
+            "calibration.",
+        )
     spec = validate_record(MatchSpec, read_yaml(file), str(file))
     if not spec.static_cameras:
         raise InputError(
@@ -79,7 +85,7 @@ def read_match(folder: Path) -> MatchFolder:
     detections = _detections(folder, spec)
     videos = _videos(folder, spec)
     _require_footage(folder, spec, detections, videos)
-    pitch = _pitch(folder, spec)
+    pitch = read_pitch(folder, spec)
     return MatchFolder(
         folder=folder,
         spec=spec,
@@ -106,8 +112,9 @@ def require_calibrated(match: MatchFolder) -> None:
         needed = f"Add the missing cameras to {match.folder / 'calibration.toml'}"
         if match.pitch is not None:
             needed = (
-                f"Click {CLICKS_NEEDED} into {match.folder / clicked_file(missing[0])}, or add the "
-                "camera to calibration.toml"
+                f"Click {CLICKS_NEEDED} into {match.folder / clicked_file(missing[0])}, or click "
+                f"on the pages: worldpose ingest {match.folder}, then worldpose review serve; or "
+                "add the camera to calibration.toml"
             )
         raise InputError(
             str(match.folder),
@@ -115,28 +122,6 @@ def require_calibrated(match: MatchFolder) -> None:
             found=f"missing camera {', '.join(missing)}; there: {_listed(known)}",
             todo=f"{needed}, or take it out of match.yaml.",
         )
-
-
-def pitch_file(folder: Path, spec: MatchSpec) -> Path | None:
-    """Where the surveyed pitch is written; None = no pitch, or the standard one.
-
-    Raises:
-        InputError: match.yaml names a pitch file that is not there or lies outside.
-    """
-    if spec.pitch == NO_PITCH:
-        return None
-    if spec.pitch is not None:
-        return existing_file(folder, spec.pitch, f"{folder / 'match.yaml'}: pitch")
-    if not (folder / "pitch.json").exists():
-        return None
-    return existing_file(folder, "pitch.json", str(folder))
-
-
-def _pitch(folder: Path, spec: MatchSpec) -> PitchSpec | None:
-    if spec.pitch == NO_PITCH:
-        return None
-    file = pitch_file(folder, spec)
-    return PitchSpec() if file is None else validate_record(PitchSpec, read_json(file), str(file))
 
 
 def _calibrations(folder: Path, spec: MatchSpec) -> dict[str, CameraCalibration]:
@@ -249,7 +234,8 @@ def _require_footage(
                 str(folder),
                 expected=f"footage of every static camera of match.yaml, also of {camera.id}",
                 found=f"missing camera {camera.id}; there: {_listed({**videos, **detections})}",
-                todo=f"Add videos/{camera.id}.mp4 or detections/{camera.id}.json (or .npz).",
+                todo=f"Add videos/{camera.id}.mp4 or detections/{camera.id}.json (or .npz)"
+                f"{_another_video(folder, camera.id)}.",
             )
     for clip in spec.clips:
         if clip.broadcast is not None and clip.id not in detections and clip.id not in videos:
@@ -260,6 +246,13 @@ def _require_footage(
                 todo=f"Add broadcast/{clip.id}.mp4 or detections/{clip.id}.json (or .npz), or "
                 "take `broadcast` out of the clip.",
             )
+
+
+def _another_video(folder: Path, camera_id: str) -> str:
+    """What to do with a camera's video whose name does not end as usual."""
+    files = sorted((folder / "videos").glob(f"{camera_id}.*"))
+    found = [file.name for file in files if file.stem == camera_id]
+    return f", or name it in match.yaml: `video: videos/{found[0]}`" if found else ""
 
 
 def _listed(names: Mapping[str, object]) -> str:

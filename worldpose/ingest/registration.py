@@ -10,7 +10,8 @@ from typing import Final
 
 from data_contracts.match import Registration, SourceFile
 from worldpose.errors import InputError
-from worldpose.ingest.match_folder import MatchFolder, pitch_file
+from worldpose.ingest.match_folder import MatchFolder
+from worldpose.ingest.pitch_file import pitch_file
 
 SETTLE_SECONDS: Final = 0.5
 """A file that changed this recently is looked at again; recorders and copies write far oftener."""

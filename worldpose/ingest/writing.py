@@ -21,8 +21,9 @@ from worldpose.errors import InputError
 from worldpose.ingest.annotations import write_clicked_markings, write_key_frames
 from worldpose.ingest.calibration_files import write_calibration_toml
 from worldpose.ingest.keypoint_arrays import read_keypoint_arrays, write_keypoint_arrays
-from worldpose.ingest.match_folder import NO_PITCH, read_match
+from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.observations import Observations
+from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.ingest.places import require_local
 from worldpose.ingest.stills import write_still
 

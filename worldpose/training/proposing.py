@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -28,7 +30,8 @@ def propose_labels(
     """Return what detectors say of frames, after writing it as a COCO data set.
 
     The folder then holds pictures/<name>.png and labels.json, which any editor of COCO keypoints
-    takes and `read_labels` reads again.
+    takes and `read_labels` reads again. It is written whole or not at all: a failure leaves nothing
+    that would stand in the way of trying again.
 
     Args:
         frames: name and picture of each, in the order they were taken, all of one size.
@@ -37,7 +40,23 @@ def propose_labels(
         folder: absent or empty.
         settings: what is sure enough to be proposed; the defaults if None.
     """
-    settings = settings or DetectionSettings()
+    place = folder.resolve()
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{place.name}.", dir=place.parent) as workshop:
+        # One level down: a temporary folder is private, the labels have the usual rights.
+        draft = Path(workshop) / place.name
+        proposed = _write(frames, detectors, pose, draft, settings or DetectionSettings())
+        draft.rename(place)  # replaces an empty folder, fails on any other
+    return [replace(each, path=folder / each.path.relative_to(draft)) for each in proposed]
+
+
+def _write(
+    frames: Iterable[tuple[str, Picture]],
+    detectors: list[Detector],
+    pose: PoseEstimator,
+    folder: Path,
+    settings: DetectionSettings,
+) -> list[LabelledPicture]:
     (folder / "pictures").mkdir(parents=True)
     proposed, size = [], (0, 0)
     for name, picture in frames:

@@ -58,10 +58,13 @@ def test_pitch_absent_is_the_standard_one(match_folder):
     assert read_match(match_folder).pitch == PitchSpec()
 
 
-def test_pitch_none_is_no_pitch_even_beside_a_pitch_file(match_folder, edit):
-    (match_folder / "pitch.json").write_text("{}")
+def test_pitch_none_is_no_pitch_and_refused_beside_a_pitch_file(match_folder, edit):
     edit(lambda content: content.update(pitch="none"))
     assert read_match(match_folder).pitch is None
+    (match_folder / "pitch.json").write_text("{}")
+    error = refusal(match_folder)
+    assert error.where == f"{match_folder / 'match.yaml'}: pitch"
+    assert error.expected == "no `pitch: none` where pitch.json lies"
 
 
 def test_pitch_json_is_read_without_being_named(match_folder):
@@ -94,6 +97,21 @@ def test_static_camera_without_footage_is_missing(match_folder):
     error = refusal(match_folder)
     assert "missing camera cam2; there: cam1" in error.found
     assert "videos/cam2.mp4" in error.todo
+
+
+def test_a_video_of_another_suffix_is_found_and_how_to_name_it_is_said(match_folder):
+    (match_folder / "detections" / "cam2.npz").unlink()
+    (match_folder / "videos").mkdir()
+    (match_folder / "videos" / "cam2.mov").write_bytes(b"video")
+    (match_folder / "videos" / "cam2.old.mov").write_bytes(b"video")
+    assert "name it in match.yaml: `video: videos/cam2.mov`" in refusal(match_folder).todo
+
+
+def test_a_folder_of_videos_alone_is_told_what_a_match_folder_is(tmp_path):
+    (tmp_path / "videos").mkdir()
+    (tmp_path / "videos" / "cam1.mp4").write_bytes(b"video")
+    error = refusal(tmp_path)
+    assert "docs/match_folder.md" in error.todo and "worldpose import" in error.todo
 
 
 def test_a_video_in_its_usual_place_is_footage(match_folder):

@@ -20,6 +20,7 @@ from worldpose.cameras import Camera, Rigid
 from worldpose.errors import InputError, UsageError
 from worldpose.release import JointTracks, write_joints, write_moving_camera
 from worldpose.release.challenge_files import write_submission
+from worldpose.release.frame_rates import frame_rate_of, read_frame_rates, write_frame_rates
 from worldpose.release.pose_file import write_poses
 from worldpose.release.statistics import clip_statistics, data_set_statistics
 from worldpose.release.statistics_pictures import bin_edges, statistics_picture
@@ -171,3 +172,27 @@ def test_bins_are_round_and_reach_beyond_the_largest(top, width):
     edges = bin_edges([0.0, top])
     assert np.diff(edges) == pytest.approx(width)
     assert edges[-2] <= top < edges[-1] + 1e-12
+
+
+@pytest.mark.parametrize("command", ["statistics", "check"])
+def test_a_frame_rate_that_nobody_stated_is_said_and_an_export_s_is_taken(tmp_path, command):
+    places = made(np.random.default_rng(3), 50, 2).astype(np.float64)
+    joints = np.tile(places.swapaxes(0, 1)[:, :, None], (1, 1, 17, 1))
+    write_joints(tmp_path / "joints.npz", JointTracks(np.arange(50), np.arange(2), joints))
+    told = "frames a second not stated: taken as 50 (--fps)"
+    assert told in CliRunner().invoke(app, [command, str(tmp_path)]).stderr
+    assert told not in CliRunner().invoke(app, [command, str(tmp_path), "--fps", "30"]).stderr
+    write_frame_rates(tmp_path, {"A_1": 25.0})
+    assert told not in CliRunner().invoke(app, [command, str(tmp_path)]).stderr
+    assert count([tmp_path]).clips["clip"].seconds == pytest.approx(2.0)
+    assert count([tmp_path], fps=50.0).clips["clip"].seconds == pytest.approx(1.0)
+
+
+def test_clips_of_several_exports_keep_their_frame_rates(tmp_path):
+    write_frame_rates(tmp_path, {"A": 25.0})
+    write_frame_rates(tmp_path, {"B": 50.0})
+    rates = read_frame_rates(tmp_path)
+    assert [frame_rate_of(rates, clip) for clip in ("A", "B", "clip")] == [25.0, 50.0, None]
+    (tmp_path / "frame_rates.json").write_text('{"A": "fast"}')
+    with pytest.raises(InputError, match=r"frame_rates\.json"):
+        read_frame_rates(tmp_path)

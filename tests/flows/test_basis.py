@@ -1,0 +1,81 @@
+"""What a run of some stages goes on from: of which pass its results are, and of which settings."""
+
+import pytest
+from stand_ins import publish_stand_in
+from test_refitting import halves
+
+from flows.basis import basis_of
+from flows.planning import plan_run, plan_stage
+from flows.registering import register
+from flows.run_record import RunLog, latest_run
+from flows.settings import selected_stages
+from worldpose.store import Store
+
+OTHER = {"tracking": {"min_joints": 6}}
+
+
+def iterate(store, match, overrides, passes):
+    """Runs of so many passes over the method."""
+    stages = selected_stages(None, None)
+    for number in range(1, passes + 1):
+        for unit in plan_run(store, match, overrides, iteration=number):
+            if not unit.published:
+                publish_stand_in(store, match, unit)
+        log = RunLog.begin(store, match, stages, overrides, iteration=number)
+        for stage in stages:
+            log.reuse(log.plan(stage).units)
+        log.close()
+    return latest_run(store, match.match_id)
+
+
+@pytest.fixture
+def clips(tiny, tmp_path):
+    """A store, and a match of two clips."""
+    folder = halves(tiny, tmp_path / "match")
+    (folder / "calibration.toml").unlink()
+    store = Store.create(tmp_path / "project")
+    return store, register(store, folder)[0]
+
+
+@pytest.mark.parametrize("start", ["tracking", "body_fitting"])
+def test_a_later_stage_goes_on_with_the_pass_that_the_latest_run_was_made_of(clips, start):
+    store, match = clips
+    iterate(store, match, {}, 2)
+    latest = iterate(store, match, OTHER, 2)
+    stages = selected_stages(start, None)
+    basis = basis_of(store, match, stages, {}, latest, 1)
+    assert basis.iteration == 2
+    first = {unit.name: unit.key for unit in plan_run(store, match, OTHER)}
+    assert basis.before["filtering/first"] == first["filtering/first"]
+    asked = OTHER if start == "tracking" else {}
+    plan = plan_stage(store, match, stages[0], asked, basis.results, basis.before)
+    assert {unit.key for unit in plan.units} <= set(latest.results.values())
+
+
+def test_a_new_setting_of_a_later_stage_finds_the_pass_before_as_it_was(clips):
+    store, match = clips
+    latest = iterate(store, match, {}, 2)
+    stages = selected_stages("body_fitting", None)
+    for tail in (3.0, 4.0):
+        asked = {"body_fitting": {"tail": tail}}
+        log = RunLog.begin(store, match, stages, asked, iteration=1)
+        assert log.iteration == 2
+        for stage in stages:
+            plan = log.plan(stage)
+            assert not plan.blocked
+            for unit in plan.units:
+                publish_stand_in(store, match, unit)
+            log.reuse(plan.units)
+        record = log.close()
+        assert (record.state, record.iteration) == ("complete", 2)
+        kept = [name for name in latest.results if name.startswith("tracking/")]
+        assert {record.results[name] for name in kept} == {latest.results[name] for name in kept}
+
+
+def test_the_whole_method_goes_on_from_nothing_but_the_pass_before(clips):
+    store, match = clips
+    latest = iterate(store, match, OTHER, 2)
+    stages = selected_stages("ingest", "tracking")
+    assert basis_of(store, match, stages, {}, latest, 1).results == {}
+    basis = basis_of(store, match, stages, {}, latest, 2)
+    assert basis.before == {unit.name: unit.key for unit in plan_run(store, match, {})}

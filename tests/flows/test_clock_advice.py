@@ -1,0 +1,51 @@
+"""Cameras out of step are named with the offset that puts them right."""
+
+import pytest
+
+from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from flows.clock_advice import clock_advice
+
+
+def match(cameras, offset=0, clips=("clip",)):
+    return MatchSpec(
+        match_id="m",
+        fps=25.0,
+        cameras=tuple(
+            CameraSpec(id=f"cam{c}", width=10, height=10, offset_frames=0 if c else offset)
+            for c in range(cameras)
+        ),
+        clips=tuple(ClipSpec(id=clip, frame_count=9) for clip in clips),
+    )
+
+
+def figures(late, error=0.06):
+    """As filtering says them, against the mean; the errors are from another stage."""
+    mean = sum(late) / len(late)
+    return {
+        "triangulation/clip": {f"clock_error_frames.cam{c}": error for c in range(len(late))},
+        "filtering/clip": {f"clock_late_frames.cam{c}": v - mean for c, v in enumerate(late)},
+    }
+
+
+@pytest.mark.parametrize("cameras", [3, 4, 6])
+@pytest.mark.parametrize(
+    ("late", "told"), [(3.0, "3.0 frames later"), (-2.2, "2.2 frames earlier")]
+)
+def test_the_one_camera_out_of_step_is_told_its_offset(cameras, late, told):
+    found = clock_advice(figures([late] + [0.0] * (cameras - 1)), match(cameras, offset=3))
+    (text,) = found
+    assert text.startswith(f"camera cam0 shows {told} than the others")
+    assert f"set its offset_frames to {3 - round(late)} in match.yaml" in text
+
+
+def test_of_two_cameras_one_is_moved():
+    assert len(clock_advice(figures([0.0, 3.0]), match(2))) == 1
+
+
+@pytest.mark.parametrize(("late", "error"), [(0.4, 0.01), (3.0, 1.0)])
+def test_what_no_whole_frame_mends_or_nobody_knows_is_not_told(late, error):
+    assert clock_advice(figures([late, 0.0, 0.0, 0.0], error), match(4)) == []
+
+
+def test_a_run_without_figures_of_clocks_tells_nothing():
+    assert clock_advice({"ingest/cam0": {"frames": 9.0}}, match(3)) == []

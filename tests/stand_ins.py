@@ -1,0 +1,36 @@
+"""Something in the place of units' results, for tests of what is decided from their keys alone."""
+
+from datetime import UTC, datetime
+
+from data_contracts.records import CONTRACT_VERSION
+from data_contracts.run import ResultManifest
+from worldpose.store import ResultId
+from worldpose.store.canonical import digest
+from worldpose.store.documents import checksum_of, seal
+from worldpose.store.paths import MANIFEST
+from worldpose.store.writer import content_of, stored_files
+
+
+def publish_stand_in(store, match, unit, files=("zarr.json",)):
+    """Publish a planned unit without computing it, of so many files as it is given names."""
+    folder = store.blobs.staging()
+    for name in files:
+        file = folder / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(f"{unit.name} {name}")
+    stored = stored_files(folder)
+    manifest = ResultManifest(
+        contract=CONTRACT_VERSION,
+        key=unit.key,
+        recipe=unit.recipe,
+        files=stored,
+        content=content_of(stored),
+        figures={},
+        created_at=datetime.now(UTC),
+        seconds=1.0,
+        run_id="0001",
+        checksum=digest(b""),
+    )
+    manifest = manifest.model_copy(update={"checksum": checksum_of(manifest)})
+    path = ResultId.of(unit.work(store.url, match, "0001")).path
+    assert store.blobs.publish_tree(folder, path, MANIFEST, seal(manifest))
