@@ -25,15 +25,21 @@ from worldpose.store import Store, pin_run
 
 CLASHING = {"worldpose", "challenge", "challenge-2025"}
 """Formats that want the same file names; a folder holds one of them."""
+COUNTED = {"joints", *CLASHING}
+"""Formats that `check` and `statistics` read, and that do not say the frame rate."""
 
 
 def export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
-    """Writes a run in several formats, and frame_rates.json, into one folder; returns the files.
+    """Writes a run in several formats into one folder; returns the files.
+
+    With what `check` and `statistics` read goes frame_rates.json.
 
     Raises:
         UsageError: an unknown format, or two that want the same files.
     """
     written = _export(origin, forms, out)
+    if not COUNTED & set(forms):
+        return written
     rates = dict.fromkeys(origin.clips, origin.spec.fps)
     return [*written, write_frame_rates(out, rates)]
 
