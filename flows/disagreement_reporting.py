@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flows.camera_reporting import still_of
 from flows.match_pictures import frame_picture
@@ -15,8 +14,6 @@ from flows.stage import Match
 from worldpose.release import JointTracks, Picture
 from worldpose.release.detection_pictures import detections_picture
 from worldpose.store import Run, Store
-
-Floats = NDArray[np.float64]
 
 SHOWN: Final = 2
 """Views that are shown: the worst, each of another person."""

@@ -14,9 +14,6 @@ from flows.stage import Match
 from worldpose.errors import StoreError, WorldposeError
 from worldpose.store import Store
 
-QUIET_SECONDS = 30.0
-"""How long nothing of an arrival may have changed: copies over a network pause for seconds."""
-
 Begin = Callable[[Match, Arrival], str]
 """Gives a match its run, once however often it is called; the run's id at Prefect."""
 

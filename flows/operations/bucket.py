@@ -31,7 +31,6 @@ class BucketInbox:
     Attributes:
         url: `s3://bucket/prefix`; credentials and endpoint are the environment's, as of a project.
         inbox: the folder that they are copied to.
-        state: where it is kept what was seen and copied.
     """
 
     def __init__(self, url: str, inbox: Path, state: StateFolder) -> None:

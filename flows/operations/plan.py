@@ -9,7 +9,6 @@ from pydantic import Field
 from data_contracts.records import Name, Record
 from flows.operations.layout import StateFolder
 
-PREFECT_PORT = 4200
 METRICS_PORT = 8573
 FLOWS = ("match", "ingest", "reprocess", "release", "finetune")
 """What the Prefect server offers, known without importing Prefect."""

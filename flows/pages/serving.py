@@ -9,9 +9,6 @@ import uvicorn
 from flows.pages.access import LOOPBACK, Access
 from flows.pages.app import create_app
 
-PORT = 8571
-"""Where the pages are unless told otherwise."""
-
 
 def serve(
     project: str, access: Access, *, host: str, port: int, tls: tuple[Path, Path] | None

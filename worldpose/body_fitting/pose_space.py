@@ -36,7 +36,6 @@ COORDINATES: Final = (
 """Joints that share a turn evenly; three coordinates each."""
 SIZE: Final = 3 * len(COORDINATES)
 
-_FREE: Final = 4.0
 _LIMITS: Final = {
     # Ranges of motion that only contortionists leave [rad]: lowest, highest by axis. The body's
     # unposed arms point sideways, so a shoulder's third angle hangs the arm.

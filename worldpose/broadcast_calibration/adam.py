@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.solving import Problem, Solution, equations_at
-
-Floats = NDArray[np.float64]
 
 RATE = 1e-3
 """Step of every number [its unit; thousands of pixels for the principal point] (M5)."""

@@ -14,7 +14,6 @@ from pydantic import Field
 from data_contracts.records import Record
 from worldpose.broadcast_calibration.optical_flow import follow
 
-Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 _POINTS: Final = 200

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE, MovingCamera
+from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.cameras import Rigid
 
 Floats = NDArray[np.float64]
@@ -47,7 +47,3 @@ def add_smoothness(camera: MovingCamera, spread: Floats, blocks: Floats, right: 
             begin = slice(second, second + count)
             blocks[first - second][begin, used, used] += one * factors[second] * information
     return 0.5 * float((gone**2).sum())
-
-
-FREE = np.full(FRAME_SIZE, np.inf)
-"""No smoothness at all."""

@@ -25,9 +25,7 @@ from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.bundle_adjustment.solving import Adjusted, solve
 from worldpose.bundle_adjustment.survey import survey_response, with_shared_errors
 from worldpose.cameras import Camera
-from worldpose.static_calibration import PARAMETERS
 
-_SIZE: Final = len(PARAMETERS)
 _STRANGER: Final = "refused: it shows other people than the other cameras do under the same ids"
 _ROUNDS: Final = 3
 """Solutions from which noise is learned; the third changes little."""

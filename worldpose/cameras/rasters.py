@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from worldpose.compiled import compiled
 
-Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 

@@ -20,8 +20,6 @@ from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.views import Tiled
 from worldpose.pitch import PitchTemplate
 
-Floats = NDArray[np.float64]
-
 STRETCH: Final = 64
 """Frames of a stretch."""
 

@@ -12,12 +12,6 @@ from data_contracts.conventions import COCO17
 LIMB_JOINTS: Final = COCO17[5:]
 """Shoulders, elbows, wrists, hips, knees and ankles, left before right."""
 
-PAPER_JOINTS: Final = ("nose", "neck", *LIMB_JOINTS)
-"""E4. COCO-17 has no neck: it is the middle of the shoulders by construction, on both sides."""
-
-CHALLENGE_JOINTS: Final = ("nose", *LIMB_JOINTS)
-"""The challenge's 15 joints but the big toes, which COCO-17 lacks."""
-
 
 def paper_joints(joints: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the joints of E4 (..., 14, 3) [m], NaN where missing.

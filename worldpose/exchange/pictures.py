@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Literal, TypeAlias
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,6 @@ Floats = NDArray[np.float64]
 CORNER: Final = 0.5
 """What the corner of a picture is from the centre of its first pixel [px]: CVAT and Label Studio
 count from the corner, the conventions of worldpose and its COCO files from the centre."""
-Visibility: TypeAlias = Literal[0, 1, 2]
-"""As in COCO: 2 seen, 1 hidden, 0 not there."""
 SEEN: Final = 0.5
 """Keypoints from this confidence on are written as seen, others as hidden [1]."""
 

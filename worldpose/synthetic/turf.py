@@ -17,7 +17,6 @@ from worldpose.compiled import compiled
 from worldpose.pitch import PitchTemplate
 
 Floats = NDArray[np.float64]
-Pictures = NDArray[np.float32]
 
 LINE_WIDTH: Final = 0.12
 """Of the painted markings, all of it on both sides of the template's line [m] (Law 1)."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -29,7 +28,6 @@ from worldpose.training.pictures import PictureCache
 from worldpose.training.settings import FineTuningSettings
 
 Pictures = Sequence[LabelledPicture]
-Net = TypeVar("Net", PeopleNet, KeypointNet)
 
 FIGURES: dict[NetKind, str] = {"people": "ap50", "keypoints": "pck"}
 """What each net is judged by: boxes at an overlap of a half, keypoints within 0.2 torsos."""

@@ -19,8 +19,6 @@ from worldpose.training.keypoint_training import RIGHT
 from worldpose.training.labels import LabelledPicture
 from worldpose.training.pictures import PictureCache
 
-Floats = NDArray[np.float64]
-
 HEIGHTS = ((34.0, 46.0), (52.0, 70.0), (70.0, 160.0))
 """Classes of people's heights [px]: of about 40, of about 60, and taller."""
 

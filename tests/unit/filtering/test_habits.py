@@ -8,7 +8,8 @@ from planted_errors import plant
 
 from data_contracts.conventions import COCO17
 from worldpose.cameras import Rigid
-from worldpose.filtering.habits import watch_motion
+from worldpose.filtering import FilteringSettings
+from worldpose.filtering.habits import learn_habits, watch_motion
 from worldpose.filtering.lateness import ClockEquations
 from worldpose.filtering.misses import Misses
 from worldpose.filtering.view_bias import TERMS, ViewBias, find_azimuths, learn_view_bias
@@ -107,6 +108,33 @@ def test_equations_of_clocks_hold_for_what_is_left_of_the_misses(scene):
     left = misses.less(0.3 * bodies[-1])
     found = ClockEquations.of(*bodies, misses).learn_lateness(left)
     np.testing.assert_array_equal(found, ClockEquations.of(*bodies, left).learn_lateness(left))
+
+
+def test_a_late_clock_is_learned_beside_sides_and_its_shift_brings_keypoints_back():
+    scene = plant(31, duration=2.0)
+    motion = watch_motion(scene.cameras, scene.joints, np.gradient(scene.joints, axis=0))
+    late = np.array([0.0, 0.6, 0.0, 0.0, 0.0, 0.0])
+    at = np.nonzero(scene.suspects.index >= 0)
+    place = (*at[:2], scene.suspects.index[at])
+    keypoints = scene.suspects.keypoints.copy()
+    keypoints[place] += late[at[1], None, None] * motion.way[at]
+    suspects = replace(scene.suspects, keypoints=keypoints)
+    people = (scene.cameras, scene.joints, scene.views, motion, suspects)
+    habits = learn_habits(*people, FilteringSettings(), 25.0)
+    # What leans to the sides' account, or to the clocks', leaves less than a tenth of a frame.
+    np.testing.assert_allclose(habits.late - habits.late.mean(), late - late.mean(), atol=0.07)
+    right = suspects.without(habits.shift(motion, scene.views))
+    exact = replace(habits, late=np.zeros(6)).shift(motion, scene.views)
+    on_time = scene.suspects.without(exact).keypoints
+    here = at[1] == 1
+    honest = ~scene.displaced[place][here]
+
+    def beside(found):
+        return np.linalg.norm((found - on_time)[place][here][honest], axis=-1)
+
+    assert np.nanmean(beside(right.keypoints)) < 0.4 * np.nanmean(
+        beside(suspects.without(exact).keypoints)
+    )
 
 
 def test_shifts_go_with_the_joint_that_a_keypoint_is(scene):
