@@ -1,5 +1,6 @@
 """What an edit touches, match by match: exactly what was made from it, found without running."""
 
+import json
 import sys
 from contextlib import contextmanager
 
@@ -19,8 +20,10 @@ from flows.reprocess import UnprocessedError, reprocess
 from flows.reprocessing import Reprocessed, reprocess_matches
 from flows.review import correct
 from flows.running import RunRequest
+from flows.stale import edits_since
 from flows.touched import find_touched
 from flows.tracking import STAGE
+from worldpose.errors import InputError
 from worldpose.store import ResultId, Store
 from worldpose.store.paths import record_path
 
@@ -182,6 +185,25 @@ def test_a_result_that_was_withdrawn_is_a_reason_and_no_failure(store):
     store.withdraw(ResultId(TINY, "tracking", "clip", store.run(TINY).results["tracking/clip"]))
     found = {unit.unit: unit for unit in find_touched(store, TINY).units}
     assert any("withdrawn" in reason for reason in found["tracking/clip"].own_reasons)
+
+
+def test_a_match_whose_weights_are_gone_is_a_problem_of_its_own(store, tmp_path):
+    gone = tmp_path / "gone.onnx"
+    finish(store, overrides={"detection": {"pose": f"onnx:{gone}"}})
+    status = json.loads(
+        CliRunner().invoke(app, ["status", "--project", store.url, "--json"]).stdout
+    )
+    assert str(gone) in json.dumps(status)
+
+
+def test_a_result_that_holds_a_withdrawn_edit_is_not_taken_for_one_without_it():
+    edits = [MergedTracks(clip="clip", kept=0, merged=person) for person in (1, 2, 3)]
+    held = [edit.model_dump(mode="json") for edit in edits[:2]]
+    assert edits_since(edits, held, "clip", "match") == edits[2:]
+    assert edits_since(edits, [], "clip", "match") == edits
+    for standing in (edits[1:], edits[:1], []):
+        with pytest.raises(InputError, match="withdrawn"):
+            edits_since(standing, held, "clip", "match")
 
 
 def test_a_match_that_fails_stops_no_other(store, tiny, tmp_path, monkeypatch):
