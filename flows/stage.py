@@ -48,7 +48,7 @@ def once_a_match(table: Callable[[Match], T]) -> Callable[[Match], T]:
     """Work out a table of a match once, though planning asks for it at every unit.
 
     Hundreds of clips of many cameras are thousands of units: what looks through all of them for
-    each one would take an hour.
+    each one grows with their cube.
     """
 
     @wraps(table)
