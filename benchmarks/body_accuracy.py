@@ -40,7 +40,7 @@ from worldpose.release import JointTracks
 from worldpose.synthetic import SCENARIOS, Scene, simulate_scene
 from worldpose.synthetic.monocular import MonocularErrors, estimate_bodies
 from worldpose.tracking import TrackingSettings, track_people
-from worldpose.triangulation import TriangulationSettings, reconstruct_joints
+from worldpose.triangulation import TriangulationSettings, put_right, reconstruct_joints
 
 Floats = NDArray[np.float64]
 BODY = load_open_body()
@@ -151,7 +151,8 @@ def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
     dark = thinned(scene, index, left, seed)
     placed = reconstruct_joints(cameras, *arrays, index, fps, TRIANGULATION).triangulation
     joints, covariance = placed.joints, placed.covariance
-    static = find_sightings(cameras, seen.keypoints, index, joints)
+    right = put_right(seen.keypoints, index, placed.exchanged)
+    static = find_sightings(cameras, right, index, joints)
     ground = PitchTemplate.from_spec(scene.surveyed).height
 
     def fitted(views: list, glimpses: object = None) -> BodyFit:

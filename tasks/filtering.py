@@ -53,14 +53,19 @@ def filtering(work: Work) -> str:
             settings,
             case.clip.fps * len(chosen) / len(case.clip.frame),
         )
-        spread = learn_from(views, suspects.without(habits.shift(motion, views)))
+        held = np.zeros(len(case.clip.camera_ids))
+        if case.first:
+            held = habits.late_in_offsets(suspects.offsets, motion)
+        placed = suspects.less_clocks(held, motion.way)
+        spread = learn_from(views, placed.without(habits.shift(motion, views)))
         counts = np.zeros(5)
         rejected = np.zeros((2, len(case.clip.camera_ids)))
         for first in range(0, len(case.clip.frame), PART):
             frames = np.arange(first, min(first + PART, len(case.clip.frame)))
             views, motion, suspects = case.at(frames)
             shift = habits.shift(motion, views)
-            judged = judge_detections(views, suspects.without(shift), spread, settings)
+            placed = suspects.less_clocks(held, motion.way)
+            judged = judge_detections(views, placed.without(shift), spread, settings)
             counts += _counts(judged, suspects)
             rejected += [
                 judged.rejected.sum(axis=(0, 2, 3)),
@@ -119,6 +124,11 @@ class _Case:
     placed: xr.Dataset
     dropped: NDArray[np.bool_] | None
     triangulation: TriangulationSettings
+
+    @property
+    def first(self) -> bool:
+        """Whether no pass came before, of which keypoints were shifted."""
+        return self.dropped is None
 
     def at(self, frames: NDArray[np.int64]) -> tuple[BodyViews, BodyMotion, Suspects]:
         """The bodies in all pictures, how they move there, and what was detected."""

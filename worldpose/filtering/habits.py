@@ -54,6 +54,21 @@ class Habits:
         sides = self.view_bias.shift(motion.azimuth, _scale(views))
         return np.asarray(sides + self.late[:, None, None, None] * motion.way)
 
+    def late_in_offsets(self, offsets: Floats, motion: BodyMotion) -> Floats:
+        """Return which part of the lateness people's offsets hold already (cameras,) [frame].
+
+        They are of joints placed before anybody knew of clocks, so that a camera seems to see
+        people beside where they are along their way.
+
+        Args:
+            offsets: (frames, cameras, persons, 2) [px], as of `Suspects`.
+            motion: of the bodies.
+        """
+        way = np.nan_to_num(motion.way.mean(axis=-2))
+        along = (np.nan_to_num(offsets) * way).sum(axis=(0, 2, 3))
+        held = along / np.maximum((way**2).sum(axis=(0, 2, 3)), 1e-12)
+        return np.clip(held, np.minimum(self.late, 0.0), np.maximum(self.late, 0.0))
+
 
 @dataclass(frozen=True, eq=False)
 class BodyMotion:

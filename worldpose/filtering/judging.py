@@ -54,6 +54,16 @@ class Suspects:
         """
         return replace(self, keypoints=self.keypoints - self.by_detection(shift))
 
+    def less_clocks(self, late: Floats, way: Floats) -> Suspects:
+        """Return the same with offsets less what of them is a camera's lateness.
+
+        Args:
+            late: (cameras,) [frame].
+            way: (frames, cameras, persons, 17, 2) [px], of joints in a frame; NaN = unknown.
+        """
+        part = late[:, None, None] * np.nan_to_num(way.mean(axis=-2))
+        return replace(self, offsets=self.offsets - part)
+
     def by_detection(self, shift: Floats) -> Floats:
         """Return the same shift (frames, cameras, detections, 17, 2) [px]; 0 = of nobody, unknown.
 

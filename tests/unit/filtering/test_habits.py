@@ -8,8 +8,8 @@ from planted_errors import plant
 
 from data_contracts.conventions import COCO17
 from worldpose.cameras import Rigid
-from worldpose.filtering import FilteringSettings
-from worldpose.filtering.habits import learn_habits, watch_motion
+from worldpose.filtering import FilteringSettings, judge_detections, learn_from
+from worldpose.filtering.habits import Habits, learn_habits, watch_motion
 from worldpose.filtering.lateness import ClockEquations
 from worldpose.filtering.misses import Misses
 from worldpose.filtering.view_bias import TERMS, ViewBias, find_azimuths, learn_view_bias
@@ -110,22 +110,36 @@ def test_equations_of_clocks_hold_for_what_is_left_of_the_misses(scene):
     np.testing.assert_array_equal(found, ClockEquations.of(*bodies, left).learn_lateness(left))
 
 
+def with_a_late_camera(scene, frames, held):
+    """The scene's habits, and what was detected there with a camera of which that is late.
+
+    Args:
+        held: share of the lateness that people's offsets hold.
+    """
+    motion = watch_motion(scene.cameras, scene.joints, np.gradient(scene.joints, axis=0))
+    late = np.array([0.0, frames, 0.0, 0.0, 0.0, 0.0])
+    at = np.nonzero(scene.suspects.index >= 0)
+    keypoints = scene.suspects.keypoints.copy()
+    shift = late[:, None, None, None] * motion.way
+    keypoints[(*at[:2], scene.suspects.index[at])] += shift[at]
+    offsets = held * np.nan_to_num(shift.mean(axis=-2))
+    suspects = replace(scene.suspects, keypoints=keypoints, offsets=offsets)
+    return Habits(ViewBias.none(), late), motion, suspects
+
+
 def test_a_late_clock_is_learned_beside_sides_and_its_shift_brings_keypoints_back():
     scene = plant(31, duration=2.0)
-    motion = watch_motion(scene.cameras, scene.joints, np.gradient(scene.joints, axis=0))
-    late = np.array([0.0, 0.6, 0.0, 0.0, 0.0, 0.0])
-    at = np.nonzero(scene.suspects.index >= 0)
-    place = (*at[:2], scene.suspects.index[at])
-    keypoints = scene.suspects.keypoints.copy()
-    keypoints[place] += late[at[1], None, None] * motion.way[at]
-    suspects = replace(scene.suspects, keypoints=keypoints)
+    true, motion, suspects = with_a_late_camera(scene, 0.6, held=0.0)
     people = (scene.cameras, scene.joints, scene.views, motion, suspects)
     habits = learn_habits(*people, FilteringSettings(), 25.0)
     # What leans to the sides' account, or to the clocks', leaves less than a tenth of a frame.
-    np.testing.assert_allclose(habits.late - habits.late.mean(), late - late.mean(), atol=0.07)
+    late = true.late - true.late.mean()
+    np.testing.assert_allclose(habits.late - habits.late.mean(), late, atol=0.07)
     right = suspects.without(habits.shift(motion, scene.views))
     exact = replace(habits, late=np.zeros(6)).shift(motion, scene.views)
     on_time = scene.suspects.without(exact).keypoints
+    at = np.nonzero(scene.suspects.index >= 0)
+    place = (*at[:2], scene.suspects.index[at])
     here = at[1] == 1
     honest = ~scene.displaced[place][here]
 
@@ -135,6 +149,34 @@ def test_a_late_clock_is_learned_beside_sides_and_its_shift_brings_keypoints_bac
     assert np.nanmean(beside(right.keypoints)) < 0.4 * np.nanmean(
         beside(suspects.without(exact).keypoints)
     )
+
+
+def test_a_clock_in_the_offsets_is_not_taken_off_twice():
+    scene = plant(31, duration=2.0)
+    habits, motion, suspects = with_a_late_camera(scene, 0.8, held=0.7)
+    held = habits.late_in_offsets(suspects.offsets, motion)
+    np.testing.assert_allclose(held, 0.7 * habits.late, atol=1e-9)
+    shift = habits.shift(motion, scene.views)
+    honest = ~scene.displaced[:, 1]
+
+    def rejected(suspects):
+        right = suspects.without(shift)
+        spread = learn_from(scene.views, right)
+        judged = judge_detections(scene.views, right, spread, FilteringSettings())
+        return judged.rejected[:, 1][honest].mean()
+
+    twice = rejected(suspects)
+    once = rejected(suspects.less_clocks(held, motion.way))
+    on_time = rejected(replace(suspects, offsets=np.zeros_like(suspects.offsets)))
+    assert once == pytest.approx(on_time, abs=1e-3)
+    assert twice > 1.5 * once
+
+
+@pytest.mark.parametrize(("held", "share"), [(-0.4, 0.0), (1.7, 1.0)])
+def test_no_more_is_of_clocks_in_offsets_than_cameras_are_late(scene, held, share):
+    habits, motion, suspects = with_a_late_camera(scene, -0.5, held)
+    found = habits.late_in_offsets(suspects.offsets, motion)
+    np.testing.assert_allclose(found, share * habits.late, atol=1e-9)
 
 
 def test_shifts_go_with_the_joint_that_a_keypoint_is(scene):
