@@ -1,4 +1,4 @@
-"""What bodies are fitted to: keypoints as they were triangulated, shapes as other clips said."""
+"""What bodies are fitted to: keypoints as triangulated, other clips' shapes, late pictures."""
 
 from types import SimpleNamespace
 
@@ -9,6 +9,12 @@ import xarray as xr
 from data_contracts.conventions import COCO17
 from tasks import body_fitting, refitting
 from tasks.clip_inputs import ClipInputs
+from worldpose.body_fitting.monocular import MonocularEstimates
+from worldpose.body_fitting.moving_view import sight_people
+from worldpose.body_fitting.pose_space import GATHER
+from worldpose.cameras import Camera, Rigid
+from worldpose.cameras.stored import camera_arrays
+from worldpose.synthetic.stadium import looking
 
 LEGS = [COCO17.index(f"{side}_{name}") for name in ("knee", "ankle") for side in ("left", "right")]
 
@@ -52,3 +58,100 @@ def test_clips_that_say_nothing_of_somebody_leave_him_anybody(monkeypatch, weigh
     known = refitting._known(None, SimpleNamespace(recipe=recipe), np.array([2, 3]), weight)
     assert list(known) == [1]
     np.testing.assert_allclose(known[1].covariance, np.eye(10) / weight)
+
+
+def beside(frames):
+    """A camera 70 m beside the pitch (frames,), which looks at the origin."""
+    pose = looking(np.array([0.0, -70.0, 15.0]), np.array([0.0, 0.0, 1.0]), 0.0)
+    return Camera(
+        focal=np.full((frames, 2), 4000.0),
+        principal_point=np.tile([959.5, 539.5], (frames, 1)),
+        distortion=np.zeros((frames, 5)),
+        cam_from_world=Rigid(
+            np.tile(pose.rotation, (frames, 1, 1)), np.tile(pose.translation, (frames, 1))
+        ),
+        image_size=np.tile([1920, 1080], (frames, 1)),
+    )
+
+
+def runner(frame):
+    """Joints (frames, 1, 17, 3) of somebody who goes 0.7 m a frame, slanting away."""
+    body = np.stack([np.tile([-0.2, 0.2], 9)[:17], np.zeros(17), np.linspace(0.1, 1.8, 17)], -1)
+    return (body + (frame - 5.5)[:, None, None] * [0.5, 0.5, 0.0])[:, None]
+
+
+def of_clip(**sources):
+    """Work on the clip of twelve frames from match frame 100 on."""
+    here = {"first_frame": 100, "frame_count": 12, **sources}
+    inputs = {"broadcast_calibration/clip": "key"}
+    recipe = SimpleNamespace(match_id="match", unit="clip", inputs=inputs, sources=here)
+    return SimpleNamespace(recipe=recipe, folder="folder")
+
+
+@pytest.mark.parametrize(("feed_offset", "late"), [("report", -0.25), ("correct", 1.25)])
+def test_pictures_are_late_by_what_rounding_leaves_and_what_was_measured(
+    monkeypatch, feed_offset, late
+):
+    arrays = camera_arrays(beside(3))
+    found = xr.Dataset(
+        {
+            name: ([f"{name}_{axis}" for axis in range(values.ndim)], values)
+            for name, values in {**arrays, "reprojection_error": np.array([1.0, 2.5, 2.0])}.items()
+        },
+        attrs={"feed_offset": {"frames": 1.5}},
+    )
+    monkeypatch.setattr(refitting, "open_input", lambda *_: found)
+    calibrated = SimpleNamespace(recipe=SimpleNamespace(settings={"feed_offset": feed_offset}))
+    store = SimpleNamespace(manifest=lambda *_: calibrated)
+    work = of_clip(offset_frames=4, broadcast_offset_frames=4.25)
+    pictures = refitting._pictures(store, work, np.arange(100, 103))
+    # Match frame 100 is at 104.25 of the video: its picture 104 was taken a quarter earlier. The
+    # feed was measured to show what static cameras show one and a half frames on.
+    assert pictures.late == late
+    assert pictures.number.tolist() == [104, 105, 106]
+    assert np.isfinite(pictures.camera.focal).all(axis=-1).tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("late", [1.0, -2.0, 0.5])
+def test_lines_of_pictures_that_are_late_are_those_of_the_frames(monkeypatch, late):
+    frame, camera = np.arange(12), beside(12)
+    keypoints = camera.project(runner(frame + late)[:, 0])[:, None]
+    seen = xr.Dataset(
+        {"keypoints": (("frame", "detection", "joint", "axis"), keypoints)},
+        coords={"frame": 100 + frame},
+    )
+    monkeypatch.setattr(refitting, "open_input", lambda *_: seen)
+    pictures = refitting._Pictures(frame, camera, late)
+    view = refitting._view(None, of_clip(seen_in_broadcast="ingest/clip"), pictures, runner(frame))
+    there = view.seen[:, 0]
+    assert there.sum() >= 10
+    # He runs straight on, so that the middle of two of his places is one.
+    np.testing.assert_allclose(view.points[there], runner(frame)[there], atol=1e-6)
+    # 7 mrad a frame along the picture, and what bends of it in between.
+    own = camera.project(runner(frame)[:, 0])[:, None]
+    here = sight_people(camera, own, runner(frame)).across
+    np.testing.assert_allclose(view.across[there], here[there], atol=1e-4)
+
+
+@pytest.mark.parametrize("late", [1.0, -2.0])
+def test_bodies_of_pictures_that_are_late_are_those_of_the_frames(monkeypatch, late):
+    frame, camera = np.arange(12), beside(12)
+
+    def turned(time):
+        return Rigid.from_rotvec(time[:, None] * [0.0, 0.0, 0.1], np.zeros(3)).rotation
+
+    rotations = np.repeat(turned(frame + late)[:, None], 24, axis=1)
+    rotations[:, 0] = camera.cam_from_world.rotation @ rotations[:, 0]
+    image = camera.project(runner(frame + late)[:, 0])
+    middle = 0.5 * (image.min(axis=1) + image.max(axis=1))
+    estimates = MonocularEstimates(104 + frame, rotations, middle, False)
+    monkeypatch.setattr(refitting, "read_monocular", lambda path: estimates)
+    monkeypatch.setattr(refitting, "require_registered", lambda *_: None)
+    work = of_clip(estimates="bodies.npz", estimates_sha256="")
+    pictures = refitting._Pictures(104 + frame, camera, late)
+    found = refitting._glimpses(work, pictures, runner(frame))
+    there = np.isfinite(found.orient).all(axis=(-2, -1))[:, 0]
+    assert there.sum() >= 10
+    np.testing.assert_allclose(found.orient[there, 0], turned(frame[there]), atol=1e-9)
+    turns = frame[there, None] * np.tile([0.0, 0.0, 0.1], 23)
+    np.testing.assert_allclose(found.angles[there, 0], turns @ GATHER.T, atol=1e-9)

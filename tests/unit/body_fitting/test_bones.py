@@ -123,3 +123,13 @@ def test_clips_that_say_nothing_leave_the_betas_of_anybody_whatever_these_weigh(
         pooled = pool_shapes(clips, weight)
         np.testing.assert_allclose(pooled.betas, clips[0].betas, atol=1e-12)
         np.testing.assert_allclose(pooled.covariance, clips[0].covariance, atol=1e-12)
+
+
+def test_limbs_are_never_shortened_by_more_than_a_small_part():
+    joints = np.zeros((1, 17, 3))
+    joints[:, 13, 2], joints[:, 15, 2] = -0.4, -0.8
+    # Two joints of 0.5 m along two axes across: 0.5 m^2 over 0.4 m would be longer than the limb.
+    covariance = np.broadcast_to(0.25 * np.eye(3), (1, 17, 3, 3))
+    shortened = shorten_limbs(joints, covariance)
+    # 15 % of 0.4 m each; the ankle goes with the knee.
+    np.testing.assert_allclose(shortened[0, [13, 15], 2], [-0.34, -0.68])

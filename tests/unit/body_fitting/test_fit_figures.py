@@ -1,5 +1,7 @@
 """Figures of a fit without the truth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_glimpses import broadcast
@@ -37,3 +39,13 @@ def test_without_pictures_there_is_no_reprojection():
     joints, covariance = seen(walker(5, rng), 0.01, rng)
     fit = fit_bodies(MODEL, joints, covariance, 50.0, BodyFittingSettings())
     assert report_fit(fit, joints, 50.0).reprojection_px == (None,)
+
+
+def test_jerk_is_the_root_mean_square_of_third_derivatives():
+    joints, covariance = seen(walker(6, np.random.default_rng(3)), 0.01, np.random.default_rng(3))
+    fit = fit_bodies(MODEL, joints, covariance, 50.0, BodyFittingSettings())
+    # 6 times 2 m/s^3 of a cube of time; the nose alone stays.
+    moved = np.tile(fit.joints[:1], (6, 1, 1, 1))
+    moved[:, :, 1:, 0] += 2.0 * (np.arange(6) / 50.0)[:, None, None] ** 3
+    report = report_fit(replace(fit, joints=moved), joints, 50.0)
+    assert report.jerk_m_s3[0] == pytest.approx(12.0 * np.sqrt(16.0 / 17.0))

@@ -74,3 +74,19 @@ def test_without_people_there_are_no_offsets():
     shapes = fit_shapes(SOLVER, {}, {}, 50.0)
     assert shapes.people == {}
     np.testing.assert_array_equal(shapes.offsets, 0.0)
+
+
+def test_what_few_seconds_say_of_offsets_is_held_back_by_how_often_errors_repeat():
+    _, joints = people(1, 100, 0.01)
+    for _, (places, _) in joints.items():
+        places[:, [15, 16], 2] += 0.04
+    sizes, spreads = [], []
+    for repeat in (1e6, 40.0, 0.02):
+        settings = SETTINGS.model_copy(update={"bias_time": repeat})
+        shapes = fit_shapes(Solver(SOLVER.chained, SOLVER.prior, settings, None), joints, {}, 50.0)
+        sizes.append(np.linalg.norm(shapes.offsets[15]))
+        spreads.append(np.trace(shapes.offsets_covariance[15]))
+    # The prior counts once for the two seconds, and a hundred times where errors repeat as often.
+    assert sizes[0] == sizes[1] > 0.01
+    assert sizes[2] < 0.1 * sizes[1]
+    assert spreads[2] < 0.02 * spreads[1]

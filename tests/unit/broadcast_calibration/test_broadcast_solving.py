@@ -54,16 +54,16 @@ def test_exact_evidence_gives_the_exact_camera():
 def test_noisy_evidence_gives_the_camera_within_its_covariance():
     true = clip.moving(30)
     ratios = []
-    for seed in range(6):
+    for seed in range(12):
         rng = np.random.default_rng(seed)
         problem = problem_of(true, rng)
         solution = solve(off(true, rng), problem, 40)
         covariance = uncertainty_of(solution, problem).clip[:3, :3]
         gone = solution.camera.center - true.center
         ratios.append(gone @ np.linalg.solve(covariance, gone) / 3.0)
-    # Chi-square of 18 over 18 lies below 2.2 in all but a thousandth; the covariance is at most
-    # twice too wide.
-    assert 0.05 < np.mean(ratios) < 2.2
+    # Errors that do not last: the covariance is too wide by two. Chi-square of 36 over 36 lies
+    # between 0.45 and 1.9 in all but a thousandth on either side.
+    assert 0.22 < np.mean(ratios) < 0.95
 
 
 def place_covariance(camera, uncertainty, place, frame=10):
@@ -250,7 +250,7 @@ def test_what_is_held_is_known_exactly_and_the_rest_within_its_covariance():
     known[0] = True
     held = known | (np.arange(7) >= 3)
     place, ratios = np.array([1.0, -3.0, 0.0]), []
-    for seed in range(6):
+    for seed in range(30):
         rng = np.random.default_rng(seed)
         problem = replace(
             problem_of(true, rng, smooth=np.full(7, np.inf)),
@@ -272,8 +272,9 @@ def test_what_is_held_is_known_exactly_and_the_rest_within_its_covariance():
             place[None]
         )
         ratios.append(float(gone[0] @ np.linalg.solve(covariance, gone[0])) / 2.0)
-    # Chi-square of 12 over 12 lies below 2.75 in all but a thousandth; at most twice too wide.
-    assert 0.05 < np.mean(ratios) < 2.75
+    # Too wide by two here as well; chi-square of 60 over 60 lies between 0.53 and 1.66 in all but
+    # a thousandth on either side.
+    assert 0.26 < np.mean(ratios) < 0.83
 
 
 def test_adam_goes_down_the_same_cost_and_stays_above():

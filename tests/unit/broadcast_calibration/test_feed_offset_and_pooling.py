@@ -134,3 +134,32 @@ def test_drawing_a_clip_to_its_own_place_changes_nothing():
     np.testing.assert_allclose(moved.rotation, camera.rotation, atol=1e-12)
     # Inverses of matrices of a condition of about 1e3.
     np.testing.assert_allclose(left.frame, known, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("frames", "bend", "error"),
+    [
+        # Every person is worth one in 0.3 s: 600 people in 15 frames each are 40.
+        (100, 0.4, 0.25),
+        (100, 0.025, 1.0),
+        # Of 800 frames every second is looked at, so that there are 80.
+        (800, 0.2, 0.25),
+    ],
+)
+def test_how_well_the_offset_is_known_follows_from_how_its_cost_bends(
+    monkeypatch, frames, bend, error
+):
+    camera = clip.moving(frames)
+    nobody = People(np.zeros((frames, 0, 17, 3)), np.zeros((frames, 0, 17, 2)), FPS)
+
+    def cost(camera, people, offset, some):
+        return 2.0 + bend * (offset - 1.25) ** 2, 600
+
+    monkeypatch.setattr("worldpose.broadcast_calibration.feed_offset._cost", cost)
+    found = estimate_feed_offset(camera, nobody, reach=6.0)
+    # A cost that is one half of a unit higher is one standard deviation off in all of them:
+    # one over the root of bend times people.
+    assert found.standard_error == pytest.approx(error)
+    assert found.determined == (error < 0.5)
+    if found.determined:
+        assert found.frames == pytest.approx(1.25)

@@ -130,3 +130,13 @@ def test_nobody_is_matched_with_nobody():
     assert len(evidence) == 0
     assert noise.frames == 1.0
     assert not estimate_feed_offset(camera, nobody, reach=2.0).determined
+
+
+@pytest.mark.parametrize(("aside", "pairs"), [(0.85, 1), (0.95, 0)])
+def test_people_whose_boxes_hardly_touch_are_no_pair(aside, pairs):
+    camera, people = crowd(1, np.random.default_rng(5), 0.0)
+    one = People(people.joints[:, :1], people.keypoints[:, 1:2].copy(), 50.0)
+    left, _, right, _ = one.boxes[0, 0]
+    # Boxes share 15 of 185, 0.08, or 5 of 195, 0.026; their bones are the same.
+    one.keypoints[..., 0] += aside * (right - left)
+    assert len(match(camera, one).frame) == pairs

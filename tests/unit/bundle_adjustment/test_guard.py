@@ -43,3 +43,15 @@ def test_nobody_gives_no_verdict(clip):
     said = verdict(held, held)
     assert (said.judges == 0).all()
     assert np.isnan(said.loss).all()
+
+
+@pytest.mark.parametrize(("scale", "loss"), [(3.0, 9.0 * np.log(5.0)), (1.5, 2.25 * np.log(17.0))])
+def test_what_a_far_keypoint_costs_grows_with_the_logarithm_of_its_square(clip, scale, loss):
+    made, true, _ = clip(frames=2, persons=1, noise=0.0)
+    made.keypoints[1, 2, 0, 4] += [3.6, 4.8]
+    everybody = np.ones((2, 1), dtype=bool)
+    held = held_out(made, true, np.arange(2), everybody, robust_scale=scale)
+    # 6 px at a noise of one: two and four scales, and the other four views are exact.
+    assert held.error[1, 2, 0, 4] == pytest.approx(6.0, rel=1e-4)
+    assert held.loss[1, 2, 0, 4] == pytest.approx(loss, rel=1e-4)
+    assert held.loss[0].max() < 1e-4

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worldpose.bundle_adjustment import keypoint_outliers, review_clicks
+from worldpose.bundle_adjustment import Clicks, keypoint_outliers, review_clicks
 from worldpose.bundle_adjustment.building import KeypointNoise
+from worldpose.static_calibration import PARAMETERS
 
 
 def found(made, cameras, limit=4.2, longest=10_000):
@@ -72,19 +73,25 @@ def test_honest_people_are_hardly_listed(clip):
     assert found(made, true).found <= 2
 
 
-@pytest.mark.parametrize("rests", [True, False])
-def test_a_wrong_click_is_more_surprising_than_honest_ones(clip, rests):
+@pytest.mark.parametrize(
+    ("rests", "surprise"),
+    # 12 px across and 9 px down at 1 px; across the camera has 0.6 px, less or besides that.
+    [(True, np.hypot(12.0 / 0.8, 9.0)), (False, np.hypot(12.0 / np.sqrt(1.36), 9.0))],
+)
+def test_a_wrong_click_is_more_surprising_than_honest_ones(clip, rests, surprise):
     made, true, _ = clip()
     clicks = made.clicks[2]
     image, inlier = clicks.points_image.copy(), clicks.inlier.copy()
-    image[4] += [12.0, -9.0]
+    image[4] = true[2].project(clicks.points_world[4:5])[0] + [12.0, -9.0]
     inlier[4] = rests
     changed = replace(clicks, points_image=image, inlier=inlier)
     all_clicks = (*made.clicks[:2], changed, *made.clicks[3:])
-    review = review_clicks(all_clicks, true, 0.0 * made.covariance, click_noise=1.0)
+    covariance = np.zeros_like(made.covariance)
+    covariance[2, PARAMETERS.index("cx"), PARAMETERS.index("cx")] = 0.36
+    review = review_clicks(all_clicks, true, covariance, click_noise=1.0)
     assert (review.camera[0], review.name[0]) == (2, "point_4")
-    # 15 px in standard deviations of 1 px, give or take the click's own noise of up to three.
-    assert review.surprise[0] == pytest.approx(15.0, abs=3.0)
+    np.testing.assert_allclose(review.residual[0], [-12.0, 9.0], atol=1e-9)
+    assert review.surprise[0] == pytest.approx(surprise, rel=1e-9)
     assert review.surprise[1] < 4.2
 
 
@@ -112,3 +119,25 @@ def test_cameras_without_clicks_have_nothing_to_review(clip):
     made, true, _ = clip(clicked=0)
     review = review_clicks(made.clicks, true, made.covariance, click_noise=1.0)
     assert len(review.camera) == len(review.surprise) == len(review.name) == 0
+
+
+@pytest.mark.parametrize(
+    ("rests", "variance", "across"),
+    # A camera that rests on a click has gone towards it; one that does not errs besides it; and of
+    # the noise a tenth is left.
+    [(True, 3.0, 1.0), (False, 3.0, 7.0), (True, 4.0, 0.04)],
+)
+def test_a_camera_that_is_hardly_known_surprises_by_clicks_it_rests_on(
+    clip, rests, variance, across
+):
+    made, true, _ = clip(clicked=1)
+    clicks = made.clicks[2]
+    image = true[2].project(clicks.points_world) - [3.0, 4.0]
+    changed = replace(clicks, points_image=image, inlier=np.array([rests]))
+    none = (Clicks.none(),) * 2
+    covariance = np.zeros_like(made.covariance)
+    covariance[2, PARAMETERS.index("cx"), PARAMETERS.index("cx")] = variance
+    review = review_clicks((*none, changed, *none), true, covariance, click_noise=2.0)
+    np.testing.assert_allclose(review.residual, [[3.0, 4.0]], atol=1e-9)
+    # The principal point moves all pixels by as much: 4 px^2 of the click, and its own across.
+    assert review.surprise[0] == pytest.approx(np.sqrt(9.0 / across + 16.0 / 4.0), rel=1e-6)

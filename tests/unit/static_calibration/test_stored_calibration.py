@@ -1,7 +1,9 @@
 import clicking_people as people
 import numpy as np
+import xarray as xr
 
 from data_contracts.static_calibration import STATIC_CALIBRATION
+from tasks.bundle_adjustment import _clicks
 from worldpose.cameras.stored import camera_arrays, camera_from_arrays
 from worldpose.static_calibration import (
     calibrate,
@@ -39,3 +41,25 @@ def test_a_given_camera_keeps_the_layout_without_evidence():
     )
     assert attributes["origin"] == "given"
     assert attributes["noise_scale"] is None
+
+
+def test_clicks_come_back_from_a_stored_camera_where_they_were_made():
+    camera, rng = people.seat(1)
+    clicked = people.click(camera, rng, wrong=60.0).clicked
+    result = calibrate(people.PITCH, clicked, people.SIZE)
+    arrays = calibration_arrays(result)
+    stored = xr.Dataset(
+        {
+            "point_residual": (("point", "axis"), arrays["point_residual"]),
+            "point_inlier": ("point", arrays["point_inlier"]),
+        },
+        coords={"point": calibration_attributes("cam-1", result)["point"]},
+    )
+    clicks = _clicks(stored, result.estimate.camera, people.PITCH)
+    made = {point.name: point.xy for point in clicked.points}
+    assert set(clicks.names) == set(made)
+    # Off by up to 60 px from where the camera shows them; rounding of that.
+    np.testing.assert_allclose(
+        clicks.points_image, [made[name] for name in clicks.names], atol=1e-6
+    )
+    assert clicks.inlier.sum() == 9

@@ -13,6 +13,12 @@ from worldpose.store.canonical import canonical_json, digest
 
 TEXT = st.text(st.characters(exclude_categories=["Cs"]))
 NUMBERS = st.integers() | st.floats(allow_nan=False, allow_infinity=False)
+FEW = st.recursive(
+    st.sampled_from([None, False, True, 0, 1, 1.5, "", "0", "null"]),
+    lambda inner: st.lists(inner, max_size=2) | st.dictionaries(st.sampled_from("ab"), inner),
+    max_leaves=3,
+)
+"""So few that two of them are often the same."""
 VALUES = st.recursive(
     st.none() | st.booleans() | NUMBERS | TEXT,
     lambda inner: st.lists(inner) | st.dictionaries(TEXT, inner),
@@ -33,10 +39,34 @@ def test_order_of_keys_does_not_matter(value: dict[str, object]) -> None:
     assert canonical_json(dict(reversed(value.items()))) == canonical_json(value)
 
 
-@given(VALUES, VALUES)
+@given(FEW | VALUES, FEW | VALUES)
 def test_equal_bytes_mean_equal_values(one: object, other: object) -> None:
     if canonical_json(one) == canonical_json(other):
         assert one == other
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (1, True),
+        (0, False),
+        (1, 1.0),
+        (0.1, 0.1 + 2.0**-56),
+        (2**53, 2**53 + 1),
+        (1, "1"),
+        (None, "null"),
+        ([], {}),
+        ([1, 2], [2, 1]),
+        ([[1], 2], [1, [2]]),
+        ({"a": None}, {}),
+        ("\u00e9", "e\u0301"),
+        ("a", "a "),
+    ],
+)
+def test_values_that_are_nearly_the_same_have_bytes_of_their_own(
+    one: object, other: object
+) -> None:
+    assert canonical_json(one) != canonical_json(other)
 
 
 def test_form_is_sorted_and_without_spaces() -> None:

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from worldpose.tracking.intersection import intersect_people
 
@@ -85,3 +86,19 @@ def test_expected_place_settles_which_of_two_pairs_counts(ring, people):
         found = intersect_people(centers, directions, weights, index, near, GATE, SINE)
         # The other pair passes metres away and keeps under (1 / 100)^2 of the weight.
         assert np.linalg.norm(found[0] - truth, axis=-1).max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("weights", "place"),
+    # At half the distance a ray counts four times as much, and as its weight says.
+    [((1.0, 1.0), 0.002), ((1.0, 4.0), 0.005), ((4.0, 1.0), 0.01 / 17.0)],
+)
+def test_rays_count_by_their_weight_over_their_squared_length(weights, place):
+    # Two that are parallel, 10 and 20 m long and 1 cm apart, and one that crosses both.
+    centers = np.array([[0.0, -10.0, 0.0], [0.01, 20.0, 0.0], [-15.0, 0.0, 0.0]])
+    directions = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])[:, None, None]
+    index, near = np.zeros((3, 1), np.int64), np.full((1, 1, 3), np.nan)
+    each = np.array([*weights, 1.0])[:, None, None]
+    found = intersect_people(centers, directions, each, index, near, GATE, SINE)
+    # The loss takes 2 (1 / 25)^2 from what is 1 cm off.
+    np.testing.assert_allclose(found[0, 0], [place, 0.0, 0.0], atol=2e-5)

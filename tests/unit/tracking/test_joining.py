@@ -5,6 +5,7 @@ import pytest
 
 from worldpose.tracking import TrackingSettings
 from worldpose.tracking.joining import End, decide, ends_of, join_costs
+from worldpose.tracking.limbs import limb_lengths
 
 SETTINGS = TrackingSettings()
 UNKNOWN = np.full(11, np.nan)
@@ -65,7 +66,7 @@ def test_who_goes_on_as_expected_costs_less_than_who_turned_and_than_who_is_else
 
 def test_longer_gap_tells_less():
     still = [cost(end(0, 0, (0, 0)), end(1, frames, (0, 0))) for frames in (5, 50, 500, 2500)]
-    assert still == sorted(still)
+    assert (np.diff(still) > 0.0).all()
 
 
 def test_other_limbs_are_another_person():
@@ -107,3 +108,43 @@ def test_odds_beforehand_tell_newcomers_from_who_was_lost():
 def test_nobody_to_join_is_no_join():
     assert decide([], [], np.empty((0, 0)), SETTINGS) == []
     assert decided([[np.inf]]) == []
+
+
+@pytest.mark.parametrize(
+    ("frames", "velocity", "variance"),
+    [
+        # 1 dm of the place, and 2.5 m/s in a second's velocity: a third of its square times the
+        # cube of half a second, or of the one second that a velocity lasts.
+        (25, (np.nan, np.nan), 0.01 + 6.25 * 0.125 / 3.0),
+        # Then 2 m/s either way, twice its square for each second more.
+        (100, (np.nan, np.nan), 0.01 + 6.25 / 3.0 + 8.0),
+        # A quarter of the first where the velocity is known again.
+        (100, (0.0, 0.0), 0.01 + 6.25 / 12.0 + 8.0),
+    ],
+)
+def test_doubt_where_somebody_goes_on_is_that_of_a_velocity_that_wanders(
+    frames, velocity, variance
+):
+    motion = {"paces": ((1.0, 1.0),), "agility": 2.5, "mean_speed": 2.0, "velocity_memory": 1.0}
+    settings = SETTINGS.model_copy(update=motion)
+    here, aside = (
+        cost(end(0, 0, (0, 0)), end(1, frames, (x, 0), velocity), settings) for x in (0.0, 1.5)
+    )
+    assert aside - here == pytest.approx(0.5 * 1.5**2 / variance)
+    # Velocities that are the same: variances of 0.5 m/s and the agility, and of two strangers.
+    alike = math.log((0.25 + 6.25) / (0.25 + 8.0)) if velocity[0] == 0.0 else 0.0
+    assert here == pytest.approx(math.log(2.0 * math.pi * variance / AREA) + alike)
+
+
+def test_a_limb_is_the_surer_the_longer_it_was_seen_and_the_steadier_it_was(people):
+    def seen(lengths):
+        joints = people(np.zeros((len(lengths), 2)))
+        joints[:, 7] = joints[:, 5] + np.array(lengths)[:, None] * [0.0, 0.0, -1.0]
+        median, variance = limb_lengths(joints, FPS)
+        return median[1], variance[1]
+
+    # 5 cm at least, for a single frame and for what is forgotten in 0.3 s, 15 frames.
+    assert seen([0.3]) == pytest.approx((0.3, 0.0025))
+    assert seen([0.3] * 60) == pytest.approx((0.3, 0.0025 / 4.0))
+    # 10 cm to either side of the median in half of the frames and more.
+    assert seen([0.2, 0.3, 0.4] * 20) == pytest.approx((0.3, (1.4826 * 0.1) ** 2 / 4.0))

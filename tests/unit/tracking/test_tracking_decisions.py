@@ -2,6 +2,9 @@ import numpy as np
 import pytest
 
 from worldpose.tracking import TrackingSettings, track_people
+from worldpose.tracking.following import Follower
+from worldpose.tracking.person import Person
+from worldpose.tracking.sightings import Sighting
 
 SETTINGS = TrackingSettings()
 FPS = 50.0
@@ -146,3 +149,33 @@ def test_two_seconds_without_anybody_hold_nobody(ring, people, seen):
         assert np.isnan(result.joints[50:150]).all()
         for frame in (20, 180):
             assert (result.detection_index[frame] >= 0).any(axis=0).sum() == 4
+
+
+@pytest.mark.parametrize(("agility", "births"), [(2.5, 2), (70.0, 1)])
+def test_who_is_unseen_may_be_as_far_beyond_the_gate_as_he_can_have_gone(
+    ring, people, seen, agility, births
+):
+    # Stands, is unseen for 0.16 s, stands 2.5 m further. Agility times sqrt(0.16^3 / 3): 0.09 m
+    # beside the gate's 0.5, or 2.59 m.
+    places = np.zeros((40, 1, 2))
+    places[28:] = [2.5, 0.0]
+    keypoints, confidence = seen(ring(5), people(places))
+    keypoints[20:28] = np.nan
+    settings = SETTINGS.model_copy(update={"agility": agility})
+    result = track_people(ring(5), keypoints, confidence, FPS, settings)
+    assert result.report.births == births
+
+
+def test_of_two_tracks_on_one_person_the_one_that_was_fixed_more_often_stays(people):
+    pose = people(np.zeros(2))
+    younger, older = Person(0, pose, 20), Person(1, pose, 0)
+    follower = Follower(np.zeros((2, 3)), FPS, True, None, SETTINGS)
+    follower.active = [younger, older]
+    here = Sighting(np.array([0, 0]), np.array([0.1, 0.1]), pose)
+    for frame in range(40):
+        for person in follower.active:
+            if frame >= person.last_fixed:
+                person.see(frame, here, FPS, SETTINGS)
+        follower._merge(frame)
+    assert follower.active == [older]
+    assert follower.ended == [younger]

@@ -3,7 +3,7 @@ import pytest
 
 from data_contracts.conventions import COCO17
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
-from worldpose.triangulation.limbs import FEWEST, LIMBS, limb_lengths
+from worldpose.triangulation.limbs import FEWEST, LIMBS, SLACK, _deviation, limb_lengths
 from worldpose.triangulation.observations import Rig
 from worldpose.triangulation.solving import no_shift, solve
 
@@ -113,3 +113,26 @@ def test_limb_that_is_hardly_ever_as_long_tells_nothing(ring, seen):
     found = solve(Rig.of(camera), keypoints, confidence, index, no_shift(), SETTINGS)
     known = np.isfinite(limb_lengths(found)[0])
     assert known.tolist() == [end[1] != ANKLE for end in LIMBS]
+
+
+def test_frames_that_three_views_agree_in_tell_how_long_a_limb_is(ring, seen):
+    camera, joints = ring(3), walker()
+    keypoints, confidence, index = seen(camera, joints)
+    found = solve(Rig.of(camera), keypoints, confidence, index, no_shift(), SETTINGS)
+    # Two views alone put the ankle 2 cm lower in seven frames of twelve.
+    found.joints[:7, 0, ANKLE, 2] -= 0.02
+    found.views[:7, 0, ANKLE] = 2
+    shank = LIMBS.index((COCO17.index("left_knee"), ANKLE))
+    assert limb_lengths(found)[0, shank] == pytest.approx(SHANK, abs=1e-6)
+    # Four frames are too few: then all of them tell.
+    found.views[7, 0, ANKLE] = 2
+    assert limb_lengths(found)[0, shank] == pytest.approx(SHANK + 0.02, abs=1e-6)
+
+
+def test_length_of_a_limb_is_as_far_off_as_its_ends_are_unsure_along_it():
+    upper, lower = np.zeros(3), np.array([0.0, 0.0, -0.5])
+    exact, along = np.zeros((3, 3)), 3.0 * SLACK**2 * np.diag([100.0, 100.0, 1.0])
+    # 6 cm too long where limbs vary by 3 cm; what ends are unsure across does not matter.
+    assert _deviation(upper, exact, lower, exact, 0.44) == pytest.approx((4.0, 0.0))
+    assert _deviation(upper, exact, lower, along, 0.44) == pytest.approx((1.0, np.log(4.0)))
+    assert _deviation(upper, exact, lower, exact, np.nan) == pytest.approx((0.0, 0.0))

@@ -10,6 +10,7 @@ from worldpose.triangulation import (
     smooth_joints,
     triangulate_joints,
 )
+from worldpose.triangulation.clocks import _Sums
 from worldpose.triangulation.smoothing import segments
 from worldpose.triangulation.track_solver import _factorize, _invert, _substitute
 
@@ -175,3 +176,28 @@ def test_whole_frames_are_moved_exactly_and_half_frames_lie_between(ring):
         pixels[:-1, 2], 0.5 * (keypoints[:-1, 2] + keypoints[1:, 2]), atol=1e-9
     )
     assert (moved[-1, 2] == -1).all()
+
+
+@pytest.mark.parametrize(
+    ("weights", "seen", "error"),
+    [
+        # They say 3, -1 and 1, together 1: a third each, which leaves 2, -2 and 0 of 1 - 1/3.
+        ([100.0, 100.0, 100.0], [3.0, -1.0, 1.0], np.sqrt(2.0) * 100.0 * 2.0 / (2.0 / 3.0)),
+        # 1, 0 and 0, together 0.6; who has more than half the say is taken to have half.
+        ([180.0, 60.0, 60.0], [1.0, 0.0, 0.0], np.hypot(180.0 * 0.4 / 0.5, np.sqrt(2.0) * 45.0)),
+    ],
+)
+def test_a_clock_errs_by_what_each_person_misses_the_others_by(
+    ring, monkeypatch, weights, seen, error
+):
+    weights = np.array(weights)
+    information = np.zeros((3, 2, 2))
+    information[:, 0, 0] = information[:, 1, 1] = weights
+    # Before the first camera alone does anybody say anything.
+    score = np.stack([weights * seen, np.zeros(3)], axis=-1)
+    sums = _Sums(information, score, np.zeros(2), np.zeros(2), np.zeros(2))
+    monkeypatch.setattr("worldpose.triangulation.clocks._regression", lambda *_: sums)
+    nothing = detections(ring(2), runner(5), 1.0)
+    found = estimate_clocks(ring(2), *nothing, FPS, SETTINGS)
+    # Over the sum of weights, and half of it from the mean of two clocks. 0.01 is known before.
+    np.testing.assert_allclose(found.standard_error, 0.5 * error / 300.0, rtol=1e-3)
