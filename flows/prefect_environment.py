@@ -25,6 +25,7 @@ import certifi
 
 from flows.prefect_database import begin_database, keep_database
 from worldpose.errors import InputError, WorldposeError
+from worldpose.store.blobs import storage_errors
 
 START_SECONDS = 120.0
 """The first start of all creates Prefect's database, which took 15 s on two busy cores."""
@@ -172,8 +173,10 @@ def _home(project: str, scratch: Path) -> Iterator[Path]:
         yield scratch
         return
     home = Path(project).resolve() / "prefect"
-    home.mkdir(parents=True, exist_ok=True)
-    with (home / "in-use").open("w") as lock:
+    with storage_errors(str(home)):
+        home.mkdir(parents=True, exist_ok=True)
+        lock = (home / "in-use").open("w")
+    with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

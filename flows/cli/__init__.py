@@ -19,13 +19,13 @@ def main() -> None:
 
     try:
         app()
-    except OSError as error:
-        line(f"error: {error.filename or 'a file'}: {error.strerror or error}", to=errors)
-        sys.exit(1)
-    except WorldposeError as error:
+    except (OSError, WorldposeError) as error:
+        message = str(error)
+        if isinstance(error, OSError):
+            message = f"{error.filename or 'a file'}: {error.strerror or error}"
         if "--json" in sys.argv:
-            print(json.dumps({"error": type(error).__name__, "message": str(error)}))  # noqa: T201
-        line(f"error: {error}", to=errors)
+            print(json.dumps({"error": type(error).__name__, "message": message}))  # noqa: T201
+        line(f"error: {message}", to=errors)
         sys.exit(2 if isinstance(error, UsageError) else 1)
     finally:
         gc.freeze()  # the process ends: freeing all its modules piece by piece takes half a second

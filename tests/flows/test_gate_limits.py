@@ -33,6 +33,7 @@ GOOD_VIDEO = {
     [
         (CAMERAS, GOOD_CAMERA, []),
         (CAMERAS, {}, []),  # a given one was judged by who gave it
+        (CAMERAS, GOOD_CAMERA | {"expected_ground_error_p95_m": 0.10}, []),  # the limit itself
         (CAMERAS, GOOD_CAMERA | {"clicks_wrong": 1.0}, ["clicks_wrong is 1, at most 0 passes"]),
         (CAMERAS, {"clicks_wrong": 0.0, "weak": 0.0}, ["expected_ground", "expected_ground"]),
         (PEOPLE, GOOD_VIDEO | {"stride": 2.0}, []),  # filled in between two looks on purpose
@@ -53,3 +54,28 @@ def test_auto_objects_to_figures_beyond_their_limits(gate, figures, objected):
     lines = gate.objections(figures)
     assert len(lines) == len(objected)
     assert all(line.startswith(start) for line, start in zip(lines, objected, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("gate", "figures", "excess"),
+    [
+        (CAMERAS, GOOD_CAMERA, 0.0),
+        (CAMERAS, {}, 0.0),
+        # Of medians 0.03 m pass, at the far side 0.10 m.
+        (CAMERAS, GOOD_CAMERA | {"expected_ground_error_median_m": 0.03}, 0.0),
+        (CAMERAS, GOOD_CAMERA | {"expected_ground_error_median_m": 0.06}, 1.0),
+        (CAMERAS, {"expected_ground_error_median_m": 0.06}, 1.0),  # the others are not known
+        (
+            CAMERAS,
+            {"expected_ground_error_median_m": 0.045, "expected_ground_error_p95_m": 0.3},
+            2.0,
+        ),
+        (CAMERAS, GOOD_CAMERA | {"clicks_wrong": 3.0}, 3.0),  # none passes
+        (PEOPLE, GOOD_VIDEO | {"stride": 2.0}, 0.0),
+        (PEOPLE, GOOD_VIDEO | {"stride": 1.0}, 1.0),  # 0.5 where 0.25 passes
+        (ADJUSTMENT, {"held_out_error_before_px": 2.0, "held_out_error_after_px": 3.0}, 0.5),
+        (ACCEPTANCE, {"bodies": 100.0, "filled": 20.0, "offset_rms_m": 0.01}, 3.0),
+    ],
+)
+def test_how_bad_a_result_is_goes_by_its_worst_figure(gate, figures, excess):
+    assert gate.excess(figures) == pytest.approx(excess, abs=1e-12)

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from datetime import UTC, datetime
 
 import pytest
 import yaml
@@ -9,6 +10,8 @@ from typer.testing import CliRunner
 
 from data_contracts.cameras import CameraCalibration
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from data_contracts.run import RunRecord, UnitFailure, WaitingUnit
+from flows.cli import run as run_command
 from flows.cli.app import app
 from flows.registering import open_for_review, register
 from worldpose.errors import InputError
@@ -116,3 +119,52 @@ def test_status_cuts_no_id_or_state_and_tells_problems_below(store, tmp_path):
     assert head.split()[-1] == "next"
     assert problem.startswith(f"{match_id}: {tmp_path / 'a'}: expected a given calibration")
     assert "worldpose review serve" in problem
+
+
+def ended(state):
+    """The record of a run that ended so."""
+    waiting = tuple(
+        WaitingUnit(unit=f"detection/{name}", request=name, reasons=("",), rejected=name == "cam2")
+        for name in ("cam0", "cam1", "cam2")
+    )
+    failed = (UnitFailure(unit="tracking/clip", error="InputError", message="nobody"),)
+    return RunRecord(
+        **{"run_id": "0001", "match_id": "a", "parent": None, "state": state, "seconds": 1.0},
+        **{name: {} for name in ("results", "settings", "overrides", "versions", "figures")},
+        executed=("ingest/cam0",),
+        reused=(),
+        failed=failed if state in ("failed", "partial") else (),
+        blocked=("triangulation/clip",),
+        waiting=waiting if state == "waiting" else (),
+        started_at=datetime(2026, 5, 1, tzinfo=UTC),
+        finished_at=datetime(2026, 5, 1, tzinfo=UTC),
+    )
+
+
+@pytest.mark.parametrize(
+    ("state", "code", "told"),
+    [
+        ("complete", 0, "is complete: 1 computed, 0 reused, 0 failed"),
+        ("failed", 1, "is failed: 1 computed, 0 reused, 1 failed"),
+        ("waiting", 3, "2 reviews pending, 1 rejected and to be corrected:"),
+        ("partial", 4, "1 failed and 1 blocked by that"),
+    ],
+)
+def test_the_exit_code_of_a_run_says_how_it_ended(state, code, told, store, tmp_path, monkeypatch):
+    register(store, made(tmp_path / "a", "a"), unfinished=True)
+    monkeypatch.setattr(run_command, "find_match", open_for_review)  # cam1 is not calibrated
+    monkeypatch.setattr(run_command, "run_match", lambda *_: ended(state))
+    answer = said(store, "run", "a")
+    assert (answer.exit_code, told in answer.stdout) == (code, True)
+    as_json = said(store, "run", "a", "--json")
+    assert as_json.exit_code == code
+    assert json.loads(as_json.stdout)["failed"] == (state in ("failed", "partial"))
+
+
+def test_of_several_folders_the_good_ones_are_taken_in_and_the_others_said(store, tmp_path):
+    good, none = str(made(tmp_path / "a", "a")), str(tmp_path / "none")
+    assert said(store, "ingest", none).exit_code == 1
+    answer = said(store, "ingest", none, good)
+    assert (answer.exit_code, store.matches()) == (4, ("a",))
+    assert f"error: {none}" in answer.stderr
+    assert said(store, "ingest", good).exit_code == 0

@@ -13,6 +13,7 @@ from flows.operations.plan import ServePlan
 from flows.operations.serving import environment_of
 from flows.prefect_database import DATABASE, begin_database, keep_database
 from flows.prefect_environment import AUTHORITIES, one_authority, prefect_server
+from worldpose.errors import StoreError
 
 
 @pytest.fixture
@@ -57,6 +58,15 @@ def test_without_a_place_to_keep_it_every_server_makes_its_own(tmp_path, kept):
     (tmp_path / DATABASE).touch()
     keep_database(tmp_path)
     assert begin_database(tmp_path / "another")
+
+
+def test_a_project_in_which_no_server_can_write_says_what_to_do(tmp_path, kept):
+    (tmp_path / "prefect").touch()  # a file where the folder should be
+    with (
+        pytest.raises(StoreError, match=r"prefect: File exists.*run again.*results are untouched"),
+        prefect_server(str(tmp_path), is_local=True),
+    ):
+        pass
 
 
 def test_a_database_elsewhere_is_not_kept(tmp_path, kept):

@@ -1,13 +1,16 @@
 """What is not well is said, with what to do about it."""
 
 import os
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
 
 import pytest
 
-from data_contracts.operations import Service, Serving
+from data_contracts.operations import Arrival, Service, Serving
+from flows.operations import health
 from flows.operations.health import check
 from flows.operations.layout import StateFolder
+from flows.operations.plan import FLOWS
 
 
 @pytest.fixture
@@ -63,3 +66,101 @@ def test_every_part_that_is_not_well_says_how_to_mend_it(server, state, tmp_path
         assert "Start the Prefect server" in found["prefect"].mend
         assert found["deployments"].mend == "Mend prefect first."
         assert found["inbox"].is_well
+
+
+class Prefect:
+    """What a Prefect server answers, by the end of its address; all is well there."""
+
+    def __init__(self):
+        self.asked = {}
+        self.answers = {
+            "/deployments/filter": [{"flow_id": name} for name in FLOWS],
+            "/flows/filter": [{"name": name} for name in FLOWS],
+            "/healthy/workers/filter": workers(1.0),
+            "/healthy-arrivals/workers/filter": workers(1.0),
+            "/flow_runs/count": 0,
+        }
+
+    def ask(self, address, body):
+        (end,) = (end for end in self.answers if address.endswith(end))
+        self.asked[end] = body
+        return self.answers[end], ""
+
+
+def workers(*silent):
+    """Workers that were heard of so long ago [s]."""
+    now = datetime.now(UTC)
+    beats = [(now - timedelta(seconds=each)).isoformat() for each in silent]
+    return [{"last_heartbeat_time": beat.replace("+00:00", "Z")} for beat in beats]
+
+
+@pytest.fixture
+def prefect(monkeypatch):
+    prefect = Prefect()
+    monkeypatch.setattr(health, "_ask", prefect.ask)
+    return prefect
+
+
+def at_prefect(tmp_path):
+    return by_part(health.at_prefect(serving(tmp_path, "http://127.0.0.1:4200/api")))
+
+
+def test_a_prefect_that_has_all_and_whose_workers_live_is_well(prefect, tmp_path):
+    found = at_prefect(tmp_path)
+    assert {part: each.is_well for part, each in found.items()} == {
+        "deployments": True,
+        "worker of healthy": True,
+        "worker of healthy-arrivals": True,
+    }
+    prefect.answers["/flows/filter"] = [{"name": name} for name in FLOWS if name != "release"]
+    deployments = at_prefect(tmp_path)["deployments"]
+    assert (deployments.is_well, deployments.state) == (False, "missing: release")
+
+
+@pytest.mark.parametrize(
+    ("silent", "is_well", "said"),
+    [
+        ([80.0], True, "80 s ago"),
+        ([100.0], False, "100 s ago"),  # it reports every 30 s
+        ([5000.0, 20.0], True, "20 s ago"),
+        ([], False, "never heard of"),
+    ],
+)
+def test_of_the_workers_of_a_pool_one_has_to_be_heard_of(prefect, tmp_path, silent, is_well, said):
+    prefect.answers["/healthy-arrivals/workers/filter"] = workers(*silent)
+    found = at_prefect(tmp_path)
+    worker = found["worker of healthy-arrivals"]
+    assert (worker.is_well, said in worker.state) == (is_well, True)
+    assert found["worker of healthy"].is_well
+
+
+def test_runs_that_run_for_more_than_a_day_are_told(prefect, tmp_path):
+    prefect.answers["/flow_runs/count"] = 2
+    runs = at_prefect(tmp_path)["runs"]
+    assert (runs.is_well, runs.state) == (False, "2 seem to run for more than a day")
+    assert "http://127.0.0.1:4200, and cancel" in runs.mend
+    asked = prefect.asked["/flow_runs/count"]["flow_runs"]
+    assert asked["state"] == {"name": {"any_": ["Running"]}}
+    before = datetime.fromisoformat(asked["expected_start_time"]["before_"])
+    # A minute for a slow machine.
+    assert 0.0 <= (datetime.now(UTC) - before).total_seconds() - 86_400.0 < 60.0
+
+
+@pytest.mark.parametrize(("free", "is_well"), [(0.99e9, False), (1.0e9, True)])
+def test_a_disk_with_less_than_a_gigabyte_is_not_well(monkeypatch, tmp_path, free, is_well):
+    disk = SimpleNamespace(disk_usage=lambda folder: SimpleNamespace(free=free))
+    monkeypatch.setattr(health, "shutil", disk)
+    found = health._disk(tmp_path)
+    assert (found.is_well, found.state) == (is_well, "1.0 GB free")
+
+
+def test_processes_that_have_ended_and_arrivals_that_were_refused_are_told(state, tmp_path):
+    dead = Service(pid=2**22 + 1)
+    known = serving(tmp_path, "", pages=dead, watch=Service(pid=os.getpid()))
+    (ended,) = health._processes(state, known)
+    assert (ended.part, ended.is_well, "pages.log" in ended.mend) == ("pages", False, True)
+    for name, seen in (("a", "taken"), ("b", "refused"), ("c", "refused")):
+        state.write_arrival(Arrival(name=name, state=seen, changed_at=datetime.now(UTC)))
+    (tmp_path / "inbox").mkdir()
+    (inbox,) = health._inbox(state, known)
+    assert (inbox.is_well, inbox.state) == (True, "3 known, 2 refused")

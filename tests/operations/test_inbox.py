@@ -6,6 +6,7 @@ import os
 import shutil
 import socket
 from multiprocessing import get_context
+from types import SimpleNamespace
 
 import pytest
 
@@ -44,6 +45,15 @@ def desk(drop, tmp_path):
     return Desk(tmp_path)
 
 
+@pytest.fixture
+def clock(monkeypatch):
+    """The machine's clock that only goes forward, as a test sets it [s]."""
+    clock = SimpleNamespace(now=1000.0)
+    read = SimpleNamespace(monotonic=lambda: clock.now)
+    monkeypatch.setattr("flows.operations.arrivals.time", read)
+    return clock
+
+
 def content(folder):
     return {
         path.relative_to(folder): (path.read_bytes(), path.stat().st_mtime_ns)
@@ -69,25 +79,47 @@ def test_a_complete_match_is_taken_once_and_stays_where_it_is(desk, drop):
     assert content(folder) == before
 
 
-def test_a_growing_match_waits_until_nothing_has_changed(desk, drop):
+def test_a_growing_match_waits_until_nothing_has_changed(desk, drop, clock):
     folder = drop()
     file = folder / "detections" / "cam01.npz"
     whole = file.read_bytes()
     for size in (10, 100, len(whole)):
+        clock.now += 10.0
         file.write_bytes(whole[:size])
         assert desk.look() == 0
         assert desk.known()["small"][0] == "arriving"
-    assert desk.look(quiet=3600.0) == 0
-    assert desk.look() == 1
+    # It was whole at 1030 s: ten seconds count from then, whatever was waited before.
+    clock.now = 1039.9
+    assert (desk.look(quiet=10.0), desk.take_in(quiet=10.0)) == (0, [])
+    clock.now = 1040.0
+    assert (desk.look(quiet=3600.0), desk.look(quiet=10.0)) == (0, 1)
+    assert [each.state for each in desk.take_in(quiet=10.0)] == ["taken"]
 
 
-def test_time_that_was_waited_before_a_reboot_does_not_count(desk, drop):
+def test_time_that_was_waited_before_a_reboot_does_not_count(desk, drop, clock):
     drop()
-    desk.look()
-    (before,) = desk.state.arrivals().values()
-    booted_later = before.model_copy(update={"unchanged_since": before.unchanged_since + 1e9})
-    desk.state.write_arrival(booted_later)
-    assert desk.look(quiet=1.0) == 0
+    desk.look(quiet=10.0)
+    clock.now = 3.0  # it begins anew
+    assert desk.look(quiet=10.0) == 0
+    clock.now = 12.9
+    assert desk.look(quiet=10.0) == 0
+    clock.now = 13.0
+    assert desk.look(quiet=10.0) == 1, "it is waited for once more, and no longer"
+
+
+def test_since_when_an_arrival_is_as_it_is_stays_until_that_changes(desk, drop):
+    folder = drop()
+
+    def since():
+        desk.look(quiet=10.0)
+        return desk.state.arrivals()["small"].changed_at
+
+    first = since()
+    assert since() == first
+    (folder / "notes").symlink_to("match.yaml")
+    refused = since()
+    assert (desk.known()["small"][0], since()) == ("refused", refused)
+    assert refused > first
 
 
 def test_a_cut_off_match_is_refused_and_taken_when_mended(desk, drop):

@@ -67,7 +67,7 @@ class Habits:
         way = np.nan_to_num(motion.way.mean(axis=-2))
         along = (np.nan_to_num(offsets) * way).sum(axis=(0, 2, 3))
         held = along / np.maximum((way**2).sum(axis=(0, 2, 3)), 1e-12)
-        return np.clip(held, np.minimum(self.late, 0.0), np.maximum(self.late, 0.0))
+        return np.asarray(np.clip(held, np.minimum(self.late, 0.0), np.maximum(self.late, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -204,3 +204,6 @@ def test_files_that_are_no_weights_are_refused_and_run_nothing(tmp_path):
     save_weights(file, KeypointNet())
     with pytest.raises(InputError, match="weights of KeypointNet"):
         load_weights(file, PeopleNet())
+    file.write_bytes(save(PeopleNet().state_dict()))  # of another program
+    with pytest.raises(InputError, match="weights of something else"):
+        load_weights(file, PeopleNet())

@@ -153,3 +153,41 @@ def test_pictures_are_asked_for_everybody_who_is_sought_in_them():
     np.testing.assert_allclose(answers.keypoints[0, 0], middle, atol=1e-12)
     # The score of a net that tells nothing else is the mean of twelve: rounded.
     assert answers.score[0] == pytest.approx(0.8, abs=1e-12)
+
+
+class Asked(Seeing):
+    """Keeps whom it was asked about."""
+
+    def estimate(self, picture, boxes):
+        self.boxes = boxes.tolist()
+        return super().estimate(picture, boxes)
+
+
+def test_neighbours_who_overlap_are_shown_to_the_net_and_answered_for_by_nobody():
+    bodies = expected((0.0, 0.0))
+    sought = seek(bodies, 0)
+    left, top, right, bottom = sought.boxes[0].tolist()
+    beside = [right - 1.0, top, right + 30.0, bottom]
+    touching = [left - 30.0, top, left, bottom]
+    detected = np.array([[touching, beside, [np.nan] * 4]])
+    net, picture = Asked(), np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    answers = look_again([(0, picture)], sought, net, 0.05, detected)
+    assert net.boxes == [[left, top, right, bottom], beside]
+    np.testing.assert_allclose(answers.keypoints[0, 0, 0], 0.5 * (left + right), atol=1e-12)
+
+
+@pytest.mark.parametrize(("least", "found"), [(0.8, 16), (0.81, 0)])
+def test_a_keypoint_below_the_least_confidence_was_not_found(least, found):
+    bodies = expected((0.0, 0.0))
+    picture = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    answers = look_again([(0, picture)], seek(bodies, 0), Seeing(), least)
+    assert np.isfinite(answers.confidence[0]).sum() == found
+    assert np.isfinite(answers.keypoints[0]).all(axis=-1).sum() == found
+
+
+def test_who_is_like_somebody_that_was_not_found_is_found_all_the_same():
+    # Four pixels from one to the next: the likeness of poses is 0.8, and 0.5 over eight.
+    bodies = expected((0.0, 0.0), (0.08, 0.0), (0.16, 0.0), deviation=0.1)
+    off = np.array([0.0, 0.2, 0.4])[:, None, None] * [1.0, 0.0]
+    verdicts = judge(bodies, answer(bodies, 0, 1, 2, off=off), seek(bodies, 0, 1, 2))
+    assert kinds(verdicts) == ["found", "another", "found"]

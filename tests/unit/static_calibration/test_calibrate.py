@@ -1,6 +1,4 @@
-from contextlib import nullcontext
 from dataclasses import replace
-from types import SimpleNamespace
 
 import clicking_people as people
 import numpy as np
@@ -10,7 +8,7 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import StaticCalibrationSettings, calibrate, checks
+from worldpose.static_calibration import StaticCalibrationSettings, calibrate
 
 PITCH, SIZE = people.PITCH, people.SIZE
 
@@ -216,19 +214,3 @@ def test_a_picture_without_lines_leaves_the_camera_to_the_clicks():
     )
     assert with_picture.report.stage == "points"
     assert any(text.startswith("painted lines:") for text in with_picture.report.decisions)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "misfit", "looked_for"),
-    [(2, 8.9, False), (3, 0.5, True), (0, 9.1, True), (3, 9.1, True)],
-)
-def test_mirrored_names_are_looked_for_where_many_clicks_are_wrong_or_all_fit_badly(
-    monkeypatch, wrong, misfit, looked_for
-):
-    evidence = SimpleNamespace(points=("center_mark",), markings=())
-    fit = SimpleNamespace(inliers=np.arange(10) >= wrong, misfit=misfit)
-    monkeypatch.setattr(checks, "_mirrored_fits", lambda *_: True)
-    settings = StaticCalibrationSettings()
-    complaint = pytest.raises(InputError, match="left and right") if looked_for else nullcontext()
-    with complaint:
-        checks.check_agreement(SimpleNamespace(evidence=evidence), fit, settings, "clicks")

@@ -111,7 +111,7 @@ def test_run_of_a_dead_process_is_known_to_be_dead(store: Store) -> None:
     process = run_process(reserve_some, store.url, outcome)
     outcome.get(timeout=60)
     process.join(60)
-    assert not any(may_be_at_work(run) for run in store.unfinished_runs("final"))
+    assert [may_be_at_work(run) for run in store.unfinished_runs("final")] == [False] * 4
 
 
 def test_run_on_another_machine_may_be_alive(folder_store: Store) -> None:

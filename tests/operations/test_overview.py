@@ -1,0 +1,138 @@
+"""A project at a glance: what waits for a person, and which runs are at work."""
+
+from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
+
+import pytest
+
+from data_contracts.review import ReviewDecision, ReviewRequest
+from data_contracts.run import RunRecord, WaitingUnit
+from flows.operations import overview
+from flows.operations.overview import Overview
+
+UNIT = "static_calibration/cam03"
+REQUEST = "static_calibration.cam03.1f2e3d4c5b6a"
+CONTENT, OTHER = "c" * 64, "d" * 64
+ASKED = datetime(2026, 5, 1, 12, tzinfo=UTC)
+ENDED = ASKED + timedelta(minutes=5)
+WRONG = "clicks_wrong is 1, at most 0 passes"
+FIGURES = {
+    "expected_ground_error_median_m": 0.01,
+    "expected_ground_error_p95_m": 0.04,
+    "clicks_wrong": 1.0,
+    "weak": 0.0,
+}
+
+
+def record(run_id="0002", waits=True):
+    """A run of one camera, whose clicks somebody has to look at."""
+    waiting = WaitingUnit(unit=UNIT, request=REQUEST, reasons=(WRONG,))
+    return RunRecord.model_validate(
+        {
+            "run_id": run_id,
+            "match_id": "m",
+            "parent": None,
+            "state": "waiting" if waits else "complete",
+            **{name: {} for name in ("settings", "overrides", "versions", "figures")},
+            **dict.fromkeys(("executed", "reused", "failed", "blocked"), ()),
+            "results": {UNIT: "0" * 32},
+            "waiting": (waiting,) if waits else (),
+            "started_at": ASKED,
+            "finished_at": ENDED,
+            "seconds": 300.0,
+        }
+    )
+
+
+def question(content=CONTENT):
+    return ReviewRequest(
+        id=REQUEST,
+        match_id="m",
+        run_id="0002",
+        gate="static_calibration",
+        keys={UNIT: "0" * 32},
+        contents={UNIT: content},
+        reasons=(WRONG,),
+        figures=FIGURES,
+        created_at=ASKED,
+    )
+
+
+def verdict(word):
+    return ReviewDecision(match_id="m", request=REQUEST, verdict=word, who="Ada", decided_at=ENDED)
+
+
+class Told:
+    """A store of one match: its latest run, its journal, and the runs that have begun."""
+
+    def __init__(self, latest, journal=(), begun=()):
+        self.latest, self.journal, self.begun = latest, journal, begun
+
+    def matches(self):
+        return ("m",)
+
+    def manifest(self, *place):
+        return SimpleNamespace(content=CONTENT, seconds=2.0, figures=FIGURES)
+
+    def unfinished_runs(self, match):
+        return tuple(SimpleNamespace(run_id=run, started_at=at) for run, at in self.begun)
+
+
+@pytest.fixture
+def glance(monkeypatch):
+    """A function that gives the match of such a store at a glance."""
+    monkeypatch.setattr(overview, "latest_run", lambda store, match: store.latest)
+    journal = lambda store, match: SimpleNamespace(records=store.journal)  # noqa: E731
+    monkeypatch.setattr(overview, "read_journal", journal)
+
+    def look(*told, **more):
+        (match,) = Overview(Told(*told, **more)).look()
+        return match
+
+    return look
+
+
+@pytest.mark.parametrize(
+    ("journal", "state", "objections", "since"),
+    [
+        ([question()], "waiting", (WRONG,), ASKED),
+        ([question(), verdict("reject")], "waiting", (WRONG,), ASKED),
+        ([question(), verdict("approve")], "done", (), None),
+        ([question(), verdict("approve"), verdict("reject")], "waiting", (WRONG,), ASKED),
+        # Somebody approved what was there before.
+        ([question(OTHER), verdict("approve")], "waiting", (WRONG,), ASKED),
+        ([], "waiting", (WRONG,), ENDED),
+    ],
+)
+def test_a_result_waits_until_it_is_approved_itself(glance, journal, state, objections, since):
+    ((stage, unit),) = glance(record(), journal).units
+    assert (stage, unit.unit, unit.state) == ("static_calibration", "cam03", state)
+    assert (unit.objections, unit.waiting_since) == (objections, since)
+    assert unit.why == (WRONG if state == "waiting" else "")
+
+
+def test_where_nobody_is_asked_a_figure_beyond_its_limit_is_said_all_the_same(glance):
+    match = glance(record(waits=False))
+    ((_, unit),) = match.units
+    assert (match.state, unit.state, unit.objections) == ("complete", "done", (WRONG,))
+    assert (unit.seconds, unit.waiting_since) == (2.0, None)
+
+
+LATER, LATEST = ENDED + timedelta(hours=1), ENDED + timedelta(hours=2)
+
+
+@pytest.mark.parametrize(
+    ("begun", "state", "since"),
+    [
+        ([], "complete", None),
+        # Killed: a later run has ended since.
+        ([("0001", ASKED)], "complete", None),
+        ([("0001", ASKED), ("0003", LATER)], "at work", LATER),
+        ([("0003", LATER), ("0004", LATEST)], "at work", LATEST),
+    ],
+)
+def test_a_match_is_at_work_while_a_run_after_the_latest_has_begun(glance, begun, state, since):
+    match = glance(record(waits=False), begun=begun)
+    assert (match.state, match.at_work_since) == (state, since)
+    first = glance(None, begun=begun)
+    assert first.state == ("at work" if begun else "not run")

@@ -1,0 +1,74 @@
+"""When clicks contradict each other too much for any camera, and what is said of one given."""
+
+from types import SimpleNamespace
+
+import clicking_people as people
+import numpy as np
+import pytest
+
+from worldpose.errors import InputError
+from worldpose.static_calibration import StaticCalibrationSettings, calibrate, checks
+
+NAMES = tuple(f"point{number}" for number in range(10))
+
+
+@pytest.fixture
+def judge(monkeypatch):
+    """A function that judges ten clicks of which so many are wrong."""
+
+    def check(wrong, misfit=1.0, mirrored=False):
+        monkeypatch.setattr(checks, "_mirrored_fits", lambda *_: mirrored)
+        problem = SimpleNamespace(evidence=SimpleNamespace(points=NAMES, markings=()))
+        fit = SimpleNamespace(inliers=np.arange(10) >= wrong, misfit=misfit)
+        checks.check_agreement(problem, fit, StaticCalibrationSettings(), "cam01")
+
+    return check
+
+
+@pytest.mark.parametrize(("wrong", "misfit"), [(0, 1.0), (2, 1.0), (2, 8.9)])
+def test_clicks_that_mostly_agree_are_not_taken_for_mirrored(judge, wrong, misfit):
+    judge(wrong, misfit, mirrored=True)
+
+
+@pytest.mark.parametrize(("wrong", "misfit"), [(3, 1.0), (0, 9.0)])
+def test_many_wrong_clicks_or_a_bad_fit_may_be_mirrored_names(judge, wrong, misfit):
+    with pytest.raises(InputError, match="only with left and right exchanged"):
+        judge(wrong, misfit, mirrored=True)
+
+
+def test_with_more_than_four_of_ten_clicks_wrong_no_camera_is_given(judge):
+    judge(4)
+    with pytest.raises(InputError, match=r"at most 40% wrong clicks.*50%.*than point5, point6"):
+        judge(5)
+
+
+def test_a_bad_fit_of_right_clicks_alone_is_no_error(judge):
+    judge(0, misfit=100.0)
+
+
+def of(clicked, **settings):
+    settings = StaticCalibrationSettings(**settings)
+    return calibrate(people.PITCH, clicked, people.SIZE, settings=settings)
+
+
+def test_a_camera_is_weak_where_its_expected_error_is_beyond_a_limit():
+    camera, rng = people.seat(1)
+    clicked = people.click(camera, rng, count=14).clicked
+    error = of(clicked).report.ground_error
+
+    def reasons(median, p95):
+        report = of(clicked, weak_median=median * error.median, weak_p95=p95 * error.p95).report
+        assert report.weak == bool(report.reasons)
+        return report.reasons
+
+    assert reasons(1.01, 1.01) == ()
+    assert ["median over" in reason for reason in reasons(0.99, 1.01)] == [True]
+    assert ["worst twentieth" in reason for reason in reasons(1.01, 0.99)] == [True]
+
+
+def test_the_click_that_fits_worst_is_said_first():
+    camera, rng = people.seat(1)
+    surprise = [point.surprise for point in of(people.click(camera, rng).clicked).report.points]
+    assert len(surprise) == 10
+    assert surprise == sorted(surprise, reverse=True)
+    assert surprise[0] > surprise[-1]
