@@ -6,6 +6,7 @@ new one and gives it the unit again. A mark beside Dask's own scratch files tell
 
 from __future__ import annotations
 
+import hashlib
 import os
 import signal
 import sys
@@ -46,11 +47,10 @@ def survivable(work: Work) -> Iterator[None]:
         OvertimeError: it was stopped often enough.
         DeadlyUnitError: it ended its process often enough.
     """
-    scratch = _worker_scratch()
-    if scratch is None:
+    mark = _mark_of(work)
+    if mark is None:
         yield
         return
-    mark = scratch / f"worldpose-{work.recipe.match_id}-{work.run_id}-{work.key}"
     before = mark.read_text().splitlines() if mark.exists() else []
     stopped = [line for line in before if line != BEGUN]
     deaths = len(before) - 2 * len(stopped)  # a line as it began, and one as it was stopped
@@ -98,12 +98,20 @@ def _append(mark: Path, line: str) -> None:
         file.write(f"{line}\n")
 
 
-def _worker_scratch() -> Path | None:
-    """A folder of this machine's Dask workers, None outside of them."""
+def _mark_of(work: Work) -> Path | None:
+    """Where a run's workers on this machine note that this was begun; None outside of Dask's.
+
+    All runs of a machine share the folder, and killed ones leave their marks. Another project, or
+    the same one made anew, has runs of the same number and results of the same key.
+    """
     # Late: what computes without Dask never imports it.
     from distributed import get_worker
 
     try:
-        return Path(get_worker().local_directory).parent
+        worker = get_worker()
     except ValueError:
         return None
+    run = f"{work.project} {work.run_id} {worker.scheduler.address}"
+    digest = hashlib.sha256(run.encode()).hexdigest()[:16]
+    name = f"worldpose-{work.recipe.match_id}-{work.key}-{digest}"
+    return Path(worker.local_directory).parent / name

@@ -2,22 +2,29 @@
 
 import os
 import time
+from types import SimpleNamespace
 
 import pytest
 
 from data_contracts.work import Recipe, Work
-from tasks import beginnings
 from tasks.beginnings import DeadlyUnitError, OvertimeError, survivable
 from worldpose.store import key_of
 
 
 @pytest.fixture
 def work(tmp_path, monkeypatch):
-    monkeypatch.setattr(beginnings, "_worker_scratch", lambda: tmp_path)
+    at_work(monkeypatch, tmp_path, "tcp://127.0.0.1:1000")
     nothing = {"sources": {}, "inputs": {}, "settings": {}, "code": {}, "libraries": {}}
     recipe = Recipe(match_id="m", stage="tracking", unit="c", **nothing)
     key = key_of(recipe)
     return Work(project="p", folder="m", recipe=recipe, key=key, run_id="0001", seconds=60.0)
+
+
+def at_work(monkeypatch, scratch, scheduler):
+    """Let this process pass for a worker of that scheduler."""
+    address = SimpleNamespace(address=scheduler)
+    worker = SimpleNamespace(local_directory=str(scratch / "worker-1"), scheduler=address)
+    monkeypatch.setattr("distributed.get_worker", lambda: worker)
 
 
 def die(work):
@@ -36,6 +43,18 @@ def test_who_ends_three_processes_is_given_up_once(work, tmp_path):
         survivable(work).__enter__()
     assert list(tmp_path.iterdir()) == []
     with survivable(work):  # it may have been the machine: the next run tries again
+        pass
+
+
+@pytest.mark.parametrize("again", ["another project", "a project made anew"])
+def test_what_killed_runs_left_counts_for_no_other_run(work, tmp_path, monkeypatch, again):
+    for _ in range(3):
+        die(work)
+    if again == "another project":
+        work = work.model_copy(update={"project": "q"})
+    else:
+        at_work(monkeypatch, tmp_path, "tcp://127.0.0.1:1001")
+    with survivable(work):
         pass
 
 
