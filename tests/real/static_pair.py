@@ -1,0 +1,80 @@
+"""The two static cameras of a real match as a match folder, from their videos and hand clicks.
+
+The clicks are CVAT annotations whose labels "(x,y)" are metres from the far left corner of a
+105 x 68 m pitch. Places that the Laws do not name, where mowing stripes meet the touch lines,
+become points of pitch.json. Both cameras hang on one mast, 0.46 m apart.
+"""
+
+import json
+import shutil
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+
+from worldpose.pitch.laws import law_points
+
+CROWN = 0.1
+"""Height of the long axis above the touch lines [m]; it fits both cameras better than 0.2."""
+LENGTH, WIDTH = 105.0, 68.0
+SWAPPED = {("right", 1394.99): "(88.5,14.84)", ("right", 2945.60): "(99.5,68)"}
+"""Two clicks of the right camera whose labels are swapped: pixel x to the label of the place."""
+TRUE_CORNER = {14.84: 13.84, 53.16: 54.16}
+"""The labels draw the penalty areas 1 m too narrow on either side [m]."""
+
+
+def read_clicks(data, side, *, correct_labels=True):
+    """Return name to place (3,) [m, world] and name to pixel (2,) of one camera.
+
+    Args:
+        data: folder of the pair.
+        side: left or right.
+        correct_labels: use the places that were clicked instead of those that the labels say. A
+            label that comes twice gets the suffix `.again`.
+    """
+    places, pixels = {}, {}
+    laws = law_points(LENGTH, WIDTH)
+    for point in ElementTree.parse(data / f"{side}_keypoints.xml").iter("points"):
+        pixel = tuple(map(float, point.get("points").split(",")))
+        label = point.get("label")
+        if correct_labels:
+            label = SWAPPED.get((side, round(pixel[0], 2)), label)
+        x, y = map(float, label.strip("()").split(","))
+        if correct_labels:
+            y = TRUE_CORNER.get(y, y)
+        x, y = x - 0.5 * LENGTH, 0.5 * WIDTH - y
+        place = np.array([x, y, -CROWN * (2.0 * y / WIDTH) ** 2])
+        on_ground = {name: law for name, law in laws.items() if law[2] == 0.0}
+        near = [name for name, law in on_ground.items() if np.hypot(*(place - law)[:2]) < 0.1]
+        name = near[0] if near else f"stripe.{label.strip('()').replace(',', '.')}"
+        name = f"{name}.again" if name in pixels else name
+        places[name], pixels[name] = place, pixel
+    return places, pixels
+
+
+def write_static_pair(data, folder, *, first_frame=8, frame_count=10, correct_labels=True):
+    """Write the match folder: both videos, the clicks of both cameras, and one clip."""
+    annotations = folder / "annotations" / "static_calibration"
+    annotations.mkdir(parents=True)
+    (folder / "videos").mkdir()
+    points = {}
+    for side in ("left", "right"):
+        shutil.copy(data / f"{side}_camera.mp4", folder / "videos" / f"{side}.mp4")
+        places, pixels = read_clicks(data, side, correct_labels=correct_labels)
+        laws = law_points(LENGTH, WIDTH)
+        points |= {name: list(place) for name, place in places.items() if name not in laws}
+        clicked = [{"name": name, "xy": list(pixel)} for name, pixel in pixels.items()]
+        (annotations / f"{side}.json").write_text(json.dumps({"points": clicked}))
+    pitch = {"length": LENGTH, "width": WIDTH, "crown": CROWN, "points": points}
+    (folder / "pitch.json").write_text(json.dumps(pitch))
+    # The left video is four frames late.
+    (folder / "match.yaml").write_text(
+        f"""contract: 1
+match_id: pair
+fps: 25
+cameras:
+  - {{id: left, width: 3072, height: 1728, offset_frames: 4}}
+  - {{id: right, width: 3072, height: 1728}}
+clips:
+  - {{id: clip, first_frame: {first_frame}, frame_count: {frame_count}}}
+"""
+    )

@@ -1,0 +1,43 @@
+"""Two static cameras of a real match, clicked by hand; skipped where the data is absent.
+
+WORLDPOSE_TEST_DATA names a folder with `static_pair` (videos and CVAT clicks).
+"""
+
+import os
+from pathlib import Path
+
+import pytest
+from static_pair import CROWN, read_clicks
+
+from data_contracts.pitch import PitchSpec
+from data_contracts.static_calibration import ClickedMarkings
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration import calibrate
+
+DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "static_pair"
+
+pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="WORLDPOSE_TEST_DATA has no static_pair")
+
+
+def calibrated(side, *, correct_labels):
+    places, pixels = read_clicks(DATA, side, correct_labels=correct_labels)
+    points = {name: tuple(place) for name, place in places.items()}
+    pitch = PitchTemplate.from_spec(PitchSpec(crown=CROWN, points=points))
+    clicked = [{"name": name, "xy": pixel} for name, pixel in pixels.items()]
+    return calibrate(pitch, ClickedMarkings.model_validate({"points": clicked}), (3072, 1728))
+
+
+@pytest.mark.parametrize(("side", "count"), [("left", 38), ("right", 39)])
+def test_hand_clicks_of_the_right_places_are_all_believed(side, count):
+    report = calibrated(side, correct_labels=True).report
+    assert sum(point.inlier for point in report.points) == count
+
+
+def test_wrong_labels_and_no_others_are_rejected():
+    # The labels put the penalty areas' corners at y = 14.84 and 53.16 m, the Laws at 13.84 and
+    # 54.16 m; the right camera's labels also swap two places.
+    for side, swapped in (("left", set()), ("right", {"stripe.105.14.84", "stripe.99.5.0.again"})):
+        report = calibrated(side, correct_labels=False).report
+        misplaced = {p.name for p in report.points if p.name.count("14.84") + p.name.count("53.16")}
+        rejected = {point.name for point in report.points if not point.inlier}
+        assert rejected == misplaced | swapped
