@@ -59,6 +59,12 @@ def simulate(
     masks: Annotated[
         bool, typer.Option("--masks", help="With --render, add who is where in every pixel.")
     ] = False,
+    recordings: Annotated[
+        Path | None,
+        typer.Option(
+            help="For foreign-*: folder of motion capture and tracking data (npz) to replay."
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Make a synthetic match folder with known truth.
@@ -66,18 +72,19 @@ def simulate(
     Example: worldpose simulate --scenario tiny --seed 1 --out matches/tiny
     """
     from worldpose.synthetic import SCENARIOS, simulate_match
+    from worldpose.synthetic.foreign import FOREIGN_SCENARIOS, simulate_foreign_match
 
+    about = {name: each.about for name, each in (SCENARIOS | FOREIGN_SCENARIOS).items()}
     if scenario == "list":
         if as_json:
-            print_json({"scenarios": {name: each.about for name, each in SCENARIOS.items()}})
+            print_json({"scenarios": about})
             return
-        rows = [(name, each.about) for name, each in SCENARIOS.items()]
-        print_table("scenarios", ("name", "what happens"), rows)
+        print_table("scenarios", ("name", "what happens"), list(about.items()))
         return
-    if scenario not in SCENARIOS:
+    if scenario not in about:
         raise UsageError(
             f"--scenario {scenario}",
-            expected=f"one of {', '.join(SCENARIOS)}",
+            expected=f"one of {', '.join(about)}",
             found=repr(scenario),
             todo="See worldpose simulate --scenario list.",
         )
@@ -89,6 +96,29 @@ def simulate(
         raise UsageError(
             "--masks", expected="--masks with --render", found="no --render", todo="Add --render."
         )
+    if scenario in FOREIGN_SCENARIOS:
+        _refuse_options(
+            f"foreign scenario {scenario}",
+            {
+                "--trajectories": trajectories is not None,
+                "--mocap": mocap is not None,
+                "--render": render,
+                "--players 0": players == 0,
+            },
+        )
+        spec = simulate_foreign_match(
+            FOREIGN_SCENARIOS[scenario],
+            seed,
+            out,
+            duration=duration,
+            cameras=cameras,
+            people=players,
+            recordings=recordings,
+            calibrated=calibrated,
+        )
+        _report_match(spec.match_id, out, as_json)
+        return
+    _refuse_options(f"scenario {scenario}", {"--recordings": recordings is not None})
     with _filming() as advance:
         spec = simulate_match(
             SCENARIOS[scenario],
@@ -106,10 +136,27 @@ def simulate(
             masks=masks,
             advance=advance,
         )
+    _report_match(spec.match_id, out, as_json)
+
+
+def _refuse_options(what: str, options: dict[str, bool]) -> None:
+    """Raise UsageError for the first option that was given and does not apply."""
+    for option, given in options.items():
+        if given:
+            raise UsageError(
+                option,
+                expected=f"an option of {what}",
+                found=f"{option}, which it does not have",
+                todo="Leave the option out, or see docs/synthetic.md for what replaces it.",
+            )
+
+
+def _report_match(match_id: str, out: Path, as_json: bool) -> None:
+    """Print which match was made."""
     if as_json:
-        print_json({"match": spec.match_id, "folder": str(out)})
+        print_json({"match": match_id, "folder": str(out)})
     else:
-        line(f"made match {spec.match_id} in {out}")
+        line(f"made match {match_id} in {out}")
 
 
 @contextmanager

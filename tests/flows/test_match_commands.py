@@ -14,7 +14,7 @@ from data_contracts.run import RunRecord, UnitFailure, WaitingUnit
 from flows.cli import run as run_command
 from flows.cli.app import app
 from flows.registering import open_for_review, register
-from worldpose.errors import InputError
+from worldpose.errors import InputError, UsageError
 from worldpose.ingest.calibration_files import write_calibration_toml
 from worldpose.store import Store
 
@@ -168,3 +168,26 @@ def test_of_several_folders_the_good_ones_are_taken_in_and_the_others_said(store
     assert (answer.exit_code, store.matches()) == (4, ("a",))
     assert f"error: {none}" in answer.stderr
     assert said(store, "ingest", good).exit_code == 0
+
+
+def test_a_match_of_the_second_world_is_made_by_name(tmp_path):
+    listed = CliRunner().invoke(app, ["simulate", "--scenario", "list", "--json"])
+    assert "foreign-mixed" in json.loads(listed.stdout)["scenarios"]
+    words = ["simulate", "--scenario", "foreign-lab", "--seed", "1", "--duration", "0.2", "--json"]
+    done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "lab")])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["match"] == "foreign-lab-1-0.2s"
+    assert (tmp_path / "lab" / "reference" / "world.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("scenario", "option"),
+    [("foreign-lab", "--render"), ("foreign-lab", "--mocap"), ("tiny", "--recordings")],
+)
+def test_an_option_that_a_scenario_does_not_have_is_refused(tmp_path, scenario, option):
+    value = [] if option == "--render" else [str(tmp_path)]
+    words = ["simulate", "--scenario", scenario, "--out", str(tmp_path / "out"), option, *value]
+    done = CliRunner().invoke(app, words)
+    assert isinstance(done.exception, UsageError)
+    assert done.exception.where == option
+    assert not (tmp_path / "out").exists()

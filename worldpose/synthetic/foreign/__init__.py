@@ -1,0 +1,21 @@
+"""The second world: match folders that differ from the others in all that can be learned.
+
+Inputs: a `ForeignScenario`, a seed, and recordings where there are some.
+Outputs: a match folder with its truth. Nothing here is shared with the first simulator: no motion,
+no noise, no camera placement; estimators are measured on it and never chosen by it.
+"""
+
+from worldpose.synthetic.foreign.matches import simulate_foreign_match
+from worldpose.synthetic.foreign.recordings import Recordings, read_recordings
+from worldpose.synthetic.foreign.scenarios import FOREIGN_SCENARIOS, ForeignScenario
+from worldpose.synthetic.foreign.scenes import ForeignScene, simulate_foreign_scene
+
+__all__ = [
+    "FOREIGN_SCENARIOS",
+    "ForeignScenario",
+    "ForeignScene",
+    "Recordings",
+    "read_recordings",
+    "simulate_foreign_match",
+    "simulate_foreign_scene",
+]

@@ -1,0 +1,295 @@
+"""Skeletons from anthropometric tables, and joints from bone directions.
+
+Segment lengths are shares of stature after P. de Leva, Adjustments to Zatsiorsky-Seluyanov's
+segment inertia parameters, Journal of Biomechanics 29, 1996 (men of 1.741 m, women of 1.735 m), and
+R. Drillis, R. Contini, Body segment parameters, 1966; face and neck after the means of the ANSUR
+survey of 1988. No body model takes part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d, minimum_filter1d
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Ground = Callable[[Floats, Floats], Floats]
+"""Height of the ground [m] at x and y [m], world."""
+Kind = Literal["man", "woman", "child"]
+
+STATURE: Final[dict[Kind, tuple[float, float]]] = {
+    "man": (1.78, 0.075),
+    "woman": (1.66, 0.068),
+    "child": (1.38, 0.11),
+}
+"""Mean and standard deviation [m]; a child of about ten years."""
+SHARES: Final[dict[Kind, dict[str, float]]] = {
+    "man": {
+        **{"thigh": 0.2425, "shank": 0.2493, "ankle": 0.043, "upper_arm": 0.1618},
+        **{"forearm": 0.1545, "trunk": 0.332, "hips": 0.098, "shoulders": 0.205},
+        **{"drop": 0.058, "neck": 0.060, "head": 1.0},
+    },
+    "woman": {
+        **{"thigh": 0.2290, "shank": 0.2500, "ankle": 0.041, "upper_arm": 0.1586},
+        **{"forearm": 0.1523, "trunk": 0.346, "hips": 0.105, "shoulders": 0.194},
+        **{"drop": 0.055, "neck": 0.058, "head": 0.96},
+    },
+    "child": {
+        **{"thigh": 0.2320, "shank": 0.2400, "ankle": 0.046, "upper_arm": 0.1550},
+        **{"forearm": 0.1440, "trunk": 0.338, "hips": 0.096, "shoulders": 0.192},
+        **{"drop": 0.055, "neck": 0.058, "head": 0.93},
+    },
+}
+"""Bones as shares of stature [1]; `drop`, how far the shoulders' centres lie below the neck along
+the trunk; `head`, the size of the face relative to a man's."""
+SPREAD: Final = 0.035
+"""Standard deviation of a person's share relative to the mean [1]."""
+FACE: Final = np.array(
+    [
+        [0.118, 0.086, 0.086, 0.0, 0.0],
+        [0.0, 0.032, -0.032, 0.073, -0.073],
+        [-0.020, 0.018, 0.018, 0.0, 0.0],
+    ]
+).T
+"""Nose, eyes and ears [m] forward, left and up of the middle between the ears."""
+NECK_FORWARD: Final = 0.6
+"""How far the ears lie before the neck's base, as a share of how far they lie above it [1]."""
+SETTLING: Final = 0.08
+"""Standard deviation in time with which the pelvis is lowered to what the legs reach [s]."""
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """One person's bones.
+
+    Attributes:
+        kind: whose proportions they vary.
+        stature: [m].
+        thigh, shank, upper_arm, forearm: left and right [m].
+        ankle: height of the ankle's centre above the sole [m].
+        trunk: from the middle of the hips to the base of the neck [m].
+        hips, shoulders: between the joints' centres [m].
+        drop: from the neck's base down to the line of the shoulders [m].
+        neck: from the neck's base up to the ears [m].
+        head: size of the face relative to `FACE` [1].
+    """
+
+    kind: Kind
+    stature: float
+    thigh: tuple[float, float]
+    shank: tuple[float, float]
+    upper_arm: tuple[float, float]
+    forearm: tuple[float, float]
+    ankle: float
+    trunk: float
+    hips: float
+    shoulders: float
+    drop: float
+    neck: float
+    head: float
+
+    @property
+    def leg(self) -> float:
+        """Length of the shorter leg [m]."""
+        return min(t + s for t, s in zip(self.thigh, self.shank, strict=True))
+
+    def record(self) -> dict[str, Any]:
+        """Return the measures by name, for the reference."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Posture:
+    """Bone directions over time: unit vectors (frames, 3) forward, left, up of the heading.
+
+    Attributes:
+        hips, shoulders: from right to left.
+        trunk: from the middle of the hips to the neck's base.
+        head_up, gaze: the head's axis, and where the face points.
+        upper_arm, forearm, thigh, shank: (frames, 2, 3), left and right, towards the end of the
+            limb.
+        height: (frames,) of the middle of the hips above the ankles' level on the ground, as a
+            share of the leg's length [1].
+        planted: (frames, 2), left and right: the ankle stays where it is.
+    """
+
+    hips: Floats
+    trunk: Floats
+    shoulders: Floats
+    head_up: Floats
+    gaze: Floats
+    upper_arm: Floats
+    forearm: Floats
+    thigh: Floats
+    shank: Floats
+    height: Floats
+    planted: Flags
+
+
+def draw_skeleton(kind: Kind, rng: np.random.Generator) -> Skeleton:
+    """Return a person of this kind: stature, proportions and a slight asymmetry."""
+    mean, spread = STATURE[kind]
+    stature = float(mean + spread * np.clip(rng.standard_normal(), -2.2, 2.2))
+    shares = SHARES[kind]
+    deviation = np.clip(rng.standard_normal(len(shares)), -2.5, 2.5)
+    own = {
+        name: share * (1.0 + SPREAD * deviation[i])
+        for i, (name, share) in enumerate(shares.items())
+    }
+
+    def both(name: str) -> tuple[float, float]:
+        uneven = 0.004 * rng.standard_normal()
+        length = own[name] * stature
+        return length * (1.0 + uneven), length * (1.0 - uneven)
+
+    single = {
+        name: own[name] * stature
+        for name in ("ankle", "trunk", "hips", "shoulders", "drop", "neck")
+    }
+    return Skeleton(
+        kind=kind,
+        stature=stature,
+        thigh=both("thigh"),
+        shank=both("shank"),
+        upper_arm=both("upper_arm"),
+        forearm=both("forearm"),
+        head=own["head"],
+        **single,
+    )
+
+
+def place_joints(
+    skeleton: Skeleton,
+    posture: Posture,
+    root: Floats,
+    heading: Floats,
+    fps: float,
+    ground: Ground,
+) -> Floats:
+    """Return anatomical joints (frames, 17, 3) [m], world, in COCO-17 order.
+
+    Bone lengths are exact. Planted ankles are held in place as in L. Kovar, J. Schreiner,
+    M. Gleicher, Footskate cleanup for motion capture editing, 2002: the limb's own course is
+    shifted while a foot is planted, the shift fades over to the next in between, the pelvis sinks
+    where the legs do not reach, and knees follow from thigh and shank.
+
+    Args:
+        skeleton: the person's bones.
+        posture: directions relative to the heading.
+        root: (frames, 2) middle of the hips in plan [m], world.
+        heading: (frames,) from the x axis towards y [rad].
+        fps: frames in a second [1/s].
+        ground: what feet stand on.
+    """
+    frames = len(root)
+    turn = _turns(heading)
+    world = {
+        name: np.einsum("fij,fj->fi", turn, getattr(posture, name))
+        for name in ("hips", "trunk", "shoulders", "head_up", "gaze")
+    }
+    limbs = {
+        name: np.einsum("fij,fsj->fsi", turn, getattr(posture, name))
+        for name in ("upper_arm", "forearm", "thigh", "shank")
+    }
+    pelvis = np.empty((frames, 3))
+    pelvis[:, :2] = root
+    pelvis[:, 2] = ground(*root.T) + skeleton.ankle + posture.height * skeleton.leg
+    sides = np.array([0.5, -0.5])
+    hip_offset = skeleton.hips * sides[:, None] * world["hips"][:, None]
+    lengths = np.stack([skeleton.thigh, skeleton.shank])
+    swung = pelvis[:, None] + hip_offset
+    swung = swung + lengths[0][:, None] * limbs["thigh"] + lengths[1][:, None] * limbs["shank"]
+    ankles = np.stack(
+        [
+            _held(swung[:, side], posture.planted[:, side], skeleton.ankle, ground)
+            for side in range(2)
+        ],
+        axis=1,
+    )
+    pelvis[:, 2] -= _sinking(pelvis[:, None] + hip_offset, ankles, posture.planted, lengths, fps)
+    hips = pelvis[:, None] + hip_offset
+    pole = limbs["thigh"] - limbs["shank"] + 0.05 * turn[:, None, :, 0]
+    knees, ankles = _bent(hips, ankles, pole, lengths)
+
+    neck = pelvis + skeleton.trunk * world["trunk"]
+    middle = neck - skeleton.drop * world["trunk"]
+    shoulders = middle[:, None] + skeleton.shoulders * sides[:, None] * world["shoulders"][:, None]
+    elbows = shoulders + np.array(skeleton.upper_arm)[:, None] * limbs["upper_arm"]
+    wrists = elbows + np.array(skeleton.forearm)[:, None] * limbs["forearm"]
+    up = world["head_up"]
+    gaze = _unit(world["gaze"] - (world["gaze"] * up).sum(-1, keepdims=True) * up)
+    axes = np.stack([gaze, np.cross(up, gaze), up], axis=1)
+    ears = neck + skeleton.neck * (world["trunk"] + NECK_FORWARD * gaze)
+    face = ears[:, None] + skeleton.head * FACE @ axes
+    return np.concatenate([face, shoulders, elbows, wrists, hips, knees, ankles], axis=1)
+
+
+def _turns(heading: Floats) -> Floats:
+    """Rotations (frames, 3, 3) from forward, left, up to the world."""
+    cos, sin = np.cos(heading), np.sin(heading)
+    zero, one = np.zeros_like(cos), np.ones_like(cos)
+    return np.stack(
+        [
+            np.stack([cos, -sin, zero], axis=-1),
+            np.stack([sin, cos, zero], axis=-1),
+            np.stack([zero, zero, one], axis=-1),
+        ],
+        axis=-2,
+    )
+
+
+def _held(course: Floats, planted: Flags, ankle: float, ground: Ground) -> Floats:
+    """An ankle's course (frames, 3) with its planted stretches brought to rest on the ground."""
+    frames = len(course)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], planted, [False]]).astype(np.int8)))
+    shift = np.zeros((frames, 3))
+    known: list[int] = []
+    for begin, end in edges.reshape(-1, 2):
+        place = course[(begin + end - 1) // 2].copy()
+        place[2] = float(ground(place[:1], place[1:2])[0]) + ankle
+        shift[begin:end] = place - course[begin:end]
+        known += [int(begin), int(end) - 1]
+    if known:
+        shift[: known[0]], shift[known[-1] :] = shift[known[0]], shift[known[-1]]
+        for leave, land in zip(known[1:-1:2], known[2::2], strict=True):
+            share = np.linspace(0.0, 1.0, land - leave + 1)[:, None]
+            share = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+            shift[leave : land + 1] = (1.0 - share) * shift[leave] + share * shift[land]
+    held = course + shift
+    floor = ground(held[:, 0], held[:, 1]) + ankle
+    held[:, 2] = np.maximum(held[:, 2], floor)
+    return held
+
+
+def _sinking(hips: Floats, ankles: Floats, planted: Flags, lengths: Floats, fps: float) -> Floats:
+    """How far the pelvis must sink (frames,) [m] for planted ankles to be within reach."""
+    reach = 0.998 * lengths.sum(axis=0)
+    away = np.linalg.norm((ankles - hips)[..., :2], axis=-1)
+    highest = ankles[..., 2] + np.sqrt(np.maximum(reach**2 - away**2, 0.0))
+    slack = np.where(planted, highest - hips[..., 2], np.inf).min(axis=1)
+    slack = np.minimum(slack, 0.0)
+    half = max(1, round(3.0 * SETTLING * fps))
+    lowest = minimum_filter1d(slack, 2 * half + 1, mode="nearest")
+    return np.asarray(-gaussian_filter1d(lowest, SETTLING * fps, mode="nearest", truncate=3.0))
+
+
+def _bent(hips: Floats, ankles: Floats, pole: Floats, lengths: Floats) -> tuple[Floats, Floats]:
+    """Knees and reachable ankles (frames, 2, 3): the knee bends towards the pole."""
+    thigh, shank = lengths[0][:, None], lengths[1][:, None]
+    line = ankles - hips
+    far = np.linalg.norm(line, axis=-1, keepdims=True)
+    along = line / far
+    far = np.clip(far, 1.05 * np.abs(thigh - shank) + 0.05, 0.9995 * (thigh + shank))
+    across = _unit(pole - (pole * along).sum(-1, keepdims=True) * along)
+    part = (far**2 + thigh**2 - shank**2) / (2.0 * far)
+    out = np.sqrt(np.maximum(thigh**2 - part**2, 0.0))
+    return hips + part * along + out * across, hips + far * along
+
+
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

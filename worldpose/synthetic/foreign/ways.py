@@ -1,0 +1,225 @@
+"""Ways of people over the ground: social forces, or tracking data of real players.
+
+Who is not tracked goes by the model of D. Helbing, P. Molnar, Social force model for pedestrian
+dynamics, Physical Review E 51, 1995: everyone relaxes to the velocity that leads to a goal, and is
+pushed away by others and by the border.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+Floats = NDArray[np.float64]
+Role = Literal["roam", "duel", "cross", "stand", "sprint"]
+
+LEAD: Final = 2.0
+"""Time before the first frame and behind the last in which people already move [s]."""
+TRACK_SMOOTHING: Final = 0.3
+"""Standard deviation in time of the smoothing of tracking data [s]."""
+FASTEST: Final = 9.0
+"""[m/s]"""
+_RELAXATION: Final = 0.45
+"""Time in which a person takes on a wanted velocity [s]."""
+_PUSH: Final = (12.0, 0.25)
+"""Of another person who touches: acceleration [m/s^2], and the distance over which it fades [m]."""
+_HARDEST: Final = (6.0, 25.0)
+"""Largest acceleration by legs, and by others [m/s^2]."""
+_BODY: Final = 0.42
+"""Distance of the middles of two people who touch [m]."""
+_SPEEDS: Final[dict[Role, tuple[float, float]]] = {
+    "roam": (0.6, 4.5),
+    "duel": (0.8, 5.0),
+    "cross": (1.0, 3.5),
+    "stand": (0.3, 1.2),
+    "sprint": (4.5, 8.5),
+}
+"""Slowest and fastest wanted speed of a role [m/s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """One person's way.
+
+    Attributes:
+        times: (samples,) [s], evenly spaced.
+        root: (samples, 2) middle of the hips [m], world.
+        heading: (samples,) the way the body faces [rad], continuous.
+        source: where it is from, for the reference.
+    """
+
+    times: Floats
+    root: Floats
+    heading: Floats
+    source: str
+
+
+def follow_tracks(times: Floats, clock: Floats, xy: Floats, scale: Floats, source: str) -> Way:
+    """Return the way of a tracked player.
+
+    Args:
+        times: (samples,) wanted [s].
+        clock: (rows,) of the tracking data [s].
+        xy: (rows, 2) [m].
+        scale: (2,) of this pitch to the pitch of the data [1].
+        source: for the reference.
+    """
+    step = times[1] - times[0]
+    place = np.stack(
+        [np.interp(times, clock, column) * s for column, s in zip(xy.T, scale, strict=True)], -1
+    )
+    # Beyond the data people coast to a stop.
+    for part, edge in ((times < clock[0], 0), (times > clock[-1], -1)):
+        if part.any():
+            near = np.abs(clock - clock[edge]) <= 0.6
+            speed = np.array([np.polyfit(clock[near], c[near], 1)[0] for c in xy.T]) * scale
+            beyond = times[part] - clock[edge]
+            place[part] += (
+                np.sign(beyond)[:, None] * 0.5 * speed * -np.expm1(-np.abs(beyond)[:, None] / 0.5)
+            )
+    place = gaussian_filter1d(place, TRACK_SMOOTHING / step, axis=0, mode="nearest")
+    velocity = np.gradient(place, step, axis=0)
+    speed = np.linalg.norm(velocity, axis=-1, keepdims=True)
+    velocity *= np.minimum(1.0, FASTEST / np.maximum(speed, 1e-9))
+    middle = len(times) // 2
+    place = (
+        place[middle]
+        + np.cumsum(velocity, axis=0) * step
+        - np.cumsum(velocity, axis=0)[middle] * step
+    )
+    return Way(times, place, _facing(velocity, step, None), source)
+
+
+def wander(
+    times: Floats,
+    roles: Sequence[Role],
+    center: Floats,
+    size: Floats,
+    obstacles: Sequence[Way],
+    rng: np.random.Generator,
+) -> list[Way]:
+    """Return ways of people who keep clear of each other within an area.
+
+    Args:
+        times: (samples,) [s], evenly spaced.
+        roles: one a person; duels are with the person before in the list.
+        center: (2,) of the area [m].
+        size: (2,) of the area [m].
+        obstacles: people whose ways are known; the others avoid them.
+        rng: draws places, goals and speeds.
+    """
+    count, step = len(roles), float(times[1] - times[0])
+    substeps = max(1, int(np.ceil(step / 0.02)))
+    place = _spread(count, center, size, [way.root[0] for way in obstacles], rng)
+    for person in range(1, count):
+        if roles[person] == "duel":
+            angle = rng.uniform(0.0, 2.0 * np.pi)
+            near = np.array([np.cos(angle), np.sin(angle)])
+            place[person] = place[person - 1] + rng.uniform(0.5, 0.9) * near
+    velocity = np.zeros((count, 2))
+    goal = np.array([_goal(roles[p], place[p], center, size, rng) for p in range(count)])
+    want = np.array([rng.uniform(*_SPEEDS[role]) for role in roles])
+    rest = np.where([role == "stand" for role in roles], rng.uniform(2.0, 9.0, count), 0.0)
+    shift = rng.uniform(-0.5, 0.5, (count, 2))
+    root = np.empty((len(times), count, 2))
+    moved = np.empty((len(times), count, 2))
+    for index in range(len(times)):
+        root[index], moved[index] = place, velocity
+        others = np.array([way.root[index] for way in obstacles]).reshape(-1, 2)
+        for _ in range(substeps):
+            h = step / substeps
+            for person, role in enumerate(roles):
+                if role == "duel" and person:
+                    goal[person] = place[person - 1] + 0.6 * velocity[person - 1] + shift[person]
+            away = goal - place
+            far = np.linalg.norm(away, axis=-1)
+            arrived = far < np.where(rest > 0.0, 1e9, 0.6)
+            for person in np.flatnonzero(arrived & (rest <= 0.0)).tolist():
+                role = roles[person]
+                if role == "duel" and person:
+                    continue
+                goal[person] = _goal(role, place[person], center, size, rng)
+                want[person] = rng.uniform(*_SPEEDS[role])
+                if rng.random() < (0.7 if role == "stand" else 0.15):
+                    rest[person] = rng.uniform(0.8, 6.0)
+            rest = np.maximum(rest - h, 0.0)
+            pace = np.where(rest > 0.0, 0.0, np.minimum(want, 1.6 * far))
+            wanted = away / np.maximum(far, 1e-6)[:, None] * pace[:, None]
+            drive = _limited((wanted - velocity) / _RELAXATION, _HARDEST[0])
+            push = _limited(_repelled(place, others), _HARDEST[1])
+            velocity = velocity + h * (drive + push)
+            place = place + h * velocity
+    root = gaussian_filter1d(root, 0.06 / step, axis=0, mode="nearest")
+    ways = []
+    for person, role in enumerate(roles):
+        towards = None
+        if role == "duel" and person:
+            towards = root[:, person - 1] - root[:, person]
+        heading = _facing(moved[:, person], step, towards, rng)
+        ways.append(Way(times, root[:, person], heading, f"social forces: {role}"))
+    return ways
+
+
+def _spread(
+    count: int, center: Floats, size: Floats, taken: list[Floats], rng: np.random.Generator
+) -> Floats:
+    """Places (count, 2) in an area, apart from each other where there is room."""
+    places: list[Floats] = []
+    for _ in range(count):
+        drawn = center + size * rng.uniform(-0.48, 0.48, (30, 2))
+        known = np.array(taken + places).reshape(-1, 2)
+        room = np.linalg.norm(drawn[:, None] - known, axis=-1).min(axis=1, initial=2.0)
+        places.append(drawn[int(room.argmax())])
+    return np.array(places).reshape(-1, 2)
+
+
+def _goal(
+    role: Role, place: Floats, center: Floats, size: Floats, rng: np.random.Generator
+) -> Floats:
+    if role == "cross":
+        # To the other side, through the middle.
+        return np.asarray(center - 0.9 * (place - center) + 0.12 * size * rng.standard_normal(2))
+    if role == "stand":
+        return np.asarray(
+            np.clip(place + rng.normal(0.0, 1.2, 2), center - 0.5 * size, center + 0.5 * size)
+        )
+    return np.asarray(center + size * rng.uniform(-0.5, 0.5, 2))
+
+
+def _repelled(place: Floats, others: Floats) -> Floats:
+    """Accelerations (persons, 2) [m/s^2] by which people push each other apart."""
+    everyone = np.concatenate([place, others])
+    apart = place[:, None] - everyone
+    far = np.linalg.norm(apart, axis=-1)
+    far[np.arange(len(place)), np.arange(len(place))] = np.inf
+    strength = _PUSH[0] * np.exp(np.clip((_BODY - far) / _PUSH[1], -30.0, 2.0))
+    return np.asarray(((strength / np.maximum(far, 1e-3))[..., None] * apart).sum(axis=1))
+
+
+def _limited(vectors: Floats, most: float) -> Floats:
+    """Vectors (persons, 2) that are no longer than `most`."""
+    size = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors * np.minimum(1.0, most / np.maximum(size, 1e-9)))
+
+
+def _facing(
+    velocity: Floats, step: float, towards: Floats | None, rng: np.random.Generator | None = None
+) -> Floats:
+    """Heading (samples,) [rad]: the way one goes, or, where slow, where one looks."""
+    speed = np.linalg.norm(velocity, axis=-1)
+    begin = 0.0 if rng is None else float(rng.uniform(-np.pi, np.pi))
+    aim = velocity + 1e-9
+    if towards is not None:
+        share = np.clip((2.5 - speed) / 1.5, 0.0, 1.0)[:, None]
+        aim = (1.0 - share) * velocity + share * 2.0 * towards
+    going = speed > 0.45 if towards is None else np.ones(len(speed), bool)
+    heading = np.full(len(speed), begin)
+    if going.any():
+        course = np.unwrap(np.arctan2(aim[going, 1], aim[going, 0]))
+        heading = np.interp(np.arange(len(speed)), np.flatnonzero(going), course)
+    return np.asarray(gaussian_filter1d(heading, 0.22 / step, mode="nearest"))
