@@ -102,16 +102,17 @@ _REVIEW = (
         dims=("click", "axis"),
         dtype="float64",
         unit="px",
-        missing="none",
-        about="projected minus clicked, after adjustment",
+        missing="nan",
+        about="projected minus clicked, after adjustment; missing where the camera cannot image it",
     ),
     ArrayLayout(
         name="click_surprise",
         dims=("click",),
         dtype="float64",
         unit="1",
-        missing="none",
-        about="residual in standard deviations of what everything else predicts",
+        missing="nan",
+        about="residual in standard deviations of what everything else predicts; missing where the "
+        "camera cannot image it",
     ),
     ArrayLayout(
         name="click_wrong",
@@ -144,5 +145,6 @@ BUNDLE_ADJUSTMENT = GroupLayout(
         "noise_correlation": "keypoints that are worth one independent one",
         "outliers_found": "keypoints and people that disagree, also beyond the list",
         "click": "names of the clicked points",
+        "click_problem": "for each clicked point that its camera cannot image, why; else empty",
     },
 )

@@ -40,6 +40,10 @@ class ResultManifest(Record):
     """Digest of `files`: two honest computations of one key agree in it."""
     figures: dict[str, float]
     """Quality figures, with the unit in the name."""
+    left_out: dict[Name, str] = {}
+    """Static cameras that no later stage may use, by id, and why."""
+    warnings: tuple[str, ...] = ()
+    """What the run tells the user about this result at its end."""
     created_at: datetime
     """When it was published."""
     seconds: float
@@ -109,7 +113,8 @@ class RunRecord(Record):
     state: RunState
     """waiting: nothing failed, but a person has to approve results; partial: some units failed, but
     units of the last stage asked for have results, or bodies where stages after `body_fitting` were
-    asked for too: those add to bodies that are there without them."""
+    asked for too: those add to bodies that are there without them. Also partial: no unit failed,
+    but too few cameras are left for later stages (`left_out`)."""
     results: dict[str, Key]
     """Unit, as `stage/unit`, to key."""
     settings: dict[str, dict[str, JsonValue]]
@@ -130,6 +135,10 @@ class RunRecord(Record):
     """Units that wait for review."""
     figures: dict[str, dict[str, float]]
     """Unit, as `stage/unit`, to quality figures."""
+    left_out: dict[Name, str] = {}
+    """Static cameras that the run did without, by id, and why."""
+    warnings: tuple[str, ...] = ()
+    """What the user must know about the results, one sentence each."""
     versions: dict[str, str]
     """Python and numeric libraries."""
     started_at: datetime

@@ -78,20 +78,29 @@ _EVIDENCE = (
         "parameters that were not solved for",
     ),
     ArrayLayout(
-        name="point_residual",
+        name="point_pixel",
         dims=("point", "axis"),
         dtype="float64",
         unit="px",
         missing="none",
-        about="projected minus clicked",
+        about="where it was clicked",
+    ),
+    ArrayLayout(
+        name="point_residual",
+        dims=("point", "axis"),
+        dtype="float64",
+        unit="px",
+        missing="nan",
+        about="projected minus clicked; missing where the camera cannot image the point",
     ),
     ArrayLayout(
         name="point_surprise",
         dims=("point",),
         dtype="float64",
         unit="1",
-        missing="none",
-        about="residual in standard deviations of what the other evidence predicts",
+        missing="nan",
+        about="residual in standard deviations of what the other evidence predicts; missing where "
+        "the camera cannot image the point",
     ),
     ArrayLayout(
         name="point_inlier",
@@ -137,10 +146,11 @@ _EVIDENCE = (
 )
 _ABOUT = {
     "point": "names of the clicked points, the most surprising first",
+    "point_problem": "for each clicked point that the camera does not rest on, why; else empty",
     "marking": "names of the drawn markings, the worst first",
     "free": "parameters that were solved for",
     "decisions": "what was chosen, and the figures that decided",
-    "reasons": "why the camera is weak; empty where it is not",
+    "reasons": "why the camera is weak, or why it is left out; empty where it is neither",
     "add_next": "points and markings whose clicks would lower the expected error most",
     "noise_scale": "factor on the stated noise that the residuals ask for; null for a given one",
     "condition": "condition number of the free parameters' correlation; null for a given one",
@@ -148,14 +158,16 @@ _ABOUT = {
 
 STATIC_CALIBRATION = GroupLayout(
     stage="static_calibration",
-    about="One static camera, and, unless it was given, how well it is known and why.",
+    about="One static camera, and, unless it was given, how well it is known and why. A camera "
+    "that cannot be calibrated has no arrays, and its reasons say why it is left out.",
     coordinates=_GROUND,
     arrays=(*CAMERA_ARRAYS, *_EVIDENCE),
     labels={**CAMERA_LABELS, "parameter": CAMERA_STEP, "parameter_": CAMERA_STEP},
     attributes={
         "camera_id": "camera of the match",
-        "origin": "given, points (stages 1 and 2) or lines (stage 3)",
+        "origin": "given, points (stages 1 and 2), lines (stage 3), or none for a camera that is "
+        "left out",
         **_ABOUT,
     },
-    optional=tuple(array.name for array in (*_GROUND, *_EVIDENCE)),
+    optional=tuple(array.name for array in (*_GROUND, *CAMERA_ARRAYS, *_EVIDENCE)),
 )

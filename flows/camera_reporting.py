@@ -20,7 +20,12 @@ from worldpose.store import Run, Store
 SHOWN = 2
 """Cameras that are shown with their clicks: the weakest."""
 
-_ORIGINS = {"given": "given", "points": "clicks", "lines": "clicks and painted lines"}
+_ORIGINS = {
+    "given": "given",
+    "points": "clicks",
+    "lines": "clicks and painted lines",
+    "none": "left out",
+}
 
 
 def camera_summaries(run: Run, spec: MatchSpec) -> list[CameraSummary]:
@@ -39,10 +44,17 @@ def camera_summaries(run: Run, spec: MatchSpec) -> list[CameraSummary]:
                 figures.get("reprojection_rms_px"),
                 None if used is None else int(used),
                 _wrong_clicks(run, unit),
-                tuple(attributes.get("reasons") or ()),
+                _reasons(run, camera.id),
             )
         )
     return summaries
+
+
+def _reasons(run: Run, camera_id: str) -> tuple[str, ...]:
+    """Why a person should look at a camera: what it was left out for, or why it is weak."""
+    left_out = run.record.left_out.get(camera_id)
+    weak = run[f"static_calibration/{camera_id}"].attrs.get("reasons") or ()
+    return tuple(weak) if left_out is None else (f"left out: {left_out}",)
 
 
 def camera_pictures(

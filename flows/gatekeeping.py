@@ -76,7 +76,11 @@ class Gatekeeper:
         if self.policy == "never":
             return ()
         asked = (ALWAYS,) if self.policy == "always" else ()
-        return (*asked, *gate.objections(manifest.figures))
+        left_out = (
+            f"camera {camera} would be left out: {reason}"
+            for camera, reason in manifest.left_out.items()
+        )
+        return (*asked, *left_out, *gate.objections(manifest.figures))
 
     def _has_refusals(self) -> bool:
         return any(

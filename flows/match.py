@@ -35,7 +35,7 @@ class IncompleteRunError(WorldposeError):
         self.run_id = record.run_id
         super().__init__(
             f"run {record.run_id} of {record.match_id}: {len(record.failed)} units failed, "
-            f"{len(record.waiting)} wait for review"
+            f"{len(record.waiting)} wait for review, {len(record.blocked)} are blocked"
         )
 
 
@@ -93,7 +93,7 @@ def process_match(
             )
         if record.failed or not (is_deployed() and undecided(record.waiting)):
             break
-    if record.failed or record.waiting:
+    if record.state != "complete":
         raise IncompleteRunError(record)
     return record.run_id
 

@@ -41,7 +41,7 @@ class Outlook:
 
     def is_recorded_by(self, latest: RunRecord | None) -> bool:
         """Whether the latest run's record is that of a run made now."""
-        if latest is None or latest.state not in ("complete", "waiting") or self.missing:
+        if latest is None or latest.failed or latest.state == "failed" or self.missing:
             return False
         is_asked = {unit.request for unit in self.waiting} == {u.request for u in latest.waiting}
         return is_asked and self.results.items() <= latest.results.items()
@@ -72,9 +72,11 @@ def look_ahead(
         for unit in gatekeeper.held(stage.name, basis.results)
     ]
     units: list[PlannedUnit] = []
+    lacks_cameras = False
     for stage in stages:
         plan = plan_stage(store, match, stage, overrides, passed(results, waiting), basis.before)
-        if plan.blocked and not waiting:
+        lacks_cameras = lacks_cameras or plan.lacks_cameras
+        if plan.blocked and not waiting and not lacks_cameras:
             raise UsageError(
                 f"--from {stages[0].name}",
                 expected=f"a latest run with all that {plan.blocked[0]} is made from",

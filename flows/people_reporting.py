@@ -66,12 +66,13 @@ def _clicks(result: xr.Dataset, names: list[str]) -> Table | None:
             str(result["click"].values[k]),
             _number(float(np.linalg.norm(result["click_residual"].values[k]))),
             _number(float(result["click_surprise"].values[k])),
+            str(result.attrs["click_problem"][k]),
         )
         for k in np.flatnonzero(result["click_wrong"].values)[:MOST]
     ]
     if not rows:
         return None
-    columns = ("camera", "marking", ">off px", ">standard deviations")
+    columns = ("camera", "marking", ">off px", ">standard deviations", "")
     return Table("Clicks to look at: proposed for removal", columns, tuple(rows))
 
 

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from data_contracts.work import Recipe, Work
+from flows.left_out import left_out_cameras
 from flows.method import METHOD
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
@@ -47,11 +48,14 @@ class StagePlan:
 
     Attributes:
         units: those whose inputs are known.
-        blocked: names, as `stage/unit`, of those that are made from a unit without a result.
+        blocked: names, as `stage/unit`, of those that are made from a unit without a result, or
+            that need more cameras than are left.
+        lacks_cameras: whether they are blocked because too many cameras are left out.
     """
 
     units: tuple[PlannedUnit, ...]
     blocked: tuple[str, ...]
+    lacks_cameras: bool = False
 
 
 def plan_stage(
@@ -64,9 +68,11 @@ def plan_stage(
 ) -> StagePlan:
     """What a stage has to do.
 
+    It is planned for the cameras that no earlier result leaves out (`flows.left_out`).
+
     Args:
         store: where results are looked for.
-        match: the match.
+        match: the match, with all its cameras.
         stage: the stage to plan.
         overrides: settings that differ from their defaults.
         results: `stage/unit` to key of what earlier stages have, or will have, computed.
@@ -74,6 +80,11 @@ def plan_stage(
     """
     if before is None and stage.since > 1:
         return StagePlan((), ())
+    left_out = left_out_cameras(store, match, METHOD[: METHOD.index(stage)], results)
+    match = match.without(left_out)
+    if left_out and len(match.folder.spec.static_cameras) < stage.min_cameras:
+        blocked_units = tuple(f"{stage.name}/{unit}" for unit in stage.units(match))
+        return StagePlan((), blocked_units, lacks_cameras=True)
     settings = settings_of(stage, overrides)
     outside = stage.outside(settings)
     units, blocked = [], []

@@ -114,7 +114,7 @@ def placed_joints(run: Run, clip: str) -> xr.Dataset:
 
 
 def static_cameras(run: Run, spec: MatchSpec, stage: str | None = None) -> dict[str, Camera]:
-    """The static cameras that a run has, by id; all of them where it has joints.
+    """The static cameras that a run has, by id; where it has joints, all that it did not leave out.
 
     Args:
         run: the run.
@@ -125,7 +125,11 @@ def static_cameras(run: Run, spec: MatchSpec, stage: str | None = None) -> dict[
         adjusted = run[ADJUSTED]
         cameras = camera_from_arrays(adjusted.data_vars)
         return {str(name): cameras[c] for c, name in enumerate(adjusted["camera"].values)}
-    units = {camera.id: f"static_calibration/{camera.id}" for camera in spec.static_cameras}
+    units = {
+        camera.id: f"static_calibration/{camera.id}"
+        for camera in spec.static_cameras
+        if camera.id not in run.record.left_out
+    }
     return {
         camera_id: camera_from_arrays(run[unit].data_vars)
         for camera_id, unit in units.items()

@@ -9,9 +9,10 @@ from datetime import UTC, datetime
 from typing import Any, Self
 
 from data_contracts.run import GatePolicy, RunRecord, RunState, UnitFailure, WaitingUnit
-from flows import body_fitting
+from flows import body_fitting, tracking
 from flows.basis import basis_of
 from flows.gatekeeping import Gatekeeper, passed
+from flows.left_out import left_out_cameras, left_out_warnings
 from flows.method import METHOD
 from flows.planning import PlannedUnit, StagePlan, plan_stage
 from flows.progress import reporter
@@ -49,8 +50,10 @@ class RunLog:
     reused: list[str] = field(default_factory=list)
     failed: list[UnitFailure] = field(default_factory=list)
     blocked: list[str] = field(default_factory=list)
+    lacks_cameras: bool = False
     waiting: list[WaitingUnit] = field(default_factory=list)
     figures: dict[str, dict[str, float]] = field(default_factory=dict)
+    warnings: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     @classmethod
     def begin(
@@ -92,7 +95,9 @@ class RunLog:
     def plan(self, stage: Stage) -> StagePlan:
         """What a stage has to do, now that those before it have run."""
         given = (self.store, self.match, stage, self.overrides)
-        return plan_stage(*given, self.passed, self.before)
+        plan = plan_stage(*given, self.passed, self.before)
+        self.lacks_cameras = self.lacks_cameras or plan.lacks_cameras
+        return plan
 
     def hold(self, stage: Stage) -> None:
         """Keep back what waits for a person behind a stage that has run."""
@@ -115,6 +120,7 @@ class RunLog:
             recipe = unit.recipe
             manifest = self.store.manifest(recipe.match_id, recipe.stage, recipe.unit, unit.key)
             self.figures[unit.name] = manifest.figures
+            self.warnings[unit.name] = manifest.warnings
             reporter().unit_done(unit.name, manifest.seconds, manifest.figures)
         else:
             self.failed.append(
@@ -134,6 +140,8 @@ class RunLog:
             stage, _, unit = name.partition("/")
             manifest = self.store.manifest(self.match.match_id, stage, unit, self.results[name])
             self.figures[name] = manifest.figures
+            self.warnings[name] = manifest.warnings
+        left_out = left_out_cameras(self.store, self.match, METHOD, self.passed)
         settings, overrides = self._settings()
         record = RunRecord(
             run_id=self.run_id,
@@ -151,6 +159,11 @@ class RunLog:
             gates=self.gatekeeper.policy,
             waiting=tuple(self.waiting),
             figures=dict(sorted(self.figures.items())),
+            left_out=left_out,
+            warnings=(
+                *left_out_warnings(self.match, left_out, tracking.MIN_CAMERAS),
+                *(text for name in self._in_order() for text in self.warnings[name]),
+            ),
             versions=libraries(),
             started_at=self.started_at,
             finished_at=datetime.now(UTC),
@@ -159,6 +172,11 @@ class RunLog:
         self.gatekeeper.ask(self.run_id, self.waiting, self.results)
         self.store.finish_run(record)
         return record
+
+    def _in_order(self) -> list[str]:
+        """The units with results, in the order of the method."""
+        stages = [stage.name for stage in METHOD]
+        return sorted(self.results, key=lambda name: (stages.index(name.partition("/")[0]), name))
 
     def _carry_over(self) -> None:
         """Keep results of later stages that are current all the same, and wait for nobody."""
@@ -187,7 +205,9 @@ class RunLog:
 
     def _state(self) -> RunState:
         if not self.failed:
-            return "waiting" if self.waiting else "complete"
+            if self.waiting:
+                return "waiting"
+            return "partial" if self.lacks_cameras else "complete"
         asked = [stage.name for stage in self.stages if stage.units(self.match)]
         through = [stage.name for stage in METHOD[: METHOD.index(body_fitting.STAGE) + 1]]
         last = next((name for name in reversed(asked) if name in through), asked[-1])

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Container, Hashable
+from dataclasses import dataclass, field, replace
 from functools import wraps
 from typing import Any, Literal, TypeVar, cast
 
@@ -43,6 +43,23 @@ class Match:
         """The match's id."""
         return self.registration.spec.match_id
 
+    def without(self, cameras: Container[str]) -> Match:
+        """The match as if it did not have these static cameras; see `flows.left_out`."""
+        spec = self.folder.spec
+        names = tuple(each.id for each in spec.static_cameras if each.id in cameras)
+        if not names:
+            return self
+        left = tuple(each for each in spec.cameras if each.id not in names)
+        fewer = spec.model_copy(update={"cameras": left})
+        name = ("without", *names)
+        return self.once(name, lambda: replace(self, folder=replace(self.folder, spec=fewer)))
+
+    def once(self, name: Hashable, find: Callable[[], T]) -> T:
+        """What `find` gives, which is called the first time that `name` is asked for."""
+        if name not in self._kept:
+            self._kept[name] = find()
+        return cast("T", self._kept[name])
+
 
 def once_a_match(table: Callable[[Match], T]) -> Callable[[Match], T]:
     """Work out a table of a match once, though planning asks for it at every unit.
@@ -53,9 +70,7 @@ def once_a_match(table: Callable[[Match], T]) -> Callable[[Match], T]:
 
     @wraps(table)
     def kept(match: Match) -> T:
-        if table not in match._kept:
-            match._kept[table] = table(match)
-        return cast("T", match._kept[table])
+        return match.once(table, lambda: table(match))
 
     return kept
 
@@ -85,6 +100,8 @@ class Stage:
         since: the first iteration that it is a part of.
         outside: for its settings, what they name outside of the match: digests of those files.
         prefers: tag of the workers that compute it, where the cluster has such.
+        leaves_out: its results may leave static cameras out of all later stages.
+        min_cameras: static cameras that it needs once some are left out.
     """
 
     name: str
@@ -98,3 +115,5 @@ class Stage:
     since: Literal[1, 2] = 1
     outside: Callable[[Any], dict[str, JsonValue]] = _nothing
     prefers: str | None = None
+    leaves_out: bool = False
+    min_cameras: int = 0

@@ -68,4 +68,5 @@ STAGE = Stage(
     units=units,
     inputs=inputs,
     sources=sources,
+    leaves_out=True,
 )

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from pydantic import JsonValue
 
 from flows import detection
 from flows.stage import Match, Stage
 from worldpose.review.identities import IDENTITY_EDITS
 from worldpose.tracking import TrackingSettings, people_allowed
+
+MIN_CAMERAS: Final = 2
+"""Static cameras from which people can be placed [1]."""
 
 
 def units(match: Match) -> tuple[str, ...]:
@@ -83,4 +88,5 @@ STAGE = Stage(
     sources=sources,
     again=again,
     later=found_again,
+    min_cameras=MIN_CAMERAS,
 )

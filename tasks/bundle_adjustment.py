@@ -23,7 +23,6 @@ from worldpose.bundle_adjustment import (
     adjust_cameras,
     adjustment_arrays,
 )
-from worldpose.cameras import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import PARAMETERS
 from worldpose.store import Store
@@ -123,9 +122,7 @@ def _open_clip(store: Store, work: Work, people: _People) -> Clip:
     return Clip(
         cameras=opened.cameras,
         covariance=np.stack([_covariance(camera) for camera in known]),
-        clicks=tuple(
-            _clicks(camera, opened.cameras[c], template) for c, camera in enumerate(known)
-        ),
+        clicks=tuple(_clicks(camera, template) for camera in known),
         frame=people.frame,
         fps=people.fps,
         keypoints=opened.keypoints[:],
@@ -146,13 +143,12 @@ def _covariance(known: xr.Dataset) -> NDArray[np.float64]:
     return np.asarray(known["covariance"].values)
 
 
-def _clicks(known: xr.Dataset, camera: Camera, pitch: PitchTemplate | None) -> Clicks:
-    """What was clicked, from where the camera projects it and how far off that is."""
-    if pitch is None or "point_residual" not in known:
+def _clicks(known: xr.Dataset, pitch: PitchTemplate | None) -> Clicks:
+    """The clicked points of a camera; none of a given one."""
+    if pitch is None or "point_pixel" not in known:
         return Clicks.none()
     names = tuple(str(name) for name in known["point"].values)
-    places = pitch.positions(names)
-    pixels = camera.project(places) - known["point_residual"].values
+    places, pixels = pitch.positions(names), known["point_pixel"].values
     return Clicks(names, places, pixels, known["point_inlier"].values)
 
 

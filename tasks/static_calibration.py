@@ -21,6 +21,7 @@ from data_contracts.work import Work
 from tasks.unit import require_registered, unit_task
 from worldpose.cameras import Camera
 from worldpose.cameras.stored import camera_arrays
+from worldpose.errors import InputError
 from worldpose.ingest.stills import read_still
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import (
@@ -30,6 +31,8 @@ from worldpose.static_calibration import (
     calibration_arrays,
     calibration_attributes,
     calibration_coordinates,
+    given_attributes,
+    left_out_attributes,
     median_picture,
 )
 from worldpose.store import Store
@@ -41,7 +44,10 @@ STILL_FRAMES: Final = 25
 
 @unit_task
 def static_calibration(work: Work) -> str:
-    """Publishes the camera, and how well it is known where it was calibrated; returns the key."""
+    """Publishes the camera, and how well it is known where it was calibrated; returns the key.
+
+    A camera that its clicks do not determine is published as left out, with the reason.
+    """
     sources: dict[str, Any] = work.recipe.sources
     with Store.open(work.project).publishing(work) as result:
         if sources["calibration"] is not None:
@@ -49,19 +55,29 @@ def static_calibration(work: Work) -> str:
             result.write(
                 STATIC_CALIBRATION,
                 arrays=camera_arrays(Camera.from_calibration(given)),
-                attributes=calibration_attributes(work.recipe.unit, None),
+                attributes=given_attributes(work.recipe.unit),
             )
             return work.key
         ((file, clicked),) = sources["clicked"].items()
         width, height = sources["image_size"]
-        calibration = calibrate(
-            PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"])),
-            clicked_markings(clicked),
-            (width, height),
-            picture=_still(work),
-            settings=StaticCalibrationSettings.model_validate(work.recipe.settings),
-            where=file,
-        )
+        pitch = PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"]))
+        settings = StaticCalibrationSettings.model_validate(work.recipe.settings)
+        picture = _still(work)
+        try:
+            calibration = calibrate(
+                pitch,
+                clicked_markings(clicked),
+                (width, height),
+                picture=picture,
+                settings=settings,
+                where=file,
+            )
+        except InputError as error:  # one camera that cannot be calibrated must not end the match
+            reason = str(error)
+            attributes = left_out_attributes(work.recipe.unit, reason)
+            result.write(STATIC_CALIBRATION, arrays={}, attributes=attributes)
+            result.left_out[work.recipe.unit] = reason
+            return work.key
         result.write(
             STATIC_CALIBRATION,
             arrays=calibration_arrays(calibration),

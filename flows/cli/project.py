@@ -89,6 +89,8 @@ def status(
     for row in rows:
         if row["problem"]:
             line(f"{row['match']}: {row['problem']}")
+        for text in row["warnings"]:
+            line(f"{row['match']}: {text}")
         if row["waiting"]:
             line(f"{row['match']}: what waits: worldpose review list {row['match']}")
         for name, run_id in row["pins"].items():
@@ -123,6 +125,8 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
         "state": "not run" if latest is None else latest.state,
         "units": units,
         "failed": [] if latest is None else [failure.unit for failure in latest.failed],
+        "left_out": {} if latest is None else latest.left_out,
+        "warnings": [] if latest is None else list(latest.warnings),
         "waiting": [unit.unit for unit in waiting],
         "settings": {} if latest is None else latest.overrides,
         "unfinished_runs": [run.run_id for run in store.unfinished_runs(match_id)],

@@ -105,6 +105,7 @@ def run(
         passes = None if most == 1 else iterate_match(store, opened, request, most)
         record = run_match(store, opened, request) if passes is None else passes.record
     seconds = time.monotonic() - started
+    warned = [*record.warnings, *clock_advice(record.figures, opened.folder.spec)]
     if as_json:
         print_json(
             {
@@ -118,6 +119,8 @@ def run(
                 "failures": [failure.model_dump() for failure in record.failed],
                 "gates": record.gates,
                 "reviews": [unit.model_dump() for unit in record.waiting],
+                "left_out": record.left_out,
+                "warnings": warned,
                 **({} if passes is None else iterations_as_json(store, passes)),
             }
         )
@@ -125,7 +128,7 @@ def run(
         if passes is not None:
             print_iterations(store, passes)
         _print(record, store.url, seconds)
-    for text in clock_advice(record.figures, opened.folder.spec):
+    for text in warned:
         line(f"warning: {text}", to=errors)
     raise typer.Exit(EXIT_CODES[record.state])
 

@@ -241,9 +241,12 @@ def _answer(found: Preview) -> dict[str, Any]:
         "residuals": [
             {
                 "name": each.name,
-                "residual": _rounded(each.residual, 3),
+                "residual": _rounded(each.residual, 3)
+                if np.isfinite(each.residual).all()
+                else None,
                 "surprise": _number(each.surprise),
                 "inlier": each.inlier,
+                "problem": each.problem,
             }
             for each in report.points
         ],

@@ -122,7 +122,7 @@ def draw_evidence(store: Store, match: Match, request: ReviewRequest) -> Evidenc
 
 def _camera(store: Store, run: Run, match: Match, camera: str) -> Evidence:
     if "point_inlier" not in run[f"static_calibration/{camera}"]:
-        return Evidence()  # it was given
+        return Evidence()  # it was given, or it is left out
     cameras = static_cameras(run, match.folder.spec, "triangulation")
     png = camera_evidence(store, run, match, camera, cameras[camera])
     caption = (

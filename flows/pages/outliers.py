@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any, Final
 
@@ -38,7 +39,7 @@ def routes(desk: Desk) -> APIRouter:
             return []
         return [
             {
-                "surprise": round(surprise, 1),
+                "surprise": round(surprise, 1) if math.isfinite(surprise) else None,
                 "of": of,
                 "edit": edit.model_dump(mode="json"),
                 "out": out,

@@ -50,6 +50,8 @@ def routes(desk: Desk) -> APIRouter:
             ],
             "clips": [_clip(desk, opened, clip.id) for clip in folder.spec.clips],
             "failures": [] if latest is None else [each.model_dump() for each in latest.failed],
+            "left_out": {} if latest is None else latest.left_out,
+            "warnings": [] if latest is None else list(latest.warnings),
         }
 
     return router

@@ -3,6 +3,7 @@
 import cProfile
 import pstats
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
@@ -23,6 +24,9 @@ class Everything:
 
     def has(self, *place):
         return True
+
+    def manifest(self, *place):
+        return SimpleNamespace(left_out={})
 
 
 @pytest.fixture

@@ -135,7 +135,7 @@ def test_a_given_camera_wins_over_clicks(clicked, tmp_path):
     assert [u.key for u in plan_run(store, match, {})] == [u.key for u in given.values()]
 
 
-def test_clicks_that_determine_no_camera_fail_by_the_file_s_name(clicked):
+def test_a_camera_that_its_clicks_do_not_determine_is_published_as_left_out(clicked):
     store, match, units = clicked
     recipe = units["static_calibration/cam00"].recipe
     ((file, listed),) = recipe.sources["clicked"].items()
@@ -143,8 +143,17 @@ def test_clicks_that_determine_no_camera_fail_by_the_file_s_name(clicked):
     recipe = recipe.model_copy(update={"sources": recipe.sources | {"clicked": {file: few}}})
     work = units["static_calibration/cam00"].work(store.url, match, "0001")
     changes = {"recipe": recipe, "key": key_of(recipe)}
-    with pytest.raises(InputError, match=file):
-        static_calibration.fn(work.model_copy(update=changes))
+    work = work.model_copy(update=changes)
+    static_calibration.fn(work)
+    (reason,) = store.manifest(
+        match.match_id, "static_calibration", "cam00", work.key
+    ).left_out.values()
+    assert file in reason
+    assert "expected 4 clicked points or more" in reason
+    stored = store.open_result(match.match_id, "static_calibration", "cam00", work.key)
+    assert stored.attrs["origin"] == "none"
+    assert stored.attrs["reasons"] == [reason]
+    assert not stored.data_vars
 
 
 def test_a_broken_still_is_refused_before_anything_runs(clicked, tmp_path):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from worldpose.bundle_adjustment.building import KeypointNoise
 from worldpose.bundle_adjustment.clip import Clicks, Clip, keypoints_of, predict
 from worldpose.cameras import Camera
-from worldpose.static_calibration import project_with_jacobian
+from worldpose.static_calibration import image_problems, project_with_jacobian
 from worldpose.triangulation import triangulate_joints
 
 _WHOLE: Final = 0.5
@@ -49,14 +49,17 @@ class ClickReview:
     Attributes:
         camera: (n,)
         name: of each point of the pitch.
-        residual: (n, 2) [px], projected minus clicked.
-        surprise: (n,) residual in standard deviations of what everything else predicts [1].
+        residual: (n, 2) [px], projected minus clicked; NaN where the camera cannot image the point.
+        surprise: (n,) residual in standard deviations of what everything else predicts [1];
+            infinite where the camera cannot image the point.
+        problem: of each, why the camera cannot image the point; empty where it can.
     """
 
     camera: NDArray[np.int64]
     name: tuple[str, ...]
     residual: NDArray[np.float64]
     surprise: NDArray[np.float64]
+    problem: tuple[str, ...]
 
 
 def keypoint_outliers(
@@ -121,12 +124,16 @@ def review_clicks(
     """
     camera: list[int] = []
     name: list[str] = []
+    problem: list[str] = []
     residual, surprise = [np.empty((0, 2))], [np.empty(0)]
     for c, clicked in enumerate(clicks):
         if not clicked.names:
             continue
         pixel, by_step = project_with_jacobian(cameras[c], clicked.points_world)
+        problems = image_problems(cameras[c], clicked.points_world)
+        imaged = np.array([not each for each in problems], dtype=np.bool_)
         off = pixel - clicked.points_image
+        by_step = np.where(imaged[:, None, None], by_step, 0.0)
         spread = np.einsum("nij,jk,nlk->nil", by_step, covariance[c], by_step)
         # A click that the camera rests on has drawn the camera towards it.
         sign = np.where(clicked.inlier, -1.0, 1.0)[:, None, None]
@@ -136,12 +143,14 @@ def review_clicks(
         values = np.maximum(values, 0.01 * click_noise**2)
         camera += [c] * len(clicked.names)
         name += clicked.names
+        problem += problems
         residual.append(off)
-        surprise.append(np.sqrt((along**2 / values).sum(axis=1)))
+        surprise.append(np.where(imaged, np.sqrt((along**2 / values).sum(axis=1)), np.inf))
     order = np.argsort(-np.concatenate(surprise), kind="stable")
     return ClickReview(
         camera=np.array(camera, dtype=np.int64)[order],
         name=tuple(name[index] for index in order),
         residual=np.concatenate(residual)[order],
         surprise=np.concatenate(surprise)[order],
+        problem=tuple(problem[index] for index in order),
     )

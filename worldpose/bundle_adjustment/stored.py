@@ -56,7 +56,7 @@ def adjustment_arrays(
         "outlier_surprise": outliers.surprise,
         "click_camera": clicks.camera,
         "click_residual": clicks.residual,
-        "click_surprise": clicks.surprise,
+        "click_surprise": np.where(np.isfinite(clicks.surprise), clicks.surprise, np.nan),
         "click_wrong": clicks.surprise > settings.wrong_click,
     }
     attributes = {
@@ -69,6 +69,7 @@ def adjustment_arrays(
         "noise_correlation": adjusted.noise.correlation,
         "outliers_found": outliers.found,
         "click": list(clicks.name),
+        "click_problem": list(clicks.problem),
     }
     return arrays, attributes
 

@@ -56,6 +56,9 @@ def report_page(
         tiles: the few figures at the top, each with what it is.
     """
     shown = list(sections)
+    if run.warnings:
+        table = Table("", ("",), tuple((Failure(text),) for text in run.warnings))
+        shown.insert(0, Section("Warnings", (table,)))
     if scores is not None:
         rows = tuple(row[1:] for row in score_rows(scores))
         table = Table("", ("score", ">value", "what it says"), rows)

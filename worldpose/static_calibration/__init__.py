@@ -18,11 +18,14 @@ from worldpose.static_calibration.report import (
     PointResidual,
     StaticCalibration,
 )
+from worldpose.static_calibration.reporting import image_problems
 from worldpose.static_calibration.settings import CameraPrior, StaticCalibrationSettings
 from worldpose.static_calibration.stored import (
     calibration_arrays,
     calibration_attributes,
     calibration_coordinates,
+    given_attributes,
+    left_out_attributes,
 )
 
 __all__ = [
@@ -39,7 +42,10 @@ __all__ = [
     "calibration_arrays",
     "calibration_attributes",
     "calibration_coordinates",
+    "given_attributes",
     "ground_error_map",
+    "image_problems",
+    "left_out_attributes",
     "median_picture",
     "project_with_jacobian",
     "stepped",

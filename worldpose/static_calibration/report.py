@@ -18,15 +18,20 @@ class PointResidual:
 
     Attributes:
         name: of the template.
-        residual: (2,) [px], projected minus clicked.
-        surprise: residual in standard deviations of what the other evidence predicts [1].
+        pixel: (2,) [px], where it was clicked.
+        residual: (2,) [px], projected minus clicked; NaN where the camera cannot image the point.
+        surprise: residual in standard deviations of what the other evidence predicts [1]; infinite
+            where the camera cannot image the point.
         inlier: does the camera rest on it.
+        problem: why the camera does not rest on it; empty where it does.
     """
 
     name: str
+    pixel: NDArray[np.float64]
     residual: NDArray[np.float64]
     surprise: float
     inlier: bool
+    problem: str = ""
 
 
 @dataclass(frozen=True)

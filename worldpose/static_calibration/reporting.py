@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from worldpose.cameras import Camera, RayStatus
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.adjustment import Problem, row_of
 from worldpose.static_calibration.advice import most_helpful
@@ -22,6 +23,11 @@ from worldpose.static_calibration.residuals import SIZE, drawn_residuals
 from worldpose.static_calibration.screening import Screened, residual_rows
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
+_CANNOT_IMAGE: Final = {
+    RayStatus.MISSING: "cannot be imaged: the camera is not known",
+    RayStatus.BEHIND: "cannot be imaged: the point is behind the camera",
+    RayStatus.BEYOND_FOLD: "cannot be imaged: the point is outside the lens's field of view",
+}
 _TRUSTED: Final = 4.0
 """Mean loss of an observation [1] to which a camera's residuals are not surprising: twice the
 stated noise."""
@@ -49,10 +55,18 @@ def report_of(
     """
     evidence = problem.evidence
     rows = residual_rows(problem, row_of(estimate.camera))
-    ranked = np.argsort(-fit.surprise, kind="stable")
+    problems = image_problems(estimate.camera, evidence.points_world)
+    imaged = np.array([not problem for problem in problems], dtype=np.bool_)
+    surprise = np.where(imaged, fit.surprise, np.inf)
+    ranked = np.argsort(-surprise, kind="stable")
     points = tuple(
         PointResidual(
-            evidence.points[i], rows.click[i], float(fit.surprise[i]), bool(fit.inliers[i])
+            evidence.points[i],
+            evidence.points_image[i],
+            np.where(imaged[i], rows.click[i], np.nan),
+            float(surprise[i]),
+            bool(fit.inliers[i]),
+            "" if fit.inliers[i] else problems[i] or _distance(rows.click[i]),
         )
         for i in ranked
     )
@@ -106,6 +120,16 @@ def report_of(
         add_next=most_helpful(estimate, pitch, clicked, settings.click_noise),
         lines=lines,
     )
+
+
+def image_problems(camera: Camera, places: NDArray[np.float64]) -> tuple[str, ...]:
+    """Return why a camera cannot image places (n, 3) [m], world; empty for those that it can."""
+    status = camera.project_with_jacobians(places).status
+    return tuple(_CANNOT_IMAGE.get(RayStatus(code), "") for code in status.tolist())
+
+
+def _distance(residual: NDArray[np.float64]) -> str:
+    return f"{float(np.linalg.norm(residual)):.0f} px off"
 
 
 def _marking_residual(name: str, off: NDArray[np.float64], inlier: bool) -> MarkingResidual:

@@ -17,11 +17,13 @@ def calibration_arrays(calibration: StaticCalibration) -> dict[str, NDArray[Any]
     A given camera has those of `camera_arrays` alone.
     """
     report = calibration.report
+    surprise = np.array([p.surprise for p in report.points], dtype=np.float64)
     return {
         **camera_arrays(calibration.estimate.camera),
         "covariance": calibration.estimate.covariance,
+        "point_pixel": np.array([p.pixel for p in report.points]).reshape(-1, 2),
         "point_residual": np.array([p.residual for p in report.points]).reshape(-1, 2),
-        "point_surprise": np.array([p.surprise for p in report.points], dtype=np.float64),
+        "point_surprise": np.where(np.isfinite(surprise), surprise, np.nan),
         "point_inlier": np.array([p.inlier for p in report.points], dtype=np.bool_),
         "marking_rms": np.array([m.rms for m in report.drawn], dtype=np.float64),
         "marking_worst": np.array([m.worst for m in report.drawn], dtype=np.float64),
@@ -36,18 +38,29 @@ def calibration_coordinates(calibration: StaticCalibration) -> dict[str, NDArray
     return {"ground_x": known.x, "ground_y": known.y}
 
 
-def calibration_attributes(camera_id: str, calibration: StaticCalibration | None) -> dict[str, Any]:
-    """The stored attributes of a camera; without a calibration it was given."""
-    if calibration is None:
-        lists = ("point", "marking", "free", "decisions", "reasons", "add_next")
-        nothing: dict[str, Any] = {name: [] for name in lists}
-        numbers = {"noise_scale": None, "condition": None}
-        return {"camera_id": camera_id, "origin": "given", **nothing, **numbers}
+def given_attributes(camera_id: str) -> dict[str, Any]:
+    """The stored attributes of a given camera."""
+    return {"camera_id": camera_id, "origin": "given", **_no_evidence()}
+
+
+def left_out_attributes(camera_id: str, reason: str) -> dict[str, Any]:
+    """The stored attributes of a camera that cannot be calibrated; it has no arrays."""
+    return {"camera_id": camera_id, "origin": "none", **_no_evidence(), "reasons": [reason]}
+
+
+def _no_evidence() -> dict[str, Any]:
+    lists = ("point", "point_problem", "marking", "free", "decisions", "reasons", "add_next")
+    return {**{name: [] for name in lists}, "noise_scale": None, "condition": None}
+
+
+def calibration_attributes(camera_id: str, calibration: StaticCalibration) -> dict[str, Any]:
+    """The stored attributes of a calibrated camera."""
     report = calibration.report
     return {
         "camera_id": camera_id,
         "origin": report.stage,
         "point": [point.name for point in report.points],
+        "point_problem": [point.problem for point in report.points],
         "marking": [marking.name for marking in report.drawn],
         "free": list(report.free),
         "decisions": list(report.decisions),

@@ -27,11 +27,16 @@ class ResultWriter:
     Attributes:
         figures: quality figures by name, with the unit in the name; fill it before leaving
             `Store.publishing`.
+        left_out: static cameras that no later stage may use, by id, with the reason; the stage
+            must have `Stage.leaves_out`. See `flows.left_out`.
+        warnings: sentences that the run prints at its end.
         manifest: the published result's manifest; None until `Store.publishing` is left.
     """
 
     def __init__(self, work: Work, folder: Path) -> None:
         self.figures: dict[str, float] = {}
+        self.left_out: dict[str, str] = {}
+        self.warnings: list[str] = []
         self.manifest: ResultManifest | None = None
         self._work, self._folder = work, folder
         self._started = time.monotonic()
@@ -101,6 +106,8 @@ class ResultWriter:
             files=files,
             content=content_of(files),
             figures={figure: float(value) for figure, value in self.figures.items()},
+            left_out=dict(sorted(self.left_out.items())),
+            warnings=tuple(self.warnings),
             created_at=datetime.now(UTC),
             seconds=time.monotonic() - self._started,
             run_id=self._work.run_id,

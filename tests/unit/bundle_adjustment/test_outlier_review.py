@@ -5,9 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worldpose.bundle_adjustment import Clicks, keypoint_outliers, review_clicks
+from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
+from worldpose.bundle_adjustment import (
+    BundleAdjustmentSettings,
+    Clicks,
+    adjust_cameras,
+    adjustment_arrays,
+    keypoint_outliers,
+    review_clicks,
+)
 from worldpose.bundle_adjustment.building import KeypointNoise
 from worldpose.static_calibration import PARAMETERS
+from worldpose.store.layout_checks import checked_arrays
 
 
 def found(made, cameras, limit=4.2, longest=10_000):
@@ -141,3 +150,44 @@ def test_a_camera_that_is_hardly_known_surprises_by_clicks_it_rests_on(
     np.testing.assert_allclose(review.residual, [[3.0, 4.0]], atol=1e-9)
     # The principal point moves all pixels by as much: 4 px^2 of the click, and its own across.
     assert review.surprise[0] == pytest.approx(np.sqrt(9.0 / across + 16.0 / 4.0), rel=1e-6)
+
+
+IMPOSSIBLE = {
+    "behind the camera": [0.0, 0.0, -30.0],
+    "outside the lens's field of view": [70.0, 0.0, 10.0],
+}
+
+
+@pytest.mark.parametrize("problem", IMPOSSIBLE)
+def test_a_click_on_a_point_that_the_camera_cannot_image_is_first_and_says_why(clip, problem):
+    made, true, _ = clip()
+    # A lens that folds at twice the focal length.
+    true = replace(true, distortion=np.array([[-0.08, 0.0, 0.0, 0.0, 0.0]] * 5))
+    made = replace(made, cameras=replace(made.cameras, distortion=true.distortion))
+    clicks = made.clicks[2]
+    pose = true[2].cam_from_world
+    place = pose.inverse().apply(np.array([IMPOSSIBLE[problem]]))
+    changed = replace(
+        clicks,
+        names=(*clicks.names, "impossible"),
+        points_world=np.concatenate([clicks.points_world, place]),
+        points_image=np.concatenate([clicks.points_image, [[960.0, 540.0]]]),
+        inlier=np.append(clicks.inlier, False),
+    )
+    clip_of = replace(made, clicks=(*made.clicks[:2], changed, *made.clicks[3:]))
+    review = review_clicks(clip_of.clicks, true, made.covariance, click_noise=1.0)
+    assert (review.camera[0], review.name[0]) == (2, "impossible")
+    assert np.isnan(review.residual[0]).all()
+    assert review.surprise[0] == np.inf
+    assert problem in review.problem[0]
+    assert not any(review.problem[1:])
+    assert np.isfinite(review.residual[1:]).all()
+    # All the way to what is stored.
+    settings = BundleAdjustmentSettings(evidence="markings", folds=2)
+    adjusted = replace(adjust_cameras(clip_of, settings), cameras=true)
+    people = np.arange(made.detection_index.shape[2])
+    arrays, attributes = adjustment_arrays(adjusted, settings, people)
+    checked = checked_arrays(BUNDLE_ADJUSTMENT, arrays, {})
+    assert checked["click_wrong"][0]
+    assert np.isnan(checked["click_surprise"][0])
+    assert "cannot be imaged" in attributes["click_problem"][0]

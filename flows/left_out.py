@@ -1,0 +1,70 @@
+"""Static cameras that a run does without, and the warnings of a run.
+
+One bad camera must not end a match. A stage that finds that a camera cannot be used says so with
+its result, and every later stage is planned as if the match did not have this camera: it is in no
+list of cameras, no recipe and no array of theirs. A stage does this in three steps:
+
+1. Its `Stage` record has `leaves_out=True`, and the stage stands before `tracking` in `METHOD`.
+2. Its task fills the result's `left_out` before it leaves `Store.publishing`::
+
+       with store.publishing(work) as result:
+           result.write(...)
+           result.left_out["cam03"] = "its people stand 40 m from those of cam01, cam02 and cam05"
+           result.warnings.append("camera cam04 shows 2.7 frames earlier than the others")
+
+   The same must be in what `write` stores, because two computations of one key are compared by it.
+3. Nothing else. `worldpose run` prints `warning: camera cam03 is left out: ...` at its end, and
+   `run --json`, `status`, the report and the pages list it. With gates, a person is asked before
+   the run goes on without the camera.
+
+`warnings` are for all stages: sentences that the user must read although the run went on.
+
+The exit code stays 0 while two cameras are left. With fewer, `tracking` and all after it have no
+results, and the run is partial (exit code 4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+
+from flows.stage import Match, Stage
+from worldpose.errors import StoreError
+from worldpose.store import Store
+
+
+def left_out_cameras(
+    store: Store, match: Match, stages: tuple[Stage, ...], results: Mapping[str, str]
+) -> dict[str, str]:
+    """Static cameras that published results leave out, by id, with the reason, in match order.
+
+    Args:
+        store: where the results are.
+        match: the whole match.
+        stages: those whose results count.
+        results: `stage/unit` to key; a result that is not published yet leaves out no camera.
+    """
+    judging = {stage.name for stage in stages if stage.leaves_out}
+    said: dict[str, str] = {}
+    for name, key in sorted(results.items()):
+        stage, _, unit = name.partition("/")
+        if stage in judging:
+            place = (match.match_id, stage, unit, key)
+            try:
+                said = {**match.once(place, partial(store.manifest, *place)).left_out, **said}
+            except StoreError:  # not computed yet, or damaged: then its reader says so
+                continue
+    return {each.id: said[each.id] for each in match.folder.spec.static_cameras if each.id in said}
+
+
+def left_out_warnings(match: Match, left_out: Mapping[str, str], needed: int) -> list[str]:
+    """One sentence for each camera, and one where fewer than `needed` cameras are left."""
+    said = [f"camera {camera} is left out: {reason}" for camera, reason in left_out.items()]
+    left = [each.id for each in match.without(left_out).folder.spec.static_cameras]
+    if left_out and len(left) < needed:
+        said.append(
+            f"{len(left)} of {len(left) + len(left_out)} static cameras can be used"
+            f"{' (' + ', '.join(left) + ')' if left else ''}, and {needed} are needed to place "
+            "people: there are no tracks, joints or bodies"
+        )
+    return said
