@@ -1,0 +1,343 @@
+"""Measures every stage on matches of the second world, or on scenarios of the first.
+
+    python benchmarks/second_world.py --matches 40 --duration 4 --seed 1 --resume DIR
+    python benchmarks/second_world.py --scenarios match hard tiny --matches 2 --seed 1 --resume DIR
+    python benchmarks/second_world.py --resume DIR --report
+
+Every match is simulated, run with default settings and scored in a process of its own, one after
+the other; stages are called as the flow plans them, without Prefect or Dask. Its row goes to
+DIR/rows.jsonl, and rows that are there are not computed again. With --recordings every second match
+replays recordings. --iterations N goes through the method N times.
+
+Seen: people whom the detections of two cameras or more show in at least half of the frames. With a
+body: those of them who have one in at least half of these frames, within 1 m. Regions: share of
+joints, seen by two cameras, whose true place lies in the stated 95 % region, by joint group.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import multiprocessing
+import shutil
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from data_contracts.conventions import COCO17
+from data_contracts.run import RunRecord
+from flows.cli.app import app
+from flows.fan_out import task_of
+from flows.registering import find_match
+from flows.release import joint_tracks
+from flows.run_record import RunLog
+from flows.settings import selected_stages
+from worldpose.evaluation import evaluate_joints
+from worldpose.evaluation.matching import joint_distances, match_people, taken
+from worldpose.ingest import read_match
+from worldpose.release import JointTracks, read_joints
+from worldpose.store import Store, open_run
+from worldpose.synthetic import SCENARIOS, simulate_match
+from worldpose.synthetic.foreign import FOREIGN_SCENARIOS, simulate_foreign_match
+
+MIX = (
+    *("foreign-match", "foreign-lab", "foreign-mixed", "foreign-two", "foreign-match"),
+    *("foreign-mixed", "foreign-lab", "foreign-match", "foreign-many", "foreign-mixed"),
+)
+"""Scenarios of ten matches in a row."""
+STAGES = ("triangulation", "retriangulation", "body_fitting")
+GROUPS = {
+    "head": ("nose", "eye", "ear"),
+    **{name: (name,) for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")},
+}
+REGION = 7.814728
+"""95 % of the chi-square distribution with three degrees of freedom."""
+GATE = 1.0
+"""Largest mean joint distance of a true person and a found one [m]."""
+SCORES = ("mpjpe_mm", "g_mpjpe_mm", "pa_mpjpe_mm", "coverage", "idf1", "switches")
+
+
+def run_in_process(project: Path, folder: Path, iteration: int) -> RunRecord:
+    """Run one pass over the method in this process; a unit that fails leaves others to go on."""
+    store = Store.open_or_new(str(project))
+    match = find_match(store, str(folder))
+    stages = selected_stages(None, None)
+    log = RunLog.begin(store, match, stages, {}, "never", iteration)
+    for stage in stages:
+        plan = log.plan(stage)
+        log.blocked += plan.blocked
+        log.reuse(unit for unit in plan.units if unit.published)
+        for unit in plan.units:
+            if unit.published:
+                continue
+            try:
+                task_of(stage).fn(unit.work(store.url, match, log.run_id))
+            except Exception as failure:  # the run goes on, as on workers; the row names it
+                log.finished(unit, failure)
+            else:
+                log.finished(unit, None)
+        log.hold(stage)
+    return log.close()
+
+
+def views_of_detections(folder: Path, truth: JointTracks) -> NDArray[np.int64]:
+    """Return how many static cameras' detections show each true person (frames, persons)."""
+    count = np.zeros(truth.joints.shape[:2], np.int64)
+    for camera in read_match(folder).spec.static_cameras:
+        known = np.load(folder / "reference" / "identities" / f"{camera.id}.npz")
+        rows = known["frame"] - int(camera.offset_frames) - truth.frames[0]
+        for row, people in zip(rows, known["person"], strict=True):
+            count[row, np.unique(people[people >= 0])] += 1
+    return count
+
+
+def score_stage(tracks: JointTracks, truth: JointTracks, fps: float) -> dict[str, Any]:
+    """Return the scores of one stage's joints, and how many lie in their regions by group."""
+    scores, _ = evaluate_joints(tracks, truth, fps=fps)
+    found: dict[str, Any] = {name: getattr(scores, name) for name in SCORES}
+    places = {int(frame): row for row, frame in enumerate(tracks.frames)}
+    rows = np.array([places.get(int(frame), -1) for frame in truth.frames])
+    people = np.where((rows >= 0)[:, None, None, None], tracks.joints[rows], np.nan)
+    match = match_people(joint_distances(people, truth.joints), GATE)
+    off = taken(people, match) - truth.joints
+    assert tracks.covariance is not None
+    covariance = np.where((rows >= 0)[:, None, None, None, None], tracks.covariance[rows], np.nan)
+    stated = taken(covariance.reshape(*covariance.shape[:3], 9), match).reshape(*off.shape, 3)
+    counts = np.isfinite(off).all(-1) & np.isfinite(stated).all((-1, -2))
+    if truth.views is not None:
+        counts &= truth.views >= 2
+    safe = np.where(counts[..., None, None], stated, np.eye(3))
+    error = np.where(counts[..., None], off, 0.0)
+    squared = (error * np.linalg.solve(safe, error[..., None])[..., 0]).sum(-1)
+    inside = counts & (squared <= REGION)
+    found["regions"] = {}
+    for group, parts in GROUPS.items():
+        joints = [j for j, name in enumerate(COCO17) if any(part in name for part in parts)]
+        found["regions"][group] = [int(inside[..., joints].sum()), int(counts[..., joints].sum())]
+    return found
+
+
+def people_with_bodies(
+    tracks: JointTracks | None, truth: JointTracks, shown: NDArray[np.int64]
+) -> dict[str, int]:
+    """Return how many people two cameras see, and how many of them have bodies."""
+    seen = shown >= 2
+    people = np.flatnonzero(seen.mean(axis=0) >= 0.5)
+    if tracks is None:
+        return {"seen": len(people), "with_bodies": 0}
+    places = {int(frame): row for row, frame in enumerate(tracks.frames)}
+    rows = np.array([places.get(int(frame), -1) for frame in truth.frames])
+    bodies = np.where((rows >= 0)[:, None, None, None], tracks.joints[rows], np.nan)
+    there = match_people(joint_distances(bodies, truth.joints), GATE) >= 0
+    share = (there & seen).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+    return {"seen": len(people), "with_bodies": int((share[people] >= 0.5).sum())}
+
+
+def measure(plan: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Simulate, run and score one match; return its row."""
+    name, seed = plan["scenario"], plan["seed"]
+    out, project = folder / "match", folder / "project"
+    row = dict(plan)
+    begun = time.monotonic()
+    if name in FOREIGN_SCENARIOS:
+        recordings = None if plan["recordings"] is None else Path(plan["recordings"])
+        given = {"duration": plan["duration"], "recordings": recordings}
+        simulate_foreign_match(FOREIGN_SCENARIOS[name], seed, out, **given)
+        record = json.loads((out / "reference" / "world.json").read_text())
+        row |= {key: record[key] for key in ("layout", "pitch", "calibration")}
+        row["detector"] = record["detector"]["name"]
+    else:
+        simulate_match(SCENARIOS[name], seed, out, duration=plan["duration"], video=False)
+    row["simulated_s"] = round(time.monotonic() - begun, 1)
+    spec = read_match(out).spec
+    truth = read_joints(out / "reference" / "joints.npz")
+    row |= {"fps": spec.fps, "cameras": len(spec.static_cameras), "people": truth.joints.shape[1]}
+    runs: list[RunRecord] = []
+    for iteration in range(1, plan["iterations"] + 1):
+        runs.append(run_in_process(project, out, iteration))
+        if runs[-1].state != "complete":
+            break
+    last = runs[-1]
+    row |= {
+        "state": last.state,
+        "failures": [f"{one.unit}: {one.error}: {one.message}" for one in last.failed],
+        "warnings": [],
+        "run_s": round(sum(run.seconds for run in runs), 1),
+        "stages": [],
+    }
+    if last.state == "complete":  # all is there: the command only says how it ended
+        say = CliRunner().invoke(app, ["run", spec.match_id, "--project", str(project)])
+        row["exit_code"] = say.exit_code
+        row["warnings"] = [line for line in say.stderr.splitlines() if line.startswith("warning")]
+    bodies = None
+    for record in runs:
+        run, scored = open_run(str(project), spec.match_id, record.run_id), {}
+        for stage in STAGES:
+            if f"{stage}/clip" in run:
+                tracks = joint_tracks(run, "clip", stage)
+                scored[stage] = score_stage(tracks, truth, spec.fps)
+                bodies = tracks if stage == "body_fitting" else bodies
+        row["stages"].append(scored)
+    return row | people_with_bodies(bodies, truth, views_of_detections(out, truth))
+
+
+def measure_apart(plan: dict[str, Any], limit: float, keep: Path | None) -> dict[str, Any]:
+    """Return the row of a match, measured in a process that may crash or hang."""
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) if keep is None else keep
+        if keep is not None:
+            shutil.rmtree(keep, ignore_errors=True)
+            keep.mkdir(parents=True)
+        answer = folder / "row.json"
+
+        def work() -> None:
+            with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+                try:
+                    row = measure(plan, folder)
+                except Exception:  # a bug of ours or of the harness: the row shows it
+                    row = plan | {"state": "traceback", "failures": [traceback.format_exc()]}
+            answer.write_text(json.dumps(row))
+
+        process = multiprocessing.get_context("fork").Process(target=work)
+        process.start()
+        process.join(limit)
+        if process.is_alive():
+            process.kill()
+            process.join()
+            return plan | {"state": "hang", "failures": [f"stopped after {limit:g} s"]}
+        if not answer.exists():
+            return plan | {"state": "crash", "failures": [f"exit code {process.exitcode}"]}
+        return dict(json.loads(answer.read_text()))
+
+
+def line_of(row: dict[str, Any]) -> str:
+    """Return a match's row for people."""
+    text = (
+        f"{row['scenario']:15s} {row['seed']:5d} {row.get('cameras', 0):3d} cameras "
+        f"{row.get('people', 0):3d} people {row['state']:9s}"
+    )
+    if "seen" in row:
+        text += f" bodies {row['with_bodies']:2d} of {row['seen']:2d} seen"
+    for scored in row.get("stages", []):
+        pairs = [
+            f"{one['g_mpjpe_mm'] or np.nan:.1f}/{one['pa_mpjpe_mm'] or np.nan:.1f}"
+            for one in scored.values()
+        ]
+        text += "  " + " ".join(pairs)
+    for failure in row.get("failures", []):
+        text += f"\n    {failure.strip().splitlines()[-1][:300]}"
+    for warning in row.get("warnings", []):
+        text += f"\n    {warning[:300]}"
+    return text
+
+
+def print_report(rows: list[dict[str, Any]]) -> None:
+    """Print how matches ended, and errors and regions by scenario, stage and iteration."""
+    enough = [
+        row
+        for row in rows
+        if row["state"] == "complete" and row["with_bodies"] >= 0.95 * row["seen"]
+    ]
+    print(f"\n{len(rows)} matches: {dict(Counter(row['state'] for row in rows))}")
+    print(f"with bodies for at least 95 % of the people that two cameras see: {len(enough)}")
+    names = list(dict.fromkeys(row["scenario"] for row in rows))
+    foreign = [name for name in names if name in FOREIGN_SCENARIOS]
+    groups = {name: [name] for name in names} | ({"second world": foreign} if foreign else {})
+    print("\nmean MPJPE / G-MPJPE / PA-MPJPE [mm], identity switches, and share of joints in their")
+    print("95 % regions [%]: " + ", ".join(GROUPS) + "; all")
+    for title, members in groups.items():
+        some = [row for row in rows if row["scenario"] in members]
+        for iteration in range(max((len(row.get("stages", [])) for row in some), default=0)):
+            for stage in STAGES:
+                scored = [
+                    row["stages"][iteration][stage]
+                    for row in some
+                    if len(row.get("stages", [])) > iteration and stage in row["stages"][iteration]
+                ]
+                if scored:
+                    print(_stage_line(title, iteration + 1, stage, scored))
+
+
+def _stage_line(title: str, iteration: int, stage: str, scored: list[dict[str, Any]]) -> str:
+    errors = [
+        np.mean([one[name] for one in scored if one[name] is not None] or [np.nan])
+        for name in ("mpjpe_mm", "g_mpjpe_mm", "pa_mpjpe_mm")
+    ]
+    counts = np.array([[one["regions"][group] for group in GROUPS] for one in scored]).sum(axis=0)
+    inside = np.append(counts, [counts.sum(axis=0)], axis=0)
+    shares = 100.0 * inside[:, 0] / np.maximum(inside[:, 1], 1)
+    return (
+        f"{title:15s} {iteration} {stage:15s} {len(scored):2d} "
+        + " / ".join(f"{error:6.1f}" for error in errors)
+        + f"  {sum(one['switches'] or 0 for one in scored):3d}   "
+        + " ".join(f"{share:5.1f}" for share in shares[:-1])
+        + f"; {shares[-1]:5.1f}"
+    )
+
+
+def plans(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Return what is to be measured."""
+    if options.scenarios:
+        numbers = [(s, options.seed + k) for s in options.scenarios for k in range(options.matches)]
+    else:
+        numbers = [(MIX[k % len(MIX)], options.seed + k) for k in range(options.matches)]
+    recordings = None if options.recordings is None else str(options.recordings)
+    return [
+        {
+            "scenario": name,
+            "seed": seed,
+            "duration": options.duration,
+            "iterations": options.iterations,
+            "recordings": recordings if k % 2 and name in FOREIGN_SCENARIOS else None,
+        }
+        for k, (name, seed) in enumerate(numbers)
+    ]
+
+
+def main() -> None:
+    """Measure what is missing, print a line a match, then the report."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--matches", type=int, default=40, help="of the mix, or of each scenario")
+    parser.add_argument("--scenarios", nargs="+", choices=[*SCENARIOS, *FOREIGN_SCENARIOS])
+    parser.add_argument("--duration", type=float, default=4.0, help="[s]")
+    parser.add_argument("--seed", type=int, default=1, help="of the first match")
+    parser.add_argument("--iterations", type=int, default=1)
+    parser.add_argument("--recordings", type=Path, help="folder for every second match")
+    parser.add_argument("--limit", type=float, default=3600.0, help="for one match [s]")
+    parser.add_argument("--resume", type=Path, default=Path("second_world"), metavar="DIR")
+    parser.add_argument("--keep", action="store_true", help="keep match folders and projects")
+    parser.add_argument("--report", action="store_true", help="only print what DIR holds")
+    options = parser.parse_args()
+    options.resume.mkdir(parents=True, exist_ok=True)
+    file = options.resume / "rows.jsonl"
+    rows = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    asked = [] if options.report else plans(options)
+    for plan in asked:
+        if any(plan.items() <= row.items() for row in rows):
+            continue
+        keep = options.resume / f"{plan['scenario']}-{plan['seed']}" if options.keep else None
+        row = measure_apart(plan, options.limit, keep)
+        rows.append(row)
+        with file.open("a") as out:
+            out.write(json.dumps(row) + "\n")
+        print(line_of(row), flush=True)
+    shown = [row for row in rows if not asked or any(p.items() <= row.items() for p in asked)]
+    if options.report:
+        print("\n".join(line_of(row) for row in shown))
+    print_report(shown)
+    if not shown:
+        sys.exit("no rows yet")
+
+
+if __name__ == "__main__":
+    main()
