@@ -8,7 +8,7 @@ from data_contracts.match import MatchSpec, Registration, SourceFile
 from flows.corrections import corrected_match
 from flows.stage import Match
 from worldpose.body_fitting import read_monocular
-from worldpose.errors import InputError
+from worldpose.errors import CorruptionError, InputError
 from worldpose.ingest import (
     MatchFolder,
     read_match,
@@ -106,17 +106,33 @@ def find_match(store: Store, name: str) -> Match:
 
 def _refuse_duplicate(store: Store, registration: Registration) -> None:
     """Refuse a second folder of known content; a folder that moved is no second one."""
-    for known in filter(None, map(store.registration, store.matches())):
-        same_content = known.identity == registration.identity
+    for match_id in store.matches():
+        try:
+            known = store.registration(match_id)
+        except CorruptionError:
+            continue  # `status` and `verify` tell; another match can be registered all the same
+        if known is None or known.identity != registration.identity:
+            continue
         renamed = known.spec.match_id != registration.spec.match_id
-        copied = known.folder != registration.folder and Path(known.folder).exists()
-        if same_content and (renamed or copied):
+        copied = known.folder != registration.folder and _is_there(Path(known.folder))
+        if renamed or copied:
             raise InputError(
                 f"{registration.folder}: match.yaml: match_id",
                 expected="a match that is not registered yet",
                 found=f"the content of {known.spec.match_id}, registered from {known.folder}",
                 todo=f"The same content is one match: use {known.spec.match_id}.",
             )
+
+
+def _is_there(folder: Path) -> bool:
+    """Does the folder exist; one that does not answer may."""
+    try:
+        folder.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def _read_new_files(

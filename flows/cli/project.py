@@ -26,6 +26,7 @@ from flows.run_record import latest_run
 from worldpose.errors import WorldposeError
 from worldpose.store import Store, collect, list_pins, plan_gc, repair
 from worldpose.store import verify as verify_store
+from worldpose.store.paths import damaged_path
 
 
 def init(
@@ -104,7 +105,25 @@ STATES = ("current", "ready", "stale", "missing")
 
 
 def _match_status(store: Store, match_id: str) -> dict[str, Any]:
-    """One match at a glance; a folder that cannot be read is said, and hides no other match."""
+    """One match at a glance; what cannot be read of it is said, and hides no other match."""
+    try:
+        return _readable_status(store, match_id)
+    except (OSError, WorldposeError) as failure:  # a damaged record, a disk that does not answer
+        return {
+            "match": match_id,
+            "run": None,
+            "state": "unreadable",
+            "units": {state: [] for state in STATES},
+            "failed": [],
+            "waiting": [],
+            "settings": {},
+            "unfinished_runs": [],
+            "pins": {},
+            "problem": str(failure),
+        }
+
+
+def _readable_status(store: Store, match_id: str) -> dict[str, Any]:
     latest = latest_run(store, match_id)
     units: dict[str, list[str]] = {state: [] for state in STATES}
     problem = None
@@ -113,7 +132,7 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
     try:
         match = open_match(store, match_id)
         planned = plan_run(store, match, asked, iteration=iteration)
-    except WorldposeError as failure:  # a setting, too, may name what is gone
+    except (OSError, WorldposeError) as failure:  # a setting, too, may name what is gone
         problem = str(failure)
     else:
         waiting = still_waiting(match, latest)
@@ -138,7 +157,11 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
 def verify(
     mend: Annotated[
         bool,
-        typer.Option("--repair", help="Withdraw damaged results; a new run computes them."),
+        typer.Option(
+            "--repair",
+            help="Withdraw damaged results, which a new run computes, and set damaged records "
+            "aside as *.damaged.",
+        ),
     ] = False,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
@@ -150,21 +173,25 @@ def verify(
     store = Store.open(project)
     with progress() as reporter:
         findings = verify_store(store, progress=reporter.bytes_read)
-    withdrawn = repair(store, findings) if mend else ()
+    withdrawn, set_aside = repair(store, findings) if mend else ((), ())
     if as_json:
         print_json(
             {
                 "findings": [{"path": each.path, "problem": each.problem} for each in findings],
                 "withdrawn": [each.path for each in withdrawn],
+                "set_aside": list(set_aside),
             }
         )
     for finding in findings:
         line(f"damaged: {finding.path}: {finding.problem}", to=errors)
     for result in withdrawn:
         line(f"withdrawn: {result.path}", to=errors)
+    for path in set_aside:
+        line(f"set aside: {damaged_path(path)}", to=errors)
     if findings and not mend:
         errors.print(
-            "worldpose verify --repair withdraws what is damaged; then run the match again"
+            "worldpose verify --repair withdraws damaged results and sets damaged records aside; "
+            "then run the match again"
         )
     if findings:
         raise typer.Exit(1)

@@ -75,7 +75,7 @@ def list_reviews(
         try:
             opened = open_for_review(store, name)
             found += reviews_of(opened, latest_run(store, name))
-        except WorldposeError as failure:
+        except (OSError, WorldposeError) as failure:
             problems[name] = str(failure)
             line(f"{name}: {failure}", to=errors)
         else:

@@ -91,7 +91,7 @@ class Overview:
         for match_id in self.store.matches():
             try:
                 glances.append(self._match(match_id))
-            except WorldposeError as error:
+            except (OSError, WorldposeError) as error:
                 glances.append(MatchGlance(match_id, problem=str(error)))
         return glances
 
@@ -101,7 +101,10 @@ class Overview:
         for match_id in self.store.matches():
             for run_id in self.store.runs(match_id):
                 key = (match_id, run_id)
-                found[key] = self._poses.get(key) or _poses_of(self.store.run(match_id, run_id))
+                try:
+                    found[key] = self._poses.get(key) or _poses_of(self.store.run(match_id, run_id))
+                except (OSError, WorldposeError):  # `look` says so of its match
+                    continue
         self._poses = found
         return list(found.values())
 

@@ -30,6 +30,11 @@ def add_answers(app: FastAPI) -> None:
         place = ".".join(str(part) for part in first["loc"])
         return JSONResponse({"error": f"{place}: {first['msg']}"}, status_code=422)
 
+    @app.exception_handler(OSError)
+    def unreachable(request: Request, error: OSError) -> JSONResponse:
+        place = f"{error.filename}: " if error.filename else ""
+        return JSONResponse({"error": f"{place}{error.strerror or error}"}, status_code=500)
+
     @app.exception_handler(WorldposeError)
     def failed(request: Request, error: WorldposeError) -> JSONResponse:
         return JSONResponse({"error": str(error)}, status_code=500)

@@ -6,7 +6,7 @@ from typing import Any
 
 from fastapi import APIRouter
 
-from data_contracts.review import ReviewRequest
+from data_contracts.review import Correction, ReviewRequest
 from flows.cli.review_text import correction_json, in_words, review_json
 from flows.method import GATES
 from flows.pages.desk import Desk
@@ -20,6 +20,15 @@ from worldpose.store import Store
 def routes(desk: Desk) -> APIRouter:
     """Routes of the queue and of one match."""
     router = APIRouter(prefix="/api/matches")
+    shown_corrections: dict[str, dict[str, Any]] = {}
+
+    def as_shown(correction: Correction) -> dict[str, Any]:
+        """A correction never changes, and a long journal has many thousand."""
+        name = f"{correction.match_id}/{correction.id}"
+        if name not in shown_corrections:
+            words = in_words(correction)
+            shown_corrections[name] = {**correction_json(correction), "words": words}
+        return shown_corrections[name]
 
     @router.get("")
     def matches() -> dict[str, Any]:
@@ -34,10 +43,7 @@ def routes(desk: Desk) -> APIRouter:
         return {
             **_glance(desk, opened),
             "reviews": [shown(each) for each in reviews_of(opened, latest)],
-            "corrections": [
-                {**correction_json(each), "words": in_words(each), "objection": why}
-                for each, why in states
-            ],
+            "corrections": [{**as_shown(each), "objection": why} for each, why in states],
             "cameras": [
                 {
                     "id": camera.id,
@@ -67,7 +73,7 @@ def _at_a_glance(desk: Desk, name: str) -> dict[str, Any]:
     """One match in the queue; one that cannot be opened says why, and hides no other."""
     try:
         return _glance(desk, desk.match(name))
-    except WorldposeError as error:
+    except (OSError, WorldposeError) as error:
         return {"match": name, "problem": str(error), "waiting": [], "run": None}
 
 

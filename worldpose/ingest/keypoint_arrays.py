@@ -103,6 +103,8 @@ def _header(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> _Header
             start = member.tell()
     except Exception as error:  # a hostile header can raise nearly anything in numpy and zipfile
         raise _wrong(where, "an npy array", f"{error}" or type(error).__name__) from error
+    if dtype.hasobject:
+        raise _wrong(where, "numbers", "Python objects, which are never loaded")
     if start + math.prod(shape) * dtype.itemsize != info.file_size:
         raise _wrong(
             where,

@@ -16,7 +16,7 @@ from worldpose.errors import InputError
 from worldpose.ingest.annotations import clicked_file, read_clicked, read_key_frames
 from worldpose.ingest.calibration_files import read_calibration
 from worldpose.ingest.pitch_file import read_pitch
-from worldpose.ingest.places import existing_file
+from worldpose.ingest.places import existing_file, reachable
 from worldpose.ingest.text_files import read_yaml
 from worldpose.ingest.validation import validate_record
 
@@ -62,9 +62,15 @@ def read_match(folder: Path) -> MatchFolder:
         folder: holds match.yaml and what that names.
 
     Raises:
-        InputError: a file or key is missing, unknown, contradicts another or leads out of the
-            folder; a static camera has neither video nor detections.
+        InputError: the folder cannot be read (its disk is not mounted, or this user may not); a
+            file or key is missing, unknown, contradicts another or leads out of the folder; a
+            static camera has neither video nor detections.
     """
+    with reachable(folder):
+        return _read_match(folder)
+
+
+def _read_match(folder: Path) -> MatchFolder:
     file = folder / "match.yaml"
     if folder.is_dir() and not file.exists():
         raise InputError(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from worldpose.errors import InputError
@@ -23,6 +25,24 @@ def require_local(name: str, where: str) -> None:
         )
 
 
+@contextmanager
+def reachable(folder: Path) -> Iterator[None]:
+    """A block that reads a match folder: what the system refuses is an `InputError`.
+
+    Raises:
+        InputError: the folder, or something in it, does not answer or may not be read.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            str(error.filename or folder),
+            expected="a match folder that this user can read",
+            found=error.strerror or str(error),
+            todo="Mount its disk, or give this user permission to read it.",
+        ) from error
+
+
 def existing_file(folder: Path, name: str, where: str, *, folders: bool = False) -> Path:
     """The file `name` in the folder.
 
@@ -40,7 +60,14 @@ def existing_file(folder: Path, name: str, where: str, *, folders: bool = False)
     try:
         there = path.is_file() or (folders and path.is_dir() and any(path.iterdir()))
         inside = path.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError, ValueError):  # no rights, a loop of links, a NUL in the name
+    except PermissionError as error:
+        raise InputError(
+            where,
+            expected="a file that this user can read",
+            found=f"{name!r}: {error.strerror}",
+            todo="Give this user permission to read it.",
+        ) from error
+    except (OSError, RuntimeError, ValueError):  # a loop of links, a NUL in the name
         there = False
     if not there:
         raise InputError(

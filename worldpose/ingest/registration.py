@@ -12,6 +12,7 @@ from data_contracts.match import Registration, SourceFile
 from worldpose.errors import InputError
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.ingest.pitch_file import pitch_file
+from worldpose.ingest.places import reachable
 
 SETTLE_SECONDS: Final = 0.5
 """A file that changed this recently is looked at again; recorders and copies write far oftener."""
@@ -34,6 +35,11 @@ def register_match(match: MatchFolder, previous: Registration | None) -> Registr
     Raises:
         InputError: a file is empty, cannot be read, or is still being written.
     """
+    with reachable(match.folder):
+        return _register(match, previous)
+
+
+def _register(match: MatchFolder, previous: Registration | None) -> Registration:
     folder = str(match.folder.resolve())
     known: dict[tuple[str, int, int], str] = {}
     if previous is not None and previous.folder == folder:
@@ -85,10 +91,15 @@ def _files_under(folder: Path, root: Path) -> list[str]:
         return [root.relative_to(folder).as_posix()]
     return [
         (Path(parent) / name).relative_to(folder).as_posix()
-        for parent, _, names in os.walk(root)
+        for parent, _, names in os.walk(root, onerror=_raise_unless_absent)
         for name in names
         if not name.startswith(".")
     ]
+
+
+def _raise_unless_absent(error: OSError) -> None:
+    if not isinstance(error, FileNotFoundError | NotADirectoryError):
+        raise error
 
 
 def _source_file(folder: Path, path: str, known: dict[tuple[str, int, int], str]) -> SourceFile:

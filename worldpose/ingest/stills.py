@@ -1,4 +1,4 @@
-"""Stills: one picture of a static camera, as PNG."""
+"""Stills: one image of a static camera, as PNG (JPEG is read too)."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from worldpose.errors import InputError
 from worldpose.ingest.text_files import require_file
+from worldpose.video.images import declared_size, decode_image
 
 STILL_BYTES = 1 << 28
 """Most that a still may hold [byte]; a noisy 4K picture has 25 MB."""
@@ -24,33 +25,30 @@ def read_still(path: Path, image_size: tuple[int, int]) -> NDArray[np.uint8]:
     Raises:
         InputError: no such file, not a picture, or one of another size.
     """
-    import cv2  # late: it takes a fifth of a second, and few commands open a picture
-
     size = require_file(path)
     content = np.fromfile(path, dtype=np.uint8) if size <= STILL_BYTES else np.empty(0, np.uint8)
-    # OpenCV gives None for a file that is cut short or no picture, and raises for an empty one.
-    picture = cv2.imdecode(content, cv2.IMREAD_COLOR_RGB) if len(content) else None
-    if picture is None:
-        raise InputError(
-            str(path),
-            expected=f"a PNG picture of at most {STILL_BYTES} bytes",
-            found=f"{size} bytes that are none",
-            todo="Export the still again.",
-        )
-    found = (picture.shape[1], picture.shape[0])
-    if found != image_size:
+    declared = declared_size(content)
+    if declared is not None and declared != image_size:
         raise InputError(
             str(path),
             expected=f"{image_size[0]} x {image_size[1]} px, the size in match.yaml",
-            found=f"{found[0]} x {found[1]}",
+            found=f"{declared[0]} x {declared[1]}",
             todo="Export the still at the size of the video, or correct match.yaml.",
         )
-    return np.ascontiguousarray(picture, dtype=np.uint8)
+    image = decode_image(content)
+    if image is None:
+        raise InputError(
+            str(path),
+            expected=f"a PNG image of at most {STILL_BYTES} bytes",
+            found=f"{size} bytes that are none",
+            todo="Export the still again.",
+        )
+    return image
 
 
 def write_still(path: Path, picture: NDArray[np.uint8]) -> None:
     """Write a picture (height, width, 3), RGB, as PNG; the same picture gives the same bytes."""
-    import cv2  # late, as above
+    import cv2  # late: it takes a fifth of a second, and few commands open an image
 
     path.parent.mkdir(parents=True, exist_ok=True)
     _, content = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))

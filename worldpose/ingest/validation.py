@@ -68,6 +68,10 @@ def _input_error(model: type[Record], detail: ErrorDetails, file: str, others: i
         expected, found, todo = "a value", "nothing", "Add this key."
     elif kind == "string_pattern_mismatch":
         expected, todo = _NAME_RULE, "Rename it."
+    elif kind == "string_type" and isinstance(value, bool):
+        found = f"{value}: YAML reads no, off, yes, on, true and false as truth values"
+        word = "yes" if value else "no"
+        todo = f"Put the word that you wrote in quotes, as in {detail['loc'][-1]}: '{word}'."
     elif kind == "string_type" and isinstance(value, int | float):
         todo = f"Put it in quotes: '{value}'."
     elif kind in ("too_short", "too_long"):

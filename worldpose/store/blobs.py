@@ -105,7 +105,9 @@ def storage_errors(path: str) -> Iterator[None]:
         yield
     except OSError as error:
         todo = _TODO.get(error.errno or 0, "Mend that and run again")
-        place = f" ({error.filename})" if error.filename not in (None, path) else ""
+        # Of a copy or a rename, the second file is the one that could not be written.
+        named = error.filename2 or error.filename
+        place = f" ({named})" if named is not None and str(named) != path else ""
         raise StoreError(
             f"{path}: {error.strerror or error}{place}. {todo}; published results are untouched."
         ) from error

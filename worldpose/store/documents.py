@@ -77,5 +77,19 @@ def unseal(kind: type[R], data: bytes, where: str) -> R:
         raise CorruptionError(f"{where} is not a {kind.__name__}: {error}") from error
 
 
+def unseal_repairable(kind: type[R], data: bytes, where: str) -> R:
+    """As `unseal`, for a record that `worldpose verify --repair` sets aside when it is damaged.
+
+    Raises:
+        CorruptionError, InputError: see `unseal`; the former says what to do.
+    """
+    try:
+        return unseal(kind, data, where)
+    except CorruptionError as error:
+        raise CorruptionError(
+            f"{error}. Restore it from a copy, or let `worldpose verify --repair` set it aside."
+        ) from error
+
+
 def _fields(record: Record) -> dict[str, Any]:
     return record.model_dump(mode="json", exclude={"checksum"})

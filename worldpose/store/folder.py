@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import shutil
@@ -11,10 +12,19 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Final
 
+from worldpose.errors import StoreError
 from worldpose.store.blobs import Entry, storage_errors
 from worldpose.store.commit_points import reached
 from worldpose.store.paths import STAGING, checked_path
+
+_WITHOUT_LINKS: Final = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
+"""What link() says on file systems that have no hard links."""
+_HERE: Final = -100
+"""AT_FDCWD: a relative path begins at the working folder."""
+_NO_REPLACE: Final = 1
+"""RENAME_NOREPLACE of Linux."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +56,9 @@ class LocalBlobs:
         target = self._at(path)
         with storage_errors(str(target)), self._temporary(data) as temporary:
             _make_folder(target.parent)
-            try:
-                os.link(temporary, target)
-            except FileExistsError:
+            if not _create_whole(temporary, target):
                 return False
-            _sync(target.parent)
+            _sync_folder(target.parent)
             return True
 
     def put(self, path: str, data: bytes) -> None:
@@ -59,7 +67,7 @@ class LocalBlobs:
         with storage_errors(str(target)), self._temporary(data) as temporary:
             _make_folder(target.parent)
             temporary.replace(target)
-            _sync(target.parent)
+            _sync_folder(target.parent)
 
     def delete(self, path: str) -> None:
         """See `Blobs`."""
@@ -121,7 +129,7 @@ class LocalBlobs:
             _sync_tree(folder)
             reached("during_publish")
             _write(folder / manifest_name, manifest)
-            _sync(folder)
+            _sync_folder(folder)
             _make_folder(target.parent)
             reached("before_commit")
             try:
@@ -130,8 +138,13 @@ class LocalBlobs:
                 # Renaming onto a folder with something in it fails: written once, for good.
                 if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
                     return False
-                raise
-            _sync(target.parent)
+                # A network file system repeats a request whose reply was lost: the first one has
+                # moved our folder, and the second finds none.
+                if error.errno not in (errno.ENOENT, errno.ESTALE) or folder.exists():
+                    raise
+                if self.read(f"{prefix}/{manifest_name}") != manifest:
+                    raise
+            _sync_folder(target.parent)
             return True
 
     def _at(self, path: str) -> Path:
@@ -167,6 +180,60 @@ def _write(path: Path, data: bytes) -> None:
         os.fsync(file.fileno())
 
 
+def _create_whole(temporary: Path, target: Path) -> bool:
+    """Give the whole, synced file `temporary` the name `target`; False where that is taken.
+
+    Of many that try at once exactly one succeeds, and no reader ever sees a part of the file. A
+    hard link does that on most file systems. Where there are none (exFAT, many network shares), a
+    rename that never replaces does.
+
+    Raises:
+        StoreError: the file system offers neither.
+        OSError: it failed for another reason.
+    """
+    try:
+        os.link(temporary, target)
+    except OSError as error:
+        # A network file system repeats a request whose reply was lost, and the repeated one finds
+        # the link of the first. Nothing else knows the temporary name: two names mean success.
+        if temporary.stat().st_nlink == 2:
+            return True
+        if isinstance(error, FileExistsError):
+            return False
+        if error.errno not in _WITHOUT_LINKS:
+            raise
+        return _rename_new(temporary, target, error)
+    return True
+
+
+def _rename_new(temporary: Path, target: Path, no_link: OSError) -> bool:
+    """Rename unless `target` exists; False where it does."""
+    try:
+        rename = ctypes.CDLL(None, use_errno=True).renameat2
+    except AttributeError:  # not Linux
+        raise _unfit(target, no_link) from no_link
+    arguments = (_HERE, os.fsencode(temporary), _HERE, os.fsencode(target), _NO_REPLACE)
+    if rename(*arguments) == 0:
+        return True
+    code = ctypes.get_errno()
+    if code == errno.EEXIST:
+        return False
+    if code == errno.ENOENT and not temporary.exists() and target.exists():
+        return True  # the reply was lost, as above
+    if code in (errno.EINVAL, errno.ENOSYS, *_WITHOUT_LINKS):
+        raise _unfit(target, no_link) from no_link
+    raise OSError(code, os.strerror(code), str(target))
+
+
+def _unfit(target: Path, error: OSError) -> StoreError:
+    return StoreError(
+        f"{target}: the file system has neither hard links ({error.strerror}) nor renames that "
+        "never replace a file, so two writers could overwrite each other. Put the project on a "
+        "disk that has one of them (ext4, XFS, Btrfs, APFS, NFS; exFAT and SMB on Linux), or in "
+        "object storage (s3://bucket/prefix)."
+    )
+
+
 def _sync(path: Path) -> None:
     descriptor = os.open(path, os.O_RDONLY)
     try:
@@ -175,11 +242,20 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
+def _sync_folder(path: Path) -> None:
+    """Sync a folder's entries; some file systems (SMB, FUSE) do that themselves and refuse it."""
+    try:
+        _sync(path)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.EBADF, errno.ENOTSUP, errno.ENOSYS):
+            raise
+
+
 def _sync_tree(folder: Path) -> None:
     for inner, _, names in os.walk(folder, topdown=False):
         for name in names:
             _sync(Path(inner, name))
-        _sync(Path(inner))
+        _sync_folder(Path(inner))
 
 
 def _make_folder(path: Path) -> None:
@@ -188,7 +264,7 @@ def _make_folder(path: Path) -> None:
         return
     _make_folder(path.parent)
     path.mkdir(exist_ok=True)
-    _sync(path.parent)
+    _sync_folder(path.parent)
 
 
 def _raise_unless_absent(error: OSError) -> None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 from data_contracts.run import Reservation, RunRecord
-from worldpose.errors import InputError, StoreError
+from worldpose.errors import CorruptionError, InputError, StoreError
 from worldpose.store.blobs import Entry
-from worldpose.store.paths import MANIFEST, ResultId, record_path, reservation_path
+from worldpose.store.paths import MANIFEST, ResultId, is_name, record_path, reservation_path
 from worldpose.store.pins import list_pins
 from worldpose.store.runs import may_be_at_work, run_order
 from worldpose.store.store import Store
@@ -32,7 +32,8 @@ class GcPlan:
 
     garbage: tuple[Garbage, ...]
     held: tuple[str, ...]
-    """One line for each run that may be at work, whose match is left alone."""
+    """One line for each match that is left alone, as a run may be at work or a record is damaged.
+    """
     runs: frozenset[str]
     """The run records, reservations and pins that the plan knows of."""
 
@@ -64,9 +65,11 @@ def plan_gc(
             one has to be unpinned first.
         older_than: the age below which results and leftovers are spared.
 
+    A match of which a run record, reservation, pin or manifest is damaged is left alone, as what
+    its runs reach is unknown.
+
     Raises:
         InputError: `forget` names a run that is not there or is pinned, or `keep_last` is below 1.
-        CorruptionError: a run record or manifest is damaged, so that what it reaches is unknown.
     """
     known = _known(store)
     _check_arguments(store, keep_last, forget)
@@ -74,20 +77,27 @@ def plan_gc(
     garbage: list[Garbage] = []
     at_work: list[Reservation] = []
     reached: set[ResultId] = set()
-    for match_id in sorted({path.split("/")[1] for path in sizes}):
-        dropped, kept = _sorted_out(store, match_id, keep_last, forget)
+    damaged: dict[str, str] = {}
+    for match_id in _matches_with_runs(sizes):
+        try:
+            dropped, kept = _sorted_out(store, match_id, keep_last, forget)
+            for run_id in kept:
+                _reach(store, store.run(match_id, run_id), reached)
+            reservations = list(_reservations(store, match_id, sizes))
+        except CorruptionError as error:
+            damaged[match_id] = f"{match_id} is left alone: {error}"
+            continue
         for run_id in dropped:
             path = record_path(match_id, run_id)
             garbage.append(Garbage(path, "run forgotten", sizes[path]))
-        for run_id in kept:
-            _reach(store, store.run(match_id, run_id), reached)
-        for path, reservation in _reservations(store, match_id, sizes):
+        for path, reservation in reservations:
             if reservation is None or f"{match_id}/{reservation.run_id}" in forget:
                 garbage.append(Garbage(path, "reservation of a dead run", sizes[path]))
             elif may_be_at_work(reservation):
                 at_work.append(reservation)
     before = datetime.now(UTC) - older_than
-    garbage.extend(_unreached(store, reached, {run.match_id for run in at_work}, before))
+    spared = {*damaged, *(run.match_id for run in at_work)}
+    garbage.extend(_unreached(store, reached, spared, before))
     garbage.extend(
         Garbage(entry.path, "staging of a dead writer", entry.size)
         for entry in store.blobs.staged()
@@ -99,7 +109,7 @@ def plan_gc(
         f"{run.match_id}/{run.run_id}."
         for run in at_work
     )
-    return GcPlan(tuple(garbage), held, known)
+    return GcPlan(tuple(garbage), (*held, *damaged.values()), known)
 
 
 def collect(store: Store, plan: GcPlan) -> int:
@@ -123,6 +133,12 @@ def collect(store: Store, plan: GcPlan) -> int:
         else:
             store.blobs.delete_tree(item.path, MANIFEST)
     return plan.size
+
+
+def _matches_with_runs(paths: Iterable[str]) -> list[str]:
+    """Matches that files below `runs` belong to; a foreign file's folder is none."""
+    parts = (path.split("/") for path in paths)
+    return sorted({each[1] for each in parts if len(each) == 3 and is_name(each[1])})
 
 
 def _known(store: Store) -> frozenset[str]:

@@ -11,6 +11,7 @@ import xarray as xr
 import zarr
 from zarr.abc.store import Store
 from zarr.codecs import BloscCodec, Crc32cCodec
+from zarr.core.buffer import Buffer
 from zarr.storage import LocalStore
 
 from data_contracts.arrays import ArrayLayout, GroupLayout
@@ -22,6 +23,15 @@ from worldpose.store.layout_checks import (
     checked_attributes,
     with_one_nan,
 )
+
+
+class _PrivateFolder(LocalStore):
+    """A folder with one writer, which creates files without the hard links that some disks lack."""
+
+    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
+        """Write a file unless it is there; no other writer can come between."""
+        if not await self.exists(key):
+            await self.set(key, value)
 
 
 def write_group(
@@ -52,7 +62,7 @@ def write_group(
     checked = checked_arrays(layout, arrays, coordinates)
     given = checked_attributes(layout, checked, attributes)
     group = zarr.create_group(
-        store=LocalStore(folder),
+        store=_PrivateFolder(folder),
         zarr_format=3,
         attributes={
             "contract": layout.contract,

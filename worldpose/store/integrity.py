@@ -11,9 +11,10 @@ from data_contracts.review import JournalEntry
 from data_contracts.run import Project, Reservation, RunRecord
 from worldpose.errors import CorruptionError, InputError, StoreError
 from worldpose.store.blobs import Entry
-from worldpose.store.documents import unseal
-from worldpose.store.paths import MANIFEST, PROJECT, ResultId
+from worldpose.store.documents import checksum_of, unseal
+from worldpose.store.paths import DAMAGED, MANIFEST, PROJECT, ResultId, damaged_path, is_name
 from worldpose.store.published import read_published
+from worldpose.store.runs import is_run_file
 from worldpose.store.store import Store
 from worldpose.store.writer import content_of
 
@@ -30,6 +31,8 @@ class Finding:
     problem: str
     result: ResultId | None = None
     """The result it belongs to; None for records and stray files."""
+    is_damaged_record: bool = False
+    """It is a run record, reservation, registration or pin that cannot be read as such."""
 
 
 def verify(
@@ -60,23 +63,38 @@ def verify(
         done += sum(entry.size for entry in entries.values())
         if progress:
             progress(done, total)
+    journals: dict[str, list[JournalEntry]] = {}
     published = {result for result, entries in groups.items() if result.manifest_path in entries}
     if match_id is None:
-        findings.extend(_check_document(store, PROJECT, published))
+        findings.extend(_check_document(store, PROJECT, published, journals))
     for entry in documents:
-        findings.extend(_check_document(store, entry.path, published))
+        findings.extend(_check_document(store, entry.path, published, journals))
         done += entry.size
         if progress:
             progress(done, total)
+    for journal in journals.values():
+        findings.extend(_check_chain(journal))
     return tuple(sorted(findings, key=lambda finding: (finding.path, finding.problem)))
 
 
-def repair(store: Store, findings: Iterable[Finding]) -> tuple[ResultId, ...]:
-    """Withdraws the damaged results, so that the next run computes those, and only those, again."""
-    damaged = sorted({finding.result for finding in findings if finding.result})
-    for result in damaged:
+def repair(
+    store: Store, findings: Iterable[Finding]
+) -> tuple[tuple[ResultId, ...], tuple[str, ...]]:
+    """Withdraws damaged results and sets damaged records aside; gives those, and paths of these.
+
+    The next run computes the withdrawn results, and only those, again. A record that is set aside
+    keeps its bytes under another name (`damaged_path`) beside its place, and a run its number.
+    Entries of the journal stay: what people said is restored from a copy, never dropped.
+    """
+    findings = list(findings)
+    results = sorted({finding.result for finding in findings if finding.result})
+    for result in results:
         store.withdraw(result)
-    return tuple(damaged)
+    records = sorted({finding.path for finding in findings if finding.is_damaged_record})
+    for path in records:
+        store.blobs.put(damaged_path(path), store.blobs.read(path) or b"")
+        store.blobs.delete(path)
+    return tuple(results), tuple(records)
 
 
 def _by_result(
@@ -118,9 +136,14 @@ def _check_result(
         yield Finding(path, "was not published with this result", result)
 
 
-def _check_document(store: Store, path: str, published: set[ResultId]) -> Iterator[Finding]:
+def _check_document(
+    store: Store, path: str, published: set[ResultId], journals: dict[str, list[JournalEntry]]
+) -> Iterator[Finding]:
     where, parts = f"{store.url}/{path}", path.split("/")
+    is_record = False
     try:
+        if path.endswith(DAMAGED) and parts[0] in ("matches", "runs", "pins"):
+            return  # set aside: nothing reads it
         data = store.blobs.read(path)
         if data is None and parts[0] in ("runs", "pins"):
             return  # ended, forgotten or unpinned since it was listed
@@ -130,31 +153,52 @@ def _check_document(store: Store, path: str, published: set[ResultId]) -> Iterat
             case [name] if name == PROJECT:
                 unseal(Project, data, where)
                 return
-            case ["matches", name] if name.endswith(".json"):
+            case ["matches", name] if _is_json(name):
+                is_record = True
                 registration = unseal(Registration, data, where)
                 fits = name == f"{registration.spec.match_id}.json"
-            case ["runs", match_id, name] if name.endswith(".open.json"):
+            case ["runs", match_id, name] if name.endswith(".open.json") and is_run_file(name):
+                is_record = True
                 reservation = unseal(Reservation, data, where)
                 fits = (match_id, name) == (
                     reservation.match_id,
                     f"{reservation.run_id}.open.json",
                 )
-            case ["runs", match_id, name] if name.endswith(".json"):
+            case ["runs", match_id, name] if is_run_file(name):
+                is_record = True
                 record = unseal(RunRecord, data, where)
                 fits = (match_id, name) == (record.match_id, f"{record.run_id}.json")
                 yield from _check_results_of(record, path, published)
             case ["reviews", match_id, name] if name.endswith(".json"):
                 entry = unseal(JournalEntry, data, where)
                 fits = (match_id, name) == (entry.match_id, f"{entry.number:06d}.json")
-            case ["pins", match_id, name] if name.endswith(".json"):
+                journals.setdefault(match_id, []).append(entry)
+            case ["pins", match_id, name] if _is_json(name):
+                is_record = True
                 pin = unseal(Pin, data, where)
                 fits = (match_id, name) == (pin.match_id, f"{pin.name}.json")
             case _:
                 raise CorruptionError(f"{where} is not a file of a project")
         if not fits:
             raise CorruptionError(f"{where} is the record of something else")
+    except CorruptionError as error:
+        yield Finding(path, str(error), is_damaged_record=is_record)
     except (StoreError, InputError) as error:
         yield Finding(path, str(error))
+
+
+def _is_json(name: str) -> bool:
+    return name.endswith(".json") and is_name(name)
+
+
+def _check_chain(entries: list[JournalEntry]) -> Iterator[Finding]:
+    """Entries of a journal that build on one that is gone or damaged."""
+    tip = None
+    for entry in sorted(entries, key=lambda entry: entry.number):
+        if entry.previous != tip:
+            path = f"reviews/{entry.match_id}/{entry.number:06d}.json"
+            yield Finding(path, "builds on an entry that is gone or damaged")
+        tip = checksum_of(entry)
 
 
 def _check_results_of(record: RunRecord, path: str, published: set[ResultId]) -> Iterator[Finding]:

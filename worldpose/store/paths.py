@@ -13,6 +13,7 @@ from worldpose.errors import InputError
 PROJECT = "project.json"
 MANIFEST = "manifest.json"
 STAGING = "staging"
+DAMAGED = ".damaged"
 
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
 _KEY: TypeAdapter[str] = TypeAdapter(Key)
@@ -92,6 +93,20 @@ def record_path(match_id: str, run_id: str) -> str:
 def reservation_path(match_id: str, run_id: str) -> str:
     """Where the reservation of a run's number lies until its record does."""
     return f"runs/{checked_name(match_id)}/{checked_name(run_id)}.open.json"
+
+
+def damaged_path(path: str) -> str:
+    """Where `repair` sets the damaged record at `path` aside; no reader looks there."""
+    return f"{path}{DAMAGED}"
+
+
+def is_name(text: str) -> bool:
+    """Can `text` be the name of a match, stage, unit, run or pin."""
+    try:
+        checked_name(text)
+    except InputError:
+        return False
+    return True
 
 
 def pin_path(match_id: str, name: str) -> str:

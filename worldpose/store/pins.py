@@ -5,8 +5,8 @@ from __future__ import annotations
 from data_contracts.pin import Pin
 from worldpose.errors import InputError
 from worldpose.store.blobs import Blobs
-from worldpose.store.documents import seal, unseal
-from worldpose.store.paths import pin_path
+from worldpose.store.documents import seal, unseal_repairable
+from worldpose.store.paths import is_name, pin_path
 
 
 def pin_run(blobs: Blobs, pin: Pin) -> Pin:
@@ -60,12 +60,12 @@ def read_pin(blobs: Blobs, match_id: str, name: str) -> Pin | None:
     """The pin of a name, None when no run has it."""
     path = pin_path(match_id, name)
     data = blobs.read(path)
-    return None if data is None else unseal(Pin, data, f"{blobs.url}/{path}")
+    return None if data is None else unseal_repairable(Pin, data, f"{blobs.url}/{path}")
 
 
 def list_pins(blobs: Blobs, match_id: str) -> tuple[Pin, ...]:
     """All pins of a match, by name."""
-    paths = [entry.path for entry in blobs.entries(f"pins/{match_id}")]
-    names = [path.rpartition("/")[2].removesuffix(".json") for path in paths]
-    pins = (read_pin(blobs, match_id, name) for name in names)
+    files = [entry.path.rpartition("/")[2] for entry in blobs.entries(f"pins/{match_id}")]
+    names = [file.removesuffix(".json") for file in files if file.endswith(".json")]
+    pins = (read_pin(blobs, match_id, name) for name in names if is_name(name))
     return tuple(pin for pin in pins if pin is not None)

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 from datetime import UTC, datetime
 
 from data_contracts.run import Reservation, RunRecord
 from worldpose.errors import InputError, StoreError
 from worldpose.store.blobs import Blobs
 from worldpose.store.commit_points import reached
-from worldpose.store.documents import seal, unseal
+from worldpose.store.documents import seal, unseal_repairable
 from worldpose.store.paths import checked_name, record_path, reservation_path
 from worldpose.store.pins import read_pin
 
 LATEST = "latest"
 
-_RECORD, _RESERVATION = ".json", ".open.json"
+_FILE = re.compile(r"(\d+)(\.open)?\.json(\.damaged)?")
+"""Name of a run's record or reservation, in its place or set aside; other files are foreign."""
 
 
 def may_be_at_work(reservation: Reservation) -> bool:
@@ -34,24 +36,16 @@ def may_be_at_work(reservation: Reservation) -> bool:
 
 def list_runs(blobs: Blobs, match_id: str) -> tuple[list[str], list[str]]:
     """Ids of a match's finished runs, and of those reserved but not finished, in order."""
-    top = f"runs/{checked_name(match_id)}"
-    names = [entry.path.removeprefix(f"{top}/") for entry in blobs.entries(top)]
-    reserved = {name.removesuffix(_RESERVATION) for name in names if name.endswith(_RESERVATION)}
-    finished = {
-        name.removesuffix(_RECORD)
-        for name in names
-        if name.endswith(_RECORD) and not name.endswith(_RESERVATION)
-    }
+    finished, reserved, _ = _files(blobs, match_id)
     return sorted(finished, key=run_order), sorted(reserved - finished, key=run_order)
 
 
 def reserve_run(blobs: Blobs, match_id: str) -> str:
     """A run number that no other run of the match has or gets: `0001`, `0002`, ..."""
     while True:
-        finished, reserved = list_runs(blobs, match_id)
-        run_id = (
-            f"{max((run_order(name)[0] for name in (*finished, *reserved)), default=0) + 1:04d}"
-        )
+        # A record that was set aside keeps its number: reviews may name the run.
+        taken = set[str]().union(*_files(blobs, match_id))
+        run_id = f"{max((run_order(name)[0] for name in taken), default=0) + 1:04d}"
         path = reservation_path(match_id, run_id)
         reservation = Reservation(
             run_id=run_id,
@@ -72,7 +66,7 @@ def read_reservation(blobs: Blobs, match_id: str, run_id: str) -> Reservation | 
     """The reservation of a run, None when it has none, or has it no more."""
     path = reservation_path(match_id, run_id)
     data = blobs.read(path)
-    return None if data is None else unseal(Reservation, data, f"{blobs.url}/{path}")
+    return None if data is None else unseal_repairable(Reservation, data, f"{blobs.url}/{path}")
 
 
 def read_record(blobs: Blobs, match_id: str, run_id: str = LATEST) -> RunRecord:
@@ -95,7 +89,7 @@ def read_record(blobs: Blobs, match_id: str, run_id: str = LATEST) -> RunRecord:
             todo=f"Run: worldpose run {match_id}",
         )
     path = record_path(match_id, wanted)
-    return unseal(RunRecord, blobs.read(path) or b"", f"{blobs.url}/{path}")
+    return unseal_repairable(RunRecord, blobs.read(path) or b"", f"{blobs.url}/{path}")
 
 
 def write_record(blobs: Blobs, record: RunRecord) -> None:
@@ -113,6 +107,26 @@ def write_record(blobs: Blobs, record: RunRecord) -> None:
         )
     reached("after_run_record")
     blobs.delete(reservation_path(record.match_id, record.run_id))
+
+
+def is_run_file(name: str) -> bool:
+    """Is `name` that of a run's record or reservation."""
+    return _FILE.fullmatch(name) is not None
+
+
+def _files(blobs: Blobs, match_id: str) -> tuple[set[str], set[str], set[str]]:
+    """Runs of a match that have a record, a reservation, or one of them set aside."""
+    top = f"runs/{checked_name(match_id)}"
+    finished: set[str] = set()
+    reserved: set[str] = set()
+    damaged: set[str] = set()
+    for entry in blobs.entries(top):
+        found = _FILE.fullmatch(entry.path.removeprefix(f"{top}/"))
+        if found is not None:
+            run_id, is_reservation, is_damaged = found.groups()
+            kind = damaged if is_damaged else reserved if is_reservation else finished
+            kind.add(run_id)
+    return finished, reserved, damaged
 
 
 def run_order(run_id: str) -> tuple[int, str]:

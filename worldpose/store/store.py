@@ -15,9 +15,9 @@ from data_contracts.work import Work
 from worldpose.errors import CorruptionError, InputError, NondeterminismError, StoreError
 from worldpose.store.blobs import Blobs, open_blobs
 from worldpose.store.commit_points import reached
-from worldpose.store.documents import seal, unseal
+from worldpose.store.documents import seal, unseal, unseal_repairable
 from worldpose.store.fingerprint import STORE_FORMAT
-from worldpose.store.paths import MANIFEST, PROJECT, ResultId, registration_path
+from worldpose.store.paths import MANIFEST, PROJECT, ResultId, is_name, registration_path
 from worldpose.store.published import read_published
 from worldpose.store.recipes import key_of
 from worldpose.store.runs import (
@@ -105,18 +105,20 @@ class Store:
 
     def matches(self) -> tuple[str, ...]:
         """Ids of the registered matches, sorted."""
-        names = (entry.path.split("/")[1:] for entry in self.blobs.entries("matches"))
-        return tuple(
+        files = (entry.path.split("/")[1:] for entry in self.blobs.entries("matches"))
+        names = (
             parts[0].removesuffix(".json")
-            for parts in names
+            for parts in files
             if len(parts) == 1 and parts[0].endswith(".json")
         )
+        return tuple(filter(is_name, names))  # macOS and others put files of their own on shares
 
     def registration(self, match_id: str) -> Registration | None:
         """What is known of a match; None when it is not registered."""
         path = registration_path(match_id)
         data = self.blobs.read(path)
-        return None if data is None else unseal(Registration, data, f"{self.url}/{path}")
+        where = f"{self.url}/{path}"
+        return None if data is None else unseal_repairable(Registration, data, where)
 
     def register(self, registration: Registration) -> None:
         """Takes a match in, or replaces what is known of it."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from worldpose.errors import InputError
 from worldpose.video.frame_index import FrameIndex, index_frames
+from worldpose.video.images import decode_image
 from worldpose.video.reading import VideoReader
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg")
@@ -151,10 +152,5 @@ def open_video(path: Path, index: FrameIndex | None = None) -> VideoReader | Ima
 
 
 def _read(file: Path, *, grey: bool) -> NDArray[np.uint8] | None:
-    """A picture as it is to be shown, RGB or grey; None where the file is no picture."""
-    import cv2  # late: it takes a fifth of a second, and most videos are files
-
-    content = np.fromfile(file, dtype=np.uint8)
-    flag = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR_RGB
-    picture = cv2.imdecode(content, flag) if len(content) else None
-    return None if picture is None else np.ascontiguousarray(picture, dtype=np.uint8)
+    """An image as it is to be shown, RGB or grey; None where the file is no image."""
+    return decode_image(np.fromfile(file, dtype=np.uint8), grey=grey)

@@ -1,6 +1,8 @@
 """Clicked markings and stills: read back as written, or refused by file and entry."""
 
 import json
+import struct
+import zlib
 
 import cv2
 import numpy as np
@@ -159,3 +161,31 @@ def test_edited_clicks_and_stills_leave_the_match_what_it_is(clicked_folder):
     changed = set(after.files) ^ set(before.files)
     name = "annotations/static_calibration/cam2.json"
     assert {file.path for file in changed} == {name, "stills/cam2.png"}
+
+
+def test_a_small_file_that_declares_a_huge_still_is_refused_unread(tmp_path):
+    """A PNG of 60,000 x 60,000 pixels takes 254 bytes, and would take 10.8 GB of memory."""
+    path = tmp_path / "cam.png"
+    header = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)
+    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(bytes(60_000))), (b"IEND", b"")]
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + b"".join(
+            struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+            for name, data in chunks
+        )
+    )
+    assert path.stat().st_size < 300
+    with pytest.raises(InputError, match=r"cam.png.*1920 x 1080 px.*found 60000 x 60000"):
+        read_still(path, (1920, 1080))
+    with pytest.raises(InputError, match="bytes that are none"):
+        read_still(path, (60_000, 60_000))
+
+
+def test_a_jpeg_still_is_read(tmp_path):
+    path = tmp_path / "cam.png"
+    _, content = cv2.imencode(".jpg", np.full((20, 30, 3), 120, np.uint8))
+    path.write_bytes(content.tobytes())
+    assert read_still(path, (30, 20)).shape == (20, 30, 3)
+    with pytest.raises(InputError, match="found 30 x 20"):
+        read_still(path, (1920, 1080))

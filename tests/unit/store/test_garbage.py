@@ -16,7 +16,7 @@ from store_samples import (
     sample_record,
 )
 
-from worldpose.errors import CorruptionError, InputError, StoreError
+from worldpose.errors import InputError, StoreError
 from worldpose.store import ResultId, Store, collect, groups, key_of, plan_gc, verify
 from worldpose.store.layout_checks import array_parts
 
@@ -178,11 +178,27 @@ def test_forgotten_runs_go_with_what_only_they_reach(folder_store: Store) -> Non
     assert verify(folder_store) == ()
 
 
-def test_damaged_run_record_stops_planning(folder_store: Store) -> None:
+@pytest.mark.parametrize("damaged", ["run", "manifest", "pin", "reservation"])
+def test_a_match_with_a_damaged_record_is_left_alone_and_no_other(
+    folder_store: Store, damaged: str
+) -> None:
     run_once(folder_store)
-    folder_store.blobs.put("runs/final/0001.json", b"damaged")
-    with pytest.raises(CorruptionError, match="0001"):
-        plan_gc(folder_store, older_than=NOW)
+    publish(folder_store, sample_recipe("spare"))
+    publish(folder_store, sample_recipe(match_id="semi"))
+    path = {
+        "run": "runs/final/0001.json",
+        "manifest": ResultId(*place()).manifest_path,
+        "pin": "pins/final/v1.json",
+        "reservation": "runs/final/0002.open.json",
+    }[damaged]
+    folder_store.blobs.put(path, b"damaged")
+    plan = plan_gc(folder_store, older_than=NOW)
+    assert {garbage.path.split("/")[1] for garbage in plan.garbage} == {"semi"}
+    (reason,) = plan.held
+    assert reason.startswith("final is left alone: ")
+    assert path in reason
+    collect(folder_store, plan)
+    assert folder_store.has(*place(sample_recipe("spare")))
 
 
 def test_absent_runs_and_empty_keeps_are_refused(folder_store: Store) -> None:

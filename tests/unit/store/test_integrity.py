@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime, timedelta
+
 import pytest
 from store_samples import (
     place,
@@ -12,8 +14,20 @@ from store_samples import (
     sample_registration,
 )
 
-from worldpose.store import ResultId, Store, repair, verify
+from data_contracts.pin import Pin
+from worldpose.errors import CorruptionError
+from worldpose.store import (
+    ResultId,
+    Store,
+    list_pins,
+    pin_run,
+    plan_gc,
+    repair,
+    verify,
+)
 from worldpose.store.documents import seal
+
+NOW = datetime(2026, 1, 1, tzinfo=UTC)
 
 
 @pytest.fixture
@@ -111,10 +125,62 @@ def test_foreign_file_is_found(full: Store) -> None:
         "results/final/tracking/stray",
         "runs/final/notes.txt",
         "matches/.hidden.json",
+        "runs/final/backup.json",
+        "pins/final/._v1.json",
     ]
     for path in foreign:
         full.blobs.put(path, b"foreign")
-    assert [finding.path for finding in verify(full)] == sorted(foreign)
+    findings = verify(full)
+    assert [finding.path for finding in findings] == sorted(foreign)
+    assert repair(full, findings)[1] == (), "it is not ours to move"
+
+
+@pytest.mark.parametrize("foreign", ["", "{}"])
+def test_foreign_files_break_no_reader(full: Store, foreign: str) -> None:
+    """macOS and back-up programs put files of their own on shares."""
+    names = (
+        *("matches/.x.json", "matches/._final.json", "matches/a/b.json", "runs/.DS_Store"),
+        *("runs/final/backup.json", "runs/final/.0001.json", "runs/final/0001.json.bak"),
+        *("runs/.x/0001.json", "pins/final/._v1.json", "pins/final/.DS_Store", "pins/.DS_Store"),
+        *("reviews/final/.DS_Store", "results/.DS_Store", "staging/.DS_Store"),
+    )
+    for path in names:
+        full.blobs.put(path, foreign.encode())
+    assert full.matches() == ("final",)
+    assert full.runs("final") == ("0001",)
+    assert full.run("final").run_id == "0001"
+    assert [each.run_id for each in full.unfinished_runs("final")] == ["0002"]
+    assert list_pins(full.blobs, "final") == ()
+    plan = plan_gc(full, older_than=timedelta(0))
+    assert [each.path for each in plan.garbage if not each.path.startswith("staging")] == []
+    assert full.reserve_run("final") == "0003"
+
+
+def test_repair_sets_damaged_records_aside_and_readers_go_on(full: Store) -> None:
+    run_once(full)
+    pin_run(
+        full.blobs, Pin(name="v1", match_id="final", run_id="0001", who="A", why="", pinned_at=NOW)
+    )
+    damaged = ["matches/final.json", "pins/final/v1.json", "runs/final/0002.open.json"]
+    damaged.append("runs/final/0003.json")
+    for path in damaged:
+        full.blobs.put(path, (full.blobs.read(path) or b"")[:40])
+    for read in (full.run, full.registration, full.unfinished_runs):
+        with pytest.raises(CorruptionError, match="verify --repair"):
+            read("final")
+    assert repair(full, verify(full)) == ((), tuple(damaged))
+    assert verify(full) == ()
+    assert full.run("final").run_id == "0001"
+    assert full.matches() == ()
+    assert list_pins(full.blobs, "final") == ()
+    assert len(full.blobs.read("runs/final/0003.json.damaged") or b"") == 40
+    assert full.reserve_run("final") == "0004", "the number of a damaged run is not given again"
+
+
+def test_repair_leaves_records_of_a_later_version_and_lost_results(full: Store) -> None:
+    full.blobs.delete(ResultId(*place()).manifest_path)
+    assert repair(full, verify(full)) == ((), ())
+    assert full.run("final").run_id == "0001"
 
 
 def test_whole_file_in_a_wrong_place_is_found(folder_store: Store) -> None:
@@ -145,7 +211,7 @@ def test_unpublished_leftovers_are_no_damage(full: Store) -> None:
 def test_repair_withdraws_what_is_damaged_and_nothing_else(full: Store) -> None:
     path = f"{ResultId(*place()).path}/joints/c/0/0/0"
     full.blobs.put(path, b"changed")
-    assert repair(full, verify(full)) == (ResultId(*place()),)
+    assert repair(full, verify(full)) == ((ResultId(*place()),), ())
     assert not full.has(*place())
     assert full.has(*place(sample_recipe("late")))
     publish(full)

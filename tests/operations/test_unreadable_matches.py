@@ -1,0 +1,130 @@
+"""A match that cannot be read, whatever the cause, is named and hides no other."""
+
+import errno
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from command_line import WORLDPOSE, worldpose
+from page_client import log_in, served
+
+from flows.operations.overview import Overview
+from flows.registering import register
+from worldpose.errors import InputError
+from worldpose.ingest import read_match
+from worldpose.store import Store
+
+
+@pytest.fixture
+def two(small_match, tmp_path):
+    """A project of two matches, `first` and `second`, with their folders beside it."""
+    store = Store.create(tmp_path / "project")
+    for number, name in enumerate(("first", "second")):
+        folder = Path(shutil.copytree(small_match, tmp_path / name))
+        text = (folder / "match.yaml").read_text()
+        (folder / "match.yaml").write_text(re.sub("match_id: .*", f"match_id: {name}", text))
+        file = folder / "pitch.json"
+        file.write_text(file.read_text() + "\n" * number)  # another match has other content
+        register(store, folder)
+    return tmp_path
+
+
+@pytest.fixture
+def stale_mount(monkeypatch, two):
+    """The first match's folder lies on a mount that has gone stale."""
+    stat = os.stat
+
+    def fail(path, *arguments, **keywords):
+        if isinstance(path, str | os.PathLike) and os.fspath(path).startswith(str(two / "first")):
+            raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), os.fspath(path))
+        return stat(path, *arguments, **keywords)
+
+    monkeypatch.setattr(os, "stat", fail)
+    return two
+
+
+def without_rights(*arguments):
+    """The command line as a user for whom permissions hold, also where tests run as root."""
+    drop = ["setpriv", "--bounding-set", "-dac_override,-dac_read_search"]
+    command = [*(drop if os.geteuid() == 0 else ()), *WORLDPOSE, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=480)
+
+
+@pytest.fixture
+def locked(two):
+    """The first match's folder may not be read."""
+    if os.geteuid() == 0 and shutil.which("setpriv") is None:
+        pytest.skip("permissions do not hold for root, and setpriv is not installed")
+    (two / "first").chmod(0)
+    yield two
+    (two / "first").chmod(0o755)
+
+
+def test_status_names_a_folder_without_permission_and_shows_the_others(locked):
+    answer = without_rights("status", "--project", locked / "project")
+    assert answer.returncode == 0, answer.stderr
+    lines = answer.stdout.splitlines()
+    assert any(line.startswith("second ") for line in lines)
+    (problem,) = [line for line in lines if line.startswith("first: ")]
+    assert str(locked / "first") in problem
+    assert "Permission denied" in problem
+    assert "Traceback" not in answer.stderr
+    answer = without_rights("review", "list", "--project", locked / "project", "--json")
+    assert '"problems"' in answer.stdout
+
+
+def test_another_match_can_be_registered_beside_a_folder_without_permission(locked, small_match):
+    third = Path(shutil.copytree(small_match, locked / "third"))
+    text = (third / "match.yaml").read_text()
+    (third / "match.yaml").write_text(re.sub("match_id: .*", "match_id: third", text))
+    file = third / "pitch.json"
+    file.write_text(file.read_text() + "\n\n")
+    answer = without_rights("ingest", third, "--project", locked / "project")
+    assert answer.returncode == 0, answer.stderr
+
+
+def test_pages_show_the_others_beside_a_stale_mount(stale_mount):
+    browser = log_in(served(stale_mount / "project"), "Ada")
+    answer = browser.get("/api/matches")
+    assert answer.status_code == 200
+    first, second = answer.json()["matches"]
+    assert "Stale file handle" in first["problem"]
+    assert second["problem"] is None
+    assert browser.get("/api/matches/first").status_code == 422
+    assert browser.get("/api/matches/second").status_code == 200
+    assert browser.get("/status").status_code == 200
+
+
+def test_a_match_folder_that_does_not_answer_is_one_clear_refusal(stale_mount):
+    with pytest.raises(InputError, match=r"first.*Stale file handle.*Mount its disk"):
+        read_match(stale_mount / "first")
+
+
+@pytest.mark.parametrize("record", ["runs/first/0001.json", "matches/first.json"])
+def test_a_damaged_record_hides_no_other_match(two, record):
+    path = two / "project" / record
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes((path.read_bytes() if path.exists() else b"{}")[:200])
+    answer = worldpose("status", "--project", two / "project")
+    assert answer.code == 0, answer.err
+    assert any(line.startswith("second ") for line in answer.out.splitlines())
+    (problem,) = [line for line in answer.out.splitlines() if line.startswith("first: ")]
+    assert record in problem
+    assert "worldpose verify --repair" in problem
+    browser = log_in(served(two / "project"), "Ada")
+    first, second = browser.get("/api/matches").json()["matches"]
+    assert record in first["problem"]
+    assert second["problem"] is None
+    states = {each.match_id: each.state for each in Overview(Store.open(two / "project")).look()}
+    assert states["second"] == "not run"
+    assert worldpose("gc", "--project", two / "project").code == 0
+    register(Store.open(two / "project"), two / "second")
+    answer = worldpose("verify", "--repair", "--project", two / "project")
+    assert answer.code == 1
+    assert f"set aside: {record}.damaged" in answer.err
+    assert worldpose("verify", "--project", two / "project").code == 0
+    answer = worldpose("status", "--project", two / "project")
+    assert "damaged" not in answer.out

@@ -1,0 +1,138 @@
+"""Disks that behave otherwise: no hard links, lost replies of a network file system, no room."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+from store_samples import place, publish, run_once
+
+from worldpose.errors import StoreError
+from worldpose.store import Store, verify
+from worldpose.store import folder as folder_module
+from worldpose.store.blobs import storage_errors
+
+
+def failing(code: int) -> Callable[..., Any]:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    return fail
+
+
+@pytest.fixture(params=[errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS])
+def without_links(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What exFAT, SMB and FUSE answer to link()."""
+    monkeypatch.setattr(os, "link", failing(request.param))
+
+
+@pytest.fixture
+def losing_replies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """NFS repeats a request whose reply was lost: the first one did what the second one finds."""
+    link, rename = os.link, Path.rename
+
+    def link_twice(source: Any, target: Any) -> None:
+        link(source, target)
+        link(source, target)
+
+    def rename_twice(source: Path, target: Any) -> Path:
+        rename(source, target)
+        return rename(source, target)
+
+    monkeypatch.setattr(os, "link", link_twice)
+    monkeypatch.setattr(Path, "rename", rename_twice)
+
+
+@pytest.mark.usefixtures("losing_replies")
+def test_a_lost_reply_to_a_link_of_ours_is_success(tmp_path: Path) -> None:
+    store = Store.create(tmp_path / "project")
+    assert store.blobs.put_new("reviews/m/000001.json", b"said")
+    assert not store.blobs.put_new("reviews/m/000001.json", b"other"), "that one is taken"
+    assert store.blobs.read("reviews/m/000001.json") == b"said"
+    assert [store.reserve_run("final") for _ in range(3)] == ["0001", "0002", "0003"]
+
+
+@pytest.mark.usefixtures("losing_replies")
+def test_a_lost_reply_to_the_rename_of_a_result_is_success(tmp_path: Path) -> None:
+    store = Store.create(tmp_path / "project")
+    assert run_once(store) == "0001"
+    assert store.has(*place())
+    assert verify(store) == ()
+
+
+def test_a_rename_that_fails_otherwise_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store.create(tmp_path / "project")
+    monkeypatch.setattr(Path, "rename", failing(errno.ESTALE))
+    with pytest.raises(StoreError, match="Stale file handle"):
+        publish(store)
+    assert not store.has(*place())
+
+
+@pytest.mark.usefixtures("without_links")
+def test_without_hard_links_a_file_is_still_created_whole_and_once(tmp_path: Path) -> None:
+    store = Store.create(tmp_path / "project")
+    with ThreadPoolExecutor(8) as pool:
+        contents = [f"{number} ".encode() * 10_000 for number in range(16)]
+        done = list(pool.map(lambda data: store.blobs.put_new("a/b.json", data), contents))
+    assert sum(done) == 1
+    assert store.blobs.read("a/b.json") == contents[done.index(True)]
+    assert store.blobs.staged() == []
+    run_once(store)
+    assert verify(store) == ()
+
+
+@pytest.mark.usefixtures("without_links")
+def test_a_disk_with_neither_links_nor_exclusive_renames_is_refused_with_the_cause(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> int:
+        folder_module.ctypes.set_errno(errno.EINVAL)
+        return -1
+
+    class Library:
+        renameat2 = staticmethod(fail)
+
+    monkeypatch.setattr(folder_module.ctypes, "CDLL", lambda *_, **__: Library)
+    with pytest.raises(StoreError, match="neither hard links") as caught:
+        Store.create(tmp_path / "project")
+    assert "permission to it" not in str(caught.value)
+    assert "ext4" in str(caught.value)
+
+
+def test_a_real_lack_of_permission_is_still_said_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "link", failing(errno.EACCES))
+    with pytest.raises(StoreError, match="Give this user permission"):
+        Store.create(tmp_path / "project")
+
+
+def test_a_disk_that_syncs_no_folders_is_fine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sync = os.fsync
+
+    def only_files(descriptor: int) -> None:
+        if Path(f"/proc/self/fd/{descriptor}").is_dir():
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", only_files)
+    store = Store.create(tmp_path / "project")
+    run_once(store)
+    assert verify(store) == ()
+
+
+def test_a_copy_that_fails_names_the_file_that_could_not_be_written() -> None:
+    full = OSError(errno.ENOSPC, "No space left on device", "source.db", None, "project/new.db")
+    with pytest.raises(StoreError) as caught, storage_errors("project/new.db"):
+        raise full
+    assert "source.db" not in str(caught.value)
+    assert str(caught.value).startswith("project/new.db: No space left on device. Free space")
