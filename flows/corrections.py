@@ -5,6 +5,7 @@ from __future__ import annotations
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
+from weakref import WeakKeyDictionary
 
 from data_contracts.match import Registration
 from data_contracts.review import Correction, Edit, MovedPoint, RedrawnMarking, Withdrawal
@@ -16,6 +17,7 @@ from worldpose.errors import InputError
 from worldpose.ingest import MatchFolder
 from worldpose.review import (
     Journal,
+    Replay,
     append,
     read_journal,
     replay_corrections,
@@ -31,8 +33,28 @@ from worldpose.store import Store
 def corrected_match(store: Store, folder: MatchFolder, registration: Registration) -> Match:
     """The match as people have corrected it; no file of its folder changes."""
     journal = read_journal(store, registration.spec.match_id)
-    replay = replay_corrections(folder, standing_corrections(journal.records))
+    replay = _replayed(store, folder, standing_corrections(journal.records))
     return Match(replay.folder, registration, journal, replay.applied, replay.stale)
+
+
+_REPLAYED: WeakKeyDictionary[
+    Store, dict[str, tuple[MatchFolder, tuple[Correction, ...], Replay]]
+] = WeakKeyDictionary()
+"""Match to its folder as it was read, the corrections that stood, and what they made of it."""
+
+
+def _replayed(store: Store, folder: MatchFolder, standing: tuple[Correction, ...]) -> Replay:
+    """All corrections replayed; what was replayed before over the same folder is not again."""
+    known = _REPLAYED.setdefault(store, {})
+    before, done, replay = known.get(folder.spec.match_id, (folder, (), Replay(folder)))
+    if before != folder or standing[: len(done)] != done:
+        done, replay = (), Replay(folder)
+    rest = standing[len(done) :]
+    if rest:
+        more = replay_corrections(replay.folder, rest)
+        replay = Replay(more.folder, replay.applied + more.applied, replay.stale + more.stale)
+    known[folder.spec.match_id] = (folder, standing, replay)
+    return replay
 
 
 def new_corrections(

@@ -173,17 +173,22 @@ def routes(desk: Desk) -> APIRouter:
 
 
 def warm_up(desk: Desk) -> None:
-    """Estimate the first clicked camera there is: kernels are then loaded before somebody waits."""
+    """Estimate one clicked camera, which loads kernels, and open all matches with their journals.
+
+    So the first person to look waits for neither.
+    """
+    is_warm = False
     for name in desk.store.matches():
         try:
             folder = desk.match(name).folder
-            for camera, clicked in folder.clicked.items():
-                if folder.pitch is not None:
-                    spec = folder.spec.camera(camera)
-                    drawing = PitchDrawing(PitchTemplate.from_spec(folder.pitch))
-                    preview(drawing, clicked, (spec.width, spec.height), settings=_POINTS_ALONE)
-                    return
-        except WorldposeError:
+            if folder.pitch is None or not folder.clicked or is_warm:
+                continue
+            camera, clicked = next(iter(folder.clicked.items()))
+            spec = folder.spec.camera(camera)
+            drawing = PitchDrawing(PitchTemplate.from_spec(folder.pitch))
+            is_warm = True
+            preview(drawing, clicked, (spec.width, spec.height), settings=_POINTS_ALONE)
+        except (OSError, WorldposeError):
             continue  # the queue says what is wrong with it
 
 

@@ -4,14 +4,20 @@ Each entry is one sealed file, `reviews/<match>/<number>.json`, created whole an
 all, on a disk and in object storage alike; creation fails where another writer took the number, so
 that no entry is lost. Each names the checksum of the one before it, so that a lost or changed entry
 is seen.
+
+A process keeps what it has read: each further look reads the last entry it knows and those that any
+process added since.
 """
 
 from __future__ import annotations
 
+import json
 import re
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from weakref import WeakKeyDictionary
 
 from data_contracts.review import JournalEntry, ReviewRecord
 from worldpose.errors import CorruptionError
@@ -22,6 +28,8 @@ from worldpose.store.paths import checked_name
 _ENTRY = re.compile(r"(\d{6,})\.json")
 READERS = 8
 """Entries fetched at a time: in object storage each is a request of its own."""
+BATCH = 64
+"""Entries that one reader fetches in a row."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +47,8 @@ class Journal:
     entries: tuple[JournalEntry, ...] = ()
     last: int = 0
     damage: tuple[str, ...] = ()
+    tip: str | None = None
+    """Checksum of the last whole entry, on which the next one builds."""
 
     @property
     def records(self) -> Iterator[ReviewRecord]:
@@ -53,34 +63,96 @@ def read_journal(store: Store, match_id: str) -> Journal:
     A damaged entry that no later one builds on was never acknowledged, or its disk lost it: it is
     ignored and told in `damage`.
 
+    A store object is given what it has read before, as long as the last entry is still the same;
+    only later ones are read. So damage that an earlier entry takes meanwhile is seen by `verify`
+    and by the next process.
+
     Raises:
         CorruptionError: an entry that a later one builds on is damaged or gone.
         InputError: an entry of another contract version.
     """
     folder = f"reviews/{checked_name(match_id)}"
-    names = (entry.path.rpartition("/")[2] for entry in store.blobs.entries(folder))
-    numbers = sorted(int(found[1]) for found in map(_ENTRY.fullmatch, names) if found)
+    with _KNOWN_LOCK:
+        known = _KNOWN.setdefault(store, {}).setdefault(match_id, _Known())
+    with known.lock:  # requests that come at once read a long journal once
+        journal = known.journal or Journal(match_id)
+        if not _is_still(store, journal, known.last_data):
+            journal, known.last_data = Journal(match_id), None
+            names = (entry.path.rpartition("/")[2] for entry in store.blobs.entries(folder))
+            numbers = sorted(int(found[1]) for found in map(_ENTRY.fullmatch, names) if found)
+        else:
+            numbers = []
+        found = _contents(store, match_id, numbers)
+        while (data := store.blobs.read(_path(match_id, _last(journal, found) + 1))) is not None:
+            found.append((_last(journal, found) + 1, data))
+        journal = _extended(journal, found, f"{store.url}/{folder}")
+        known.last_data = found[-1][1] if found else known.last_data
+        known.journal = journal
+        return journal
+
+
+@dataclass
+class _Known:
+    """What a store object has read of a journal.
+
+    Attributes:
+        journal: None before the first look.
+        last_data: the bytes of its last entry, None where there is none.
+        lock: held by the one that reads.
+    """
+
+    journal: Journal | None = None
+    last_data: bytes | None = None
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+
+_KNOWN: WeakKeyDictionary[Store, dict[str, _Known]] = WeakKeyDictionary()
+_KNOWN_LOCK = threading.Lock()
+
+
+def _contents(store: Store, match_id: str, numbers: Sequence[int]) -> list[tuple[int, bytes]]:
+    """Entries that are listed, with their bytes; none for one that is gone meanwhile."""
+
+    def read(some: Sequence[int]) -> list[tuple[int, bytes]]:
+        return [(number, store.blobs.read(_path(match_id, number)) or b"") for number in some]
+
+    batches = [numbers[first : first + BATCH] for first in range(0, len(numbers), BATCH)]
     with ThreadPoolExecutor(READERS) as pool:
-        contents = list(pool.map(store.blobs.read, (_path(match_id, n) for n in numbers)))
-    entries: list[JournalEntry] = []
-    damage = []
-    for number, data in zip(numbers, contents, strict=True):
-        where = f"{store.url}/{_path(match_id, number)}"
+        return [each for some in pool.map(read, batches) for each in some]
+
+
+def _is_still(store: Store, journal: Journal, last_data: bytes | None) -> bool:
+    """Is the last known entry there as it was; of an empty journal nothing is known."""
+    return journal.last > 0 and store.blobs.read(_path(journal.match_id, journal.last)) == last_data
+
+
+def _last(journal: Journal, found: Sequence[tuple[int, bytes]]) -> int:
+    return found[-1][0] if found else journal.last
+
+
+def _extended(journal: Journal, found: Sequence[tuple[int, bytes]], folder: str) -> Journal:
+    """The journal with further entries: the number of each, and its bytes."""
+    if not found:
+        return journal
+    entries, damage, tip = list(journal.entries), list(journal.damage), journal.tip
+    for number, data in found:
+        where = f"{folder}/{number:06d}.json"
         try:
-            entry = unseal(JournalEntry, data or b"", where)
+            entry = unseal(JournalEntry, data, where)
         except CorruptionError as error:
             damage.append(f"{error}; it is ignored: what it said must be said again")
             continue
-        if (entry.match_id, entry.number) != (match_id, number):
+        if (entry.match_id, entry.number) != (journal.match_id, number):
             raise CorruptionError(f"{where} is entry {entry.number} of {entry.match_id}")
-        if entry.previous != _tip(entries):
+        if entry.previous != tip:
+            whole = f"entries up to {entries[-1].number}" if entries else "no entries"
             raise CorruptionError(
-                f"{where} builds on an entry that is gone or damaged; entries "
-                f"{[each.number for each in entries]} before it are whole. Restore the folder "
-                f"{folder} from a copy."
+                f"{where} builds on an entry that is gone or damaged; {whole} before it are "
+                f"whole. Restore the folder {folder} from a copy."
             )
         entries.append(entry)
-    return Journal(match_id, tuple(entries), max(numbers, default=0), tuple(damage))
+        tip = json.loads(data)["checksum"]
+    return Journal(journal.match_id, tuple(entries), found[-1][0], tuple(damage), tip)
 
 
 def append(store: Store, journal: Journal, records: Sequence[ReviewRecord]) -> Journal | None:
@@ -101,12 +173,13 @@ def append(store: Store, journal: Journal, records: Sequence[ReviewRecord]) -> J
     entry = JournalEntry(
         match_id=journal.match_id,
         number=number,
-        previous=_tip(journal.entries),
+        previous=journal.tip,
         records=tuple(records),
     )
     if not store.blobs.put_new(_path(journal.match_id, number), seal(entry)):
         return None
-    return Journal(journal.match_id, (*journal.entries, entry), number, journal.damage)
+    entries = (*journal.entries, entry)
+    return Journal(journal.match_id, entries, number, journal.damage, checksum_of(entry))
 
 
 def say(
@@ -130,7 +203,3 @@ def say(
 
 def _path(match_id: str, number: int) -> str:
     return f"reviews/{checked_name(match_id)}/{number:06d}.json"
-
-
-def _tip(entries: Sequence[JournalEntry]) -> str | None:
-    return checksum_of(entries[-1]) if entries else None

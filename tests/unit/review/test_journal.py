@@ -3,6 +3,7 @@
 import threading
 import uuid
 from datetime import UTC, datetime
+from multiprocessing import get_context
 
 import pytest
 
@@ -131,13 +132,73 @@ def test_the_journal_goes_on_after_an_entry_cut_short(store):
 def test_an_entry_that_later_ones_build_on_is_missed(store, harm):
     for name in "abc":
         say(store, "m", lambda _, name=name: [correction(name)])
+    assert said(read_journal(store, "m")) == ["a", "b", "c"]
     second = files(store)[1]
     if harm == "cut":
         second.write_bytes(second.read_bytes()[:-10])
     else:
         second.unlink()
     with pytest.raises(CorruptionError, match="000003"):
-        read_journal(store, "m")
+        read_journal(Store.open(store.url), "m")  # another process, which has read nothing yet
+    assert said(read_journal(store, "m")) == ["a", "b", "c"], "this one has"
+    assert "000003" in verify(store)[-1].path
+
+
+def test_only_what_is_new_is_read_again(store, monkeypatch):
+    for number in range(20):
+        say(store, "m", lambda _, number=number: [correction(str(number))])
+    one = Store.open(store.url)
+    read_journal(one, "m")
+    read = []
+    blobs_read = type(one.blobs).read
+    monkeypatch.setattr(
+        type(one.blobs), "read", lambda self, path: (read.append(path), blobs_read(self, path))[1]
+    )
+    monkeypatch.setattr(type(one.blobs), "entries", None)  # a list of all is not asked for either
+    assert len(said(read_journal(one, "m"))) == 20
+    assert read == ["reviews/m/000020.json", "reviews/m/000021.json"]
+
+
+def test_what_other_processes_add_is_read_by_all(store):
+    """Each has its own memory of the journal, as processes have; they take turns."""
+    several = [Store.open(store.url) for _ in range(3)]
+    for number in range(12):
+        say(several[number % 3], "m", lambda _, number=number: [correction(str(number))])
+        for each in several:
+            assert said(read_journal(each, "m")) == [str(n) for n in range(number + 1)]
+    assert verify(store) == ()
+
+
+def test_a_journal_that_was_restored_or_made_again_is_read_anew(store):
+    for name in "abc":
+        say(store, "m", lambda _, name=name: [correction(name)])
+    for file in files(store)[1:]:
+        file.unlink()  # back to a copy of before
+    assert said(read_journal(store, "m")) == ["a"]
+    for file in files(store):
+        file.unlink()
+    other = Store.open(store.url)
+    for name in "xyz":
+        say(other, "m", lambda _, name=name: [correction(name)])
+    assert said(read_journal(store, "m")) == ["x", "y", "z"], "the same numbers, other content"
+
+
+def test_many_processes_at_once_lose_and_double_nothing(store):
+    context = get_context("fork")
+    writers = [context.Process(target=say_ten, args=(store.url, writer)) for writer in range(3)]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join(120)
+    found = said(read_journal(store, "m"))
+    assert sorted(found) == sorted(f"{writer}.{n}" for writer in range(3) for n in range(10))
+    assert verify(store) == ()
+
+
+def say_ten(url, writer):
+    store = Store.open(url)
+    for number in range(10):
+        say(store, "m", lambda _, number=number: [correction(f"{writer}.{number}")])
 
 
 def test_an_entry_of_another_place_is_refused(store):
