@@ -5,6 +5,8 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Literal
 
+from pydantic import Field
+
 from data_contracts.records import CONTRACT_VERSION, Record
 
 ArrivalState = Literal["arriving", "incomplete", "refused", "taken"]
@@ -29,6 +31,11 @@ class Arrival(Record):
     """Digest of the names, sizes and times of all its files as they were last seen."""
     unchanged_since: float = 0.0
     """When it was first seen like this, on this machine's clock that only goes forward [s]."""
+    is_begun: bool = False
+    """Whether taking it in has begun and not ended; written before the first of its files is read.
+    """
+    deaths: int = Field(default=0, ge=0)
+    """How often the process that took it in, as it is now, ended in the middle of that."""
     match_id: str | None = None
     """The match that it became."""
     flow_run: str | None = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Final
 
 from data_contracts.operations import Arrival
 from flows.operations.inbox import Entry, RefusalError, changed, look, missing_of
@@ -13,6 +14,9 @@ from flows.registering import register
 from flows.stage import Match
 from worldpose.errors import StoreError, WorldposeError
 from worldpose.store import Store
+
+MAX_DEATHS: Final = 2
+"""Of processes that took an arrival in, after which it is refused."""
 
 Begin = Callable[[Match, Arrival], str]
 """Gives a match its run, once however often it is called; the run's id at Prefect."""
@@ -28,7 +32,7 @@ def watch_once(state: StateFolder, inbox: Path, quiet: float) -> list[str]:
     """
     with state.only_one("arrivals", wait=False) as is_held:
         ready = _looked(state, inbox, quiet) if is_held else []
-    return [f"{arrival.name} {arrival.fingerprint}" for _, arrival in ready]
+    return [f"{each.name} {each.fingerprint} {each.deaths}" for _, each in ready]
 
 
 def take_in(
@@ -36,7 +40,9 @@ def take_in(
 ) -> list[Arrival]:
     """Take in every arrival that is complete; gives all that were decided on.
 
-    Killed anywhere and called again, it registers nothing twice and begins no second run.
+    Killed anywhere and called again, it registers nothing twice and begins no second run. An
+    arrival whose taking in ended the process (out of memory, a crash) comes after all others the
+    next time, and is refused after `MAX_DEATHS`.
 
     Args:
         store: the project.
@@ -47,11 +53,34 @@ def take_in(
     """
     decided = []
     with state.only_one("arrivals", wait=True):
-        for entry, arrival in _looked(state, inbox, quiet):
-            result = _decide(store, entry, arrival, begin)
+        ready = _looked(state, inbox, quiet)
+        for entry, arrival in sorted(ready, key=lambda each: each[1].deaths):
+            result = _take(store, state, entry, arrival, begin)
             state.write_arrival(result)
             decided.append(result)
     return decided
+
+
+def _take(
+    store: Store, state: StateFolder, entry: Entry, arrival: Arrival, begin: Begin
+) -> Arrival:
+    """Decide on one arrival; what is noted before tells the next process that this one died."""
+    if arrival.deaths >= MAX_DEATHS:
+        return changed(
+            arrival,
+            "refused",
+            f"the process that took it in died {arrival.deaths} times, killed or by a crash: the "
+            "system's log says which (out of memory?). It is tried again when a file of it changes",
+        )
+    number = arrival.deaths + 1
+    state.write_arrival(
+        changed(arrival, "arriving", f"being taken in, try {number}", is_begun=True)
+    )
+    try:
+        return _decide(store, entry, arrival, begin)
+    except BaseException:
+        state.write_arrival(arrival)  # ended by an error or a signal, which is no death
+        raise
 
 
 def _looked(state: StateFolder, inbox: Path, quiet: float) -> list[tuple[Entry, Arrival]]:

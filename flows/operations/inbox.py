@@ -65,6 +65,8 @@ def look(
 ) -> list[tuple[Entry, Arrival, bool]]:
     """Each arrival that is not taken yet, what is known of it now, and whether to take it in.
 
+    Called by the one that holds the lock of the arrivals.
+
     It is complete when match.yaml is there and nothing of it has changed for `quiet` seconds.
     What was refused or incomplete is looked at again when it has changed.
 
@@ -89,6 +91,8 @@ def look(
             found.append((entry, _changed(entry, before, "incomplete", reason), False))
             continue
         is_same = before is not None and before.fingerprint == fingerprint
+        # The lock is ours: what is begun was begun by a process that lives no more.
+        deaths = before.deaths + before.is_begun if before is not None and is_same else 0
         # After a reboot that clock begins anew: then it is waited for once more.
         since = before.unchanged_since if before is not None and is_same else now
         since = min(since, now)
@@ -99,9 +103,10 @@ def look(
             entry,
             before,
             "arriving",
-            f"taken in when nothing of it has changed for {quiet:g} s",
+            f"taken in when nothing of it has changed for {quiet:g} s{_died(deaths)}",
             fingerprint=fingerprint,
             unchanged_since=since,
+            deaths=deaths,
         )
         found.append((entry, arrival, is_same and now - since >= quiet))
     return found
@@ -164,7 +169,9 @@ def missing_of(path: Path) -> str:
     return ""
 
 
-def changed(arrival: Arrival, state: ArrivalState, reason: str, **more: str | None) -> Arrival:
+def changed(
+    arrival: Arrival, state: ArrivalState, reason: str, **more: str | bool | None
+) -> Arrival:
     """The arrival in another state."""
     update = {"state": state, "reason": reason, "changed_at": datetime.now(UTC), **more}
     return arrival.model_copy(update=update)
@@ -210,6 +217,12 @@ def _require_plain(name: str) -> None:
         raise RefusalError(f"the name {name!a} has characters that names here may not have")
 
 
+def _died(deaths: int) -> str:
+    if deaths == 0:
+        return ""
+    return f"; the process that took it in died {deaths} time{'s' if deaths > 1 else ''}"
+
+
 def _changed(
     entry: Entry,
     before: Arrival | None,
@@ -218,6 +231,7 @@ def _changed(
     *,
     fingerprint: str = "",
     unchanged_since: float = 0.0,
+    deaths: int = 0,
 ) -> Arrival:
     arrival = Arrival(
         name=entry.name,
@@ -226,6 +240,7 @@ def _changed(
         priority=entry.priority,
         fingerprint=fingerprint,
         unchanged_since=unchanged_since,
+        deaths=deaths,
         changed_at=datetime.now(UTC),
     )
     is_news = before is None or (before.state, before.reason) != (state, reason)

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from pydantic import ValidationError
+
 from data_contracts.operations import Arrival, Priority, Serving
 from worldpose.errors import UsageError
 from worldpose.release import whole_file
@@ -58,14 +60,25 @@ class StateFolder:
 
     def arrivals(self) -> dict[str, Arrival]:
         """What is known of the inbox, by name."""
-        files = sorted((self.folder / "arrivals").glob("*.json"))
-        found = (Arrival.model_validate_json(file.read_bytes()) for file in files)
-        return {arrival.name: arrival for arrival in found}
+        found = {}
+        for file in sorted((self.folder / "arrivals").glob("*.json")):
+            try:
+                arrival = Arrival.model_validate_json(file.read_bytes())
+            except (FileNotFoundError, ValidationError):
+                continue  # forgotten meanwhile, or damaged: then it is looked at as a new one
+            found[arrival.name] = arrival
+        return found
 
     def write_arrival(self, arrival: Arrival) -> None:
         """Keep what is known of one entry; its name never becomes a path."""
         with whole_file(self._arrival_file(arrival.name)) as draft:
             draft.write_text(arrival.model_dump_json(indent=2) + "\n")
+
+    def end_orderly(self) -> None:
+        """All processes of the service were ended on purpose: that is no death of what they did."""
+        for arrival in self.arrivals().values():
+            if arrival.is_begun:
+                self.write_arrival(arrival.model_copy(update={"is_begun": False}))
 
     def forget_arrival(self, name: str) -> None:
         """Its entry is gone from the inbox."""

@@ -192,6 +192,7 @@ def serve(plan: ServePlan, token: str, ready: Callable[[], None], tell: Tell) ->
                     supervisor.look()
             finally:
                 supervisor.end()
+                state.end_orderly()
                 state.serving.unlink(missing_ok=True)
 
 

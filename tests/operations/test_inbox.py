@@ -208,6 +208,87 @@ def test_a_match_that_moves_to_another_queue_is_known(desk, drop):
     assert {match for match, _ in desk.begun} == {"tiny-0-0.2s-3cameras-2players"}
 
 
+def take_in_and_die(folder, poisoned):
+    """A process that dies, as from the system's out-of-memory killer, when it reads one match."""
+    from flows.operations import arrivals
+
+    register = arrivals.register
+
+    def register_or_die(store, match, **options):
+        if match.name == poisoned:
+            os._exit(137)
+        return register(store, match, **options)
+
+    arrivals.register = register_or_die
+    Desk(folder).take_in()
+
+
+def die(desk, poisoned="aaa"):
+    process = get_context("fork").Process(
+        target=take_in_and_die, args=(desk.inbox.parent, poisoned)
+    )
+    process.start()
+    process.join(120)
+    return process.exitcode
+
+
+def test_a_match_that_ends_the_process_stops_no_other_and_is_refused(desk, drop):
+    drop("aaa")
+    folder = drop("bbb")
+    text = (folder / "match.yaml").read_text()
+    (folder / "match.yaml").write_text(text.replace("tiny-0-0.2s", "other"))
+    pitch = folder / "pitch.json"
+    pitch.write_text(pitch.read_text() + " ")
+    desk.look()
+    first = watch_once(desk.state, desk.inbox, 0.0)
+    assert die(desk) == 137
+    assert desk.known()["aaa"] == ("arriving", "being taken in, try 1")
+    assert desk.store.matches() == (), "it was the first"
+    again = watch_once(desk.state, desk.inbox, 0.0)
+    assert len(again) == 2
+    assert again != first, "asked for once more, it is another run"
+    assert "died 1 time" in desk.known()["aaa"][1]
+    assert die(desk) == 137
+    assert desk.store.matches() == ("other-3cameras-2players",), "others come first"
+    decided = desk.take_in()
+    assert [(each.name, each.state) for each in decided] == [("aaa", "refused")]
+    assert "died 2 times" in decided[0].reason
+    assert "out of memory?" in decided[0].reason
+    assert (desk.look(), desk.take_in()) == (0, [])
+    (desk.inbox / "aaa" / "notes.txt").write_text("smaller now")
+    desk.look()
+    assert [each.state for each in desk.take_in()] == ["taken"]
+
+
+def test_what_was_ended_on_purpose_or_by_an_error_is_no_death(desk, drop, monkeypatch):
+    drop("aaa")
+    desk.look()
+
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("flows.operations.arrivals.register", interrupt)
+        for _ in range(3):
+            with pytest.raises(KeyboardInterrupt):
+                desk.take_in()
+    assert desk.state.arrivals()["aaa"].deaths == 0
+    for _ in range(3):
+        assert die(desk) == 137
+        desk.state.end_orderly()  # as `worldpose serve` does when it is told to end
+    assert [each.state for each in desk.take_in()] == ["taken"]
+
+
+def test_a_damaged_note_of_an_arrival_is_made_again(desk, drop):
+    drop()
+    desk.look()
+    (file,) = (desk.state.folder / "arrivals").glob("*.json")
+    file.write_bytes(file.read_bytes()[:30])
+    assert desk.look() == 0
+    assert desk.look() == 1
+    assert [each.state for each in desk.take_in()] == ["taken"]
+
+
 def test_priorities_are_folders_unless_these_are_matches(desk, drop):
     drop("background")  # holds a match.yaml
     drop("urgent/b")
