@@ -32,18 +32,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from typer.testing import CliRunner
 
-from data_contracts.conventions import COCO17
 from data_contracts.run import RunRecord
-from flows.cli.app import app
+from flows.clock_advice import clock_advice
 from flows.fan_out import task_of
 from flows.registering import find_match
 from flows.release import joint_tracks
 from flows.run_record import RunLog
 from flows.settings import selected_stages
 from worldpose.evaluation import evaluate_joints
-from worldpose.evaluation.matching import joint_distances, match_people, taken
+from worldpose.evaluation.matching import joint_distances, match_people
+from worldpose.evaluation.regions import JOINT_GROUPS, region_counts
 from worldpose.ingest import read_match
 from worldpose.release import JointTracks, read_joints
 from worldpose.store import Store, open_run
@@ -56,12 +55,6 @@ MIX = (
 )
 """Scenarios of ten matches in a row."""
 STAGES = ("triangulation", "retriangulation", "body_fitting")
-GROUPS = {
-    "head": ("nose", "eye", "ear"),
-    **{name: (name,) for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")},
-}
-REGION = 7.814728
-"""95 % of the chi-square distribution with three degrees of freedom."""
 GATE = 1.0
 """Largest mean joint distance of a true person and a found one [m]."""
 SCORES = ("mpjpe_mm", "g_mpjpe_mm", "pa_mpjpe_mm", "coverage", "idf1", "switches")
@@ -105,25 +98,7 @@ def score_stage(tracks: JointTracks, truth: JointTracks, fps: float) -> dict[str
     """Return the scores of one stage's joints, and how many lie in their regions by group."""
     scores, _ = evaluate_joints(tracks, truth, fps=fps)
     found: dict[str, Any] = {name: getattr(scores, name) for name in SCORES}
-    places = {int(frame): row for row, frame in enumerate(tracks.frames)}
-    rows = np.array([places.get(int(frame), -1) for frame in truth.frames])
-    people = np.where((rows >= 0)[:, None, None, None], tracks.joints[rows], np.nan)
-    match = match_people(joint_distances(people, truth.joints), GATE)
-    off = taken(people, match) - truth.joints
-    assert tracks.covariance is not None
-    covariance = np.where((rows >= 0)[:, None, None, None, None], tracks.covariance[rows], np.nan)
-    stated = taken(covariance.reshape(*covariance.shape[:3], 9), match).reshape(*off.shape, 3)
-    counts = np.isfinite(off).all(-1) & np.isfinite(stated).all((-1, -2))
-    if truth.views is not None:
-        counts &= truth.views >= 2
-    safe = np.where(counts[..., None, None], stated, np.eye(3))
-    error = np.where(counts[..., None], off, 0.0)
-    squared = (error * np.linalg.solve(safe, error[..., None])[..., 0]).sum(-1)
-    inside = counts & (squared <= REGION)
-    found["regions"] = {}
-    for group, parts in GROUPS.items():
-        joints = [j for j, name in enumerate(COCO17) if any(part in name for part in parts)]
-        found["regions"][group] = [int(inside[..., joints].sum()), int(counts[..., joints].sum())]
+    found["regions"] = {name: list(n) for name, n in region_counts(tracks, truth).items()}
     return found
 
 
@@ -171,14 +146,11 @@ def measure(plan: dict[str, Any], folder: Path) -> dict[str, Any]:
     row |= {
         "state": last.state,
         "failures": [f"{one.unit}: {one.error}: {one.message}" for one in last.failed],
-        "warnings": [],
+        "left_out": last.left_out,
+        "warnings": [*last.warnings, *clock_advice(last.figures, spec)],
         "run_s": round(sum(run.seconds for run in runs), 1),
         "stages": [],
     }
-    if last.state == "complete":  # all is there: the command only says how it ended
-        say = CliRunner().invoke(app, ["run", spec.match_id, "--project", str(project)])
-        row["exit_code"] = say.exit_code
-        row["warnings"] = [line for line in say.stderr.splitlines() if line.startswith("warning")]
     bodies = None
     for record in runs:
         run, scored = open_run(str(project), spec.match_id, record.run_id), {}
@@ -237,7 +209,7 @@ def line_of(row: dict[str, Any]) -> str:
     for failure in row.get("failures", []):
         text += f"\n    {failure.strip().splitlines()[-1][:300]}"
     for warning in row.get("warnings", []):
-        text += f"\n    {warning[:300]}"
+        text += f"\n    warning: {warning[:300]}"
     return text
 
 
@@ -254,7 +226,7 @@ def print_report(rows: list[dict[str, Any]]) -> None:
     foreign = [name for name in names if name in FOREIGN_SCENARIOS]
     groups = {name: [name] for name in names} | ({"second world": foreign} if foreign else {})
     print("\nmean MPJPE / G-MPJPE / PA-MPJPE [mm], identity switches, and share of joints in their")
-    print("95 % regions [%]: " + ", ".join(GROUPS) + "; all")
+    print("95 % regions [%]: " + ", ".join(JOINT_GROUPS) + "; all")
     for title, members in groups.items():
         some = [row for row in rows if row["scenario"] in members]
         for iteration in range(max((len(row.get("stages", [])) for row in some), default=0)):
@@ -273,7 +245,9 @@ def _stage_line(title: str, iteration: int, stage: str, scored: list[dict[str, A
         np.mean([one[name] for one in scored if one[name] is not None] or [np.nan])
         for name in ("mpjpe_mm", "g_mpjpe_mm", "pa_mpjpe_mm")
     ]
-    counts = np.array([[one["regions"][group] for group in GROUPS] for one in scored]).sum(axis=0)
+    counts = np.array([[one["regions"][group] for group in JOINT_GROUPS] for one in scored]).sum(
+        axis=0
+    )
     inside = np.append(counts, [counts.sum(axis=0)], axis=0)
     shares = 100.0 * inside[:, 0] / np.maximum(inside[:, 1], 1)
     return (

@@ -114,6 +114,11 @@ def test_people_by_social_forces_keep_clear_of_each_other():
     assert min(nearest) < 0.8  # and still come close
 
 
+def test_nobody_is_left_to_go_by_social_forces_where_all_replay_recordings():
+    times = np.arange(-LEAD, 3.0, 0.02)
+    assert wander(times, [], np.zeros(2), np.ones(2), [], np.random.default_rng(0)) == []
+
+
 def test_a_tracked_player_is_followed_within_the_smoothing():
     clock = np.arange(0.0, 5.0, 0.1)
     xy = np.stack([3.0 * clock, 1.0 + 0.5 * clock], axis=-1)

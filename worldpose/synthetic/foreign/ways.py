@@ -113,6 +113,8 @@ def wander(
         obstacles: people whose ways are known; the others avoid them.
         rng: draws places, goals and speeds.
     """
+    if not roles:
+        return []
     count, step = len(roles), float(times[1] - times[0])
     substeps = max(1, int(np.ceil(step / 0.02)))
     place = _spread(count, center, size, [way.root[0] for way in obstacles], rng)

@@ -1,0 +1,72 @@
+"""Stated confidence regions against truth."""
+
+import numpy as np
+import pytest
+
+from data_contracts.conventions import COCO17
+from worldpose.errors import InputError
+from worldpose.evaluation.regions import JOINT_GROUPS, region_counts
+from worldpose.release import JointTracks
+
+
+def people(frames=60, persons=4, spread=0.03, stated=0.03, seed=0):
+    """True people 3 m apart, and predictions with normal errors of a known size."""
+    rng = np.random.default_rng(seed)
+    true = rng.normal(0.0, 0.4, (frames, persons, 17, 3))
+    true[..., 0] += 3.0 * np.arange(persons)[:, None]
+    covariance = np.broadcast_to(stated**2 * np.eye(3), (*true.shape, 3)).copy()
+    found = true + spread * rng.standard_normal(true.shape)
+    numbers, ids = np.arange(frames), np.arange(persons)
+    return JointTracks(numbers, ids, found, covariance), JointTracks(numbers, ids, true)
+
+
+def test_every_joint_is_in_one_group():
+    joints = [
+        name for parts in JOINT_GROUPS.values() for name in COCO17 if any(p in name for p in parts)
+    ]
+    assert sorted(joints) == sorted(COCO17)
+
+
+@pytest.mark.parametrize("level", [0.5, 0.95])
+def test_regions_of_the_true_size_hold_the_stated_share(level):
+    found = region_counts(*people(), level)
+    inside, count = np.array(list(found.values())).sum(axis=0)
+    assert count == 60 * 4 * 17
+    assert inside / count == pytest.approx(level, abs=0.02)
+
+
+def test_regions_half_as_wide_hold_what_the_chi_square_distribution_says():
+    found = region_counts(*people(stated=0.015))
+    inside, count = np.array(list(found.values())).sum(axis=0)
+    assert inside / count == pytest.approx(0.4177, abs=0.02)  # P(chi2_3 < 7.8147 / 4)
+
+
+def test_only_the_group_that_is_off_falls_out():
+    prediction, truth = people()
+    prediction.joints[:, :, [COCO17.index("left_hip"), COCO17.index("right_hip")], 2] += 0.2
+    found = region_counts(prediction, truth)
+    assert found["hip"][0] == 0
+    assert found["knee"][0] > 0.9 * found["knee"][1]
+
+
+def test_missing_joints_frames_and_unseen_joints_do_not_count():
+    prediction, truth = people(frames=4, persons=2)
+    prediction.joints[0, 0, 0] = np.nan
+    views = np.full(truth.joints.shape[:3], 3)
+    views[1, 1, 1] = 1
+    some = JointTracks(
+        prediction.frames[:3],
+        prediction.person_ids,
+        prediction.joints[:3],
+        prediction.covariance[:3],
+    )
+    seen = JointTracks(truth.frames, truth.person_ids, truth.joints, views=views)
+    count = sum(total for _, total in region_counts(some, seen).values())
+    assert count == 3 * 2 * 17 - 2
+
+
+def test_joints_without_covariance_are_refused():
+    prediction, truth = people(frames=2)
+    plain = JointTracks(prediction.frames, prediction.person_ids, prediction.joints)
+    with pytest.raises(InputError, match="covariance"):
+        region_counts(plain, truth)

@@ -1,0 +1,76 @@
+"""How many true joints lie in the stated confidence regions of predicted ones."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from data_contracts.conventions import COCO17
+from worldpose.errors import InputError
+from worldpose.evaluation.matching import joint_distances, match_people, taken
+from worldpose.evaluation.settings import EvaluationSettings
+from worldpose.release import JointTracks
+
+Flags = NDArray[np.bool_]
+
+JOINT_GROUPS: Final = {
+    "head": ("nose", "eye", "ear"),
+    **{name: (name,) for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")},
+}
+"""Groups of joints, by parts of their names."""
+
+
+def region_counts(
+    prediction: JointTracks,
+    reference: JointTracks,
+    level: float = 0.95,
+    settings: EvaluationSettings | None = None,
+) -> dict[str, tuple[int, int]]:
+    """Return, for each group of joints, how many lie in their regions, and how many there are.
+
+    A region is the ellipsoid of the stated covariance that holds the true joint with probability
+    `level` if errors are normal: d^T C^-1 d is below the quantile of the chi-square distribution
+    with three degrees of freedom. People are paired frame by frame as for the other scores.
+
+    Args:
+        prediction: estimated joints with covariance.
+        reference: true joints; with `views`, only joints that enough cameras saw count.
+        level: stated probability, above 0 and below 1.
+        settings: gate and views; the defaults if None.
+
+    Raises:
+        InputError: the prediction has no covariance.
+    """
+    settings = settings or EvaluationSettings()
+    if prediction.covariance is None:
+        raise InputError(
+            "prediction",
+            expected="joints with covariance",
+            found="joints without",
+            todo="Export the joints of a run, or leave regions out.",
+        )
+    rows = np.searchsorted(prediction.frames, reference.frames)
+    rows = np.minimum(rows, len(prediction.frames) - 1)
+    there: Flags = np.asarray(prediction.frames[rows] == reference.frames)
+    joints = np.where(there[:, None, None, None], prediction.joints[rows], np.nan)
+    stated = np.where(there[:, None, None, None, None], prediction.covariance[rows], np.nan)
+    match = match_people(joint_distances(joints, reference.joints), settings.match_gate)
+    error = taken(joints, match) - reference.joints
+    flat = taken(stated.reshape(*stated.shape[:3], 9), match)
+    covariance = flat.reshape(*flat.shape[:3], 3, 3)
+    known = np.isfinite(error).all(axis=-1) & np.isfinite(covariance).all(axis=(-1, -2))
+    counts: Flags = np.asarray(known)
+    if reference.views is not None:
+        counts &= reference.views >= settings.min_views
+    error = np.where(counts[..., None], error, 0.0)
+    covariance = np.where(counts[..., None, None], covariance, np.eye(3))
+    squared = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(axis=-1)
+    inside: Flags = np.asarray(counts & (squared <= chi2.ppf(level, 3)))
+    found = {}
+    for group, parts in JOINT_GROUPS.items():
+        some = [index for index, name in enumerate(COCO17) if any(part in name for part in parts)]
+        found[group] = (int(inside[..., some].sum()), int(counts[..., some].sum()))
+    return found
