@@ -178,7 +178,7 @@ def main() -> None:
     image = keypoints.reshape(options.frames, CAMERAS, -1, 2)
     rays = cameras.unproject(image).directions.reshape(shape)
     weights = np.where(np.isfinite(rays[..., 0]), 1.0, 0.0)
-    centers, gates = np.ascontiguousarray(cameras.center), np.full(options.people, GATE)
+    centers, gates = np.ascontiguousarray(cameras.center), np.full((CAMERAS, options.people), GATE)
 
     def ours(t: int) -> np.ndarray:
         return ray_affinity(joints[t], centers, rays[t], weights[t], gates, SETTINGS.min_joints)

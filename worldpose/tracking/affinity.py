@@ -28,12 +28,12 @@ def ray_affinity(
         directions: (cameras, detections, joints, 3) unit rays, world.
         weights: (cameras, detections, joints), 0 or less where not seen; else their size says
             nothing.
-        gates: (persons,) [m], distances beyond which a person's affinity is not needed.
+        gates: (cameras, persons) [m], distances beyond which an affinity is not needed.
         min_joints: least joints known on both sides.
 
     Returns:
         (cameras, persons, detections) [-m]; minus infinity with too few joints in common or
-        beyond the person's gate.
+        beyond the gate.
 
     Note:
         T1: the plain mean over the joints known on both sides. A pair is given up as soon as the
@@ -53,7 +53,7 @@ def ray_affinity(
                 continue
             for person in range(persons):
                 total, count = 0.0, 0
-                too_far = gates[person] * seen
+                too_far = gates[c, person] * seen
                 for joint in range(joint_count):
                     if not weights[c, detection, joint] > 0.0:
                         continue
@@ -69,7 +69,7 @@ def ray_affinity(
                     count += 1
                     if total > too_far:
                         break
-                if count >= min_joints and total <= gates[person] * count:
+                if count >= min_joints and total <= gates[c, person] * count:
                     affinity[c, person, detection] = -total / count
     return affinity
 

@@ -193,7 +193,7 @@ def _grown(
         joints = intersect_people(
             centers, directions, weights, index[:, None], unknown, settings.gate, sine
         )
-        gates = np.array([gate])
+        gates = np.full((len(centers), 1), gate)
         distances = -ray_affinity(joints, centers, directions, weights, gates, settings.min_joints)[
             :, 0
         ]

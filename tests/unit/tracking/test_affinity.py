@@ -20,7 +20,7 @@ def rays(*directions):
 def affinity_of(joints, centers, directions, min_joints, gate=np.inf):
     """All joints seen weigh the same."""
     weights = np.where(np.isfinite(directions[..., 0]), 1.0, 0.0)
-    gates = np.full(len(joints), gate)
+    gates = np.full((len(centers), len(joints)), gate)
     return ray_affinity(joints, centers, directions, weights, gates, min_joints)
 
 
@@ -124,8 +124,8 @@ def test_pairs_given_up_early_are_those_beyond_the_gate(seed):
     directions = rng.normal(size=(1, 5, 4, 3))
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     weights = rng.uniform(0.1, 1, (1, 5, 4))
-    every = ray_affinity(joints, ORIGIN, directions, weights, np.full(3, np.inf), 1)
-    near = ray_affinity(joints, ORIGIN, directions, weights, np.full(3, 1.3), 1)
+    every = ray_affinity(joints, ORIGIN, directions, weights, np.full((len(ORIGIN), 3), np.inf), 1)
+    near = ray_affinity(joints, ORIGIN, directions, weights, np.full((len(ORIGIN), 3), 1.3), 1)
     np.testing.assert_array_equal(near, np.where(every >= -1.3, every, -np.inf))
 
 

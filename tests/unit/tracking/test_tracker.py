@@ -284,3 +284,31 @@ def test_arrays_of_different_cameras_are_refused(ring, people, seen):
         track_people(ring(3), keypoints, confidence, FPS, SETTINGS)
     with pytest.raises(InputError, match="expected keypoints"):
         track_people(ring(4), keypoints[:2], confidence, FPS, SETTINGS)
+
+
+def test_a_missed_person_does_not_take_the_detections_of_a_newcomer_beside(ring, people, seen):
+    # The second appears 0.5 m beside the first, 0.35 m beside every camera's rays to the first,
+    # who is hidden from three of four cameras for a moment.
+    angle = np.radians(72.0)
+    places = np.zeros((60, 2, 2))
+    places[:, 1] = 0.5 * np.cos(angle), 0.5 * np.sin(angle)
+    keypoints, confidence = seen(ring(4), people(places))
+    keypoints[:20, :, 1] = np.nan
+    keypoints[20:24, :3, 0] = np.nan
+    result = track_people(ring(4), keypoints, confidence, FPS, SETTINGS)
+    assert owners(result) == [0, 1]
+
+
+def test_a_fall_is_followed_though_it_leaves_the_prediction(ring, people, seen):
+    # From running at 6 m/s to lying still within 0.3 s, in a low camera rig.
+    time = np.arange(0.0, 2.0, 1 / FPS)
+    slowed = np.clip(time - 1.0, 0.0, 0.3)
+    along = 6.0 * np.minimum(time, 1.0) + 6.0 * slowed - 10.0 * slowed**2
+    joints = people(np.stack([along, 0 * along], -1)[:, None])
+    tilt = np.clip((time - 1.0) / 0.3, 0.0, 1.0)[:, None] * np.pi / 2
+    height = joints[:, 0, :, 2].copy()
+    joints[:, 0, :, 0] += np.sin(tilt) * height
+    joints[:, 0, :, 2] = np.cos(tilt) * height + 0.1
+    result = track_people(ring(4), *seen(ring(4), joints), FPS, SETTINGS)
+    assert owners(result) == [0]
+    assert (result.detection_index >= 0).all()
