@@ -29,7 +29,8 @@ _ACCEPTANCE = (
         unit="1",
         missing="none",
         about="covariance of a step of each camera, in the units of its parameters; all zero for "
-        "a given camera whose change was refused",
+        "a given camera whose change was refused, and relative to all cameras together where all "
+        "are given",
     ),
     ArrayLayout(
         name="accepted",
@@ -38,6 +39,21 @@ _ACCEPTANCE = (
         unit="1",
         missing="none",
         about="was the camera changed; else it is as `static_calibration` has it",
+    ),
+    *(
+        ArrayLayout(
+            name=f"moved_{name}",
+            dims=("camera",),
+            dtype="float64",
+            unit=unit,
+            missing="0",
+            about=about,
+        )
+        for name, unit, about in (
+            ("center", "m", "distance between the camera's centers before and after"),
+            ("rotation", "rad", "angle between its axes before and after"),
+            ("focal", "1", "relative change of its focal length"),
+        )
     ),
     ArrayLayout(
         name="judges",
@@ -137,6 +153,9 @@ BUNDLE_ADJUSTMENT = GroupLayout(
     attributes={
         "camera": "camera ids in the order of the camera dimension",
         "reasons": "why each camera was changed or not",
+        "held_out_gain": "part of their loss that the change spares left-out people",
+        "held_out_significance": "the same in standard errors",
+        "people_shift": "distance by which left-out people moved together [m]",
         "weak": "parameters that make up each camera's weakest direction",
         "proposed_frames": "match frames that suit adjustment best",
         "used_frames": "match frames that people were taken from",

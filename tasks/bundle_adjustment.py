@@ -39,7 +39,7 @@ def bundle_adjustment(work: Work) -> str:
         arrays, attributes = adjustment_arrays(adjusted, settings, people.person)
         attributes |= {"camera": work.recipe.sources["cameras"]}
         result.write(BUNDLE_ADJUSTMENT, arrays=arrays, attributes=attributes)
-        result.figures.update(_figures(adjusted))
+        result.figures.update(_figures(adjusted, attributes["camera"]))
     return work.key
 
 
@@ -152,14 +152,21 @@ def _clicks(known: xr.Dataset, pitch: PitchTemplate | None) -> Clicks:
     return Clicks(names, places, pixels, known["point_inlier"].values)
 
 
-def _figures(adjusted: BundleAdjustment) -> dict[str, float]:
+def _figures(adjusted: BundleAdjustment, camera_ids: list[str]) -> dict[str, float]:
     """Figures of the adjustment."""
     figures = {
         "cameras_changed": float(adjusted.accepted.sum()),
         "cameras_refused": float((~adjusted.accepted).sum()),
         "noise_scale": adjusted.noise.scale,
         "noise_correlation": adjusted.noise.correlation,
+        "held_out_gain": adjusted.evidence.gain,
+        "held_out_significance": adjusted.evidence.significance,
+        "people_shift_m": adjusted.evidence.shift,
     }
+    for c in np.flatnonzero(adjusted.accepted):
+        center, rotation, _ = adjusted.motion[c].tolist()
+        figures[f"moved_center_m.{camera_ids[c]}"] = center
+        figures[f"moved_rotation_deg.{camera_ids[c]}"] = float(np.degrees(rotation))
     error = adjusted.verdict.error
     if np.isfinite(error).any():
         figures["held_out_error_before_px"] = float(np.nanmedian(error[:, 0]))

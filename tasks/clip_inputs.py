@@ -284,7 +284,9 @@ def _cameras(
     """The cameras in order, and how well they are known, where all of them tell."""
     if ADJUSTED in work.recipe.inputs:
         adjusted = open_input(store, work, ADJUSTED)
-        return camera_from_arrays(adjusted.data_vars), adjusted["camera_covariance"].values
+        stated = adjusted["camera_covariance"].values
+        known = stated.any(axis=(1, 2)).all()  # a given camera that was not changed tells none
+        return camera_from_arrays(adjusted.data_vars), stated if known else None
     each = [open_input(store, work, f"static_calibration/{camera}") for camera in camera_ids]
     cameras = Camera.stack([camera_from_arrays(camera.data_vars) for camera in each])
     if all("covariance" in camera for camera in each):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -19,16 +19,30 @@ from worldpose.bundle_adjustment.building import (
 from worldpose.bundle_adjustment.clip import Clip, Observed, observe, with_learned_noise
 from worldpose.bundle_adjustment.contradictions import Contradictions, find_contradictions
 from worldpose.bundle_adjustment.frames import propose_frames
-from worldpose.bundle_adjustment.guard import HeldOut, Verdict, held_out, verdict
+from worldpose.bundle_adjustment.gauge import align_points, relative_covariance
+from worldpose.bundle_adjustment.guard import (
+    Evidence,
+    HeldOut,
+    Verdict,
+    all_evidence,
+    held_out,
+    verdict,
+)
 from worldpose.bundle_adjustment.noise import measured_noise
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.bundle_adjustment.solving import Adjusted, solve
 from worldpose.bundle_adjustment.survey import survey_response, with_shared_errors
 from worldpose.cameras import Camera
+from worldpose.static_calibration import PARAMETERS, project_with_jacobian
 
 _STRANGER: Final = "refused: it shows other people than the other cameras do under the same ids"
 _ROUNDS: Final = 3
 """Solutions from which noise is learned; the third changes little."""
+_LEAST_DOUBT: Final = 0.01
+"""Smallest factor on the prior variance of given cameras [1]: a tenth of its deviations."""
+_FEW: Final = 4
+"""Cameras of a rig that needs significant evidence [1]: each joint of a left-out person then has
+at most three other views, whose errors are not averaged out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +60,9 @@ class BundleAdjustment:
         judged: match frames that judges were taken from.
         noise: of keypoints, as measured.
         verdict: judges' errors with calibrated and with changed cameras, also where refused.
+        evidence: what all judges together say of the change that was asked for.
+        motion: (cameras, 3) of the accepted cameras: of the center [m], of the axes [rad], of the
+            focal length [1]; 0 where refused.
         refused: (cameras,) batch as it would have been without the guard.
         iterations: of the last solution.
         converged: it came to rest.
@@ -62,6 +79,8 @@ class BundleAdjustment:
     judged: NDArray[np.int64]
     noise: KeypointNoise
     verdict: Verdict
+    evidence: Evidence
+    motion: NDArray[np.float64]
     refused: Camera
     iterations: int
     converged: bool
@@ -102,13 +121,20 @@ def adjust_cameras(
     before, stranger = adjuster.before, adjuster.stranger
     standing = stranger.copy()
     first: Verdict | None = None
+    objection = ""
     while True:
-        said = verdict(before, adjuster.judgement(standing))
+        after = adjuster.judgement(standing)
+        said = verdict(before, after)
         first = first or said
+        evidence = all_evidence(before, after, ~stranger)
         with np.errstate(invalid="ignore"):
             confirmed = (said.judges >= settings.min_judges) & (said.loss[:, 1] <= said.loss[:, 0])
         if (confirmed | standing).all():
-            break
+            objection = "" if standing.all() else adjuster.objection(before, after, standing)
+            if not objection:
+                break
+            # Calibrated cameras rest on their markings and may still change without the others.
+            confirmed = ~clip.given & (len(clip.given) > _FEW)
         standing |= ~confirmed
         if (~standing).sum() < 2:
             standing[:] = True
@@ -116,13 +142,18 @@ def adjust_cameras(
     freely = adjuster.solved(stranger)
     last = freely if standing.all() or (standing == stranger).all() else adjuster.solved(standing)
     own = adjuster.uncertainty(last)
+    cameras = _where(~standing, last.cameras, clip.cameras)
+    motion = np.where(standing[:, None], 0.0, camera_motion(clip.cameras, cameras))
     return BundleAdjustment(
         clip=clip,
-        cameras=_where(~standing, last.cameras, clip.cameras),
+        cameras=cameras,
         covariance=np.where(standing[:, None, None], clip.covariance, own),
         accepted=~standing,
         reasons=tuple(
-            _STRANGER if stranger[c] else _reason(first, c, not standing[c], settings)
+            _STRANGER
+            if stranger[c]
+            else _reason(first, c, not standing[c], settings, objection)
+            + ("" if standing[c] else _motion(motion[c]))
             for c in range(count)
         ),
         proposed=clip.frame[proposed],
@@ -130,10 +161,32 @@ def adjust_cameras(
         judged=clip.frame[judged],
         noise=adjuster.noise,
         verdict=first,
+        evidence=evidence,
+        motion=motion,
         refused=freely.cameras,
         iterations=last.iterations,
         converged=last.converged,
         observations=len(everybody.image),
+    )
+
+
+def camera_motion(before: Camera, after: Camera) -> NDArray[np.float64]:
+    """Return how far cameras moved: (cameras, 3) of center [m], axes [rad], focal length [1].
+
+    Args:
+        before: (cameras,) batch.
+        after: (cameras,) batch.
+    """
+    turned = before.cam_from_world.rotation @ after.cam_from_world.rotation.swapaxes(1, 2)
+    # By the chord: the trace loses half of the digits of a small angle.
+    chord = np.linalg.norm(turned - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
+    return np.stack(
+        [
+            np.linalg.norm(after.center - before.center, axis=1),
+            2.0 * np.arcsin(np.clip(chord, 0.0, 1.0)),
+            after.focal[:, 0] / before.focal[:, 0] - 1.0,
+        ],
+        axis=1,
     )
 
 
@@ -156,6 +209,9 @@ class _Adjuster:
         if settings.evidence == "markings_and_players":
             found = find_contradictions(clip, judged, self.before, settings)
         self.stranger, self.doubt, self.offset = found.stranger, found.doubt, found.offset
+        if clip.given.all():
+            # Of cameras that state nothing none is known to be the wrong one.
+            self.doubt, self.offset = np.ones(len(self.doubt)), np.zeros_like(self.offset)
         if settings.evidence == "markings_and_players" and len(self.everybody.points):
             self._learn()
 
@@ -173,17 +229,54 @@ class _Adjuster:
             self.noise = measured_noise(
                 rough.cameras, rough.points, self.everybody, settings.robust_scale
             )
-        # Nobody is surer than he says he is. Once: repeated, one camera that shows somebody else
-        # would free all the others step by step.
-        self.doubt = self.doubt * np.maximum(measured_doubt(problem, rough), 1.0)
+        # A stated covariance is never made smaller; the prior of given cameras states nothing.
+        # Once: repeated, one camera that shows other people would free all the others.
+        least = np.where(self.clip.given, _LEAST_DOUBT, 1.0)
+        self.doubt = self.doubt * np.maximum(measured_doubt(problem, rough), least)
+
+    def objection(self, before: HeldOut, after: HeldOut, standing: NDArray[np.bool_]) -> str:
+        """Why the change is refused as a whole; empty where nothing speaks against it.
+
+        Cameras with a covariance of their own, and others enough to judge them, need no more than
+        each camera's verdict.
+        """
+        changed = ~standing
+        given = self.clip.given & changed
+        if not given.any() and len(given) > _FEW:
+            return ""
+        judged = given if given.any() else changed
+        evidence = all_evidence(before, after, judged)
+        settings = self.settings
+        if evidence.significance < settings.min_significance:
+            return (
+                f"the loss of all of them falls by {evidence.significance:.1f} standard errors, "
+                f"{settings.min_significance:g} are asked for"
+            )
+        needed = settings.given.min_gain / max(len(given) - 1, 1)
+        if given.any() and evidence.gain < needed:
+            return (
+                f"the loss of all of them falls by {100.0 * evidence.gain:.1f} %, "
+                f"{100.0 * needed:.1f} % are asked for where {len(given)} cameras are given"
+            )
+        if self.clip.given.all():
+            deviation = float(np.sqrt(np.median(self.doubt)) * np.nanmedian(self.clip.distance))
+            most = settings.given.center * deviation
+            if evidence.shift > most:
+                return (
+                    f"left-out people move together by {1e3 * evidence.shift:.1f} mm, which no "
+                    f"keypoint can confirm; {1e3 * most:.1f} mm are allowed"
+                )
+        return ""
 
     def solved(self, standing: NDArray[np.bool_], without: int | None = None) -> Adjusted:
         """The adjustment to everybody, or to everybody but one group."""
         if self.settings.evidence == "markings":
             return solve(markings_problem(self.clip, standing, self.settings), MARKINGS_SOLVER)
         observed = self.everybody
-        # A camera that stands as it was has no say: it would drag the others to its error.
-        kept = ~standing[observed.camera_of]
+        # A calibrated camera whose change was refused has no say: its markings contradict people.
+        # A given one that nothing contradicts enough stays as it is, and the others agree with it.
+        say = ~standing | (self.clip.given & ~self.stranger)
+        kept = say[observed.camera_of]
         if without is not None:
             groups = self._groups(len(self.used))
             row = np.searchsorted(self.used, observed.frame_of)
@@ -192,16 +285,60 @@ class _Adjuster:
         problem = players_problem(
             self.clip, observed, self.noise, standing, self.settings, self.doubt
         )
-        return solve(problem, self.settings.solver, self.offset, covariance=without is None)
+        solution = solve(problem, self.settings.solver, self.offset, covariance=without is None)
+        if self.clip.given.all() and not (standing & ~self.stranger).any():
+            return self._where_people_were(solution, observed, standing)
+        return solution
+
+    def _where_people_were(
+        self, solution: Adjusted, observed: Observed, standing: NDArray[np.bool_]
+    ) -> Adjusted:
+        """The solution with people where the given cameras had them, as a whole.
+
+        A similarity transform of all cameras and people changes no residual: only the given cameras
+        tell it, and people are where all of them together put them.
+        """
+        first = np.searchsorted(observed.point_of, np.arange(len(solution.points)))
+        person, joint = observed.person_of[first], observed.joint_of[first]
+        before = self.clip.joints[observed.frame_of[first], person, joint]
+        found = np.isfinite(before).all(axis=1)
+        back = align_points(solution.points[found], before[found])
+        cameras = _where(~standing, back.move_cameras(solution.cameras), solution.cameras)
+        return replace(solution, cameras=cameras, points=back.move_points(solution.points))
 
     def uncertainty(self, adjusted: Adjusted) -> NDArray[np.float64]:
-        """The covariance (cameras, 12, 12) of adjusted cameras."""
-        information, _ = camera_knowledge(self.clip.covariance, self.settings.given)
+        """The covariance (cameras, 12, 12) of adjusted cameras.
+
+        Where only given cameras tell where the world lies, it is relative to all of them together:
+        what they err by in common misplaces no person in one picture against the others.
+        """
+        if self.clip.given.all() and self.settings.evidence == "markings_and_players":
+            points = self.everybody.points
+            weight = self._keypoint_information(adjusted.cameras)
+            origin = np.median(points, axis=0)
+            return relative_covariance(
+                adjusted.camera_covariance, adjusted.cameras, weight, origin
+            )[0]
+        information, _ = camera_knowledge(self.clip, self.settings)
         doubt = self.doubt[:, None, None]
         response = survey_response(self.clip, self.settings.survey_error)
         return with_shared_errors(
             adjusted.camera_covariance, information / doubt, np.sqrt(doubt) * response
         )
+
+    def _keypoint_information(self, cameras: Camera) -> NDArray[np.float64]:
+        """What keypoints tell of a step of each camera (cameras, 12, 12), people being known."""
+        observed = self.everybody
+        count = len(cameras.focal)
+        information = np.zeros((count, len(PARAMETERS), len(PARAMETERS)))
+        for c in range(count):
+            rows = observed.camera_of == c
+            points = observed.points[observed.point_of[rows]]
+            _, by_step = project_with_jacobian(cameras[c], points)
+            by_step = by_step / observed.noise[rows][:, None, None]
+            by_step = by_step[np.isfinite(by_step).all(axis=(1, 2))]
+            information[c] = np.einsum("nai,naj->ij", by_step, by_step)
+        return information
 
     def judgement(self, standing: NDArray[np.bool_] | None) -> HeldOut:
         """Every group's errors with cameras adjusted without it; None = cameras as they were."""
@@ -210,13 +347,14 @@ class _Adjuster:
         if standing is None or self.settings.evidence == "markings":
             cameras = self.clip.cameras if standing is None else self.solved(standing).cameras
             return held_out(self.clip, cameras, self.judged, groups >= 0, robust)
-        loss = error = np.full((1, 1, 1, 1), np.nan)
+        loss = error = joints = np.full((1, 1, 1, 1), np.nan)
         for group in np.unique(groups):
             cameras = self.solved(standing, without=group).cameras
             held = held_out(self.clip, cameras, self.judged, groups == group, robust)
             loss = np.where(np.isnan(loss), held.loss, loss)
             error = np.where(np.isnan(error), held.error, error)
-        return HeldOut(loss, error)
+            joints = np.where(np.isnan(joints), held.joints, joints)
+        return HeldOut(loss, error, joints)
 
     def _groups(self, frames: int) -> NDArray[np.int64]:
         """The group (frames, persons) of everybody; parts of the time where there is one person."""
@@ -245,8 +383,14 @@ def _where(changed: NDArray[np.bool_], new: Camera, old: Camera) -> Camera:
     return Camera.stack([(new if take else old)[c] for c, take in enumerate(changed)])
 
 
-def _reason(said: Verdict, c: int, accepted: bool, settings: BundleAdjustmentSettings) -> str:
-    """Why a camera's change was accepted or refused, with the figures that decided."""
+def _reason(
+    said: Verdict,
+    c: int,
+    accepted: bool,
+    settings: BundleAdjustmentSettings,
+    objection: str,
+) -> str:
+    """Why a camera's change was accepted or refused, with the numbers that decided."""
     judges = int(said.judges[c])
     if judges < settings.min_judges:
         return f"refused: {judges} left-out keypoints, {settings.min_judges} are asked for"
@@ -254,8 +398,20 @@ def _reason(said: Verdict, c: int, accepted: bool, settings: BundleAdjustmentSet
     change = f"loss of {judges} left-out keypoints {before:.3f} to {after:.3f}"
     if accepted:
         return f"accepted: {change}"
-    risen = "" if after > before else ", risen once other cameras were refused"
-    return f"refused: {change}{risen}"
+    if after > before:
+        return f"refused: {change}"
+    if objection:
+        return f"refused: {change}, but {objection}"
+    return f"refused: {change}, risen once other cameras were refused"
+
+
+def _motion(motion: NDArray[np.float64]) -> str:
+    """How far a camera moved."""
+    center, rotation, focal = motion.tolist()
+    return (
+        f"; moved {100.0 * center:.1f} cm and {np.degrees(rotation):.3f} degrees, focal length "
+        f"{100.0 * focal:+.2f} %"
+    )
 
 
 def _nothing(
@@ -279,6 +435,8 @@ def _nothing(
         judged=clip.frame[judged],
         noise=KeypointNoise(),
         verdict=Verdict(np.zeros(count, dtype=np.int64), nan, nan),
+        evidence=Evidence(0.0, 0.0, 0.0, 0.0, 0.0),
+        motion=np.zeros((count, 3)),
         refused=clip.cameras,
         iterations=0,
         converged=True,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.bundle_adjustment.clip import Clip, Observed
-from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, GivenCameraPrior
+from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.bundle_adjustment.solving import Adjusted, Problem, SolverSettings
 from worldpose.static_calibration import PARAMETERS
 
@@ -62,7 +62,7 @@ def players_problem(
         settings: robust scale, and the prior of given cameras.
         doubt: (cameras,) factor on the variance that calibration states [1].
     """
-    information, free = camera_knowledge(clip.covariance, settings.given)
+    information, free = camera_knowledge(clip, settings)
     information = information / np.reshape(doubt, (-1, 1, 1))
     variance = (observed.noise * noise.scale) ** 2 * noise.correlation
     scale = settings.robust_scale / np.sqrt(noise.correlation)
@@ -134,15 +134,15 @@ def markings_problem(
 
 
 def camera_knowledge(
-    covariance: NDArray[np.float64], given: GivenCameraPrior
+    clip: Clip, settings: BundleAdjustmentSettings
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the information (cameras, 12, 12) about a step, and what may move (cameras, 12).
 
     Args:
-        covariance: (cameras, 12, 12); zero for what was not solved for, all zero where given.
-        given: spreads of those cameras.
+        clip: cameras and how well they are known.
+        settings: what given cameras are taken to err by.
     """
-    known = known_covariance(covariance, given)
+    known = known_covariance(clip, settings)
     information = np.zeros_like(known)
     free: NDArray[np.bool_] = np.diagonal(known, axis1=1, axis2=2) > 0.0
     for c in range(len(known)):
@@ -155,16 +155,26 @@ def camera_knowledge(
     return 0.5 * (information + information.swapaxes(1, 2)), free
 
 
-def known_covariance(
-    covariance: NDArray[np.float64], given: GivenCameraPrior
-) -> NDArray[np.float64]:
-    """Return the covariance (cameras, 12, 12) of a step, that of given cameras by their prior.
+def known_covariance(clip: Clip, settings: BundleAdjustmentSettings) -> NDArray[np.float64]:
+    """Return the covariance (cameras, 12, 12) of a step by the camera's source.
 
     Args:
-        covariance: (cameras, 12, 12); all zero where given.
-        given: spreads of those cameras.
+        clip: cameras; the prior of given ones scales with their distance to people.
+        settings: that prior, and factors on what calibration states.
     """
-    spread = np.zeros(_SIZE)
-    spread[:7] = [given.rotation] * 3 + [given.center] * 3 + [given.focal]
-    stated = covariance.any(axis=(1, 2), keepdims=True)
-    return np.where(stated, covariance, np.diag(spread**2))
+    count = len(clip.covariance)
+    distance = clip.distance
+    usual = float(np.nanmedian(distance)) if np.isfinite(distance).any() else 1.0
+    distance = np.where(np.isfinite(distance), distance, usual)
+    given = settings.given
+    spread = np.zeros((count, _SIZE))
+    spread[:, :3] = given.rotation
+    spread[:, 3:6] = given.center * distance[:, None]
+    spread[:, 6] = given.focal
+    on_lines = np.zeros(count, dtype=np.bool_) if clip.on_lines is None else clip.on_lines
+    factor = np.where(on_lines, settings.lines_uncertainty, settings.clicks_uncertainty)
+    return np.where(
+        clip.given[:, None, None],
+        spread[:, :, None] ** 2 * np.eye(_SIZE),
+        factor[:, None, None] ** 2 * clip.covariance,
+    )

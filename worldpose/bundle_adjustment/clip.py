@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -72,6 +73,30 @@ class Clip:
     triangulation: TriangulationSettings
     pitch: PitchTemplate | None = None
     on_lines: NDArray[np.bool_] | None = None
+
+    @cached_property
+    def given(self) -> NDArray[np.bool_]:
+        """Whether each camera (cameras,) comes from a file that states no covariance."""
+        return np.asarray(~self.covariance.any(axis=(1, 2)))
+
+    @cached_property
+    def distance(self) -> NDArray[np.float64]:
+        """Median depth (cameras,) of people before each camera [m]; NaN where it sees nobody."""
+        frame, camera, person = np.nonzero(self.detection_index >= 0)
+        found = np.isfinite(self.joints[..., 0])
+        number = np.maximum(found.sum(axis=-1), 1)[..., None]
+        place = np.where(found[..., None], self.joints, 0.0).sum(axis=-2) / number
+        pose = self.cameras.cam_from_world
+        depth = np.einsum("ni,ni->n", place[frame, person], pose.rotation[camera, 2])
+        depth += pose.translation[camera, 2]
+        known = np.asarray(found.any(axis=-1))[frame, person]
+        depth[~known | (depth <= 0.0)] = np.nan
+        out = np.full(len(pose.rotation), np.nan)
+        for c in range(len(out)):
+            seen = depth[camera == c]
+            if np.isfinite(seen).any():
+                out[c] = np.nanmedian(seen)
+        return out
 
 
 class Observed(NamedTuple):

@@ -81,14 +81,14 @@ def find_contradictions(
     image, weight = keypoints_of(keypoints, confidence, clip.detection_index[frames])
     joints = clip.joints[frames]
     _, noise = predict(clip.cameras, joints, weight, clip.triangulation)
-    known = known_covariance(clip.covariance, settings.given)
+    known = known_covariance(clip, settings)
     stated = stated_errors(clip.cameras, joints, clip.triangulation, known)
     # What the others' joints may be off, as the camera sees it.
     place = noise**2 + (stated.scale**2 * _joint_variance(stated))[..., None]
     with np.errstate(invalid="ignore"):
         squared = held.error**2 / (place + stated.variance[..., None])
     found = Contradictions.none(len(known))
-    information, free = camera_knowledge(clip.covariance, settings.given)
+    information, free = camera_knowledge(clip, settings)
     for c in range(len(known)):
         told = np.isfinite(squared[:, c])
         if told.sum() < _SEEN or np.median(squared[:, c][told]) < _LIMIT * _MEDIAN:

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.bundle_adjustment.clip import Clip, keypoints_of, predict
+from worldpose.bundle_adjustment.gauge import Similarity, align_points
 from worldpose.cameras import Camera
 from worldpose.triangulation import triangulate_joints
+
+_PARTS: Final = 4
+"""Of the time; what left-out people say in one of them counts as one observation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,10 +26,12 @@ class HeldOut:
     Attributes:
         loss: (frames, cameras, persons, 17) Cauchy's loss [1]; NaN where there is none.
         error: (frames, cameras, persons, 17) length [px].
+        joints: (frames, persons, 17, 3) [m], world, from all cameras; NaN where there is none.
     """
 
     loss: NDArray[np.float64]
     error: NDArray[np.float64]
+    joints: NDArray[np.float64]
 
 
 def held_out(
@@ -48,10 +55,9 @@ def held_out(
     loss = np.full((*index.shape, keypoints.shape[-2]), np.nan)
     error = loss.copy()
     judges = np.flatnonzero(people.any(axis=0))
-    index = index[:, :, judges]
-    image, weight = keypoints_of(keypoints, confidence, index.astype(np.int64))
+    image, weight = keypoints_of(keypoints, confidence, index[:, :, judges].astype(np.int64))
     for c in range(len(cameras.focal)):
-        joints = _without(clip, cameras, c, keypoints, confidence, index)
+        joints = _without(clip, cameras, c, keypoints, confidence, index[:, :, judges])
         predicted, noise = predict(
             cameras[c : c + 1], joints, weight[:, c : c + 1], clip.triangulation
         )
@@ -60,7 +66,9 @@ def held_out(
         error[:, c, judges] = length
         loss[:, c, judges] = robust_scale**2 * np.log1p(squared / robust_scale**2)
     loss[~np.isfinite(error)] = np.nan
-    return HeldOut(loss, error)
+    joints = np.full((len(frames), index.shape[2], *loss.shape[3:], 3), np.nan)
+    joints[:, judges] = _without(clip, cameras, None, keypoints, confidence, index[:, :, judges])
+    return HeldOut(loss, error, joints)
 
 
 def joints_without(
@@ -81,13 +89,14 @@ def joints_without(
 def _without(
     clip: Clip,
     cameras: Camera,
-    camera: int,
+    camera: int | None,
     keypoints: NDArray[np.float64],
     confidence: NDArray[np.float64],
     index: NDArray[np.int16],
 ) -> NDArray[np.float64]:
     others = index.copy()
-    others[:, camera] = -1
+    if camera is not None:
+        others[:, camera] = -1
     return triangulate_joints(cameras, keypoints, confidence, others, clip.triangulation).joints
 
 
@@ -117,3 +126,62 @@ def verdict(before: HeldOut, after: HeldOut) -> Verdict:
             loss[c, side] = held.loss[:, c][both[:, c]].mean()
             error[c, side] = np.median(held.error[:, c][both[:, c]])
     return Verdict(judges, loss, error)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What all left-out people say of a change of all cameras together.
+
+    Attributes:
+        gain: part of the loss that the change removes [1]; negative where it adds.
+        significance: the fall of the loss over its standard error [1]. A person in a quarter of
+            the time is one observation, since a detector's errors last.
+        shift: how far people moved together [m].
+        turn: and turned together [rad].
+        scale: and grew together [1].
+    """
+
+    gain: float
+    significance: float
+    shift: float
+    turn: float
+    scale: float
+
+
+def all_evidence(before: HeldOut, after: HeldOut, cameras: NDArray[np.bool_]) -> Evidence:
+    """Return what left-out people say.
+
+    Args:
+        before: with cameras as they were.
+        after: with changed cameras.
+        cameras: (cameras,) bool, those whose keypoints count.
+    """
+    fall = (before.loss - after.loss)[:, cameras]
+    told = np.isfinite(fall)
+    part = np.arange(len(fall)) * _PARTS // max(len(fall), 1)
+    groups = []
+    for person in range(fall.shape[2]):
+        for each in range(_PARTS):
+            inside = fall[part == each, :, person][told[part == each, :, person]]
+            if len(inside):
+                groups.append(float(inside.mean()))
+    gain = significance = 0.0
+    if told.any():
+        gain = float(fall[told].sum() / max(before.loss[:, cameras][told].sum(), 1e-12))
+    if len(groups) > 1:
+        error = float(np.std(groups, ddof=1)) / len(groups) ** 0.5
+        significance = float(np.mean(groups)) / max(error, 1e-12)
+    moved = common_motion(before.joints, after.joints)
+    both = np.isfinite(before.joints[..., 0]) & np.isfinite(after.joints[..., 0])
+    shift = 0.0
+    if both.any():
+        center = before.joints[both].mean(axis=0)
+        shift = float(np.linalg.norm(moved.move_points(center) - center))
+    turn = float(np.arccos(np.clip((np.trace(moved.rotation) - 1.0) / 2.0, -1.0, 1.0)))
+    return Evidence(gain, significance, shift, turn, moved.scale - 1.0)
+
+
+def common_motion(before: NDArray[np.float64], after: NDArray[np.float64]) -> Similarity:
+    """Return the similarity transform by which joints (..., 3) moved together."""
+    both = np.isfinite(before).all(axis=-1) & np.isfinite(after).all(axis=-1)
+    return align_points(before[both], after[both])

@@ -12,17 +12,23 @@ from worldpose.static_calibration.line_settings import SURVEY_ERROR
 
 
 class GivenCameraPrior(Record):
-    """How far off a camera may be that was given without saying how well it is known.
+    """Uncertainty of a camera that a file gives without a covariance, and what may change it.
 
-    Standard deviations; lens and principal point are taken as they are.
+    Standard deviations before people are looked at: how much the views disagree then scales all of
+    them together. Lens coefficients and principal point are taken as they are.
     """
 
     rotation: float = Field(default=0.0005, gt=0)
     """About each axis [rad]: a pixel at a focal length of 2000 px."""
-    center: float = Field(default=0.15, gt=0)
-    """Along each axis [m]: what careful calibration from pitch markings leaves."""
+    center: float = Field(default=0.0025, gt=0)
+    """Along each axis, relative to the distance between camera and people [1]: 1 cm in a room,
+    0.15 m in a stadium."""
     focal: float = Field(default=0.002, gt=0)
     """Relative [1]: five zoom steps of a survey's rounding, 2 px at the picture's border."""
+    min_gain: float = Field(default=0.4, ge=0)
+    """Part by which the loss of left-out people in given cameras must fall, times the number of
+    cameras less one [1]: 0.13 with four cameras, 0.03 with sixteen. A detector errs differently in
+    every view, and few cameras fit that as well as an error of a camera."""
 
 
 class BundleAdjustmentSettings(Record):
@@ -52,7 +58,14 @@ class BundleAdjustmentSettings(Record):
     min_judges: int = Field(default=100, ge=1)
     """Least left-out keypoints in a camera that can accept its change [1]: six people once."""
     given: GivenCameraPrior = GivenCameraPrior()
-    """Of cameras that nobody calibrated here."""
+    """Of cameras that a file gives."""
+    clicks_uncertainty: float = Field(default=1.0, gt=0)
+    """Factor on the standard deviations that calibration from clicks states [1]."""
+    lines_uncertainty: float = Field(default=1.0, gt=0)
+    """Factor on the standard deviations that calibration on painted lines states [1]."""
+    min_significance: float = Field(default=3.0, ge=0)
+    """Standard errors by which the loss of left-out people must fall for given cameras, and for
+    rigs of up to four cameras, to change at all [1]."""
     survey_error: float = Field(default=SURVEY_ERROR, ge=0)
     """How far the ends of painted lines are from the surveyed ones, standard deviation along each
     axis [m]: all cameras share it."""

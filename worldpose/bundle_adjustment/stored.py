@@ -44,6 +44,9 @@ def adjustment_arrays(
         **camera_arrays(adjusted.cameras),
         "camera_covariance": adjusted.covariance,
         "accepted": adjusted.accepted,
+        "moved_center": adjusted.motion[:, 0],
+        "moved_rotation": adjusted.motion[:, 1],
+        "moved_focal": adjusted.motion[:, 2],
         "judges": adjusted.verdict.judges,
         "held_out_loss": adjusted.verdict.loss,
         "held_out_error": adjusted.verdict.error,
@@ -61,6 +64,9 @@ def adjustment_arrays(
     }
     attributes = {
         "reasons": list(adjusted.reasons),
+        "held_out_gain": adjusted.evidence.gain,
+        "held_out_significance": adjusted.evidence.significance,
+        "people_shift": adjusted.evidence.shift,
         "weak": [direction.about for direction in weak],
         "proposed_frames": adjusted.proposed.tolist(),
         "used_frames": adjusted.used.tolist(),

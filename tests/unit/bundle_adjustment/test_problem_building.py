@@ -9,6 +9,7 @@ from worldpose.bundle_adjustment import BundleAdjustmentSettings, GivenCameraPri
 from worldpose.bundle_adjustment.building import (
     KeypointNoise,
     camera_knowledge,
+    known_covariance,
     markings_problem,
     measured_doubt,
     players_problem,
@@ -28,7 +29,7 @@ def everybody(made):
 
 def test_the_prior_is_the_inverse_of_what_calibration_knows(clip):
     made, *_ = clip()
-    information, free = camera_knowledge(made.covariance, GivenCameraPrior())
+    information, free = camera_knowledge(made, SETTINGS)
     k3 = PARAMETERS.index("k3")
     assert free[:, :k3].all()
     assert not free[:, k3].any()
@@ -37,12 +38,25 @@ def test_the_prior_is_the_inverse_of_what_calibration_knows(clip):
     np.testing.assert_allclose(product, np.diag(free[0].astype(float)), atol=1e-12)
 
 
-def test_a_given_camera_moves_in_pose_and_focal_length_alone():
-    information, free = camera_knowledge(np.zeros((1, 12, 12)), GivenCameraPrior(center=0.2))
+def test_a_given_camera_moves_in_pose_and_focal_length_alone(clip):
+    made, *_ = clip(noise=0.0)
+    made = replace(made, covariance=np.zeros_like(made.covariance))
+    settings = BundleAdjustmentSettings(given=GivenCameraPrior(center=0.004))
+    information, free = camera_knowledge(made, settings)
     assert [PARAMETERS[k] for k in np.flatnonzero(free[0])] == [
         *("rx", "ry", "rz", "tx", "ty", "tz", "log_focal")
     ]
-    assert information[0, 3, 3] == pytest.approx(25.0)
+    # The cameras stand 52 m from the middle: 0.2 m.
+    assert 1.0 / np.sqrt(information[0, 3, 3]) == pytest.approx(0.2, rel=0.15)
+
+
+def test_a_source_may_be_believed_less_than_it_states(clip):
+    made, *_ = clip()
+    made = replace(made, on_lines=np.array([True, False, False, False, True]))
+    believed = known_covariance(made, SETTINGS)
+    settings = BundleAdjustmentSettings(clicks_uncertainty=2.0, lines_uncertainty=3.0)
+    ratio = known_covariance(made, settings)[:, 0, 0] / believed[:, 0, 0]
+    np.testing.assert_allclose(ratio, [9.0, 4.0, 4.0, 4.0, 9.0])
 
 
 def test_observations_are_those_of_joints_that_enough_cameras_agree_on(clip):

@@ -1,0 +1,186 @@
+"""Prints what each stage makes of the Shelf sequence with few cameras and in short windows.
+
+    python benchmarks/shelf_subsets.py DATA [--windows 211 121 60 30] [--cameras 2 3 4 5]
+        [--iterations 2] [--until body_fitting] [--keep FOLDER] [--set STAGE.SETTING=JSON ...]
+
+DATA holds `shelf_dev` as `shelf.py` says. Every subset of so many cameras is a match of its own,
+and so is every window of so many frames, side by side from the first frame on. The stages run in
+this process; with --keep, what the folder has already is not computed again. Scored are joints of
+`triangulation` (T), `retriangulation` (R), and bodies (B): PCP3D at alpha 0.5 and mean error [mm].
+The last lines say how often a stage is worse than its input by more than 0.3 points or 1 mm.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import re
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from shelf import load_scorer
+
+from flows.fan_out import task_of
+from flows.method import METHOD
+from flows.planning import plan_run
+from flows.registering import register
+from worldpose.errors import WorldposeError
+from worldpose.ingest import import_match
+from worldpose.store import Store
+
+FPS = 25.0
+POINTS, MILLIMETERS = 0.3, 1.0
+"""Loss through a stage that counts as worse."""
+
+
+def write_case(given: Path, cameras: tuple[str, ...], frames: range, folder: Path) -> Path:
+    """Return the match folder of some cameras and frames."""
+    name = "-".join(camera.removeprefix("cam") for camera in cameras)
+    match = folder / "matches" / f"shelf-{name}-{frames.start}-{frames.stop - 1}"
+    if match.exists():
+        return match
+    with tempfile.TemporaryDirectory() as temporary:
+        detections = Path(temporary) / "detections"
+        detections.mkdir()
+        for camera in cameras:
+            people = json.loads((given / "detections" / f"{camera}.json").read_text())
+            kept = [person for person in people if person["image_id"] in frames]
+            (detections / f"{camera}.json").write_text(json.dumps(kept))
+        parts = re.split(r"(?m)^(?=\[)", (given / "calibration.toml").read_text())
+        calibration = Path(temporary) / "calibration.toml"
+        calibration.write_text(
+            "".join(p for p in parts if any(f'name = "{camera}"' in p for camera in cameras))
+        )
+        import_match(calibration, detections, FPS, match)
+    return match
+
+
+def run(
+    store: Store, folder: Path, until: str, iterations: int, overrides: dict[str, Any]
+) -> tuple[str, list[dict[str, str]]]:
+    """Return the match's id, and for every iteration `stage/unit` to key, computing what lacks."""
+    match, _ = register(store, folder)
+    names = [stage.name for stage in METHOD]
+    stages = dict(zip(names, METHOD, strict=True))
+    found = []
+    for number in range(1, iterations + 1):
+        last = until if number == iterations else names[-1]
+        chosen = METHOD[: names.index(last) + 1]
+        units = plan_run(store, match, overrides, chosen, iteration=number)
+        for unit in units:
+            recipe = unit.recipe
+            if not store.has(match.match_id, recipe.stage, recipe.unit, unit.key):
+                task_of(stages[recipe.stage]).fn(unit.work(store.url, match, "0001"))
+        found.append({unit.name: unit.key for unit in units})
+    return match.match_id, found
+
+
+def score(
+    scorer: Any, truth: Any, store: Store, match: str, keys: dict[str, str], stage: str
+) -> tuple[float, float]:
+    """Return PCP3D [%] and the mean error of matched people [mm]."""
+    (unit,) = (name for name in keys if name.startswith(f"{stage}/"))
+    stored = store.open_result(match, *unit.split("/"), keys[unit])
+    frames = stored["frame"].values
+    poses = dict(zip(frames.tolist(), stored["joints"].values, strict=True))
+    found, _ = scorer.evaluate(truth["gt"], truth["frames"], poses, "shelf", frames=frames)
+    error = found["mpjpe_mm_matched"]
+    return found["avg_pcp_actors_1_3"], np.nan if error is None else error
+
+
+def main() -> None:
+    """Print a line a case and a summary."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--windows", type=int, nargs="+", default=[211, 121, 60, 30])
+    parser.add_argument("--cameras", type=int, nargs="+", default=[5, 4, 3, 2])
+    parser.add_argument("--without", nargs="*", default=[], help="subsets of these alone")
+    parser.add_argument("--iterations", type=int, default=1)
+    parser.add_argument("--until", default="body_fitting")
+    parser.add_argument("--keep", type=Path)
+    parser.add_argument("--set", nargs="*", default=[], dest="settings")
+    options = parser.parse_args()
+    data = options.data / "shelf_dev"
+    overrides: dict[str, dict[str, Any]] = {}
+    for each in options.settings:
+        name, _, value = each.partition("=")
+        stage, _, setting = name.partition(".")
+        overrides.setdefault(stage, {})[setting] = json.loads(value)
+    scorer, truth = load_scorer(data), np.load(data / "gt.npz")
+    every = sorted(file.stem for file in (data / "import" / "detections").glob("*.json"))
+    first, last = int(truth["frames"][0]), int(truth["frames"][-1])
+    stages = ["triangulation", "retriangulation", "body_fitting"]
+    stages = (
+        stages[: 1 + max(1, stages.index(options.until))] if options.until in stages else stages
+    )
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = options.keep or Path(temporary)
+        project = folder / "project"
+        store = Store.open(project) if project.exists() else Store.create(project)
+        worse: dict[str, list[str]] = {}
+        for length, count in itertools.product(options.windows, options.cameras):
+            for start in range(first, last + 2 - length, length):
+                frames = range(start, start + length)
+                for cameras in itertools.combinations(every, count):
+                    if options.without and set(every) - set(cameras) != set(options.without):
+                        continue
+                    tell_case(
+                        (data / "import", cameras, frames, folder),
+                        (scorer, truth, store, stages),
+                        (options.until, options.iterations, overrides),
+                        worse,
+                    )
+    for comparison, cases in worse.items():
+        bad = [case for case in cases if case]
+        print(f"{comparison}: worse in {len(bad)} of {len(cases)}", *bad, sep="\n    ")
+
+
+def tell_case(
+    case: tuple[Path, tuple[str, ...], range, Path],
+    scoring: tuple[Any, Any, Store, list[str]],
+    how: tuple[str, int, dict[str, Any]],
+    worse: dict[str, list[str]],
+) -> None:
+    """Print one case, and add what is worse in it than in its input."""
+    _, cameras, frames, _ = case
+    scorer, truth, store, stages = scoring
+    label = f"{''.join(c.removeprefix('cam') for c in cameras):5s} {frames.start}-{frames.stop - 1}"
+    rows = np.isin(truth["frames"], frames)
+    if not np.isfinite(truth["gt"][rows][:, [0, 2], 0, 0]).any():
+        return
+    try:
+        match, found = run(store, write_case(*case), *how)
+    except WorldposeError as error:
+        print(f"{label}: {type(error).__name__}: {str(error).splitlines()[0]}", flush=True)
+        return
+    scores = {}
+    for number, keys in enumerate(found, 1):
+        for stage in stages:
+            if any(name.startswith(f"{stage}/") for name in keys):
+                letter = {"triangulation": "T", "retriangulation": "R", "body_fitting": "B"}[stage]
+                scores[f"{letter}{number}"] = score(scorer, truth, store, match, keys, stage)
+    adjusted = store.open_result(
+        match, "bundle_adjustment", "cameras", found[0]["bundle_adjustment/cameras"]
+    )
+    print(
+        f"{label}  "
+        + "  ".join(f"{name} {pcp:6.2f} {error:5.1f}" for name, (pcp, error) in scores.items())
+        + f"  changed {int(adjusted['accepted'].values.sum())}",
+        flush=True,
+    )
+    pairs = [("T1", "R1", True), ("R1", "B1", False), ("R1", "R2", True), ("B1", "B2", False)]
+    for before, after, both in pairs:
+        if before in scores and after in scores:
+            lost = scores[before][0] - scores[after][0]
+            risen = scores[after][1] - scores[before][1]
+            bad = lost > POINTS or (both and risen > MILLIMETERS)
+            said = f"{label}: {-lost:+.2f} points, {risen:+.1f} mm" if bad else ""
+            worse.setdefault(f"{before} to {after}", []).append(said)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

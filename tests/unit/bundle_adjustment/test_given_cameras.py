@@ -1,0 +1,74 @@
+"""Given cameras, no pitch, people who cross: adjustment improves or refuses, and never drifts."""
+
+import numpy as np
+import pytest
+from lab import joint_error, make_lab, triangulated
+
+from worldpose.bundle_adjustment import adjust_cameras
+
+CASES = {
+    "exact": {},
+    "5 mm and 0.05 degrees": {"center": 0.005, "rotation": np.radians(0.05)},
+    "5 cm and 0.3 degrees": {"center": 0.05, "rotation": np.radians(0.3)},
+    "a focal length 10 % off": {"focal": 1.1},
+}
+EXACT, SMALL, LARGE, FOCAL = CASES
+
+
+@pytest.mark.parametrize("cameras", [3, 4])
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("seed", [2, 3])
+def test_joints_are_never_worse_than_with_the_given_cameras(case, seed, cameras):
+    lab = make_lab(seed, cameras=cameras, **CASES[case])
+    adjusted = adjust_cameras(lab.clip)
+    told = adjusted.covariance if adjusted.accepted.all() else None
+    before = triangulated(lab, lab.clip.cameras)
+    after = triangulated(lab, adjusted.cameras, told)
+    for aligned in (False, True):
+        assert joint_error(lab, after, aligned) < joint_error(lab, before, aligned) + 0.001
+    if case in (EXACT, SMALL):
+        assert not adjusted.accepted.any()
+        np.testing.assert_array_equal(adjusted.motion, 0.0)
+        assert all(reason.startswith("refused") for reason in adjusted.reasons)
+
+
+@pytest.mark.parametrize("case", [LARGE, FOCAL])
+def test_errors_that_people_show_are_corrected(case):
+    lab = make_lab(3, **CASES[case])
+    adjusted = adjust_cameras(lab.clip)
+    assert adjusted.accepted.all()
+    given = joint_error(lab, triangulated(lab, lab.clip.cameras), aligned=True)
+    best = joint_error(lab, triangulated(lab, lab.true), aligned=True)
+    after = joint_error(lab, triangulated(lab, adjusted.cameras), aligned=True)
+    assert after < (0.5 * given + 0.5 * best if case == LARGE else given - 0.002)
+
+
+def test_people_stay_where_all_given_cameras_put_them():
+    lab = make_lab(1, center=0.05, rotation=np.radians(0.3))
+    adjusted = adjust_cameras(lab.clip)
+    assert adjusted.accepted.all()
+    assert adjusted.evidence.significance > 3.0
+    assert adjusted.evidence.shift < 0.01
+    assert abs(adjusted.evidence.scale) < 0.01
+    before, after = triangulated(lab, lab.clip.cameras), triangulated(lab, adjusted.cameras)
+    # The joints of single people move; all of them together do not.
+    assert np.linalg.norm(np.nanmean(after - before, axis=(0, 1, 2))) < 0.006
+    assert np.nanmean(np.linalg.norm(after - before, axis=-1)) > 0.006
+
+
+def test_stated_uncertainty_leaves_out_what_all_cameras_share():
+    lab = make_lab(1, center=0.05, rotation=np.radians(0.3))
+    adjusted = adjust_cameras(lab.clip)
+    # Centers err by 5 cm and by 2.5 cm in common; people tell the rest to a centimetre or two.
+    spread = np.sqrt(np.einsum("cii->c", adjusted.covariance[:, 3:6, 3:6]) / 3.0)
+    assert (spread < 0.03).all()
+    joints = triangulated(lab, adjusted.cameras, adjusted.covariance)
+    plain = triangulated(lab, adjusted.cameras)
+    assert joint_error(lab, joints) < joint_error(lab, plain) + 0.001
+
+
+def test_two_cameras_cannot_confirm_each_other():
+    lab = make_lab(1, cameras=2, center=0.05, rotation=np.radians(0.3))
+    adjusted = adjust_cameras(lab.clip)
+    assert not adjusted.accepted.any()
+    np.testing.assert_array_equal(adjusted.cameras.numbers, lab.clip.cameras.numbers)
