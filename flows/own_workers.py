@@ -13,13 +13,13 @@ from flows.planning import PlannedUnit
 from flows.prefect_environment import START_SECONDS, local_cluster
 
 if TYPE_CHECKING:
-    from distributed import LocalCluster
+    from flows.private_cluster import PrivateCluster
 
 KEEP_SECONDS = 5.0
 """How often workers that are gone are begun anew."""
 
 
-def starting_cluster(asked: int | None, missing: list[PlannedUnit]) -> LocalCluster:
+def starting_cluster(asked: int | None, missing: list[PlannedUnit]) -> PrivateCluster:
     """Workers on this machine that begin to start, and import at once what they will need.
 
     Args:
@@ -27,7 +27,8 @@ def starting_cluster(asked: int | None, missing: list[PlannedUnit]) -> LocalClus
         missing: what is to be computed first.
     """
     import dask
-    from distributed import LocalCluster
+
+    from flows.private_cluster import PrivateCluster
 
     given = dask.config.get("distributed.worker.preload")
     named = [given] if isinstance(given, str) else given
@@ -38,7 +39,7 @@ def starting_cluster(asked: int | None, missing: list[PlannedUnit]) -> LocalClus
     # slow machine.
     dask.config.set({"distributed.deploy.lost-worker-timeout": START_SECONDS})
     workers = workers_for(asked, missing)
-    cluster = LocalCluster(**{**local_cluster(workers), "n_workers": 0, "preload": preload})
+    cluster = PrivateCluster(**{**local_cluster(workers), "n_workers": 0, "preload": preload})
     cluster.scale(workers)
     return cluster
 
@@ -50,7 +51,7 @@ def workers_for(asked: int | None, missing: list[PlannedUnit]) -> int:
 
 
 @contextmanager
-def kept_complete(cluster: LocalCluster) -> Iterator[Callable[[int], None]]:
+def kept_complete(cluster: PrivateCluster) -> Iterator[Callable[[int], None]]:
     """Begin workers anew that are gone for good, as are those that end while they start.
 
     Dask notices that they are gone, but begins others only when it is asked for workers. Gives a

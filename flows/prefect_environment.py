@@ -7,15 +7,19 @@ sets the environment; it must be called before Prefect is imported.
 
 from __future__ import annotations
 
+import base64
 import fcntl
 import os
+import re
+import secrets
 import socket
 import subprocess
 import sys
 import tempfile
 import time
+import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -37,6 +41,25 @@ ALWAYS = {
 AUTHORITIES = "PREFECT_API_SSL_CERT_FILE"
 LOOPBACK = "127.0.0.1,localhost"
 """Never asked for through a proxy."""
+SERVER_LOGIN = "PREFECT_SERVER_API_AUTH_STRING"
+"""What a Prefect server asks its clients for, as USER:PASSWORD."""
+CLIENT_LOGIN = "PREFECT_API_AUTH_STRING"
+"""What clients of a Prefect server log in with."""
+CLOUD_LOGIN = "PREFECT_API_KEY"
+"""What clients of Prefect Cloud log in with."""
+DATABASE = (
+    "PREFECT_API_DATABASE_CONNECTION_URL",
+    "PREFECT_API_DATABASE_PASSWORD",
+    "PREFECT_SERVER_DATABASE_CONNECTION_URL",
+    "PREFECT_SERVER_DATABASE_PASSWORD",
+)
+"""What a Prefect server logs in to its database with."""
+_SECRET = re.compile(
+    r"TOKENS?(?![A-Z])|SECRET|PASSW|PASSPHRASE|CREDENTIAL|AUTH_STRING|(API|ACCESS|PRIVATE)_?KEY|"
+    r"(CONNECTION|DATABASE|WEBHOOK)_URL|^WORLDPOSE_ALERT|^AWS_(PROFILE|ROLE|WEB)",
+    re.IGNORECASE,
+)
+"""Names of variables that hold a secret, or lead to one."""
 UNLESS_GIVEN = {
     # The server gets every line; the terminal has progress and failures of our own.
     "PREFECT_LOGGING_EXTRA_LOGGERS": "worldpose",
@@ -60,8 +83,36 @@ EMBEDDED = {
 """Of a server that lasts as long as its run, unless given."""
 
 
+def new_login() -> str:
+    """A random login for a Prefect server, as its variables have it."""
+    return f"worldpose:{secrets.token_urlsafe(24)}"
+
+
+def authorization(login: str) -> str:
+    """The Authorization header with which an HTTP client logs in to a Prefect server."""
+    return f"Basic {base64.b64encode(login.encode()).decode()}"
+
+
+def without_secrets(environment: Mapping[str, str], keep: Iterable[str] = ()) -> dict[str, str]:
+    """An environment without the variables that hold secrets, judged by their names.
+
+    Args:
+        environment: of a process.
+        keep: variables that its child needs; a name that ends with `*` stands for all that begin
+            with the rest.
+    """
+    kept = tuple(keep)
+    exact = {name for name in kept if not name.endswith("*")}
+    begins = tuple(name[:-1] for name in kept if name.endswith("*"))
+    return {
+        name: value
+        for name, value in environment.items()
+        if name in exact or (begins and name.startswith(begins)) or not _SECRET.search(name)
+    }
+
+
 def served_environment(api: str, home: Path | None) -> dict[str, str]:
-    """The environment of the processes of `worldpose serve`.
+    """The environment of the processes of `worldpose serve`, without any secret.
 
     Args:
         api: address of Prefect's API.
@@ -74,8 +125,10 @@ def served_environment(api: str, home: Path | None) -> dict[str, str]:
     }
     proxies = {name: os.environ.get(name) for name in ("NO_PROXY", "no_proxy")}
     no_proxy = {name: ",".join(filter(None, [had, LOOPBACK])) for name, had in proxies.items()}
-    pages = {"PREFECT_API_URL": api, "PREFECT_UI_API_URL": api}
-    return {**os.environ, **ALWAYS, **given, **no_proxy, **own, **pages}
+    # The dashboard asks the server that it came from, under whatever name and port that was.
+    origins = {"PREFECT_SERVER_CORS_ALLOWED_ORIGINS": api.removesuffix("/api")}
+    pages = {"PREFECT_API_URL": api, "PREFECT_UI_API_URL": "/api", **origins}
+    return {**without_secrets(os.environ), **ALWAYS, **given, **no_proxy, **own, **pages}
 
 
 def one_authority(folder: Path) -> dict[str, str]:
@@ -103,7 +156,10 @@ def served_cluster() -> dict[str, Any]:
     address = os.environ.get("WORLDPOSE_DASK")
     if address:
         return {"address": address}
-    return {"cluster_kwargs": local_cluster(int(os.environ.get("WORLDPOSE_WORKERS") or 0))}
+    return {
+        "cluster_class": "flows.private_cluster.PrivateCluster",
+        "cluster_kwargs": local_cluster(int(os.environ.get("WORLDPOSE_WORKERS") or 0)),
+    }
 
 
 def local_cluster(workers: int) -> dict[str, Any]:
@@ -115,7 +171,7 @@ def local_cluster(workers: int) -> dict[str, Any]:
         "dashboard_address": "127.0.0.1:0",
         "silence_logs": "CRITICAL",
         # A unit that ends its worker gives itself up; those that waited beside it are not to blame.
-        "scheduler_kwargs": {"allowed_failures": 100},
+        "scheduler_kwargs": {"allowed_failures": 100, "dashboard": False},
         # A worker would look at its own stack a hundred times a second.
         "config": {"distributed.worker.profile.enabled": False},
     }
@@ -156,6 +212,7 @@ def prefect_server(project: str, *, is_local: bool = False) -> Iterator[Callable
             _home(project, Path(scratch)) as home,
             _environment({"PREFECT_HOME": str(home)}),
             _environment(one_authority(Path(scratch)) if is_local else {}),
+            _environment({CLIENT_LOGIN: new_login()}),
             _embedded_server(home, Path(scratch) / "server.log") as (address, wait_until_ready),
             _environment({"PREFECT_API_URL": address}),
         ):
@@ -206,12 +263,17 @@ def _embedded_server(home: Path, log: Path) -> Iterator[tuple[str, Callable[[], 
         # The server ends when its standard input does, so a killed run leaves none behind. It is
         # given the socket rather than a port, which another process could have taken meanwhile.
         server = subprocess.Popen(
-            [sys.executable, "-m", "flows.embedded_server", str(listening.fileno())],
+            [sys.executable, "-m", "flows.prefect_server", "--socket", str(listening.fileno())],
             stdin=subprocess.PIPE,
             stdout=output,
             stderr=subprocess.STDOUT,
             pass_fds=[listening.fileno()],
-            env={**EMBEDDED, **os.environ},
+            env={
+                **EMBEDDED,
+                **without_secrets(os.environ, keep=DATABASE),
+                SERVER_LOGIN: os.environ[CLIENT_LOGIN],
+                "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": address.removesuffix("/api"),
+            },
             start_new_session=True,  # Ctrl-C is for the run, which then ends its server
         )
 
@@ -250,6 +312,32 @@ def _require_answer(address: str) -> None:
             found="no answer",
             todo="Start it, or unset PREFECT_API_URL to run without one.",
         )
+    require_login(address)
+
+
+def require_login(address: str) -> None:
+    """Check that a Prefect server takes this process's login.
+
+    Raises:
+        InputError: it asks for another one.
+    """
+    login, key = os.environ.get(CLIENT_LOGIN), os.environ.get(CLOUD_LOGIN)
+    headers = {"authorization": f"Bearer {key}"} if key else {}
+    if login:
+        headers = {"authorization": authorization(login)}
+    request = urllib.request.Request(f"{address}/admin/version", headers=headers)
+    try:
+        urllib.request.build_opener().open(request, timeout=5).close()
+    except urllib.error.HTTPError as error:
+        if error.code in (401, 403):
+            raise InputError(
+                CLIENT_LOGIN,
+                expected=f"the login of the Prefect server at {address}",
+                found="another" if headers else "none",
+                todo=f"Set it to what that server has in {SERVER_LOGIN}.",
+            ) from None
+    except (OSError, ValueError):
+        return  # whoever asks next says why it does not answer
 
 
 def _answers(address: str) -> bool:

@@ -29,8 +29,10 @@ from worldpose.errors import InputError
 from worldpose.store import Store
 
 if TYPE_CHECKING:
-    from distributed import LocalCluster
+    from distributed import Security
     from prefect.task_runners import TaskRunner
+
+    from flows.private_cluster import PrivateCluster
 
 DASK_SECONDS = 10.0
 """How long a Dask scheduler may take to answer."""
@@ -52,6 +54,8 @@ class RunRequest:
         iteration: which pass over the method, unless `from_stage` goes on with the latest run's;
             the passes before it have their results.
         time_limits: stage to the minutes that a unit may be at work, where not as long as all.
+        security: the certificate that the scheduler at `dask` asks for; None = as Dask's
+            configuration says.
     """
 
     settings: Overrides
@@ -62,6 +66,7 @@ class RunRequest:
     gates: GatePolicy | None = None
     iteration: int = 1
     time_limits: TimeLimits = field(default_factory=dict)
+    security: Security | None = None
 
 
 def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
@@ -122,7 +127,8 @@ def _with_prefect(
 
         from flows.match import IncompleteRunError, process_match
 
-        runner = cast("TaskRunner[Any]", DaskTaskRunner(address=request.dask))
+        client = {} if request.security is None else {"security": request.security}
+        runner = cast("TaskRunner[Any]", DaskTaskRunner(address=request.dask, client_kwargs=client))
         try:
             run_id = process_match.with_options(task_runner=runner)(
                 project=store.url,
@@ -183,12 +189,12 @@ def _machines(
         reporter().say("starting Prefect and Dask")
     server = prefect_server(store.url, is_local=request.dask is None)
     with _ending_at_once(), server as wait_until_ready, ExitStack() as stack:
-        cluster: LocalCluster | None = None
+        cluster: PrivateCluster | None = None
         ask_for: Callable[[int], None] = _no_more
         if request.dask is None:
             cluster = stack.enter_context(starting_cluster(request.workers, missing))
             ask_for = stack.enter_context(kept_complete(cluster))
-            request = replace(request, dask=cluster.scheduler_address)
+            request = replace(request, dask=cluster.scheduler_address, security=cluster.security)
         else:
             _require_scheduler(request.dask)
         # Late: it takes seconds to import, which pass while server and workers start.

@@ -13,6 +13,8 @@ from http.cookiejar import CookieJar
 import psutil
 from command_line import WORLDPOSE, worldpose
 
+from flows.prefect_environment import authorization
+
 TOKEN = "a token of twenty-four.."
 PATIENCE = 900.0
 """What a step may take on two busy cores [s]; it takes a tenth on idle ones."""
@@ -83,9 +85,26 @@ class Served:
         _, left = psutil.wait_procs(family, timeout=20)
         return len(left)
 
+    def secret(self, name):
+        """What the service keeps for `prefect` and `metrics`."""
+        return (self.project / "operations" / "secrets" / name).read_text().strip()
+
     def ask(self, path, body=None):
         """Prefect's own API."""
-        return fetch(f"http://127.0.0.1:{self.ports['prefect']}/api{path}", body)
+        headers = {"authorization": authorization(self.secret("prefect"))}
+        for _ in range(MOST_TROUBLES):
+            try:
+                return fetch(f"http://127.0.0.1:{self.ports['prefect']}/api{path}", body, headers)
+            except urllib.error.HTTPError as error:
+                if error.code != 503:  # SQLite's one writer was busy; Prefect's clients try again
+                    raise
+                time.sleep(2.0)
+        return fetch(f"http://127.0.0.1:{self.ports['prefect']}/api{path}", body, headers)
+
+    def figures(self):
+        """What Prometheus scrapes."""
+        headers = {"authorization": f"Bearer {self.secret('metrics')}"}
+        return fetch(f"http://127.0.0.1:{self.ports['metrics']}/metrics", headers=headers)
 
     def runs(self, name):
         return self.ask("/flow_runs/filter", {"flow_runs": {"name": {"any_": [name]}}})

@@ -40,5 +40,8 @@ def serve(
     access = access_for(host, token=token, names=names or (), secure=tls is not None)
     logging.basicConfig(format="%(asctime)s  %(message)s", level=logging.WARNING)
     logging.getLogger("worldpose.pages").setLevel(logging.INFO)
-    line(f"review pages of {Store.open(project).url}: {address(access, host, port)}")
+    # A token that the operator chose is not printed: this may go to a log.
+    where = address(access, host, port)
+    shown = where if token is None else where.partition("#")[0]
+    line(f"review pages of {Store.open(project).url}: {shown}")
     serve_pages(project, access, host=host, port=port, tls=tls)

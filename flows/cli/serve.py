@@ -95,8 +95,10 @@ def serve(
         _check(folder, as_json=as_json)
         return
     from flows.operations.senders import senders_of
+    from flows.operations.service_secrets import METRICS_TOKEN, secrets_of
     from flows.operations.serving import serve as serve_all
     from flows.pages.access import access_for
+    from flows.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN
 
     senders_of(os.environ)  # refused now, not where nobody looks
     tls = certificate_and_key(certificate, key)
@@ -132,19 +134,29 @@ def serve(
         disk_gb=disk_gb,
     )
     access = access_for(host, token=token, names=names or (), secure=tls is not None)
+    secrets = secrets_of(plan, access.token)
+    variable = CLIENT_LOGIN if given else SERVER_LOGIN
+    is_kept = not given and variable not in os.environ
+    login_at = plan.state_folder.prefect_login if is_kept else variable
+    is_given = METRICS_TOKEN in os.environ
+    token_at = METRICS_TOKEN if is_given else plan.state_folder.metrics_token
 
     def ready() -> None:
         line(f"serving {plan.project}")
         line(f"inbox          {plan.inbox}")
-        line(f"dashboard      {plan.dashboard}")
+        # Where a secret is kept, not what it is: this may go to a log.
+        if secrets.prefect is None:
+            line(f"dashboard      {plan.dashboard}  which asks for no login: others may use it")
+        else:
+            line(f"dashboard      {plan.dashboard}  log in with: {login_at}")
         # A token that somebody chose is not said: this may go to a log.
         login = "/login" if token else f"/login#token={access.token}"
         line(f"review pages   {plan.pages}{login}")
         line(f"status page    {plan.pages}/status")
-        line(f"figures        http://{host}:{metrics_port}/metrics")
+        line(f"figures        http://{host}:{metrics_port}/metrics  bearer token: {token_at}")
         line("Ctrl-C ends it; begun again it goes on where it was")
 
-    serve_all(plan, access.token, ready, lambda text: line(text, to=errors))
+    serve_all(plan, secrets, ready, lambda text: line(text, to=errors))
 
 
 def _check(folder: StateFolder, *, as_json: bool) -> None:

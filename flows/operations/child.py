@@ -34,17 +34,10 @@ def prefect(plan: ServePlan) -> None:
     """Prefect's server: its API, its services and its pages."""
     from urllib.parse import urlsplit
 
-    import uvicorn
-    from prefect.server.api.server import create_app
+    from flows.prefect_server import serve
 
     address = urlsplit(plan.prefect)
-    uvicorn.run(
-        create_app(final=True),
-        host=address.hostname or "127.0.0.1",
-        port=address.port or 80,
-        log_level="error",
-        timeout_graceful_shutdown=2,
-    )
+    serve(address.hostname or "127.0.0.1", address.port or 80, ())
 
 
 def worker(plan: ServePlan) -> None:
@@ -55,9 +48,9 @@ def worker(plan: ServePlan) -> None:
     from flows.operations.recovery import begin_again
 
     async def serve() -> None:
-        await install(plan)
+        installed = await install(plan)
         await begin_again(plan, at_start=True)
-        await work(plan)
+        await work(plan, installed)
 
     anyio.run(serve)
 

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import timedelta
 from typing import Any, Final
+from uuid import UUID
 
 from prefect import Flow
 from prefect.client.orchestration import PrefectClient, get_client
-from prefect.client.schemas.actions import WorkPoolCreate, WorkPoolUpdate
+from prefect.client.schemas.actions import DeploymentUpdate, WorkPoolCreate, WorkPoolUpdate
 from prefect.exceptions import ObjectNotFound
 from prefect.schedules import Interval, Schedule
-from prefect.workers.process import ProcessWorker
 
 from flows.operations.layout import PRIORITIES
 from flows.operations.plan import ServePlan
+from flows.operations.served_worker import JOB_TEMPLATE, Installed, ServedWorker
 from worldpose.errors import InputError
 
 
@@ -35,6 +37,8 @@ class Deployed:
         parameters: those that the plan decides.
         schedule: when it runs by itself.
         module: where the flow lies.
+        fixed: parameters of the plan that a run may not change: what it works on, and whose code
+            its workers run.
     """
 
     flow: str
@@ -43,6 +47,12 @@ class Deployed:
     parameters: Callable[[ServePlan], dict[str, Any]] = field(default=_of_project)
     schedule: Callable[[ServePlan], Schedule] | None = None
     module: str = "flows.operations.deployed"
+    fixed: tuple[str, ...] = ("project",)
+
+    @property
+    def entrypoint(self) -> str:
+        """Module and name: found wherever worldpose is installed."""
+        return f"{self.module}.{self.flow}"
 
 
 DEPLOYED: Final = (
@@ -62,6 +72,7 @@ DEPLOYED: Final = (
         None,
         lambda plan: {"plan": plan.model_dump(mode="json")},
         lambda plan: Interval(timedelta(minutes=plan.sweep_minutes)),
+        fixed=("plan",),
     ),
     Deployed(
         "reprocess",
@@ -74,6 +85,7 @@ DEPLOYED: Final = (
             "time_limits": plan.time_limits,
         },
         module="flows.reprocess",
+        fixed=("project", "dask"),
     ),
     Deployed("release", "Freeze a match's complete run under a name, with a report.", None),
     Deployed("finetune", "Train the embedded nets on reviewed labels.", "background"),
@@ -86,8 +98,11 @@ def pools(plan: ServePlan) -> tuple[str, str]:
     return plan.name, f"{plan.name}-arrivals"
 
 
-async def install(plan: ServePlan) -> None:
+async def install(plan: ServePlan) -> dict[UUID, Installed]:
     """Tell the server of all there is; done again it changes only what is different.
+
+    Returns:
+        What a worker may run, by the ids of its deployments.
 
     Raises:
         InputError: another project has deployments of this name at the server.
@@ -99,36 +114,47 @@ async def install(plan: ServePlan) -> None:
         await _pool(client, arrivals, 1, "What arrives, while matches run")
         for rank, queue in enumerate(PRIORITIES, 1):
             await _queue(client, matches, queue, rank)
-    for deployed in DEPLOYED:
-        await _deploy(plan, deployed)
+    return dict([await _deploy(plan, deployed) for deployed in DEPLOYED])
 
 
-async def work(plan: ServePlan) -> None:
-    """Run what is due, until this process ends."""
+async def work(plan: ServePlan, installed: Mapping[UUID, Installed]) -> None:
+    """Run what is due, until this process ends.
+
+    Args:
+        plan: what is served.
+        installed: what is run; a run of anything else fails.
+    """
     import anyio
 
     matches, arrivals = pools(plan)
     async with anyio.create_task_group() as group:
         for pool in (matches, arrivals):
-            worker = ProcessWorker(pool, name=f"{pool} on this machine", limit=None)
+            worker = ServedWorker(pool, installed)
             group.start_soon(worker.start, False, False, lambda text: None)
 
 
-async def _deploy(plan: ServePlan, deployed: Deployed) -> None:
+async def _deploy(plan: ServePlan, deployed: Deployed) -> tuple[UUID, Installed]:
     flow: Flow[..., Any] = getattr(importlib.import_module(deployed.module), deployed.flow)
     matches, arrivals = pools(plan)
+    parameters = deployed.parameters(plan)
     deployment = await flow.ato_deployment(
         name=plan.name,
         description=deployed.about,
-        parameters=deployed.parameters(plan),
+        parameters=parameters,
         schedule=None if deployed.schedule is None else deployed.schedule(plan),
         work_pool_name=arrivals if deployed.queue is None else matches,
         work_queue_name=deployed.queue,
-        enforce_parameter_schema=False,
+        enforce_parameter_schema=False,  # the worker checks, with what it runs
     )
-    # A module's name is found wherever worldpose is installed.
-    deployment.entrypoint = f"{deployed.module}.{deployed.flow}"
-    await deployment.aapply()
+    deployment.entrypoint = deployed.entrypoint
+    number = await deployment.aapply()
+    async with get_client() as client:  # applied again, it would leave these as they are there
+        again = DeploymentUpdate(
+            entrypoint=deployed.entrypoint, pull_steps=[], job_variables={}, path=None
+        )
+        await client.update_deployment(number, again)
+    fixed = json.loads(json.dumps({name: parameters[name] for name in deployed.fixed}))
+    return number, Installed(deployed.entrypoint, flow, fixed)
 
 
 async def _refuse_other_project(client: PrefectClient, plan: ServePlan) -> None:
@@ -155,18 +181,19 @@ async def _pool(client: PrefectClient, name: str, limit: int, about: str) -> Non
     try:
         await client.read_work_pool(name)
     except ObjectNotFound:
-        template = ProcessWorker.get_default_base_job_template()
         await client.create_work_pool(
             WorkPoolCreate(
                 name=name,
-                type=ProcessWorker.type,
-                base_job_template=template,
+                type=ServedWorker.type,
+                base_job_template=JOB_TEMPLATE,
                 concurrency_limit=limit,
                 description=about,
             )
         )
     else:
-        await client.update_work_pool(name, WorkPoolUpdate(concurrency_limit=limit))
+        # Also what was changed there, or made by an earlier version, is as it should be again.
+        again = WorkPoolUpdate(concurrency_limit=limit, base_job_template=JOB_TEMPLATE)
+        await client.update_work_pool(name, again)
 
 
 async def _queue(client: PrefectClient, pool: str, name: str, rank: int) -> None:

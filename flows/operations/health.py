@@ -7,15 +7,17 @@ import os
 import shutil
 import urllib.error
 import urllib.request
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 from data_contracts.operations import Serving
 from flows.operations.layout import StateFolder, is_alive
 from flows.operations.plan import FLOWS
+from flows.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN, authorization
 
 WORKER_SECONDS: Final = 90.0
 """A worker that the Prefect server has not heard of for so long is gone; it reports every 30."""
@@ -53,7 +55,7 @@ def check(state: StateFolder) -> list[Finding]:
     found = [Finding("serve", True, f"process {pid}, since {serving.started_at:%Y-%m-%d %H:%M}Z")]
     found += _processes(state, serving)
     found += _answering(state, serving)
-    found += at_prefect(serving)
+    found += at_prefect(serving, _login(state, serving))
     found += _inbox(state, serving)
     found.append(_disk(state.folder))
     return found
@@ -85,28 +87,47 @@ def _answering(state: StateFolder, serving: Serving) -> Iterator[Finding]:
             yield Finding(name, False, problem, f"See {log}; end worldpose serve and begin again.")
 
 
-def at_prefect(serving: Serving) -> Iterator[Finding]:
-    """Whether deployments are there, and somebody takes their runs."""
+def _login(state: StateFolder, serving: Serving) -> str | None:
+    if not serving.owns_prefect:
+        return os.environ.get(CLIENT_LOGIN)
+    try:
+        return os.environ.get(SERVER_LOGIN) or state.prefect_login.read_text().strip()
+    except OSError:
+        return None  # the finding then says that the server refuses
+
+
+def at_prefect(serving: Serving, login: str | None = None) -> Iterator[Finding]:
+    """Whether deployments are there, and somebody takes their runs.
+
+    Args:
+        serving: what is served.
+        login: what clients log in to its server with; None = it asks for none.
+    """
     again = "End worldpose serve and begin it again: it installs what is missing."
-    deployments, problem = _ask(
+    ask = _ask if login is None else partial(_ask, login=login)
+    deployments, problem = ask(
         f"{serving.prefect}/deployments/filter",
         {"deployments": {"name": {"any_": [serving.name]}}},
     )
     if problem:
-        yield Finding("deployments", False, problem, "Mend prefect first.")
+        variable = SERVER_LOGIN if serving.owns_prefect else CLIENT_LOGIN
+        is_refused = problem.endswith(" 401")
+        mend = f"Set {variable} as it was when the service began." if is_refused else ""
+        yield Finding("deployments", False, problem, mend or "Mend prefect first.")
         return
-    offered = {each["name"] for each in _flows(serving, deployments)}
+    offered = {each["name"] for each in _flows(serving, deployments, ask)}
     missing = set(FLOWS) - offered
     words = f"missing: {', '.join(sorted(missing))}" if missing else ", ".join(sorted(offered))
     yield Finding("deployments", not missing, words, again)
     for pool in (serving.name, f"{serving.name}-arrivals"):
-        workers, problem = _ask(f"{serving.prefect}/work_pools/{pool}/workers/filter", {})
+        address = f"{serving.prefect}/work_pools/{pool}/workers/filter"
+        workers, problem = ask(address, {})
         seen = [_time(each["last_heartbeat_time"]) for each in workers or ()]
         silent = (datetime.now(UTC) - max(seen)).total_seconds() if seen else float("inf")
         is_well = not problem and silent < WORKER_SECONDS
         words = f"was heard of {silent:.0f} s ago" if seen else problem or "never heard of"
         yield Finding(f"worker of {pool}", is_well, words, f"See the log worker.log. {again}")
-    late, problem = _ask(
+    late, problem = ask(
         f"{serving.prefect}/flow_runs/count",
         {
             "deployments": {"name": {"any_": [serving.name]}},
@@ -127,9 +148,12 @@ def at_prefect(serving: Serving) -> Iterator[Finding]:
         )
 
 
-def _flows(serving: Serving, deployments: list[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+def _flows(
+    serving: Serving, deployments: list[Mapping[str, Any]], ask: Callable[..., tuple[Any, str]]
+) -> list[Mapping[str, Any]]:
     ids = sorted({each["flow_id"] for each in deployments})
-    flows, problem = _ask(f"{serving.prefect}/flows/filter", {"flows": {"id": {"any_": ids}}})
+    asked = {"flows": {"id": {"any_": ids}}}
+    flows, problem = ask(f"{serving.prefect}/flows/filter", asked)
     return [] if problem else flows
 
 
@@ -151,11 +175,16 @@ def _disk(folder: Path) -> Finding:
     return Finding("disk", free >= LOW_DISK_GB, f"{free:.1f} GB free", mend)
 
 
-def _ask(address: str, body: Mapping[str, Any] | None = None) -> tuple[Any, str]:
+def _ask(
+    address: str, body: Mapping[str, Any] | None = None, login: str | None = None
+) -> tuple[Any, str]:
     """What a server answers, and what is wrong where it does not."""
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     data = None if body is None else json.dumps(body).encode()
-    request = urllib.request.Request(address, data, {"content-type": "application/json"})
+    headers = {"content-type": "application/json"}
+    if login:
+        headers["authorization"] = authorization(login)
+    request = urllib.request.Request(address, data, headers)
     try:
         with opener.open(request, timeout=10) as answer:
             content = answer.read()

@@ -23,7 +23,7 @@ PRIORITIES: Final[tuple[Priority, ...]] = ("urgent", "normal", "background")
 
 @dataclass(frozen=True)
 class StateFolder:
-    """The folder of a served project's state: no result and no secret is in it.
+    """The folder of a served project's state: no result is in it, and no secret but `secrets/`.
 
     Attributes:
         folder: `<project>/operations`, or as it was given.
@@ -86,6 +86,16 @@ class StateFolder:
 
     def _arrival_file(self, name: str) -> Path:
         return self.folder / "arrivals" / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.json"
+
+    @property
+    def prefect_login(self) -> Path:
+        """What clients log in to our own Prefect server with; for this user alone."""
+        return self.folder / "secrets" / "prefect"
+
+    @property
+    def metrics_token(self) -> Path:
+        """What Prometheus asks for figures with; for this user alone."""
+        return self.folder / "secrets" / "metrics"
 
     @contextmanager
     def only_one(self, what: str, *, wait: bool) -> Iterator[bool]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hmac
 import json
 import shutil
 import time
@@ -18,6 +19,7 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 from prometheus_client.registry import Collector
 
 from flows.gates import Figures
+from flows.host_guard import LOOPBACK, host_name
 from flows.method import GATES
 from flows.operations.layout import StateFolder
 from flows.operations.overview import MatchGlance, Overview, UnitGlance, age
@@ -93,18 +95,27 @@ def exposition(figures: ProjectFigures) -> bytes:
     return generate_latest(registry)
 
 
-def metrics_server(plan: ServePlan, figures: ProjectFigures) -> ThreadingHTTPServer:
-    """A server of `/metrics` and `/health`, for hosts that name it rightly."""
-    hosts = {"127.0.0.1", "localhost", "[::1]", plan.host, *plan.names}
+def metrics_server(plan: ServePlan, figures: ProjectFigures, token: str) -> ThreadingHTTPServer:
+    """A server of `/metrics` and `/health`, for requests that name it.
+
+    Args:
+        plan: where it listens, and its names.
+        figures: what `/metrics` answers.
+        token: what `/metrics` asks for, as `Authorization: Bearer TOKEN`.
+    """
+    names = LOOPBACK | {plan.host.lower(), *(name.lower() for name in plan.names)}
+    expected = f"Bearer {token}".encode()
 
     class Handler(BaseHTTPRequestHandler):
         server_version, sys_version = "worldpose", ""
         timeout = 10
 
         def do_GET(self) -> None:
-            name = self.headers.get("host", "").rpartition(":")[0] or self.headers.get("host", "")
-            if name not in hosts:
+            given = self.headers.get("authorization", "").encode("utf-8", "replace")
+            if host_name(self.headers.get("host", "")) not in names:
                 self._answer(421, b"this server has another name\n")
+            elif self.path == "/metrics" and not hmac.compare_digest(given, expected):
+                self._answer(401, b"expected Authorization: Bearer TOKEN\n")
             elif self.path == "/metrics":
                 self._answer(200, exposition(figures), CONTENT_TYPE_LATEST)
             elif self.path == "/health":
@@ -117,6 +128,8 @@ def metrics_server(plan: ServePlan, figures: ProjectFigures) -> ThreadingHTTPSer
             self.send_header("content-type", kind)
             self.send_header("content-length", str(len(body)))
             self.send_header("x-content-type-options", "nosniff")
+            if code == 401:
+                self.send_header("www-authenticate", "Bearer")
             self.end_headers()
             self.wfile.write(body)
 

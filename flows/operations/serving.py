@@ -20,8 +20,9 @@ from data_contracts.operations import Service, Serving
 from flows.operations.health import at_prefect
 from flows.operations.layout import PRIORITIES
 from flows.operations.plan import ServePlan
+from flows.operations.service_secrets import Secrets
 from flows.prefect_database import begin_database, keep_database
-from flows.prefect_environment import one_authority, served_environment
+from flows.prefect_environment import one_authority, require_login, served_environment
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.store import Store
 
@@ -68,12 +69,12 @@ class _Supervisor:
 
     Attributes:
         plan: what is served.
-        token: what people log in to the pages with.
+        secrets: what its parts keep from everybody else.
         tell: takes lines for whoever started this.
     """
 
     plan: ServePlan
-    token: str
+    secrets: Secrets
     tell: Tell
     parts: list[_Part] = field(default_factory=list)
 
@@ -140,7 +141,6 @@ class _Supervisor:
         log.parent.mkdir(parents=True, exist_ok=True)
         if log.exists() and log.stat().st_size > LOG_BYTES:
             log.replace(log.with_suffix(".log.1"))
-        secrets = {"WORLDPOSE_REVIEW_TOKEN": self.token} if part.name == "pages" else {}
         with log.open("ab") as output:
             part.said = output.tell()
             part.process = subprocess.Popen(
@@ -151,18 +151,18 @@ class _Supervisor:
                 stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                env=environment_of(self.plan) | secrets,
+                env=environment_of(self.plan) | self.secrets.of(part.name, self.plan),
                 start_new_session=True,  # Ctrl-C is for this process, which then ends its parts
             )
         part.began = time.monotonic()
 
 
-def serve(plan: ServePlan, token: str, ready: Callable[[], None], tell: Tell) -> None:
+def serve(plan: ServePlan, secrets: Secrets, ready: Callable[[], None], tell: Tell) -> None:
     """Serve a project until SIGINT or SIGTERM.
 
     Args:
         plan: what is served, and how.
-        token: what people log in to the pages with.
+        secrets: what its parts keep from everybody else.
         ready: called when everything answers.
         tell: takes lines for whoever started this.
 
@@ -183,7 +183,7 @@ def serve(plan: ServePlan, token: str, ready: Callable[[], None], tell: Tell) ->
                 todo="See how it is with --check, or end it first.",
             )
         with _until_told() as told:
-            supervisor = _Supervisor(plan, token, tell)
+            supervisor = _Supervisor(plan, secrets, tell)
             try:
                 _bring_up(supervisor, told)
                 if not told.is_set():
@@ -232,6 +232,8 @@ def _bring_up(supervisor: _Supervisor, told: threading.Event) -> None:
             found="no answer",
             todo="Start it, or unset PREFECT_API_URL to have one started.",
         )
+    else:
+        require_login(plan.prefect)
     pages = supervisor.start("pages", plan.pages)
     worker = supervisor.start("worker")
     watch = supervisor.start("watch", f"http://{plan.host}:{plan.metrics_port}/metrics")
@@ -241,12 +243,14 @@ def _bring_up(supervisor: _Supervisor, told: threading.Event) -> None:
     _wait_for(supervisor, watch, lambda: answers(addresses["watch"]), told)
     serving = plan.state_folder.read_serving()
     if serving is not None:
-        _wait_for(supervisor, worker, lambda: _is_at_work(serving), told)
+        login = supervisor.secrets.prefect
+        _wait_for(supervisor, worker, lambda: _is_at_work(serving, login), told)
 
 
-def _is_at_work(serving: Serving) -> bool:
+def _is_at_work(serving: Serving, login: str | None) -> bool:
     """Whether runs are taken; that one of them hangs is another matter."""
-    return all(finding.is_well for finding in at_prefect(serving) if finding.part != "runs")
+    findings = at_prefect(serving, login)
+    return all(finding.is_well for finding in findings if finding.part != "runs")
 
 
 def _wait_for(

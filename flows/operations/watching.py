@@ -30,6 +30,7 @@ from flows.operations.overview import Overview
 from flows.operations.plan import ServePlan
 from flows.operations.recovery import begin_again, may_begin_again
 from flows.operations.senders import senders_of
+from flows.operations.service_secrets import METRICS_TOKEN
 from worldpose.store import Store
 
 INBOX_SECONDS: Final = 2.0
@@ -48,7 +49,7 @@ def watch(plan: ServePlan) -> None:
     """Watch until this process ends."""
     store = Store.create(plan.project)
     figures = ProjectFigures(store, plan.state_folder)
-    server = metrics_server(plan, figures)
+    server = metrics_server(plan, figures, os.environ[METRICS_TOKEN])
     threading.Thread(target=server.serve_forever, daemon=True).start()
     asyncio.run(_watch(plan, store))
 

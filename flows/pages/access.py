@@ -9,9 +9,11 @@ import json
 import secrets
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from threading import Lock
 from typing import Final
 
+from flows.host_guard import LOOPBACK as LOOPBACK
 from worldpose.errors import UsageError
 
 SESSION_SECONDS: Final = 12 * 3600
@@ -20,7 +22,11 @@ TOKEN_LENGTH: Final = 16
 """Fewest characters of a token that somebody chose."""
 NAME_LENGTH: Final = 80
 """Most characters of a person's name."""
-LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
+WRONG_TOKENS: Final = 5
+"""Wrong tokens from one address within `WRONG_SECONDS`; after them none is looked at."""
+WRONG_SECONDS: Final = 10.0
+MOST_REMEMBERED: Final = 10_000
+"""Wrong tokens and ended sessions that are remembered, the latest."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +34,8 @@ class Access:
     """What lets people in.
 
     Sessions are signed with a key made from the token: they outlive the server's process where the
-    token does, and end for all when it changes.
+    token does, and end for all when it changes. One that its person ended is refused until the
+    process ends.
 
     Attributes:
         token: what people log in with.
@@ -40,6 +47,9 @@ class Access:
     token: str
     hosts: frozenset[str] = LOOPBACK
     secure: bool = False
+    _ended: dict[str, float] = field(default_factory=dict, init=False, compare=False)
+    _wrong: list[tuple[float, str]] = field(default_factory=list, init=False, compare=False)
+    _lock: Lock = field(default_factory=Lock, init=False, compare=False)
 
     @property
     def cookie(self) -> str:
@@ -59,13 +69,36 @@ class Access:
         if not self._same(signature, self._sign("session", packed)):
             return None
         content = json.loads(base64.urlsafe_b64decode(packed + "=" * (-len(packed) % 4)))
-        if content["until"] < (time.time() if now is None else now):
+        if content["until"] < (time.time() if now is None else now) or signature in self._ended:
             return None
         return str(content["who"])
+
+    def end(self, session: str) -> None:
+        """Refuse a session from now on: its person has logged out."""
+        with self._lock:
+            self._ended[session.partition(".")[2]] = time.time()
+            while len(self._ended) > MOST_REMEMBERED:
+                self._ended.pop(next(iter(self._ended)))
+
+    def may_try(self, address: str, now: float | None = None) -> bool:
+        """Whether a token from this address is looked at: it has not just sent many wrong ones."""
+        since = (time.monotonic() if now is None else now) - WRONG_SECONDS
+        with self._lock:
+            self._wrong[:] = [each for each in self._wrong if each[0] > since][-MOST_REMEMBERED:]
+            return sum(each[1] == address for each in self._wrong) < WRONG_TOKENS
+
+    def note_wrong(self, address: str, now: float | None = None) -> None:
+        """Remember that this address sent a wrong token."""
+        with self._lock:
+            self._wrong.append((time.monotonic() if now is None else now, address))
 
     def form_secret(self, session: str) -> str:
         """What a page of this session sends along with everything that changes something."""
         return self._sign("form", session)
+
+    def has_form_secret(self, session: str, given: str) -> bool:
+        """Is this the session's form secret; it takes as long to say no as yes."""
+        return self._same(given, self.form_secret(session))
 
     def has_token(self, given: str) -> bool:
         """Is this the token; it takes as long to say no as yes."""
@@ -76,7 +109,8 @@ class Access:
         return hmac.new(self.token.encode(), text, hashlib.sha256).hexdigest()
 
     def _same(self, given: str, right: str) -> bool:
-        return hmac.compare_digest(given.encode(), right.encode())
+        # JSON can hold halves of characters, which have no bytes of their own.
+        return hmac.compare_digest(given.encode("utf-8", "surrogatepass"), right.encode())
 
 
 def access_for(host: str, *, token: str | None, names: Iterable[str], secure: bool) -> Access:
@@ -99,7 +133,7 @@ def access_for(host: str, *, token: str | None, names: Iterable[str], secure: bo
             found=f"{len(token)}",
             todo="Make one with: openssl rand -hex 16.",
         )
-    hosts = {*LOOPBACK, *names} | ({host} - {"0.0.0.0", "::"})
+    hosts = {name.lower() for name in (*LOOPBACK, *names, host)} - {"0.0.0.0", "::"}
     if host not in LOOPBACK:
         if token is None:
             raise UsageError(

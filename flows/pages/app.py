@@ -10,7 +10,7 @@ from typing import Final
 
 from fastapi import APIRouter, FastAPI, Request
 from fastapi.responses import JSONResponse, Response
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from data_contracts.records import Record
 from flows.operations import status_page
@@ -42,9 +42,16 @@ class Login(Record):
     """What a person logs in with."""
 
     who: str = Field(min_length=1, max_length=NAME_LENGTH)
-    """Kept with all that the person decides and corrects."""
+    """Kept with all that the person decides and corrects; printable, so that no log line breaks."""
     token: str
-    """As the server printed it, or as somebody chose it."""
+    """As the server printed it, or as the operator chose it."""
+
+    @field_validator("who")
+    @classmethod
+    def _printable(cls, who: str) -> str:
+        if not who.isprintable():
+            raise ValueError("expected a name of printable characters, found others")
+        return who
 
 
 def create_app(project: str, access: Access) -> FastAPI:
@@ -101,7 +108,15 @@ def _sessions(desk: Desk) -> APIRouter:
 
     @router.post("/api/login")
     def login(given: Login, request: Request) -> JSONResponse:
+        address = "" if request.client is None else request.client.host
+        if not access.may_try(address):
+            return JSONResponse(
+                {"error": "too many wrong tokens: wait for ten seconds"},
+                status_code=429,
+                headers={"retry-after": "10"},
+            )
         if not access.has_token(given.token):
+            access.note_wrong(address)
             return JSONResponse({"error": "this is not the token"}, status_code=401)
         request.state.who = given.who
         answer = JSONResponse({"who": given.who})
@@ -116,7 +131,8 @@ def _sessions(desk: Desk) -> APIRouter:
         return answer
 
     @router.post("/api/logout")
-    def logout() -> JSONResponse:
+    def logout(request: Request) -> JSONResponse:
+        access.end(request.state.session)
         answer = JSONResponse({})
         answer.delete_cookie(access.cookie, httponly=True, samesite="strict")
         return answer

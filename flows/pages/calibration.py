@@ -13,7 +13,7 @@ from fastapi.responses import JSONResponse, Response
 from numpy.typing import NDArray
 from pydantic import Field
 
-from data_contracts.records import Record
+from data_contracts.records import Name, Record
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking, Pixel
 from flows.pages.desk import Desk
 from flows.review import reviews_of
@@ -34,9 +34,9 @@ _POINTS_ALONE: Final = StaticCalibrationSettings(lines=False)
 class Clicked(Record):
     """Everything clicked in one picture, as the page has it."""
 
-    points: dict[str, Pixel] = Field(default={}, max_length=200)
+    points: dict[Name, Pixel] = Field(default={}, max_length=200)
     """Name to place [px]."""
-    drawn: dict[str, tuple[Pixel, ...]] = Field(default={}, max_length=100)
+    drawn: dict[Name, tuple[Pixel, ...]] = Field(default={}, max_length=100)
     """Name to places along it [px]."""
     refine: bool = False
     """Refine on the painted lines of the picture: seconds, not milliseconds."""

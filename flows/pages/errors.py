@@ -28,7 +28,9 @@ def add_answers(app: FastAPI) -> None:
     def malformed(request: Request, error: RequestValidationError) -> JSONResponse:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
-        return JSONResponse({"error": f"{place}: {first['msg']}"}, status_code=422)
+        said = f"{place}: {first['msg']}"
+        # A key of the body can hold halves of characters, which no answer can.
+        return JSONResponse({"error": said.encode("utf-8", "replace").decode()}, status_code=422)
 
     @app.exception_handler(OSError)
     def unreachable(request: Request, error: OSError) -> JSONResponse:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import logging
 from http.cookies import CookieError, SimpleCookie
 from typing import Final
-from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.responses import JSONResponse, RedirectResponse, Response
+from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from flows.host_guard import refusal, refuse_foreign
 from flows.pages.access import Access
 
 OPEN: Final = frozenset(
@@ -76,45 +76,30 @@ class Guard:
     def _refusal(
         self, scope: Scope, headers: Headers, who: str | None, session: str | None
     ) -> Response | None:
-        host = headers.get("host", "")
-        if _host_name(host) not in self.access.hosts:
-            return _refused(421, "this server has another name")
+        foreign = refuse_foreign(scope, headers, self.access.hosts)
+        if foreign is not None:
+            return foreign
         path, method = scope["path"], scope["method"]
         if path not in OPEN and who is None:
             if method == "GET" and path == "/":
                 return RedirectResponse("/login", status_code=303)
-            return _refused(401, "log in first")
+            return refusal(401, "log in first")
         if method in SAFE:
             return None
-        origin = headers.get("origin")
-        if origin is not None and urlsplit(origin).netloc != host:
-            return _refused(403, "this comes from a page of another server")
         if headers.get("sec-fetch-site", "same-origin") != "same-origin":
-            return _refused(403, "this comes from a page of another server")
+            return refusal(403, "this comes from a page of another server")
         if headers.get("content-type", "").partition(";")[0] != "application/json":
-            return _refused(415, "only JSON is taken in")
-        if path not in OPEN and headers.get("x-form-secret") != self.access.form_secret(
-            session or ""
+            return refusal(415, "only JSON is taken in")
+        if path not in OPEN and not self.access.has_form_secret(
+            session or "", headers.get("x-form-secret", "")
         ):
-            return _refused(403, "the page is of another session: load it again")
+            return refusal(403, "the page is of another session: load it again")
         length = headers.get("content-length", "")
-        if not length.isdigit():  # in pieces of unknown number it could be of any length
-            return _refused(411, "say how long it is")
-        if int(length) > BODY_BYTES:
-            return _refused(413, f"at most {BODY_BYTES} bytes are taken in")
+        if not (length.isascii() and length.isdigit()):  # of unknown length it could be any
+            return refusal(411, "say how long it is")
+        if len(length) > 12 or int(length) > BODY_BYTES:
+            return refusal(413, f"at most {BODY_BYTES} bytes are taken in")
         return None
-
-
-def _refused(status: int, why: str) -> JSONResponse:
-    return JSONResponse({"error": why}, status_code=status)
-
-
-def _host_name(host: str) -> str:
-    """The name in a Host header, without its port: a tunnel may have another."""
-    try:
-        return urlsplit(f"//{host}").hostname or ""
-    except ValueError:
-        return ""
 
 
 def _cookie(headers: Headers, name: str) -> str | None:

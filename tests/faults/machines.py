@@ -17,7 +17,7 @@ import psutil
 
 from flows.operations.plan import ServePlan
 from flows.operations.serving import answers
-from flows.prefect_environment import served_environment
+from flows.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN, new_login, served_environment
 
 START_SECONDS = 300.0
 """What a part may take to begin: machines are busy."""
@@ -143,6 +143,7 @@ class Machines:
         self.api = f"http://{here}:{_free_port()}/api"
         self.dask = f"tcp://{here}:{_free_port()}"
         own = {"PREFECT_API_URL": self.api, "PREFECT_HOME": str(folder / "prefect")}
+        own[CLIENT_LOGIN] = new_login()
         self.environment = {**os.environ, **own, "NO_PROXY": "*", "no_proxy": "*"}
         self.parts = {}
 
@@ -155,6 +156,7 @@ class Machines:
                 environment = self.environment
                 if name == "prefect":
                     environment = served_environment(self.api, self.folder / "prefect")
+                    environment[SERVER_LOGIN] = self.environment[CLIENT_LOGIN]
                 self.parts[name] = Part(command, environment, self.folder / f"{name}.log")
                 self.parts[name].start()
             self._wait_until(lambda: answers(f"{self.api}/health"))

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from command_line import TINY, succeed, worldpose
 
+from flows.prefect_environment import CLIENT_LOGIN, authorization
 from worldpose.store import Store, compare_stores
 
 LOOPBACK_ONLY = str(Path(__file__).with_name("loopback_only"))
@@ -44,7 +45,10 @@ def test_a_run_is_visible_at_the_server_by_name(server, tiny, tmp_path):
         request = urllib.request.Request(
             f"{server}/{kind}/filter",
             data=b'{"sort": "EXPECTED_START_TIME_DESC", "limit": 50}',
-            headers={"content-type": "application/json"},
+            headers={
+                "content-type": "application/json",
+                "authorization": authorization(os.environ[CLIENT_LOGIN]),
+            },
         )
         with urllib.request.urlopen(request) as answer:
             return json.load(answer)

@@ -1,19 +1,41 @@
 """What a run and its own Prefect server, alone on a machine, are spared."""
 
+import dataclasses
 import gc
+import http.client
 import importlib
+import os
 import sqlite3
 import ssl
+import subprocess
+import sys
 from contextlib import closing
+from types import SimpleNamespace
+from urllib.parse import urlsplit
 
+import psutil
 import pytest
+from distributed import Client, Security
 
 from flows import prefect_database
+from flows.operations.child import PARTS
 from flows.operations.plan import ServePlan
+from flows.operations.service_secrets import METRICS_TOKEN, secrets_of
 from flows.operations.serving import environment_of
 from flows.prefect_database import DATABASE, begin_database, keep_database
-from flows.prefect_environment import AUTHORITIES, one_authority, prefect_server
-from worldpose.errors import StoreError
+from flows.prefect_environment import (
+    AUTHORITIES,
+    CLIENT_LOGIN,
+    SERVER_LOGIN,
+    authorization,
+    local_cluster,
+    one_authority,
+    prefect_server,
+    require_login,
+    without_secrets,
+)
+from flows.private_cluster import PrivateCluster
+from worldpose.errors import InputError, StoreError
 
 
 @pytest.fixture
@@ -92,12 +114,150 @@ def test_only_those_on_this_machine_who_talk_plainly_are_given_it(tmp_path, monk
         assert AUTHORITIES not in environment_of(plan.model_copy(update=other))
 
 
+def test_only_the_run_itself_gets_an_answer_of_its_server(tmp_path, kept):
+    with prefect_server(str(tmp_path), is_local=True) as wait_until_ready:
+        wait_until_ready()
+        api, login = os.environ["PREFECT_API_URL"], os.environ[CLIENT_LOGIN]
+        assert SERVER_LOGIN not in os.environ
+        address = urlsplit(api)
+
+        def ask(**headers):
+            connection = http.client.HTTPConnection(address.hostname, address.port, timeout=60)
+            connection.request("POST", "/api/flow_runs/filter", "{}", {**headers})
+            return connection.getresponse().status
+
+        right = {"Authorization": authorization(login), "Content-Type": "application/json"}
+        assert ask(**right) == 200
+        assert ask() == 401
+        assert ask(Authorization=authorization(f"{login}x")) == 401
+        assert ask(**right, Host="evil.example") == 421
+        assert ask(**right, Origin="http://evil.example") == 403
+    assert CLIENT_LOGIN not in os.environ
+    with prefect_server(str(tmp_path), is_local=True):
+        assert os.environ[CLIENT_LOGIN] != login
+
+
+def test_a_prefect_server_without_a_login_does_not_start():
+    server = [sys.executable, "-m", "flows.prefect_server", "--host", "0.0.0.0"]
+    environment = without_secrets(os.environ)
+    said = subprocess.run(server, env=environment, capture_output=True, text=True, timeout=300)
+    assert said.returncode != 0
+    assert SERVER_LOGIN in said.stderr
+    assert "openssl" in said.stderr
+
+
+def test_a_server_that_asks_for_another_login_is_named(server, monkeypatch):
+    require_login(server)
+    for login, found in (("worldpose:wrong", "another"), ("", "none")):
+        monkeypatch.setenv(CLIENT_LOGIN, login)
+        with pytest.raises(InputError, match=f"{CLIENT_LOGIN}: .*found {found}.*{SERVER_LOGIN}"):
+            require_login(server)
+
+
+def test_secrets_go_to_the_parts_that_need_them(tmp_path, monkeypatch):
+    given = {
+        "WORLDPOSE_ALERT_URL": "https://hook",
+        "WORLDPOSE_ALERT_MAIL": "smtps://user:password@host",
+        "AWS_ACCESS_KEY_ID": "key",
+        "AWS_SECRET_ACCESS_KEY": "secret",
+        "PREFECT_API_DATABASE_CONNECTION_URL": "postgresql://user:password@host",
+        "GITHUB_TOKEN": "token",
+        "OPENAI_API_KEY": "key",
+        "PGPASSWORD": "password",
+        "WORLDPOSE_REVIEW_TOKEN": "of the terminal",
+    }
+    harmless = {"AWS_REGION": "eu", "TOKENIZERS_PARALLELISM": "false", "LC_ALL": "C.UTF-8"}
+    cloud = [name for name in os.environ if name.startswith("AWS_")]
+    for name in (CLIENT_LOGIN, SERVER_LOGIN, METRICS_TOKEN, *cloud):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in {**given, **harmless}.items():
+        monkeypatch.setenv(name, value)
+    plan = ServePlan(
+        project=str(tmp_path), inbox=tmp_path, state=tmp_path / "state", prefect="http://x/api"
+    )
+    everywhere = environment_of(plan)
+    assert everywhere.keys().isdisjoint({*given, CLIENT_LOGIN, SERVER_LOGIN, METRICS_TOKEN})
+    assert everywhere.items() >= harmless.items()
+    secrets = secrets_of(plan, "pages' token")
+    login, metrics = secrets.prefect, secrets.metrics
+    cloud = {name: value for name, value in given.items() if name.startswith("AWS")}
+    region = {"AWS_REGION": "eu"}
+    database = "PREFECT_API_DATABASE_CONNECTION_URL"
+    alerts = {name: value for name, value in given.items() if "ALERT" in name}
+    client = {CLIENT_LOGIN: login}
+    expected = {
+        "prefect": {SERVER_LOGIN: login, database: given[database]},
+        "worker": client,
+        "watch": {**client, **alerts, METRICS_TOKEN: metrics},
+        "pages": {**client, "WORLDPOSE_REVIEW_TOKEN": "pages' token"},
+    }
+    assert {part: secrets.of(part, plan) for part in PARTS} == expected
+    # Those who read and write the store need its key; the bucket's only who copies from it.
+    on_s3 = plan.model_copy(update={"project": "s3://projects/x"})
+    bucket = plan.model_copy(update={"bucket": "s3://arriving"})
+    stored = {part: {**cloud, **region} for part in PARTS if part != "prefect"} | {"prefect": {}}
+    assert {part: secrets.of(part, on_s3) for part in PARTS} == {
+        part: {**values, **stored[part]} for part, values in expected.items()
+    }
+    assert secrets.of("worker", bucket) == client
+    assert secrets.of("watch", bucket).items() >= cloud.items()
+    # The same again at the next start, made anew where others may have read it.
+    assert secrets_of(plan, "") == dataclasses.replace(secrets, pages="")
+    (tmp_path / "state" / "secrets" / "prefect").chmod(0o640)
+    (tmp_path / "state" / "secrets" / "metrics").unlink()
+    (tmp_path / "state" / "secrets" / "metrics").symlink_to("prefect")
+    renewed = secrets_of(plan, "")
+    assert len({login, metrics, renewed.prefect, renewed.metrics}) == 4
+    assert (tmp_path / "state" / "secrets" / "prefect").stat().st_mode & 0o777 == 0o600
+
+
+def listening():
+    """Ports at which this process and those that it started listen."""
+    here = psutil.Process()
+    connections = [
+        each
+        for process in [here, *here.children(recursive=True)]
+        for each in process.net_connections("inet")
+    ]
+    return {each.laddr.port for each in connections if each.status == psutil.CONN_LISTEN}
+
+
+def test_own_workers_serve_their_run_alone():
+    before = listening()
+    with PrivateCluster(**local_cluster(1)) as cluster, Client(cluster) as client:
+        assert client.submit(sum, [1, 2]).result() == 3
+        address = cluster.scheduler_address
+        plain = {"timeout": 5, "set_as_default": False}
+        with pytest.raises(OSError, match="TLS certificate does not match"):
+            Client(address, security=Security.temporary(), **plain)
+        with pytest.raises(OSError):
+            Client(address.replace("tls://", "tcp://"), **plain)
+        # What listens is the scheduler, the nanny and the worker, each for TLS.
+        ports = listening() - before
+        assert len(ports) == 3
+        for port in ports:
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+            with pytest.raises((http.client.HTTPException, OSError)):
+                connection.request("GET", "/health")
+                connection.getresponse()
+
+
+def test_a_worker_that_somebody_starts_reports_its_use_to_nobody(monkeypatch):
+    monkeypatch.delenv("DO_NOT_TRACK", raising=False)
+    command = "import os, tasks.preload; print(os.environ['DO_NOT_TRACK'])"
+    said = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True)
+    assert said.stdout == "1\n"
+
+
 def test_workers_collect_no_garbage_until_they_have_imported_all():
+    stopped = []
     try:
         preload = importlib.import_module("tasks.preload")
         importlib.reload(preload)  # whether or not something had imported it
         assert not gc.isenabled()
-        preload.dask_setup(None)
+        node = SimpleNamespace(http_server=SimpleNamespace(stop=lambda: stopped.append(True)))
+        preload.dask_setup(node)
+        assert stopped == [True]
         assert gc.isenabled()
         assert gc.get_freeze_count() > 0
     finally:

@@ -1,5 +1,6 @@
 """The pages' server lets in who it should, and refuses what a page does not send."""
 
+import json
 import logging
 import sys
 from pathlib import Path
@@ -10,7 +11,7 @@ from command_line import TINY
 from page_client import HERE, MATCH, TOKEN, a_click, moved
 
 from flows import corrections
-from flows.pages.access import SESSION_SECONDS, access_for
+from flows.pages.access import SESSION_SECONDS, WRONG_SECONDS, WRONG_TOKENS, access_for
 from flows.pages.app import create_app
 from flows.pages.guard import BODY_BYTES, OPEN
 from worldpose.errors import UsageError
@@ -109,11 +110,98 @@ def test_nothing_is_changed_by_getting(app):
 
 
 @pytest.mark.parametrize(
-    "host", ["evil.example", "evil.example:8571", "127.0.0.1.evil.example", ""]
+    "host",
+    [
+        "evil.example",
+        "evil.example:8571",
+        "127.0.0.1.evil.example",
+        "",
+        "evil@127.0.0.1",
+        "evil@127.0.0.1:8571",
+        "127.0.0.1:8571:1",
+        "127.0.0.1/x",
+        "[::1",
+    ],
 )
 def test_a_name_that_leads_here_by_rebinding_is_refused(ada, host):
     assert ada.get("/api/matches", headers={"host": host}).status_code == 421
     assert ada.get("/api/health", headers={"host": host}).status_code == 421
+
+
+def test_another_site_reads_nothing_even_with_the_session(ada):
+    for headers in (
+        {"origin": "http://evil.example"},
+        {"origin": "null"},
+        {"sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors", "sec-fetch-dest": "image"},
+        {"sec-fetch-site": "same-site", "sec-fetch-mode": "navigate", "sec-fetch-dest": "iframe"},
+    ):
+        assert ada.get("/api/matches", headers=headers).status_code == 403, headers
+        assert ada.options("/api/matches", headers=headers).status_code == 403, headers
+    # A link on another page, as in a chat or in Prefect's dashboard, is followed.
+    link = {"sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate"}
+    assert ada.get("/", headers={**link, "sec-fetch-dest": "document"}).status_code == 200
+
+
+def test_a_session_that_was_ended_opens_nothing(app, stranger):
+    ada = page_client.log_in(app, "Ada")
+    cookie = {"cookie": f"{app.state.access.cookie}={ada.cookies[app.state.access.cookie]}"}
+    assert stranger.get(MATCH, headers=cookie).status_code == 200
+    assert ada.post("/api/logout", json={}).status_code == 200
+    assert stranger.get(MATCH, headers=cookie).status_code == 401
+    other = page_client.log_in(app, "Ada")
+    assert other.get(MATCH).status_code == 200
+
+
+def test_wrong_tokens_are_looked_at_a_few_at_a_time(project_copy):
+    stranger = page_client.browser(page_client.served(project_copy))
+    wrong = {"who": "Eve", "token": TOKEN + "x"}
+    right = {"who": "Ada", "token": TOKEN}
+    codes = [stranger.post("/api/login", json=wrong).status_code for _ in range(WRONG_TOKENS + 2)]
+    assert codes == [401] * WRONG_TOKENS + [429] * 2
+    assert stranger.post("/api/login", json=right).status_code == 429
+    access = access_for("127.0.0.1", token=TOKEN, names=(), secure=False)
+    for second in range(WRONG_TOKENS):
+        assert access.may_try("a", now=float(second))
+        access.note_wrong("a", now=float(second))
+    assert not access.may_try("a", now=WRONG_SECONDS - 0.1)
+    assert access.may_try("b", now=WRONG_SECONDS - 0.1)  # another address is not kept waiting
+    assert access.may_try("a", now=WRONG_SECONDS + 0.1)
+
+
+@pytest.mark.parametrize("text", ['"\\ud800"', '"\\udfff\\u0000"', '"' + "é" * 5000 + '"'])
+def test_a_token_of_any_characters_is_a_wrong_one(stranger, text):
+    body = f'{{"who": "Eve", "token": {text}}}'
+    assert stranger.post("/api/login", content=body, headers=JSON).status_code in (401, 422, 429)
+    body = f'{{"who": "Eve", "token": "x", {text}: 1}}'
+    assert stranger.post("/api/login", content=body, headers=JSON).status_code in (422, 429)
+
+
+@pytest.mark.parametrize(
+    "who", ["Eve\n2026-01-01 Ada: 'POST /x': 200", "Eve\r", "\x1b[2J", "\ud800"]
+)
+def test_a_name_that_would_forge_a_log_line_logs_nobody_in(app, stranger, who, caplog):
+    body = json.dumps({"who": who, "token": TOKEN})
+    with caplog.at_level(logging.INFO, logger="worldpose.pages"):
+        assert stranger.post("/api/login", content=body, headers=JSON).status_code == 422
+        stranger.post("/api/x%0aAda: 'POST", json={})
+    assert all(message.isprintable() for message in caplog.messages)
+    assert not any(message.startswith("Ada") for message in caplog.messages)
+
+
+def test_names_of_no_marking_are_a_fault_of_the_request(ada):
+    preview = f"{MATCH}/pictures/cam03/preview"
+    for name in ("no_such", "../x", "", "a b", "\n", "x" * 500):
+        for kind, place in (("points", [1.0, 2.0]), ("drawn", [[1.0, 2.0]])):
+            answer = ada.post(preview, json={kind: {name: place}})
+            assert answer.status_code in (200, 422), (kind, name)
+
+
+def test_a_token_that_the_operator_chose_is_not_printed(project_copy, tmp_path):
+    with page_client.serving(project_copy, tmp_path):
+        pass
+    said = (tmp_path / "pages.log").read_text()
+    assert "/login" in said
+    assert TOKEN not in said
 
 
 def test_a_body_that_is_too_long_or_of_unknown_length_is_refused(ada):

@@ -1,13 +1,14 @@
 """What a deployment's run shows at Prefect: how far it is, its units, where to review."""
 
 import json
+import os
 from datetime import UTC, datetime
 
 import pytest
 from command_line import TINY
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import ArtifactFilter, ArtifactFilterKey
-from prefect.settings import PREFECT_API_URL, temporary_settings
+from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
 
 from data_contracts.operations import Service, Serving
 from flows.method import METHOD
@@ -29,7 +30,8 @@ def artifact(server):
         return found[0]
 
     # Prefect has read its settings when this file imported it, before the server was there.
-    with temporary_settings({PREFECT_API_URL: server}):
+    login = {PREFECT_API_AUTH_STRING: os.environ["PREFECT_API_AUTH_STRING"]}
+    with temporary_settings({PREFECT_API_URL: server, **login}):
         yield read
 
 

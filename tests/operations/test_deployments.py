@@ -2,21 +2,26 @@
 
 import asyncio
 import importlib
+import os
 import re
 from pathlib import Path
+from uuid import uuid4
 
 import pytest
 from prefect import Flow
 from prefect.client.orchestration import get_client
-from prefect.client.schemas.objects import StateType
-from prefect.settings import PREFECT_API_URL, temporary_settings
+from prefect.client.schemas.actions import DeploymentUpdate, WorkPoolUpdate
+from prefect.client.schemas.objects import FlowRun, StateType
+from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
 from prefect.states import Cancelling, Completed, Crashed, Running, Suspended
+from prefect.workers.process import ProcessWorker
 
 from flows.operations import recovery
 from flows.operations.deployed import release_folder
 from flows.operations.deployments import DEPLOYED, install
 from flows.operations.plan import FLOWS, ServePlan
 from flows.operations.recovery import begin_again
+from flows.operations.served_worker import RefusedRunError, require_installed
 from flows.operations.watching import failed_runs
 from worldpose.errors import InputError, UsageError
 from worldpose.store import Store
@@ -30,7 +35,8 @@ def plan(server, tmp_path_factory):
         project=str(folder), inbox=folder, state=folder, prefect=server, name="ops", at_once=2
     )
     # Prefect has read its settings when this file imported it, before the server was there.
-    with temporary_settings({PREFECT_API_URL: server}):
+    login = {PREFECT_API_AUTH_STRING: os.environ["PREFECT_API_AUTH_STRING"]}
+    with temporary_settings({PREFECT_API_URL: server, **login}):
         asyncio.run(install(plan))
         yield plan
 
@@ -66,6 +72,80 @@ def test_deployments_have_queues_by_priority_and_limits(plan):
     assert ServePlan.model_validate(ingest.parameters["plan"]) == plan
     (schedule,) = ingest.schedules
     assert schedule.schedule.interval.total_seconds() == 900.0
+
+
+def test_pools_and_deployments_that_were_changed_are_put_right(plan):
+    async def change():
+        async with get_client() as client:
+            template = ProcessWorker.get_default_base_job_template()
+            await client.update_work_pool("ops", WorkPoolUpdate(base_job_template=template))
+            match = await client.read_deployment_by_name("match/ops")
+            steps = [{"prefect.deployments.steps.run_shell_script": {"script": "id"}}]
+            changed = DeploymentUpdate(entrypoint="os.system", pull_steps=steps)
+            await client.update_deployment(match.id, changed)
+
+    async def look():
+        async with get_client() as client:
+            pool = await client.read_work_pool("ops")
+            return pool.base_job_template, await client.read_deployment_by_name("match/ops")
+
+    asyncio.run(change())
+    installed = asyncio.run(install(plan))
+    template, match = asyncio.run(look())
+    assert set(template["variables"]["properties"]) == {"stream_output"}
+    assert not template["variables"]["additionalProperties"]
+    assert (match.entrypoint, match.pull_steps) == ("flows.operations.deployed.match", [])
+    assert installed[match.id].entrypoint == match.entrypoint
+    assert len(installed) == len(DEPLOYED)
+
+
+def test_the_worker_takes_installed_runs_with_parameters_of_their_own_alone(plan):
+    installed = asyncio.run(install(plan))
+    ids = {each.entrypoint.rpartition(".")[2]: number for number, each in installed.items()}
+
+    def run(flow, parameters, **changes):
+        given = {"flow_id": uuid4(), "deployment_id": ids[flow], "parameters": parameters}
+        return FlowRun(**{**given, **changes})
+
+    match = {"project": plan.project, "match_id": "m", "settings": {}}
+    arrivals = {"plan": plan.model_dump(mode="json")}
+    good = [
+        run("match", {**match, "time_limits": {}, "gates": "auto"}),
+        run("match", match, job_variables={"stream_output": False}),
+        run("ingest", arrivals),
+        run("release", {"project": plan.project, "match_id": "m", "name": "v1", "licence": "any"}),
+        run("reprocess", {"project": plan.project, "dask": None, "workers": None}),
+    ]
+    for each in good:
+        assert require_installed(each, installed).entrypoint.endswith(
+            next(flow for flow, number in ids.items() if number == each.deployment_id)
+        )
+    bad = {
+        "no deployment": [
+            run("match", match, deployment_id=None),
+            run("match", match, deployment_id=uuid4()),
+        ],
+        "may not choose": [
+            run("match", match, job_variables={name: "x"})
+            for name in ("command", "env", "working_dir", "env.PYTHONPATH", "name")
+        ],
+        "may not change": [
+            run("match", {**match, "project": "/another"}),
+            run("match", {"match_id": "m", "settings": {}}),
+            run("ingest", {"plan": {**arrivals["plan"], "inbox": "/etc"}}),
+            run("reprocess", {"project": plan.project, "dask": "tcp://evil:8786"}),
+        ],
+        "parameters": [
+            run("match", {"project": plan.project, "settings": {}}),
+            run("match", {**match, "unknown": 1}),
+            run("match", {**match, "settings": "no mapping"}),
+            run("match", {**match, "iteration": "many"}),
+        ],
+    }
+    for reason, runs in bad.items():
+        for each in runs:
+            with pytest.raises(RefusedRunError, match=reason):
+                require_installed(each, installed)
 
 
 def test_a_release_lies_in_the_project_under_a_name_that_leads_nowhere_else(tmp_path):

@@ -11,9 +11,10 @@ from command_line import TINY, succeed
 
 from flows.operations.plan import ServePlan
 from flows.operations.serving import answers
-from flows.prefect_environment import served_environment
+from flows.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN, new_login, served_environment
 from worldpose.store import Store, compare_stores, verify
 
+LOGIN = new_login()
 START_SECONDS = 300
 """What a server may take to begin on a busy machine."""
 
@@ -25,6 +26,7 @@ def prefect_on_postgres(postgres, tmp_path):
     plan = ServePlan(project="none", inbox=tmp_path, state=tmp_path, prefect=api)
     environment = served_environment(api, tmp_path / "prefect")
     environment["PREFECT_API_DATABASE_CONNECTION_URL"] = postgres[0]
+    environment[SERVER_LOGIN] = LOGIN
     program = [sys.executable, "-m", "flows.operations.child", "prefect", plan.model_dump_json()]
     server = subprocess.Popen(program, stdin=subprocess.PIPE, env=environment)
     wait_until(lambda: answers(f"{api}/health"))
@@ -39,7 +41,7 @@ def test_real_components_give_the_bytes_of_an_embedded_run(
     bucket, prefect_on_postgres, dask, postgres, tiny, tiny_run
 ):
     project = f"{bucket}/{uuid.uuid4().hex}"
-    environment = {"PREFECT_API_URL": prefect_on_postgres}
+    environment = {"PREFECT_API_URL": prefect_on_postgres, CLIENT_LOGIN: LOGIN}
     done = succeed(
         *("run", tiny, "--project", project, "--dask", dask[0], "--json"),
         timeout=1500,

@@ -77,7 +77,7 @@ def test_a_match_in_the_inbox_becomes_a_result_with_one_command(served, webhook,
     assert arrivals["urgent/hostile"]["state"] == "refused"
     assert "is a link" in arrivals["urgent/hostile"]["reason"]
     assert served.project.joinpath("inbox", "good", "match.yaml").is_file()
-    figures = fetch(f"http://127.0.0.1:{served.ports['metrics']}/metrics")
+    figures = served.figures()
     assert 'worldpose_matches{state="complete"} 1.0' in figures
     assert fetch(f"http://127.0.0.1:{served.ports['prefect']}/").startswith("<!")
 

@@ -47,12 +47,12 @@ def served(project_copy):
         prefect="http://127.0.0.1:4200/api",
         metrics_port=0,
     )
-    server = metrics_server(plan, ProjectFigures(Store.open(str(project_copy)), state))
+    server = metrics_server(plan, ProjectFigures(Store.open(str(project_copy)), state), "token")
     Thread(target=server.serve_forever, daemon=True).start()
 
-    def ask(path, host="127.0.0.1:8573"):
+    def ask(path, host="127.0.0.1:8573", token="token"):
         connection = http.client.HTTPConnection(*server.server_address, timeout=30)
-        connection.request("GET", path, headers={"host": host})
+        connection.request("GET", path, headers={"host": host, "authorization": f"Bearer {token}"})
         answer = connection.getresponse()
         return answer.status, answer.read().decode(), answer.headers["content-type"]
 
@@ -127,7 +127,14 @@ def test_the_figures_server_answers_to_its_own_name_alone(served):
     assert served("/health")[0] == 200
     assert served("/metrics", host="evil.example")[0] == 421
     assert served("/metrics", host="")[0] == 421
+    assert served("/metrics", host="evil@127.0.0.1")[0] == 421
     assert served("/../etc/passwd")[0] == 404
+
+
+def test_figures_are_for_those_who_have_their_token(served):
+    for token in ("", "toke", "tokens", "é"):
+        assert served("/metrics", token=token)[0] == 401
+        assert served("/health", token=token)[0] == 200
 
 
 def test_what_is_scraped_again_is_looked_at_anew(project_copy):

