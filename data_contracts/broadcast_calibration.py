@@ -9,14 +9,14 @@ from pydantic import Field
 from data_contracts.arrays import ArrayLayout, GroupLayout
 from data_contracts.cameras import CAMERA_LABELS
 from data_contracts.observations import FRAME
-from data_contracts.records import CONTRACT_VERSION, Record
+from data_contracts.records import CONTRACT_VERSION, FRAME_LIMIT, Record
 from data_contracts.static_calibration import ClickedMarkings
 
 
 class KeyFrame(Record):
     """One picked frame of a clip."""
 
-    frame: int = Field(ge=0)
+    frame: int = Field(ge=0, le=FRAME_LIMIT)
     """Number in the video, from 0."""
     markings: ClickedMarkings
     """Points and drawn markings of its picture."""

@@ -2,29 +2,40 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+from pydantic import Field
+
 from data_contracts.arrays import ArrayLayout
 from data_contracts.conventions import DISTORTION
-from data_contracts.records import Name, Record
+from data_contracts.records import ImageLength, Name, Record
 
 Vector3 = tuple[float, float, float]
+
+_Pixels = Annotated[float, Field(ge=-1e7, le=1e7)]
+_Metres = Annotated[float, Field(ge=-1e7, le=1e7)]
+_Coefficient = Annotated[float, Field(ge=-1e7, le=1e7)]
+_Focal = Annotated[float, Field(gt=0, le=1e7)]
 
 
 class CameraCalibration(Record):
     """One calibrated static camera."""
 
     id: Name
-    image_size: tuple[int, int]
+    image_size: tuple[ImageLength, ImageLength]
     """Width and height [px]."""
-    focal_px: tuple[float, float]
+    focal_px: tuple[_Focal, _Focal]
     """fx, fy [px]."""
-    principal_point_px: tuple[float, float]
+    principal_point_px: tuple[_Pixels, _Pixels]
     """cx, cy [px]; (0, 0) is the centre of the top-left pixel."""
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: tuple[_Coefficient, _Coefficient, _Coefficient, _Coefficient, _Coefficient] = (
+        *(0.0, 0.0, 0.0, 0.0, 0.0),
+    )
     """k1, k2, p1, p2, k3: OpenCV's order [1]."""
     rotation: tuple[Vector3, Vector3, Vector3]
     """Rows of R in x_cam = R x_world + t."""
-    translation: Vector3
-    """t in x_cam = R x_world + t [m]."""
+    translation: tuple[_Metres, _Metres, _Metres]
+    """t in x_cam = R x_world + t, as far as the Earth is large [m]."""
 
 
 CAMERA_LABELS: dict[str, tuple[str, ...]] = {

@@ -9,7 +9,17 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from data_contracts.records import CONTRACT_VERSION, Digest, Name, Record
+from data_contracts.records import (
+    CONTRACT_VERSION,
+    Digest,
+    Frame,
+    FrameOffset,
+    FramesPerSecond,
+    ImageLength,
+    Name,
+    PersonId,
+    Record,
+)
 
 
 class CameraSpec(Record):
@@ -17,13 +27,13 @@ class CameraSpec(Record):
 
     id: Name
     kind: Literal["static", "broadcast"] = "static"
-    width: int = Field(gt=0)
+    width: ImageLength
     """[px]"""
-    height: int = Field(gt=0)
+    height: ImageLength
     """[px]"""
-    fps: float | None = Field(default=None, gt=0)
+    fps: FramesPerSecond | None = None
     """[1/s]; absent = the match's."""
-    offset_frames: float = 0.0
+    offset_frames: FrameOffset = 0.0
     """This camera's own frame number at match frame 0: camera frame = match frame + offset."""
     video: str | None = None
     """Video file or folder of images, relative to the match folder."""
@@ -35,14 +45,14 @@ class ClipSpec(Record):
     """A stretch of the match that is reconstructed as one piece."""
 
     id: Name
-    first_frame: int = 0
+    first_frame: Frame = 0
     """First match frame."""
-    frame_count: int = Field(gt=0)
+    frame_count: int = Field(gt=0, le=10_000_000)
     broadcast: Name | None = None
     """The broadcast camera that filmed this clip, if any."""
-    broadcast_offset_frames: float = 0.0
+    broadcast_offset_frames: FrameOffset = 0.0
     """Frame of the broadcast clip's own video at the clip's first frame."""
-    people: dict[int, Name] = {}
+    people: dict[PersonId, Name] = {}
     """Person ids of the clip's tracks, and whom of the roster they are, as far as is known."""
 
 
@@ -62,7 +72,7 @@ class MatchSpec(Record):
 
     contract: Literal[1] = CONTRACT_VERSION
     match_id: Name
-    fps: float = Field(gt=0)
+    fps: FramesPerSecond
     """[1/s] of match time."""
     cameras: tuple[CameraSpec, ...] = Field(min_length=1)
     clips: tuple[ClipSpec, ...] = Field(min_length=1)

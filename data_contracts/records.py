@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 CONTRACT_VERSION: Final[Literal[1]] = 1
 """Version of all contracts in this package; readers refuse any other (docs/conventions.md)."""
@@ -17,6 +17,31 @@ Digest = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 
 Key = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{32}$")]
 """Name of a result: the first 128 bits of its recipe's SHA-256."""
+
+
+FRAME_LIMIT: Final = (1 << 31) - 1
+"""Largest frame number, as that of many video formats: a year at 60 frames/s."""
+
+Frame = Annotated[int, Field(ge=-FRAME_LIMIT, le=FRAME_LIMIT)]
+"""A frame number; negative before match frame 0 [frame]."""
+
+FrameOffset = Annotated[float, Field(ge=-FRAME_LIMIT, le=FRAME_LIMIT)]
+"""A distance of two clocks [frame]."""
+
+ImageLength = Annotated[int, Field(gt=0, le=1 << 16)]
+"""Width or height of an image; most image libraries read no more [px]."""
+
+FramesPerSecond = Annotated[float, Field(ge=1, le=1000)]
+"""From time lapses to high-speed cameras [1/s]."""
+
+PixelCoordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+"""x or y; (0, 0) is the centre of the top-left pixel [px]."""
+
+DetectionIndex = Annotated[int, Field(ge=0, le=100_000)]
+"""Place among a camera's detections of a frame."""
+
+PersonId = Annotated[int, Field(ge=0, le=FRAME_LIMIT)]
+"""Id of a person's track in a clip."""
 
 
 class Record(BaseModel):

@@ -7,7 +7,17 @@ from typing import Annotated, Literal
 
 from pydantic import Field, JsonValue
 
-from data_contracts.records import CONTRACT_VERSION, Digest, Key, Name, Record
+from data_contracts.records import (
+    CONTRACT_VERSION,
+    DetectionIndex,
+    Digest,
+    Frame,
+    Key,
+    Name,
+    PersonId,
+    PixelCoordinate,
+    Record,
+)
 from data_contracts.static_calibration import Pixel
 
 Origin = Literal["automatic", "corrected", "filled", "rejected"]
@@ -62,7 +72,7 @@ class MovedPoint(Record):
     """A static camera, or the clip of a moving one."""
     marking: Name
     """Name of the point in the pitch template."""
-    frame: int | None = None
+    frame: Frame | None = None
     """Frame of the clip's video; None for a static camera."""
     was: Pixel | None = None
     """Where it was when the person moved it [px]; None where it was not clicked."""
@@ -78,7 +88,7 @@ class RedrawnMarking(Record):
     """A static camera, or the clip of a moving one."""
     marking: Name
     """Name of the line or arc in the pitch template."""
-    frame: int | None = None
+    frame: Frame | None = None
     """Frame of the clip's video; None for a static camera."""
     was: tuple[Pixel, ...] = ()
     """How it was drawn when the person drew it anew [px]; empty where it was not."""
@@ -91,9 +101,9 @@ class DeletedDetection(Record):
 
     kind: Literal["deleted_detection"] = "deleted_detection"
     camera: Name
-    frame: int
+    frame: Frame
     """Match frame."""
-    detection: int
+    detection: DetectionIndex
     """Its place among the camera's detections of the frame."""
 
 
@@ -102,11 +112,11 @@ class AddedDetection(Record):
 
     kind: Literal["added_detection"] = "added_detection"
     camera: Name
-    frame: int
+    frame: Frame
     """Match frame."""
-    detection: int = Field(ge=0)
+    detection: DetectionIndex
     """The place that the person takes among the camera's detections of the frame: a free one."""
-    box: tuple[float, float, float, float]
+    box: tuple[PixelCoordinate, PixelCoordinate, PixelCoordinate, PixelCoordinate]
     """x0, y0, x1, y1 [px]."""
     keypoints: tuple[Pixel | None, ...] = Field(default=(None,) * 17, min_length=17, max_length=17)
     """[px], in the order of COCO-17; None where a joint cannot be seen."""
@@ -118,7 +128,7 @@ class ChosenFrames(Record):
     kind: Literal["chosen_frames"] = "chosen_frames"
     stage: Name
     clip: Name
-    frames: tuple[int, ...]
+    frames: tuple[Frame, ...]
     """Match frames."""
 
 
@@ -127,9 +137,9 @@ class MovedKeypoint(Record):
 
     kind: Literal["moved_keypoint"] = "moved_keypoint"
     camera: Name
-    frame: int
+    frame: Frame
     """Match frame."""
-    detection: int
+    detection: DetectionIndex
     """Its place among the camera's detections of the frame."""
     joint: Name
     """Name in COCO-17."""
@@ -143,9 +153,9 @@ class Sighting(Record):
     """One detection that tells who is meant, whatever ids the tracker gives."""
 
     camera: Name
-    frame: int
+    frame: Frame
     """Match frame."""
-    detection: int
+    detection: DetectionIndex
     """Its place among the camera's detections of the frame."""
 
 
@@ -154,10 +164,10 @@ class MergedTracks(Record):
 
     kind: Literal["merged_tracks"] = "merged_tracks"
     clip: Name
-    kept: int
+    kept: PersonId
     kept_seen: Sighting | None = None
     """Where the person saw who that is; no longer so, and the correction does not apply."""
-    merged: int
+    merged: PersonId
     merged_seen: Sighting | None = None
     """As `kept_seen`."""
 
@@ -167,10 +177,10 @@ class SplitTrack(Record):
 
     kind: Literal["split_track"] = "split_track"
     clip: Name
-    person: int
+    person: PersonId
     seen: Sighting | None = None
     """Where the person saw who that is; no longer so, and the correction does not apply."""
-    first_frame_of_new: int
+    first_frame_of_new: Frame
     """Match frame."""
 
 
@@ -179,7 +189,7 @@ class NamedTrack(Record):
 
     kind: Literal["named_track"] = "named_track"
     clip: Name
-    person: int
+    person: PersonId
     seen: Sighting | None = None
     """Where the person saw who that is; no longer so, and the correction does not apply."""
     name: Name | None
@@ -242,7 +252,7 @@ class Acceptance(Record):
     """Of one camera, as they are without corrections: `stage/unit` to key."""
     at_least: float | None = Field(default=None, ge=0, le=1)
     """Everybody whose score is at least this [1]; None = nobody but those named."""
-    people: tuple[tuple[int, int], ...] = ()
+    people: tuple[tuple[Frame, DetectionIndex], ...] = ()
     """Match frame, and place among the detections of the frame."""
     who: str = Field(min_length=1)
     accepted_at: datetime

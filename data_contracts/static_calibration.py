@@ -8,9 +8,9 @@ from pydantic import Field
 
 from data_contracts.arrays import ArrayLayout, GroupLayout
 from data_contracts.cameras import CAMERA_ARRAYS, CAMERA_LABELS
-from data_contracts.records import CONTRACT_VERSION, Name, Record
+from data_contracts.records import CONTRACT_VERSION, Name, PixelCoordinate, Record
 
-Pixel = tuple[float, float]
+Pixel = tuple[PixelCoordinate, PixelCoordinate]
 """x, y [px]; (0, 0) is the centre of the top-left pixel."""
 
 

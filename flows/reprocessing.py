@@ -12,6 +12,7 @@ from flows.planning import PlannedUnit
 from flows.progress import reporter
 from flows.running import RunRequest, run_match, shared_machines
 from flows.touched import Touched, find_touched
+from worldpose.errors import InternalError, WorldposeError
 from worldpose.store import Store
 
 State = Literal["never run", "untouched", "touched", "complete", "waiting", "partial", "failed"]
@@ -84,7 +85,9 @@ def _reprocess(
         reporter().say(f"{match_id}: {len(touched.to_compute)} units to compute")
         record = _run(store, touched, machines_for(touched.to_compute))
     except Exception as failure:  # whatever it is, the other matches go on
-        text = str(failure) or type(failure).__name__
+        text = str(failure)
+        if not isinstance(failure, WorldposeError | OSError):
+            text = str(InternalError.wrapping(match_id, failure))
         reporter().say(f"{match_id} failed: {text}")
         return Reprocessed(match_id, "failed", touched, problem=text)
     return Reprocessed(match_id, record.state, touched, record)

@@ -123,15 +123,13 @@ class RunLog:
             self.warnings[unit.name] = manifest.warnings
             reporter().unit_done(unit.name, manifest.seconds, manifest.figures)
         else:
+            message = str(failure) or type(failure).__name__
             self.failed.append(
                 UnitFailure(
-                    unit=unit.name,
-                    error=type(failure).__name__,
-                    message=str(failure),
-                    key=unit.key,
+                    unit=unit.name, error=type(failure).__name__, message=message, key=unit.key
                 )
             )
-            reporter().unit_failed(unit.name, str(failure))
+            reporter().unit_failed(unit.name, message)
 
     def close(self) -> RunRecord:
         """Store the record: from here on the run counts, and people are asked what it waits for."""

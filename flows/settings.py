@@ -62,7 +62,7 @@ def parse_overrides(assignments: list[str], stages: tuple[Stage, ...] = METHOD) 
         _place(f"--set {assignment}", field, list(by_name[stage_name].settings.model_fields))
         try:
             value = json.loads(text)
-        except ValueError:
+        except (ValueError, RecursionError):  # no JSON, or brackets without end
             value = text
         overrides.setdefault(stage_name, {})[field] = value
     for stage_name in overrides:

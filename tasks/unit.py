@@ -15,7 +15,15 @@ from prefect.client.schemas.objects import State, TaskRun
 from data_contracts.records import Record
 from data_contracts.work import Work
 from tasks.beginnings import survivable
-from worldpose.errors import CorruptionError, InputError, NondeterminismError, StoreError
+from worldpose.errors import (
+    CorruptionError,
+    InputError,
+    InternalError,
+    MemoryLimitError,
+    NondeterminismError,
+    StoreError,
+    WorldposeError,
+)
 from worldpose.ingest.registration import digest_of_files
 from worldpose.store import Store, code_version, libraries
 
@@ -31,7 +39,17 @@ def unit_task(compute: Callable[[Work], str]) -> Task[[Work], str]:
     def checked(work: Work) -> str:
         require_same_code(work)
         with survivable(work):
-            return compute(work)
+            try:
+                return compute(work)
+            except (WorldposeError, OSError):
+                raise
+            except MemoryError as error:
+                raise MemoryLimitError(
+                    f"{work.recipe.name}: not enough memory ({error or 'out of memory'}). Run "
+                    "fewer workers (--workers 1), or give the worker more memory."
+                ) from error
+            except Exception as error:  # a bug must not read as a fault of the match
+                raise InternalError.wrapping(work.recipe.name, error) from error
 
     return task(
         task_run_name="{work.recipe.stage} {work.recipe.unit}",

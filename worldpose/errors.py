@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import traceback
+
 
 class WorldposeError(Exception):
     """Base of every error that a user can cause or mend."""
@@ -38,6 +40,40 @@ class UsageError(InputError):
 
 class DegenerateError(WorldposeError):
     """The geometry does not determine the answer."""
+
+
+class InternalError(WorldposeError):
+    """Worldpose itself is wrong; nothing that was given to it is.
+
+    Args:
+        where: what was at work: `triangulation/clip`, or `tracking: array joints[3, 1]`.
+        problem: what went wrong, as a programmer would say it.
+    """
+
+    def __init__(self, where: str, problem: str) -> None:
+        self.where, self.problem = where, problem
+        super().__init__(
+            f"{where}: {problem}. This is a bug in worldpose, not in your data: please report it "
+            "with this message and the match."
+        )
+
+    @classmethod
+    def wrapping(cls, where: str, error: BaseException) -> InternalError:
+        """The error for an exception that no code foresaw; names the line that raised it."""
+        steps = traceback.extract_tb(error.__traceback__)
+        place = ""
+        if steps:
+            ours = [step for step in steps if "site-packages" not in step.filename]
+            step = (ours or list(steps))[-1]
+            place = f" at {step.filename}:{step.lineno} in {step.name}"
+        return cls(where, f"internal error {type(error).__name__}{place}: {error}")
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return type(self), (self.where, self.problem)
+
+
+class MemoryLimitError(WorldposeError):
+    """There is not enough memory for a unit of work."""
 
 
 class StoreError(WorldposeError):

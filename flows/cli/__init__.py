@@ -8,6 +8,8 @@ from __future__ import annotations
 import gc
 import json
 import sys
+import tempfile
+import traceback
 
 
 def main() -> None:
@@ -15,7 +17,7 @@ def main() -> None:
     # Late: every process that a run starts imports this module once more, and no command.
     from flows.cli.app import app
     from flows.cli.console import errors, line
-    from worldpose.errors import UsageError, WorldposeError
+    from worldpose.errors import InternalError, UsageError, WorldposeError
 
     try:
         app()
@@ -27,5 +29,20 @@ def main() -> None:
             print(json.dumps({"error": type(error).__name__, "message": message}))  # noqa: T201
         line(f"error: {message}", to=errors)
         sys.exit(2 if isinstance(error, UsageError) else 1)
+    except Exception as error:
+        message = f"{InternalError.wrapping('worldpose', error)} All of it: {_kept_trace()}"
+        if "--json" in sys.argv:
+            print(json.dumps({"error": "InternalError", "message": message}))  # noqa: T201
+        line(f"error: {message}", to=errors)
+        sys.exit(1)
     finally:
         gc.freeze()  # the process ends: freeing all its modules piece by piece takes half a second
+
+
+def _kept_trace() -> str:
+    """Path of a file with the traceback of the exception that is being handled."""
+    with tempfile.NamedTemporaryFile(
+        "w", prefix="worldpose-error-", suffix=".txt", delete=False, encoding="utf-8"
+    ) as file:
+        traceback.print_exc(file=file)
+    return file.name

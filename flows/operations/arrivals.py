@@ -12,7 +12,7 @@ from flows.operations.inbox import Entry, RefusalError, changed, look, missing_o
 from flows.operations.layout import StateFolder
 from flows.registering import register
 from flows.stage import Match
-from worldpose.errors import StoreError, WorldposeError
+from worldpose.errors import InternalError, StoreError, WorldposeError
 from worldpose.store import Store
 
 MAX_DEATHS: Final = 2
@@ -110,7 +110,7 @@ def _decide(store: Store, entry: Entry, arrival: Arrival, begin: Begin) -> Arriv
     except OSError as error:
         return changed(arrival, "incomplete", f"{error.filename}: {error.strerror}")
     except Exception as error:  # what no reader foresaw: nothing of it was taken in
-        return changed(arrival, "refused", f"{type(error).__name__}: {error}")
+        return changed(arrival, "refused", str(InternalError.wrapping(arrival.name, error)))
     known = {**match.folder.calibrations, **match.folder.clicked}
     unclicked = [each.id for each in match.folder.spec.static_cameras if each.id not in known]
     if unclicked:

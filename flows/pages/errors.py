@@ -7,7 +7,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 
 from flows.stale import StaleEditError
-from worldpose.errors import InputError, WorldposeError
+from worldpose.errors import InputError, InternalError, WorldposeError
 
 
 def add_answers(app: FastAPI) -> None:
@@ -40,3 +40,9 @@ def add_answers(app: FastAPI) -> None:
     @app.exception_handler(WorldposeError)
     def failed(request: Request, error: WorldposeError) -> JSONResponse:
         return JSONResponse({"error": str(error)}, status_code=500)
+
+    @app.exception_handler(Exception)
+    def unforeseen(request: Request, error: Exception) -> JSONResponse:
+        """The server's log has the traceback; the page says that nobody did anything wrong."""
+        where = f"{request.method} {request.url.path}"
+        return JSONResponse({"error": str(InternalError.wrapping(where, error))}, status_code=500)

@@ -3,6 +3,7 @@
 import errno
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -160,6 +161,7 @@ def test_ingesting_twice_says_so_and_changes_nothing(tiny, project_copy):
         (["--set", "triangulation.min_view=3"], "Did you mean 'min_views'"),
         (["--set", "triangulaton.min_views=3"], "Did you mean 'triangulation'"),
         (["--set", "triangulation.min_views=many"], "integer"),
+        (["--set", "triangulation.min_views=" + "[" * 3000], "integer"),
         (["--set", "min_views"], "stage.name=value"),
         (["--from", "triangulation", "--until", "tracking"], "Swap them"),
         (["--until", "body"], "one of ingest, static_calibration, detection, redetection"),
@@ -255,6 +257,27 @@ def test_what_the_system_refuses_is_said_as_json_too(monkeypatch, capsys):
     expected = {"error": "PermissionError", "message": "clips/x.mp4: Permission denied"}
     assert json.loads(said.out) == expected
     assert "clips/x.mp4: Permission denied" in said.err
+
+
+@pytest.mark.parametrize("flags", [[], ["--json"]])
+def test_a_bug_is_called_one_and_its_traceback_is_kept(monkeypatch, capsys, flags):
+    def broken():
+        raise ZeroDivisionError("division by zero")
+
+    monkeypatch.setattr("flows.cli.app.app", broken)
+    monkeypatch.setattr("sys.argv", ["worldpose", "status", *flags])
+    monkeypatch.setattr("gc.freeze", lambda: None)  # the process goes on here
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 1
+    said = capsys.readouterr()
+    assert "Traceback" not in said.err
+    assert "This is a bug in worldpose, not in your data" in said.err
+    kept = Path(said.err.split("All of it: ")[1].strip())
+    assert "ZeroDivisionError: division by zero" in kept.read_text()
+    kept.unlink()
+    if flags:
+        assert json.loads(said.out)["error"] == "InternalError"
 
 
 def test_finding_nobody_is_said(tiny, tmp_path):

@@ -18,7 +18,7 @@ from tasks.static_calibration import static_calibration
 from tasks.triangulation import camera_errors
 from tasks.unit import unit_task
 from worldpose.cameras.stored import camera_from_arrays
-from worldpose.errors import CorruptionError, InputError, StoreError
+from worldpose.errors import CorruptionError, InputError, StoreError, WorldposeError
 from worldpose.ingest.stills import write_still
 from worldpose.release import read_camera
 from worldpose.store import Store, explain_difference, key_of
@@ -247,3 +247,38 @@ def test_a_run_until_a_stage_is_partial_when_some_of_its_units_are_there(planned
             ingest.fn(unit.work(store.url, match, log.run_id))
         log.finished(unit, RuntimeError("x") if unit.name == first.name else None)
     assert log.close().state == "partial"
+
+
+@pytest.mark.parametrize(
+    ("raised", "told"),
+    [
+        (ValueError("odd shapes"), "This is a bug in worldpose, not in your data"),
+        (MemoryError("7 GiB"), "not enough memory (7 GiB)"),
+    ],
+)
+def test_a_bug_in_a_unit_is_not_blamed_on_the_match(planned, monkeypatch, raised, told):
+    _, match, _ = planned
+    store = planned[0]
+    unit = plan_run(store, match, {})[0]
+
+    def compute(work):
+        raise raised
+
+    monkeypatch.setattr("tasks.unit.require_same_code", lambda work: None)
+    with pytest.raises(WorldposeError) as caught:
+        unit_task(compute).fn(unit.work(store.url, match, "0001"))
+    assert unit.name in str(caught.value)
+    assert told in str(caught.value)
+
+
+def test_what_a_reader_says_of_an_input_is_passed_on_as_it_is(planned, monkeypatch):
+    store, match, _ = planned
+    refusal = InputError("match.yaml: fps", expected="1", found="2", todo="Correct it.")
+
+    def compute(work):
+        raise refusal
+
+    monkeypatch.setattr("tasks.unit.require_same_code", lambda work: None)
+    with pytest.raises(InputError) as caught:
+        unit_task(compute).fn(plan_run(store, match, {})[0].work(store.url, match, "0001"))
+    assert caught.value is refusal

@@ -20,7 +20,7 @@ from worldpose.broadcast_calibration.moving_camera import MovingCamera, joined
 from worldpose.broadcast_calibration.priors import prior_of
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.solving import Problem, solve
-from worldpose.errors import InputError, WorldposeError
+from worldpose.errors import DegenerateError, InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import CameraEstimate, StaticCalibration, calibrate
 from worldpose.static_calibration.residuals import nearest_on_markings
@@ -84,7 +84,7 @@ def calibrate_keys(
             found[key.frame - first] = calibrate(
                 pitch, key.markings, image_size, settings=settings.key_frame, where=place
             )
-        except WorldposeError as error:
+        except (InputError, DegenerateError) as error:
             refused[key.frame - first] = f"{error}"
     if not found:
         raise InputError(

@@ -41,14 +41,12 @@ def read_markers(path: Path) -> Markers:
     """
     if not path.is_file():
         raise _wrong(path, "a C3D or TRC file", "nothing")
+    if path.suffix.lower() == ".c3d":
+        return _read_c3d(path)
     try:
-        if path.suffix.lower() == ".c3d":
-            return _read_c3d(path)
         return _read_trc(path)
-    except InputError:
-        raise
-    # What a damaged file makes of a reader is not known beforehand.
-    except Exception as error:
+    # A line, cell or key that a cut-off file lacks, and text that is no number or no UTF-8.
+    except (OSError, LookupError, ValueError) as error:
         raise _wrong(path, "a whole C3D or TRC file", f"{error!r}") from error
 
 
@@ -121,13 +119,16 @@ def _read_c3d(path: Path) -> Markers:
         import c3d
     except ImportError:
         raise _wrong(path, "the package c3d, which reads it", "none installed") from None
-    with path.open("rb") as file:
-        reader = c3d.Reader(file)
-        unit = reader.get("POINT:UNITS").string_value.strip().lower()
-        names = tuple(label.strip() for label in reader.point_labels)
-        # Copies: the reader gives the same array again and again. Residual -1 means missing.
-        rows = [points[:, :4].copy() for _, points, _ in reader.read_frames()]
-        rate = float(reader.point_rate)
+    try:
+        with path.open("rb") as file:
+            reader = c3d.Reader(file)
+            unit = reader.get("POINT:UNITS").string_value.strip().lower()
+            names = tuple(label.strip() for label in reader.point_labels)
+            # Copies: the reader gives the same array again and again. Residual -1 means missing.
+            rows = [points[:, :4].copy() for _, points, _ in reader.read_frames()]
+            rate = float(reader.point_rate)
+    except Exception as error:  # c3d documents no closed list for damaged files
+        raise _wrong(path, "a whole C3D or TRC file", f"{error!r}") from error
     values = np.array(rows, dtype=np.float64).reshape(len(rows), -1, 4)
     points = np.where(values[..., 3:] < 0.0, np.nan, values[..., :3])
     return _checked(path, rate, names[: points.shape[1]], points, unit)

@@ -20,6 +20,7 @@ from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
 from worldpose.ingest.given_cameras import (
     NUMBER_LIMIT,
+    ROTATION_TOLERANCE,
     brief,
     calibration_error,
     cameras_by_name,
@@ -95,6 +96,14 @@ def _rotation(table: Mapping[str, Any], where: str) -> NDArray[np.float64]:
     if given.size != 3:
         raise calibration_error(
             f"{where}.rotation", "3 numbers (Rodrigues vector) or 3x3", f"shape {given.shape}"
+        )
+    angle = float(np.linalg.norm(given))
+    if angle > 2.0 * np.pi + ROTATION_TOLERANCE:
+        raise InputError(
+            f"{where}.rotation",
+            expected="a Rodrigues vector in radians, no longer than 2 pi",
+            found=f"one of length {angle:g}",
+            todo="If these are degrees, multiply them by pi / 180.",
         )
     matrix: NDArray[np.float64] = Rotation.from_rotvec(given.ravel()).as_matrix()
     return matrix

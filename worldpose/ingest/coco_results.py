@@ -17,13 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17
+from data_contracts.records import FRAME_LIMIT
 from worldpose.errors import InputError
-from worldpose.ingest.keypoint_arrays import ARRAY_BYTES, COORDINATE_LIMIT, FRAME_LIMIT
+from worldpose.ingest.keypoint_arrays import (
+    ARRAY_BYTES,
+    COORDINATE_LIMIT,
+    PEOPLE_LIMIT,
+)
 from worldpose.ingest.observations import Observations
 from worldpose.ingest.text_files import read_json
 
-JSON_BYTES: Final = 1 << 30
-"""Largest JSON file that is read [byte], about a million people; npz takes more."""
+JSON_BYTES: Final = 1 << 28
+"""Largest JSON file that is read [byte], about 250,000 people; Python takes 30 times as much memory
+to read it. npz takes more people in less."""
 
 OVERSHOOT: Final = 1.1
 """Largest confidence that is taken for 1: an interpolated heat map's peak rises a little above."""
@@ -169,6 +175,13 @@ def _by_frame(
     row = np.repeat(np.arange(len(frame)), count)
     slot = np.arange(len(frames)) - np.repeat(first, count)
     most = int(count.max(initial=0))
+    if most > PEOPLE_LIMIT:
+        raise InputError(
+            str(path),
+            expected=f"at most {PEOPLE_LIMIT} people per frame",
+            found=f"{most} with image_id {frame[np.argmax(count)]}",
+            todo="Check image_id, or keep the detections of each image with the highest scores.",
+        )
     if len(frame) * most * 4 * (3 * _JOINTS + 5) > ARRAY_BYTES:
         raise InputError(
             str(path),

@@ -18,6 +18,17 @@ SIZE_LIMIT: Final = 1 << 16
 NUMBER_LIMIT: Final = 1e9
 """Largest number that is believed in any entry, whatever its unit."""
 
+FOCAL_RATIOS: Final = (0.05, 1000.0)
+"""Least and largest focal length over the image's longer side [1]: a field of view of 168 degrees,
+and a telescope's of 0.06."""
+
+CENTER_SIZES: Final = 10
+"""Farthest principal point from the image's centre, in longer sides of the image [1]: a small crop
+of a large sensor lies a few beside it."""
+
+DISTANCE_LIMIT: Final = 1e7
+"""Largest coordinate of a translation [m]: from the Earth's equator to its pole."""
+
 ROTATION_TOLERANCE: Final = 1e-4
 """Largest error of R R^T = I [1] that is taken for rounding; four decimals give less."""
 
@@ -53,8 +64,12 @@ def given_camera(
         raise calibration_error(
             f"{where}: size", f"whole pixels from 1 to {SIZE_LIMIT}", str(size.tolist())
         )
-    if np.any(focal <= 0):
-        raise calibration_error(f"{where}: focal length", "positive [px]", str(focal.tolist()))
+    _require_optics(where, size, focal, principal_point)
+    far = float(np.max(np.abs(translation)))
+    if far > DISTANCE_LIMIT:
+        raise calibration_error(
+            f"{where}: translation", f"metres, at most {DISTANCE_LIMIT:g}", f"{far:g}"
+        )
     error = float(np.max(np.abs(rotation @ rotation.T - np.eye(3))))
     if error > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
         kind = "a mirror image" if error <= ROTATION_TOLERANCE else f"R R^T off by {error:.2g}"
@@ -78,6 +93,31 @@ def given_camera(
         raise calibration_error(
             f"{where}: name", "up to 64 letters, digits and . _ -, none of . _ - first", repr(name)
         ) from invalid
+
+
+def _require_optics(
+    where: str,
+    size: NDArray[np.float64],
+    focal: NDArray[np.float64],
+    principal_point: NDArray[np.float64],
+) -> None:
+    """Refuse a focal length or principal point that no image of this size can have."""
+    ratio = focal / np.max(size)
+    if np.any(ratio < FOCAL_RATIOS[0]) or np.any(ratio > FOCAL_RATIOS[1]):
+        low, high = (bound * float(np.max(size)) for bound in FOCAL_RATIOS)
+        raise InputError(
+            f"{where}: focal length",
+            expected=f"positive pixels, {low:g} to {high:g} for {size[0]:g} x {size[1]:g}",
+            found=str(focal.tolist()),
+            todo="Give it in pixels: focal length in mm / sensor width in mm * image width.",
+        )
+    if np.any(np.abs(principal_point - size / 2) > CENTER_SIZES * np.max(size)):
+        raise InputError(
+            f"{where}: principal point",
+            expected=f"pixels within {CENTER_SIZES} image sizes of the image's centre",
+            found=str(principal_point.tolist()),
+            todo="Give it in pixels from the image's top-left corner.",
+        )
 
 
 def cameras_by_name(

@@ -17,6 +17,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17
+from data_contracts.records import FRAME_LIMIT
 from worldpose.errors import InputError
 from worldpose.ingest.observations import Observations
 from worldpose.ingest.text_files import require_file
@@ -24,11 +25,17 @@ from worldpose.ingest.text_files import require_file
 ARRAY_BYTES: Final = 4 << 30
 """Most that the arrays of one file may fill [byte]; two hours of 25 people at 50 Hz are 2 GB."""
 
+PEOPLE_LIMIT: Final = 1000
+"""Most people per frame of one camera; a stadium's stands in one image have a few hundred."""
+
+PACKED_RATIO: Final = 200
+"""Largest ratio of unpacked to packed bytes: poses with much room for absent people reach 50."""
+
+PACKED_BYTES: Final = 1 << 26
+"""Unpacked bytes up to which the ratio does not matter."""
+
 COORDINATE_LIMIT: Final = 1e6
 """Farthest from the picture's origin that a keypoint or box corner is believed [px]."""
-
-FRAME_LIMIT: Final = (1 << 31) - 1
-"""Largest frame number that is believed: a year at 60 frames/s."""
 
 _BLOCK: Final = 4096
 """Frames checked at a time, which keeps the checks' own memory small."""
@@ -67,14 +74,11 @@ def read_keypoint_arrays(path: Path) -> Observations:
             too large, frames that do not rise, infinite values, or a keypoint without confidence.
     """
     require_file(path)
-    try:
-        with zipfile.ZipFile(path) as file:
-            infos = _members(path, file)
-            headers = {name: _header(path, file, info) for name, info in infos.items()}
-            _check_headers(path, infos, headers)
-            arrays = {name: _array(path, file, info) for name, info in infos.items()}
-    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
-        raise _wrong(str(path), "an npz file", f"{error}") from error
+    with _opened(path) as file:
+        infos = _members(path, file)
+        headers = {name: _header(path, file, info) for name, info in infos.items()}
+        _check_headers(path, infos, headers)
+        arrays = {name: _array(path, file, info) for name, info in infos.items()}
     people = Observations(
         frame=cast("NDArray[np.int64]", arrays["frame"]),
         keypoints=cast("NDArray[np.float32]", arrays["keypoints"]),
@@ -84,6 +88,14 @@ def read_keypoint_arrays(path: Path) -> Observations:
     )
     _check_values(path, people)
     return people
+
+
+def _opened(path: Path) -> zipfile.ZipFile:
+    try:
+        return zipfile.ZipFile(path)
+    # ValueError and NotImplementedError: a directory of nonsense, or of a later version.
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
+        raise _wrong(str(path), "an npz file", f"{error}") from error
 
 
 def _members(path: Path, file: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
@@ -102,7 +114,7 @@ def _header(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> _Header
             shape, fortran, dtype = _read_header(member)
             start = member.tell()
     except Exception as error:  # a hostile header can raise nearly anything in numpy and zipfile
-        raise _wrong(where, "an npy array", f"{error}" or type(error).__name__) from error
+        raise _wrong(where, "an npy array", _brief(error)) from error
     if dtype.hasobject:
         raise _wrong(where, "numbers", "Python objects, which are never loaded")
     if start + math.prod(shape) * dtype.itemsize != info.file_size:
@@ -137,9 +149,26 @@ def _check_headers(
         if not fits:
             known = tuple(sizes.get(dim, dim) if isinstance(dim, str) else dim for dim in dims)
             raise _wrong(where, f"shape {known}".replace("'", ""), f"{shape}")
+    if sizes["detections"] > PEOPLE_LIMIT:
+        raise InputError(
+            f"{path}: {infos['score'].filename}",
+            expected=f"at most {PEOPLE_LIMIT} people per frame",
+            found=f"room for {sizes['detections']}",
+            todo="Keep the detections of each frame with the highest scores.",
+        )
     total = sum(info.file_size for info in infos.values())
-    if total > ARRAY_BYTES:
-        raise _wrong(str(path), f"at most {ARRAY_BYTES} bytes of arrays", f"{total}")
+    packed = sum(info.compress_size for info in infos.values())
+    if total > min(ARRAY_BYTES, max(PACKED_BYTES, packed * PACKED_RATIO)):
+        limit = f"at most {ARRAY_BYTES} bytes of arrays"
+        if total <= ARRAY_BYTES:
+            limit = f"arrays packed at most {PACKED_RATIO} to 1"
+        raise InputError(
+            str(path),
+            expected=limit,
+            found=f"{total} bytes of arrays in {packed}",
+            todo="Give the detection dimension no more room than the fullest frame needs, or save "
+            "the arrays without compression.",
+        )
 
 
 def _array(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[np.generic]:
@@ -148,7 +177,7 @@ def _array(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[
             array: NDArray[np.generic] = npy.read_array(member, allow_pickle=False)
             return np.ascontiguousarray(array)
     except Exception as error:  # see _header
-        raise _wrong(f"{path}: {info.filename}", "a whole array", f"{error}") from error
+        raise _wrong(f"{path}: {info.filename}", "a whole array", _brief(error)) from error
 
 
 def _check_values(path: Path, people: Observations) -> None:
@@ -189,6 +218,11 @@ def _check_block(path: Path, start: int, people: Observations) -> None:
             raise _wrong(
                 f"{path}: {name}{where} (frame {people.frame[place[0]]})", rule, f"{value}"
             )
+
+
+def _brief(error: Exception) -> str:
+    text = str(error) or type(error).__name__
+    return text if len(text) <= 200 else text[:197] + "..."
 
 
 def _wrong(where: str, expected: str, found: str) -> InputError:

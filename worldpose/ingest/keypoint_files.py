@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from data_contracts.records import FRAME_LIMIT
 from worldpose.errors import InputError
 from worldpose.ingest.coco_results import read_coco_results
-from worldpose.ingest.keypoint_arrays import ARRAY_BYTES, FRAME_LIMIT, read_keypoint_arrays
+from worldpose.ingest.keypoint_arrays import ARRAY_BYTES, read_keypoint_arrays
 from worldpose.ingest.observations import Observations
 
 

@@ -57,7 +57,7 @@ def write_group(
         How many files that is.
 
     Raises:
-        InputError: the arrays or attributes are not what the layout says.
+        InternalError: the arrays or attributes are not what the layout says.
     """
     checked = checked_arrays(layout, arrays, coordinates)
     given = checked_attributes(layout, checked, attributes)

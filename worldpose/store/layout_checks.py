@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import ArrayLayout, GroupLayout
-from worldpose.errors import InputError
+from worldpose.errors import InputError, InternalError
 from worldpose.store.canonical import canonical_json
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -25,7 +25,7 @@ def checked_arrays(
     """All arrays by name in the layout's order, as they were given.
 
     Raises:
-        InputError: an array is unknown, absent, of another dtype or dimension, disagrees with
+        InternalError: an array is unknown, absent, of another dtype or dimension, disagrees with
             another in a dimension's size, or holds NaN or infinity where there must be none.
     """
     _check_names(layout, "array", arrays, [array.name for array in layout.arrays])
@@ -42,11 +42,10 @@ def checked_arrays(
         for dim, size in zip(array.dims, values.shape, strict=True):
             expected, source = sizes.setdefault(dim, (size, f"array {array.name}"))
             if size != expected:
-                raise InputError(
+                raise InternalError(
                     f"{where}, dimension {dim}",
-                    expected=f"size {expected}, as in {source}",
-                    found=f"size {size}, shape {values.shape}",
-                    todo="Give every array of the group the same dimension sizes.",
+                    f"expected size {expected}, as in {source}, found size {size}, shape "
+                    f"{values.shape}",
                 )
         _check_values(where, array, values)
         checked[array.name] = values
@@ -89,10 +88,16 @@ def checked_attributes(
     An attribute named as a dimension labels it, so it must be a list of the dimension's size.
 
     Raises:
-        InputError: an attribute is unknown, absent, not plain JSON, or labels a dimension wrongly.
+        InternalError: an attribute is unknown, absent, not plain JSON, or labels a dimension
+            wrongly.
     """
     _check_names(layout, "attribute", attributes, list(layout.attributes))
-    plain: dict[str, Any] = json.loads(canonical_json(dict(attributes)))
+    try:
+        plain: dict[str, Any] = json.loads(canonical_json(dict(attributes)))
+    except InputError as error:
+        raise InternalError(
+            f"{layout.stage}: attributes", f"expected {error.expected}, found {error.found}"
+        ) from error
     sizes = {
         dim: size
         for array in (*layout.coordinates, *layout.arrays)
@@ -102,11 +107,10 @@ def checked_attributes(
     for name in plain.keys() & sizes.keys():
         value = plain[name]
         if not isinstance(value, list) or len(value) != sizes[name]:
-            raise InputError(
+            found = f"{len(value)} of them" if isinstance(value, list) else repr(value)
+            raise InternalError(
                 f"{layout.stage}: attribute {name}",
-                expected=f"a list of {sizes[name]} labels, one for each {name}",
-                found=f"{len(value)} of them" if isinstance(value, list) else repr(value),
-                todo=f"Give the labels in the order of the {name} dimension.",
+                f"expected a list of {sizes[name]} labels, one for each {name}, found {found}",
             )
     return {name: plain[name] for name in layout.attributes if name in plain}
 
@@ -117,28 +121,19 @@ def _check_names(
     unknown = sorted(given.keys() - set(known))
     absent = sorted(set(known) - given.keys() - set(layout.optional))
     if unknown or absent:
-        raise InputError(
+        raise InternalError(
             f"{layout.stage}: {kind}s",
-            expected=", ".join(known) or "none",
-            found=f"unknown: {', '.join(unknown) or 'none'}; absent: {', '.join(absent) or 'none'}",
-            todo=f"Write the {kind}s that the layout in data_contracts names.",
+            f"expected {', '.join(known) or 'none'}, found unknown: "
+            f"{', '.join(unknown) or 'none'}; absent: {', '.join(absent) or 'none'}",
         )
 
 
 def _check_form(where: str, array: ArrayLayout, values: NDArray[Any]) -> None:
     if values.dtype != np.dtype(array.dtype):
-        raise InputError(
-            where,
-            expected=f"dtype {array.dtype}",
-            found=f"dtype {values.dtype}",
-            todo="Convert it where its range and precision are known.",
-        )
+        raise InternalError(where, f"expected dtype {array.dtype}, found dtype {values.dtype}")
     if values.ndim != len(array.dims):
-        raise InputError(
-            where,
-            expected=f"dimensions ({', '.join(array.dims)})",
-            found=f"shape {values.shape}",
-            todo="Reshape it; dimensions are never guessed.",
+        raise InternalError(
+            where, f"expected dimensions ({', '.join(array.dims)}), found shape {values.shape}"
         )
 
 
@@ -155,11 +150,9 @@ def _check_values(where: str, array: ArrayLayout, values: NDArray[Any]) -> None:
         number += int(wrong.sum())
     if number:
         allowed = {"nan": "finite numbers or NaN", "-1": "indices from 0, or -1 for missing"}
-        raise InputError(
-            f"{where}{list(first)}",
-            expected=allowed.get(array.missing, "finite numbers only"),
-            found=f"{value}, and {number} such in all",
-            todo="Mark what is missing as the layout says, or find out why it is not finite.",
+        expected = allowed.get(array.missing, "finite numbers only")
+        raise InternalError(
+            f"{where}{list(first)}", f"expected {expected}, found {value}, and {number} such in all"
         )
 
 

@@ -13,7 +13,7 @@ from data_contracts.arrays import GroupLayout
 from data_contracts.records import CONTRACT_VERSION
 from data_contracts.run import ResultManifest, StoredFile
 from data_contracts.work import Work
-from worldpose.errors import InputError, StoreError
+from worldpose.errors import InternalError, StoreError
 from worldpose.store.blobs import storage_errors
 from worldpose.store.canonical import canonical_json, digest
 from worldpose.store.commit_points import reached
@@ -52,7 +52,7 @@ class ResultWriter:
         """Writes the result's arrays, once; see `worldpose.store.groups.write_group`.
 
         Raises:
-            InputError: they are not what the layout says.
+            InternalError: they are not what the layout says.
             StoreError: the disk is full or not writable, or the result was written already.
         """
         # Late: status and resumed runs read manifests only, and Zarr takes most of a second.
@@ -62,11 +62,10 @@ class ResultWriter:
         if self._files:
             raise StoreError(f"{name}: a result is written once; it has been written")
         if layout.stage != self._work.recipe.stage:
-            raise InputError(
+            raise InternalError(
                 f"result of {name}",
-                expected=f"the layout of stage {self._work.recipe.stage}",
-                found=f"the layout of stage {layout.stage}",
-                todo="Write the layout that data_contracts has for the stage.",
+                f"expected the layout of stage {self._work.recipe.stage}, found the layout of "
+                f"stage {layout.stage}",
             )
         reached("before_write")
         with storage_errors(str(self._folder)):
@@ -78,7 +77,7 @@ class ResultWriter:
         """The manifest of what has been written.
 
         Raises:
-            InputError: a figure is not finite.
+            InternalError: a figure is not finite.
             StoreError: nothing has been written, or not all of it is there.
         """
         name = self._work.recipe.name
@@ -86,11 +85,8 @@ class ResultWriter:
             raise StoreError(f"{name}: nothing was written, so there is nothing to publish")
         for figure, value in self.figures.items():
             if not math.isfinite(value):
-                raise InputError(
-                    f"figure {figure} of {name}",
-                    expected="a finite number",
-                    found=str(value),
-                    todo="Leave a figure out where there is nothing to compute it from.",
+                raise InternalError(
+                    f"figure {figure} of {name}", f"expected a finite number, found {value}"
                 )
         with storage_errors(str(self._folder)):
             files = stored_files(self._folder)

@@ -229,7 +229,7 @@ TEXT = st.text(st.characters(exclude_categories=["Cs", "Cc"]), max_size=8)
 @given(
     match_id=NAMES,
     cameras=st.lists(NAMES, min_size=1, max_size=3, unique=True),
-    fps=st.floats(1, 1e4),
+    fps=st.floats(1, 1e3),
     offset=st.integers(-(10**6), 10**6),
     frames=st.integers(1, 10**6),
     person=TEXT,

@@ -44,7 +44,7 @@ FIRST = "match.yaml: cameras[0]"
     ("data", "where", "expected", "found", "todo"),
     [
         (match(fps=...), "match.yaml: fps", "a value", "nothing", "Add"),
-        (match(fps=-1), "match.yaml: fps", "greater than 0", "-1", "Correct"),
+        (match(fps=-1), "match.yaml: fps", "greater than or equal to 1", "-1", "Correct"),
         (match(fps="25"), "match.yaml: fps", "a valid number", "'25'", "Correct"),
         (match(fps=True), "match.yaml: fps", "a valid number", "True", "Correct"),
         (match(fps=math.nan), "match.yaml: fps", "a finite number", "nan", "Correct"),

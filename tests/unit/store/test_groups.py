@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 from store_samples import ATTRIBUTES, LAYOUT, all_sample_arrays, sample_coordinates
 
 from data_contracts.arrays import ArrayLayout, GroupLayout
-from worldpose.errors import InputError
+from worldpose.errors import InternalError
 from worldpose.store.groups import write_group
 
 
@@ -123,7 +123,7 @@ def test_wrong_values_of_all_parts_are_counted_and_nothing_is_written(
 ) -> None:
     values = np.zeros((3, 100))
     values[2, 40], values[0, 99] = np.inf, -np.inf
-    with pytest.raises(InputError, match=r"x\[2, 40\].*found inf, and 2 such in all"):
+    with pytest.raises(InternalError, match=r"x\[2, 40\].*found inf, and 2 such in all"):
         write_group(tmp_path, long_layout, {"x": values}, {}, {})
     assert list(tmp_path.iterdir()) == []
 
@@ -151,7 +151,7 @@ def test_wrong_values_of_all_parts_are_counted_and_nothing_is_written(
 def test_array_that_breaks_the_layout_is_refused(
     tmp_path: Path, changes: dict[str, Any], message: str
 ) -> None:
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InternalError, match=message):
         write(tmp_path, **changes)
     assert list(tmp_path.iterdir()) == [], "checked before anything is written"
 
@@ -159,9 +159,9 @@ def test_array_that_breaks_the_layout_is_refused(
 def test_absent_array_is_refused_unless_optional(tmp_path: Path) -> None:
     arrays = all_sample_arrays()
     del arrays["views"]
-    with pytest.raises(InputError, match="absent: views"):
+    with pytest.raises(InternalError, match="absent: views"):
         write_group(tmp_path, LAYOUT, arrays, sample_coordinates(), ATTRIBUTES)
-    with pytest.raises(InputError, match=r"coordinates.*absent: frame"):
+    with pytest.raises(InternalError, match=r"coordinates.*absent: frame"):
         write_group(tmp_path, LAYOUT, all_sample_arrays(), {}, ATTRIBUTES)
 
 
@@ -178,7 +178,7 @@ def test_absent_array_is_refused_unless_optional(tmp_path: Path) -> None:
 def test_attribute_that_breaks_the_layout_is_refused(
     tmp_path: Path, attributes: dict[str, Any], message: str
 ) -> None:
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InternalError, match=message):
         write_group(tmp_path, LAYOUT, all_sample_arrays(), sample_coordinates(), attributes)
 
 

@@ -23,7 +23,13 @@ from store_samples import (
     sample_work,
 )
 
-from worldpose.errors import CorruptionError, InputError, NondeterminismError, StoreError
+from worldpose.errors import (
+    CorruptionError,
+    InputError,
+    InternalError,
+    NondeterminismError,
+    StoreError,
+)
 from worldpose.store import ResultId, Store, verify
 from worldpose.store.canonical import canonical_json, digest
 from worldpose.store.paths import MANIFEST, PROJECT
@@ -118,7 +124,7 @@ def test_work_with_a_foreign_key_is_refused(folder_store: Store) -> None:
 def test_layout_of_another_stage_is_refused(folder_store: Store) -> None:
     work = sample_work(folder_store, sample_recipe(stage="triangulation"))
     with (
-        pytest.raises(InputError, match="layout of stage"),
+        pytest.raises(InternalError, match="layout of stage"),
         folder_store.publishing(work) as writer,
     ):
         writer.write(LAYOUT, sample_arrays(), sample_coordinates(), ATTRIBUTES)
@@ -126,7 +132,7 @@ def test_layout_of_another_stage_is_refused(folder_store: Store) -> None:
 
 def test_figure_that_is_not_finite_is_refused(folder_store: Store) -> None:
     with (
-        pytest.raises(InputError, match="figure error_px"),
+        pytest.raises(InternalError, match="figure error_px"),
         folder_store.publishing(sample_work(folder_store)) as writer,
     ):
         writer.write(LAYOUT, sample_arrays(), sample_coordinates(), ATTRIBUTES)

@@ -1,0 +1,1 @@
+"""Seeded mutations of good matches, stores and requests: `python -m tests.fuzz --help`."""

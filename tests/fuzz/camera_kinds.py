@@ -1,0 +1,565 @@
+"""Cameras that film otherwise, calibrations written otherwise, and the pitch."""
+
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from .kinds import FILM, kind, kinds
+from .scene import Camera, law_points
+
+HUGE = 10**9
+
+
+def some(draft, rng):
+    """The id of a camera, at random."""
+    return str(rng.choice(list(draft.cameras)))
+
+
+def target_of(draft):
+    return draft.people.reshape(-1, 3).mean(axis=0)
+
+
+def change(draft, rng, **values):
+    name = some(draft, rng)
+    draft.cameras[name] = replace(draft.cameras[name], **values)
+
+
+def put(draft, name, camera):
+    """Add a camera to a match."""
+    draft.cameras[name] = camera
+    draft.spec["cameras"].append({"id": name, "width": camera.width, "height": camera.height})
+
+
+def remove(draft, name):
+    del draft.cameras[name]
+    draft.spec["cameras"] = [each for each in draft.spec["cameras"] if each["id"] != name]
+
+
+# ---------------------------------------------------------------- cameras that film otherwise
+
+
+def _scale(draft, rng, factors):
+    for name, factor in zip(list(draft.cameras), np.broadcast_to(factors, 4), strict=False):
+        camera = draft.cameras[name]
+        draft.cameras[name] = replace(
+            camera,
+            width=max(1, round(camera.width * factor)),
+            height=max(1, round(camera.height * factor)),
+            focal=tuple(f * factor for f in camera.focal),
+            principal=tuple((c + 0.5) * factor - 0.5 for c in camera.principal),
+        )
+    draft.pixel_noise *= min(1.0, float(np.min(factors)))
+    draft.click_noise *= min(1.0, float(np.min(factors)))
+
+
+kinds(
+    "camera",
+    {
+        "one_smaller_image": (2 / 3, 1, 1, 1),
+        "mixed_image_sizes": (2 / 3, 4 / 3, 1, 2),
+        "image_of_8k": (4, 1, 1, 1),
+        "odd_image_size": (641 / 1920, 1, 1, 1),
+    },
+    _scale,
+    phase=FILM,
+    harmless=True,
+)
+kinds(
+    "camera",
+    {"images_of_160_by_90": 1 / 12, "image_of_one_pixel": (1 / 1920, 1, 1, 1)},
+    _scale,
+    phase=FILM,
+)
+
+
+@kind("camera", phase=FILM, harmless=True)
+def portrait(draft, rng):
+    name = some(draft, rng)
+    camera = draft.cameras[name]
+    (fx, fy), (cx, cy) = camera.focal, camera.principal
+    turned = Camera(
+        *(camera.height, camera.width, (fy, fx), (camera.height - 1 - cy, cx)),
+        *(camera.distortion, camera.rotation, camera.translation),
+    )
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    draft.cameras[name] = replace(
+        turned, rotation=quarter @ camera.rotation, translation=quarter @ camera.translation
+    )
+
+
+def _roll(draft, rng, angle):
+    name = some(draft, rng)
+    camera = draft.cameras[name]
+    draft.cameras[name] = camera.looking(camera.center, target_of(draft), roll=angle)
+
+
+kinds(
+    "camera",
+    {"rolled_a_little": 0.15, "rolled_by_90": math.pi / 2, "upside_down": math.pi},
+    _roll,
+    phase=FILM,
+    harmless=True,
+)
+
+
+def _lens(draft, rng, distortion):
+    change(draft, rng, distortion=distortion)
+
+
+LENSES = {
+    "barrel_lens": (-0.15, 0.03, 0.0, 0.0, 0.0),
+    "pincushion_lens": (0.1, 0.0, 0.0, 0.0, 0.0),
+    "tangential_lens": (-0.05, 0.0, 0.002, -0.001, 0.0),
+    "sixth_order_lens": (-0.2, 0.08, 0.0, 0.0, -0.02),
+}
+kinds("camera", LENSES, _lens, phase=FILM, base="given", harmless=True)
+kinds(
+    "camera",
+    {
+        **{f"clicked_{name}": lens for name, lens in LENSES.items()},
+        "folding_lens": (-0.9, 0.0, 0.0, 0.0, 0.0),
+        "strong_lens": (-0.5, 0.3, 0.0, 0.0, -0.1),
+    },
+    _lens,
+    phase=FILM,
+)
+
+
+def _focal(draft, rng, factor):
+    name = some(draft, rng)
+    camera = draft.cameras[name]
+    draft.cameras[name] = replace(camera, focal=tuple(np.multiply(camera.focal, factor).tolist()))
+
+
+kinds(
+    "camera", {"wide_lens": 0.6, "long_lens": 1.4, "oblong_pixels": (1.0, 1.03)}, _focal, phase=FILM
+)
+
+
+@kind("camera", phase=FILM)
+def off_center_image(draft, rng):
+    change(draft, rng, principal=(959.5 + 192.0, 539.5 - 162.0))
+
+
+def _place(draft, rng, place):
+    name = some(draft, rng)
+    middle = target_of(draft)
+    camera = draft.cameras[name]
+    way = (camera.center - middle)[:2] / np.linalg.norm((camera.center - middle)[:2])
+    out, height, aim = place
+    center = [*(middle[:2] + out * way), height]
+    looked_at = middle + [*(aim * np.array([-way[1], way[0]])), 0.0]
+    draft.cameras[name] = camera.looking(center, looked_at)
+
+
+kinds(
+    "camera",
+    {
+        "at_eye_level": (25.0, 1.6, 0.0),
+        "under_the_roof": (40.0, 40.0, 0.0),
+        "among_the_people": (4.0, 1.7, 0.0),
+        "underground": (25.0, -3.0, 0.0),
+        "far_away": (200.0, 30.0, 0.0),
+        "looking_away": (25.0, 10.0, 500.0),
+        "overhead": (0.5, 25.0, 0.0),
+        "inside_a_person": (0.1, 1.0, 1.0),
+    },
+    _place,
+    phase=FILM,
+)
+
+
+def _count(draft, rng, count):
+    names = list(draft.cameras)
+    for name in names[count:]:
+        remove(draft, name)
+    middle = target_of(draft)
+    while len(draft.cameras) < count:
+        angle = rng.uniform(0, 2 * math.pi)
+        place = middle + [28 * math.cos(angle), 28 * math.sin(angle), rng.uniform(8, 14)]
+        put(draft, f"more{len(draft.cameras)}", draft.cameras[names[0]].looking(place, middle))
+
+
+kinds("camera", {"three_cameras": 3, "six_cameras": 6}, _count, phase=FILM, harmless=True)
+kinds("camera", {"one_camera": 1, "two_cameras": 2, "sixteen_cameras": 16}, _count, phase=FILM)
+
+
+@kind("camera", phase=FILM)
+def two_cameras_at_one_place(draft, rng):
+    put(draft, "twin", draft.cameras[some(draft, rng)])
+
+
+@kind("camera", phase=FILM)
+def all_cameras_on_one_side(draft, rng):
+    middle = target_of(draft)
+    for n, name in enumerate(list(draft.cameras)):
+        place = middle + [0.5 * n - 1.0, -28.0, 10.0]
+        draft.cameras[name] = draft.cameras[name].looking(place, middle)
+
+
+@kind("camera", phase=FILM)
+def mirrored_images(draft, rng):
+    name = some(draft, rng)
+    camera = draft.cameras[name]
+
+    class Mirrored(Camera):
+        def pixels(self, points):
+            found = super().pixels(points)
+            found[..., 0] = self.width - 1 - found[..., 0]
+            return found
+
+    draft.cameras[name] = Mirrored(**vars(camera))
+
+
+# ------------------------------------------------------------------------- calibration.toml
+
+
+def one_table(draft, rng):
+    return draft.given[str(rng.choice(list(draft.given)))]
+
+
+def tables(draft, rng, all_of_them):
+    return list(draft.given.values()) if all_of_them else [one_table(draft, rng)]
+
+
+def _lens_order(draft, rng, how):
+    order, all_of_them = how
+    for table in tables(draft, rng, all_of_them):
+        table["distortions"] = [table["distortions"][i] for i in order]
+
+
+kinds(
+    "toml",
+    {
+        "one_lens_in_another_order": ((0, 1, 4, 2, 3), False),
+        "all_lenses_in_another_order": ((0, 1, 4, 2, 3), True),
+        "lenses_backwards": ((4, 3, 2, 1, 0), True),
+    },
+    _lens_order,
+    base="given",
+)
+
+
+def _scaled_entry(draft, rng, how):
+    key, factor, all_of_them = how
+    for table in tables(draft, rng, all_of_them):
+        table[key] = np.multiply(table[key], factor).tolist()
+
+
+kinds(
+    "toml",
+    {
+        "one_camera_in_millimetres": ("translation", 1000.0, False),
+        "all_cameras_in_millimetres": ("translation", 1000.0, True),
+        "all_cameras_in_centimetres": ("translation", 100.0, True),
+        "all_cameras_in_kilometres": ("translation", 1e-3, True),
+        "all_cameras_in_yards": ("translation", 1.0936, True),
+        "one_rotation_in_degrees": ("rotation", 57.29577951, False),
+        "all_rotations_in_degrees": ("rotation", 57.29577951, True),
+        "one_inverse_rotation": ("rotation", -1.0, False),
+        "all_inverse_rotations": ("rotation", -1.0, True),
+        "one_inverse_translation": ("translation", -1.0, False),
+    },
+    _scaled_entry,
+    base="given",
+)
+
+
+def _focal_entry(draft, rng, how):
+    factor, all_of_them = how
+    for table in tables(draft, rng, all_of_them):
+        for axis in (0, 1):
+            table["matrix"][axis][axis] *= factor
+
+
+kinds(
+    "toml",
+    {
+        "one_focal_10_percent_long": (1.1, False),
+        "one_focal_10_percent_short": (0.9, False),
+        "all_focals_10_percent_long": (1.1, True),
+        "one_focal_in_millimetres": (0.0055, False),
+        "one_focal_of_nothing": (1e-12, False),
+        "one_huge_focal": (1e5, False),
+        "one_negative_focal": (-1.0, False),
+        "zero_focal": (0.0, False),
+        "one_infinite_focal": (math.inf, False),
+        "one_missing_focal": (math.nan, False),
+    },
+    _focal_entry,
+    base="given",
+)
+
+
+def _entry(draft, rng, how):
+    key, value = how
+    table = one_table(draft, rng)
+    table[key] = value(table[key]) if callable(value) else value
+
+
+kinds(
+    "toml",
+    {
+        "rotation_of_text": ("rotation", "north"),
+        "rotation_missing_a_number": ("rotation", lambda r: r[:2]),
+        "rotation_as_quaternion": ("rotation", lambda r: [1.0, *r]),
+        "rotation_beyond_numbers": ("rotation", [1e200, 0.0, 0.0]),
+        "huge_rotation": ("rotation", [1e8, 2e8, 3e8]),
+        "no_rotation": ("rotation", [0.0, 0.0, 0.0]),
+        "translation_of_nan": ("translation", "raw:[nan, 0.0, 1.0]"),
+        "translation_of_infinity": ("translation", "raw:[inf, 0.0, 1.0]"),
+        "huge_translation": ("translation", [1e9, 0.0, 0.0]),
+        "huge_whole_translation": ("translation", "raw:[" + "9" * 400 + ", 0, 1]"),
+        "translation_of_text": ("translation", ["1.0", "2.0", "3.0"]),
+        "translation_of_truth": ("translation", [True, False, True]),
+        "size_swapped": ("size", lambda s: s[::-1]),
+        "size_of_zero": ("size", [0, 0]),
+        "size_of_fractions": ("size", [1920.5, 1080.5]),
+        "huge_size": ("size", [10**12, 10**12]),
+        "matrix_transposed": ("matrix", lambda m: np.transpose(m).tolist()),
+        "matrix_of_four": ("matrix", lambda m: [m[0][0], m[1][1], m[0][2], m[1][2]]),
+        "matrix_with_skew": ("matrix", lambda m: [[m[0][0], 5.0, m[0][2]], m[1], m[2]]),
+        "ragged_matrix": ("matrix", lambda m: [m[0], m[1][:2], m[2]]),
+        "empty_matrix": ("matrix", []),
+        "principal_point_swapped": (
+            "matrix",
+            lambda m: [[m[0][0], 0.0, m[1][2]], [0.0, m[1][1], m[0][2]], m[2]],
+        ),
+        "principal_point_far_outside": (
+            "matrix",
+            lambda m: [[m[0][0], 0.0, 1e7], [0.0, m[1][1], 1e7], m[2]],
+        ),
+        "lens_of_six": ("distortions", [0.1] * 6),
+        "lens_of_fisheye": ("fisheye", True),
+        "lens_of_eight": ("distortions", lambda d: [*d, 0.3, 0.2, 0.1]),
+        "huge_lens": ("distortions", [1e8, -1e8, 0.0, 0.0, 1e8]),
+        "lens_of_one": ("distortions", [1.0, 1.0, 1.0, 1.0, 1.0]),
+        "name_with_umlaut": ("name", "Kamera ä"),
+        "name_of_another_camera": ("name", "somebody"),
+        "name_that_climbs": ("name", "../cam0"),
+        "name_that_is_empty": ("name", ""),
+        "name_that_is_a_number": ("name", 3),
+        "name_that_is_a_list": ("name", ["cam0"]),
+    },
+    _entry,
+    base="given",
+)
+kinds(
+    "toml",
+    {
+        "lens_of_four": ("distortions", lambda d: d[:4]),
+        "lens_of_eight_with_zeros": ("distortions", lambda d: [*d, 0.0, 0.0, 0.0]),
+        "translation_as_column": ("translation", lambda t: [[v] for v in t]),
+        "rotation_of_six_decimals": ("rotation", lambda r: np.round(r, 6).tolist()),
+        "rotation_as_matrix": ("rotation", lambda r: cv2.Rodrigues(np.array(r))[0].tolist()),
+        "rounded_matrix": (
+            "rotation",
+            lambda r: np.round(cv2.Rodrigues(np.array(r))[0], 5).tolist(),
+        ),
+        "further_keys": ("error", 0.3),
+    },
+    _entry,
+    base="given",
+    harmless=True,
+)
+
+
+@kind("toml", base="given")
+def rotation_transposed_as_matrix(draft, rng):
+    table = one_table(draft, rng)
+    table["rotation"] = cv2.Rodrigues(np.array(table["rotation"]))[0].T.tolist()
+
+
+@kind("toml", base="given")
+def mirrored_rotation(draft, rng):
+    table = one_table(draft, rng)
+    turned = cv2.Rodrigues(np.array(table["rotation"]))[0]
+    turned[0] *= -1
+    table["rotation"] = turned.tolist()
+
+
+@kind("toml", base="given")
+def places_instead_of_translations(draft, rng):
+    for table, camera in zip(draft.given.values(), draft.cameras.values(), strict=False):
+        table["translation"] = camera.center.tolist()
+
+
+@kind("toml", base="given")
+def axes_of_opengl(draft, rng):
+    flip = np.diag([1.0, -1.0, -1.0])
+    for table in draft.given.values():
+        turned = flip @ cv2.Rodrigues(np.array(table["rotation"]))[0]
+        table["rotation"] = turned.tolist()
+        table["translation"] = (flip @ table["translation"]).tolist()
+
+
+@kind("toml", base="given")
+def two_cameras_exchanged(draft, rng):
+    one, other = rng.choice(list(draft.given), 2, replace=False)
+    draft.given[one]["name"], draft.given[other]["name"] = (
+        draft.given[other]["name"],
+        draft.given[one]["name"],
+    )
+
+
+@kind("toml", base="given", harmless=True)
+def tables_in_another_order(draft, rng):
+    names = list(draft.given)
+    draft.given = {name: draft.given[name] for name in rng.permutation(names)}
+
+
+def _move_world(draft, rotation, shift):
+    """Every camera and truth in another world frame."""
+    for table in draft.given.values():
+        turned = cv2.Rodrigues(np.array(table["rotation"]))[0]
+        table["translation"] = (table["translation"] - turned @ rotation.T @ shift).tolist()
+        table["rotation"] = cv2.Rodrigues(turned @ rotation.T)[0].ravel().tolist()
+    draft.truth = draft.people @ rotation.T + shift
+
+
+@kind("toml", base="given", harmless=True)
+def world_100_km_off(draft, rng):
+    _move_world(draft, np.eye(3), np.array([6e4, 8e4, 150.0]))
+
+
+@kind("toml", base="given", harmless=True)
+def world_turned(draft, rng):
+    _move_world(draft, cv2.Rodrigues(np.array([0.0, 0.0, 1.1]))[0], np.array([3.0, -2.0, 0.0]))
+
+
+@kind("toml", base="given")
+def world_with_y_up(draft, rng):
+    _move_world(draft, cv2.Rodrigues(np.array([-math.pi / 2, 0.0, 0.0]))[0], np.zeros(3))
+
+
+@kind("toml", base="given")
+def calibration_of_one_camera_missing(draft, rng):
+    del draft.given[str(rng.choice(list(draft.given)))]
+
+
+@kind("toml", base="given")
+def calibration_of_a_further_camera(draft, rng):
+    draft.given["more"] = {**one_table(draft, rng), "name": "more"}
+
+
+@kind("toml", base="given")
+def calibration_twice(draft, rng):
+    draft.given["again"] = dict(one_table(draft, rng))
+
+
+@kind("toml", base="given")
+def calibration_without_a_key(draft, rng):
+    table = one_table(draft, rng)
+    del table[str(rng.choice(["size", "matrix", "distortions", "rotation", "translation"]))]
+
+
+# ------------------------------------------------------------------------------------ pitch
+
+
+def _pitch(draft, rng, content):
+    draft.pitch = content() if callable(content) else content
+
+
+def _surveyed(scale=1.0):
+    return {
+        name: [round(v * scale, 4) for v in place]
+        for name, place in law_points().items()
+        if name.startswith(("corner", "penalty_area"))
+    }
+
+
+kinds(
+    "pitch",
+    {
+        "standard_pitch_written_down": {"length": 105.0, "width": 68.0, "crown": 0.2},
+        "pitch_of_whole_numbers": {"length": 105, "width": 68},
+        "surveyed_points": lambda: {"points": _surveyed()},
+    },
+    _pitch,
+    base="clicked",
+    harmless=True,
+)
+kinds(
+    "pitch",
+    {
+        "pitch_in_millimetres": {"length": 105000.0, "width": 68000.0},
+        "pitch_in_centimetres": {"length": 10500.0, "width": 6800.0},
+        "pitch_in_yards": {"length": 114.8, "width": 74.4},
+        "pitch_in_feet": {"length": 344.5, "width": 223.1},
+        "pitch_swapped": {"length": 68.0, "width": 105.0},
+        "pitch_of_another_size": {"length": 100.0, "width": 64.0},
+        "huge_pitch": {"length": 1e9, "width": 68.0},
+        "wide_pitch": {"length": 105.0, "width": 1e9},
+        "pitch_beyond_numbers": {"length": 1e308, "width": 1e308},
+        "tiny_pitch": {"length": 10.0, "width": 6.0},
+        "pitch_of_zero": {"length": 0, "width": 0},
+        "negative_pitch": {"length": -105.0, "width": 68.0},
+        "pitch_of_text": {"length": "105 m", "width": 68.0},
+        "crown_of_50_m": {"crown": 50.0},
+        "crown_in_millimetres": {"crown": 200.0},
+        "negative_crown": {"crown": -0.2},
+        "no_crown": {"crown": 0.0},
+        "pitch_with_a_typo": {"lenght": 105.0},
+        "pitch_as_list": [105.0, 68.0],
+        "surveyed_in_millimetres": lambda: {"points": _surveyed(1000.0)},
+        "surveyed_mirrored": lambda: {
+            "points": {name: [-x, y, z] for name, (x, y, z) in _surveyed().items()}
+        },
+        "surveyed_point_5_m_off": {"points": {"corner_left_near": [-47.5, -34.0, 0.0]}},
+        "surveyed_point_1000_km_off": {"points": {"corner_left_near": [1e6, -34.0, 0.0]}},
+        "surveyed_points_all_one": lambda: {
+            "points": {name: [0.0, 0.0, 0.0] for name in _surveyed()}
+        },
+        "surveyed_in_two_numbers": {"points": {"corner_left_near": [-52.5, -34.0]}},
+        "line_to_nowhere": {"lines": {"x": {"start": "corner_left_near", "end": "moon"}}},
+        "line_of_one_point": {
+            "lines": {"touch_line_near": {"start": "center_mark", "end": "center_mark"}}
+        },
+        "arc_in_degrees": {
+            "arcs": {
+                "x": {"center": "center_mark", "radius": 9.15, "start_angle": 0, "end_angle": 360}
+            }
+        },
+        "huge_arc": {
+            "arcs": {
+                "x": {"center": "center_mark", "radius": 1e9, "start_angle": 0, "end_angle": 6.28}
+            }
+        },
+        "ten_thousand_arcs": lambda: {
+            "arcs": {
+                f"a{n}": {
+                    "center": "center_mark",
+                    "radius": 9.0,
+                    "start_angle": 0.0,
+                    "end_angle": 6.0,
+                }
+                for n in range(10000)
+            }
+        },
+        "pitch_of_contract_2": {"contract": 2},
+    },
+    _pitch,
+    base="clicked",
+)
+
+
+@kind("pitch", base="clicked")
+def pitch_named_and_missing(draft, rng):
+    draft.spec["pitch"] = "stadium.json"
+
+
+@kind("pitch", base="clicked")
+def no_pitch_but_clicks(draft, rng):
+    draft.spec["pitch"] = "none"
+
+
+@kind("pitch", base="clicked")
+def pitch_that_climbs(draft, rng):
+    draft.spec["pitch"] = "../../etc/passwd"
+
+
+@kind("pitch", base="given")
+def pitch_beside_none(draft, rng):
+    draft.pitch = {"length": 105.0, "width": 68.0}

@@ -1,0 +1,373 @@
+"""A small match of its own making: stick people who walk, cameras, clicks, and the folder of it.
+
+Nothing here comes from the project's simulator: people are sticks, the pitch's points are written
+down from the Laws of the Game, and OpenCV projects. A case mutates a `Draft` and writes it.
+"""
+
+import io
+import json
+import math
+import zipfile
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+import yaml
+
+FPS = 25.0
+FRAMES = 10
+COCO_JOINTS = 17
+
+
+@dataclass
+class Camera:
+    """A camera as it films: OpenCV's model, x_cam = R x_world + t, lengths in metres and pixels."""
+
+    width: int
+    height: int
+    focal: tuple
+    principal: tuple
+    distortion: tuple
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    @property
+    def center(self):
+        return -self.rotation.T @ self.translation
+
+    @property
+    def matrix(self):
+        (fx, fy), (cx, cy) = self.focal, self.principal
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    def pixels(self, points):
+        """Pixels (..., 2) of world points (..., 3); NaN behind the camera and outside the image."""
+        flat = np.reshape(np.asarray(points, dtype=float), (-1, 3))
+        depth = flat @ self.rotation[2] + self.translation[2]
+        rvec = cv2.Rodrigues(self.rotation)[0]
+        found, _ = cv2.projectPoints(
+            flat[:, None], rvec, self.translation, self.matrix, np.array(self.distortion)
+        )
+        found = found[:, 0]
+        # Beyond the field of view a polynomial lens folds points back into the image.
+        plain = (flat @ self.rotation.T + self.translation)[:, :2] / depth[:, None]
+        edge = np.array([self.width, self.height]) / (2.0 * np.array(self.focal))
+        seen = (depth > 0.5) & (np.abs(plain) < 1.5 * edge + 0.2).all(axis=1)
+        seen &= (found >= 0).all(axis=1) & (found < [self.width, self.height]).all(axis=1)
+        found[~seen] = np.nan
+        return found.reshape(*np.shape(points)[:-1], 2)
+
+    def looking(self, center, target, roll=0.0):
+        """The same camera at another place."""
+        forward = np.subtract(target, center) / np.linalg.norm(np.subtract(target, center))
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        down = np.cross(forward, right)
+        turn = np.array(
+            [
+                [math.cos(roll), math.sin(roll), 0.0],
+                [-math.sin(roll), math.cos(roll), 0.0],
+                [0.0, 0.0, 1.0],
+            ]
+        )
+        rotation = turn @ np.array([right, down, forward])
+        return replace(self, rotation=rotation, translation=-rotation @ np.asarray(center, float))
+
+
+def law_points(length=105.0, width=68.0, crown=0.2):
+    """Named points of a pitch (x, y, z) [m], as the Laws of the Game lay them out."""
+    flat = {"center_mark": (0.0, 0.0)}
+    for end, up in (("near", -1), ("far", 1)):
+        flat[f"halfway_{end}"] = (0.0, up * width / 2)
+        flat[f"center_circle_{end}"] = (0.0, up * 9.15)
+        for side, out in (("left", -1), ("right", 1)):
+            goal = out * length / 2
+            flat[f"corner_{side}_{end}"] = (goal, up * width / 2)
+            flat[f"penalty_area_{side}_{end}_back"] = (goal, up * 20.16)
+            flat[f"penalty_area_{side}_{end}_front"] = (goal - out * 16.5, up * 20.16)
+            flat[f"goal_area_{side}_{end}_back"] = (goal, up * 9.16)
+            flat[f"goal_area_{side}_{end}_front"] = (goal - out * 5.5, up * 9.16)
+            across = math.sqrt(9.15**2 - 5.5**2)
+            flat[f"penalty_arc_{side}_{end}"] = (goal - out * 16.5, up * across)
+            flat[f"penalty_mark_{side}"] = (goal - out * 11.0, 0.0)
+    return {name: (x, y, -crown * (2 * y / width) ** 2) for name, (x, y) in flat.items()}
+
+
+LINES = {
+    "touch_line_near": ("corner_left_near", "corner_right_near"),
+    "touch_line_far": ("corner_left_far", "corner_right_far"),
+    "goal_line_left": ("corner_left_near", "corner_left_far"),
+    "goal_line_right": ("corner_right_near", "corner_right_far"),
+    "halfway_line": ("halfway_near", "halfway_far"),
+}
+
+
+def walking(start, heading, height, seconds, phase):
+    """COCO-17 joints (frames, 17, 3) [m] of sticks that walk at 1.4 m/s, above z = 0."""
+    size = height / 1.75
+    t = np.asarray(seconds, dtype=float)
+    ahead = np.array([math.cos(heading), math.sin(heading), 0.0])
+    left = np.array([-math.sin(heading), math.cos(heading), 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+    root = np.array([*start, 0.0]) + 1.4 * t[:, None] * ahead
+
+    def at(forward, sideways, above):
+        forward, sideways, above = np.broadcast_arrays(forward, sideways, above, t)[:3]
+        parts = zip((forward, sideways, above), (ahead, left, up), strict=True)
+        return root + size * sum(value[:, None] * axis for value, axis in parts)
+
+    joints = np.zeros((len(t), COCO_JOINTS, 3))
+    places = [(0.11, 0.0, 1.60), (0.09, 0.03, 1.64), (0.09, -0.03, 1.64)]
+    places += [(0.0, 0.075, 1.62), (0.0, -0.075, 1.62)]
+    for joint, place in enumerate(places):
+        joints[:, joint] = at(*place)
+    swing = 0.45 * np.sin(2 * math.pi * 0.95 * t + phase)
+    for side, sign in ((0, 1.0), (1, -1.0)):
+        arm, leg = -sign * swing, sign * swing
+        joints[:, 5 + side] = at(0.0, sign * 0.19, 1.43)
+        elbow = (0.29 * np.sin(arm), sign * 0.22, 1.43 - 0.29 * np.cos(arm))
+        joints[:, 7 + side] = at(*elbow)
+        joints[:, 9 + side] = at(
+            elbow[0] + 0.25 * np.sin(arm + 0.3), sign * 0.22, elbow[2] - 0.25 * np.cos(arm + 0.3)
+        )
+        joints[:, 11 + side] = at(0.0, sign * 0.12, 0.94)
+        knee = (0.43 * np.sin(leg), sign * 0.11, 0.94 - 0.43 * np.cos(leg))
+        joints[:, 13 + side] = at(*knee)
+        bend = leg - np.clip(0.5 - leg, 0.0, 0.6)
+        joints[:, 15 + side] = at(
+            knee[0] + 0.41 * np.sin(bend), sign * 0.11, knee[2] - 0.41 * np.cos(bend)
+        )
+    return joints
+
+
+@dataclass
+class Draft:
+    """A match before it is written; kinds change it.
+
+    Attributes:
+        cameras: as they film, by id.
+        people: truth (frames, people, 17, 3) [m], world.
+        spec: content of match.yaml.
+        given: tables of calibration.toml by camera; None where cameras are clicked.
+        clicks: content of each camera's annotations.
+        seen: arrays of each camera's detections.
+        pitch: content of pitch.json, if any.
+        coco: write detections as COCO results.
+        overrides: settings as `--set` takes them.
+        truth: the people again where a kind moves the world; None where no truth is known.
+        after: functions of the written folder that spoil its files.
+    """
+
+    cameras: dict
+    people: np.ndarray
+    spec: dict
+    given: dict | None = None
+    clicks: dict = field(default_factory=dict)
+    seen: dict = field(default_factory=dict)
+    pitch: dict | None = None
+    coco: bool = False
+    overrides: list = field(default_factory=list)
+    truth: np.ndarray | None = None
+    after: list = field(default_factory=list)
+    click_noise: float = 0.6
+    pixel_noise: float = 1.0
+
+    def camera_spec(self, name):
+        return next(each for each in self.spec["cameras"] if each.get("id") == name)
+
+
+def new_draft(rng, is_clicked):
+    """A good match: four cameras around a penalty area or the centre, three people."""
+    middle = np.array([rng.choice([-40.0, 0.0, 40.0]), rng.uniform(-6, 6), 0.9])
+    cameras = {}
+    turn = rng.uniform(0, 2 * math.pi)
+    for n in range(4):
+        angle = turn + n * math.pi / 2 + rng.uniform(-0.3, 0.3)
+        distance = rng.uniform(24, 34)
+        above = rng.uniform(9, 15)
+        place = middle + [distance * math.cos(angle), distance * math.sin(angle), above]
+        focal = rng.uniform(900, 1200)
+        plain = Camera(
+            *(1920, 1080, (focal, focal), (959.5, 539.5), (-0.05, 0.01, 0.0, 0.0, 0.0)),
+            *(np.eye(3), np.zeros(3)),
+        )
+        cameras[f"cam{n}"] = plain.looking(place, middle + [*rng.uniform(-2, 2, 2), 0.0])
+    seconds = np.arange(FRAMES) / FPS
+    starts = [
+        middle[:2] + [3.0 * math.cos(a), 3.0 * math.sin(a)] for a in turn + np.arange(3) * 2.1
+    ]
+    people = [
+        walking(start, rng.uniform(0, 6.28), rng.uniform(1.65, 1.95), seconds, rng.uniform(0, 6.28))
+        for start in starts
+    ]
+    spec = {
+        "contract": 1,
+        "match_id": "fuzz",
+        "fps": FPS,
+        "cameras": [
+            {"id": name, "width": camera.width, "height": camera.height}
+            for name, camera in cameras.items()
+        ],
+        "clips": [{"id": "clip", "first_frame": 0, "frame_count": FRAMES}],
+    }
+    people = np.stack(people, axis=1)
+    people[..., 2] -= 0.2 * (people[..., 1] / 34.0) ** 2  # they stand on the crown
+    draft = Draft(cameras, people, spec, truth=people)
+    if not is_clicked:
+        draft.spec["pitch"] = "none"
+        draft.given = {}
+    return draft
+
+
+def film(draft, rng):
+    """Fill in clicks or given cameras, and detections, from what the cameras see."""
+    for number, (name, camera) in enumerate(draft.cameras.items()):
+        draft.camera_spec(name).update(width=camera.width, height=camera.height)
+        draft.seen[name] = detections_of(draft, camera, rng)
+        if draft.given is not None:
+            draft.given[f"table{number}"] = {
+                "name": name,
+                "size": [camera.width, camera.height],
+                "matrix": camera.matrix.tolist(),
+                "distortions": list(camera.distortion),
+                "rotation": cv2.Rodrigues(camera.rotation)[0].ravel().tolist(),
+                "translation": camera.translation.tolist(),
+            }
+            continue
+        points = law_points()
+        pixels = camera.pixels(list(points.values()))
+        found = pixels + rng.normal(0, draft.click_noise, pixels.shape)
+        inside = (found > 2).all(axis=1) & (found < [camera.width - 2, camera.height - 2]).all(
+            axis=1
+        )
+        draft.clicks[name] = {
+            "points": [
+                {"name": point, "xy": [round(float(v), 2) for v in xy]}
+                for point, xy, kept in zip(points, found, inside, strict=True)
+                if kept
+            ],
+            "drawn": [],
+        }
+
+
+def detections_of(draft, camera, rng):
+    """What a detector finds of the people: pixels with noise, in no stated order."""
+    frames, count = draft.people.shape[:2]
+    order = np.array([rng.permutation(count) for _ in range(frames)])
+    pixels = camera.pixels(draft.people) + rng.normal(
+        0, draft.pixel_noise, (frames, count, COCO_JOINTS, 2)
+    )
+    pixels = np.take_along_axis(pixels, order[:, :, None, None], axis=1)
+    confidence = rng.uniform(0.45, 0.95, pixels.shape[:-1])
+    seen = np.isfinite(pixels).all(axis=-1)
+    few = seen.sum(axis=-1) < 6
+    pixels[~seen | few[..., None]] = np.nan
+    confidence[np.isnan(pixels[..., 0])] = np.nan
+    with np.errstate(invalid="ignore"):
+        gone = np.where(few[..., None], np.nan, 0.0)
+        low = np.where(np.isnan(pixels), np.inf, pixels).min(axis=2) - 8 + gone
+        high = np.where(np.isnan(pixels), -np.inf, pixels).max(axis=2) + 8 + gone
+    return {
+        "frame": np.arange(frames),
+        "keypoints": pixels,
+        "confidence": confidence,
+        "boxes": np.concatenate([low, high], axis=-1),
+        "score": np.where(few, np.nan, rng.uniform(0.6, 0.99, (frames, count))),
+    }
+
+
+def drawn_line(draft, camera, name, count, rng, noise=0.6):
+    """Pixels along a line of the pitch as a camera sees it; empty where it is out of view."""
+    points = law_points()
+    start, end = (np.array(points[each]) for each in LINES[name])
+    along = start + np.linspace(0, 1, 400)[:, None] * (end - start)
+    along[:, 2] = -0.2 * (along[:, 1] / 34.0) ** 2
+    pixels = camera.pixels(along)
+    pixels = pixels[np.isfinite(pixels).all(axis=1)]
+    if len(pixels) < 2:
+        return []
+    chosen = pixels[np.linspace(0, len(pixels) - 1, count).round().astype(int)]
+    chosen = chosen + rng.normal(0, noise, chosen.shape)
+    return np.clip(chosen, 0, [camera.width - 1, camera.height - 1]).round(2).tolist()
+
+
+def write(draft, folder):
+    """Write the match folder; nothing is checked."""
+    folder.mkdir(parents=True)
+    (folder / "match.yaml").write_text(
+        yaml.safe_dump(draft.spec, sort_keys=False, allow_unicode=True)
+    )
+    if draft.given is not None:
+        (folder / "calibration.toml").write_text(toml_text(draft.given))
+    if draft.pitch is not None:
+        (folder / "pitch.json").write_text(json.dumps(draft.pitch))
+    annotations = folder / "annotations" / "static_calibration"
+    for name, content in draft.clicks.items():
+        annotations.mkdir(parents=True, exist_ok=True)
+        (annotations / f"{name}.json").write_text(json.dumps(content))
+    (folder / "detections").mkdir()
+    for name, arrays in draft.seen.items():
+        if draft.coco:
+            content = json.dumps(coco_results(arrays))
+            (folder / "detections" / f"{name}.json").write_text(content)
+        else:
+            (folder / "detections" / f"{name}.npz").write_bytes(npz_bytes(arrays))
+    for spoil in draft.after:
+        spoil(folder)
+
+
+def npz_bytes(arrays, compression=zipfile.ZIP_STORED):
+    """The arrays as an npz file; values that are not arrays are stored as bytes."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", compression) as file:
+        for name, values in arrays.items():
+            content = values
+            if not isinstance(values, bytes):
+                kept = values.dtype if values.dtype.kind not in "fi" else None
+                if kept is None and values.dtype in (np.float64, np.int64):
+                    kept = "<i8" if name == "frame" else "<f4"
+                form = io.BytesIO()
+                np.lib.format.write_array(
+                    form, np.asarray(values, dtype=kept or values.dtype), version=(1, 0)
+                )
+                content = form.getvalue()
+            file.writestr(f"{name}.npy", content)
+    return packed.getvalue()
+
+
+def coco_results(arrays):
+    """The same people as COCO keypoint results."""
+    results = []
+    for row, frame in enumerate(arrays["frame"]):
+        for person in range(arrays["score"].shape[1]):
+            keypoints, confidence = (
+                arrays["keypoints"][row, person],
+                arrays["confidence"][row, person],
+            )
+            if not np.isfinite(confidence).any():
+                continue
+            triples = np.column_stack([keypoints, confidence])
+            x0, y0, x1, y1 = arrays["boxes"][row, person]
+            results.append(
+                {
+                    "image_id": int(frame),
+                    "category_id": 1,
+                    "keypoints": np.nan_to_num(triples).ravel().round(3).tolist(),
+                    "bbox": [round(float(v), 2) for v in (x0, y0, x1 - x0, y1 - y0)],
+                    "score": float(arrays["score"][row, person]),
+                }
+            )
+    return results
+
+
+def toml_text(tables):
+    """Tables of plain values as TOML; a value that is a string starting with `raw:` stays as is."""
+    lines = []
+    for key, table in tables.items():
+        lines.append(
+            f"[{key}]" if all(c.isalnum() or c in "_-" for c in key) else f"[{json.dumps(key)}]"
+        )
+        for name, value in table.items():
+            raw = isinstance(value, str) and value.startswith("raw:")
+            lines.append(f"{name} = {value[4:] if raw else json.dumps(value)}")
+    return "\n".join(lines).replace("NaN", "nan").replace("Infinity", "inf") + "\n"

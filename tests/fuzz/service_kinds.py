@@ -1,0 +1,536 @@
+"""Damage to a store, and requests to the review pages that no page of ours sends."""
+
+import json
+import re
+import shutil
+
+import numpy as np
+
+from .file_kinds import SPOILS, TEXTUAL
+from .kinds import kinds
+from .people_kinds import one
+
+MATCH = "fuzz"
+TOKEN = "a-token-of-twenty-four.."
+HERE = "http://127.0.0.1:8571"
+
+
+class Project:
+    """A finished project, copied to be spoilt, and what is asked of its pages.
+
+    Attributes:
+        root: the store.
+        folder: the match folder.
+        asked: requests, each method, path and keywords.
+    """
+
+    def __init__(self, template, work):
+        self.root, self.folder = work / "project", work / "match"
+        shutil.copytree(template / "project", self.root)
+        shutil.copytree(template / "match", self.folder)
+        for file in (self.root / "matches").glob("*.json"):
+            _move(file, str(template / "match"), str(self.folder))
+        self.asked = []
+        self.truth = None
+
+    def files(self, pattern):
+        return sorted(path for path in self.root.glob(pattern) if path.is_file())
+
+
+def _move(file, old, new):
+    """The registration of a copied match names the copy."""
+    from data_contracts.match import Registration
+    from worldpose.store.documents import seal, unseal
+
+    known = unseal(Registration, file.read_bytes(), str(file))
+    file.write_bytes(seal(known.model_copy(update={"folder": known.folder.replace(old, new)})))
+
+
+# -------------------------------------------------------------------------------------- store
+
+PLACES = {
+    "record": "runs/*/0001.json",
+    "registration": "matches/*.json",
+    "project": "project.json",
+    "manifest": "results/*/*/*/*/manifest.json",
+    "chunk": "results/*/*/*/*/**/c/**",
+    "group": "results/*/*/*/*/**/zarr.json",
+    "journal": "reviews/*/*.json",
+}
+
+
+def _store_file(project, rng, how):
+    pattern, change = how
+    files = project.files(pattern)
+    if files:
+        file = one(rng, files)
+        file.write_bytes(change(file.read_bytes() or b"x", rng))
+
+
+for place, pattern in PLACES.items():
+    kinds(
+        "store",
+        {
+            f"{place}_{label}": (pattern, SPOILS[label])
+            for label in SPOILS
+            if not any(word in label for word in (*TEXTUAL, "nested", "10_mb", "bom", "crlf"))
+        },
+        _store_file,
+        base="stored",
+    )
+
+
+def _store_lost(project, rng, pattern):
+    files = project.files(pattern)
+    if files:
+        one(rng, files).unlink()
+
+
+kinds(
+    "store",
+    {f"{place}_lost": pattern for place, pattern in PLACES.items()},
+    _store_lost,
+    base="stored",
+)
+
+FOREIGN = (
+    ".x.json",
+    ".DS_Store",
+    "._0001.json",
+    "backup.json",
+    "0001 (copy).json",
+    "Thumbs.db",
+    "ä.json",
+)
+
+
+def _foreign(project, rng, place):
+    folder = project.root / place
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / one(rng, FOREIGN)).write_bytes(one(rng, [b"", b"{}", b"\0\1"]))
+
+
+kinds(
+    "store",
+    {
+        f"foreign_file_in_{place.replace('/', '_') or 'the_project'}": place
+        for place in (
+            *("", "matches", "runs", f"runs/{MATCH}", "results", f"results/{MATCH}"),
+            *("reviews", f"reviews/{MATCH}", "pins", f"pins/{MATCH}", "staging"),
+        )
+    },
+    _foreign,
+    base="stored",
+)
+
+
+def _store_act(project, rng, act):
+    act(project)
+
+
+def _rename(project, old, new):
+    if (project.root / old).exists():
+        (project.root / old).rename(project.root / new)
+
+
+kinds(
+    "store",
+    {
+        "results_lost": lambda p: shutil.rmtree(p.root / "results"),
+        "runs_lost": lambda p: shutil.rmtree(p.root / "runs"),
+        "staging_left": lambda p: (p.root / "staging" / "dead" / "c").mkdir(parents=True),
+        "match_under_another_name": lambda p: _rename(p, f"matches/{MATCH}.json", "matches/b.json"),
+        "results_are_a_file": lambda p: (
+            shutil.rmtree(p.root / "results"),
+            (p.root / "results").write_text("x"),
+        ),
+        "reservation_of_the_dead": lambda p: (p.root / f"runs/{MATCH}/0002.open.json").write_text(
+            "{}"
+        ),
+        "reservation_empty": lambda p: (p.root / f"runs/{MATCH}/0007.open.json").write_bytes(b""),
+        "record_of_huge_number": lambda p: shutil.copy(
+            p.root / f"runs/{MATCH}/0001.json", p.root / f"runs/{MATCH}/{'9' * 40}.json"
+        ),
+        "record_is_a_folder": lambda p: (p.root / f"runs/{MATCH}/0002.json").mkdir(),
+        "registration_is_a_folder": lambda p: (p.root / "matches/b.json").mkdir(),
+        "record_links_to_itself": lambda p: (p.root / f"runs/{MATCH}/0002.json").symlink_to(
+            "0002.json"
+        ),
+        "match_folder_lost": lambda p: shutil.rmtree(p.folder),
+        "match_folder_is_a_file": lambda p: (shutil.rmtree(p.folder), p.folder.write_text("x")),
+        "match_yaml_lost": lambda p: (p.folder / "match.yaml").unlink(),
+        "match_yaml_of_another_match": lambda p: (p.folder / "match.yaml").write_text(
+            (p.folder / "match.yaml").read_text().replace("fuzz", "other")
+        ),
+        "project_of_a_later_format": lambda p: (p.root / "project.json").write_text(
+            '{"checksum": "' + "0" * 64 + '", "contract": 9}'
+        ),
+    },
+    _store_act,
+    base="stored",
+)
+
+
+def use_store(project):
+    """Everything that reads a project, as the command line does it: exceptions by command."""
+    from flows.cli.project import _match_status
+    from flows.registering import open_match
+    from flows.review import reviews_of, warnings_of
+    from flows.run_record import latest_run
+    from worldpose.store import Store, open_run, plan_gc, repair, verify
+
+    from .judging import run_match
+
+    def status():
+        store = Store.open(str(project.root))
+        for match_id in store.matches():
+            _match_status(store, match_id)
+
+    def check():
+        verify(Store.open(str(project.root)), progress=lambda done, total: None)
+
+    def collect():
+        plan_gc(Store.open(str(project.root)))
+
+    def look():
+        store = Store.open(str(project.root))
+        match = open_match(store, MATCH)
+        warnings_of(match)
+        reviews_of(match, latest_run(store, MATCH))
+
+    def read():
+        run = open_run(str(project.root), MATCH)
+        for name in ("triangulation/clip", "body_fitting/clip"):
+            if name in run:
+                np.isfinite(run[name]["joints"].values).sum()
+
+    def mend():
+        store = Store.open(str(project.root))
+        repair(store, verify(store, progress=lambda done, total: None))
+
+    def again():
+        _, _, record, failures = run_match(project.folder, project.root, until="triangulation")
+        if failures:
+            raise failures[0][1]
+        assert record.state == "complete"
+
+    raised = []
+    for command in (status, check, collect, look, read, mend, again):
+        try:
+            command()
+        except Exception as error:
+            raised.append((command.__name__, error))
+    return raised
+
+
+# ------------------------------------------------------------------------------------ requests
+
+NAMES = {
+    "unknown": "nobody",
+    "empty": "%20",
+    "climbing": "..%2f..%2fetc%2fpasswd",
+    "of_unicode": "%E7%90%83",
+    "of_bad_utf8": "%ff%fe",
+    "of_nul": "a%00b",
+    "of_newlines": "a%0d%0aSet-Cookie:x",
+    "long": "x" * 4000,
+    "of_markup": "%3Cscript%3E",
+    "of_surrogate": "%ed%a0%80",
+    "with_a_leading_dot": ".x",
+    "of_spaces": "a%20b",
+}
+NUMBERS = {
+    "negative": "-1",
+    "huge": "9" * 30,
+    "very_long": "9" * 5000,
+    "fractional": "1.5",
+    "textual": "abc",
+    "nan": "nan",
+    "empty": "",
+    "beyond_the_clip": "100000",
+}
+DEEP = "[" * 50000 + "]" * 50000
+BODIES = {
+    "null": "null",
+    "list": "[]",
+    "mapping": "{}",
+    "text": '"x"',
+    "number": "1e400",
+    "nan": "NaN",
+    "not_json": "{",
+    "empty": "",
+    "deep": DEEP,
+    "bytes": b"\xff\xfe\x00",
+    "surrogate": '{"who": "\\ud800", "token": "\\ud800"}',
+    "token_surrogate": '{"who": "Ada", "token": "\\ud800"}',
+    "token_of_unicode": '{"who": "Ada", "token": "\u00e9\u4e16"}',
+    "login_of_number": '{"who": 7, "token": 8}',
+    "login_of_newlines": '{"who": "a\\nb\\u0000", "token": "' + TOKEN + '"}',
+    "large": '{"a": "' + "x" * 900_000 + '"}',
+    "too_large": '{"a": "' + "x" * 1_200_000 + '"}',
+    "points_of_unknown_name": '{"points": {"moon": [1, 2]}}',
+    "points_of_space": '{"points": {"a b": [1, 2]}}',
+    "points_of_surrogate": '{"points": {"\\ud800": [1, 2]}}',
+    "points_of_huge_number": '{"points": {"center_mark": [1e308, -1e308]}}',
+    "points_outside": '{"points": {"center_mark": [-9000, 20]}}',
+    "points_many": json.dumps({"points": {f"p{n}": [n, n] for n in range(250)}}),
+    "points_at_one_place": json.dumps(
+        {
+            "points": {
+                n: [5, 5]
+                for n in ("center_mark", "halfway_near", "halfway_far", "corner_left_near")
+            }
+        }
+    ),
+    "points_on_a_line": json.dumps(
+        {
+            "points": {
+                n: [k * 300, 500]
+                for k, n in enumerate(
+                    (
+                        "center_mark",
+                        "halfway_near",
+                        "halfway_far",
+                        "corner_left_near",
+                        "corner_right_far",
+                    )
+                )
+            }
+        }
+    ),
+    "drawn_many": json.dumps({"drawn": {"halfway_line": [[n % 1900, 5] for n in range(50000)]}}),
+    "drawn_empty": '{"drawn": {"halfway_line": []}}',
+    "refine": '{"points": {"center_mark": [5, 5]}, "refine": true}',
+    "edits_of_null": '{"edits": null}',
+    "edits_of_unknown_kind": '{"edits": [{"id": "x.000000000001", "edit": {"kind": "x"}}]}',
+    "edit_of_huge_frame": json.dumps(
+        {
+            "edits": [
+                {
+                    "id": "moved_keypoint.000000000001",
+                    "edit": {
+                        "kind": "moved_keypoint",
+                        "camera": "cam0",
+                        "frame": 10**30,
+                        "detection": 0,
+                        "joint": "nose",
+                        "xy": [1, 2],
+                    },
+                }
+            ]
+        }
+    ),
+    "edit_of_negative_detection": json.dumps(
+        {
+            "edits": [
+                {
+                    "id": "deleted_detection.000000000001",
+                    "edit": {
+                        "kind": "deleted_detection",
+                        "camera": "cam0",
+                        "frame": 0,
+                        "detection": -1,
+                    },
+                }
+            ]
+        }
+    ),
+    "edit_of_huge_detection": json.dumps(
+        {
+            "edits": [
+                {
+                    "id": "added_detection.000000000001",
+                    "edit": {
+                        "kind": "added_detection",
+                        "camera": "cam0",
+                        "frame": 0,
+                        "detection": 10**9,
+                        "box": [0, 0, 10, 10],
+                    },
+                }
+            ]
+        }
+    ),
+    "edit_of_unknown_camera": json.dumps(
+        {
+            "edits": [
+                {
+                    "id": "deleted_detection.000000000001",
+                    "edit": {
+                        "kind": "deleted_detection",
+                        "camera": "moon",
+                        "frame": 0,
+                        "detection": 0,
+                    },
+                }
+            ]
+        }
+    ),
+    "edit_of_huge_pixel": json.dumps(
+        {
+            "edits": [
+                {
+                    "id": "moved_point.000000000001",
+                    "edit": {
+                        "kind": "moved_point",
+                        "camera": "cam0",
+                        "marking": "center_mark",
+                        "xy": [1e300, 2],
+                    },
+                }
+            ]
+        }
+    ),
+    "edit_of_many_pixels": json.dumps(
+        {
+            "edits": [
+                {
+                    "id": "redrawn_marking.000000000001",
+                    "edit": {
+                        "kind": "redrawn_marking",
+                        "camera": "cam0",
+                        "marking": "halfway_line",
+                        "xy": [[n % 1900, 7] for n in range(40000)],
+                    },
+                }
+            ]
+        }
+    ),
+    "tracks_of_huge_ids": json.dumps(
+        {
+            "edits": [
+                {
+                    "id": "merged_tracks.000000000001",
+                    "edit": {"kind": "merged_tracks", "clip": "clip", "kept": 10**40, "merged": -1},
+                }
+            ]
+        }
+    ),
+    "accept_of_two": '{"at_least": 2}',
+    "accept_of_huge_frames": json.dumps({"people": [[10**30, 10**30]]}),
+    "verdict_of_nothing": '{"verdict": ""}',
+}
+TYPES = {
+    "text": "text/plain",
+    "form": "application/x-www-form-urlencoded",
+    "none": None,
+    "charset": "application/json; charset=utf-16",
+    "multipart": "multipart/form-data; boundary=x",
+    "unicode": "application/json; x=\u00e9".encode("latin-1"),
+}
+HEADERS = {
+    "cookie_of_noise": {"cookie": "\x01=\xff; a=b; ;;=".encode("latin-1")},
+    "cookie_of_a_session": {"cookie": "worldpose_review_00000000=e30.0"},
+    "origin_of_evil": {"origin": "http://evil.example"},
+    "origin_that_is_none": {"origin": "http://[::1"},
+    "host_of_evil": {"host": "evil.example"},
+    "host_that_is_none": {"host": "[::1"},
+    "length_of_text": {"content-length": "abc"},
+    "length_negative": {"content-length": "-5"},
+    "length_of_digits": {"content-length": "\u00b2".encode("latin-1")},
+    "secret_of_noise": {"x-form-secret": b"\xff\xfe"},
+    "range_of_noise": {"range": "bytes=9-1,abc"},
+}
+GOOD = {"match_id": MATCH, "owner": "cam0", "camera": "cam0", "clip": "clip", "number": "0"}
+ROUTES = []
+
+
+def routes(app):
+    """Methods and paths of a server, in order; those that begin runs are left alone."""
+    found = {
+        (method.upper(), path)
+        for path, methods in app.openapi()["paths"].items()
+        for method in methods
+    }
+    return sorted(each for each in found if not re.search("continu|resume|/runs?$", each[1]))
+
+
+def _path(rng, path, bad=None):
+    """The path with good names, one of them replaced by a bad one."""
+    holes = re.findall(r"{(\w+)[^}]*}", path)
+    spoilt = one(rng, holes) if bad is not None and holes else None
+    for hole in holes:
+        value = bad if hole == spoilt else GOOD.get(hole, "x")
+        path = re.sub(r"{" + hole + r"[^}]*}", lambda _, value=value: value, path)
+    return path
+
+
+def _ask(project, rng, how):
+    kind, value = how
+    choices = ROUTES
+    if kind == "body":
+        choices = [each for each in ROUTES if each[0] in ("POST", "PUT", "DELETE")]
+    for _ in range(6):
+        method, path = one(rng, choices)
+        keywords = {}
+        url = _path(rng, path, value if kind == "name" else None)
+        if kind == "number":
+            key = one(rng, ["frame", "number", "person", "first", "limit"])
+            url = f"{_path(rng, path, value if rng.random() < 0.3 else None)}?{key}={value}"
+        if method in ("POST", "PUT", "DELETE", "PATCH"):
+            keywords["content"] = value if kind == "body" else '{"edits": []}'
+            keywords["headers"] = {"content-type": "application/json"}
+        if kind == "type" and "headers" in keywords:
+            keywords["headers"] = {"content-type": value} if value else {}
+        if kind == "header":
+            keywords["headers"] = {**keywords.get("headers", {}), **value}
+        if kind == "method":
+            method = value
+        project.asked.append((method, url, keywords))
+
+
+for label, value in NAMES.items():
+    kinds("request", {f"request_name_{label}": ("name", value)}, _ask, base="stored")
+for label, value in NUMBERS.items():
+    kinds("request", {f"request_number_{label}": ("number", value)}, _ask, base="stored")
+for label, value in BODIES.items():
+    kinds("request", {f"request_body_{label}": ("body", value)}, _ask, base="stored")
+for label, value in TYPES.items():
+    kinds("request", {f"request_type_{label}": ("type", value)}, _ask, base="stored")
+for label, value in HEADERS.items():
+    kinds("request", {f"request_{label}": ("header", value)}, _ask, base="stored")
+for value in ("PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "HEAD", "PROPFIND"):
+    kinds("request", {f"request_by_{value.lower()}": ("method", value)}, _ask, base="stored")
+
+
+def _login_body(project, rng, body):
+    project.asked.append(
+        ("POST", "/api/login", {"content": body, "headers": {"content-type": "application/json"}})
+    )
+
+
+kinds(
+    "request",
+    {f"login_{label}": body for label, body in BODIES.items() if len(body) < 10_000},
+    _login_body,
+    base="stored",
+)
+
+
+def ask_all(project):
+    """Answers of the pages to what is asked: method, path, status and the answer's beginning."""
+    from fastapi.testclient import TestClient
+
+    from flows.pages.access import access_for
+    from flows.pages.app import create_app
+
+    app = create_app(
+        str(project.root), access_for("127.0.0.1", token=TOKEN, names=(), secure=False)
+    )
+    client = TestClient(app, base_url=HERE, raise_server_exceptions=False)
+    login = client.post("/api/login", json={"who": "Ada", "token": TOKEN})
+    secret = client.get("/api/session").json()["form_secret"] if login.status_code == 200 else ""
+    answers = []
+    for method, path, keywords in project.asked:
+        headers = {"x-form-secret": secret, **(keywords.pop("headers", None) or {})}
+        try:
+            answer = client.request(method, path, headers=headers, **keywords)
+        except (
+            ValueError,
+            TypeError,
+            UnicodeError,
+        ) as error:  # the client itself refuses to send it
+            answers.append((method, path[:80], 0, f"not sent: {error}"[:200]))
+            continue
+        answers.append((method, path[:80], answer.status_code, answer.text[:300]))
+    return answers
