@@ -21,6 +21,7 @@ import io
 import json
 import multiprocessing
 import shutil
+import signal
 import sys
 import tempfile
 import time
@@ -180,7 +181,7 @@ def measure_apart(plan: dict[str, Any], limit: float, keep: Path | None) -> dict
                     row = plan | {"state": "traceback", "failures": [traceback.format_exc()]}
             answer.write_text(json.dumps(row))
 
-        process = multiprocessing.get_context("fork").Process(target=work)
+        process = multiprocessing.get_context("fork").Process(target=work, daemon=True)
         process.start()
         process.join(limit)
         if process.is_alive():
@@ -292,6 +293,7 @@ def main() -> None:
     parser.add_argument("--keep", action="store_true", help="keep match folders and projects")
     parser.add_argument("--report", action="store_true", help="only print what DIR holds")
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("stopped"))  # and so ends the match's process
     options.resume.mkdir(parents=True, exist_ok=True)
     file = options.resume / "rows.jsonl"
     rows = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []

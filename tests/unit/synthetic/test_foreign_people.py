@@ -1,4 +1,4 @@
-"""People of the second world: bones, feet, ways, recordings."""
+"""People of the second world: bones, feet, trajectories, recordings."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from worldpose.synthetic.foreign import FOREIGN_SCENARIOS, read_recordings, simu
 from worldpose.synthetic.foreign.gait import Manner, walk_posture
 from worldpose.synthetic.foreign.recordings import JOINTS, play_motion
 from worldpose.synthetic.foreign.skeletons import draw_skeleton, place_joints
-from worldpose.synthetic.foreign.ways import LEAD, follow_tracks, wander
+from worldpose.synthetic.foreign.trajectories import LEAD, follow_tracks, wander
 
 FPS = 100.0
 BONES = (
@@ -102,8 +102,8 @@ def test_people_by_social_forces_keep_clear_of_each_other():
     area = np.array([8.0, 8.0])
     nearest = []
     for seed in range(4):
-        ways = wander(times, roles, np.zeros(2), area, [], np.random.default_rng(seed))
-        places = np.stack([way.root for way in ways], axis=1)
+        trajectories = wander(times, roles, np.zeros(2), area, [], np.random.default_rng(seed))
+        places = np.stack([trajectory.root for trajectory in trajectories], axis=1)
         apart = np.linalg.norm(places[:, :, None] - places[:, None], axis=-1)
         apart[:, np.arange(8), np.arange(8)] = np.inf
         nearest.append(apart.min())
@@ -123,11 +123,11 @@ def test_a_tracked_player_is_followed_within_the_smoothing():
     clock = np.arange(0.0, 5.0, 0.1)
     xy = np.stack([3.0 * clock, 1.0 + 0.5 * clock], axis=-1)
     times = np.arange(-1.0, 4.5, 0.01)
-    way = follow_tracks(times, clock, xy, np.array([1.0, 2.0]), "test")
+    trajectory = follow_tracks(times, clock, xy, np.array([1.0, 2.0]), "test")
     inner = (times > 1.0) & (times < 3.5)
-    assert way.root[inner, 0] == pytest.approx(3.0 * times[inner], abs=0.02)
-    assert way.root[inner, 1] == pytest.approx(2.0 + times[inner], abs=0.02)
-    assert way.heading[inner] == pytest.approx(np.arctan2(1.0, 3.0), abs=0.01)
+    assert trajectory.root[inner, 0] == pytest.approx(3.0 * times[inner], abs=0.02)
+    assert trajectory.root[inner, 1] == pytest.approx(2.0 + times[inner], abs=0.02)
+    assert trajectory.heading[inner] == pytest.approx(np.arctan2(1.0, 3.0), abs=0.01)
 
 
 def write_motion(folder, frames=90):
@@ -165,8 +165,8 @@ def test_a_recorded_motion_is_replayed_with_the_persons_bones(tmp_path):
     skeleton = draw_skeleton("woman", np.random.default_rng(5))
     times = np.arange(-LEAD, 3.0, 0.01)
     place = np.array([3.0, -2.0])
-    way, posture = play_motion(motion, skeleton, times, place, np.random.default_rng(6))
-    joints = place_joints(skeleton, posture, way.root, way.heading, 100.0, flat)
+    trajectory, posture = play_motion(motion, skeleton, times, place, np.random.default_rng(6))
+    joints = place_joints(skeleton, posture, trajectory.root, trajectory.heading, 100.0, flat)
     for one, two in BONES:
         assert np.ptp(np.linalg.norm(joints[:, one] - joints[:, two], axis=-1)) < 1e-9
     assert joints[:, 11:13].mean(axis=1)[:, :2] == pytest.approx(np.tile(place, (500, 1)), abs=1e-6)
@@ -175,7 +175,9 @@ def test_a_recorded_motion_is_replayed_with_the_persons_bones(tmp_path):
     assert wrists.max() > 0.15  # one arm swings, whichever side it is now
     assert wrists.min() < 0.05
     # The nose is before the ears, on the side to which the knees point.
-    front = np.stack([np.cos(way.heading), np.sin(way.heading), 0.0 * way.heading], axis=-1)
+    front = np.stack(
+        [np.cos(trajectory.heading), np.sin(trajectory.heading), 0.0 * trajectory.heading], axis=-1
+    )
     assert ((joints[:, 0] - joints[:, 3:5].mean(axis=1)) * front).sum(-1).min() > 0.05
 
 

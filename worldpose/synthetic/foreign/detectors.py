@@ -44,7 +44,7 @@ _STICKMAN: Final = (
     .reshape(2, 17)
     .T
 )
-"""Across and down, of a figure one high; left is on the right of who faces the camera."""
+"""Across and down, of a figure one high that faces the camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class Detector:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """A camera's detections and whose they are.
+    """A camera's detections and the person of each.
 
     Attributes:
         observations: what the factory gets.
@@ -126,7 +126,7 @@ def detect_people(
     lost: float,
     rng: np.random.Generator,
 ) -> Report:
-    """Return what a detector reports in a camera's pictures.
+    """Return what a detector reports in a camera's images.
 
     Args:
         detector: of the match.
@@ -143,13 +143,13 @@ def detect_people(
     spread = profile.noise * size * (size / 100.0) ** -0.3
     spread = np.hypot(spread, profile.floor)[..., None] * _EASE
     hidden = (view.hider >= 0) | view.behind_self
-    error = _errors(profile, frames, persons, fps, rng) * spread[..., None]
+    error = _draw_errors(profile, frames, persons, fps, rng) * spread[..., None]
     error *= np.where(hidden, 2.0, 1.0)[..., None]
     known = np.linalg.norm(error, axis=-1) / size[..., None]
     error = error + _bias(detector, view, size)
     keypoints = defined + error
-    keypoints, strayed = _stray(profile, keypoints, view, fps, rng)
-    keypoints = _swap(profile, keypoints, view, fps, rng)
+    keypoints, strayed = _misplace_joints(profile, keypoints, view, fps, rng)
+    keypoints = _swap_sides(profile, keypoints, view, fps, rng)
     if profile.grid > 0.0:
         cell = profile.grid * size[..., None, None]
         keypoints = np.round(keypoints / cell) * cell
@@ -158,14 +158,14 @@ def detect_people(
     there = view.inside & np.where(hidden, luck < profile.hidden_kept, luck > profile.joint_missed)
     there &= np.isfinite(keypoints).all(axis=-1)
     found = rng.random(persons) < 1.0 / (1.0 + (profile.smallest / np.maximum(size, 1.0)) ** 6)
-    found &= ~_bursts(profile.person_missed, 0.25, (frames, persons), fps, rng)
+    found &= ~_draw_bursts(profile.person_missed, 0.25, (frames, persons), fps, rng)
     found &= (view.hider >= 0).mean(axis=-1) < 0.75
-    keypoints, there, found = _merge(profile, keypoints, there, found, view, fps, rng)
+    keypoints, there, found = _merge_people(profile, keypoints, there, found, view, fps, rng)
     found &= there.sum(axis=-1) >= 4
     if lost > 0.0:
-        found &= ~_bursts(lost, 0.1, (frames, 1), fps, rng)
-    confidence = _confidence(profile, known, hidden, rng)
-    false, sure = _false_people(profile, size, image_size, frames, rng)
+        found &= ~_draw_bursts(lost, 0.1, (frames, 1), fps, rng)
+    confidence = _draw_confidence(profile, known, hidden, rng)
+    false, sure = _draw_false_positives(profile, size, image_size, frames, rng)
     doubles = found & (rng.random(found.shape) < profile.duplicates)
     again = keypoints + 0.5 * spread[..., None] * rng.standard_normal(keypoints.shape)
     keypoints = np.concatenate([keypoints, again, false], axis=1)
@@ -177,10 +177,10 @@ def detect_people(
     there &= found[..., None]
     keypoints = np.where(there[..., None], keypoints, np.nan)
     confidence = np.where(there, np.clip(confidence, 0.01, 1.0), np.nan)
-    return _listed(keypoints, confidence, whose, displaced & there, rng)
+    return _list_detections(keypoints, confidence, whose, displaced & there, rng)
 
 
-def _errors(
+def _draw_errors(
     profile: DetectorProfile, frames: int, persons: int, fps: float, rng: np.random.Generator
 ) -> Floats:
     """Errors (frames, persons, 17, 2) of unit size: resonant, sudden, and shared along limbs."""
@@ -213,14 +213,14 @@ def _bias(detector: Detector, view: View, size: Floats) -> Floats:
     return np.asarray(bias * size[..., None, None])
 
 
-def _stray(
+def _misplace_joints(
     profile: DetectorProfile, keypoints: Floats, view: View, fps: float, rng: np.random.Generator
 ) -> tuple[Floats, Flags]:
     """Keypoints some of which are far off for a while, and which these are."""
     shape = keypoints.shape[:3]
-    away = _bursts(profile.strayed, 0.12, shape, fps, rng)
-    # Behind somebody else the other's joint is as good.
-    away |= (view.hider >= 0) & _bursts(6.0 * profile.strayed, 0.15, shape, fps, rng)
+    away = _draw_bursts(profile.strayed, 0.12, shape, fps, rng)
+    # A joint behind another person is taken from that person more often.
+    away |= (view.hider >= 0) & _draw_bursts(6.0 * profile.strayed, 0.15, shape, fps, rng)
     frame, person, joint = np.nonzero(away)
     kind = rng.integers(3, size=len(frame))
     hider = view.hider[frame, person, joint]
@@ -242,14 +242,14 @@ def _stray(
     return moved, away
 
 
-def _swap(
+def _swap_sides(
     profile: DetectorProfile, keypoints: Floats, view: View, fps: float, rng: np.random.Generator
 ) -> Floats:
     """Keypoints with the sides of parts exchanged in bursts, more often from behind."""
     swapped = keypoints.copy()
     for part in (*_PARTS, tuple(range(17))):
-        on = _bursts(0.5 * profile.swapped, 0.2, view.size.shape, fps, rng)
-        more = _bursts(profile.swapped, 0.2, view.size.shape, fps, rng)
+        on = _draw_bursts(0.5 * profile.swapped, 0.2, view.size.shape, fps, rng)
+        more = _draw_bursts(profile.swapped, 0.2, view.size.shape, fps, rng)
         on |= more & (np.cos(view.azimuth) < 0.0)
         frame, person = np.nonzero(on)
         joints = np.array(part)
@@ -260,7 +260,7 @@ def _swap(
     return swapped
 
 
-def _merge(
+def _merge_people(
     profile: DetectorProfile,
     keypoints: Floats,
     there: Flags,
@@ -272,7 +272,7 @@ def _merge(
     """Two people who overlap become one: half of the joints of each."""
     frames, persons = found.shape
     keypoints, there, found = keypoints.copy(), there.copy(), found.copy()
-    merging = _bursts(profile.merged, 0.3, (frames, persons), fps, rng)
+    merging = _draw_bursts(profile.merged, 0.3, (frames, persons), fps, rng)
     crowded = (view.hider >= 0).mean(axis=-1) > 0.4
     for frame, person in np.argwhere(merging & crowded & found):
         hiders = view.hider[frame, person]
@@ -286,7 +286,7 @@ def _merge(
     return keypoints, there, found
 
 
-def _confidence(
+def _draw_confidence(
     profile: DetectorProfile, known: Floats, hidden: Flags, rng: np.random.Generator
 ) -> Floats:
     """Confidence (frames, persons, 17); biases, straying and swaps do not lower it."""
@@ -301,14 +301,14 @@ def _confidence(
     return np.asarray(rng.beta(4.0, 2.0, known.shape))
 
 
-def _false_people(
+def _draw_false_positives(
     profile: DetectorProfile,
     size: Floats,
     image_size: NDArray[np.int64],
     frames: int,
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats]:
-    """Keypoints (frames, false, 17, 2) of people who are not there, and their confidence."""
+    """Keypoints (frames, false, 17, 2) of false positives, and their confidence."""
     ghosts = int(rng.poisson(profile.ghosts))
     flashes = rng.poisson(profile.flashes, frames)
     count = ghosts + int(flashes.max(initial=0))
@@ -332,7 +332,7 @@ def _false_people(
     return places, rng.uniform(0.15, 0.8, places.shape[:3])
 
 
-def _listed(
+def _list_detections(
     keypoints: Floats,
     confidence: Floats,
     whose: NDArray[np.int64],
@@ -366,7 +366,7 @@ def _listed(
     return Report(observations, person, displaced[rows, order] & found[..., None])
 
 
-def _bursts(
+def _draw_bursts(
     share: float, length: float, shape: tuple[int, ...], fps: float, rng: np.random.Generator
 ) -> Flags:
     """Flags that are on for a share of the first dimension, for a mean time [s] at once."""

@@ -1,4 +1,4 @@
-"""Posture of people on their ways: joint angles of published gait curves, gestures, looks.
+"""Posture of walking and running people: joint angles of published gait curves, gestures, looks.
 
 Hip and knee angles over the gait cycle are those of walking in D. A. Winter, The biomechanics and
 motor control of human gait, 1991, and of running in T. F. Novacheck, The biomechanics of running,
@@ -38,7 +38,7 @@ _RUN: Final = np.array(
 ).T
 """Running, likewise."""
 _NEUTRAL: Final = (4.0, 6.0)
-"""Hip and knee flexion of who stands [deg]."""
+"""Hip and knee flexion of a standing person [deg]."""
 _RUNNING_FROM: Final = (1.9, 2.6)
 """Speeds between which a walk becomes a run [m/s]."""
 _HOLD: Final = (0.04, 0.42, 0.24)
@@ -48,7 +48,7 @@ _FLIGHT: Final = 0.05
 _ROLL: Final = 0.5
 """How far the hips go over a resting ankle at most; then the heel rises [share of the leg]."""
 _STILL: Final = 0.05
-"""Who is slower than this keeps both feet down [m/s]."""
+"""A slower person keeps both feet down [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -141,12 +141,12 @@ def walk_posture(
     gestures: tuple[Gesture, ...],
     rng: np.random.Generator,
 ) -> Posture:
-    """Return the posture of who follows a way over the ground.
+    """Return the posture of a person who walks or runs along a trajectory.
 
     Args:
         times: (frames,) [s], evenly spaced.
         root: (frames, 2) middle of the hips in plan [m], world.
-        heading: (frames,) the way the body faces [rad].
+        heading: (frames,) direction that the body faces [rad].
         leg: its length [m].
         manner: the person's.
         gestures: what the person does besides.
@@ -181,11 +181,11 @@ def walk_posture(
     swing = manner.sway * moving * np.sin(2.0 * np.pi * cycle + 0.6)
     up = np.array([0.0, 0.0, 1.0])
     tilt = np.radians(3.0) * moving * np.cos(2.0 * np.pi * cycle)
-    hips = _level(np.radians(6.0) * swing) + tilt[:, None] * up
+    hips = _lateral_axis(np.radians(6.0) * swing) + tilt[:, None] * up
     lean = manner.lean + np.radians(7.0) * run + 0.5 * np.arctan(np.gradient(ahead, step) / 9.81)
     lean = gaussian_filter1d(lean, 0.15 / step, mode="nearest")
-    look = _wander(times, 2.5, rng) * np.radians(28.0)
-    nod = _wander(times, 3.0, rng) * np.radians(9.0) - np.radians(6.0)
+    look = _random_course(times, 2.5, rng) * np.radians(28.0)
+    nod = _random_course(times, 3.0, rng) * np.radians(9.0) - np.radians(6.0)
     arm = np.empty((len(times), 2, 2))
     for side, sign in enumerate((1.0, -1.0)):
         reach = manner.swing * np.radians(14.0 + 22.0 * run) * moving
@@ -202,7 +202,7 @@ def walk_posture(
     posture = Posture(
         hips=_unit(hips),
         trunk=_unit(np.stack([np.sin(lean), 0.02 * swing, np.cos(lean)], axis=-1)),
-        shoulders=_level(-np.radians(8.0) * swing),
+        shoulders=_lateral_axis(-np.radians(8.0) * swing),
         head_up=_unit(np.stack([np.sin(-nod), 0.0 * nod, np.cos(nod)], axis=-1)),
         gaze=np.stack([np.cos(look) * np.cos(nod), np.sin(look) * np.cos(nod), np.sin(nod)], -1),
         upper_arm=_sagittal(arm[..., 0], splay),
@@ -213,7 +213,7 @@ def walk_posture(
         planted=planted,
     )
     for gesture in gestures:
-        posture = _gestured(posture, gesture, times)
+        posture = _add_gesture(posture, gesture, times)
     return posture
 
 
@@ -238,7 +238,7 @@ def _stride_size(pace: Floats, rate: Floats, leg: float, run: Floats) -> Floats:
 
 
 def _angles(part: Floats, size: Floats, bend: Floats, run: Floats) -> Floats:
-    """Hip and knee flexion (frames, 2) [rad]; walking backwards swings the hips the other way."""
+    """Hip and knee flexion (frames, 2) [rad]; walking backwards mirrors the swing of the hips."""
     both = (1.0 - run)[:, None] * _curve(_WALK, part) + run[:, None] * _curve(_RUN, part)
     mean = (1.0 - run)[:, None] * _WALK[:, 1:].mean(0) + run[:, None] * _RUN[:, 1:].mean(0)
     share = np.minimum(bend, 1.0)[:, None]
@@ -268,12 +268,12 @@ def _sagittal(angle: Floats, outward: Floats) -> Floats:
     return _unit(np.stack([np.sin(angle), np.tan(out), -np.cos(angle)], axis=-1))
 
 
-def _level(angle: Floats) -> Floats:
+def _lateral_axis(angle: Floats) -> Floats:
     """From the right to the left of what is turned by an angle [rad] (frames, 3)."""
     return np.stack([-np.sin(angle), np.cos(angle), 0.0 * angle], axis=-1)
 
 
-def _wander(times: Floats, period: float, rng: np.random.Generator) -> Floats:
+def _random_course(times: Floats, period: float, rng: np.random.Generator) -> Floats:
     """A smooth random course (frames,) of unit size, of three waves; period [s]."""
     waves = [
         np.sin(2.0 * np.pi * (times / (period * rng.uniform(0.6, 2.2)) + rng.random()))
@@ -282,7 +282,7 @@ def _wander(times: Floats, period: float, rng: np.random.Generator) -> Floats:
     return np.asarray(np.sqrt(2.0 / 3.0) * np.sum(waves, axis=0))
 
 
-def _gestured(posture: Posture, gesture: Gesture, times: Floats) -> Posture:
+def _add_gesture(posture: Posture, gesture: Gesture, times: Floats) -> Posture:
     """The posture with a gesture blended in."""
     near = np.clip(2.0 * np.abs(times - gesture.time) / gesture.length, 0.0, 1.0)
     on = gesture.strength * 0.5 * (1.0 + np.cos(np.pi * near))
@@ -323,7 +323,7 @@ def _gestured(posture: Posture, gesture: Gesture, times: Floats) -> Posture:
 
 
 def _blend(vectors: Floats, goal: Floats, share: Floats) -> Floats:
-    """Unit vectors turned towards a goal by a share (frames,) of the way."""
+    """Unit vectors turned towards a goal by a share (frames,) of the trajectory."""
     mixed = (1.0 - share)[:, None] * vectors + share[:, None] * goal / np.linalg.norm(goal)
     return _unit(mixed)
 

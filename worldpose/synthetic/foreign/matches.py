@@ -91,7 +91,7 @@ def simulate_foreign_match(
         spec,
         calibrations=scene.given,
         observations={
-            name: _numbered(report.observations, scene.offsets[name])
+            name: _number_frames(report.observations, scene.offsets[name])
             for name, report in scene.reports.items()
         },
         pitch=None if scene.pitch is None else scene.pitch.stated,
@@ -101,7 +101,7 @@ def simulate_foreign_match(
     return spec
 
 
-def _numbered(observations: Observations, offset: int) -> Observations:
+def _number_frames(observations: Observations, offset: int) -> Observations:
     """The same with the camera's own frame numbers."""
     return Observations(frame=observations.frame + offset, **observations.arrays())
 

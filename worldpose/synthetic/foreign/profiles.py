@@ -23,7 +23,7 @@ class DetectorProfile(Record):
     view_bias: float = 0.007
     """Bias by the side that is seen, each of two harmonics [person height]."""
     height_bias: float = 0.012
-    """Bias along the picture's vertical by the sine of the camera's elevation [person height]."""
+    """Bias along the image's vertical by the sine of the camera's elevation [person height]."""
     noise: float = 0.017
     """Of a person 100 px tall [person height]; relative to their height it falls with the 0.3rd
     power of it."""
@@ -50,7 +50,7 @@ class DetectorProfile(Record):
     person_missed: float = 0.02
     """Share of person-frames without a detection [1]."""
     smallest: float = 24.0
-    """Half of the people of this height in the picture are found [px]."""
+    """Half of the people of this height in the image are found [px]."""
     merged: float = 0.4
     """Share of overlaps in which two people become one [1]."""
     ghosts: float = 0.4

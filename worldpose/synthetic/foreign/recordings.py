@@ -19,7 +19,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from worldpose.errors import InputError
 from worldpose.synthetic.foreign.skeletons import Posture, Skeleton
-from worldpose.synthetic.foreign.ways import LEAD, Way
+from worldpose.synthetic.foreign.trajectories import LEAD, Trajectory
 
 Floats = NDArray[np.float64]
 
@@ -194,12 +194,12 @@ def play_motion(
     times: Floats,
     place: Floats,
     rng: np.random.Generator,
-) -> tuple[Way, Posture]:
-    """Return a person's way and posture who replays a motion.
+) -> tuple[Trajectory, Posture]:
+    """Return the trajectory and posture of a person who replays a motion.
 
-    Directions of bones are those of the recording, way and height are scaled by the legs. The part,
-    its direction, its tempo and whether left and right are exchanged are drawn; at the ends of the
-    recording it is played backwards.
+    Directions of bones are those of the recording; the length of the legs scales trajectory and
+    height. The part, its direction, its tempo and whether left and right are exchanged are drawn;
+    at the ends of the recording it is played backwards.
 
     Args:
         motion: the recording.
@@ -280,4 +280,4 @@ def play_motion(
         height=(middle[:, 2] - level) / leg,
         planted=planted,
     )
-    return Way(times, path, course + direction, source), posture
+    return Trajectory(times, path, course + direction, source), posture

@@ -29,7 +29,7 @@ LENSES: Final = {
 """Share of each kind [1]. `fisheye`: nearly equidistant; `beyond`: a barrel with a swirl that the
 five coefficients of the lens model cannot have."""
 _BEYOND: Final = 0.9
-"""Largest displacement by that swirl, at the corner of a picture 1920 px wide [px]."""
+"""Largest displacement by that swirl, at the corner of a image 1920 px wide [px]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class RigCamera:
         return np.asarray(pixels + swirl[..., None] * towards)
 
     def sees(self, pixels: Floats) -> NDArray[np.bool_]:
-        """Return which pixels (..., 2) lie in the picture."""
+        """Return which pixels (..., 2) lie in the image."""
         with np.errstate(invalid="ignore"):
             inside = (pixels >= -0.5) & (pixels <= self.camera.image_size - 0.5)
         return np.asarray(inside.all(axis=-1))
@@ -104,7 +104,7 @@ def _draw_camera(
     action: Floats,
     rng: np.random.Generator,
 ) -> RigCamera:
-    place, mounting = _place(index, count, start, layout, field, rng)
+    place, mounting = _draw_place(index, count, start, layout, field, rng)
     aim = action[rng.integers(len(action))] * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
     share = rng.uniform(0.3, 0.9)
     aim = share * action.mean(axis=0) + (1.0 - share) * aim
@@ -118,7 +118,7 @@ def _draw_camera(
     half = float(np.quantile(off_axis, rng.uniform(0.6, 1.0))) + np.radians(3.0)
     low, high = {"fisheye": (38.0, 55.0)}.get(lens, (9.0, 40.0))
     half = float(np.clip(half, np.radians(low), np.radians(high)))
-    distortion = _distortion(lens, half, rng)
+    distortion = _draw_distortion(lens, half, rng)
     edge = np.tan(half)
     powers = edge ** np.array([2, 4, 6])
     focal = 0.5 * size[0] / (edge * (1.0 + powers @ distortion[[0, 1, 4]]))
@@ -128,7 +128,7 @@ def _draw_camera(
         focal=np.array([focal, focal * aspect]),
         principal_point=middle,
         distortion=distortion,
-        cam_from_world=_looking(place, aim, np.radians(2.0) * rng.standard_normal()),
+        cam_from_world=_look_at(place, aim, np.radians(2.0) * rng.standard_normal()),
         image_size=np.array(size),
     )
     beyond = (0.0, 3, 0.0)
@@ -138,7 +138,7 @@ def _draw_camera(
     return RigCamera(camera, lens, mounting, beyond)
 
 
-def _place(
+def _draw_place(
     index: int,
     count: int,
     start: float,
@@ -172,20 +172,20 @@ def _place(
         away = rng.uniform(4.0, 30.0)
         return np.array([side * (half[0] + away), across, rng.uniform(3.0, 12.0)]), "behind a goal"
     angle = start + 2.0 * np.pi * share
-    way = np.array([np.cos(angle), np.sin(angle)])
-    edge = 1.0 / np.max(np.abs(way) / half)
+    outward = np.array([np.cos(angle), np.sin(angle)])
+    edge = 1.0 / np.max(np.abs(outward) / half)
     if kind == "eye level":
         away, height = rng.uniform(2.0, 8.0), rng.uniform(1.4, 2.4)
     elif kind == "around":
         away, height = rng.uniform(5.0, 30.0), rng.uniform(4.0, 16.0)
     else:
         away, height = rng.uniform(8.0, 40.0), rng.uniform(18.0, 42.0)
-    return np.array([*(edge + away) * way, height]), kind
+    return np.array([*(edge + away) * outward, height]), kind
 
 
-def _distortion(lens: str, half: float, rng: np.random.Generator) -> Floats:
+def _draw_distortion(lens: str, half: float, rng: np.random.Generator) -> Floats:
     """k1 k2 p1 p2 k3 of a lens of this kind that sees `half` [rad] to either side."""
-    # The corner of a 16:9 picture is 15 % farther out than its side.
+    # The corner of a 16:9 image is 15 % farther out than its side.
     reach = np.tan(min(1.2 * half, np.radians(62.0)))
     tangential = 2e-4 * rng.standard_normal(2)
     if lens == "rectilinear":
@@ -207,8 +207,8 @@ def _distortion(lens: str, half: float, rng: np.random.Generator) -> Floats:
     return distortion
 
 
-def _looking(center: Floats, aim: Floats, roll: float) -> Rigid:
-    """The pose of a camera that sees a point in the middle of its picture."""
+def _look_at(center: Floats, aim: Floats, roll: float) -> Rigid:
+    """The pose of a camera that sees a point in the middle of its image."""
     z = (aim - center) / np.linalg.norm(aim - center)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)

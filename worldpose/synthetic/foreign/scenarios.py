@@ -8,7 +8,7 @@ from pydantic import Field
 
 from data_contracts.records import Name, Record
 from worldpose.synthetic.foreign.rigs import Layout
-from worldpose.synthetic.foreign.ways import Role
+from worldpose.synthetic.foreign.trajectories import Role
 
 Range = tuple[float, float]
 

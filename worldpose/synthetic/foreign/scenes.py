@@ -43,8 +43,8 @@ from worldpose.synthetic.foreign.statements import (
     measure_camera,
     visible_points,
 )
+from worldpose.synthetic.foreign.trajectories import LEAD, Role, Trajectory, follow_tracks, wander
 from worldpose.synthetic.foreign.visibility import view_people
-from worldpose.synthetic.foreign.ways import LEAD, Role, Way, follow_tracks, wander
 
 Floats = NDArray[np.float64]
 
@@ -81,9 +81,9 @@ class ForeignScene:
 
     Attributes:
         fps: frames in a second [1/s].
-        truth: anatomical joints; `views` counts cameras in whose picture nobody hides the joint.
+        truth: anatomical joints; `views` counts the cameras that see the joint.
         defined: what the detector takes for joints.
-        people: who and how.
+        people: bones, motion and joints of each person.
         cameras: by id.
         given: cameras as calibration.toml has them, by id; empty where they are to be clicked.
         clicked: by id of a camera without calibration.
@@ -159,7 +159,7 @@ def simulate_foreign_scene(
         field = np.array([pitch.painted.length, pitch.painted.width])
         size = part * field
         center = 0.5 * (1.0 - part) * field * rng.uniform(-1.0, 1.0, 2)
-    ground: Ground = _level if painted is None else painted.height
+    ground: Ground = _flat_ground if painted is None else painted.height
     persons = _draw_people(
         scenario, count, times, center, size, pitch, ground, recordings, streams[1]
     )
@@ -174,7 +174,7 @@ def simulate_foreign_scene(
     )
     rig = draw_rig(mounted, layout, space, action, rng)
     if painted is not None and not given:
-        rig = _clickable(rig, painted, layout, space, action, rng)
+        rig = _remount_cameras(rig, painted, layout, space, action, rng)
     named = {f"view{index:02d}": camera for index, camera in enumerate(rig)}
 
     rng = np.random.default_rng(streams[3])
@@ -268,9 +268,9 @@ def _draw_people(
     rngs = [np.random.default_rng(one) for one in own]
     kinds = cast("list[Kind]", list(STATURE))
     skeletons = [draw_skeleton(kinds[rng.choice(3, p=scenario.kinds)], one) for one in rngs]
-    known: dict[int, Way] = {}
+    known: dict[int, Trajectory] = {}
     replayed = {}
-    tracking = None if pitch is None else _tracking(recordings, times, rng)
+    tracking = None if pitch is None else _draw_tracking(recordings, times, rng)
     if tracking is not None and pitch is not None:
         players = rng.permutation(len(tracking.players))[:count]
         scale = np.array([pitch.painted.length / 105.0, pitch.painted.width / 68.0])
@@ -291,24 +291,24 @@ def _draw_people(
             )
     free = [person for person in range(count) if person not in known]
     roles: list[Role] = [scenario.roles[rng.integers(len(scenario.roles))] for _ in free]
-    ways = wander(times, roles, center, size, list(known.values()), rng)
-    known |= dict(zip(free, ways, strict=True))
+    trajectories = wander(times, roles, center, size, list(known.values()), rng)
+    known |= dict(zip(free, trajectories, strict=True))
     fps = 1.0 / (times[1] - times[0])
     people = []
     for person, (skeleton, rng) in enumerate(zip(skeletons, rngs, strict=True)):
-        way, posture = known[person], replayed.get(person)
+        trajectory, posture = known[person], replayed.get(person)
         if posture is None:
             manner = draw_manner(rng)
             gestures = draw_gestures(scenario.gestures, times[0], times[-1], rng)
             posture = walk_posture(
-                times, way.root, way.heading, skeleton.leg, manner, gestures, rng
+                times, trajectory.root, trajectory.heading, skeleton.leg, manner, gestures, rng
             )
-        joints = place_joints(skeleton, posture, way.root, way.heading, fps, ground)
-        people.append(Person(skeleton, joints, way.source))
+        joints = place_joints(skeleton, posture, trajectory.root, trajectory.heading, fps, ground)
+        people.append(Person(skeleton, joints, trajectory.source))
     return people
 
 
-def _tracking(
+def _draw_tracking(
     recordings: Recordings | None, times: Floats, rng: np.random.Generator
 ) -> Tracking | None:
     """Tracking data long enough for the clip, in most matches where there are some."""
@@ -321,7 +321,7 @@ def _tracking(
     return long[rng.integers(len(long))]
 
 
-def _clickable(
+def _remount_cameras(
     rig: list[RigCamera],
     pitch: PitchTemplate,
     layout: Layout,
@@ -329,7 +329,7 @@ def _clickable(
     action: Floats,
     rng: np.random.Generator,
 ) -> list[RigCamera]:
-    """The rig with cameras mounted anew that see too few markings, as far as others do."""
+    """The rig, with new cameras for those that see too few markings."""
     mounted = []
     for camera in rig:
         for _ in range(12):
@@ -340,6 +340,6 @@ def _clickable(
     return mounted
 
 
-def _level(x: Floats, y: Floats) -> Floats:
+def _flat_ground(x: Floats, y: Floats) -> Floats:
     """The ground of a hall."""
     return np.asarray(0.0 * x + 0.0 * y)

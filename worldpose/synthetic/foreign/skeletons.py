@@ -187,7 +187,7 @@ def place_joints(
         ground: what feet stand on.
     """
     frames = len(root)
-    turn = _turns(heading)
+    turn = _heading_rotations(heading)
     world = {
         name: np.einsum("fij,fj->fi", turn, getattr(posture, name))
         for name in ("hips", "trunk", "shoulders", "head_up", "gaze")
@@ -206,15 +206,17 @@ def place_joints(
     swung = swung + lengths[0][:, None] * limbs["thigh"] + lengths[1][:, None] * limbs["shank"]
     ankles = np.stack(
         [
-            _held(swung[:, side], posture.planted[:, side], skeleton.ankle, ground)
+            _hold_ankle(swung[:, side], posture.planted[:, side], skeleton.ankle, ground)
             for side in range(2)
         ],
         axis=1,
     )
-    pelvis[:, 2] -= _sinking(pelvis[:, None] + hip_offset, ankles, posture.planted, lengths, fps)
+    pelvis[:, 2] -= _pelvis_drop(
+        pelvis[:, None] + hip_offset, ankles, posture.planted, lengths, fps
+    )
     hips = pelvis[:, None] + hip_offset
     pole = limbs["thigh"] - limbs["shank"] + 0.05 * turn[:, None, :, 0]
-    knees, ankles = _bent(hips, ankles, pole, lengths)
+    knees, ankles = _solve_knees(hips, ankles, pole, lengths)
 
     neck = pelvis + skeleton.trunk * world["trunk"]
     middle = neck - skeleton.drop * world["trunk"]
@@ -229,7 +231,7 @@ def place_joints(
     return np.concatenate([face, shoulders, elbows, wrists, hips, knees, ankles], axis=1)
 
 
-def _turns(heading: Floats) -> Floats:
+def _heading_rotations(heading: Floats) -> Floats:
     """Rotations (frames, 3, 3) from forward, left, up to the world."""
     cos, sin = np.cos(heading), np.sin(heading)
     zero, one = np.zeros_like(cos), np.ones_like(cos)
@@ -243,7 +245,7 @@ def _turns(heading: Floats) -> Floats:
     )
 
 
-def _held(course: Floats, planted: Flags, ankle: float, ground: Ground) -> Floats:
+def _hold_ankle(course: Floats, planted: Flags, ankle: float, ground: Ground) -> Floats:
     """An ankle's course (frames, 3) with its planted stretches brought to rest on the ground."""
     frames = len(course)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], planted, [False]]).astype(np.int8)))
@@ -266,7 +268,9 @@ def _held(course: Floats, planted: Flags, ankle: float, ground: Ground) -> Float
     return held
 
 
-def _sinking(hips: Floats, ankles: Floats, planted: Flags, lengths: Floats, fps: float) -> Floats:
+def _pelvis_drop(
+    hips: Floats, ankles: Floats, planted: Flags, lengths: Floats, fps: float
+) -> Floats:
     """How far the pelvis must sink (frames,) [m] for planted ankles to be within reach."""
     reach = 0.998 * lengths.sum(axis=0)
     away = np.linalg.norm((ankles - hips)[..., :2], axis=-1)
@@ -278,7 +282,9 @@ def _sinking(hips: Floats, ankles: Floats, planted: Flags, lengths: Floats, fps:
     return np.asarray(-gaussian_filter1d(lowest, SETTLING * fps, mode="nearest", truncate=3.0))
 
 
-def _bent(hips: Floats, ankles: Floats, pole: Floats, lengths: Floats) -> tuple[Floats, Floats]:
+def _solve_knees(
+    hips: Floats, ankles: Floats, pole: Floats, lengths: Floats
+) -> tuple[Floats, Floats]:
     """Knees and reachable ankles (frames, 2, 3): the knee bends towards the pole."""
     thigh, shank = lengths[0][:, None], lengths[1][:, None]
     line = ankles - hips

@@ -1,4 +1,4 @@
-"""What people state about a match: clicks in pictures, cameras from elsewhere, the pitch."""
+"""What people state about a match: clicks in images, cameras from elsewhere, the pitch."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ SURVEY: Final = 0.005
 TAPE: Final = 0.02
 """Of a length measured by tape [m]."""
 CLICK: Final = (0.3, 1.1)
-"""Spread of one person's clicks in a picture of 1920 px, least and most [px]."""
+"""Spread of one person's clicks in a image of 1920 px, least and most [px]."""
 CLICK_TAIL: Final = 4.0
 """Degrees of freedom of clicks (Student's t) [1]."""
 MISNAMED: Final = 0.04
 """Share of cameras with a click under a wrong name [1]."""
 FEW: Final = 9
-"""Where fewer points are in a picture, lines and arcs are drawn too [1]."""
+"""Where fewer points are in a image, lines and arcs are drawn too [1]."""
 _CONFUSED: Final = (("left", "right"), ("near", "far"), ("front", "back"))
 _MARGIN: Final = 6.0
 
@@ -83,10 +83,10 @@ def _points(places: dict[str, Floats]) -> dict[str, tuple[float, float, float]]:
 
 
 def visible_points(camera: RigCamera, pitch: PitchTemplate) -> list[str]:
-    """Return the named points of the pitch that are in a camera's picture."""
+    """Return the named points of the pitch that are in a camera's image."""
     names = list(pitch.points)
     pixels = camera.project(pitch.positions(names))
-    inside = _inside(camera, pixels)
+    inside = _is_inside(camera, pixels)
     return [name for name, there in zip(names, inside, strict=True) if there]
 
 
@@ -115,32 +115,32 @@ def click_points(
         if other:
             names[victim] = str(rng.choice(other))
     points = tuple(
-        ClickedPoint(name=names[name], xy=_written(camera, xy))
+        ClickedPoint(name=names[name], xy=_round_click(camera, xy))
         for name, xy in zip(chosen, pixels, strict=True)
     )
     drawn: list[DrawnMarking] = []
     if len(there) < FEW:
         for name in pitch.marking_names:
             course = camera.project(pitch.marking_points(name, 0.3))
-            course = course[_inside(camera, course)]
+            course = course[_is_inside(camera, course)]
             if len(course) < 8 or np.ptp(course, axis=0).max() < 80.0:
                 continue
             rows = np.sort(
                 rng.choice(len(course), min(len(course), int(rng.integers(4, 11))), False)
             )
             line = course[rows] + 1.3 * spread / unit * rng.standard_t(CLICK_TAIL, (len(rows), 2))
-            drawn.append(DrawnMarking(name=name, xy=tuple(_written(camera, xy) for xy in line)))
+            drawn.append(DrawnMarking(name=name, xy=tuple(_round_click(camera, xy) for xy in line)))
     markings = ClickedMarkings(points=points, drawn=tuple(drawn))
     return markings, {new: name for name, new in names.items() if new != name}
 
 
-def _inside(camera: RigCamera, pixels: Floats) -> NDArray[np.bool_]:
+def _is_inside(camera: RigCamera, pixels: Floats) -> NDArray[np.bool_]:
     with np.errstate(invalid="ignore"):
         inside = (pixels > _MARGIN) & (pixels < camera.camera.image_size - 1.0 - _MARGIN)
     return np.asarray(inside.all(axis=-1))
 
 
-def _written(camera: RigCamera, xy: Floats) -> tuple[float, float]:
+def _round_click(camera: RigCamera, xy: Floats) -> tuple[float, float]:
     x, y = np.clip(xy, 0.0, camera.camera.image_size - 1.0)
     return round(float(x), 1), round(float(y), 1)
 

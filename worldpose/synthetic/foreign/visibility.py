@@ -24,11 +24,11 @@ _TRUNK: Final = (5, 6, 11, 12)
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """People in one camera's picture.
+    """People in one camera's image.
 
     Attributes:
         pixels: (frames, persons, 17, 2) [px]; NaN behind the camera.
-        inside: (frames, persons, 17) in the picture and not behind a pillar.
+        inside: (frames, persons, 17) in the image and not behind a pillar.
         hider: (frames, persons, 17) int16, the person before a joint, -1 for none.
         behind_self: (frames, persons, 17) behind the person's own trunk.
         size: (frames, persons) height of a standing person there [px].
@@ -55,7 +55,7 @@ class View:
 def view_people(
     camera: RigCamera, joints: Floats, statures: Floats, pillar: tuple[float, float] | None
 ) -> View:
-    """Return where people are in the picture and what hides them.
+    """Return where people are in the image and what hides them.
 
     Args:
         camera: true camera.
@@ -77,8 +77,8 @@ def view_people(
     return View(
         pixels=pixels,
         inside=inside,
-        hider=_hiders(pixels, depth, scale * statures),
-        behind_self=_behind_own_trunk(camera, joints, pixels, depth, scale * statures),
+        hider=_find_hiders(pixels, depth, scale * statures),
+        behind_self=_is_behind_trunk(camera, joints, pixels, depth, scale * statures),
         size=scale * statures,
         azimuth=np.arctan2((away * left).sum(-1), (away * forward).sum(-1)),
         elevation=np.arctan2(away[..., 2], level),
@@ -94,7 +94,7 @@ def facing(joints: Floats) -> tuple[Floats, Floats]:
     return np.stack([left[..., 1], -left[..., 0], 0.0 * left[..., 0]], axis=-1), left
 
 
-def _hiders(pixels: Floats, depth: Floats, size: Floats) -> NDArray[np.int16]:
+def _find_hiders(pixels: Floats, depth: Floats, size: Floats) -> NDArray[np.int16]:
     persons = depth.shape[1]
     hider = np.full(pixels.shape[:3], -1, np.int16)
     nearest = np.full(pixels.shape[:3], np.inf)
@@ -111,7 +111,7 @@ def _hiders(pixels: Floats, depth: Floats, size: Floats) -> NDArray[np.int16]:
         frame, other = np.nonzero(meets)
         if not len(frame):
             continue
-        covered = _covered(pixels[frame, other], pixels[frame, person], size[frame, person])
+        covered = _is_covered(pixels[frame, other], pixels[frame, person], size[frame, person])
         before = depth[frame, person][:, None]
         closer = covered & (before < nearest[frame, other])
         hider[frame, other] = np.where(closer, person, hider[frame, other])
@@ -119,7 +119,7 @@ def _hiders(pixels: Floats, depth: Floats, size: Floats) -> NDArray[np.int16]:
     return hider
 
 
-def _covered(points: Floats, body: Floats, size: Floats) -> Flags:
+def _is_covered(points: Floats, body: Floats, size: Floats) -> Flags:
     """Which points (rows, joints, 2) a body (rows, 17, 2) of a size (rows,) [px] covers."""
     covered = np.zeros(points.shape[:2], np.bool_)
     for one, two, width in CAPSULES:
@@ -131,7 +131,7 @@ def _covered(points: Floats, body: Floats, size: Floats) -> Flags:
     return covered
 
 
-def _behind_own_trunk(
+def _is_behind_trunk(
     camera: RigCamera, joints: Floats, pixels: Floats, depth: Floats, size: Floats
 ) -> Flags:
     """Joints (frames, persons, 17) more than a trunk's half depth behind the own trunk."""

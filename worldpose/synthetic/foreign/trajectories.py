@@ -1,8 +1,8 @@
-"""Ways of people over the ground: social forces, or tracking data of real players.
+"""Trajectories of people over the ground: social forces, or tracking data of real players.
 
-Who is not tracked goes by the model of D. Helbing, P. Molnar, Social force model for pedestrian
-dynamics, Physical Review E 51, 1995: everyone relaxes to the velocity that leads to a goal, and is
-pushed away by others and by the border.
+People without tracking data follow D. Helbing, P. Molnar, Social force model for pedestrian
+dynamics, Physical Review E 51, 1995: everyone relaxes to the velocity that leads to a goal, and
+other people push them away.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ _SPEEDS: Final[dict[Role, tuple[float, float]]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
-    """One person's way.
+class Trajectory:
+    """One person's trajectory.
 
     Attributes:
         times: (samples,) [s], evenly spaced.
         root: (samples, 2) middle of the hips [m], world.
-        heading: (samples,) the way the body faces [rad], continuous.
+        heading: (samples,) direction that the body faces [rad], continuous.
         source: where it is from, for the reference.
     """
 
@@ -59,8 +59,10 @@ class Way:
     source: str
 
 
-def follow_tracks(times: Floats, clock: Floats, xy: Floats, scale: Floats, source: str) -> Way:
-    """Return the way of a tracked player.
+def follow_tracks(
+    times: Floats, clock: Floats, xy: Floats, scale: Floats, source: str
+) -> Trajectory:
+    """Return the trajectory of a tracked player.
 
     Args:
         times: (samples,) wanted [s].
@@ -92,7 +94,7 @@ def follow_tracks(times: Floats, clock: Floats, xy: Floats, scale: Floats, sourc
         + np.cumsum(velocity, axis=0) * step
         - np.cumsum(velocity, axis=0)[middle] * step
     )
-    return Way(times, place, _facing(velocity, step, None), source)
+    return Trajectory(times, place, _headings(velocity, step, None), source)
 
 
 def wander(
@@ -100,31 +102,31 @@ def wander(
     roles: Sequence[Role],
     center: Floats,
     size: Floats,
-    obstacles: Sequence[Way],
+    obstacles: Sequence[Trajectory],
     rng: np.random.Generator,
-) -> list[Way]:
-    """Return ways of people who keep clear of each other within an area.
+) -> list[Trajectory]:
+    """Return trajectories of people who keep clear of each other within an area.
 
     Args:
         times: (samples,) [s], evenly spaced.
         roles: one a person; duels are with the person before in the list.
         center: (2,) of the area [m].
         size: (2,) of the area [m].
-        obstacles: people whose ways are known; the others avoid them.
+        obstacles: people whose trajectories are known; the others avoid them.
         rng: draws places, goals and speeds.
     """
     if not roles:
         return []
     count, step = len(roles), float(times[1] - times[0])
     substeps = max(1, int(np.ceil(step / 0.02)))
-    place = _spread(count, center, size, [way.root[0] for way in obstacles], rng)
+    place = _draw_places(count, center, size, [trajectory.root[0] for trajectory in obstacles], rng)
     for person in range(1, count):
         if roles[person] == "duel":
             angle = rng.uniform(0.0, 2.0 * np.pi)
             near = np.array([np.cos(angle), np.sin(angle)])
             place[person] = place[person - 1] + rng.uniform(0.5, 0.9) * near
     velocity = np.zeros((count, 2))
-    goal = np.array([_goal(roles[p], place[p], center, size, rng) for p in range(count)])
+    goal = np.array([_draw_goal(roles[p], place[p], center, size, rng) for p in range(count)])
     want = np.array([rng.uniform(*_SPEEDS[role]) for role in roles])
     rest = np.where([role == "stand" for role in roles], rng.uniform(2.0, 9.0, count), 0.0)
     shift = rng.uniform(-0.5, 0.5, (count, 2))
@@ -132,7 +134,7 @@ def wander(
     moved = np.empty((len(times), count, 2))
     for index in range(len(times)):
         root[index], moved[index] = place, velocity
-        others = np.array([way.root[index] for way in obstacles]).reshape(-1, 2)
+        others = np.array([trajectory.root[index] for trajectory in obstacles]).reshape(-1, 2)
         for _ in range(substeps):
             h = step / substeps
             for person, role in enumerate(roles):
@@ -145,29 +147,29 @@ def wander(
                 role = roles[person]
                 if role == "duel" and person:
                     continue
-                goal[person] = _goal(role, place[person], center, size, rng)
+                goal[person] = _draw_goal(role, place[person], center, size, rng)
                 want[person] = rng.uniform(*_SPEEDS[role])
                 if rng.random() < (0.7 if role == "stand" else 0.15):
                     rest[person] = rng.uniform(0.8, 6.0)
             rest = np.maximum(rest - h, 0.0)
             pace = np.where(rest > 0.0, 0.0, np.minimum(want, 1.6 * far))
             wanted = away / np.maximum(far, 1e-6)[:, None] * pace[:, None]
-            drive = _limited((wanted - velocity) / _RELAXATION, _HARDEST[0])
-            push = _limited(_repelled(place, others), _HARDEST[1])
+            drive = _limit_length((wanted - velocity) / _RELAXATION, _HARDEST[0])
+            push = _limit_length(_repulsion(place, others), _HARDEST[1])
             velocity = velocity + h * (drive + push)
             place = place + h * velocity
     root = gaussian_filter1d(root, 0.06 / step, axis=0, mode="nearest")
-    ways = []
+    trajectories = []
     for person, role in enumerate(roles):
         towards = None
         if role == "duel" and person:
             towards = root[:, person - 1] - root[:, person]
-        heading = _facing(moved[:, person], step, towards, rng)
-        ways.append(Way(times, root[:, person], heading, f"social forces: {role}"))
-    return ways
+        heading = _headings(moved[:, person], step, towards, rng)
+        trajectories.append(Trajectory(times, root[:, person], heading, f"social forces: {role}"))
+    return trajectories
 
 
-def _spread(
+def _draw_places(
     count: int, center: Floats, size: Floats, taken: list[Floats], rng: np.random.Generator
 ) -> Floats:
     """Places (count, 2) in an area, apart from each other where there is room."""
@@ -180,7 +182,7 @@ def _spread(
     return np.array(places).reshape(-1, 2)
 
 
-def _goal(
+def _draw_goal(
     role: Role, place: Floats, center: Floats, size: Floats, rng: np.random.Generator
 ) -> Floats:
     if role == "cross":
@@ -193,7 +195,7 @@ def _goal(
     return np.asarray(center + size * rng.uniform(-0.5, 0.5, 2))
 
 
-def _repelled(place: Floats, others: Floats) -> Floats:
+def _repulsion(place: Floats, others: Floats) -> Floats:
     """Accelerations (persons, 2) [m/s^2] by which people push each other apart."""
     everyone = np.concatenate([place, others])
     apart = place[:, None] - everyone
@@ -203,16 +205,16 @@ def _repelled(place: Floats, others: Floats) -> Floats:
     return np.asarray(((strength / np.maximum(far, 1e-3))[..., None] * apart).sum(axis=1))
 
 
-def _limited(vectors: Floats, most: float) -> Floats:
+def _limit_length(vectors: Floats, most: float) -> Floats:
     """Vectors (persons, 2) that are no longer than `most`."""
     size = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors * np.minimum(1.0, most / np.maximum(size, 1e-9)))
 
 
-def _facing(
+def _headings(
     velocity: Floats, step: float, towards: Floats | None, rng: np.random.Generator | None = None
 ) -> Floats:
-    """Heading (samples,) [rad]: the way one goes, or, where slow, where one looks."""
+    """Heading (samples,) [rad]: direction of motion, or of `towards` while slow."""
     speed = np.linalg.norm(velocity, axis=-1)
     begin = 0.0 if rng is None else float(rng.uniform(-np.pi, np.pi))
     aim = velocity + 1e-9
