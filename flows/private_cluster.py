@@ -2,10 +2,14 @@
 
 Dask runs whatever code a client sends, and a scheduler listens to every user of its machine. This
 one takes no connection without a certificate that exists in the memory of one run's processes.
+For a cluster over several machines, `python -m flows.private_cluster FOLDER` writes such a one.
 """
 
 from __future__ import annotations
 
+import os
+import sys
+from pathlib import Path
 from typing import Any
 
 import dask
@@ -32,3 +36,26 @@ class PrivateCluster(LocalCluster):
         await super()._start()  # type: ignore[no-untyped-call]
         scheduler: Any = self.scheduler
         scheduler.http_server.stop()
+
+
+def write_certificate(folder: Path) -> None:
+    """Write `certificate.pem` and `key.pem`, valid for a year, for this user alone.
+
+    Schedulers, workers and clients that have both trust each other and nobody else.
+    """
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    made = Security.temporary()
+    for name, content in (
+        ("certificate.pem", made.tls_worker_cert),
+        ("key.pem", made.tls_worker_key),
+    ):
+        (folder / name).unlink(missing_ok=True)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
+        with os.fdopen(os.open(folder / name, flags, 0o600), "w") as file:
+            file.write(content)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit("usage: python -m flows.private_cluster FOLDER")
+    write_certificate(Path(sys.argv[1]))

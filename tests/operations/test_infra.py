@@ -1,15 +1,20 @@
 """What infra/ sets up fits together: names, ports, options, secrets; tools check what they can."""
 
+import ast
 import re
 import shutil
+import ssl
 import subprocess
 from pathlib import Path
 
+import dask
+import distributed  # noqa: F401  its settings are then among Dask's
 import pytest
 import typer
 import yaml
 
 from flows.cli.serve import add_to
+from flows.private_cluster import write_certificate
 
 INFRA = Path(__file__).parents[2] / "infra"
 KUSTOMIZATION = INFRA / "kubernetes" / "kustomization.yaml"
@@ -49,6 +54,131 @@ def test_compose_opens_its_ports_to_this_machine_alone_and_holds_no_secret():
     secret = [value for name, value in given if re.search("PASSWORD|SECRET|TOKEN", name)]
     assert len(secret) >= 5
     assert all(re.fullmatch(r"\$\{\w+:\?\}", value) for value in secret), secret
+
+
+LOGINS = {
+    "prefect": "PREFECT_SERVER_API_AUTH_STRING",
+    "serve": "WORLDPOSE_REVIEW_TOKEN",
+    "grafana": "GF_SECURITY_ADMIN_PASSWORD",
+}
+"""Services of compose that people reach, and what each asks for its login in."""
+
+
+def test_compose_publishes_only_what_asks_for_a_login():
+    for name, service in SERVICES.items():
+        is_published = "ports" in service
+        assert is_published == (name in LOGINS), name
+        if is_published:
+            assert LOGINS[name] in service["environment"]
+        elif name != "bucket":
+            assert service["networks"] == ["inside"], name
+    assert COMPOSE["networks"]["inside"] == {"internal": True}
+    assert SERVICES["serve"]["environment"]["WORLDPOSE_METRICS_TOKEN"]
+    login = SERVICES["prefect"]["environment"]["PREFECT_SERVER_API_AUTH_STRING"]
+    assert SERVICES["serve"]["environment"]["PREFECT_API_AUTH_STRING"] == login
+    guarded = ["python", "-m", "flows.prefect_server"]
+    assert SERVICES["prefect"]["entrypoint"][:3] == guarded
+
+
+def test_compose_gives_alerts_and_tokens_to_serve_alone():
+    for name, service in SERVICES.items():
+        given = set(service.get("environment", {}))
+        held = {each for each in given if re.search("REVIEW|METRICS_TOKEN|ALERT", each)}
+        assert held == set() or name == "serve", name
+    assert "AWS_SECRET_ACCESS_KEY" not in SERVICES["prefect"]["environment"]
+    assert "AWS_SECRET_ACCESS_KEY" not in SERVICES["dask-scheduler"]["environment"]
+
+
+def dask_parts():
+    """Commands, environment and secrets of what takes part in Dask, by set-up and name."""
+    for name in ("dask-scheduler", "dask-worker", "dask-worker-gpu", "serve"):
+        service = SERVICES[name]
+        command = service.get("entrypoint") or service["command"]
+        files = {f"/run/secrets/{secret}" for secret in service["secrets"]}
+        yield f"compose {name}", command, service["environment"], files
+    kustomization = yaml.safe_load(KUSTOMIZATION.read_text())
+    (paths,) = [
+        dict(each.split("=", 1) for each in generated["literals"])
+        for generated in kustomization["configMapGenerator"]
+        if generated["name"] == "dask-tls-paths"
+    ]
+    for manifest in manifests():
+        kind, name = named(manifest)
+        if kind == "Deployment" and name != "prefect":
+            (container,) = manifest["spec"]["template"]["spec"]["containers"]
+            command = container.get("command") or container["args"]
+            assert {"configMapRef": {"name": "dask-tls-paths"}} in container["envFrom"]
+            mounted = {mount["mountPath"] for mount in container["volumeMounts"]}
+            files = {"/tls/certificate.pem", "/tls/key.pem"} if "/tls" in mounted else set()
+            yield f"kubernetes {name}", command, paths, files
+
+
+def test_dask_takes_no_connection_without_its_certificate():
+    parts = list(dask_parts())
+    assert len(parts) == 8
+    for name, command, environment, files in parts:
+        text = " ".join(command)
+        assert "tcp://" not in text, name
+        assert "tls://" in text or "--protocol tls" in text, name
+        if "worker" in name:
+            assert "tasks.preload" in text, name
+        prefix = "DASK_DISTRIBUTED__COMM__"
+        assert environment[f"{prefix}REQUIRE_ENCRYPTION"] == "true", name
+        given = {v for k, v in environment.items() if k.startswith(f"{prefix}TLS__")}
+        assert given == files, name
+        # Names that Dask knows.
+        for key in (key for key in environment if key.startswith(prefix)):
+            place = key.removeprefix("DASK_").lower().replace("__", ".")
+            assert dask.config.get(place.replace("_", "-"), "unknown") != "unknown", key
+
+
+def test_a_dask_scheduler_over_http_tells_health_and_figures_alone():
+    routes = "DASK_DISTRIBUTED__SCHEDULER__HTTP__ROUTES"
+    (scheduler,) = [each for each in manifests() if named(each) == ("Deployment", "dask-scheduler")]
+    (container,) = scheduler["spec"]["template"]["spec"]["containers"]
+    in_kubernetes = {each["name"]: each["value"] for each in container["env"]}[routes]
+    for value in (SERVICES["dask-scheduler"]["environment"][routes], in_kubernetes):
+        assert ast.literal_eval(value) == [
+            "distributed.http.scheduler.prometheus",
+            "distributed.http.health",
+        ]
+
+
+def test_pods_of_kubernetes_are_reached_by_those_alone_that_a_policy_names():
+    policies = [each["spec"] for each in manifests() if each["kind"] == "NetworkPolicy"]
+    assert {"podSelector": {}, "policyTypes": ["Ingress"]} in policies
+    for manifest in manifests():
+        kind, name = named(manifest)
+        if kind != "Deployment":
+            continue
+        spec = manifest["spec"]["template"]["spec"]
+        (container,) = spec["containers"]
+        assert not spec["automountServiceAccountToken"], name
+        assert container["securityContext"]["capabilities"] == {"drop": ["ALL"]}, name
+        assert not container["securityContext"]["allowPrivilegeEscalation"], name
+        (policy,) = [each for each in policies if name in str(each["podSelector"])]
+        for rule in policy["ingress"]:
+            assert rule["from"], name
+            ports = {port["name"] for port in container.get("ports", ())}
+            assert {port["port"] for port in rule.get("ports", ())} <= ports, name
+    text = str([each for each in manifests() if named(each) == ("Deployment", "prefect")])
+    assert "flows.prefect_server" in text
+    assert "prefect-login" in text
+    # The guard answers a probe that names the server.
+    assert text.count("'name': 'Host', 'value': 'prefect'") == 2
+
+
+def test_a_certificate_is_for_this_user_alone_and_made_anew(tmp_path):
+    folder = tmp_path / "tls"
+    write_certificate(folder)
+    key = (folder / "key.pem").read_text()
+    write_certificate(folder)
+    assert folder.stat().st_mode & 0o777 == 0o700
+    for name in ("certificate.pem", "key.pem"):
+        assert (folder / name).stat().st_mode & 0o777 == 0o600
+    assert (folder / "key.pem").read_text() != key
+    context = ssl.create_default_context(cafile=folder / "certificate.pem")
+    context.load_cert_chain(folder / "certificate.pem", folder / "key.pem")
 
 
 @pytest.mark.parametrize("setup", ["compose", "kubernetes"])
@@ -138,7 +268,7 @@ def test_kubectl_builds_the_kubernetes_set_up():
     documents = list(yaml.safe_load_all(built.stdout))
     assert {each["metadata"]["namespace"] for each in documents} == {"worldpose"}
     assert "image: worldpose\n" not in built.stdout
-    assert len(documents) == len(manifests()) + 1  # the settings that are made of literals
+    assert len(documents) == len(manifests()) + 2  # the settings that are made of literals
 
 
 @needs("kubernetes-validate")
@@ -158,6 +288,7 @@ def test_compose_takes_its_set_up_and_refuses_one_without_secrets():
     tool = shutil.which("docker-compose")
     command = [tool, "-f", INFRA / "compose" / "compose.yaml", "--profile", "gpu"]
     secrets = ["WORLDPOSE_REVIEW_TOKEN", "POSTGRES_PASSWORD", "S3_SECRET", "GRAFANA_PASSWORD"]
+    secrets += ["PREFECT_PASSWORD", "WORLDPOSE_METRICS_TOKEN"]
     given = {"PATH": "/bin", **dict.fromkeys(secrets, "secret")}
     built = subprocess.run([*command, "config"], capture_output=True, text=True, env=given)
     assert built.returncode == 0, built.stderr
@@ -183,6 +314,11 @@ def test_the_batch_script_is_a_shell_script_that_asks_for_its_arguments():
     assert "a match folder" in bare.stderr
     directives = re.findall(r"^#SBATCH (--[\w-]+)", script.read_text(), re.MULTILINE)
     assert {"--nodes", "--time", "--requeue"} <= set(directives)
+    text = script.read_text()
+    assert "prefect server start" not in text
+    assert text.index('mktemp -d "$project/operations') < text.index("flows.private_cluster")
+    for started in ("dask scheduler --protocol tls", "flows.prefect_server", "--preload tasks"):
+        assert text.index("COMM__REQUIRE_ENCRYPTION=true") < text.index(started)
 
 
 def test_the_image_is_made_of_what_is_there():
@@ -193,3 +329,21 @@ def test_the_image_is_made_of_what_is_there():
     ignored = (INFRA / "container" / "Containerfile.ignore").read_text()
     for source in re.findall(r"^COPY (\w+) \w+$", text, re.MULTILINE):
         assert f"!{source}\n" in ignored
+
+
+def test_every_line_of_the_threat_model_names_tests_that_are_there():
+    text = (INFRA.parent / "docs" / "security.md").read_text()
+    tests = "".join(file.read_text() for file in (INFRA.parent / "tests").rglob("test_*.py"))
+    rows = [line for line in text.splitlines() if line.startswith("|")]
+    named = {name for row in rows for name in re.findall(r"`([a-z_]{25,})`", row)}
+    assert len(named) >= 15
+    assert [name for name in sorted(named) if f"def test_{name}(" not in tests] == []
+    files = set(re.findall(r"`(?:tests/)?((?:flows/|operations/)?test_\w+\.py)`", text))
+    there = {file.name for file in (INFRA.parent / "tests").rglob("test_*.py")}
+    assert {file.rpartition("/")[2] for file in files} <= there
+    said = text.partition("## Who may do what")[2].partition("## How")[0]
+    assert all(
+        "`" in row
+        for row in said.splitlines()
+        if row.startswith("| ") and "---" not in row[:6] and not row.startswith("| who")
+    )
