@@ -192,7 +192,7 @@ def warnings_said(record, match):
     """What `worldpose run` warns of after a run, in its own words."""
     from flows import clock_advice
 
-    said = list(clock_advice.clock_advice(record.figures, match.folder.spec))
+    said = [*record.warnings, *clock_advice.clock_advice(record.figures, match.folder.spec)]
     for name, figures in record.figures.items():
         if figures.get("joints") == 0:
             said.append(f"{name} found nobody")

@@ -7,7 +7,6 @@ picture are taken. Every file is an npz of arrays; names as the methods have the
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +18,13 @@ from numpy.typing import NDArray
 from worldpose.body.model import JOINTS
 from worldpose.cameras import Rigid
 from worldpose.errors import InputError
+from worldpose.ingest.npz_files import read_npz
+from worldpose.ingest.text_files import require_file
 
 Floats = NDArray[np.float64]
+
+ESTIMATE_BYTES: Final = 1 << 30
+"""Most that the arrays of one file may fill [byte]: 1.5 million bodies as matrices."""
 
 WHOLE: Final = ("pred_thetas", "pred_theta_mats", "poses", "pose", "thetas")
 """Names of all 24 turns in one array."""
@@ -63,12 +67,8 @@ def read_monocular(path: Path) -> MonocularEstimates:
     Raises:
         InputError: unreadable, or lacking turns or places.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: np.asarray(file[name]) for name in file.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise _wrong(path, "an npz file of plain arrays", f"{error}") from error
-    return monocular_of(arrays, path)
+    require_file(path)
+    return monocular_of(read_npz(path, ESTIMATE_BYTES), path)
 
 
 def monocular_of(arrays: Mapping[str, NDArray[Any]], where: Path) -> MonocularEstimates:

@@ -7,10 +7,9 @@ little-endian order, NaN where missing (`data_contracts.observations`).
 
 from __future__ import annotations
 
-import math
 import zipfile
 from pathlib import Path
-from typing import IO, Final, cast
+from typing import Final, cast
 
 import numpy as np
 from numpy.lib import format as npy
@@ -19,6 +18,14 @@ from numpy.typing import NDArray
 from data_contracts.conventions import COCO17
 from data_contracts.records import FRAME_LIMIT
 from worldpose.errors import InputError
+from worldpose.ingest.npz_files import (
+    Header,
+    npz_error,
+    open_npz,
+    read_array,
+    read_header,
+    require_size,
+)
 from worldpose.ingest.observations import Observations
 from worldpose.ingest.text_files import require_file
 
@@ -27,12 +34,6 @@ ARRAY_BYTES: Final = 4 << 30
 
 PEOPLE_LIMIT: Final = 1000
 """Most people per frame of one camera; a stadium's stands in one image have a few hundred."""
-
-PACKED_RATIO: Final = 200
-"""Largest ratio of unpacked to packed bytes: poses with much room for absent people reach 50."""
-
-PACKED_BYTES: Final = 1 << 26
-"""Unpacked bytes up to which the ratio does not matter."""
 
 COORDINATE_LIMIT: Final = 1e6
 """Farthest from the picture's origin that a keypoint or box corner is believed [px]."""
@@ -47,8 +48,6 @@ _SHAPES: Final = {
     "boxes": ("frames", "detections", 4),
     "score": ("frames", "detections"),
 }
-
-_Header = tuple[tuple[int, ...], bool, np.dtype[np.generic]]
 
 
 def write_keypoint_arrays(path: Path, people: Observations) -> None:
@@ -74,11 +73,11 @@ def read_keypoint_arrays(path: Path) -> Observations:
             too large, frames that do not rise, infinite values, or a keypoint without confidence.
     """
     require_file(path)
-    with _opened(path) as file:
+    with open_npz(path) as file:
         infos = _members(path, file)
-        headers = {name: _header(path, file, info) for name, info in infos.items()}
+        headers = {name: read_header(path, file, info) for name, info in infos.items()}
         _check_headers(path, infos, headers)
-        arrays = {name: _array(path, file, info) for name, info in infos.items()}
+        arrays = {name: read_array(path, file, info) for name, info in infos.items()}
     people = Observations(
         frame=cast("NDArray[np.int64]", arrays["frame"]),
         keypoints=cast("NDArray[np.float32]", arrays["keypoints"]),
@@ -90,50 +89,17 @@ def read_keypoint_arrays(path: Path) -> Observations:
     return people
 
 
-def _opened(path: Path) -> zipfile.ZipFile:
-    try:
-        return zipfile.ZipFile(path)
-    # ValueError and NotImplementedError: a directory of nonsense, or of a later version.
-    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
-        raise _wrong(str(path), "an npz file", f"{error}") from error
-
-
 def _members(path: Path, file: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     names = [info.filename for info in file.infolist()]
     expected = [f"{name}.npy" for name in _SHAPES]
     if sorted(names) != sorted(expected):
         found = ", ".join(names[:8]) or "nothing"
-        raise _wrong(str(path), f"the members {', '.join(expected)}", found)
+        raise npz_error(str(path), f"the members {', '.join(expected)}", found)
     return {name: file.getinfo(f"{name}.npy") for name in _SHAPES}
 
 
-def _header(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> _Header:
-    where = f"{path}: {info.filename}"
-    try:
-        with file.open(info) as member:
-            shape, fortran, dtype = _read_header(member)
-            start = member.tell()
-    except Exception as error:  # a hostile header can raise nearly anything in numpy and zipfile
-        raise _wrong(where, "an npy array", _brief(error)) from error
-    if dtype.hasobject:
-        raise _wrong(where, "numbers", "Python objects, which are never loaded")
-    if start + math.prod(shape) * dtype.itemsize != info.file_size:
-        raise _wrong(
-            where,
-            f"{start + math.prod(shape) * dtype.itemsize} bytes for its shape {shape}",
-            f"{info.file_size} bytes",
-        )
-    return shape, fortran, dtype
-
-
-def _read_header(member: IO[bytes]) -> _Header:
-    if npy.read_magic(member) != (1, 0):
-        raise ValueError("another version than npy 1.0")  # later ones allow headers of 4 GB
-    return npy.read_array_header_1_0(member)
-
-
 def _check_headers(
-    path: Path, infos: dict[str, zipfile.ZipInfo], headers: dict[str, _Header]
+    path: Path, infos: dict[str, zipfile.ZipInfo], headers: dict[str, Header]
 ) -> None:
     sizes: dict[str, int] = {}
     for name, dims in _SHAPES.items():
@@ -141,14 +107,14 @@ def _check_headers(
         shape, _, dtype = headers[name]
         wanted = np.dtype("<i8" if name == "frame" else "<f4")
         if dtype != wanted:
-            raise _wrong(where, f"{wanted.str} ({wanted.name}, little-endian)", dtype.str)
+            raise npz_error(where, f"{wanted.str} ({wanted.name}, little-endian)", dtype.str)
         fits = len(shape) == len(dims) and all(
             n >= 0 and n == (sizes.setdefault(dim, n) if isinstance(dim, str) else dim)
             for n, dim in zip(shape, dims, strict=True)
         )
         if not fits:
             known = tuple(sizes.get(dim, dim) if isinstance(dim, str) else dim for dim in dims)
-            raise _wrong(where, f"shape {known}".replace("'", ""), f"{shape}")
+            raise npz_error(where, f"shape {known}".replace("'", ""), f"{shape}")
     if sizes["detections"] > PEOPLE_LIMIT:
         raise InputError(
             f"{path}: {infos['score'].filename}",
@@ -156,37 +122,18 @@ def _check_headers(
             found=f"room for {sizes['detections']}",
             todo="Keep the detections of each frame with the highest scores.",
         )
-    total = sum(info.file_size for info in infos.values())
-    packed = sum(info.compress_size for info in infos.values())
-    if total > min(ARRAY_BYTES, max(PACKED_BYTES, packed * PACKED_RATIO)):
-        limit = f"at most {ARRAY_BYTES} bytes of arrays"
-        if total <= ARRAY_BYTES:
-            limit = f"arrays packed at most {PACKED_RATIO} to 1"
-        raise InputError(
-            str(path),
-            expected=limit,
-            found=f"{total} bytes of arrays in {packed}",
-            todo="Give the detection dimension no more room than the fullest frame needs, or save "
-            "the arrays without compression.",
-        )
-
-
-def _array(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[np.generic]:
-    try:
-        with file.open(info) as member:
-            array: NDArray[np.generic] = npy.read_array(member, allow_pickle=False)
-            return np.ascontiguousarray(array)
-    except Exception as error:  # see _header
-        raise _wrong(f"{path}: {info.filename}", "a whole array", _brief(error)) from error
+    require_size(path, list(infos.values()), ARRAY_BYTES)
 
 
 def _check_values(path: Path, people: Observations) -> None:
     steps = np.diff(people.frame)
     if np.any(steps <= 0):
         place = int(np.argmax(steps <= 0)) + 1
-        raise _wrong(f"{path}: frame[{place}]", "frame numbers that rise", f"{people.frame[place]}")
+        raise npz_error(
+            f"{path}: frame[{place}]", "frame numbers that rise", f"{people.frame[place]}"
+        )
     if np.any(np.abs(people.frame) > FRAME_LIMIT):
-        raise _wrong(f"{path}: frame", f"frame numbers up to {FRAME_LIMIT}", "larger ones")
+        raise npz_error(f"{path}: frame", f"frame numbers up to {FRAME_LIMIT}", "larger ones")
     for start in range(0, len(people.frame), _BLOCK):
         _check_block(path, start, people.rows(slice(start, start + _BLOCK)))
 
@@ -215,15 +162,6 @@ def _check_block(path: Path, start: int, people: Observations) -> None:
             place = tuple(int(i) for i in np.argwhere(wrong)[0])
             value = getattr(people, name)[place]
             where = [place[0] + start, *place[1:]]
-            raise _wrong(
+            raise npz_error(
                 f"{path}: {name}{where} (frame {people.frame[place[0]]})", rule, f"{value}"
             )
-
-
-def _brief(error: Exception) -> str:
-    text = str(error) or type(error).__name__
-    return text if len(text) <= 200 else text[:197] + "..."
-
-
-def _wrong(where: str, expected: str, found: str) -> InputError:
-    return InputError(where, expected=expected, found=found, todo="Write or export it again.")

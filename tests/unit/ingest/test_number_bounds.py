@@ -142,7 +142,7 @@ def test_an_npz_has_at_most_1000_people_per_frame(tmp_path):
 
 
 def test_a_small_file_does_not_unpack_to_gigabytes(tmp_path, monkeypatch):
-    monkeypatch.setattr("worldpose.ingest.keypoint_arrays.PACKED_BYTES", 1 << 16)
+    monkeypatch.setattr("worldpose.ingest.npz_files.PACKED_BYTES", 1 << 16)
     save(tmp_path / "a.npz", PEOPLE_LIMIT, np.savez_compressed)
     with pytest.raises(InputError, match="arrays packed at most 200 to 1"):
         read_keypoint_arrays(tmp_path / "a.npz")

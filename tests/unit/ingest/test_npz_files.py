@@ -1,0 +1,68 @@
+"""Arrays of npz files that others wrote: read, or refused before anything is allocated."""
+
+import io
+import zipfile
+
+import numpy as np
+import pytest
+
+from worldpose.errors import InputError
+from worldpose.ingest.npz_files import read_npz
+
+
+def written(path, **members):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, content in members.items():
+            if not isinstance(content, bytes):
+                form = io.BytesIO()
+                np.lib.format.write_array(form, content, version=(1, 0))
+                content = form.getvalue()
+            file.writestr(f"{name}.npy", content)
+    return path
+
+
+def header(text):
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
+
+
+def test_arrays_come_back_in_either_order(tmp_path):
+    values = np.arange(12.0).reshape(3, 4)
+    path = written(tmp_path / "a.npz", plain=values, fortran=np.asfortranarray(values))
+    found = read_npz(path, 1000)
+    np.testing.assert_array_equal(found["plain"], values)
+    np.testing.assert_array_equal(found["fortran"], values)
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (
+            header("{'descr': '<f4', 'fortran_order': False, 'shape': (10, 10**12), }\n"),
+            "npy array",
+        ),
+        (header("{'descr': '<f4', 'fortran_order': False, 'shape': (10, 100), }\n"), "4073 bytes"),
+        (header("{'descr': '<f4', 'fortran_order': False, 'shape': (-1,), }\n"), "bytes"),
+        (header("[" * 3000 + "]" * 3000), "npy array"),
+        (header("__import__('os').system('id')\n"), "npy array"),
+        (b"", "npy array"),
+        (b"\x93NUMPY\x02\x00", "npy 1.0"),
+    ],
+)
+def test_a_member_that_lies_is_named(tmp_path, content, told):
+    path = written(tmp_path / "a.npz", score=content)
+    with pytest.raises(InputError, match=told) as caught:
+        read_npz(path, 10**6)
+    assert caught.value.where == f"{path}: score.npy"
+    assert len(str(caught.value)) < 600
+
+
+def test_arrays_beyond_the_limit_are_not_unpacked(tmp_path):
+    path = written(tmp_path / "a.npz", score=np.zeros(1000))
+    with pytest.raises(InputError, match="at most 7000 bytes of arrays, found 8128 bytes"):
+        read_npz(path, 7000)
+
+
+def test_no_archive_is_refused(tmp_path):
+    (tmp_path / "a.npz").write_bytes(b"no archive")
+    with pytest.raises(InputError, match="expected an npz file"):
+        read_npz(tmp_path / "a.npz", 1000)
