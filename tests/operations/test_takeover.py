@@ -507,12 +507,17 @@ def test_a_service_begun_again_puts_the_pools_right_and_keeps_its_login(served):
     served.end()
     served.begin()
     assert served.secret("prefect") == login
-    for pool in ("worldpose", "worldpose-arrivals"):
-        template = served.ask(f"/work_pools/{pool}")["base_job_template"]
-        assert set(template["variables"]["properties"]) == {"stream_output"}
-    deployment = deployment_of(served)
-    assert deployment["entrypoint"] == "flows.operations.deployed.ingest"
-    assert not deployment["pull_steps"]
+
+    def is_right():
+        """Soon: a worker that was heard of before the restart counts as one that is there."""
+        pools = [served.ask(f"/work_pools/{name}") for name in ("worldpose", "worldpose-arrivals")]
+        chosen = [set(pool["base_job_template"]["variables"]["properties"]) for pool in pools]
+        deployment = deployment_of(served)
+        code = (deployment["entrypoint"], deployment["pull_steps"])
+        installed = ("flows.operations.deployed.ingest", [])
+        return chosen == [{"stream_output"}] * 2 and code == installed
+
+    wait_until(is_right, served.explain)
     assert served.check().json["healthy"], served.explain()
     with pytest.raises(Exception, match="401"):
         fetch(f"http://127.0.0.1:{served.ports['prefect']}/api/deployments/filter", {})
