@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import logging
 import shutil
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from threading import Lock
+from typing import Any, Final, Literal
 
 from data_contracts.operations import Arrival
 from flows.operations.layout import StateFolder
@@ -17,6 +19,11 @@ from flows.operations.senders import Sender
 from worldpose.release import whole_file
 
 AlertKind = Literal["run_failed", "gate_waiting", "quality", "disk_low", "arrival_refused"]
+
+FIRST_PAUSE: Final = 30.0
+"""After a first failure of a sender; each further one doubles it [s]."""
+LONGEST_PAUSE: Final = 3600.0
+"""Between two tries of a sender that fails [s]."""
 
 LOG = logging.getLogger("worldpose.operations")
 
@@ -103,48 +110,102 @@ def _of_match(plan: ServePlan, match: MatchGlance) -> Iterator[Alert]:
 class Teller:
     """Tells of each alert once, as long as it holds; what could not be told is told later.
 
+    Each sender has its own pace: `hold` says what there is to be told, and never waits; `deliver`
+    hands it to one sender, stops at the first failure, and tries again after a pause that doubles.
+
     Attributes:
         state: where it is kept what was told, so that a restart repeats nothing.
         senders: the ways to tell it; none tells the log alone.
+        pause: after a first failure of a sender [s].
     """
 
-    def __init__(self, state: StateFolder, senders: Sequence[Sender]) -> None:
-        self.state, self.senders = state, tuple(senders)
-        kept = state.alerts.read_text() if state.alerts.exists() else "{}"
-        self._told: dict[str, dict[str, Any]] = json.loads(kept)
+    def __init__(
+        self, state: StateFolder, senders: Sequence[Sender], pause: float = FIRST_PAUSE
+    ) -> None:
+        self.state, self.senders, self.pause = state, tuple(senders), pause
+        self._told = _kept_alerts(state)
+        self._lock = Lock()
+        self._pauses: dict[str, float] = {}
+        self._due: dict[str, float] = {}
 
     def tell(self, alerts: Iterable[Alert]) -> list[Alert]:
-        """Tell what is new; gives that, where all ways took it."""
-        before, told = self._told, {}
-        new = []
-        for alert in {each.key: each for each in alerts}.values():
-            if alert.key not in before:
-                LOG.warning("alert: %s", alert.text)
-            took = before.get(alert.key, {}).get("told_by")
-            now = self._send(alert, took or ())
-            told[alert.key] = {**_content(alert), "told_by": now}
-            if now != took and len(now) == len(self.senders):
-                new.append(alert)
-        if told != before:
-            self._told = told
-            with whole_file(self.state.alerts) as draft:
-                draft.write_text(json.dumps(told, indent=2) + "\n")
-        return new
-
-    def _send(self, alert: Alert, took: Sequence[str]) -> list[str]:
-        """The names of all senders that have taken it, now or before."""
-        took = [sender.name for sender in self.senders if sender.name in took]
+        """Hold and deliver to all senders in turn; gives what is new, where all ways took it."""
+        alerts = list({each.key: each for each in alerts}.values())
+        before = {key: kept.get("told_by") for key, kept in self._told.items()}
+        self.hold(alerts)
         for sender in self.senders:
-            if sender.name in took:
-                continue
+            self.deliver(sender)
+        names = [sender.name for sender in self.senders]
+        told = {key: kept["told_by"] for key, kept in self._told.items()}
+        return [
+            each
+            for each in alerts
+            if told[each.key] != before.get(each.key) and set(told[each.key]) == set(names)
+        ]
+
+    def hold(self, alerts: Iterable[Alert]) -> None:
+        """From now on these alerts are to be told, and no others."""
+        with self._lock:
+            before, told = self._told, {}
+            for alert in alerts:
+                if alert.key not in before:
+                    LOG.warning("alert: %s", alert.text)
+                took = before.get(alert.key, {}).get("told_by", [])
+                told[alert.key] = {**_content(alert), "told_by": list(took)}
+            self._told = told
+            if told != before:
+                self._keep()
+
+    def deliver(self, sender: Sender) -> None:
+        """Hand what a sender has not taken yet to it, until it fails; not while it is paused."""
+        name = sender.name
+        while time.monotonic() >= self._due.get(name, float("-inf")):
+            with self._lock:
+                pending = [key for key, kept in self._told.items() if name not in kept["told_by"]]
+                if not pending:
+                    return
+                content = {at: it for at, it in self._told[pending[0]].items() if at != "told_by"}
             try:
-                sender.send(_content(alert))
-            except (OSError, ValueError) as error:
+                sender.send(content)
+            except Exception as error:
+                pause = min(2.0 * self._pauses.get(name, 0.5 * self.pause), LONGEST_PAUSE)
+                self._pauses[name], self._due[name] = pause, time.monotonic() + pause
                 # What the error says may hold the address, and that a secret.
-                LOG.warning("%s did not take an alert: %s", sender.name, type(error).__name__)
-            else:
-                took.append(sender.name)
-        return took
+                kind = type(error).__name__
+                LOG.warning(
+                    "%s did not take an alert: %s; again in %.0f s, with %s more",
+                    *(name, kind, pause, len(pending) - 1),
+                )
+                return
+            if self._pauses.pop(name, None) is not None:
+                LOG.warning("%s takes alerts again", name)
+            with self._lock:
+                kept = self._told.get(pending[0])
+                if kept is not None:  # it may be over meanwhile
+                    took = {*kept["told_by"], name}
+                    kept["told_by"] = [each.name for each in self.senders if each.name in took]
+                    self._keep()
+
+    def _keep(self) -> None:
+        try:
+            with whole_file(self.state.alerts) as draft:
+                draft.write_text(json.dumps(self._told, indent=2) + "\n")
+        except OSError as error:  # the disk may be what is to be told of
+            LOG.warning("%s cannot be written: %s", self.state.alerts, error.strerror)
+
+
+def _kept_alerts(state: StateFolder) -> dict[str, dict[str, Any]]:
+    """What was told; nothing where the file is damaged, so that it is told once more."""
+    try:
+        kept = json.loads(state.alerts.read_text())
+        return {
+            key: {**each, "told_by": list(each.get("told_by", []))} for key, each in kept.items()
+        }
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, AttributeError, TypeError):
+        LOG.warning("%s cannot be read; alerts that hold are told once more", state.alerts)
+        return {}
 
 
 def _content(alert: Alert) -> Mapping[str, str]:

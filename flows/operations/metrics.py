@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Lock
-from typing import Final
+from typing import Any, Final
 
 from prometheus_client import CollectorRegistry
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -20,12 +20,15 @@ from prometheus_client.registry import Collector
 
 from flows.gates import Figures
 from flows.host_guard import LOOPBACK, host_name
+from flows.http_server import Connections
 from flows.method import GATES
 from flows.operations.layout import StateFolder
 from flows.operations.overview import MatchGlance, Overview, UnitGlance, age
 from flows.operations.plan import ServePlan
 from worldpose.store import Store
 
+MAX_SCRAPES: Final = 50
+"""Open connections of those who ask for figures."""
 SIZE_SECONDS: Final = 300.0
 """How old the store's size may be: it is a sum over all its files."""
 STATES: Final = ("complete", "waiting", "partial", "failed", "at work", "not run", "unreadable")
@@ -136,7 +139,25 @@ def metrics_server(plan: ServePlan, figures: ProjectFigures, token: str) -> Thre
         def log_message(self, format: str, *args: object) -> None:
             """Scrapes are no news."""
 
-    return ThreadingHTTPServer((plan.host, plan.metrics_port), Handler)
+    return _MetricsServer((plan.host, plan.metrics_port), Handler)
+
+
+class _MetricsServer(ThreadingHTTPServer):
+    """One thread a connection, of which there are few: slow ones are closed."""
+
+    request_queue_size = 128
+
+    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
+        self.connections = Connections(MAX_SCRAPES)
+        super().__init__(address, handler)
+
+    def get_request(self) -> tuple[Any, Any]:
+        connection, address = super().get_request()
+        self.connections.admit(connection, address)
+        return connection, address
+
+    def service_actions(self) -> None:
+        self.connections.sweep()
 
 
 def _counts(

@@ -29,8 +29,15 @@ class Sender(Protocol):
         """Have it delivered.
 
         Raises:
-            OSError, ValueError: it was not taken; errors of mail are OSErrors.
+            Exception: it was not taken.
         """
+
+
+class _NoRedirects(urllib.request.HTTPRedirectHandler):
+    """An answer of 3xx is an error."""
+
+    def redirect_request(self, *_: object) -> None:
+        return None
 
 
 @dataclass(frozen=True)
@@ -40,12 +47,35 @@ class Webhook:
     address: str
     name: str = "webhook"
 
+    @classmethod
+    def at(cls, address: str) -> Webhook:
+        """The webhook of an http: or https: address.
+
+        Raises:
+            UsageError: it is none.
+        """
+        try:
+            parts = urlsplit(address)
+            is_web = parts.scheme in ("http", "https") and bool(parts.hostname)
+            port = parts.port
+        except ValueError:
+            is_web, port = False, None
+        if not is_web or port == 0:
+            raise UsageError(
+                "WORLDPOSE_ALERT_URL",
+                expected="https://HOST/PATH (or http:)",
+                found="something else, which may hold a secret",
+                todo="Set it so, or unset it to post nothing.",
+            )
+        return cls(address)
+
     def send(self, content: Mapping[str, str]) -> None:
-        """See `Sender`."""
+        """See `Sender`. Redirects are not followed: a POST would become a GET."""
         headers = {"content-type": "application/json", "user-agent": "worldpose"}
         body = json.dumps(content).encode()
         request = urllib.request.Request(self.address, data=body, headers=headers)
-        with urllib.request.urlopen(request, timeout=ANSWER_SECONDS) as answer:
+        opener = urllib.request.build_opener(_NoRedirects)
+        with opener.open(request, timeout=ANSWER_SECONDS) as answer:
             if not 200 <= answer.status < 300:
                 raise ValueError(f"it answered {answer.status}")
 
@@ -130,8 +160,8 @@ def senders_of(environment: Mapping[str, str]) -> tuple[Sender, ...]:
     """The ways that WORLDPOSE_ALERT_URL and WORLDPOSE_ALERT_MAIL name.
 
     Raises:
-        UsageError: the latter is no address of mail.
+        UsageError: one of them is no address of its kind.
     """
     webhook, mail = environment.get("WORLDPOSE_ALERT_URL"), environment.get("WORLDPOSE_ALERT_MAIL")
-    found: list[Sender] = [Webhook(webhook)] if webhook else []
+    found: list[Sender] = [Webhook.at(webhook)] if webhook else []
     return (*found, Mail.at(mail)) if mail else tuple(found)

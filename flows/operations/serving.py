@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,9 +11,10 @@ import threading
 import time
 import urllib.request
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from pathlib import Path
 from types import FrameType
 from typing import Final
 
@@ -35,7 +37,7 @@ BEGIN_SECONDS: Final = 300.0
 END_SECONDS: Final = 15.0
 """What a process may take to end before it is killed."""
 LOG_BYTES: Final = 10_000_000
-"""A longer log is set aside as `.1` when its process begins."""
+"""A longer log is set aside as `.1`, also while its process is at work."""
 
 Tell = Callable[[str], None]
 
@@ -88,6 +90,7 @@ class _Supervisor:
         """Begin again what has ended."""
         now = time.monotonic()
         for part in self.parts:
+            bound_log(self.plan.state_folder.logs / f"{part.name}.log")
             if part.process is not None and part.process.poll() is not None:
                 code = part.process.returncode
                 is_steady = now - part.began > STEADY_SECONDS
@@ -139,8 +142,7 @@ class _Supervisor:
     def _begin(self, part: _Part) -> None:
         log = self.plan.state_folder.logs / f"{part.name}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
-        if log.exists() and log.stat().st_size > LOG_BYTES:
-            log.replace(log.with_suffix(".log.1"))
+        bound_log(log)
         with log.open("ab") as output:
             part.said = output.tell()
             part.process = subprocess.Popen(
@@ -194,6 +196,18 @@ def serve(plan: ServePlan, secrets: Secrets, ready: Callable[[], None], tell: Te
                 supervisor.end()
                 state.end_orderly()
                 state.serving.unlink(missing_ok=True)
+
+
+def bound_log(log: Path) -> None:
+    """Set a log that is too long aside, in place of the one before.
+
+    Its process goes on writing to the same file, which it appends to, from the beginning.
+    """
+    if not log.exists() or log.stat().st_size <= LOG_BYTES:
+        return
+    with suppress(OSError):  # on a full disk it is the log that makes room
+        shutil.copyfile(log, log.with_suffix(".log.1"))
+    os.truncate(log, 0)
 
 
 def answers(address: str) -> bool:

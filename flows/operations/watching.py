@@ -8,6 +8,9 @@ import logging
 import os
 import threading
 import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
@@ -29,7 +32,7 @@ from flows.operations.metrics import ProjectFigures, metrics_server
 from flows.operations.overview import Overview
 from flows.operations.plan import ServePlan
 from flows.operations.recovery import begin_again, may_begin_again
-from flows.operations.senders import senders_of
+from flows.operations.senders import Sender, senders_of
 from flows.operations.service_secrets import METRICS_TOKEN
 from worldpose.store import Store
 
@@ -39,6 +42,12 @@ BUCKET_SECONDS: Final = 10.0
 """Between two looks at an inbox in object storage."""
 ALERT_SECONDS: Final = 30.0
 """Between two looks for alerts and lost runs."""
+DELIVERY_SECONDS: Final = 2.0
+"""Between two looks of a sender for alerts that it has not taken."""
+TROUBLE_SECONDS: Final = 3600.0
+"""Between two log lines about a failure that lasts."""
+TROUBLE_LENGTH: Final = 500
+"""Of such a line."""
 FAILED_DAYS: Final = 7
 """A failed run is no alert any more after so long."""
 
@@ -55,7 +64,44 @@ def watch(plan: ServePlan) -> None:
 
 
 async def _watch(plan: ServePlan, store: Store) -> None:
-    await asyncio.gather(_watch_bucket(plan), _watch_inbox(plan), _watch_runs(plan, store))
+    teller = Teller(plan.state_folder, senders_of(os.environ))
+    await asyncio.gather(  # each at its own pace: none waits for what another waits for
+        _watch_bucket(plan),
+        _watch_inbox(plan),
+        _begin_lost_runs_again(plan),
+        _watch_alerts(plan, store, teller),
+        *(_deliver(teller, sender) for sender in teller.senders),
+    )
+
+
+class Trouble:
+    """Something that is done again and again: a failure that lasts is said once, then hourly.
+
+    Attributes:
+        what: is done, in words.
+    """
+
+    def __init__(self, what: str) -> None:
+        self.what = what
+        self._said: str | None = None
+        self._at = 0.0
+
+    @contextmanager
+    def told(self) -> Iterator[None]:
+        """A block whose failure is logged, on one line, and goes no further."""
+        try:
+            yield
+        except Exception as error:
+            said = " ".join(f"{type(error).__name__}: {error}".split())[:TROUBLE_LENGTH]
+            now = time.monotonic()
+            if said != self._said or now - self._at >= TROUBLE_SECONDS:
+                LOG.warning("%s failed: %s; it is tried again", self.what, said)
+                LOG.debug("%s", self.what, exc_info=error)
+                self._said, self._at = said, now
+        else:
+            if self._said is not None:
+                LOG.warning("%s works again", self.what)
+                self._said = None
 
 
 async def _watch_bucket(plan: ServePlan) -> None:
@@ -64,25 +110,23 @@ async def _watch_bucket(plan: ServePlan) -> None:
     from flows.operations.bucket import BucketInbox  # late: object storage is an extra
 
     bucket = BucketInbox(plan.bucket, plan.inbox, plan.state_folder)
+    trouble = Trouble("looking at the bucket")
     while True:
-        try:
+        with trouble.told():
             await asyncio.to_thread(bucket.fetch, time.monotonic(), plan.quiet_seconds)
-        except Exception:
-            LOG.exception("the bucket could not be looked at; it will be again")
         await asyncio.sleep(BUCKET_SECONDS)
 
 
 async def _watch_inbox(plan: ServePlan) -> None:
+    trouble = Trouble("looking at the inbox")
     while True:
         began = time.monotonic()
-        try:
+        with trouble.told():
             ready = await asyncio.to_thread(
                 watch_once, plan.state_folder, plan.inbox, plan.quiet_seconds
             )
             if ready:
                 await _ingest(plan, ready)
-        except Exception:
-            LOG.exception("the inbox could not be looked at; it will be again")
         took = time.monotonic() - began
         await asyncio.sleep(max(INBOX_SECONDS, 10.0 * took))
 
@@ -95,20 +139,35 @@ async def _ingest(plan: ServePlan, ready: list[str]) -> None:
     )
 
 
-async def _watch_runs(plan: ServePlan, store: Store) -> None:
-    overview = Overview(store)
-    teller = Teller(plan.state_folder, senders_of(os.environ))
+async def _begin_lost_runs_again(plan: ServePlan) -> None:
+    trouble = Trouble("looking for lost runs")
     while True:
         await asyncio.sleep(ALERT_SECONDS)
-        try:
+        with trouble.told():
             await begin_again(plan)
+
+
+async def _watch_alerts(plan: ServePlan, store: Store, teller: Teller) -> None:
+    overview = Overview(store)
+    at_prefect = Trouble("asking Prefect for failed runs")
+    trouble = Trouble("looking for alerts")
+    failed: list[FailedRun] = []
+    while True:
+        await asyncio.sleep(ALERT_SECONDS)
+        with at_prefect.told():
             failed = await failed_runs(plan)
+        with trouble.told():
             matches = await asyncio.to_thread(overview.look)
             arrivals = plan.state_folder.arrivals().values()
-            alerts = alerts_now(plan, matches, arrivals, failed)
-            await asyncio.to_thread(teller.tell, alerts)
-        except Exception:
-            LOG.exception("alerts could not be looked for; they will be again")
+            await asyncio.to_thread(teller.hold, alerts_now(plan, matches, arrivals, failed))
+
+
+async def _deliver(teller: Teller, sender: Sender) -> None:
+    """Hand alerts to one sender, in a thread of its own: however long it takes, nobody waits."""
+    pool = ThreadPoolExecutor(1, thread_name_prefix=sender.name)
+    while True:
+        await asyncio.sleep(DELIVERY_SECONDS)
+        await asyncio.get_running_loop().run_in_executor(pool, teller.deliver, sender)
 
 
 async def failed_runs(plan: ServePlan) -> list[FailedRun]:

@@ -57,11 +57,20 @@ class Guard:
         state = scope.setdefault("state", {})
         state["who"], state["session"] = who, session
 
+        is_gone = False
+
+        async def heard() -> Message:
+            nonlocal is_gone
+            message = await receive()
+            is_gone = is_gone or message["type"] == "http.disconnect"
+            return message
+
         async def sealed(message: Message) -> None:
             if message["type"] == "http.response.start":
                 _seal(MutableHeaders(scope=message), scope["path"])
                 asked = scope["path"].endswith(ASKING) and message["status"] < 400
-                if scope["method"] not in SAFE and not asked:
+                # A client that left in the middle of its request has asked for nothing.
+                if scope["method"] not in SAFE and not asked and not is_gone:
                     place = f"{scope['method']} {scope['path']}"
                     # Who logs in is somebody from then on.
                     logger.info("%s: %r: %s", state["who"] or "nobody", place, message["status"])
@@ -69,9 +78,9 @@ class Guard:
 
         refusal = self._refusal(scope, headers, who, session)
         if refusal is not None:
-            await refusal(scope, receive, sealed)
+            await refusal(scope, heard, sealed)
             return
-        await self.app(scope, receive, sealed)
+        await self.app(scope, heard, sealed)
 
     def _refusal(
         self, scope: Scope, headers: Headers, who: str | None, session: str | None

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import uvicorn
-
+from flows.http_server import serve_http
 from flows.pages.access import LOOPBACK, Access
 from flows.pages.app import create_app
 
@@ -24,16 +23,14 @@ def serve(
 
     Raises:
         InputError: no such project.
+        UsageError: the port is taken.
     """
     certificate, key = (None, None) if tls is None else map(str, tls)
-    uvicorn.run(
+    serve_http(
         create_app(project, access),
         host=host,
         port=port,
-        log_level="warning",
         server_header=False,
-        access_log=False,
-        ws="none",
         ssl_certfile=certificate,
         ssl_keyfile=key,
         timeout_graceful_shutdown=2,

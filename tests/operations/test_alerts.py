@@ -1,6 +1,9 @@
 """Somebody is told of each matter once: a real server takes what is posted."""
 
+import socket
 from datetime import UTC, datetime, timedelta
+from threading import Thread
+from types import SimpleNamespace
 
 import pytest
 
@@ -9,7 +12,9 @@ from flows.operations.alerts import Alert, FailedRun, Teller, alerts_now
 from flows.operations.layout import StateFolder
 from flows.operations.overview import MatchGlance, UnitGlance
 from flows.operations.plan import ServePlan
-from flows.operations.senders import Webhook
+from flows.operations.senders import Webhook, senders_of
+from flows.operations.watching import Trouble
+from worldpose.errors import UsageError
 
 NOW = datetime.now(UTC)
 
@@ -55,9 +60,109 @@ def test_what_the_webhook_did_not_take_is_posted_again(webhook, tmp_path, caplog
     assert teller.tell([alert]) == []
     assert Teller(StateFolder(tmp_path), [Webhook("http://127.0.0.1:9/secret")]).tell([alert]) == []
     assert Teller(StateFolder(tmp_path), [Webhook("no address")]).tell([alert]) == []
+    assert Teller(StateFolder(tmp_path), [Webhook("file:///etc/passwd")]).tell([alert]) == []
     assert Teller(StateFolder(tmp_path), [Webhook(webhook.address)]).tell([alert]) == [alert]
     assert len(webhook.posted) == 2
     assert "secret" not in caplog.text
+
+
+@pytest.fixture
+def silent():
+    """The address of a server that takes connections and says nothing, ever."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield f"http://127.0.0.1:{server.getsockname()[1]}/secret"
+
+
+def many(count):
+    return [Alert(str(number), "quality", f"alert {number}") for number in range(count)]
+
+
+def test_a_silent_webhook_is_asked_once_and_then_left_for_a_while(
+    silent, tmp_path, caplog, monkeypatch
+):
+    """Sixty alerts were sixty times ten seconds, and a line of the log each, for ever."""
+    monkeypatch.setattr("flows.operations.senders.ANSWER_SECONDS", 0.2)
+    clock = SimpleNamespace(now=1000.0)
+    monkeypatch.setattr(
+        "flows.operations.alerts.time", SimpleNamespace(monotonic=lambda: clock.now)
+    )
+    teller = Teller(StateFolder(tmp_path), [Webhook(silent)])
+    for _ in range(2880):  # a day of looks
+        clock.now += 30.0
+        teller.tell(many(60))
+    told = [record.message for record in caplog.records if "did not take" in record.message]
+    assert 20 < len(told) < 35, "the pause doubles up to an hour"
+    assert "59 more" in told[0]
+    assert "secret" not in caplog.text
+
+
+def test_a_silent_webhook_keeps_no_mail_from_being_sent(silent, tmp_path):
+    class Box:
+        name, taken = "mail", []
+
+        def send(self, content):
+            self.taken.append(content["text"])
+
+    box, hook = Box(), Webhook(silent)
+    teller = Teller(StateFolder(tmp_path), [hook, box])
+    teller.hold(many(60))
+    waiting = Thread(target=teller.deliver, args=[hook], daemon=True)
+    waiting.start()
+    teller.deliver(box)
+    assert len(box.taken) == 60
+    assert waiting.is_alive(), "the webhook is still waited for"
+    teller.hold([])  # nor does that keep others from saying what holds
+
+
+def test_delivery_stops_at_the_first_failure_and_goes_on_after_it(webhook, tmp_path, caplog):
+    teller = Teller(StateFolder(tmp_path), [Webhook(webhook.address)], pause=0.0)
+    webhook.codes += [204, 500]
+    assert [each.key for each in teller.tell(many(5))] == ["0"]
+    assert len(webhook.posted) == 2
+    assert [each.key for each in teller.tell(many(5))] == ["1", "2", "3", "4"]
+    assert [posted["text"] for _, posted in webhook.posted][2:] == [
+        f"alert {number}" for number in (1, 2, 3, 4)
+    ]
+    assert "takes alerts again" in caplog.text
+
+
+def test_a_redirect_is_a_failure_and_is_not_followed(webhook, tmp_path):
+    webhook.codes += [302, 307]
+    teller = Teller(StateFolder(tmp_path), [Webhook(webhook.address)], pause=0.0)
+    assert teller.tell(many(1)) == []
+    assert teller.tell(many(1)) == []
+    assert len(webhook.posted) == 2
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["file:///etc/passwd", "ftp://h/x", "//h/x", "http://", "http://h:99999/", "h/secret"],
+)
+def test_an_address_that_is_no_web_address_is_refused_at_start(address):
+    with pytest.raises(UsageError, match="WORLDPOSE_ALERT_URL") as caught:
+        senders_of({"WORLDPOSE_ALERT_URL": address})
+    assert "secret," not in str(caught.value).replace("hold a secret", "")
+    assert address not in str(caught.value)
+
+
+def test_damaged_notes_of_what_was_told_are_begun_anew(webhook, tmp_path):
+    (tmp_path / "alerts.json").write_text('{"disk_low": ')
+    teller = Teller(StateFolder(tmp_path), [Webhook(webhook.address)])
+    assert len(teller.tell(many(1))) == 1
+
+
+def test_a_trouble_that_lasts_is_one_line_and_its_end_another(caplog):
+    trouble = Trouble("looking at the inbox")
+    for _ in range(100):
+        with trouble.told():
+            raise OSError(28, "No space left on device")
+    with trouble.told():
+        pass
+    assert [record.message for record in caplog.records] == [
+        "looking at the inbox failed: OSError: [Errno 28] No space left on device; "
+        "it is tried again",
+        "looking at the inbox works again",
+    ]
 
 
 def test_a_question_is_no_alert_before_its_time(plan):

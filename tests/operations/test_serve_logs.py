@@ -1,0 +1,43 @@
+"""Logs are bounded while their processes are at work."""
+
+import subprocess
+import sys
+
+from flows.operations import serving
+
+
+def test_a_log_is_set_aside_while_its_process_writes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(serving, "LOG_BYTES", 1000)
+    log = tmp_path / "pages.log"
+    script = "import sys\nfor line in sys.stdin: print(line.strip() * 10, flush=True)"
+    with log.open("ab") as output:
+        process = subprocess.Popen(
+            [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=output, text=True
+        )
+    size = 0
+    for number in range(200):
+        process.stdin.write(f"{number:010d}\n")
+        process.stdin.flush()
+        serving.bound_log(log)
+        size = max(size, log.stat().st_size)
+    process.stdin.close()
+    process.wait(60)
+    serving.bound_log(log)
+    assert size < 40_000
+    assert log.stat().st_size <= 1000
+    kept = (log.with_suffix(".log.1").read_bytes() + log.read_bytes()).decode()
+    assert "\0" not in kept
+    assert kept.endswith(f"{199:010d}" * 10 + "\n")
+
+
+def test_a_log_on_a_full_disk_makes_room(tmp_path, monkeypatch):
+    monkeypatch.setattr(serving, "LOG_BYTES", 1000)
+    log = tmp_path / "pages.log"
+    log.write_text("x" * 2000)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(serving.shutil, "copyfile", full)
+    serving.bound_log(log)
+    assert log.stat().st_size == 0

@@ -1,0 +1,176 @@
+"""Clients that are slow, or say nothing at all, keep nobody else from the pages."""
+
+import http.client
+import os
+import resource
+import socket
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from statistics import quantiles
+
+import pytest
+from command_line import WORLDPOSE
+from page_client import TOKEN
+from service import free_ports
+
+from worldpose.store import Store
+
+HALF_HEADERS = b"GET /api/health HTTP/1.1\r\nHost: 127.0.0.1\r\n"
+HALF_BODY = (
+    b"POST /api/login HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\n"
+    b"Content-Length: 1000\r\n\r\n{"
+)
+
+
+@contextmanager
+def pages(tmp_path, *, files):
+    """The port of a process that serves pages and may have so many files open; its log."""
+    Store.create(tmp_path / "project")
+    (port,) = free_ports(1)
+    log = tmp_path / "pages.log"
+    command = [*WORLDPOSE, "review", "serve", "--port", port, "--project", tmp_path / "project"]
+
+    def limit():
+        resource.setrlimit(resource.RLIMIT_NOFILE, (files, files))
+
+    with log.open("wb") as output:
+        server = subprocess.Popen(
+            list(map(str, command)),
+            env={**os.environ, "WORLDPOSE_REVIEW_TOKEN": TOKEN},
+            stdout=output,
+            stderr=output,
+            preexec_fn=limit,
+        )
+    try:
+        deadline = time.monotonic() + 300
+        while ask(port) != 200:
+            assert server.poll() is None, log.read_text()
+            assert time.monotonic() < deadline
+            time.sleep(0.2)
+        yield port, log, server
+    finally:
+        server.terminate()
+        server.wait(60)
+
+
+def ask(port, path="/api/health"):
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    try:
+        connection.request("GET", path)
+        return connection.getresponse().status
+    except OSError:
+        return None
+    finally:
+        connection.close()
+
+
+def open_many(port, count):
+    """So many connections, by turns silent, with half of the headers, and with half of a body."""
+    opened = []
+    for number in range(count):
+        each = socket.socket()
+        each.setblocking(False)
+        each.connect_ex(("127.0.0.1", port))
+        opened.append([each, (b"", HALF_HEADERS, HALF_BODY)[number % 3]])
+    return opened
+
+
+def send_first(opened):
+    for pair in opened:
+        try:
+            pair[1] = pair[1][pair[0].send(pair[1]) :] if pair[1] else b""
+        except OSError:
+            continue  # not connected yet, or closed again
+
+
+def still_open(opened):
+    """How many the server has not closed."""
+    left = 0
+    for each, _ in opened:
+        try:
+            left += each.recv(1 << 16) != b""
+        except BlockingIOError:
+            left += 1
+        except OSError:
+            continue
+    return left
+
+
+def attack(port, count, seconds):
+    """Seconds that each request of somebody else takes while so many connections are held."""
+    opened = open_many(port, count)
+    took, end = [], time.monotonic() + seconds
+    try:
+        while time.monotonic() < end:
+            send_first(opened)
+            began = time.monotonic()
+            assert ask(port) == 200
+            took.append(time.monotonic() - began)
+            time.sleep(0.05)
+        return took, still_open(opened)
+    finally:
+        for each, _ in opened:
+            each.close()
+
+
+def test_slow_connections_are_closed_and_others_are_served(tmp_path):
+    """In small: 300 of them, at a process that may have 128 files open, which gives 32."""
+    with pages(tmp_path, files=128) as (port, log, _):
+        size = log.stat().st_size
+        took, left = attack(port, 300, 13.0)
+        assert left <= 32
+        assert len(took) > 10
+        told = log.read_text(errors="replace")[size:]
+        assert "connections were closed" in told
+        assert len(told.splitlines()) < 5, told
+        assert "Traceback" not in told
+
+
+def test_a_body_that_comes_byte_by_byte_is_not_waited_for(tmp_path):
+    with pages(tmp_path, files=1024) as (port, _, _), socket.socket() as slow:
+        slow.connect(("127.0.0.1", port))
+        slow.sendall(HALF_BODY)
+        slow.settimeout(1.0)
+        began = time.monotonic()
+        while time.monotonic() - began < 60:
+            try:
+                slow.sendall(b" ")
+                if slow.recv(1000) == b"":
+                    break
+            except TimeoutError:
+                continue
+            except OSError:
+                break
+        assert 8.0 < time.monotonic() - began < 45.0
+
+
+@pytest.mark.slow
+def test_eleven_hundred_slow_connections(tmp_path, capsys):
+    """As many as end a server with 1,024 files that waits for each of them."""
+    if resource.getrlimit(resource.RLIMIT_NOFILE)[1] < 4096:
+        pytest.skip("this process may not open so many connections")
+    with pages(tmp_path, files=1024) as (port, log, server):
+        quiet = [seconds_of(port) for _ in range(50)]
+        size = log.stat().st_size
+        took, left = attack(port, 1100, 45.0)
+        with capsys.disabled():
+            print(
+                f"\n{len(took)} requests beside 1,100 slow connections: "
+                f"p50 {1e3 * quantiles(took, n=100)[49]:.0f} ms, "
+                f"p99 {1e3 * quantiles(took, n=100)[98]:.0f} ms, "
+                f"most {1e3 * max(took):.0f} ms (before: p50 {1e3 * sorted(quiet)[25]:.0f} ms); "
+                f"{left} left open, log grew by {log.stat().st_size - size} bytes",
+                file=sys.stderr,
+            )
+        assert left <= 200
+        assert log.stat().st_size - size < 10_000
+        assert quantiles(took, n=100)[98] < 1.0
+        assert server.poll() is None
+
+
+def seconds_of(port):
+    began = time.monotonic()
+    assert ask(port) == 200
+    return time.monotonic() - began
