@@ -8,7 +8,7 @@ stand in. People keep the order of the file within a frame.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final
@@ -19,20 +19,23 @@ from numpy.typing import NDArray
 from data_contracts.conventions import COCO17
 from data_contracts.records import FRAME_LIMIT
 from worldpose.errors import InputError
+from worldpose.ingest.json_items import JsonItems
 from worldpose.ingest.keypoint_arrays import (
     ARRAY_BYTES,
     COORDINATE_LIMIT,
     PEOPLE_LIMIT,
 )
+from worldpose.ingest.npz_files import PACKED_BYTES, PACKED_RATIO
 from worldpose.ingest.observations import Observations
-from worldpose.ingest.text_files import read_json
 
-JSON_BYTES: Final = 1 << 28
-"""Largest JSON file that is read [byte], about 250,000 people; Python takes 30 times as much memory
-to read it. npz takes more people in less."""
+JSON_BYTES: Final = 1 << 30
+"""Largest JSON file that is read [byte], about two million people; npz takes more in less time."""
 
 OVERSHOOT: Final = 1.1
 """Largest confidence that is taken for 1: an interpolated heat map's peak rises a little above."""
+
+BATCH: Final = 4096
+"""Results that are held as Python's objects at a time."""
 
 _JOINTS: Final = len(COCO17)
 _COUNT_TODO: Final = "Export all 17 joints in COCO's order, and 0, 0, 0 where one is missing."
@@ -42,43 +45,65 @@ _CONFIDENCE_TODO: Final = "Scale the detector's scores so that 1 is certain and 
 def read_coco_results(path: Path) -> Observations:
     """The people of a results file by rising frame; frames without people are not listed.
 
+    Read a batch at a time: memory is bounded by the arrays, not by Python's objects.
+
     Raises:
         InputError: naming file, result and joint: unreadable, another number of joints, NaN, a
-            confidence outside 0..1, or not a frame index.
+            confidence outside 0..1, not a frame index, or more people than a picture can hold.
     """
-    results, is_data_set = _results(path)
-    frames = _frames(path, results)
-    triples = _table(path, results, range(len(results)), "keypoints", 3 * _JOINTS)
-    triples = triples.reshape(-1, _JOINTS, 3)
-    if is_data_set and np.all(np.isin(triples[..., 2], (0, 1, 2))):
-        triples[..., 2] = np.minimum(triples[..., 2], 1)  # visibility: 1 hidden, 2 visible
-    _check_keypoints(path, triples)
-    boxes = _optional(path, results, "bbox", 4)
-    scores = _optional(path, results, "score", 1)[:, 0]
-    return _by_frame(path, frames, triples.astype(np.float32), boxes, scores)
-
-
-def _results(path: Path) -> tuple[list[dict[str, Any]], bool]:
-    content = read_json(path, JSON_BYTES)
-    is_data_set = isinstance(content, dict)
-    if is_data_set:
-        content = content.get("annotations")
-    if not isinstance(content, list):
+    items = JsonItems(path, "annotations", JSON_BYTES)
+    batches = [_read_batch(path, results, first) for first, results in _batches(path, items)] or [
+        _read_batch(path, [], 0)
+    ]
+    if not items.has_list:
         raise InputError(
             str(path),
             expected="a list of COCO keypoint results, or a COCO data set with `annotations`",
-            found=_brief(content),
+            found=_brief(items.other),
             todo="Export the poses as COCO keypoint results.",
         )
-    for index, result in enumerate(content):
+    frames, triples, boxes, scores = (np.concatenate(each) for each in zip(*batches, strict=True))
+    if items.is_mapping and np.all(np.isin(triples[..., 2], (0, 1, 2))):
+        triples[..., 2] = np.minimum(triples[..., 2], 1)  # visibility: 1 hidden, 2 visible
+    confidence = triples[..., 2]
+    right = np.asarray((confidence >= 0) & (confidence <= OVERSHOOT), dtype=np.bool_)
+    _require_right(path, triples, right, 0, "a confidence from 0 to 1", _CONFIDENCE_TODO)
+    return _by_frame(path, frames, triples, boxes, scores)
+
+
+_Batch = tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]
+"""Frames (n,), keypoints (n, 17, 3), boxes (n, 4) and scores (n,) of some results."""
+
+
+def _batches(path: Path, items: Iterable[Any]) -> Iterator[tuple[int, list[dict[str, Any]]]]:
+    """Results a batch at a time, with the place of the first in the file."""
+    batch: list[dict[str, Any]] = []
+    for index, result in enumerate(items):
         if type(result) is not dict:
             raise _wrong(path, index, "", "a mapping with image_id and keypoints", _brief(result))
-    return content, is_data_set
+        batch.append(result)
+        if len(batch) == BATCH:
+            yield index + 1 - BATCH, batch
+            batch = []
+    if batch:
+        yield index + 1 - len(batch), batch
 
 
-def _frames(path: Path, results: list[dict[str, Any]]) -> NDArray[np.int64]:
+def _read_batch(path: Path, results: list[dict[str, Any]], first: int) -> _Batch:
+    frames = _frames(path, results, first)
+    triples = _table(path, results, range(len(results)), "keypoints", 3 * _JOINTS, first)
+    triples = triples.reshape(-1, _JOINTS, 3)
+    certain = f"pixels up to {COORDINATE_LIMIT:g}, finite (a missing joint is 0, 0, 0)"
+    near = np.asarray(np.all(np.abs(triples) <= COORDINATE_LIMIT, axis=-1))
+    _require_right(path, triples, near, first, certain, _COUNT_TODO)
+    boxes = _optional(path, results, "bbox", 4, first)
+    scores = _optional(path, results, "score", 1, first)[:, 0]
+    return frames, triples.astype(np.float32), boxes, scores
+
+
+def _frames(path: Path, results: list[dict[str, Any]], first: int) -> NDArray[np.int64]:
     frames = [result.get("image_id") for result in results]
-    for index, frame in enumerate(frames):
+    for index, frame in enumerate(frames, first):
         if type(frame) is not int or not 0 <= frame <= FRAME_LIMIT:
             todo = "Number the pictures from 0 in the order of the video."
             what = "the frame index, a whole number from 0"
@@ -87,7 +112,12 @@ def _frames(path: Path, results: list[dict[str, Any]]) -> NDArray[np.int64]:
 
 
 def _table(
-    path: Path, results: list[dict[str, Any]], indices: Sequence[int], key: str, width: int
+    path: Path,
+    results: list[dict[str, Any]],
+    indices: Sequence[int],
+    key: str,
+    width: int,
+    first: int,
 ) -> NDArray[np.float64]:
     """Entry `key` of some results as (results, width); NaN and infinity are let through."""
     rows = [results[index].get(key) for index in indices]
@@ -100,7 +130,7 @@ def _table(
             return np.array(rows, dtype=np.float64).reshape(-1, width)
         except OverflowError:  # an integer beyond float64
             pass
-    raise _first_wrong(path, rows, indices, key, width)
+    raise _first_wrong(path, rows, [first + index for index in indices], key, width)
 
 
 def _first_wrong(
@@ -120,33 +150,34 @@ def _first_wrong(
     raise AssertionError("called for a table without a fault")
 
 
-def _check_keypoints(path: Path, triples: NDArray[np.float64]) -> None:
-    confidence = triples[..., 2]
-    certain = f"pixels up to {COORDINATE_LIMIT:g}, finite (a missing joint is 0, 0, 0)"
-    for wrong, expected, todo in (
-        (~(np.abs(triples) <= COORDINATE_LIMIT).all(axis=-1), certain, _COUNT_TODO),
-        ((confidence < 0) | (confidence > OVERSHOOT), "a confidence from 0 to 1", _CONFIDENCE_TODO),
-    ):
-        if np.any(wrong):
-            index, joint = (int(i) for i in np.argwhere(wrong)[0])
-            place = f"keypoints joint {joint} ({COCO17[joint]})"
-            found = ", ".join(f"{number:g}" for number in triples[index, joint])
-            raise _wrong(path, index, place, expected, f"x, y, c = {found}", todo)
+def _require_right(
+    path: Path,
+    triples: NDArray[np.floating],
+    right: NDArray[np.bool_],
+    first: int,
+    expected: str,
+    todo: str,
+) -> None:
+    if not np.all(right):
+        index, joint = (int(i) for i in np.argwhere(~right)[0])
+        place = f"keypoints joint {joint} ({COCO17[joint]})"
+        found = ", ".join(f"{number:g}" for number in triples[index, joint])
+        raise _wrong(path, first + index, place, expected, f"x, y, c = {found}", todo)
 
 
 def _optional(
-    path: Path, results: list[dict[str, Any]], key: str, width: int
+    path: Path, results: list[dict[str, Any]], key: str, width: int, first: int
 ) -> NDArray[np.float64]:
     """Entry `key` as (results, width) [px], or scores; NaN rows where it is absent or null."""
     given = [index for index, result in enumerate(results) if result.get(key) is not None]
     values = np.full((len(results), width), np.nan)
-    table = _table(path, results, given, key, width)
+    table = _table(path, results, given, key, width, first)
     # The last two of a box are its size; neither they nor a score can be negative.
     fits = (np.abs(table) <= COORDINATE_LIMIT).all(axis=1) & (table[:, -2:] >= 0).all(axis=1)
     if not np.all(fits):
         row = int(np.argmin(fits))
         what = "a finite score from 0" if key == "score" else "x, y, width and height [px]"
-        raise _wrong(path, given[row], key, what, f"{table[row].tolist()}")
+        raise _wrong(path, first + given[row], key, what, f"{table[row].tolist()}")
     values[given] = table
     return values
 
@@ -182,10 +213,12 @@ def _by_frame(
             found=f"{most} with image_id {frame[np.argmax(count)]}",
             todo="Check image_id, or keep the detections of each image with the highest scores.",
         )
-    if len(frame) * most * 4 * (3 * _JOINTS + 5) > ARRAY_BYTES:
+    # A full frame pads all others: a small file could fill the memory.
+    limit = min(ARRAY_BYTES, max(PACKED_BYTES, PACKED_RATIO * path.stat().st_size))
+    if len(frame) * most * 4 * (3 * _JOINTS + 5) > limit:
         raise InputError(
             str(path),
-            expected=f"frames and people that fit into {ARRAY_BYTES} bytes",
+            expected=f"frames and people that fit into {limit} bytes",
             found=f"{most} people in frame {frame[np.argmax(count)]}",
             todo="Check image_id.",
         )

@@ -40,6 +40,8 @@ COORDINATE_LIMIT: Final = 1e6
 
 _BLOCK: Final = 4096
 """Frames checked at a time, which keeps the checks' own memory small."""
+_BLOCK_PEOPLE: Final = 100_000
+"""Detections of those frames, at most."""
 
 _SHAPES: Final = {
     "frame": ("frames",),
@@ -134,8 +136,9 @@ def _check_values(path: Path, people: Observations) -> None:
         )
     if np.any(np.abs(people.frame) > FRAME_LIMIT):
         raise npz_error(f"{path}: frame", f"frame numbers up to {FRAME_LIMIT}", "larger ones")
-    for start in range(0, len(people.frame), _BLOCK):
-        _check_block(path, start, people.rows(slice(start, start + _BLOCK)))
+    block = max(1, min(_BLOCK, _BLOCK_PEOPLE // max(1, people.score.shape[1])))
+    for start in range(0, len(people.frame), block):
+        _check_block(path, start, people.rows(slice(start, start + block)))
 
 
 def _check_block(path: Path, start: int, people: Observations) -> None:

@@ -1,5 +1,6 @@
 import json
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldpose.errors import InputError
+from worldpose.ingest import coco_results, json_items
 from worldpose.ingest.coco_results import read_coco_results
 
 
@@ -175,6 +177,80 @@ def test_crowd_that_would_fill_the_memory_is_refused(read, refusal, monkeypatch)
     assert "200 people in frame 0" in refusal(results).found
 
 
+def test_results_of_several_batches_keep_their_places(read, refusal, monkeypatch):
+    monkeypatch.setattr(coco_results, "BATCH", 3)
+    results = [person(frame, score=0.1 * frame + 0.1) for frame in range(8)]
+    np.testing.assert_allclose(read(results).score[:, 0], 0.1 * np.arange(1, 9), rtol=1e-6)
+    for index, wrong in ((4, person(keypoints=[1.0] * 3)), (5, person(score=-1)), (7, 3)):
+        error = refusal([*results[:index], wrong, *results[index + 1 :]])
+        assert f"result {index}" in error.where
+
+
+@pytest.mark.parametrize("entry", ["{}", "[]", '{"image_id":0,"keypoints":[]}', '""', "0"])
+def test_a_large_file_of_small_entries_takes_little_memory(tmp_path, entry):
+    """26 MB of them took 770 MB: Python's objects are many times their text."""
+    path = tmp_path / "cam1.json"
+    path.write_text("[" + ",".join([entry] * (4_000_000 // len(entry))) + "]")
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError):
+            read_coco_results(path)
+        assert tracemalloc.get_traced_memory()[1] < 20e6
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        *("[1,]", "[1 2]", "[1", "[", '{"annotations"', '{"annotations":[1,]}', "{,}", '{"a":1,}'),
+        *('{"a" 1}', "[] 1", "{1: 2}", '{"annotations":[],"annotations":[]}', "", " ", "[nul]"),
+        *("[" * 100_000, '{"x":' * 100_000, '["a]', "[1e]", '"\\u12"', "[" + "1" * 5000 + "]"),
+    ],
+)
+def test_what_is_no_json_is_said_so(tmp_path, content):
+    path = tmp_path / "cam1.json"
+    path.write_text(content)
+    with pytest.raises(InputError) as caught:
+        list(json_items.JsonItems(path, "annotations", 1 << 20))
+    assert (caught.value.where, caught.value.expected) == (str(path), "JSON")
+
+
+def test_an_entry_without_end_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(json_items, "ENTRY_LENGTH", 1000)
+    monkeypatch.setattr(json_items, "CHUNK", 100)
+    path = tmp_path / "cam1.json"
+    path.write_text("[" + "[1, 2], " * 10 + "[" + "1, " * 5000)
+    with pytest.raises(InputError, match="longer than 1000 characters"):
+        list(json_items.JsonItems(path, "annotations", 1 << 20))
+
+
+def test_bytes_that_are_no_text_are_said_so(tmp_path):
+    path = tmp_path / "cam1.json"
+    path.write_bytes(b'[{"image_id": "\xff"}]')
+    with pytest.raises(InputError, match="Save it as UTF-8"):
+        read_coco_results(path)
+    path.write_text(json.dumps([person()]), encoding="utf-8-sig")
+    assert len(read_coco_results(path).frame) == 1
+
+
+@settings(max_examples=100)
+@given(st.data())
+def test_entries_are_those_that_python_reads_wherever_the_file_is_cut(tmp_path_factory, data):
+    path = tmp_path_factory.getbasetemp() / "cut.json"
+    values = data.draw(st.lists(JSON, max_size=4))
+    content = data.draw(
+        st.sampled_from([values, {"a": JSON_OTHERS, "annotations": values, "b": [values, 1]}])
+    )
+    path.write_text(json.dumps(content, ensure_ascii=data.draw(st.booleans()), indent=1))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(json_items, "CHUNK", data.draw(st.integers(1, 40)))
+        items = json_items.JsonItems(path, "annotations", 1 << 20)
+        assert json.dumps(list(items)) == json.dumps(values)
+    assert (items.has_list, items.is_mapping) == (True, isinstance(content, dict))
+
+
+JSON_OTHERS = [{"id": 1, "name": "ö\U0001f3c3"}, 1.5e-3, None]
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=4),
     lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=3), inner),

@@ -205,6 +205,15 @@ def test_arrays_beyond_the_limit_are_refused(path, make_people, refusal, monkeyp
     assert refusal().expected == "at most 1000 bytes of arrays"
 
 
+def test_padding_may_be_packed_well(path, make_people):
+    """One person in a thousand places, in a file that is small whatever it fills."""
+    arrays = {name: np.asarray(array) for name, array in make_people(0, 20, 300).arrays().items()}
+    for array in arrays.values():
+        array[:, 1:] = np.nan
+    np.savez_compressed(path, frame=np.arange(20), **arrays)
+    assert read_keypoint_arrays(path).score.shape == (20, 300)
+
+
 def test_a_header_of_gigabytes_is_refused_unread(path, make_people, refusal):
     with zipfile.ZipFile(path, "w") as file:
         for name in members(make_people()):
