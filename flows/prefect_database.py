@@ -1,8 +1,8 @@
 """Prefect's empty database, made once for each of its versions.
 
 Prefect makes one by a hundred migrations, which takes as long as starting does. All are the same
-while they are empty: the first is kept beside the code, or in the home folder where that is
-read-only, and new projects begin with a copy.
+while they are empty: the first is kept in the user's cache folder (XDG_CACHE_HOME, or ~/.cache),
+and new projects begin with a copy.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from worldpose.release import whole_file
+from worldpose.store.blobs import storage_errors
 
 DATABASE = "prefect.db"
 """In PREFECT_HOME."""
@@ -25,14 +26,20 @@ def begin_database(home: Path) -> bool:
 
     Returns:
         Whether the server is to make the first of its version there, which is then to be kept.
+
+    Raises:
+        StoreError: `home` cannot be written to.
     """
     kept = kept_database()
     if (home / DATABASE).exists():
         return False
     if not kept.exists():
         return True
-    with whole_file(home / DATABASE) as draft:
-        shutil.copyfile(kept, draft)
+    with storage_errors(str(home / DATABASE)), whole_file(home / DATABASE) as draft:
+        try:
+            shutil.copyfile(kept, draft)
+        except OSError as error:  # a copy names its source first, whichever of them failed
+            raise OSError(error.errno, error.strerror) from error
     return False
 
 
@@ -52,6 +59,6 @@ def keep_database(home: Path) -> None:
 
 def kept_database() -> Path:
     """Where the empty database of this Prefect is kept."""
-    code = Path(__file__).parent
-    root = code if os.access(code, os.W_OK) else Path.home() / ".cache" / "worldpose"
-    return root / "__pycache__" / f"prefect-{version('prefect')}.db"
+    given = os.environ.get("XDG_CACHE_HOME", "")
+    cache = Path(given) if Path(given).is_absolute() else Path("~/.cache").expanduser()
+    return cache / "worldpose" / f"prefect-{version('prefect')}.db"

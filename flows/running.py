@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 from data_contracts.run import GatePolicy, RunRecord
 from flows.basis import basis_of
 from flows.gatekeeping import Gatekeeper
-from flows.lost_machines import require_machines
+from flows.lost_machines import require_machines, require_room
 from flows.outlook import look_ahead
 from flows.own_workers import kept_complete, starting_cluster, workers_for
 from flows.planning import PlannedUnit
@@ -25,7 +25,7 @@ from flows.run_record import RunLog, latest_run
 from flows.settings import Overrides, selected_stages
 from flows.stage import Match, Stage
 from flows.time_limits import TimeLimits
-from worldpose.errors import InputError
+from worldpose.errors import InputError, WorldposeError
 from worldpose.store import Store
 
 if TYPE_CHECKING:
@@ -143,6 +143,7 @@ def _with_prefect(
         except IncompleteRunError as failure:
             run_id = failure.run_id
         except Exception as failure:
+            require_room(failure, store.url)
             require_machines(failure)
             raise
         finally:
@@ -202,7 +203,11 @@ def _machines(
 
         if not is_watched:
             stack.enter_context(_without_heartbeats())
-        wait_until_ready()
+        try:
+            wait_until_ready()
+        except WorldposeError as failure:
+            require_room(failure, store.url)
+            raise
         if cluster is not None:
             cluster.wait_for_workers(1, START_SECONDS)
         yield request, ask_for

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 import platform
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,10 +20,10 @@ from worldpose.errors import (
     CorruptionError,
     InputError,
     InternalError,
-    MemoryLimitError,
     NondeterminismError,
     StoreError,
     WorldposeError,
+    require_memory,
 )
 from worldpose.ingest.registration import digest_of_files
 from worldpose.store import Store, code_version, libraries
@@ -37,18 +38,19 @@ def unit_task(compute: Callable[[Work], str]) -> Task[[Work], str]:
 
     @functools.wraps(compute)
     def checked(work: Work) -> str:
+        # A log line that Prefect's server does not take (a full disk) is no output of a worker.
+        logging.raiseExceptions = False
         require_same_code(work)
         with survivable(work):
             try:
                 return compute(work)
-            except (WorldposeError, OSError):
+            except WorldposeError:
                 raise
-            except MemoryError as error:
-                raise MemoryLimitError(
-                    f"{work.recipe.name}: not enough memory ({error or 'out of memory'}). Run "
-                    "fewer workers (--workers 1), or give the worker more memory."
-                ) from error
-            except Exception as error:  # a bug must not read as a fault of the match
+            except Exception as error:
+                require_memory(error, work.recipe.name)
+                if isinstance(error, OSError):
+                    raise
+                # A bug must not read as a fault of the match.
                 raise InternalError.wrapping(work.recipe.name, error) from error
 
     return task(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import traceback
 
 
@@ -73,7 +74,28 @@ class InternalError(WorldposeError):
 
 
 class MemoryLimitError(WorldposeError):
-    """There is not enough memory for a unit of work."""
+    """The system gave no memory, or no thread."""
+
+
+def require_memory(failure: BaseException, where: str = "") -> None:
+    """Go on only if a failure is not that of too little memory.
+
+    Args:
+        failure: what was raised.
+        where: what was at work, for the message.
+
+    Raises:
+        MemoryLimitError: it is.
+    """
+    is_thread = isinstance(failure, RuntimeError) and "start new thread" in str(failure)
+    is_refused = isinstance(failure, OSError) and failure.errno == errno.ENOMEM
+    if isinstance(failure, MemoryError) or is_thread or is_refused:
+        said = f"not enough memory ({str(failure) or type(failure).__name__})"
+        raise MemoryLimitError(
+            f"{where}{': ' if where else ''}{said}: the system refused "
+            f"{'a thread' if is_thread else 'a piece of it'}. Free some, raise the limit "
+            "(ulimit -v, ulimit -u, or the container's), or use fewer --workers; then run again."
+        ) from failure
 
 
 class StoreError(WorldposeError):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import json
+import logging
 import sys
 import tempfile
 import traceback
@@ -17,10 +18,16 @@ def main() -> None:
     # Late: every process that a run starts imports this module once more, and no command.
     from flows.cli.app import app
     from flows.cli.console import errors, line
-    from worldpose.errors import InternalError, UsageError, WorldposeError
+    from worldpose.errors import InternalError, UsageError, WorldposeError, require_memory
 
+    # A log line that Prefect's server does not take (a full disk) is no output of the command.
+    logging.raiseExceptions = False
     try:
-        app()
+        try:
+            app()
+        except (MemoryError, RuntimeError, OSError) as failure:
+            require_memory(failure)
+            raise
     except (OSError, WorldposeError) as error:
         message = str(error)
         if isinstance(error, OSError):

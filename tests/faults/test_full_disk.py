@@ -1,0 +1,113 @@
+"""A run on a disk that is full ends with one clear line, and is completed when there is room."""
+
+import errno
+import os
+import shutil
+import subprocess
+
+import pytest
+from command_line import worldpose
+
+from flows import prefect_database
+from flows.lost_machines import require_room
+from flows.prefect_database import begin_database
+from worldpose.errors import MemoryLimitError, StoreError, require_memory
+from worldpose.synthetic import SCENARIOS, simulate_match
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A function that gives a folder on a disk of so many kilobytes, or another size later."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+
+    def mount(kilobytes):
+        again = ["remount,"] if folder.is_mount() else [""]
+        options = f"{again[0]}size={kilobytes}k"
+        command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)]
+        if subprocess.run(command, capture_output=True).returncode != 0:
+            pytest.skip("this user may not mount")
+        return folder
+
+    yield mount
+    if folder.is_mount():
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+@pytest.fixture
+def match(tmp_path):
+    small = {"duration": 0.2, "cameras": 3, "players": 2, "stills": False, "video": False}
+    simulate_match(SCENARIOS["tiny"], 0, tmp_path / "match", **small)
+    return tmp_path / "match"
+
+
+@pytest.mark.faults
+@pytest.mark.slow
+@pytest.mark.parametrize("kilobytes", [600, 2500])
+def test_a_run_on_a_full_disk_says_so_and_goes_on_when_there_is_room(match, small_disk, kilobytes):
+    """At the start, where Prefect's database does not fit, and in the middle."""
+    folder = small_disk(kilobytes)
+    arguments = ("run", match, "--project", folder / "project", "--until", "static_calibration")
+    answer = worldpose(*arguments)
+    assert answer.code == 1
+    *_, last = answer.err.splitlines()
+    assert last.startswith(f"error: {folder}")
+    assert "No space left on device" in last
+    assert "Free space there" in last
+    assert "Traceback" not in answer.err
+    assert "Error logging to API" not in answer.err
+    small_disk(100_000)
+    assert worldpose(*arguments).code == 0
+    assert worldpose("verify", "--project", folder / "project").code == 0
+
+
+def test_a_full_disk_names_the_project_and_not_the_kept_database(tmp_path, monkeypatch):
+    kept = tmp_path / "kept.db"
+    kept.write_bytes(b"empty")
+    monkeypatch.setattr(prefect_database, "kept_database", lambda: kept)
+
+    def full(source, target):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), source, None, target)
+
+    monkeypatch.setattr(shutil, "copyfile", full)
+    with pytest.raises(StoreError, match="No space left on device") as caught:
+        begin_database(tmp_path / "project" / "prefect")
+    assert str(caught.value).startswith(f"{tmp_path}/project/prefect/prefect.db: ")
+    assert "kept.db" not in str(caught.value)
+
+
+def test_the_kept_database_is_in_the_users_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert prefect_database.kept_database().parent == tmp_path / "worldpose"
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    assert prefect_database.kept_database().parent == tmp_path / "home" / ".cache" / "worldpose"
+
+
+def test_what_prefect_raises_is_the_disk_only_where_that_is_full(tmp_path, monkeypatch):
+    failure = ValueError("500 Internal Server Error")
+    require_room(failure, str(tmp_path))
+    require_room(failure, "s3://bucket/project")
+    usage = shutil.disk_usage(tmp_path)._replace(free=4096)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
+    with pytest.raises(StoreError, match=r"No space left on device \(4096 bytes are free\)"):
+        require_room(failure, str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    "failure",
+    [
+        MemoryError("Unable to allocate 8.00 GiB for an array"),
+        MemoryError(),
+        RuntimeError("can't start new thread"),
+        OSError(errno.ENOMEM, "Cannot allocate memory"),
+    ],
+)
+def test_too_little_memory_is_named(failure):
+    with pytest.raises(MemoryLimitError, match=r"^not enough memory \(.+\).*ulimit -v"):
+        require_memory(failure)
+
+
+def test_other_failures_are_not_taken_for_memory():
+    for failure in (RuntimeError("bug"), OSError(errno.ENOSPC, "full"), ValueError("bad")):
+        require_memory(failure)
