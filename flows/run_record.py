@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from typing import Any, Self
 
 from data_contracts.run import GatePolicy, RunRecord, RunState, UnitFailure, WaitingUnit
-from flows import body_fitting, tracking
+from flows import body_fitting, tracking, triangulation
 from flows.basis import basis_of
 from flows.gatekeeping import Gatekeeper, passed
 from flows.left_out import left_out_cameras, left_out_warnings
@@ -201,11 +201,20 @@ class RunLog:
                     overrides[stage.name] = self.latest.overrides[stage.name]
         return settings, overrides
 
+    def _lacks_people(self) -> bool:
+        """Return whether a stage of this run found no person, or no joint, in any clip."""
+        for stage, figure in ((tracking.STAGE, "people"), (triangulation.STAGE, "joints")):
+            clips = [f"{stage.name}/{unit}" for unit in stage.units(self.match)]
+            found = [self.figures.get(clip, {}).get(figure) for clip in clips]
+            if stage in self.stages and found and all(count == 0 for count in found):
+                return True
+        return False
+
     def _state(self) -> RunState:
         if not self.failed:
             if self.waiting:
                 return "waiting"
-            return "partial" if self.lacks_cameras else "complete"
+            return "partial" if self.lacks_cameras or self._lacks_people() else "complete"
         asked = [stage.name for stage in self.stages if stage.units(self.match)]
         through = [stage.name for stage in METHOD[: METHOD.index(body_fitting.STAGE) + 1]]
         last = next((name for name in reversed(asked) if name in through), asked[-1])

@@ -18,7 +18,7 @@ from worldpose.review.identities import (
     stored_identities,
 )
 from worldpose.store import Store, key_of
-from worldpose.tracking import TrackingSettings, track_people
+from worldpose.tracking import TrackingSettings, diagnose_no_people, track_people
 
 
 @unit_task
@@ -28,7 +28,8 @@ def tracking(work: Work) -> str:
     with store.publishing(work) as result:
         said = work.recipe.sources.get("identities") or []
         edits = TypeAdapter(list[IdentityEdit]).validate_python(said)
-        found, figures = _automatic(store, work) if edits else _tracked(store, work)
+        found, figures, warnings = _automatic(store, work) if edits else _tracked(store, work)
+        result.warnings += warnings
         replay = replay_identities(found, edits)
         corrected = replay.identities
         if edits:
@@ -53,8 +54,12 @@ def tracking(work: Work) -> str:
     return work.key
 
 
-def _automatic(store: Store, work: Work) -> tuple[Identities, dict[str, float]]:
-    """What the tracker found and its figures: as they are published, else tracked anew.
+Tracked = tuple[Identities, dict[str, float], tuple[str, ...]]
+"""What the tracker found, its figures, and its warnings."""
+
+
+def _automatic(store: Store, work: Work) -> Tracked:
+    """Return what the tracker found: as it is published, else tracked again.
 
     Both are the same bytes.
     """
@@ -64,18 +69,18 @@ def _automatic(store: Store, work: Work) -> tuple[Identities, dict[str, float]]:
     unit = (recipe.match_id, recipe.stage, recipe.unit, key_of(plain))
     if not store.has(*unit):
         return _tracked(store, work)
-    return stored_identities(store.open_result(*unit)), dict(store.manifest(*unit).figures)
+    manifest = store.manifest(*unit)
+    return stored_identities(store.open_result(*unit)), dict(manifest.figures), manifest.warnings
 
 
-def _tracked(store: Store, work: Work) -> tuple[Identities, dict[str, float]]:
+def _tracked(store: Store, work: Work) -> Tracked:
     sources: dict[str, Any] = work.recipe.sources
     clip = open_clip(store, work)
+    settings = TrackingSettings.model_validate(work.recipe.settings)
+    given = (clip.keypoints, clip.confidence, clip.fps, settings)
     tracks = track_people(
         clip.cameras,
-        clip.keypoints,
-        clip.confidence,
-        clip.fps,
-        TrackingSettings.model_validate(work.recipe.settings),
+        *given,
         pitch_size=sources["pitch_size"],
         people=sources["people"],
     )
@@ -89,4 +94,14 @@ def _tracked(store: Store, work: Work) -> tuple[Identities, dict[str, float]]:
         names={},
         joins=tracks.joins,
     )
-    return found, figures_of(tracks.report, clip.camera_ids)
+    warnings: tuple[str, ...] = ()
+    if not len(tracks.person):
+        reason = diagnose_no_people(
+            clip.cameras,
+            clip.camera_ids,
+            *given,
+            ground=sources["pitch_size"] is not None,
+            births=tracks.report.births,
+        )
+        warnings = (f"{work.recipe.name} found no person: {reason.message}",)
+    return found, figures_of(tracks.report, clip.camera_ids), warnings

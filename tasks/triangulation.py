@@ -70,8 +70,21 @@ def place_joints(
             coordinates={"frame": clip.frame, "person": tracks["person"].values},
             attributes={"camera": list(clip.camera_ids)},
         )
+    agreement = reduce(add, agreements).report(model.detector.noise[-1].factor)
+    if agreement.joints == 0 and index.shape[2]:
+        most = int(np.count_nonzero(index >= 0, axis=1).max())
+        reason = (
+            f"no person is seen by more than {most} cameras at once and min_views asks for "
+            f"{settings.min_views}"
+            if most < settings.min_views
+            else f"no {settings.min_views} views agree within max_deviation="
+            f"{settings.max_deviation:g} at an angle of min_angle={settings.min_angle:g} rad"
+        )
+        result.warnings.append(
+            f"{work.recipe.name} placed no joint of {index.shape[2]} people: {reason}."
+        )
     for report in (
-        reduce(add, agreements).report(model.detector.noise[-1].factor),
+        agreement,
         reduce(add, changes).report(model.motion.acceleration, model.motion.repeated),
         model.clocks.report,
     ):

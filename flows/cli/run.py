@@ -177,13 +177,6 @@ def _print(record: RunRecord, project: str, seconds: float) -> None:
     _print_waiting(record)
     if not (record.executed or record.failed or record.waiting):
         line("nothing to do: every result is current")
-    for name, figures in record.figures.items():
-        if figures.get("joints") == 0:
-            line(
-                f"warning: {name} found nobody. Are translations in metres, the cameras in step, "
-                "and the settings within reach of these cameras?",
-                to=errors,
-            )
     line(f"results: {project}/results/{record.match_id}")
 
 

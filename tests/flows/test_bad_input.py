@@ -280,11 +280,20 @@ def test_a_bug_is_called_one_and_its_traceback_is_kept(monkeypatch, capsys, flag
         assert json.loads(said.out)["error"] == "InternalError"
 
 
-def test_finding_nobody_is_said(tiny, tmp_path):
+def test_a_run_without_people_is_partial_and_says_why(tiny, tmp_path):
+    asked = ("--until", "tracking", "--set", "tracking.min_angle=1.57")
+    answer = worldpose("run", tiny, "--project", tmp_path / "new", *asked)
+    assert answer.code == 4
+    assert "tracking/clip found no person" in answer.err
+    assert "tracking.min_angle asks for 90 (1.57 rad)" in answer.err
+
+
+def test_a_run_without_joints_is_partial_and_says_why(tiny, tmp_path):
     asked = ("--until", "triangulation", "--set", "triangulation.min_views=9")
     answer = worldpose("run", tiny, "--project", tmp_path / "new", *asked)
-    assert answer.code == 0
-    assert "triangulation/clip found nobody" in answer.err
+    assert answer.code == 4
+    assert "triangulation/clip placed no joint of" in answer.err
+    assert "min_views asks for 9" in answer.err
 
 
 def test_settings_can_be_looked_up(tmp_path):

@@ -4,8 +4,17 @@ Inputs: cameras and the people each of them detected. Outputs: the detection of 
 every frame and camera, quick joints [m], and a summary of each track.
 """
 
+from worldpose.tracking.diagnosis import NoPeople, diagnose_no_people
 from worldpose.tracking.rosters import people_allowed
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import Tracking, TrackingReport, track_people
 
-__all__ = ["Tracking", "TrackingReport", "TrackingSettings", "people_allowed", "track_people"]
+__all__ = [
+    "NoPeople",
+    "Tracking",
+    "TrackingReport",
+    "TrackingSettings",
+    "diagnose_no_people",
+    "people_allowed",
+    "track_people",
+]

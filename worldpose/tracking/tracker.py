@@ -29,6 +29,8 @@ BLOCK = 64
 class TrackingReport(Record):
     """How tracking went."""
 
+    people: int
+    """People found [1]."""
     births: int
     """Tracks started [1]."""
     dropped: int
@@ -172,6 +174,7 @@ def _result(follower: Follower, frames: int, pitch_size: tuple[float, float] | N
     count = int(np.count_nonzero(matched))
     joins = _joins(candidates, chains, everyone)
     report = TrackingReport(
+        people=len(chains),
         births=len(everyone),
         dropped=len(everyone) - sum(map(len, chains)),
         merged=follower.merged,

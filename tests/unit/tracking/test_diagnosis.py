@@ -1,0 +1,165 @@
+"""Each reason for finding no person is told from the detections, with its numbers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from worldpose.cameras import Rigid
+from worldpose.tracking import TrackingSettings, diagnose_no_people, track_people
+
+FPS = 25.0
+SETTINGS = TrackingSettings()
+PLACES = np.array([[0.0, 0.0], [2.0, 1.0], [-3.0, 2.0], [4.0, -3.0]])
+
+
+def walk(people, frames=80, radius=1.5):
+    """Four people who walk on circles of their own."""
+    time = np.arange(frames)[:, None] / FPS
+    turn = np.array([1.0, -0.7, 0.5, -1.2]) * time + np.arange(4)
+    return people(PLACES + radius * np.stack([np.cos(turn), np.sin(turn)], axis=-1))
+
+
+def moved(cameras, centers):
+    """The cameras with other centres, looking the same way."""
+    rotation = cameras.cam_from_world.rotation
+    translation = -np.einsum("cij,cj->ci", rotation, centers)
+    return replace(cameras, cam_from_world=Rigid(rotation, translation))
+
+
+def reason(cameras, keypoints, confidence, *, ground=True, settings=SETTINGS):
+    """The diagnosis, after tracking has found no person."""
+    pitch = (105.0, 68.0) if ground else None
+    tracks = track_people(cameras, keypoints, confidence, FPS, settings, pitch_size=pitch)
+    assert tracks.report.people == 0
+    names = [f"cam{n}" for n in range(len(cameras.focal))]
+    given = (cameras, names, keypoints, confidence, FPS, settings)
+    return diagnose_no_people(*given, ground=ground, births=tracks.report.births)
+
+
+def beside(ring, apart):
+    """Two cameras side by side that look the same way."""
+    camera = ring(4)[np.array([0, 0])]
+    side = camera.cam_from_world.rotation[0, 0]
+    return moved(camera, camera.center + np.array([[0.0], [apart]]) * side)
+
+
+def test_no_detection_in_any_camera(ring):
+    keypoints, confidence = np.full((5, 4, 2, 17, 2), np.nan), np.full((5, 4, 2, 17), np.nan)
+    found = reason(ring(4), keypoints, confidence)
+    assert found.cause == "no_detections"
+    assert "no camera has a detection" in found.message
+
+
+def test_detections_with_too_few_keypoints(ring, people, seen):
+    keypoints, confidence = seen(ring(4), walk(people))
+    keypoints[..., 4:, :] = np.nan
+    found = reason(ring(4), keypoints, confidence)
+    assert (found.cause, found.evidence["keypoints"]) == ("too_few_keypoints", 4)
+    assert "min_joints asks for 5" in found.message
+
+
+def test_one_camera_alone(ring, people, seen):
+    keypoints, confidence = seen(ring(4), walk(people))
+    keypoints[:, 1:] = np.nan
+    found = reason(ring(4), keypoints, confidence)
+    assert found.cause == "one_camera"
+    assert "cam0 320, cam1 0" in found.message
+
+
+def test_cameras_that_never_have_detections_at_the_same_time(ring, people, seen):
+    keypoints, confidence = seen(ring(2), walk(people))
+    keypoints[:40, 0] = np.nan
+    keypoints[40:, 1] = np.nan
+    found = reason(ring(2), keypoints, confidence)
+    assert found.cause == "never_together"
+    assert "cam0 40 to 79, cam1 0 to 39" in found.message
+
+
+def test_cameras_side_by_side(ring, people, seen):
+    cameras = beside(ring, 0.46)
+    found = reason(cameras, *seen(cameras, walk(people), noise=0.3))
+    assert found.cause == "narrow_angle"
+    # 0.46 m at 30 m: 0.88 degrees.
+    assert found.evidence["angle_deg"] == pytest.approx(0.88, rel=0.2)
+    assert found.evidence["cameras_apart_m"] == pytest.approx(0.46)
+    assert "0.46 m apart" in found.message
+    assert "asks for 5.7 (0.1 rad)" in found.message
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(1000.0, "millimetres"), (100.0, "centimetres"), (3.281, "feet")]
+)
+def test_translations_in_another_unit(ring, people, seen, factor, unit):
+    keypoints, confidence = seen(ring(4), walk(people))
+    found = reason(moved(ring(4), factor * ring(4).center), keypoints, confidence, ground=False)
+    assert found.cause == "wrong_size"
+    assert found.evidence["size"] == pytest.approx(factor, rel=0.1)
+    assert unit in found.message
+
+
+def test_a_world_whose_zero_is_not_the_ground(ring, people, seen):
+    keypoints, confidence = seen(ring(4), walk(people))
+    raised = moved(ring(4), ring(4).center + [0.0, 0.0, 4.0])
+    found = reason(raised, keypoints, confidence)
+    assert found.cause == "wrong_height"
+    assert found.evidence["height_m"] == pytest.approx(5.1, abs=0.2)
+
+
+@pytest.mark.parametrize("late", [-30, 12])
+def test_a_clock_that_is_off(ring, people, seen, late):
+    cameras = ring(5)[np.array([0, 2])]
+    keypoints, confidence = seen(cameras, walk(people, 200, radius=5.0))
+    late_keypoints = keypoints[40:160].copy()
+    late_keypoints[:, 1] = keypoints[40 - late : 160 - late, 1]
+    # Tracking may find people who are none: rays of two people meet now and then.
+    given = (cameras, ("cam0", "cam1"), late_keypoints, confidence[40:160], FPS, SETTINGS)
+    found = diagnose_no_people(*given, ground=True)
+    assert (found.cause, found.evidence["shift_frames"]) == ("clock", late)
+    assert f"by {abs(late)}" in found.message
+
+
+def test_cameras_that_contradict_each_other(ring, people, seen):
+    cameras = ring(5)[np.array([0, 2])]
+    keypoints, confidence = seen(cameras, walk(people))
+    tilt = 0.2
+    wrong = cameras.cam_from_world.rotation.copy()
+    wrong[1] = (
+        np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+        @ wrong[1]
+    )
+    translation = -np.einsum("cij,cj->ci", wrong, cameras.center)
+    turned = replace(cameras, cam_from_world=Rigid(wrong, translation))
+    found = reason(turned, keypoints, confidence)
+    assert found.cause == "cameras_contradict"
+    assert "cam0 and cam1" in found.message
+
+
+def test_cameras_that_show_other_places(ring, people, seen):
+    cameras = ring(5)[np.array([0, 2])]
+    away = np.array([[0.0, 0.0, 0.0], [60.0, 20.0, 0.0]])
+    keypoints, confidence = seen(moved(cameras, cameras.center), walk(people))
+    found = reason(moved(cameras, cameras.center + away), keypoints, confidence)
+    assert found.cause == "one_camera_each"
+
+
+def test_people_who_are_seen_too_shortly(ring, people, seen):
+    keypoints, confidence = seen(ring(4), walk(people))
+    keypoints[3:] = np.nan
+    found = reason(ring(4), keypoints, confidence)
+    assert found.cause == "too_short"
+    assert "4 tracks were started" in found.message
+
+
+def test_settings_out_of_reach_are_named(ring, people, seen):
+    settings = TrackingSettings(size_range=(3.0, 4.0))
+    found = reason(ring(4), *seen(ring(4), walk(people)), settings=settings)
+    assert found.cause == "wrong_size"
+    assert "size_range accepts 3 to 4" in found.message
+
+
+def test_two_cameras_at_one_place(ring, people, seen):
+    cameras = beside(ring, 0.0)
+    found = reason(cameras, *seen(cameras, walk(people)))
+    assert found.cause == "same_place"
+    assert "cam0 and cam1" in found.message

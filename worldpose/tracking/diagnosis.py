@@ -1,0 +1,353 @@
+"""Why a clip's detections became no people: measured on the detections and the cameras.
+
+Where cameras agree on their people (`pair_agreement`), what differs from the settings is the
+reason; where they do not, their clocks, places and poses are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.cameras import Camera
+from worldpose.tracking.clip_arrays import ClipArray
+from worldpose.tracking.pair_agreement import Meeting, match_pair
+from worldpose.tracking.settings import TrackingSettings
+
+WINDOW: Final = 400
+"""Most frames that are looked at."""
+SAME_PLACE: Final = 1e-3
+"""Cameras nearer to each other than this are at one place [m]."""
+UNITS: Final = {1000.0: "millimetres", 100.0: "centimetres", 39.37: "inches", 3.281: "feet"}
+"""Units that translations come in by mistake, by what they make of a metre."""
+
+
+@dataclass(frozen=True)
+class NoPeople:
+    """Why tracking found no person.
+
+    Attributes:
+        cause: one word for it.
+        message: the reason with its numbers, and what to do, in full sentences.
+        evidence: the numbers by name.
+    """
+
+    cause: str
+    message: str
+    evidence: dict[str, float]
+
+
+def diagnose_no_people(
+    cameras: Camera,
+    camera_ids: Sequence[str],
+    keypoints: ClipArray,
+    confidence: ClipArray,
+    fps: float,
+    settings: TrackingSettings,
+    *,
+    ground: bool,
+    births: int = 0,
+) -> NoPeople:
+    """Return why tracking found no person in a clip.
+
+    Args:
+        cameras: batch (cameras,).
+        camera_ids: of these.
+        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
+        confidence: (frames, cameras, detections, 17); 0, less or NaN where not found.
+        fps: frames per second [1/s].
+        settings: with which tracking found none.
+        ground: whether people stand on z = 0.
+        births: tracks that were started and dropped again.
+    """
+    usable = _usable(keypoints, confidence, settings.min_joints)
+    present = np.asarray(usable.any(axis=-1))
+    counts = usable.sum(axis=(0, 2))
+    detected = {name: float(n) for name, n in zip(camera_ids, counts, strict=True)}
+    empty = _too_little(present, detected, keypoints, confidence, settings)
+    if empty is not None:
+        return empty
+    frames = _window(present)
+    rays = _rays(cameras, keypoints, confidence, frames, settings.min_joints)
+    extent = float(np.ptp(cameras.center[counts > 0], axis=0).max())
+    if extent < SAME_PLACE:
+        together = " and ".join(name for name, count in detected.items() if count > 0)
+        return NoPeople(
+            cause="same_place",
+            message=f"{together} are at the same place ({extent:.3g} m apart): their rays meet "
+            "nowhere but there. Two cameras must stand apart; is one of them given twice?",
+            evidence={"cameras_apart_m": extent},
+        )
+    pairs = [
+        pair
+        for pair in combinations(range(len(camera_ids)), 2)
+        if present[:, pair].all(axis=1).any()
+    ]
+    meetings = [match_pair(cameras, rays, pair, 0, settings.min_joints) for pair in pairs]
+    meetings.sort(key=lambda each: (each.agrees, len(each.angle) * each.share), reverse=True)
+    agreeing = [each for each in meetings if each.agrees]
+    if agreeing:
+        return _limit(cameras, camera_ids, agreeing, settings, ground, births)
+    found = _other_clock(cameras, camera_ids, rays, meetings, fps, settings)
+    if found is not None:
+        return found
+    if not _overlap(cameras, rays, ground, settings):
+        return NoPeople(
+            cause="one_camera_each",
+            message="no place where the people of one camera may be is in the image of another: "
+            "every person is seen by one camera. Two cameras must show the same people.",
+            evidence=detected,
+        )
+    best = meetings[0]
+    a, b = (camera_ids[n] for n in best.cameras)
+    return NoPeople(
+        cause="cameras_contradict",
+        message=f"no two cameras agree on their people: of the best pair, {a} and {b}, "
+        f"{len(best.angle)} of {best.possible} detections have a partner on their epipolar lines. "
+        "Camera poses or lenses are wrong, or files belong to other cameras: compare each "
+        "camera's projection of the scene with its image.",
+        evidence={"matches": float(len(best.angle)), "possible": float(best.possible)},
+    )
+
+
+def _usable(keypoints: ClipArray, confidence: ClipArray, least: int) -> NDArray[np.bool_]:
+    """Return which detections (frames, cameras, detections) have joints enough."""
+    rows = [
+        np.count_nonzero(
+            (confidence[start : start + WINDOW] > 0.0)
+            & np.isfinite(keypoints[start : start + WINDOW][..., 0]),
+            axis=-1,
+        )
+        >= least
+        for start in range(0, confidence.shape[0], WINDOW)
+    ]
+    return np.concatenate(rows) if rows else np.zeros(confidence.shape[:3], dtype=np.bool_)
+
+
+def _too_little(
+    present: NDArray[np.bool_],
+    detected: dict[str, float],
+    keypoints: ClipArray,
+    confidence: ClipArray,
+    settings: TrackingSettings,
+) -> NoPeople | None:
+    """Return why detections cannot be compared at all, if so.
+
+    Args:
+        present: (frames, cameras), whether a camera has a usable detection in a frame.
+        detected: usable detections by camera.
+        keypoints: as given.
+        confidence: as given.
+        settings: of tracking.
+    """
+    seeing = [name for name, count in detected.items() if count > 0]
+    counts = ", ".join(f"{name} {count:.0f}" for name, count in detected.items())
+    if not seeing:
+        any_, most = _usable(keypoints, confidence, 1).sum(), 0
+        while any_ and _usable(keypoints, confidence, most + 1).any():
+            most += 1
+        if any_:
+            return NoPeople(
+                cause="too_few_keypoints",
+                message=f"the most complete of {any_} detections has {most} keypoints; "
+                f"tracking.min_joints asks for {settings.min_joints}.",
+                evidence={"detections": float(any_), "keypoints": float(most)},
+            )
+        return NoPeople(
+            cause="no_detections",
+            message="no camera has a detection in this clip. Look at the detections, at the "
+            "clip's frames in match.yaml, and at what the pitch filter removed.",
+            evidence=detected,
+        )
+    if len(seeing) == 1:
+        return NoPeople(
+            cause="one_camera",
+            message=f"one camera alone has detections ({counts}). A person needs two.",
+            evidence=detected,
+        )
+    if not (np.count_nonzero(present, axis=1) >= 2).any():
+        spans = ", ".join(
+            f"{name} {frames[0]} to {frames[-1]}"
+            for name, column in zip(detected, present.T, strict=True)
+            if len(frames := np.flatnonzero(column))
+        )
+        return NoPeople(
+            cause="never_together",
+            message="no two cameras have detections in the same frame; frames of the clip with "
+            f"detections: {spans}. Look at offset_frames and at the clip's frames in match.yaml.",
+            evidence=detected,
+        )
+    return None
+
+
+def _window(present: NDArray[np.bool_]) -> slice:
+    """Return up to `WINDOW` frames around the middle of those that two cameras see."""
+    both = np.flatnonzero(np.count_nonzero(present, axis=1) >= 2)
+    start = max(0, int(both[len(both) // 2]) - WINDOW // 2)
+    return slice(start, min(len(present), start + WINDOW))
+
+
+def _rays(
+    cameras: Camera, keypoints: ClipArray, confidence: ClipArray, frames: slice, least: int
+) -> NDArray[np.float64]:
+    """Return unit rays (frames, cameras, detections, 17, 3) [world]; NaN where not usable."""
+    image = np.asarray(keypoints[frames], dtype=np.float64)
+    rays = cameras.unproject(image.reshape(*image.shape[:2], -1, 2)).directions
+    rays = rays.reshape(*image.shape[:-1], 3).copy()
+    rays[~(np.asarray(confidence[frames]) > 0.0)] = np.nan
+    rays[np.count_nonzero(np.isfinite(rays[..., 0]), axis=-1) < least] = np.nan
+    return rays
+
+
+def _limit(
+    cameras: Camera,
+    names: Sequence[str],
+    agreeing: list[Meeting],
+    settings: TrackingSettings,
+    ground: bool,
+    births: int,
+) -> NoPeople:
+    """Return which limit refuses people on whom two cameras agree."""
+    best = agreeing[0]
+    a, b = (names[n] for n in best.cameras)
+    count = len(best.angle)
+    apart = float(np.linalg.norm(np.subtract(*cameras.center[list(best.cameras)])))
+    angle, distance = float(np.median(best.angle)), float(np.median(best.distance))
+    height, depth = float(np.median(best.height)), float(np.median(best.depth))
+    size = float(np.nanmedian(best.size)) if np.isfinite(best.size).any() else math.nan
+    seen = f"{a} and {b} agree on their people ({count} of {best.possible} detections)"
+    evidence = {
+        "matches": float(count),
+        "angle_deg": math.degrees(angle),
+        "cameras_apart_m": apart,
+        "depth_m": depth,
+        "ray_distance_m": distance,
+        "height_m": height,
+        **({"size": size} if math.isfinite(size) else {}),
+    }
+    widest = max(float(np.median(each.angle)) for each in agreeing)
+    if widest < settings.min_angle:
+        return NoPeople(
+            cause="narrow_angle",
+            message=f"{seen}, but the rays of one person meet at "
+            f"{math.degrees(angle):.2g} degrees and tracking.min_angle asks for "
+            f"{math.degrees(settings.min_angle):.2g} ({settings.min_angle:g} rad): the cameras are "
+            f"{apart:.2f} m apart and people {depth:.0f} m away, so an error of one centimetre "
+            f"across the rays is {0.01 / max(angle, 1e-9):.1f} m along them. Add a camera that "
+            "sees them from another side.",
+            evidence=evidence,
+        )
+    low, high = settings.size_range
+    if math.isfinite(size) and not low <= size <= high:
+        unit, factor = min(
+            ((name, factor) for factor, name in UNITS.items()),
+            key=lambda each: abs(math.log(size / each[1])),
+        )
+        near = abs(math.log(size / factor)) < 0.3
+        guess = f"translations seem to be in {unit}" if near else "is the unit the metre?"
+        return NoPeople(
+            cause="wrong_size",
+            message=f"{seen}, but these are {size:.3g} times as large as adults "
+            f"(tracking.size_range accepts {low:g} to {high:g}): {guess}. Camera translations "
+            f"are read as metres; {a} and {b} are {apart:.4g} apart.",
+            evidence=evidence,
+        )
+    low, high = settings.body_heights
+    if ground and not low <= height <= high:
+        return NoPeople(
+            cause="wrong_height",
+            message=f"{seen}, but the middle of their bodies is at z = {height:.2f} m "
+            f"(tracking.body_heights accepts {low:g} to {high:g}). On a pitch people stand at "
+            "z = 0 and z points up: look at the world frame of the cameras, or write pitch: none.",
+            evidence=evidence,
+        )
+    if distance > settings.epipolar_gate:
+        return NoPeople(
+            cause="rays_miss",
+            message=f"{seen}, but the rays of one joint pass {distance:.2f} m apart and "
+            f"tracking.epipolar_gate accepts {settings.epipolar_gate:g}: the cameras are not "
+            "known well enough.",
+            evidence=evidence,
+        )
+    if not births:
+        return NoPeople(
+            cause="limits_together",
+            message=f"{seen}, and no limit of tracking alone refuses them (angle "
+            f"{math.degrees(widest):.2g} degrees, {distance:.2f} m between rays, {size:.2g} times "
+            "an adult's size), but no group of detections passes all of them. Loosen "
+            "tracking.min_angle, epipolar_gate or size_range.",
+            evidence=evidence,
+        )
+    return NoPeople(
+        cause="too_short",
+        message=f"{seen}, but none was seen for long enough: {births} tracks were started and "
+        f"dropped; tracking.min_track asks for {settings.min_track:g} s, and frames with fewer "
+        f"than {settings.birth_views} cameras count {settings.pair_evidence:g}.",
+        evidence={**evidence, "tracks": float(births)},
+    )
+
+
+def _other_clock(
+    cameras: Camera,
+    names: Sequence[str],
+    rays: NDArray[np.float64],
+    meetings: list[Meeting],
+    fps: float,
+    settings: TrackingSettings,
+) -> NoPeople | None:
+    """Return the offset at which two cameras agree that do not as they are, if there is one."""
+    reach = min(len(rays) // 2, round(4.0 * fps))
+    found: list[tuple[float, int, Meeting]] = []
+    busiest = sorted(meetings, key=lambda each: each.possible, reverse=True)[:3]
+    for now in busiest:
+        for shift in range(-reach, reach + 1):
+            then = match_pair(cameras, rays, now.cameras, shift, settings.min_joints)
+            if then.agrees and then.share >= 2.0 * now.share:
+                found.append((then.share, shift, then))
+    if not found:
+        return None
+    top = max(share for share, _, _ in found)
+    # A person who stands still agrees at many offsets; the middle of the best ones is told.
+    near = sorted(shift for share, shift, _ in found if share >= 0.95 * top)
+    shift = near[len(near) // 2]
+    share, _, then = next(each for each in found if each[1] == shift)
+    a, b = (names[n] for n in then.cameras)
+    now = next(each for each in meetings if each.cameras == then.cameras)
+    return NoPeople(
+        cause="clock",
+        message=f"{a} and {b} agree on {100 * share:.0f} % of their people when {b} is taken "
+        f"{abs(shift)} frames {'later' if shift > 0 else 'earlier'}, and on {100 * now.share:.0f} "
+        f"% as match.yaml has them: correct offset_frames of one of them by {abs(shift)}.",
+        evidence={"shift_frames": float(shift), "share": share, "share_now": now.share},
+    )
+
+
+def _overlap(
+    cameras: Camera, rays: NDArray[np.float64], ground: bool, settings: TrackingSettings
+) -> bool:
+    """Return whether people of one camera may be in the image of another."""
+    centers, size = cameras.center, cameras.image_size
+    middle = 0.5 * sum(settings.body_heights)
+    for a in range(len(centers)):
+        seen = rays[:, a][np.isfinite(rays[:, a, :, :, 0]).any(axis=-1)]
+        if not len(seen):
+            continue
+        ray = np.nanmean(seen[:: max(1, len(seen) // 50)], axis=1)
+        ranges = np.geomspace(1.0, 200.0, 30)[:, None]
+        if ground:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ranges = ((middle - centers[a, 2]) / ray[:, 2])[None]
+            ranges = np.where(ranges > 0.0, ranges, np.nan)
+        places = centers[a] + ranges[..., None] * ray
+        image = cameras.project(places.reshape(1, -1, 3))
+        inside = np.asarray(((image >= 0.0) & (image <= size[:, None])).all(axis=-1))
+        inside[a] = False
+        if inside.any():
+            return True
+    return False
