@@ -11,7 +11,8 @@ replays recordings. --iterations N goes through the method N times.
 
 Seen: people whom the detections of two cameras or more show in at least half of the frames. With a
 body: those of them who have one in at least half of these frames, within 1 m. Regions: share of
-joints, seen by two cameras, whose true place lies in the stated 95 % region, by joint group.
+joints, seen by two cameras, whose true place lies in the stated 95 % region, by joint group; in
+brackets for what the detector takes for joints, where the reference has that.
 """
 
 from __future__ import annotations
@@ -137,6 +138,8 @@ def measure(plan: dict[str, Any], folder: Path) -> dict[str, Any]:
     row["simulated_s"] = round(time.monotonic() - begun, 1)
     spec = read_match(out).spec
     truth = read_joints(out / "reference" / "joints.npz")
+    file = out / "reference" / "defined_joints.npz"
+    defined = read_joints(file) if file.is_file() else None
     row |= {"fps": spec.fps, "cameras": len(spec.static_cameras), "people": truth.joints.shape[1]}
     runs: list[RunRecord] = []
     for iteration in range(1, plan["iterations"] + 1):
@@ -159,6 +162,9 @@ def measure(plan: dict[str, Any], folder: Path) -> dict[str, Any]:
             if f"{stage}/clip" in run:
                 tracks = joint_tracks(run, "clip", stage)
                 scored[stage] = score_stage(tracks, truth, spec.fps)
+                if defined is not None:
+                    counts = np.array(list(region_counts(tracks, defined).values())).sum(axis=0)
+                    scored[stage]["regions_defined"] = counts.tolist()
                 bodies = tracks if stage == "body_fitting" else bodies
         row["stages"].append(scored)
     return row | people_with_bodies(bodies, truth, views_of_detections(out, truth))
@@ -250,6 +256,8 @@ def _stage_line(title: str, iteration: int, stage: str, scored: list[dict[str, A
         axis=0
     )
     inside = np.append(counts, [counts.sum(axis=0)], axis=0)
+    brackets = [one["regions_defined"] for one in scored if "regions_defined" in one]
+    known = np.sum(brackets, axis=0) if brackets else None
     shares = 100.0 * inside[:, 0] / np.maximum(inside[:, 1], 1)
     return (
         f"{title:15s} {iteration} {stage:15s} {len(scored):2d} "
@@ -257,6 +265,7 @@ def _stage_line(title: str, iteration: int, stage: str, scored: list[dict[str, A
         + f"  {sum(one['switches'] or 0 for one in scored):3d}   "
         + " ".join(f"{share:5.1f}" for share in shares[:-1])
         + f"; {shares[-1]:5.1f}"
+        + (f" ({100.0 * known[0] / max(known[1], 1):5.1f})" if known is not None else "")
     )
 
 
