@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from data_contracts.records import CONTRACT_VERSION, Name, Record
 
-Point = tuple[float, float, float]
+Coordinate = Annotated[float, Field(ge=-300, le=300)]
+"""[m], world."""
+Point = tuple[Coordinate, Coordinate, Coordinate]
+Angle = Annotated[float, Field(ge=-13, le=13)]
+"""[rad], at most two turns."""
 
 
 class LineSpec(Record):
@@ -26,11 +30,11 @@ class ArcSpec(Record):
     """
 
     center: Name
-    radius: float = Field(gt=0)
+    radius: float = Field(gt=0, le=100)
     """[m]"""
-    start_angle: float
+    start_angle: Angle
     """[rad]"""
-    end_angle: float
+    end_angle: Angle
     """[rad]"""
 
 
@@ -38,11 +42,14 @@ class PitchSpec(Record):
     """pitch.json; absent in a match folder = the standard 105 x 68 m pitch with a 0.2 m crown."""
 
     contract: Literal[1] = CONTRACT_VERSION
-    length: float = Field(default=105.0, gt=0)
-    """Between the centres of the goal lines [m]."""
-    width: float = Field(default=68.0, gt=0)
-    """Between the centres of the touch lines [m]."""
-    crown: float = Field(default=0.2, ge=0)
+    length: float = Field(default=105.0, gt=0, le=200)
+    """Between the centres of the goal lines [m]: 80 to 130, unless `any_size`."""
+    width: float = Field(default=68.0, gt=0, le=200)
+    """Between the centres of the touch lines [m]: 40 to 100, unless `any_size`."""
+    any_size: bool = False
+    """The pitch is not of the Laws: its size, and the places of points that have names of the Laws,
+    are not checked."""
+    crown: float = Field(default=0.2, ge=0, le=1)
     """Height of the long axis above the touch lines [m]."""
     points: dict[Name, Point] = {}
     """Surveyed positions that replace the nominal ones, by name; world [m]."""

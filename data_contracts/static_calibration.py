@@ -152,7 +152,7 @@ _ABOUT = {
     "decisions": "what was chosen, and the figures that decided",
     "reasons": "why the camera is weak, or why it is left out; empty where it is neither",
     "add_next": "points and markings whose clicks would lower the expected error most",
-    "noise_scale": "factor on the stated noise that the residuals ask for; null for a given one",
+    "noise_scale": "factor on the stated noise that is taken; null for a given one",
     "condition": "condition number of the free parameters' correlation; null for a given one",
 }
 

@@ -151,5 +151,7 @@ def _figures(report: CalibrationReport) -> dict[str, float]:
         "clicks_used": float(len(used)),
         "clicks_wrong": float(len(report.wrong)),
         "weak": float(report.weak),
+        "click_noise_px": report.click_noise,
+        "click_freedom": report.click_freedom,
     }
     return {name: value for name, value in figures.items() if np.isfinite(value)}

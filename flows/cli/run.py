@@ -23,6 +23,7 @@ from flows.cli.console import (
 )
 from flows.cli.iterations import as_json as iterations_as_json
 from flows.cli.iterations import parse_iterations, print_iterations
+from flows.click_advice import click_advice
 from flows.clock_advice import clock_advice
 from flows.iteration import iterate_match
 from flows.method import METHOD
@@ -105,7 +106,11 @@ def run(
         passes = None if most == 1 else iterate_match(store, opened, request, most)
         record = run_match(store, opened, request) if passes is None else passes.record
     seconds = time.monotonic() - started
-    warned = [*record.warnings, *clock_advice(record.figures, opened.folder.spec)]
+    warned = [
+        *record.warnings,
+        *clock_advice(record.figures, opened.folder.spec),
+        *click_advice(record.figures, _stated_click_noise(record)),
+    ]
     if as_json:
         print_json(
             {
@@ -131,6 +136,11 @@ def run(
     for text in warned:
         line(f"warning: {text}", to=errors)
     raise typer.Exit(EXIT_CODES[record.state])
+
+
+def _stated_click_noise(record: RunRecord) -> float:
+    stated = record.settings.get("static_calibration", {}).get("click_noise")
+    return float(stated) if isinstance(stated, int | float) else 1.0
 
 
 def _policy(gates: str) -> GatePolicy:

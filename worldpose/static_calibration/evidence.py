@@ -11,6 +11,8 @@ from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 
+_MOST = 200
+"""Drawn pixels of a marking that are used [1]: more take time and tell nothing new."""
 _OUTSIDE = 1.0
 """Pixels by which a click may lie off the picture: rounding at its border."""
 
@@ -103,6 +105,7 @@ def gather(
         for pixel in marking.xy:
             _check_inside(place, pixel, image_size)
         pixels.setdefault(marking.name, []).extend(marking.xy)
+    pixels = {name: _thinned(drawn) for name, drawn in pixels.items()}
     samples = [pitch.marking_points(name, spacing) for name in pixels]
     counts = [len(drawn) for drawn in pixels.values()]
     return Evidence(
@@ -116,6 +119,26 @@ def gather(
         drawn_marking=np.repeat(np.arange(len(pixels)), counts),
         straight=np.array([name in pitch.lines for name in pixels], dtype=np.bool_),
     )
+
+
+def crowding(evidence: Evidence, reach: float) -> NDArray[np.float64]:
+    """Return how many pixels of its marking lie within `reach` [px] of each drawn pixel (d,).
+
+    A hand errs alike over a stretch of a line: pixels that crowd there tell no more than one.
+    """
+    count = np.ones(len(evidence.drawn_image))
+    for index in range(len(evidence.markings)):
+        on = evidence.drawn_marking == index
+        pixels = evidence.drawn_image[on]
+        apart = np.linalg.norm(pixels[:, None] - pixels, axis=-1)
+        count[on] = (apart <= reach).sum(axis=1)
+    return count
+
+
+def _thinned(pixels: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return at most `_MOST` of a marking's pixels, evenly from the order in which they are."""
+    chosen = np.linspace(0, len(pixels) - 1, min(len(pixels), _MOST)).astype(np.int64)
+    return [pixels[index] for index in chosen]
 
 
 def _check_inside(where: str, pixel: tuple[float, float], image_size: tuple[int, int]) -> None:

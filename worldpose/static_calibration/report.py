@@ -65,7 +65,11 @@ class CalibrationReport:
         drawn: residuals of drawn markings, the worst first.
         wrong: names of clicks and drawn markings that the camera does not rest on, the most
             surprising first.
-        noise_scale: factor on the stated noise that the residuals ask for [1].
+        noise_scale: factor on the stated noise that is taken [1]: 1 unless the residuals clearly
+            say another.
+        click_noise: standard deviation of the inlying clicks that their residuals say, each axis
+            [px]; NaN without degrees of freedom.
+        click_freedom: degrees of freedom that it rests on [1].
         condition: of the information about the free parameters, each in its prior's spreads [1].
         ground_error: the coverage map.
         weak: must a person look at this camera.
@@ -81,6 +85,8 @@ class CalibrationReport:
     drawn: tuple[MarkingResidual, ...]
     wrong: tuple[str, ...]
     noise_scale: float
+    click_noise: float
+    click_freedom: float
     condition: float
     ground_error: GroundErrorMap
     weak: bool

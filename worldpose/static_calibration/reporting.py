@@ -28,6 +28,8 @@ _CANNOT_IMAGE: Final = {
     RayStatus.BEHIND: "cannot be imaged: the point is behind the camera",
     RayStatus.BEYOND_FOLD: "cannot be imaged: the point is outside the lens's field of view",
 }
+_SAME: Final = 0.01
+"""Difference from the stated noise that is worth no word [1]."""
 _TRUSTED: Final = 4.0
 """Mean loss of an observation [1] to which a camera's residuals are not surprising: twice the
 stated noise."""
@@ -41,6 +43,7 @@ def report_of(
     lines: LineRefinement | None,
     pitch: PitchTemplate,
     settings: StaticCalibrationSettings,
+    stated: float,
 ) -> CalibrationReport:
     """Return what there is to say about a camera.
 
@@ -51,8 +54,10 @@ def report_of(
         decisions: what was chosen so far.
         lines: stage 3, where there was a picture.
         pitch: the template.
-        settings: thresholds.
+        settings: thresholds, and the noise of clicks that was found.
+        stated: noise of clicks that was stated [px].
     """
+    scale = fit.noise_scale * settings.click_noise / stated
     evidence = problem.evidence
     rows = residual_rows(problem, row_of(estimate.camera))
     problems = image_problems(estimate.camera, evidence.points_world)
@@ -88,9 +93,15 @@ def report_of(
             f"expected ground error {known.p95:.2f} m on the worst twentieth of the seen pitch, "
             f"over {settings.weak_p95:g} m"
         )
-    if fit.misfit > _TRUSTED:
+    if fit.misfit > _TRUSTED * fit.noise_scale**2:
         reasons.append(
             f"residuals {np.sqrt(fit.misfit):.1f} times the stated noise: a name may be wrong"
+        )
+    if abs(scale - 1.0) > _SAME:
+        decisions = (
+            *decisions,
+            f"clicks and drawn pixels are {scale:.2g} times as far off as stated, which "
+            "is taken for their noise",
         )
     if lines is not None and not lines.refined:
         reasons.append(f"no painted lines to confirm it: {lines.reason}")
@@ -112,7 +123,9 @@ def report_of(
             *(point.name for point in points if not point.inlier),
             *(marking.name for marking in drawn if not marking.inlier),
         ),
-        noise_scale=fit.noise_scale,
+        noise_scale=scale,
+        click_noise=fit.click_noise,
+        click_freedom=fit.click_freedom,
         condition=_condition(fit.covariance, problem.free),
         ground_error=known,
         weak=bool(reasons),
@@ -158,7 +171,7 @@ def _true_name(
         worst[name] = float(np.abs(off).max())
     nearest = min(worst, key=lambda name: worst[name])
     drawn = f"{evidence.markings[index]} left out: its pixels lie"
-    if worst[nearest] > settings.wrong_marking * problem.drawn_noise:
+    if worst[nearest] > settings.wrong_marking * settings.drawn_noise:
         return f"{drawn} on no marking"
     return f"{drawn} on {nearest}, {worst[nearest]:.1f} px off at most"
 

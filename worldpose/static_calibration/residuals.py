@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from worldpose.cameras.distortion import fold_squared
 from worldpose.cameras.projection import project_with_jacobians
 from worldpose.compiled import compiled
 
@@ -35,13 +36,37 @@ polynomials may fold a marking back into the picture."""
 def point_residuals(
     c: Floats, world: Floats, pixels: Floats, residual: Floats, jacobian: Floats
 ) -> None:
-    """Write pixel residuals (n, 2) of points and their derivatives (n, 2, 12) by a step [px]."""
+    """Write pixel residuals (n, 2) of points and their derivatives (n, 2, 12) by a step [px].
+
+    Beyond the radius where the lens folds, the magnification of that radius holds on: an image
+    that goes on outwards. Folded back into the picture, a point under a wrong name would fit once
+    the lens is bent enough.
+    """
     n = len(world)
+    fold = fold_squared(c[4], c[5], c[8])
+    straight = c.copy()
+    place, pixel = np.empty((1, 1, 3)), np.empty((1, 1, 2))
+    by_all, code = np.empty((1, 1, 2, 18)), np.empty((1, 1), dtype=np.uint8)
     image = np.empty((1, n, 2))
     full = np.empty((1, n, 2, 18))
     status = np.empty((1, n), dtype=np.uint8)
     project_with_jacobians(c.reshape(1, 22), world.reshape(1, n, 3), image, full, status)
+    magnification = 1.0
+    if fold < np.inf:
+        magnification += fold * (c[4] + fold * (c[5] + fold * c[8]))
+        straight[0], straight[1] = magnification * c[0], magnification * c[1]
+        straight[4:9] = 0.0
     for i in range(n):
+        s = fold
+        if fold < np.inf and status[0, i] == 0:
+            z = c[15] * world[i, 0] + c[16] * world[i, 1] + c[17] * world[i, 2] + c[20]
+            x = c[9] * world[i, 0] + c[10] * world[i, 1] + c[11] * world[i, 2] + c[18]
+            y = c[12] * world[i, 0] + c[13] * world[i, 1] + c[14] * world[i, 2] + c[19]
+            s = (x * x + y * y) / (z * z)
+            if s > fold:
+                place[0, 0] = world[i]
+                project_with_jacobians(straight.reshape(1, 22), place, pixel, by_all, code)
+                image[0, i], full[0, i], status[0, i] = pixel[0, 0], by_all[0, 0], code[0, 0]
         for k in range(2):
             if status[0, i] != 0:
                 residual[i, k] = _LOST
@@ -51,8 +76,15 @@ def point_residuals(
             residual[i, k] = image[0, i, k] - pixels[i, k]
             for j in range(6):
                 jacobian[i, k, j] = d[3 + j]
-            jacobian[i, k, 6] = d[9] * c[0] + d[10] * c[1]
+            jacobian[i, k, 6] = image[0, i, k] - c[2 + k]
             jacobian[i, k, 7], jacobian[i, k, 8] = d[11], d[12]
+            if s > fold:
+                # That the fold itself moves with the lens is left out: a step of which the cost
+                # does not fall is refused.
+                plane = (image[0, i, k] - c[2 + k]) / magnification
+                for j in range(3):
+                    jacobian[i, k, 9 + j] = plane * fold ** (1 + j)
+                continue
             jacobian[i, k, 9], jacobian[i, k, 10], jacobian[i, k, 11] = d[13], d[14], d[17]
 
 
@@ -79,7 +111,7 @@ def nearest_on_markings(
         place: (d, 3) [m], world, written; NaN where the marking is not before the camera.
         normal: (d, 2), written: from the marking to the pixel, either sign.
     """
-    cap = (_REACH * reach / c[0]) ** 2
+    cap = min((_REACH * reach / c[0]) ** 2, fold_squared(c[4], c[5], c[8]))
     image = np.empty((len(samples), 2))
     for i in range(len(samples)):
         p = samples[i]

@@ -7,12 +7,25 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from worldpose.errors import InputError
-from worldpose.static_calibration.adjustment import Fits, Problem, adjust, row_of
+from worldpose.static_calibration.adjustment import (
+    Fits,
+    Problem,
+    adjust,
+    camera_of_row,
+    row_of,
+)
 from worldpose.static_calibration.bending import with_bends
 from worldpose.static_calibration.parameters import CameraEstimate
-from worldpose.static_calibration.residuals import drawn_residuals, point_residuals
+from worldpose.static_calibration.residuals import (
+    PRIORS,
+    SIZE,
+    drawn_residuals,
+    point_residuals,
+    prior_residuals,
+)
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 _ROBUST: Final = 3.0
@@ -20,9 +33,28 @@ _ROBUST: Final = 3.0
 _SINGULAR: Final = 1e-14
 """Least eigenvalue of the scaled information [1]: below it a point lies in the camera's center,
 and rounding decides."""
-_OWN_WORTH: Final = 40.0
-"""Residuals that the stated noise is worth when the noise is estimated [1]: a few clicks cannot
-overrule it."""
+_CLEARLY: Final = 0.002
+"""Probability that honest residuals of the stated noise say by chance that it is another [1]."""
+_STATED_FREEDOM: Final = 4.0
+"""Degrees of freedom that the stated noise is worth where residuals say that it is another [1]: a
+statement within a factor of 1.4."""
+_LARGEST_SCALE: Final = 5.0
+"""Largest factor on the stated noise that is believed [1]; beyond, names are wrong."""
+_NOISES: Final = (1.5, 2.0, 3.0, 4.0)
+"""Factors on the stated noise that are tried where the stated one does not explain the clicks [1];
+none is believed to be worse than the last."""
+CLEAR_GAIN: Final = 6.0
+"""Twice the logarithm of how much more probable another noise than the stated one must be [1]:
+twenty times."""
+_NOISE_SPREAD: Final = 0.5
+"""Of the logarithm of this factor [1]: people click half to twice as well as they say."""
+_TWO_PI: Final = float(np.log(2.0 * np.pi))
+_POINT_NUMBERS: Final = 2
+_LINE_NUMBERS: Final = 2
+_ARC_NUMBERS: Final = 4
+"""Numbers that a click, a straight marking and an arc tell, however long they are drawn [1]."""
+_ENOUGH_NUMBERS: Final = 8
+"""Numbers that must be left for a marking to be taken for wrong [1]: four clicks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +86,11 @@ class Screened:
         inliers: (n,) bool.
         markings: (m,) bool, drawn markings that the camera rests on.
         surprise: (n,) residual in standard deviations of what the other evidence predicts.
-        noise_scale: factor on the stated noise that the residuals ask for.
+        noise_scale: factor on the stated noise that is taken: 1 unless the residuals clearly say
+            another.
+        click_noise: standard deviation of the inlying clicks that their residuals say [px]; NaN
+            without degrees of freedom.
+        click_freedom: degrees of freedom that it rests on [1].
         misfit: mean loss of an observation in the stated noise [1]; about 1 for honest ones.
     """
 
@@ -66,6 +102,8 @@ class Screened:
     markings: NDArray[np.bool_]
     surprise: NDArray[np.float64]
     noise_scale: float
+    click_noise: float
+    click_freedom: float
     misfit: float
 
 
@@ -98,6 +136,8 @@ def screen(
     From a robust fit's inliers, one click at a time leaves or returns: the inlier whose own
     residual would grow most beyond `limit` if it were left out, else the outlier that the others
     predict. In the linear regime this is leave-one-out for every click at the price of one fit.
+    The noise that a click is judged by is that of the others: the stated one, unless their
+    residuals clearly say another. A click on a point that the camera cannot image never stays.
     A drawn marking is wrong where half of it is far off: that is another marking's name.
 
     Args:
@@ -114,17 +154,15 @@ def screen(
     row = robust.rows[0]
     problem = problem.surveyed_from(row, settings)
     length = np.linalg.norm(residual_rows(problem, row).click, axis=1) / problem.click_noise
-    inliers = length < limit * max(1.0, _spread(length))
-    markings = _right_markings(problem, row, settings)
+    inliers = (length < limit * max(1.0, _spread(length))) & _imaged(problem, row)
+    markings = _right_markings(problem, row, inliers, settings)
     seen = set()
     while True:
         seen.add(inliers.tobytes() + markings.tobytes())
         kept = problem.only(inliers, markings)
         fit = adjust(kept, row[None])
         row = fit.rows[0]
-        covariance, scale = _covariance(kept, fit)
-        rows = residual_rows(problem, row)
-        surprise = _surprise(rows, covariance, scale * problem.click_noise, inliers)
+        _, _, surprise = _judged_clicks(problem, kept, fit, inliers)
         following = inliers.copy()
         wrong = np.where(inliers, surprise, 0.0)
         right = np.where(inliers, np.inf, surprise)
@@ -132,7 +170,7 @@ def screen(
             following[np.argmax(wrong)] = False
         elif count and right.min() < limit:
             following[np.argmin(right)] = True
-        following_markings = _right_markings(problem, row, settings)
+        following_markings = _right_markings(problem, row, following, settings)
         if following.tobytes() + following_markings.tobytes() in seen:
             break
         # Half of the clicks against the other half is no majority, whoever goes next.
@@ -140,6 +178,99 @@ def screen(
             break
         inliers, markings = following, following_markings
     return rest_on(problem, row, inliers, markings)
+
+
+def screen_at_best_noise(
+    problem: Problem, start: NDArray[np.float64], settings: StaticCalibrationSettings
+) -> tuple[Problem, Screened, StaticCalibrationSettings]:
+    """Return problem, fit and settings at the noise of clicks that explains them best.
+
+    A few clicks far off are wrong ones at the stated noise, or honest ones at a larger noise. The
+    explanation with the larger posterior probability is taken: inliers are Gaussian, a wrong click
+    is anywhere in the image, and the noise is near the stated one, which stands unless another is
+    clearly more probable.
+
+    Args:
+        problem: what was clicked.
+        start: (22,) camera near the answer.
+        settings: the stated noise, and what is wrong.
+
+    Raises:
+        InputError: only a camera that cannot be explains the clicks.
+    """
+    fit = screen(problem, start, settings)
+    best = problem.surveyed_from(fit.row, settings), fit, settings
+    if fit.inliers.all() and fit.noise_scale <= 1.0:
+        return best
+    least = improbability(*best, factor=1.0, with_prior=False)
+    for factor in _NOISES:
+        other, rough = at_noise(problem, factor, settings)
+        try:
+            tried = screen(other, fit.row, rough)
+        except InputError:
+            continue
+        found = other.surveyed_from(tried.row, rough), tried, rough
+        own = improbability(*found, factor=factor, with_prior=False)
+        if own < least - (CLEAR_GAIN if best[2] is settings else 0.0):
+            best, least = found, own
+    return best
+
+
+def at_noise(
+    problem: Problem, factor: float, settings: StaticCalibrationSettings
+) -> tuple[Problem, StaticCalibrationSettings]:
+    """Return problem and settings with so many times the noise of clicks and drawn pixels."""
+    noisy = {name: factor * getattr(settings, name) for name in ("click_noise", "drawn_noise")}
+    return (
+        replace(
+            problem,
+            click_noise=factor * problem.click_noise,
+            drawn_noise=factor * problem.drawn_noise,
+        ),
+        settings.model_copy(update=noisy),
+    )
+
+
+def improbability(
+    problem: Problem,
+    fit: Screened,
+    settings: StaticCalibrationSettings,
+    *,
+    factor: float,
+    with_prior: bool,
+) -> float:
+    """Return minus twice the logarithm of an explanation's posterior, but for a constant.
+
+    Args:
+        problem: what was clicked, at the noise of the explanation.
+        fit: to it.
+        settings: at this noise.
+        factor: on the stated noise.
+        with_prior: count how plausible the camera is: to compare other assumptions about it. Of
+            two noises it tells nothing, and a lens that the prior does not know would be taken
+            for noise.
+    """
+    kept = problem.only(fit.inliers, fit.markings)
+    rows = residual_rows(kept, fit.row)
+    scale = fit.noise_scale
+    squared = (_click_loss(kept, rows) + _drawn_loss(kept, rows)) / scale**2
+    volume = 2.0 * float(np.log(scale)) * (2 * len(kept.click_noise) + len(kept.drawn_noise))
+    volume += 4.0 * float(np.log(kept.click_noise).sum()) + 2.0 * len(kept.click_noise) * _TWO_PI
+    volume += 2.0 * float(np.log(kept.drawn_noise).sum()) + len(kept.drawn_noise) * _TWO_PI
+    anywhere = 2.0 * np.log(float(np.prod(problem.image_size)))
+    honest = 2.0 * np.log((1.0 - settings.wrong_rate) / settings.wrong_rate)
+    wrong = float((~fit.inliers).sum()) * (anywhere + honest)
+    lost = float((~fit.markings[problem.evidence.drawn_marking]).sum())
+    wrong += lost * np.log(float(np.hypot(*problem.image_size)))
+    free = np.ix_(problem.free, problem.free)
+    told = -float(np.linalg.slogdet(fit.tangent_covariance[free])[1])
+    if with_prior:
+        told += 4.0 * float(np.log(problem.prior[4]))  # of the principal point's prior
+        known = np.empty(PRIORS)
+        prior_residuals(fit.row, problem.prior, known, np.empty((PRIORS, SIZE)))
+        squared += float((known**2).sum())
+    far = float(np.log(scale * factor)) / _NOISE_SPREAD
+    return float(squared + volume + wrong + told + far**2)
 
 
 def rest_on(
@@ -159,13 +290,13 @@ def rest_on(
     kept = problem.only(inliers, markings)
     fit = adjust(kept, row[None])
     row = fit.rows[0]
-    covariance, scale = _covariance(kept, fit)
-    surprise = _surprise(
-        residual_rows(problem, row), covariance, scale * problem.click_noise, inliers
-    )
+    covariance, noise, surprise = _judged_clicks(problem, kept, fit, inliers)
+    scale = noise.scale
     own = residual_rows(kept, row)
     evidence_rows = 2 * len(own.click) + len(own.drawn)
-    squared = _click_loss(kept, own) + _drawn_loss(problem, own)
+    share = noise.freedom / max(evidence_rows, 1)
+    click_freedom = share * 2 * len(own.click)
+    click_squared = float((own.click**2).sum())
     return Screened(
         row=row,
         covariance=with_bends(kept, row, covariance, scale),
@@ -175,7 +306,9 @@ def rest_on(
         markings=markings,
         surprise=surprise,
         noise_scale=scale,
-        misfit=float(squared / max(evidence_rows, 1)),
+        click_noise=float(np.sqrt(click_squared / click_freedom)) if click_freedom else np.nan,
+        click_freedom=click_freedom,
+        misfit=float(noise.squared / max(evidence_rows, 1)),
     )
 
 
@@ -211,15 +344,16 @@ def held_out_error(problem: Problem, fit: Screened) -> float:
     evidence = problem.evidence
     rows = residual_rows(problem, fit.row)
     units = [
-        (rows.click[i], rows.by_click[i], float(problem.click_noise[i]))
+        (rows.click[i], rows.by_click[i], problem.click_noise[i : i + 1])
         for i in np.flatnonzero(fit.inliers)
     ]
     for index in np.flatnonzero(fit.markings):
         on = evidence.drawn_marking == index
-        units.append((rows.drawn[on], rows.by_drawn[on], problem.drawn_noise))
+        units.append((rows.drawn[on], rows.by_drawn[on], problem.drawn_noise[on]))
     total, count = 0.0, 0
     for residual, by_step, noise in units:
-        share = by_step @ fit.tangent_covariance @ by_step.T / (noise * fit.noise_scale) ** 2
+        sigma = np.broadcast_to(noise * fit.noise_scale, len(residual))
+        share = by_step @ fit.tangent_covariance @ by_step.T / np.outer(sigma, sigma)
         predicted = np.linalg.lstsq(np.eye(len(residual)) - share, residual, rcond=1e-9)[0]
         total += float(predicted @ predicted)
         count += len(residual)
@@ -227,16 +361,34 @@ def held_out_error(problem: Problem, fit: Screened) -> float:
 
 
 def _right_markings(
-    problem: Problem, row: NDArray[np.float64], settings: StaticCalibrationSettings
+    problem: Problem,
+    row: NDArray[np.float64],
+    inliers: NDArray[np.bool_],
+    settings: StaticCalibrationSettings,
 ) -> NDArray[np.bool_]:
-    """Return which drawn markings (m,) are near their projections; all where too few are."""
+    """Return which drawn markings (m,) are near their projections; all where too little is left.
+
+    Clicks and markings are one electorate: markings are wrong where what stays, clicks included,
+    tells most of all numbers, and enough of them for a camera.
+    """
+    evidence = problem.evidence
     off = np.abs(residual_rows(problem, row).drawn)
-    count = len(problem.evidence.markings)
-    on = problem.evidence.drawn_marking
-    middle = np.array([np.median(off[on == index]) for index in range(count)])
-    right = middle < settings.wrong_marking * problem.drawn_noise
-    enough = right.sum() >= (1.0 - settings.max_wrong_share) * count
-    return np.asarray(right if enough else np.ones(count, dtype=np.bool_))
+    on = evidence.drawn_marking
+    middle = np.array([np.median(off[on == index]) for index in range(len(evidence.markings))])
+    right = np.asarray(middle < settings.wrong_marking * settings.drawn_noise)
+    numbers = np.where(evidence.straight, _LINE_NUMBERS, _ARC_NUMBERS)
+    all_numbers = _POINT_NUMBERS * len(inliers) + int(numbers.sum())
+    left = _POINT_NUMBERS * int(inliers.sum()) + int(numbers[right].sum())
+    share = 1.0 - settings.max_wrong_share
+    few = right.sum() < share * len(right) and left < _ENOUGH_NUMBERS
+    enough = left >= share * all_numbers and not few
+    return right if enough else np.ones(len(right), dtype=np.bool_)
+
+
+def _imaged(problem: Problem, row: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which clicked points (n,) a camera (22,) can image."""
+    camera = camera_of_row(row, problem.image_size)
+    return np.asarray(np.isfinite(camera.project(problem.evidence.points_world)).all(axis=-1))
 
 
 def _spread(length: NDArray[np.float64]) -> float:
@@ -244,31 +396,114 @@ def _spread(length: NDArray[np.float64]) -> float:
     return float(np.median(length)) / 1.1774 if len(length) else 1.0
 
 
-def _covariance(problem: Problem, fit: Fits) -> tuple[NDArray[np.float64], float]:
-    """Return the covariance (12, 12) and the noise's scale that the residuals ask for."""
+@dataclass(frozen=True)
+class _Noise:
+    """How far the residuals of a fit are off.
+
+    Attributes:
+        scale: factor on the stated noise that is taken.
+        worth: degrees of freedom that the scale rests on; infinite for the stated noise.
+        squared: sum of squared residuals in the stated noise.
+        freedom: degrees of freedom of that sum.
+    """
+
+    scale: float
+    worth: float
+    squared: float
+    freedom: float
+
+    @classmethod
+    def told(cls, squared: float, freedom: float) -> _Noise:
+        """The stated noise, unless the residuals clearly say another."""
+        stated = cls(1.0, np.inf, squared, freedom)
+        if freedom < 1.0:
+            return stated
+        low, high = chi2.ppf([0.5 * _CLEARLY, 1.0 - 0.5 * _CLEARLY], freedom)
+        if low <= squared <= high:
+            return stated
+        worth = _STATED_FREEDOM + freedom
+        scale = np.sqrt((_STATED_FREEDOM + squared) / (worth - 2.0))
+        return cls(min(float(scale), _LARGEST_SCALE), worth, squared, freedom)
+
+
+def _judged_clicks(
+    problem: Problem, kept: Problem, fit: Fits, inliers: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], _Noise, NDArray[np.float64]]:
+    """Return the covariance (12, 12), the noise, and each click's surprise (n,).
+
+    Surprise is in standard deviations of a Gaussian: that of a click of which the noise is only
+    estimated is less than its distance (Student's law in two dimensions).
+
+    Args:
+        problem: what was clicked.
+        kept: that of it which the fit rests on.
+        fit: a single one.
+        inliers: (n,) which clicks it rests on.
+    """
+    covariance, noise = _covariance(kept, fit)
+    row = fit.rows[0]
+    rows = residual_rows(problem, row)
+    length = _surprise(rows, covariance, noise.scale * problem.click_noise, inliers)
+    surprise = np.empty(len(length))
+    for index, own in enumerate(length):
+        others = noise
+        if inliers[index]:
+            left = max(noise.squared - (own * noise.scale) ** 2, 0.0)
+            others = _Noise.told(left, noise.freedom - 2.0)
+        # Drawn pixels that are nearer than stated do not make clicks nearer.
+        scale = max(others.scale, 1.0)
+        surprise[index] = _as_gaussian(own * noise.scale / scale, others.worth)
+    surprise[~_imaged(problem, row)] = np.inf
+    return covariance, noise, surprise
+
+
+def _as_gaussian(distance: float, worth: float) -> float:
+    """Return the distance of a Gaussian in two dimensions that is exceeded as often."""
+    if not worth < np.inf:
+        return distance
+    return float(np.sqrt(worth * np.log1p(distance**2 / worth)))
+
+
+def _covariance(problem: Problem, fit: Fits) -> tuple[NDArray[np.float64], _Noise]:
+    """Return the covariance (12, 12), and the noise that the residuals say."""
     observed = fit.evidence_information[0]
     prior = fit.information[0] - observed
     free = np.ix_(problem.free, problem.free)
     rows = residual_rows(problem, fit.rows[0])
     squared = _click_loss(problem, rows) + _drawn_loss(problem, rows)
     count = 2 * len(rows.click) + len(rows.drawn)
+    if not _is_invertible(fit.information[0][free]):
+        raise _no_camera(problem, count)
     spent = float(np.trace(np.linalg.solve(fit.information[0][free], observed[free])))
-    squared_scale = (_OWN_WORTH + squared) / (_OWN_WORTH + max(count - spent, 0.0))
-    scale = float(np.sqrt(squared_scale))
+    noise = _Noise.told(squared, max(count - spent, 0.0))
     covariance = np.zeros_like(prior)
-    total = observed[free] / scale**2 + prior[free]
-    # Coefficients of the lens and meters differ by many powers of ten.
+    total = observed[free] / noise.scale**2 + prior[free]
     size = np.sqrt(np.abs(np.diag(total)))
     scaled = total / np.outer(size, size)
-    if not np.linalg.eigvalsh(scaled)[0] > _SINGULAR:
-        raise InputError(
-            "clicked markings",
-            expected="clicks that a camera beside or above the pitch can have made",
-            found=f"{count} pixel coordinates that bring the camera down to a clicked point",
-            todo="Check names and pixels of the clicks, and image_size.",
-        )
+    if not _is_invertible(total):
+        raise _no_camera(problem, count)
     covariance[free] = np.linalg.inv(scaled) / np.outer(size, size)
-    return covariance, scale
+    return covariance, noise
+
+
+def _is_invertible(information: NDArray[np.float64]) -> bool:
+    """Whether an information can be inverted, each parameter in its own unit.
+
+    Coefficients of the lens and meters differ by many powers of ten.
+    """
+    size = np.sqrt(np.abs(np.diag(information)))
+    if not (np.isfinite(information).all() and size.all()):
+        return False
+    return bool(np.linalg.eigvalsh(information / np.outer(size, size))[0] > _SINGULAR)
+
+
+def _no_camera(problem: Problem, count: int) -> InputError:
+    return InputError(
+        problem.where,
+        expected="clicks that a camera beside or above the pitch can have made",
+        found=f"{count} pixel coordinates that bring the camera down to a clicked point",
+        todo="Check names and pixels of the clicks, and image_size.",
+    )
 
 
 def _click_loss(problem: Problem, rows: Rows) -> float:

@@ -65,6 +65,9 @@ class StaticCalibrationSettings(Record):
     drawn_noise: float = Field(default=1.5, gt=0)
     """Standard deviation of a point drawn along a marking, across it [px]: hand annotations of
     SoccerNet lie 1.2 px (median 0.8) off the best camera."""
+    drawn_reach: float = Field(default=8.0, ge=0)
+    """Stretch of a drawn marking, either way, along which a hand errs alike [px]: pixels nearer to
+    each other than this share the weight of one."""
     drawn_loss: float = Field(default=6.0, gt=0)
     """Cauchy scale of drawn points, in their standard deviations [1]: nearly least squares for
     honest ones, and a marking under a wrong name cannot drag the camera along."""
@@ -73,6 +76,9 @@ class StaticCalibrationSettings(Record):
     wrong_click: float = Field(default=4.2, gt=0)
     """A click is wrong when leaving it out moves its own residual by more than this many standard
     deviations [1]: 0.015 % of honest clicks (chi-square, two degrees of freedom)."""
+    wrong_rate: float = Field(default=0.03, gt=0, lt=0.5)
+    """Share of clicks that have a wrong name or a slip of the hand [1]: it decides whether clicks
+    that are far off are wrong, or honest ones of a larger noise than stated."""
     wrong_marking: float = Field(default=8.0, gt=0)
     """A drawn marking is wrong when half of it is farther off than this many standard deviations
     [1]: 12 px, no slip of the hand but another marking's name."""
