@@ -180,6 +180,7 @@ def measure_apart(plan: dict[str, Any], limit: float, keep: Path | None) -> dict
         answer = folder / "row.json"
 
         def work() -> None:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)  # it ends at once with its parent
             with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
                 try:
                     row = measure(plan, folder)
