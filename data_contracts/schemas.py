@@ -12,6 +12,7 @@ from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.broadcast_calibration import BROADCAST_CALIBRATION, KeyFrames
 from data_contracts.broadcast_pooling import BROADCAST_POOLING
 from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
+from data_contracts.camera_consistency import CAMERA_CONSISTENCY, CameraFault
 from data_contracts.cameras import CameraCalibration
 from data_contracts.conventions import CONVENTIONS, Conventions
 from data_contracts.detection import DETECTION
@@ -45,6 +46,7 @@ RECORDS: dict[str, type[Record]] = {
     "pitch": PitchSpec,
     "clicked_markings": ClickedMarkings,
     "key_frames": KeyFrames,
+    "camera_fault": CameraFault,
     "track": Track,
     "join": Join,
     "review_request": ReviewRequest,
@@ -72,6 +74,7 @@ LAYOUTS: tuple[GroupLayout, ...] = (
     STATIC_CALIBRATION,
     DETECTION,
     REDETECTION,
+    CAMERA_CONSISTENCY,
     TRACKING,
     TRIANGULATION,
     BUNDLE_ADJUSTMENT,

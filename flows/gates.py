@@ -99,6 +99,13 @@ class PeopleLimits(Record):
     now and then look like somebody."""
 
 
+class ConsistencyLimits(Record):
+    """What static cameras may show of each other; a camera that is left out is asked about too."""
+
+    contradictions: float = Field(default=0, ge=0)
+    """Cameras that contradict another where nothing tells which is wrong [1]."""
+
+
 class IdentityLimits(Record):
     """What the tracks of a clip may show."""
 
@@ -181,6 +188,9 @@ CAMERAS = Gate(
 )
 PEOPLE = Gate(
     "detection", "Is everybody on the pitch found, and nobody else?", PeopleLimits(), _of_people
+)
+CONSISTENCY = Gate(
+    "camera_consistency", "Are these cameras wrong, for this reason?", ConsistencyLimits()
 )
 IDENTITIES = Gate("tracking", "Is every person one track, from end to end?", IdentityLimits())
 JOINTS = Gate("triangulation", "Are the joints where the pictures show them?", JointLimits())

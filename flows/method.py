@@ -11,6 +11,7 @@ from flows import (
     broadcast_calibration,
     broadcast_pooling,
     bundle_adjustment,
+    camera_consistency,
     detection,
     filtering,
     gates,
@@ -30,6 +31,7 @@ METHOD: tuple[Stage, ...] = (
     static_calibration.STAGE,  # [camera]  C1-C5; then gate CAMERAS, C7
     detection.STAGE,  # [camera, clip]  D1-D5; then gate PEOPLE, D6
     redetection.STAGE,  # [camera, clip]  R2, from the second iteration on
+    camera_consistency.STAGE,  # [clip]  then gate CONSISTENCY
     tracking.STAGE,  # [clip]           T1, T2; then gate IDENTITIES
     triangulation.STAGE,  # [clip]      T3, T4; then gate JOINTS
     bundle_adjustment.STAGE,  #         B1-B3; then gate ADJUSTMENT
@@ -45,6 +47,7 @@ METHOD: tuple[Stage, ...] = (
 GATES: tuple[Gate, ...] = (
     gates.CAMERAS,
     gates.PEOPLE,
+    gates.CONSISTENCY,
     gates.IDENTITIES,
     gates.JOINTS,
     gates.ADJUSTMENT,

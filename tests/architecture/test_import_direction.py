@@ -27,6 +27,7 @@ STAGES_IN_WORLDPOSE = (
     "detection",
     "training",
     "tracking",
+    "camera_consistency",
     "triangulation",
     "bundle_adjustment",
     "body",

@@ -22,6 +22,7 @@ CAMERAS = 16
 FILES = {
     "ingest": 21,
     "static_calibration": 30,
+    "camera_consistency": 4,
     "tracking": 31,
     "triangulation": 300,
     "bundle_adjustment": 45,

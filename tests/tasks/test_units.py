@@ -230,13 +230,14 @@ def test_units_behind_a_failed_one_are_recorded_as_blocked(planned, failing):
     assert record.blocked == (
         "body_fitting/clip",
         "bundle_adjustment/cameras",
+        "camera_consistency/clip",
         "filtering/clip",
         "retriangulation/clip",
         "tracking/clip",
         "triangulation/clip",
     )
     # The other cameras have their results: only what needs all of them waits.
-    assert len(record.executed) == len(plan_run(store, match, {})) - 7
+    assert len(record.executed) == len(plan_run(store, match, {})) - 8
 
 
 def test_a_run_until_a_stage_is_partial_when_some_of_its_units_are_there(planned):

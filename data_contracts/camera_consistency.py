@@ -1,0 +1,66 @@
+"""Result of stage `camera_consistency`: which cameras contradict the others, and why."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from data_contracts.arrays import ArrayLayout, GroupLayout
+from data_contracts.records import Name, Record
+
+FaultKind = Literal[
+    "flipped",
+    "mirrored",
+    "focal",
+    "lens",
+    "clock",
+    "frame_rate",
+    "swapped",
+    "duplicate",
+    "pose",
+    "contradiction",
+]
+"""What is wrong: a pose turned by 180 degrees about the world's z axis, a pose or image mirrored,
+the focal length, the distortion, the clock, the frame rate, another camera's video, the same video
+as another camera's, a pose in other units or conventions, or two cameras that contradict each
+other."""
+
+
+class CameraFault(Record):
+    """A camera that contradicts the others."""
+
+    camera: Name
+    kind: FaultKind
+    reason: str
+    """What is wrong and what to do, as a sentence about this camera."""
+    value: float | None = None
+    """Stated over right focal length, frames to add to its offset, or right over stated frame
+    rate; None for the other kinds."""
+    other: Name | None = None
+    """The other camera of a swap, duplicate or contradiction."""
+    share_now: float
+    """Share of its detections that agree with other cameras as stated [1]."""
+    share_corrected: float | None
+    """The same with the fault corrected; None where no correction is known."""
+
+
+CAMERA_CONSISTENCY = GroupLayout(
+    stage="camera_consistency",
+    about="How static cameras agree on the people of a clip.",
+    arrays=(
+        ArrayLayout(
+            name="agreement",
+            dims=("camera", "camera_"),
+            dtype="float32",
+            unit="1",
+            missing="none",
+            about="detections of two cameras that match, above chance, per frame",
+        ),
+    ),
+    attributes={
+        "camera": "camera ids in the order of the camera dimensions",
+        "faults": "a `camera_fault` record for each camera that contradicts the others",
+        "left_out": "ids of cameras that later stages do without",
+        "confirmed": "ids of cameras that others agree with",
+        "unconfirmed": "ids of cameras that share nobody with others",
+    },
+)

@@ -1,0 +1,74 @@
+"""Task of stage `camera_consistency`: which static cameras contradict the others in a clip."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.camera_consistency import CAMERA_CONSISTENCY
+from data_contracts.work import Work
+from tasks.clip_inputs import open_clip
+from tasks.unit import open_input, unit_task
+from worldpose.camera_consistency import (
+    ConsistencySettings,
+    check_consistency,
+    describe_faults,
+    faulty_cameras,
+)
+from worldpose.store import Store
+
+
+@unit_task
+def camera_consistency(work: Work) -> str:
+    """Publishes which cameras agree, and leaves out those with a fault; returns the key."""
+    store = Store.open(work.project)
+    sources: dict[str, Any] = work.recipe.sources
+    settings = ConsistencySettings.model_validate(work.recipe.settings)
+    with store.publishing(work) as result:
+        clip = open_clip(store, work)
+        names = clip.camera_ids
+        found = check_consistency(
+            clip.cameras,
+            _covariance(store, work, names),
+            clip.keypoints,
+            clip.confidence,
+            clip.fps,
+            settings,
+            ground=sources["ground"],
+        )
+        faults = describe_faults(found, names, sources["offset_frames"], clip.fps)
+        wrong = faulty_cameras(found) if settings.leave_out else set()
+        result.write(
+            CAMERA_CONSISTENCY,
+            arrays={"agreement": found.agreement.astype(np.float32)},
+            attributes={
+                "camera": list(names),
+                "faults": [fault.model_dump(mode="json") for fault in faults],
+                "left_out": sorted(names[c] for c in wrong),
+                "confirmed": [names[c] for c in found.confirmed],
+                "unconfirmed": [names[c] for c in found.unconfirmed],
+            },
+        )
+        for place, fault in zip(found.faults, faults, strict=True):
+            if place.camera in wrong:
+                result.left_out[fault.camera] = fault.reason
+            else:
+                result.warnings.append(f"camera {fault.camera}: {fault.reason}")
+        named = len(faulty_cameras(found))
+        result.figures.update(
+            cameras_wrong=float(named),
+            contradictions=float(len(found.faults) - named),
+            cameras_confirmed=float(len(found.confirmed)),
+            cameras_unconfirmed=float(len(found.unconfirmed)),
+        )
+    return work.key
+
+
+def _covariance(store: Store, work: Work, cameras: Sequence[str]) -> NDArray[np.float64]:
+    """Return the covariance (cameras, 12, 12) of a step of each camera; NaN where it was given."""
+    unknown = np.full((12, 12), np.nan)
+    each = [open_input(store, work, f"static_calibration/{camera}") for camera in cameras]
+    return np.stack([c["covariance"].values if "covariance" in c else unknown for c in each])

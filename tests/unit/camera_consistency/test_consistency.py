@@ -1,0 +1,282 @@
+"""Cameras with one planted fault each; people are rigid figures that walk straight on."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from worldpose.camera_consistency import ConsistencySettings, check_consistency
+from worldpose.camera_consistency.hypotheses import LEFT_RIGHT
+from worldpose.cameras import Camera, Rigid
+from worldpose.errors import InputError
+
+SETTINGS = ConsistencySettings(sample_frames=18)
+PITCH = (105.0, 68.0)
+FRAMES, FPS = 100, 25.0
+FIGURE = np.array(
+    [
+        *((0.1, 0.0, 1.65), (0.08, 0.03, 1.68), (0.08, -0.03, 1.68)),
+        *((0.0, 0.07, 1.66), (0.0, -0.07, 1.66), (0.0, 0.18, 1.42), (0.0, -0.18, 1.42)),
+        *((0.05, 0.25, 1.15), (0.05, -0.25, 1.15), (0.2, 0.25, 0.95), (0.2, -0.25, 0.95)),
+        *((0.0, 0.12, 0.92), (0.0, -0.12, 0.92), (0.1, 0.12, 0.5), (-0.1, -0.12, 0.5)),
+        *((0.15, 0.12, 0.08), (-0.15, -0.12, 0.08)),
+    ]
+)
+
+
+def looking(center, target, focal=1500.0, distortion=(-0.1, 0.05, 0.0, 0.0, 0.0)):
+    center, target = np.array(center, float), np.array(target, float)
+    z = (target - center) / np.linalg.norm(target - center)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(z, x), z])
+    return Camera(
+        focal=np.full(2, focal),
+        principal_point=np.array([959.5, 539.5]),
+        distortion=np.array(distortion),
+        cam_from_world=Rigid(rotation, -rotation @ center),
+        image_size=np.array([1920, 1080]),
+    )
+
+
+def rig():
+    """Five cameras around the right half of the pitch."""
+    places = [(5, -42, 9), (30, -45, 14), (62, -10, 7), (58, 25, 11), (20, 44, 18)]
+    return [looking(place, (22.0 + n, 2.0 - n, 1.0)) for n, place in enumerate(places)]
+
+
+def walkers(count=6, seed=4):
+    """People (FRAMES, count, 17, 3) [m] who walk straight on at 1 to 5 m/s."""
+    rng = np.random.default_rng(seed)
+    start = rng.uniform([10, -12], [35, 14], (count, 2))
+    angle = rng.uniform(0, 2 * np.pi, count)
+    way = rng.uniform(1, 5, count)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    places = start + np.arange(FRAMES)[:, None, None] / FPS * way
+    turn = np.zeros((count, 3, 3))
+    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(angle)
+    turn[:, 1, 0], turn[:, 0, 1], turn[:, 2, 2] = np.sin(angle), -np.sin(angle), 1.0
+    world = (FIGURE @ turn.swapaxes(-1, -2))[None].repeat(FRAMES, axis=0)
+    world[..., :2] += places[:, :, None]
+    return world
+
+
+def seen(cameras, world, seed=0):
+    """Detections (FRAMES, cameras, people, 17, 2) [px] with a pixel of noise, in random order."""
+    rng = np.random.default_rng(seed)
+    image = np.stack([c.project(world.reshape(len(world), -1, 3)) for c in cameras], axis=1)
+    image = image.reshape(len(world), len(cameras), *world.shape[1:3], 2)
+    inside = (image >= 0) & (image < [1920, 1080])
+    image = np.where(inside.all(-1, keepdims=True), image, np.nan)
+    image += rng.normal(0, 1.0, image.shape)
+    return image[:, :, rng.permutation(image.shape[2])]
+
+
+def check(cameras, keypoints, covariance=None, pitch=PITCH):
+    confidence = np.where(np.isfinite(keypoints[..., 0]), 0.8, np.nan)
+    return check_consistency(
+        Camera.stack(cameras),
+        covariance,
+        keypoints,
+        confidence,
+        FPS,
+        SETTINGS,
+        ground=pitch is not None,
+    )
+
+
+def named(result):
+    return [(fault.camera, fault.kind) for fault in result.faults]
+
+
+def posed(camera, rotation, translation):
+    return replace(camera, cam_from_world=Rigid(rotation, translation))
+
+
+def stated(camera, kind):
+    """The camera with a fault in its calibration."""
+    rotation, t = camera.cam_from_world.rotation, camera.cam_from_world.translation
+    if kind == "flipped":
+        return posed(camera, rotation @ np.diag([-1.0, -1.0, 1.0]), t)
+    if kind == "mirrored":
+        flip = np.diag([-1.0, 1.0, 1.0])
+        return posed(camera, flip @ rotation @ np.diag([1.0, -1.0, 1.0]), flip @ t)
+    if kind == "focal":
+        return replace(camera, focal=camera.focal * 1.1)
+    if kind == "pose":
+        return posed(camera, rotation, t * 1000.0)
+    assert kind == "degrees"
+    turned = Rigid.from_rotvec(np.degrees(camera.cam_from_world.rotvec), t)
+    return replace(camera, cam_from_world=turned)
+
+
+@pytest.mark.parametrize("pitch", [PITCH, None])
+def test_cameras_that_agree_are_confirmed(pitch):
+    cameras = rig()
+    result = check(cameras, seen(cameras, walkers()), pitch=pitch)
+    assert result.faults == ()
+    assert result.confirmed == (0, 1, 2, 3, 4)
+
+
+@pytest.mark.parametrize("kind", ["flipped", "mirrored", "focal", "pose", "degrees"])
+def test_a_wrong_calibration_is_named_with_its_fault(kind):
+    cameras = rig()
+    keypoints = seen(cameras, walkers())
+    cameras[3] = stated(cameras[3], kind)
+    result = check(cameras, keypoints)
+    assert named(result) == [(3, "pose" if kind == "degrees" else kind)]
+    assert result.confirmed == (0, 1, 2, 4)
+    fault = result.faults[0]
+    assert fault.share_corrected > max(0.8, fault.share_now)
+    if kind == "focal":
+        assert fault.value == pytest.approx(1.1, abs=0.02)
+    if kind == "degrees":
+        assert "degrees" in fault.detail
+
+
+def test_lens_coefficients_in_another_order_are_named():
+    cameras = rig()
+    cameras[1] = looking((30, -45, 14), (23.0, 1.0, 1.0), 900.0, (-0.1, 0.1, 0.001, -0.001, -0.1))
+    keypoints = seen(cameras, walkers())
+    order = [0, 1, 4, 2, 3]  # k1 k2 k3 p1 p2, read as k1 k2 p1 p2 k3
+    cameras[1] = replace(cameras[1], distortion=cameras[1].distortion[order])
+    result = check(cameras, keypoints)
+    assert named(result) == [(1, "lens")]
+    assert "k1 k2 k3 p1 p2" in result.faults[0].detail
+
+
+@pytest.mark.parametrize("late", [-9, 6])
+def test_a_wrong_clock_is_named_in_frames(late):
+    cameras = rig()
+    keypoints = seen(cameras, walkers())
+    keypoints[:, 2] = shifted(keypoints[:, 2], np.arange(FRAMES) + late)
+    result = check(cameras, keypoints)
+    assert named(result) == [(2, "clock")]
+    assert result.faults[0].value == pytest.approx(-late, abs=1)
+
+
+def test_a_wrong_frame_rate_is_named():
+    cameras = rig()
+    keypoints = seen(cameras, walkers())
+    # A camera of 50 frames per second whose frames are taken for 25 per second.
+    keypoints[:, 2] = shifted(keypoints[:, 2], np.arange(FRAMES) // 2)
+    result = check(cameras, keypoints)
+    assert named(result) == [(2, "frame_rate")]
+    assert result.faults[0].value == 2.0
+
+
+def test_exchanged_videos_of_two_cameras_are_named():
+    cameras = rig()
+    keypoints = seen(cameras, walkers())
+    keypoints[:, [1, 3]] = keypoints[:, [3, 1]]
+    result = check(cameras, keypoints)
+    assert sorted(named(result)) == [(1, "swapped"), (3, "swapped")]
+    assert {fault.camera: fault.other for fault in result.faults} == {1: 3, 3: 1}
+
+
+def test_the_same_video_twice_is_named_once():
+    cameras = rig()
+    keypoints = seen(cameras, walkers())
+    keypoints[:, 4] = keypoints[:, 0]
+    result = check(cameras, keypoints)
+    assert named(result) == [(4, "duplicate")]
+    assert result.faults[0].other == 0
+
+
+def test_mirrored_images_are_named():
+    cameras = rig()
+    keypoints = seen(cameras, walkers())
+    mirrored = keypoints[:, 0][..., LEFT_RIGHT, :].copy()
+    mirrored[..., 0] = 1919.0 - mirrored[..., 0]
+    keypoints[:, 0] = mirrored
+    assert named(check(cameras, keypoints)) == [(0, "mirrored")]
+
+
+def test_of_two_cameras_no_one_can_tell_which_is_wrong():
+    cameras = [rig()[1], rig()[3]]
+    keypoints = seen(cameras, walkers())
+    cameras[1] = stated(cameras[1], "flipped")
+    (fault,) = check(cameras, keypoints).faults
+    assert (fault.kind, {fault.camera, fault.other}) == ("contradiction", {0, 1})
+    assert fault.cause == "flipped"
+
+
+def test_of_three_cameras_the_one_that_contradicts_two_is_wrong():
+    cameras = [rig()[n] for n in (0, 2, 4)]
+    keypoints = seen(cameras, walkers())
+    cameras[1] = stated(cameras[1], "focal")
+    assert named(check(cameras, keypoints)) == [(1, "focal")]
+
+
+def test_a_camera_that_sees_nobody_in_common_cannot_be_confirmed():
+    cameras = rig()
+    cameras[4] = looking((-30, 44, 18), (-40, -10, 1))
+    elsewhere = walkers(3, seed=1)
+    elsewhere[..., 0] -= 62.0
+    keypoints = seen(cameras, walkers())
+    keypoints[:, 4] = np.nan
+    keypoints[:, 4:, :3] = seen(cameras[4:], elsewhere)
+    result = check(cameras, keypoints)
+    assert result.faults == ()
+    assert result.unconfirmed == (4,)
+
+
+@pytest.mark.parametrize("cameras", [1, 2, 5])
+def test_without_people_nothing_is_known(cameras):
+    result = check(rig()[:cameras], np.full((FRAMES, cameras, 1, 17, 2), np.nan))
+    assert (result.faults, result.confirmed) == ((), ())
+    assert result.unconfirmed == tuple(range(cameras))
+
+
+def test_one_person_who_stands_still_blames_no_camera():
+    cameras = rig()
+    world = np.repeat(walkers(1)[:1], FRAMES, axis=0)
+    assert check(cameras, seen(cameras, world)).faults == ()
+
+
+def test_two_cameras_at_one_place_with_videos_of_their_own_are_right():
+    cameras = [*rig(), rig()[0]]
+    keypoints = seen(cameras, walkers())
+    keypoints[:, 5] += np.random.default_rng(1).normal(0, 3.0, keypoints[:, 5].shape)
+    assert check(cameras, keypoints).faults == ()
+
+
+def test_people_who_move_symmetrically_about_the_centre_spot_hide_no_other_fault():
+    cameras = [
+        looking(p, (0, 0, 1)) for p in ((-30, -45, 10), (25, -44, 12), (40, 42, 9), (-8, 46, 14))
+    ]
+    half = walkers(5)
+    half[..., 0] -= 22.0
+    turned = half * [-1.0, -1.0, 1.0]
+    keypoints = seen(cameras, np.concatenate([half, turned], axis=1))
+    assert check(cameras, keypoints).faults == ()
+    cameras[2] = stated(cameras[2], "focal")
+    assert named(check(cameras, keypoints)) == [(2, "focal")]
+
+
+def test_a_calibration_error_within_its_covariance_is_no_fault():
+    cameras = rig()
+    keypoints = seen(cameras, walkers())
+    cameras[1] = replace(cameras[1], focal=cameras[1].focal * 1.04)
+    covariance = np.full((5, 12, 12), np.nan)
+    covariance[1] = np.diag([1e-6] * 3 + [1e-4] * 3 + [0.02**2] + [0.0] * 5)
+    assert check(cameras, keypoints, covariance).faults == ()
+
+
+def test_shapes_that_do_not_fit_are_refused():
+    with pytest.raises(InputError, match="same clip"):
+        check_consistency(
+            Camera.stack(rig()),
+            None,
+            np.zeros((4, 3, 1, 17, 2)),
+            np.zeros((4, 3, 1, 17)),
+            FPS,
+            SETTINGS,
+        )
+
+
+def shifted(keypoints, frames):
+    """A camera's detections that show frame `frames[t]` in frame t."""
+    inside = (frames >= 0) & (frames < len(keypoints))
+    out = np.full_like(keypoints, np.nan)
+    out[inside] = keypoints[frames[inside]]
+    return out

@@ -1,0 +1,14 @@
+"""Finds cameras that contradict the others, and says what is wrong with them."""
+
+from worldpose.camera_consistency.diagnosis import Consistency, Fault, check_consistency
+from worldpose.camera_consistency.explanation import describe_faults, faulty_cameras
+from worldpose.camera_consistency.settings import ConsistencySettings
+
+__all__ = [
+    "Consistency",
+    "ConsistencySettings",
+    "Fault",
+    "check_consistency",
+    "describe_faults",
+    "faulty_cameras",
+]

@@ -1,0 +1,372 @@
+"""Compares cameras of a rig at sampled frames, as they are stated and under hypotheses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.camera_consistency.hypotheses import STATED, Hypothesis
+from worldpose.camera_consistency.pair_scores import MIN_JOINTS, pair_scores
+from worldpose.camera_consistency.settings import ConsistencySettings
+from worldpose.cameras import Camera
+from worldpose.tracking.affinity import match_greedily, ray_affinity
+from worldpose.tracking.epipolar import associate
+from worldpose.tracking.settings import TrackingSettings
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+HEIGHTS: Final = (-0.4, 2.2)
+"""Mean heights of a person's joints above the ground that are accepted [m]."""
+ORBITS_DEG: Final = (105.0, 215.0, 50.0, 320.0, 160.0, 270.0)
+"""Turns of a camera about the people at which only chance makes detections match [degree]."""
+JOINT_NOISES: Final = (0.015, 0.025, 0.04, 0.06, 0.08)
+"""Standard deviations of a detector's joint on the body that are tried [m]."""
+KEPT: Final = 0.75
+"""Share of the matches that the least noise must keep."""
+PIVOT_RANGE: Final = (3.0, 150.0)
+"""Distances of that place from the camera [m]."""
+SAME_PIXELS: Final = 1.5
+"""Distance between keypoints of two videos that counts as none [px]: compression moves them."""
+SAME_SHARE: Final = 0.015
+"""The same as a share of a person's height in the image."""
+IN_VIEW: Final = 0.7
+"""Share of a person's joints in the image from which on a camera should find the person."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Rays of one camera's detections.
+
+    Attributes:
+        rays: (frames, detections, 17, 3) unit vectors, world; NaN where not seen.
+        center: (3,) [m], world.
+        spread: (frames, detections) standard deviation of a ray's direction [rad].
+    """
+
+    rays: Floats
+    center: Floats
+    spread: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """How a camera agrees with its partners under a hypothesis.
+
+    Attributes:
+        hypothesis: the fault, with its correction.
+        matches: matches above chance, summed over the partners [persons per frame].
+        chance: matches that chance brings [persons per frame].
+        partners: cameras that agree clearly.
+        by_frame: (frames,) matches with all partners, chance included; NaN where the camera has
+            no frame.
+    """
+
+    hypothesis: Hypothesis
+    matches: float
+    chance: float
+    partners: int
+    by_frame: Floats
+
+    def certainty(self, other: Trial) -> float:
+        """Return how many standard errors more matches this has than another trial."""
+        gain = self.by_frame - other.by_frame
+        gain = gain[np.isfinite(gain)]
+        if len(gain) < 4:
+            return 0.0
+        # Frames next to each other show the same people: half of them count.
+        error = float(np.std(gain, ddof=1)) / math.sqrt(0.5 * len(gain))
+        return float(gain.mean()) / max(error, 1e-3)
+
+
+class Comparison:
+    """Cameras, their detections, and how many of these match.
+
+    Attributes:
+        cameras: as stated, batch (cameras,).
+        count: number of cameras.
+        frames: number of frames.
+        sample: (n,) frames at which cameras are compared.
+        search: places among the sampled frames at which hypotheses are fitted.
+        held_out: places at which they are tested.
+        people_seen: (cameras,) mean number of detections in a frame.
+    """
+
+    def __init__(
+        self,
+        cameras: Camera,
+        pixel_noise: Floats,
+        keypoints: Floats,
+        ground: bool,
+        settings: ConsistencySettings,
+    ) -> None:
+        """Sample frames and turn their detections into rays.
+
+        Args:
+            cameras: batch (cameras,).
+            pixel_noise: (cameras,) standard deviation of a keypoint and of the calibration [px].
+            keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
+            ground: whether people stand on z = 0.
+            settings: frames and noise.
+        """
+        self.cameras = cameras
+        self.count = int(cameras.batch_shape[0])
+        self.frames = len(keypoints)
+        wanted = min(settings.sample_frames, self.frames)
+        self.sample = np.unique(np.linspace(0, self.frames - 1, wanted).round().astype(np.int64))
+        places = np.arange(len(self.sample))
+        self.search = places[::3]
+        self.held_out = np.setdiff1d(places, self.search) if len(places) > 3 else places
+        self._everywhere = places
+        self._ground = ground
+        self._heights = HEIGHTS if ground else (-math.inf, math.inf)
+        self._joint_noise = JOINT_NOISES[-1]
+        self._pixel_noise = pixel_noise
+        self._keypoints = [_packed(keypoints[:, c]) for c in range(self.count)]
+        self.views = [self.view(c, STATED) for c in range(self.count)]
+        self.people_seen = np.array(
+            [np.isfinite(v.rays[..., 0]).any(axis=-1).sum(axis=1).mean() for v in self.views]
+        )
+
+    def view(self, c: int, hypothesis: Hypothesis, frames: Ints | None = None) -> View:
+        """Return the rays of camera `c` under a hypothesis.
+
+        Args:
+            c: the camera.
+            hypothesis: its correction.
+            frames: (n,) frames that get rays, -1 = none; None = the sampled ones.
+        """
+        camera = self.cameras[c] if hypothesis.camera is None else hypothesis.camera
+        points = self._keypoints[c if hypothesis.source is None else hypothesis.source]
+        frames = self.times(hypothesis) if frames is None else frames
+        points = np.where((frames >= 0)[:, None, None, None], points[frames], np.nan)
+        points = hypothesis.corrected(points, camera.image_size)
+        rays = np.full((*points.shape[:-1], 3), np.nan)
+        known = np.isfinite(points).all(axis=-1)
+        rays[known] = camera.unproject(points[known]).directions
+        spread = np.full(points.shape[:2], self._pixel_noise[c] / float(camera.focal.mean()))
+        return View(rays, np.ascontiguousarray(camera.center), spread)
+
+    def times(self, hypothesis: Hypothesis) -> Ints:
+        """Return the camera's frame at each sampled frame under a hypothesis; -1 = none."""
+        return self.sample if hypothesis.time is None else hypothesis.time
+
+    def scores(self, view: View, partner: View, at: Ints, there: Ints) -> Floats:
+        """Return the matches (n,) of two views at pairs of their frames; -1 = no frame."""
+        return np.asarray(
+            pair_scores(
+                view.rays,
+                view.center,
+                view.spread,
+                at,
+                partner.rays,
+                partner.center,
+                partner.spread,
+                there,
+                self._heights,
+                self._joint_noise,
+            )
+        )
+
+    def quick(self, c: int, hypothesis: Hypothesis, partners: Sequence[int]) -> float:
+        """Return the matches per frame under a hypothesis where it is fitted, with chance."""
+        view = self.view(c, hypothesis, self.times(hypothesis)[self.search])
+        places = np.arange(len(self.search))
+        return float(
+            sum(self.scores(view, self.views[p], places, self.search).mean() for p in partners)
+        )
+
+    def trial(self, c: int, hypothesis: Hypothesis, partners: Sequence[int]) -> Trial:
+        """Return how camera `c` agrees with its partners under a hypothesis, in held-out frames."""
+        view, there = self.view(c, hypothesis), self.held_out
+        at = np.where(self.times(hypothesis)[there] < 0, -1, there)
+        matches = chance = 0.0
+        agreeing = 0
+        by_frame = np.where(at < 0, np.nan, 0.0)
+        at, there = at[at >= 0], there[at >= 0]
+        if not len(at):
+            return Trial(hypothesis, 0.0, 0.0, 0, by_frame)
+        for p in partners:
+            scores = self.scores(view, self.views[p], at, there)
+            by_frame[np.isfinite(by_frame)] += scores
+            found = scores.mean()
+            usual = np.median(
+                [
+                    self.scores(moved, self.views[p], at, there).mean()
+                    for moved in _orbited(view, self.views[p], ORBITS_DEG[:4])
+                ]
+            )
+            matches += max(0.0, float(found - usual))
+            chance += float(usual)
+            agreeing += found - usual > 4.0 * chance_noise(usual)
+        return Trial(hypothesis, matches, chance, agreeing, by_frame)
+
+    def agreement(self, a: int, b: int) -> tuple[float, float]:
+        """Return matches of two cameras above chance per frame, and their standard deviation."""
+        found = self.scores(self.views[a], self.views[b], self._everywhere, self._everywhere)
+        chance = [
+            self.scores(moved, self.views[b], self.search, self.search).mean()
+            for moved in _orbited(self.views[a], self.views[b], ORBITS_DEG)
+        ]
+        usual = float(np.median(chance))
+        spread = 1.4826 * float(np.median(np.abs(np.array(chance) - usual)))
+        return float(found.mean()) - usual, max(spread, chance_noise(usual))
+
+    def fit_noise(self) -> None:
+        """Take the least noise of joints with which the cameras agree nearly as much as with most.
+
+        People close together are told apart, and small faults seen, only at the noise that there
+        is; it differs between detectors and with people's size in the image.
+        """
+        pairs = [(a, b) for a in range(self.count) for b in range(a)]
+        totals = []
+        for noise in JOINT_NOISES:
+            self._joint_noise = noise
+            above = 0.0
+            for a, b in pairs:
+                found = self.scores(self.views[a], self.views[b], self.search, self.search).mean()
+                chance = [
+                    self.scores(moved, self.views[b], self.search, self.search).mean()
+                    for moved in _orbited(self.views[a], self.views[b], ORBITS_DEG[:2])
+                ]
+                above += max(0.0, float(found - np.mean(chance)))
+            totals.append(above)
+        enough = np.array(totals) >= KEPT * max(totals)
+        self._joint_noise = JOINT_NOISES[int(np.argmax(enough))]
+
+    def same_video(self, a: int, b: int) -> bool:
+        """Return whether two cameras have the same detections, up to compression."""
+        same = people = frames = 0
+        for n in self.search:
+            first, second = (self._keypoints[c][self.sample[n]] for c in (a, b))
+            first = first[np.isfinite(first[..., 0]).sum(axis=-1) >= MIN_JOINTS]
+            second = second[np.isfinite(second[..., 0]).sum(axis=-1) >= MIN_JOINTS]
+            if not (len(first) and len(second)):
+                continue
+            apart = np.linalg.norm(first[:, None] - second[None], axis=-1)
+            height = np.nanmax(first[..., 1], axis=-1) - np.nanmin(first[..., 1], axis=-1)
+            common = np.isfinite(apart).sum(axis=-1) >= MIN_JOINTS
+            mean = np.where(common, np.nansum(apart, axis=-1), np.inf)
+            mean = mean / np.maximum(1, np.isfinite(apart).sum(axis=-1))
+            near = mean < np.maximum(SAME_PIXELS, SAME_SHARE * height)[:, None]
+            same += int(near.any(axis=1).sum())
+            people += min(len(first), len(second))
+            frames += 1
+        return frames >= 3 and same >= 0.7 * people
+
+    def people(self, among: Sequence[int], views: int = 2) -> list[Floats]:
+        """Return the people (persons, 17, 3) [m] that cameras agree on, frame by frame.
+
+        Args:
+            among: the cameras.
+            views: least cameras that must see a person.
+        """
+        found = []
+        most = max(self.views[c].rays.shape[1] for c in among)
+        centers = np.stack([self.views[c].center for c in among])
+        focal = self.cameras.focal.mean(axis=-1)
+        for n in range(len(self.sample)):
+            rays = np.full((len(among), most, 17, 3), np.nan)
+            weights = np.zeros(rays.shape[:3])
+            for k, c in enumerate(among):
+                own = self.views[c].rays[n]
+                rays[k, : len(own)] = own
+                weights[k, : len(own)] = np.isfinite(own[..., 0]) * focal[c] ** 2
+            groups = associate(centers, rays, weights, self._ground, TrackingSettings())
+            joints = [g.joints for g in groups if np.count_nonzero(g.index >= 0) >= views]
+            found.append(np.stack(joints) if joints else np.zeros((0, 17, 3)))
+        return found
+
+    def shares(
+        self, c: int, hypothesis: Hypothesis, people: Sequence[Floats]
+    ) -> tuple[float, float, int]:
+        """Return how a camera agrees with people whom others found.
+
+        Returns:
+            Share of the camera's detections that are one of them, share of those in the camera's
+            image that it found, and how many are in its image [person-frames].
+        """
+        camera = self.cameras[c] if hypothesis.camera is None else hypothesis.camera
+        view = self.view(c, hypothesis)
+        at = self.times(hypothesis)
+        matched = detections = expected = found = 0
+        gate = TrackingSettings().gate
+        for n, joints in enumerate(people):
+            if at[n] < 0:
+                continue
+            rays = view.rays[n][None]
+            weights = np.isfinite(rays[..., 0]).astype(np.float64)
+            detections += int((weights.sum(axis=-1) >= MIN_JOINTS).sum())
+            if not len(joints):
+                continue
+            affinity = ray_affinity(
+                joints,
+                view.center[None],
+                rays,
+                weights,
+                np.full((1, len(joints)), gate),
+                MIN_JOINTS,
+            )
+            index = match_greedily(affinity)[0]
+            matched += int((index >= 0).sum())
+            image = camera.project(joints.reshape(-1, 3)).reshape(*joints.shape[:2], 2)
+            inside = ((image >= 0.0) & (image < camera.image_size)).all(axis=-1)
+            visible = inside.sum(axis=1) >= IN_VIEW * np.isfinite(joints[..., 0]).sum(axis=1)
+            expected += int(visible.sum())
+            found += int((visible & (index >= 0)).sum())
+        return matched / max(1, detections), found / max(1, expected), expected
+
+
+def chance_noise(chance: float) -> float:
+    """Return the standard deviation of matches per frame that chance brings.
+
+    A clip has some ten independent moments: people move on slowly.
+    """
+    return 0.3 * math.sqrt(float(chance) + 0.05)
+
+
+def _orbited(view: View, partner: View, degrees: Sequence[float]) -> Iterator[View]:
+    """Yield the camera turned about the vertical through the place at which both look.
+
+    It sees as many people at the same heights as before, at wrong places: a displacement would
+    keep matches along the rays.
+    """
+    ray, other = (_mean_ray(each) for each in (view, partner))
+    way = partner.center - view.center
+    cosine = float(ray @ other)
+    depth = float(way @ ray - cosine * (way @ other)) / max(1e-3, 1.0 - cosine**2)
+    pivot = view.center + np.clip(depth, *PIVOT_RANGE) * ray
+    for angle in np.radians(degrees):
+        turn = np.array(
+            [
+                [math.cos(angle), -math.sin(angle), 0.0],
+                [math.sin(angle), math.cos(angle), 0.0],
+                [0.0, 0.0, 1.0],
+            ]
+        )
+        rays = np.ascontiguousarray(view.rays @ turn.T)
+        yield replace(view, rays=rays, center=pivot + turn @ (view.center - pivot))
+
+
+def _mean_ray(view: View) -> Floats:
+    """Return the mean direction (3,) of a view's rays."""
+    known = np.isfinite(view.rays[..., 0])
+    mean = view.rays[known].sum(axis=0)
+    length = float(np.linalg.norm(mean))
+    return mean / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
+
+
+def _packed(keypoints: Floats) -> Floats:
+    """Return detections (frames, detections, 17, 2) with enough joints, without gaps."""
+    known = np.isfinite(keypoints[..., 0]).sum(axis=-1) >= MIN_JOINTS
+    order = np.argsort(~known, axis=1, kind="stable")
+    most = max(1, int(known.sum(axis=1).max(initial=1)))
+    order = order[:, :most]
+    packed = np.take_along_axis(keypoints, order[:, :, None, None], axis=1)
+    there = np.take_along_axis(known, order, axis=1)
+    return np.ascontiguousarray(np.where(there[..., None, None], packed, np.nan))

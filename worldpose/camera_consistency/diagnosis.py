@@ -1,0 +1,532 @@
+"""Which cameras contradict the others, and the fault that explains it best."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.camera_consistency import FaultKind
+from worldpose.camera_consistency.comparison import Comparison, Trial, chance_noise
+from worldpose.camera_consistency.hypotheses import (
+    STATED,
+    Hypothesis,
+    focal_scaled,
+    lens_hypotheses,
+    pose_hypotheses,
+    turned,
+)
+from worldpose.camera_consistency.settings import ConsistencySettings
+from worldpose.cameras import Camera
+from worldpose.errors import InputError
+from worldpose.static_calibration.parameters import project_with_jacobian
+from worldpose.tracking.clip_arrays import ClipArray
+
+Floats = NDArray[np.float64]
+
+PARTNERS: Final = 4
+"""Cameras that a camera which agrees is compared with more closely."""
+GIVEN_TILT: Final = 0.003
+"""How far a given camera may be turned without being wrong [rad]."""
+MIN_FOCAL_ERROR: Final = 0.03
+"""Logarithm of a focal length's ratio from which on it is called wrong."""
+MIN_SHIFT: Final = 2
+"""Shift of a clock from which on it is called wrong [frame]; less is estimated in triangulation."""
+CLEAR: Final = 0.5
+"""Share of a camera's detections that match those of one other, below which all is tried."""
+RATES: Final = (0.5, 2.0, 24 / 25, 25 / 24, 25 / 30, 30 / 25, 24 / 30, 30 / 24)
+"""Ratios of the real to the stated frame rate that are tried."""
+CLOCK_BAND_S: Final = 0.5
+"""Shift of a clock that is tried where a camera agrees in part [s]; else the whole stretch."""
+MIN_GAIN: Final[dict[FaultKind, float]] = {
+    "flipped": 1.5,
+    "mirrored": 1.5,
+    "pose": 1.5,
+    "swapped": 1.5,
+    "focal": 1.15,
+    "lens": 1.05,
+    "clock": 1.15,
+    "frame_rate": 1.15,
+}
+"""Least ratio of matches with and without the correction. Lens orders have no free number."""
+SIMPLER: Final[dict[FaultKind, float]] = {
+    "pose": 1.05,
+    "focal": 1.02,
+    "lens": 1.02,
+    "frame_rate": 1.05,
+}
+"""How many times as many matches an explanation needs to be preferred to a simpler one."""
+FINE: Final = ("focal", "lens", "clock", "frame_rate")
+"""Faults that may be small."""
+MIN_CERTAINTY: Final = 3.5
+"""Least certainty of a small fault, in standard errors."""
+CONTRADICTED: Final = 0.2
+"""Share of the people in a camera's image below which, if it finds so few, others contradict it."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A camera that contradicts the others.
+
+    Attributes:
+        camera: its place among the cameras.
+        kind: the most probable fault.
+        detail: what exactly, in words; may be empty.
+        value: ratio or frames, where the fault has one.
+        other: place of the other camera of a swap, duplicate or contradiction.
+        cause: of a contradiction, the fault of this camera that would explain it.
+        share_now: share of its detections that agree with others as stated [1].
+        share_corrected: the same with the fault corrected; None where no correction is known.
+    """
+
+    camera: int
+    kind: FaultKind
+    detail: str = ""
+    value: float | None = None
+    other: int | None = None
+    cause: FaultKind | None = None
+    share_now: float = 0.0
+    share_corrected: float | None = None
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """What cameras say of each other.
+
+    Attributes:
+        faults: cameras that contradict the others, the clearest first.
+        confirmed: cameras that others agree with.
+        unconfirmed: cameras that share nobody with others: nothing is known of them.
+        agreement: (cameras, cameras) matches of two cameras above chance [persons per frame].
+    """
+
+    faults: tuple[Fault, ...]
+    confirmed: tuple[int, ...]
+    unconfirmed: tuple[int, ...]
+    agreement: Floats
+
+
+def check_consistency(
+    cameras: Camera,
+    covariance: Floats | None,
+    keypoints: ClipArray,
+    confidence: ClipArray,
+    fps: float,
+    settings: ConsistencySettings,
+    *,
+    ground: bool = True,
+) -> Consistency:
+    """Return which cameras contradict the others, and the most probable fault of each.
+
+    Every two cameras are compared by how many of their detections meet in space, one to one, above
+    what chance brings. The largest group that agrees is taken for right. For every other camera,
+    and for those of the group that agree in part, hypotheses are tried: each corrects the camera's
+    calibration, images or clock. What makes clearly more detections match, in frames that it
+    was not fitted to, is the fault.
+
+    Args:
+        cameras: batch (cameras,).
+        covariance: (cameras, 12, 12) of a step of each; NaN or None for given cameras.
+        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
+        confidence: (frames, cameras, detections, 17); 0 or less leaves a keypoint out. Its size
+            says nothing here.
+        fps: frames per second [1/s].
+        settings: frames that are compared, and noise.
+        ground: whether people stand on z = 0; else they may be anywhere.
+
+    Raises:
+        InputError: the shapes do not fit together.
+    """
+    if keypoints.shape != (*confidence.shape, 2) or cameras.batch_shape != confidence.shape[1:2]:
+        raise InputError(
+            "camera consistency",
+            expected="keypoints (frames, cameras, detections, joints, 2), confidence without the "
+            "last, cameras (cameras,)",
+            found=f"{keypoints.shape}, {confidence.shape}, {cameras.batch_shape}",
+            todo="Give arrays of the same clip and cameras.",
+        )
+    count = int(cameras.batch_shape[0])
+    part = _busiest(confidence, settings.stretch_frames)
+    points = np.array(keypoints[part], dtype=np.float64)
+    points[~(np.asarray(confidence[part]) > 0.0)] = np.nan
+    if count < 2 or not len(points):
+        return Consistency((), (), tuple(range(count)), np.zeros((count, count)))
+    given, tilt = np.ones(count, dtype=np.bool_), np.full(count, GIVEN_TILT)
+    focal_error, noise = np.full(count, MIN_FOCAL_ERROR), np.full(count, settings.pixel_noise)
+    if covariance is not None:
+        known = [bool(np.isfinite(each).all()) for each in covariance]
+        given = np.logical_not(known)
+        for c in (place for place in range(count) if known[place]):
+            deviation = np.sqrt(np.diagonal(covariance[c]))
+            tilt[c] = max(GIVEN_TILT, 3.0 * float(deviation[:3].max()))
+            focal_error[c] = max(MIN_FOCAL_ERROR, 4.0 * float(deviation[6]))
+            noise[c] = math.hypot(noise[c], _calibration_noise(cameras[c], covariance[c]))
+    comparison = Comparison(cameras, noise, points, ground, settings)
+    comparison.fit_noise()
+    return _Diagnosis(comparison, fps, given, tilt, focal_error).run()
+
+
+def _busiest(confidence: ClipArray, longest: int) -> slice:
+    """Return the stretch of frames, of at most `longest`, with the most detections."""
+    frames = confidence.shape[0]
+    if frames <= longest:
+        return slice(0, frames)
+    starts = np.linspace(0, frames - longest, 8).astype(int)
+    middles = [int(start) + longest // 2 for start in starts]
+    counts = [np.count_nonzero(np.asarray(confidence[m : m + 1]) > 0.0) for m in middles]
+    start = int(starts[int(np.argmax(counts))])
+    return slice(start, start + longest)
+
+
+def _calibration_noise(camera: Camera, covariance: Floats) -> float:
+    """Return how far off the camera's uncertainty puts people in its image [px]."""
+    size = camera.image_size
+    grid = np.stack(np.meshgrid(*(s * np.array([0.2, 0.5, 0.8]) for s in size)), -1).reshape(-1, 2)
+    rays = camera.unproject(grid)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        way = (1.0 - rays.origins[:, 2]) / rays.directions[:, 2]
+    hit = np.isfinite(way) & (way > 0.0) & (way < 200.0)
+    if not hit.any():
+        return 0.0
+    points = rays.origins[hit] + way[hit, None] * rays.directions[hit]
+    _, jacobian = project_with_jacobian(camera, points)
+    variance = np.einsum("nij,jk,nik->n", jacobian, covariance, jacobian) / 2.0
+    return float(np.sqrt(np.nanmedian(variance)))
+
+
+class _Diagnosis:
+    """Peels off the camera with the clearest fault until none is left."""
+
+    def __init__(
+        self,
+        comparison: Comparison,
+        fps: float,
+        given: NDArray[np.bool_],
+        tilt: Floats,
+        focal_error: Floats,
+    ) -> None:
+        self.comparison = comparison
+        self.fps = fps
+        self.given, self.tilt, self.focal_error = given, tilt, focal_error
+        count = comparison.count
+        self.agreement, self.deviation = np.zeros((count, count)), np.ones((count, count))
+        for a in range(count):
+            for b in range(a + 1, count):
+                found, deviation = comparison.agreement(a, b)
+                self.agreement[a, b] = self.agreement[b, a] = found
+                self.deviation[a, b] = self.deviation[b, a] = deviation
+        self.faults: list[Fault] = []
+
+    def run(self) -> Consistency:
+        """Return the faults, and which cameras others confirm."""
+        count = self.comparison.count
+        self.find_duplicates()
+        core = self.core([c for c in range(count) if c not in self.faulty])
+        if not core:
+            self.contradictions()
+        for c in [c for c in range(count) if c not in core and c not in self.faulty and core]:
+            found = self.explain(c, core, gross=True)
+            if found is not None:
+                self.blame(c, found[0], core)
+            else:
+                self.unexplained(c, core)
+        self.complete_swaps(core)
+        self.peel(core)
+        return Consistency(
+            tuple(self.faults),
+            tuple(c for c in core if c not in self.faulty),
+            tuple(c for c in range(count) if c not in core and c not in self.faulty),
+            self.agreement,
+        )
+
+    @property
+    def faulty(self) -> set[int]:
+        """Cameras that are known to be wrong."""
+        return {fault.camera for fault in self.faults}
+
+    def core(self, among: Sequence[int]) -> list[int]:
+        """Return the connected cameras with the most agreement; none where no two agree."""
+        edges = self.agreement > 4.0 * self.deviation
+        left, best, most = set(among), list[int](), 0.0
+        while left:
+            group, queue = list[int](), [left.pop()]
+            while queue:
+                c = queue.pop()
+                group.append(c)
+                reached = left & {int(each) for each in np.flatnonzero(edges[c])}
+                left -= reached
+                queue += sorted(reached)
+            weight = float(np.where(edges, self.agreement, 0.0)[np.ix_(group, group)].sum())
+            if weight > most:
+                best, most = sorted(group), weight
+        return best
+
+    def peel(self, core: list[int]) -> None:
+        """Find faults among cameras that agree in part, the clearest first."""
+        seen = self.comparison.people_seen
+        share = self.agreement / np.maximum(1.0, np.minimum(seen[:, None], seen))
+        suspects = list(core)
+        while suspects:
+            found = []
+            for c in suspects:
+                partners = [p for p in core if p != c and p not in self.faulty]
+                partners.sort(key=lambda p: -self.agreement[c, p])
+                gross = bool(share[c].max() < CLEAR)
+                trials = self.explain(c, partners[:PARTNERS], gross)
+                if trials is not None:
+                    found.append((trials[0].matches - trials[1].matches, c, trials[0]))
+            if not found:
+                return
+            _, worst, trial = max(found, key=lambda each: each[0])
+            self.blame(worst, trial, [p for p in core if p not in self.faulty])
+            suspects = [c for _, c, _ in found if c != worst]
+
+    def blame(self, c: int, trial: Trial, core: Sequence[int]) -> None:
+        """Note a fault that the cameras of `core` show; with one camera alone, a contradiction."""
+        others = [p for p in core if p != c]
+        people = self.comparison.people(others) if len(others) > 1 else None
+        now = corrected = 0.0
+        if people is not None:
+            now = self.comparison.shares(c, STATED, people)[0]
+            corrected = self.comparison.shares(c, trial.hypothesis, people)[0]
+        hypothesis = trial.hypothesis
+        if len(others) == 1 and hypothesis.kind != "swapped":
+            self.faults.append(
+                Fault(
+                    c,
+                    "contradiction",
+                    hypothesis.detail,
+                    hypothesis.value,
+                    others[0],
+                    hypothesis.kind,
+                )
+            )
+        else:
+            self.faults.append(
+                Fault(
+                    c,
+                    hypothesis.kind,
+                    hypothesis.detail,
+                    hypothesis.value,
+                    hypothesis.source,
+                    None,
+                    now,
+                    corrected,
+                )
+            )
+
+    # -- faults of cameras that agree with no others -----------------------------------------
+
+    def find_duplicates(self) -> None:
+        """Find cameras with the same video: the one that others confirm less is wrong."""
+        count = self.comparison.count
+        support = np.where(self.agreement > 4.0 * self.deviation, self.agreement, 0.0).sum(axis=1)
+        for a in range(count):
+            for b in range(a + 1, count):
+                if self.faulty & {a, b} or not self.comparison.same_video(a, b):
+                    continue
+                wrong, right = (a, b) if support[a] < support[b] else (b, a)
+                self.faults.append(Fault(wrong, "duplicate", other=right))
+
+    def complete_swaps(self, core: Sequence[int]) -> None:
+        """Note the other camera of each swap, unless others confirm it."""
+        for fault in list(self.faults):
+            other = fault.other
+            if fault.kind == "swapped" and other not in {None, *core, *self.faulty}:
+                self.faults.append(replace(fault, camera=int(other or 0), other=fault.camera))
+
+    def contradictions(self) -> None:
+        """Where no two cameras agree, find the single fault that makes them agree."""
+        comparison = self.comparison
+        left = [c for c in range(comparison.count) if c not in self.faulty]
+        best: tuple[float, int, Trial] | None = None
+        for c in left:
+            found = self.explain(c, [p for p in left if p != c], gross=True)
+            if found is not None and (best is None or found[0].matches > best[0]):
+                best = (found[0].matches, c, found[0])
+        for a in left:
+            for b in left:
+                exchanged = self.exchanged(a, b) if a < b else None
+                if exchanged is not None and (best is None or exchanged.matches > best[0]):
+                    best = (exchanged.matches, a, exchanged)
+        if best is None:
+            return
+        _, c, trial = best
+        if trial.hypothesis.kind == "swapped" and trial.hypothesis.source is not None:
+            self.faults.append(Fault(c, "swapped", other=trial.hypothesis.source))
+            self.faults.append(Fault(trial.hypothesis.source, "swapped", other=c))
+        elif trial.partners >= 2:
+            self.blame(c, trial, left)
+        else:
+            self.blame(c, trial, [next(p for p in left if p != c)])
+
+    def exchanged(self, a: int, b: int) -> Trial | None:
+        """Return the agreement of two cameras with each other's videos; None without."""
+        comparison = self.comparison
+        views = [
+            comparison.view(c, Hypothesis("swapped", "", source=s)) for c, s in ((a, b), (b, a))
+        ]
+        there = comparison.held_out
+        by_frame = comparison.scores(views[0], views[1], there, there)
+        found = float(by_frame.mean())
+        now = float(
+            comparison.scores(comparison.views[a], comparison.views[b], there, there).mean()
+        )
+        if found < MIN_GAIN["swapped"] * now or found - now < 4.0 * chance_noise(now):
+            return None
+        return Trial(Hypothesis("swapped", "", source=b), found - now, now, 1, by_frame)
+
+    def unexplained(self, c: int, core: Sequence[int]) -> None:
+        """Note a camera that misses the people whom the others see, whatever is the reason."""
+        people = self.comparison.people(core, views=3)
+        share, found, expected = self.comparison.shares(c, STATED, people)
+        seen = np.isfinite(self.comparison.views[c].rays[..., 0]).any(axis=-1).sum()
+        enough = len(self.comparison.sample)
+        if min(expected, seen) >= enough and found < CONTRADICTED:
+            self.faults.append(Fault(c, "pose", share_now=share))
+
+    # -- one camera --------------------------------------------------------------------------
+
+    def explain(self, c: int, partners: Sequence[int], gross: bool) -> tuple[Trial, Trial] | None:
+        """Return the fault of a camera that its partners confirm and the camera as stated.
+
+        Every kind of fault is fitted to a third of the frames and tested on the others.
+
+        Args:
+            c: the camera.
+            partners: cameras that are taken for right.
+            gross: whether it agrees with none, so that everything is tried.
+        """
+        if not partners:
+            return None
+        comparison = self.comparison
+        quick = comparison.quick(c, STATED, partners)
+        now: Trial | None = None
+        best: Trial | None = None
+        for value, hypothesis in self.proposals(c, partners, gross):
+            need = MIN_GAIN[hypothesis.kind]
+            if value < need * quick or value - quick < 0.2:
+                continue
+            if now is None:
+                now = comparison.trial(c, self.polished(c, STATED, partners), partners)
+            turns = hypothesis.kind in ("lens", "focal")
+            tried = self.polished(c, hypothesis, partners) if turns else hypothesis
+            trial = comparison.trial(c, tried, partners)
+            if trial.matches < need * now.matches or not self.certain(trial, now):
+                continue
+            if best is None or self.rank(trial) > self.rank(best):
+                best = trial
+        return None if best is None or now is None else (best, now)
+
+    @staticmethod
+    def certain(trial: Trial, now: Trial) -> bool:
+        """Return whether a correction brings more matches than chance does.
+
+        Frames that agree make a small change certain; several partners make a large one.
+        """
+        if trial.hypothesis.kind in FINE and trial.certainty(now) > MIN_CERTAINTY:
+            return True
+        if trial.partners > now.partners and trial.certainty(now) > MIN_CERTAINTY:
+            return True
+        gain = trial.matches - now.matches
+        return trial.partners >= now.partners + 2 and gain > 4.0 * chance_noise(trial.chance)
+
+    @staticmethod
+    def rank(trial: Trial) -> float:
+        """Return how good an explanation is: matches, less for what has more freedom."""
+        return trial.matches / SIMPLER.get(trial.hypothesis.kind, 1.0)
+
+    def polished(self, c: int, hypothesis: Hypothesis, partners: Sequence[int]) -> Hypothesis:
+        """Return the hypothesis with the camera turned, within its uncertainty, to fit best.
+
+        A small turn of a camera looks like some faults of its lens.
+        """
+        camera = self.comparison.cameras[c] if hypothesis.camera is None else hypothesis.camera
+        best, value = hypothesis, self.comparison.quick(c, hypothesis, partners)
+        turn = np.zeros(3)
+        for step in (0.5, 0.25, 0.125):
+            for axis in (0, 1, 2, 0, 1):
+                for sign in (-1.0, 1.0):
+                    tried = turn.copy()
+                    tried[axis] += sign * step * self.tilt[c]
+                    if abs(tried[axis]) > self.tilt[c]:
+                        continue
+                    option = replace(hypothesis, camera=turned(camera, tried))
+                    found = self.comparison.quick(c, option, partners)
+                    if found > value:
+                        best, value, turn = option, found, tried
+                        break
+        return best
+
+    def proposals(
+        self, c: int, partners: Sequence[int], gross: bool
+    ) -> Iterator[tuple[float, Hypothesis]]:
+        """Yield the best correction of each kind, with the matches where it was fitted."""
+        comparison, camera = self.comparison, self.comparison.cameras[c]
+
+        def best(options: Iterable[Hypothesis]) -> Iterator[tuple[float, Hypothesis]]:
+            tried = [(comparison.quick(c, each, partners), each) for each in options]
+            yield from sorted(tried, key=lambda each: -each[0])[:1]
+
+        if self.given[c]:
+            yield from best(lens_hypotheses(camera))
+        reach = 0.7 if gross else 0.35
+        for _, coarse in best(focal_lengths(camera, 1.0, reach, round(reach / 0.05))):
+            around = 1.0 / (coarse.value or 1.0)
+            for value, fine in best(focal_lengths(camera, around, 0.04, 4)):
+                if abs(math.log(fine.value or 1.0)) > self.focal_error[c]:
+                    yield value, fine
+        yield from self.clocks(c, partners, gross)
+        if gross:
+            poses = list(pose_hypotheses(camera))
+            for kind in ("flipped", "mirrored", "pose"):
+                yield from best(each for each in poses if each.kind == kind)
+            others = (s for s in range(comparison.count) if s != c)
+            yield from best(Hypothesis("swapped", "", source=s) for s in others)
+
+    def clocks(
+        self, c: int, partners: Sequence[int], gross: bool
+    ) -> Iterator[tuple[float, Hypothesis]]:
+        """Yield the best constant shift of a camera's clock, and the best other frame rate."""
+        comparison, search = self.comparison, self.comparison.search
+        view = comparison.view(c, STATED, np.arange(comparison.frames))
+        longest = comparison.frames - 1
+        band = longest if gross else min(longest, round(CLOCK_BAND_S * self.fps))
+        shifts = np.arange(-band, band + 1)
+        table = np.zeros((len(shifts), len(search)))
+        for k, n in enumerate(search):
+            frames = comparison.sample[n] + shifts
+            at = np.where((frames >= 0) & (frames <= longest), frames, -1)
+            for p in partners:
+                there = np.full(len(shifts), n)
+                table[:, k] += comparison.scores(view, comparison.views[p], at, there)
+        moments = comparison.sample[search]
+        rates = np.array((1.0, *RATES))
+        # Matches along lines of the table, of every rate and start.
+        rows = shifts[:, None] + np.round((rates[:, None, None] - 1.0) * moments) + band
+        rows = rows.astype(np.int64)
+        inside = (rows >= 0) & (rows < len(shifts))
+        along = table[rows.clip(0, len(shifts) - 1), np.arange(len(moments))]
+        along = np.where(inside, along, 0.0).mean(axis=-1)
+        shift = int(shifts[int(along[0].argmax())])
+        if abs(shift) >= MIN_SHIFT:
+            yield float(along[0].max()), self.timed("clock", float(shift), shift, 1.0)
+        row, column = np.unravel_index(int(along[1:].argmax()), along[1:].shape)
+        rate = float(rates[1:][row])
+        yield float(along[1:].max()), self.timed("frame_rate", rate, int(shifts[column]), rate)
+
+    def timed(self, kind: FaultKind, value: float, start: int, rate: float) -> Hypothesis:
+        """Return the hypothesis that a camera's clock starts and runs otherwise."""
+        frames = np.round(start + rate * self.comparison.sample).astype(np.int64)
+        inside = (frames >= 0) & (frames < self.comparison.frames)
+        return Hypothesis(kind, "", value=value, time=np.where(inside, frames, -1))
+
+
+def focal_lengths(camera: Camera, around: float, reach: float, steps: int) -> Iterator[Hypothesis]:
+    """Yield focal lengths about `around` times the stated one, in logarithmic steps."""
+    for ratio in around * np.exp(np.linspace(-reach, reach, 2 * steps + 1)):
+        yield Hypothesis("focal", "", focal_scaled(camera, float(ratio)), value=float(1.0 / ratio))

@@ -1,0 +1,162 @@
+"""What may be wrong with a camera; a hypothesis says how to correct its calibration or images."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from data_contracts.camera_consistency import FaultKind
+from worldpose.cameras import Camera, Rigid
+
+LEFT_RIGHT: Final = np.array([0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15])
+"""COCO-17 with left and right exchanged."""
+LENS_ORDERS: Final = (
+    (0, 1, 3, 4, 2),
+    (0, 1, 4, 2, 3),
+    (0, 1, 2, 4, 3),
+    (0, 1, 4, 3, 2),
+    (0, 1, 3, 2, 4),
+    (2, 3, 0, 1, 4),
+    (0, 2, 3, 1, 4),
+    (0, 3, 1, 2, 4),
+    (1, 0, 2, 3, 4),
+    (1, 2, 3, 4, 0),
+    (4, 0, 1, 2, 3),
+)
+"""Places at which k1 k2 p1 p2 k3 may stand among the five stated numbers."""
+LENGTH_UNITS: Final = {
+    "millimetres": 1e-3,
+    "centimetres": 1e-2,
+    "kilometres": 1e3,
+    "feet": 0.3048,
+    "yards": 0.9144,
+}
+"""Metres of the units that a position may be stated in."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One possible fault of a camera, by its correction.
+
+    Attributes:
+        kind: of the fault.
+        detail: what exactly, for people.
+        camera: the corrected calibration; None = as stated.
+        mirrored: whether the detections are mirrored back, left for right.
+        upside_down: whether the detections are turned by 180 degrees.
+        value: the number that was estimated: ratio, frames; None without.
+        source: camera whose detections it gets; None = its own.
+        time: (sampled frames,) its frame at each of them, -1 = none; None = the same frame.
+    """
+
+    kind: FaultKind
+    detail: str
+    camera: Camera | None = None
+    mirrored: bool = False
+    upside_down: bool = False
+    value: float | None = None
+    source: int | None = None
+    time: NDArray[np.int64] | None = None
+
+    def corrected(
+        self, stated: NDArray[np.float64], size: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Return detections (..., 17, 2) [px] as a right video would have shown them."""
+        if self.mirrored:
+            image = stated[..., LEFT_RIGHT, :].copy()
+            image[..., 0] = size[0] - 1.0 - image[..., 0]
+            return image
+        if self.upside_down:
+            return np.asarray(size - 1.0 - stated)
+        return stated
+
+
+STATED: Final = Hypothesis("pose", "")
+"""A camera as it is stated."""
+
+
+def posed(
+    camera: Camera, rotation: NDArray[np.float64], translation: NDArray[np.float64]
+) -> Camera:
+    """Return the camera with another pose."""
+    return replace(camera, cam_from_world=Rigid(rotation, translation))
+
+
+def focal_scaled(camera: Camera, ratio: float) -> Camera:
+    """Return the camera with its focal length times `ratio`."""
+    return replace(camera, focal=camera.focal * ratio)
+
+
+def turned(camera: Camera, rotvec: NDArray[np.float64]) -> Camera:
+    """Return the camera turned about its own centre by a rotation vector [rad] of its axes."""
+    rotation = Rotation.from_rotvec(rotvec).as_matrix() @ camera.cam_from_world.rotation
+    return posed(camera, rotation, -rotation @ camera.center)
+
+
+def pose_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
+    """Yield how a whole pose may be wrong: other end, mirrored, units, conventions."""
+    rotation, t = camera.cam_from_world.rotation, camera.cam_from_world.translation
+    half = np.diag([-1.0, -1.0, 1.0])
+    yield Hypothesis("flipped", "", posed(camera, rotation @ half, t))
+    for axes, detail in (
+        ((-1.0, 1.0, -1.0), "left and right are exchanged in the names"),
+        ((1.0, -1.0, -1.0), "near and far are exchanged in the names"),
+    ):
+        yield Hypothesis("mirrored", detail, posed(camera, rotation @ np.diag(axes), t))
+    flip = np.diag([-1.0, 1.0, 1.0])
+    for axes, detail in (
+        ((-1.0, 1.0, 1.0), "its pose is mirrored left to right"),
+        ((1.0, -1.0, 1.0), "its pose is mirrored near to far"),
+    ):
+        yield Hypothesis(
+            "mirrored", detail, posed(camera, flip @ rotation @ np.diag(axes), flip @ t)
+        )
+    yield Hypothesis("mirrored", "its images are mirrored", mirrored=True)
+    yield Hypothesis("pose", "its images are upside down", upside_down=True)
+    yield Hypothesis(
+        "pose",
+        "the pose is that of the camera in the world",
+        posed(camera, rotation.T, -rotation.T @ t),
+    )
+    yield Hypothesis(
+        "pose", "the translation is the camera's position", posed(camera, rotation, -rotation @ t)
+    )
+    opengl = np.diag([1.0, -1.0, -1.0])
+    yield Hypothesis(
+        "pose", "y points up and z backwards", posed(camera, opengl @ rotation, opengl @ t)
+    )
+    for unit, scale in LENGTH_UNITS.items():
+        yield Hypothesis("pose", f"the position is in {unit}", posed(camera, rotation, t * scale))
+    rotvec = Rotation.from_matrix(rotation).as_rotvec()
+    angle = float(np.linalg.norm(rotvec))
+    if angle > 1e-9:
+        axis = rotvec / angle
+        for turns in range(-29, 30):
+            degrees = angle + 2.0 * math.pi * turns
+            if 6.0 < abs(degrees) <= 181.0:
+                turned = Rotation.from_rotvec(axis * math.radians(degrees)).as_matrix()
+                yield Hypothesis("pose", "the rotation is in degrees", posed(camera, turned, t))
+
+
+def lens_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
+    """Yield how lens coefficients may be misread: in another order, inverted, not there."""
+    stated = camera.distortion
+    tried = [stated]
+    orders = [(stated[list(order)], order) for order in LENS_ORDERS]
+    names = np.array(["k1", "k2", "p1", "p2", "k3"])
+    choices = [
+        (values, "the coefficients stand in the order " + " ".join(names[np.argsort(order)]))
+        for values, order in orders
+    ]
+    choices.append((-stated, "the coefficients have the opposite sign"))
+    choices.append((np.zeros(5), "the images have no distortion"))
+    for values, detail in choices:
+        if not any(np.array_equal(values, other) for other in tried):
+            tried.append(values)
+            yield Hypothesis("lens", detail, replace(camera, distortion=values))
