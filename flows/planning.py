@@ -48,8 +48,8 @@ class StagePlan:
 
     Attributes:
         units: those whose inputs are known.
-        blocked: names, as `stage/unit`, of those that are made from a unit without a result, or
-            that need more cameras than are left.
+        blocked: names, as `stage/unit`, of those that are made from a unit without a result, that
+            wait for a decision which cameras are left out, or that need more than are left.
         lacks_cameras: whether they are blocked because too many cameras are left out.
     """
 
@@ -80,8 +80,11 @@ def plan_stage(
     """
     if before is None and stage.since > 1:
         return StagePlan((), ())
-    left_out = left_out_cameras(store, match, METHOD[: METHOD.index(stage)], results)
+    earlier = METHOD[: METHOD.index(stage)]
+    left_out = left_out_cameras(store, match, earlier, results)
     match = match.without(left_out)
+    if stage.min_cameras and not _cameras_are_decided(match, earlier, results):
+        return StagePlan((), tuple(f"{stage.name}/{unit}" for unit in stage.units(match)))
     if left_out and len(match.folder.spec.static_cameras) < stage.min_cameras:
         blocked_units = tuple(f"{stage.name}/{unit}" for unit in stage.units(match))
         return StagePlan((), blocked_units, lacks_cameras=True)
@@ -111,6 +114,16 @@ def plan_stage(
         published = store.has(match.match_id, stage.name, unit, key)
         units.append(PlannedUnit(recipe, key, published))
     return StagePlan(tuple(units), tuple(blocked))
+
+
+def _cameras_are_decided(
+    match: Match, stages: tuple[Stage, ...], results: Mapping[str, str]
+) -> bool:
+    """Whether every result is there that may leave cameras out: none has failed or waits."""
+    judging = (stage for stage in stages if stage.leaves_out)
+    return all(
+        f"{stage.name}/{unit}" in results for stage in judging for unit in stage.units(match)
+    )
 
 
 def plan_run(

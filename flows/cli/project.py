@@ -115,6 +115,8 @@ def _match_status(store: Store, match_id: str) -> dict[str, Any]:
             "state": "unreadable",
             "units": {state: [] for state in STATES},
             "failed": [],
+            "left_out": {},
+            "warnings": [],
             "waiting": [],
             "settings": {},
             "unfinished_runs": [],

@@ -112,7 +112,10 @@ def test_a_moved_click_reaches_its_camera_and_what_sees_through_it_alone(clicked
     after = {unit.name: unit for unit in plan_run(store, match, {})}
     changed = {name for name, unit in after.items() if unit.key != before[name].key}
     camera = f"static_calibration/{file.stem}"
-    clip = ("tracking", "triangulation", "retriangulation", "body_fitting", "filtering")
+    clip = (
+        *("camera_consistency", "tracking", "triangulation"),
+        *("retriangulation", "body_fitting", "filtering"),
+    )
     assert changed == {camera, "bundle_adjustment/cameras", *(f"{stage}/clip" for stage in clip)}
     # What `worldpose why` and `worldpose diff` say.
     (reason,) = explain_difference(before[camera].recipe, after[camera].recipe)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from data_contracts.conventions import COCO17
 from data_contracts.review import AddedDetection, DeletedDetection, MovedKeypoint
@@ -91,7 +92,6 @@ def test_a_detection_taken_out_leaves_the_others_in_their_places():
         (keypoint(None, was=(0.0, 1.5)), "was (0.0, 1.5) when it was corrected, and is [0.0, 1.0]"),
         (keypoint((1.0, 1.0), was=None), "was not seen when"),
         (deleted(frame=FIRST + 1, detection=1), "no detection 1"),
-        (deleted(detection=-1), "no detection -1"),
         (added(0), "there is a detection 0"),
         (added(3), "2 is the next"),
     ],
@@ -102,6 +102,11 @@ def test_what_does_not_fit_what_was_seen_says_why_and_changes_nothing(edit, reas
     assert reason in objection
     for name, array in replay.observations.arrays().items():
         assert same(array, observations().arrays()[name])
+
+
+def test_a_correction_names_no_detection_before_the_first():
+    with pytest.raises(ValidationError, match="greater than or equal to 0"):
+        deleted(detection=-1)
 
 
 @pytest.mark.parametrize("edit", [keypoint(None), deleted()])
