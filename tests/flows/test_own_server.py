@@ -114,7 +114,9 @@ def test_only_those_on_this_machine_who_talk_plainly_are_given_it(tmp_path, monk
         assert AUTHORITIES not in environment_of(plan.model_copy(update=other))
 
 
-def test_only_the_run_itself_gets_an_answer_of_its_server(tmp_path, kept):
+def test_only_the_run_itself_gets_an_answer_of_its_server(tmp_path, kept, monkeypatch):
+    for name in ("PREFECT_API_URL", CLIENT_LOGIN, SERVER_LOGIN):  # of a server of other tests
+        monkeypatch.delenv(name, raising=False)
     with prefect_server(str(tmp_path), is_local=True) as wait_until_ready:
         wait_until_ready()
         api, login = os.environ["PREFECT_API_URL"], os.environ[CLIENT_LOGIN]

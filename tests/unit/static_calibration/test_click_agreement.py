@@ -12,38 +12,42 @@ from worldpose.static_calibration import StaticCalibrationSettings, calibrate, c
 NAMES = tuple(f"point{number}" for number in range(10))
 
 
+def fitted(wrong, misfit=1.0):
+    """A fit to ten clicks of which so many are wrong."""
+    return SimpleNamespace(inliers=np.arange(10) >= wrong, misfit=misfit)
+
+
 @pytest.fixture
 def judge(monkeypatch):
-    """A function that judges ten clicks of which so many are wrong."""
-
-    def check(wrong, misfit=1.0, mirrored=False):
-        monkeypatch.setattr(checks, "_mirrored_fits", lambda *_: mirrored)
-        problem = SimpleNamespace(evidence=SimpleNamespace(points=NAMES, markings=()))
-        fit = SimpleNamespace(inliers=np.arange(10) >= wrong, misfit=misfit)
-        checks.check_agreement(problem, fit, StaticCalibrationSettings(), "cam01")
-
-    return check
+    """A function that judges ten clicks that no other size of the pitch explains."""
+    monkeypatch.setattr(checks, "_fitting_size", lambda *_: None)
+    monkeypatch.setattr(checks, "at_noise", lambda problem, *_: (problem, None))
+    problem = SimpleNamespace(where="cam01", evidence=SimpleNamespace(points=NAMES, markings=()))
+    settings = StaticCalibrationSettings()
+    return lambda fit: checks.check_agreement(problem, fit, people.PITCH, settings, settings)
 
 
-@pytest.mark.parametrize(("wrong", "misfit"), [(0, 1.0), (2, 1.0), (2, 8.9)])
-def test_clicks_that_mostly_agree_are_not_taken_for_mirrored(judge, wrong, misfit):
-    judge(wrong, misfit, mirrored=True)
+@pytest.mark.parametrize(("wrong", "misfit"), [(0, 1.0), (2, 1.0), (2, 3.9)])
+def test_clicks_that_mostly_agree_need_no_other_explanation(wrong, misfit):
+    assert not checks.is_suspicious(fitted(wrong, misfit), 1.0)
 
 
-@pytest.mark.parametrize(("wrong", "misfit"), [(3, 1.0), (0, 9.0)])
-def test_many_wrong_clicks_or_a_bad_fit_may_be_mirrored_names(judge, wrong, misfit):
-    with pytest.raises(InputError, match="only with left and right exchanged"):
-        judge(wrong, misfit, mirrored=True)
+@pytest.mark.parametrize(
+    ("wrong", "misfit", "factor"), [(3, 1.0, 1.0), (0, 4.0, 1.0), (0, 1.0, 2.0)]
+)
+def test_many_wrong_clicks_or_a_bad_fit_may_be_other_than_told(wrong, misfit, factor):
+    # The misfit is in the noise of the fit, which is `factor` times the stated one.
+    assert checks.is_suspicious(fitted(wrong, misfit), factor)
 
 
 def test_with_more_than_four_of_ten_clicks_wrong_no_camera_is_given(judge):
-    judge(4)
+    judge(fitted(4))
     with pytest.raises(InputError, match=r"at most 40% wrong clicks.*50%.*than point5, point6"):
-        judge(5)
+        judge(fitted(5))
 
 
 def test_a_bad_fit_of_right_clicks_alone_is_no_error(judge):
-    judge(0, misfit=100.0)
+    judge(fitted(0, misfit=100.0))
 
 
 def of(clicked, **settings):
