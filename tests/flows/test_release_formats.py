@@ -25,7 +25,9 @@ class StubRun(Mapping):
 
     def __init__(self, **results):
         self.results = {name.replace("__", "/"): data for name, data in results.items()}
-        self.record = SimpleNamespace(run_id="0001", match_id="m", results=self.results)
+        self.record = SimpleNamespace(
+            run_id="0001", match_id="m", results=self.results, left_out={}
+        )
 
     def __getitem__(self, name):
         return self.results[name]

@@ -264,7 +264,7 @@ def test_the_command_lists_what_it_would_compute_and_why(store):
     edit_box(store)
     answer = CliRunner().invoke(app, ["reprocess", "--dry-run", "--project", store.url])
     assert answer.exit_code == 0
-    assert f"{TINY}: touched, run 0001; 7 units to compute" in answer.stdout
+    assert f"{TINY}: touched, run 0001; 8 units to compute" in answer.stdout
     assert "made from ingest/cam01" in " ".join(answer.stdout.split())
     assert store.runs(TINY) == ("0001",)
 
