@@ -7,7 +7,8 @@ import os
 from pathlib import Path
 
 import pytest
-from static_pair import CROWN, read_clicks
+from command_line import worldpose
+from static_pair import CROWN, read_clicks, write_static_pair
 
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
@@ -44,3 +45,14 @@ def test_wrong_labels_and_no_others_are_rejected():
         # One wrong corner of the left camera lies 12 px off, and its clicks err by 3 px: at four
         # standard deviations it stays.
         assert len(misplaced - rejected) <= 1
+
+
+@pytest.mark.usefixtures("server")
+def test_cameras_on_one_mast_end_partial_with_the_true_reason(tmp_path):
+    write_static_pair(DATA, tmp_path / "pair", frame_count=4)
+    answer = worldpose("run", tmp_path / "pair", "--project", tmp_path / "worldpose-data")
+    assert answer.code == 4, answer.err
+    # 0.46 m between cameras, about 50 m from the people.
+    assert "the rays of one person meet at 0." in answer.err
+    assert "the cameras are 0.4" in answer.err
+    assert "contradicts" not in answer.err

@@ -29,6 +29,9 @@ JOINT_NOISES: Final = (0.015, 0.025, 0.04, 0.06, 0.08)
 """Standard deviations of a detector's joint on the body that are tried [m]."""
 KEPT: Final = 0.75
 """Share of the matches that the least noise must keep."""
+MIN_ANGLE: Final = 0.03
+"""Angle between the rays of two cameras to the people from which on these can be compared [rad]: a
+centimetre across the rays is 0.3 m along them."""
 PIVOT_RANGE: Final = (3.0, 150.0)
 """Distances of that place from the camera [m]."""
 SAME_PIXELS: Final = 1.5
@@ -217,6 +220,20 @@ class Comparison:
         spread = 1.4826 * float(np.median(np.abs(np.array(chance) - usual)))
         return float(found.mean()) - usual, max(spread, chance_noise(usual))
 
+    def is_side_by_side(self, a: int, b: int) -> bool:
+        """Return whether people see two cameras in nearly one direction.
+
+        Rays of such cameras meet anywhere along themselves, so that they cannot contradict each
+        other.
+        """
+        view, partner = self.views[a], self.views[b]
+        ray = _mean_ray(view)
+        depth = float(view.center[2] / -ray[2]) if self._ground and ray[2] < 0.0 else np.nan
+        if not np.isfinite(depth):
+            depth = float(np.linalg.norm(_meeting_place(view, partner) - view.center))
+        apart = float(np.linalg.norm(view.center - partner.center))
+        return apart < MIN_ANGLE * float(np.clip(depth, *PIVOT_RANGE))
+
     def fit_noise(self) -> None:
         """Take the least noise of joints with which the cameras agree nearly as much as with most.
 
@@ -336,11 +353,7 @@ def _orbited(view: View, partner: View, degrees: Sequence[float]) -> Iterator[Vi
     It sees as many people at the same heights as before, at wrong places: a displacement would
     keep matches along the rays.
     """
-    ray, other = (_mean_ray(each) for each in (view, partner))
-    way = partner.center - view.center
-    cosine = float(ray @ other)
-    depth = float(way @ ray - cosine * (way @ other)) / max(1e-3, 1.0 - cosine**2)
-    pivot = view.center + np.clip(depth, *PIVOT_RANGE) * ray
+    pivot = _meeting_place(view, partner)
     for angle in np.radians(degrees):
         turn = np.array(
             [
@@ -351,6 +364,15 @@ def _orbited(view: View, partner: View, degrees: Sequence[float]) -> Iterator[Vi
         )
         rays = np.ascontiguousarray(view.rays @ turn.T)
         yield replace(view, rays=rays, center=pivot + turn @ (view.center - pivot))
+
+
+def _meeting_place(view: View, partner: View) -> Floats:
+    """Return the place (3,) [m] on a view's mean ray that is nearest to its partner's."""
+    ray, other = (_mean_ray(each) for each in (view, partner))
+    way = partner.center - view.center
+    cosine = float(ray @ other)
+    depth = float(way @ ray - cosine * (way @ other)) / max(1e-3, 1.0 - cosine**2)
+    return np.asarray(view.center + np.clip(depth, *PIVOT_RANGE) * ray)
 
 
 def _mean_ray(view: View) -> Floats:

@@ -342,7 +342,12 @@ class _Diagnosis:
     def contradictions(self) -> None:
         """Where no two cameras agree, find the single fault that makes them agree."""
         comparison = self.comparison
-        left = [c for c in range(comparison.count) if c not in self.faulty]
+        judged = [c for c in range(comparison.count) if c not in self.faulty]
+        left = [
+            c
+            for c in judged
+            if any(p != c and not comparison.is_side_by_side(c, p) for p in judged)
+        ]
         best: tuple[float, int, Trial] | None = None
         for c in left:
             found = self.explain(c, [p for p in left if p != c], gross=True)

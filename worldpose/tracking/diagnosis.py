@@ -94,6 +94,10 @@ def diagnose_no_people(
     agreeing = [each for each in meetings if each.agrees]
     if agreeing:
         return _limit(cameras, camera_ids, agreeing, settings, ground, births)
+    matched = [each for each in meetings if len(each.angle)]
+    if matched and max(np.median(each.angle) for each in matched) < settings.min_angle:
+        # Cameras at nearly one place share few people where each looks elsewhere.
+        return _limit(cameras, camera_ids, matched, settings, ground, births)
     found = _other_clock(cameras, camera_ids, rays, meetings, fps, settings)
     if found is not None:
         return found
@@ -213,7 +217,16 @@ def _limit(
     ground: bool,
     births: int,
 ) -> NoPeople:
-    """Return which limit refuses people on whom two cameras agree."""
+    """Return which limit refuses people whom two cameras share.
+
+    Args:
+        cameras: batch (cameras,).
+        names: of these.
+        agreeing: pairs with matches, the best first.
+        settings: of tracking.
+        ground: whether people stand on z = 0.
+        births: tracks that were started and dropped again.
+    """
     best = agreeing[0]
     a, b = (names[n] for n in best.cameras)
     count = len(best.angle)
@@ -222,6 +235,8 @@ def _limit(
     height, depth = float(np.median(best.height)), float(np.median(best.depth))
     size = float(np.nanmedian(best.size)) if np.isfinite(best.size).any() else math.nan
     seen = f"{a} and {b} agree on their people ({count} of {best.possible} detections)"
+    if not best.agrees:
+        seen = f"{count} of {best.possible} detections of {a} and {b} match"
     evidence = {
         "matches": float(count),
         "angle_deg": math.degrees(angle),
