@@ -68,7 +68,7 @@ def test_people_of_videos_reach_tracking_on_the_match_s_clock(filmed, tmp_path, 
     store = Store.create(tmp_path / "project")
     match, _ = register(store, filmed)
     names = [stage.name for stage in METHOD]
-    results = computed(store, match, names.index("detection") + 1)
+    results = computed(store, match, names.index("tracking"))
     late = store.open_result("filmed", "ingest", "right", results["ingest/right"])
     # Frames 20 to 29 are pictures 23 to 32 of `right`, which has 31.
     assert late.attrs["video"]["missing_frames"] == [[28, 29]]
