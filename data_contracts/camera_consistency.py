@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from data_contracts.arrays import ArrayLayout, GroupLayout
-from data_contracts.records import Name, Record
+from data_contracts.records import Name, Number, Record, Share
 
 FaultKind = Literal[
     "flipped",
@@ -32,14 +32,14 @@ class CameraFault(Record):
     kind: FaultKind
     reason: str
     """What is wrong and what to do, as a sentence about this camera."""
-    value: float | None = None
+    value: Number | None = None
     """Stated over right focal length, frames to add to its offset, or right over stated frame
     rate; None for the other kinds."""
     other: Name | None = None
     """The other camera of a swap, duplicate or contradiction."""
-    share_now: float
+    share_now: Share
     """Share of its detections that agree with other cameras as stated [1]."""
-    share_corrected: float | None
+    share_corrected: Share | None
     """The same with the fault corrected; None where no correction is known."""
 
 

@@ -10,7 +10,9 @@ from data_contracts.arrays import ArrayLayout
 from data_contracts.conventions import DISTORTION
 from data_contracts.records import ImageLength, Name, Record
 
-Vector3 = tuple[float, float, float]
+Entry = Annotated[float, Field(ge=-1.01, le=1.01)]
+"""Of a rotation matrix, rounded."""
+Vector3 = tuple[Entry, Entry, Entry]
 
 _Pixels = Annotated[float, Field(ge=-1e7, le=1e7)]
 _Metres = Annotated[float, Field(ge=-1e7, le=1e7)]

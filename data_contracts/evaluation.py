@@ -4,31 +4,31 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import JsonValue
+from pydantic import Field, JsonValue
 
-from data_contracts.records import Record
+from data_contracts.records import Amount, Count, Frame, Record, Share
 
 
 class CameraErrors(Record):
     """Errors of a group of cameras, over all their frames and points."""
 
-    ground_error_median_m: float | None = None
+    ground_error_median_m: Amount | None = None
     """On the pitch surface, between a true point and the back-projection of its true pixel [m]."""
-    ground_error_p95_m: float | None = None
+    ground_error_p95_m: Amount | None = None
     """The same; 95 % of the points are better [m]."""
-    reprojection_error_median_px: float | None = None
+    reprojection_error_median_px: Amount | None = None
     """In the picture, over the pitch at player height [px]."""
-    reprojection_error_p95_px: float | None = None
+    reprojection_error_p95_px: Amount | None = None
     """The same; 95 % of the points are better [px]."""
-    center_error_m: float | None = None
+    center_error_m: Amount | None = None
     """Distance of the camera centres, mean [m]."""
-    rotation_error_deg: float | None = None
+    rotation_error_deg: Amount | None = None
     """Angle between the orientations, mean [deg]."""
-    focal_error_percent: float | None = None
+    focal_error_percent: Amount | None = None
     """Difference of the focal lengths, mean [%]."""
-    coverage: float | None = None
+    coverage: Share | None = None
     """Share of the frames that have an estimate [0..1]."""
-    cameras: int | None = None
+    cameras: Count | None = None
     """Cameras compared."""
 
 
@@ -42,65 +42,65 @@ class CameraEvaluation(Record):
 class Evaluation(Record):
     """Scores of a prediction against a reference (definitions: docs/metrics.md)."""
 
-    mpjpe_mm: float | None = None
+    mpjpe_mm: Amount | None = None
     """Mean distance of matched joints without any alignment [mm]."""
-    g_mpjpe_mm: float | None = None
+    g_mpjpe_mm: Amount | None = None
     """Mean joint distance after one similarity for all people's whole trajectories [mm]."""
-    g_mpjpe_rigid_mm: float | None = None
+    g_mpjpe_rigid_mm: Amount | None = None
     """The same, without scale [mm]."""
-    per_person_g_mpjpe_mm: float | None = None
+    per_person_g_mpjpe_mm: Amount | None = None
     """Mean joint distance after one similarity for each person's whole trajectory [mm]."""
-    per_person_g_mpjpe_rigid_mm: float | None = None
+    per_person_g_mpjpe_rigid_mm: Amount | None = None
     """The same, without scale [mm]."""
-    pa_mpjpe_mm: float | None = None
+    pa_mpjpe_mm: Amount | None = None
     """Mean joint distance after one similarity for each person in each frame [mm]."""
-    pa_mpjpe_rigid_mm: float | None = None
+    pa_mpjpe_rigid_mm: Amount | None = None
     """The same, without scale [mm]."""
-    per_meter_drift_cm_per_m: float | None = None
+    per_meter_drift_cm_per_m: Amount | None = None
     """Error behind g_mpjpe_mm over the length of the true path, mean over people [cm/m]."""
-    per_meter_drift_rigid_cm_per_m: float | None = None
+    per_meter_drift_rigid_cm_per_m: Amount | None = None
     """The same, of g_mpjpe_rigid_mm [cm/m]."""
-    per_person_drift_cm_per_m: float | None = None
+    per_person_drift_cm_per_m: Amount | None = None
     """The same, of per_person_g_mpjpe_mm [cm/m]."""
-    per_person_drift_rigid_cm_per_m: float | None = None
+    per_person_drift_rigid_cm_per_m: Amount | None = None
     """The same, of per_person_g_mpjpe_rigid_mm [cm/m]."""
-    g_scale: float | None = None
+    g_scale: Amount | None = None
     """Factor by which the alignment of g_mpjpe_mm enlarges the prediction [1]."""
-    challenge_score: float | None = None
+    challenge_score: Amount | None = None
     """Global plus five times local joint error, without alignment and big toes [m]."""
-    challenge_global_m: float | None = None
+    challenge_global_m: Amount | None = None
     """Its first part: mean joint distance in the world [m]."""
-    challenge_local_m: float | None = None
+    challenge_local_m: Amount | None = None
     """Its second part before the factor: mean joint distance relative to the mid-hip [m]."""
-    acceleration_error_m_s2: float | None = None
+    acceleration_error_m_s2: Amount | None = None
     """Mean error of joint acceleration [m/s^2]."""
-    track_coverage: float | None = None
+    track_coverage: Share | None = None
     """Share of true person-frames that the scores of whole tracks are taken on [0..1]."""
-    pcp3d: float | None = None
+    pcp3d: float | None = Field(default=None, ge=0, le=100)
     """Share of correct limbs at alpha 0.5, missing limbs counted wrong [%]."""
-    coverage: float | None = None
+    coverage: Share | None = None
     """Share of true person-frames that have a matched prediction [0..1]."""
-    joint_coverage: float | None = None
+    joint_coverage: Share | None = None
     """Share of true joints that have a predicted joint [0..1]."""
-    false_persons_per_frame: float | None = None
+    false_persons_per_frame: Amount | None = None
     """Predicted people in a frame that match no true one, mean."""
-    idf1: float | None = None
+    idf1: Share | None = None
     """Share of person-frames on either side that carry the right id [0..1]."""
-    hota: float | None = None
+    hota: Share | None = None
     """Geometric mean of finding people and keeping them apart, over 19 distances [0..1]."""
-    detection_accuracy: float | None = None
+    detection_accuracy: Share | None = None
     """The part of HOTA that is finding people [0..1]."""
-    association_accuracy: float | None = None
+    association_accuracy: Share | None = None
     """The part of HOTA that is keeping them apart [0..1]."""
-    switches: int | None = None
+    switches: Count | None = None
     """Times that a true person changes from one predicted id to another."""
-    switches_per_minute: float | None = None
+    switches_per_minute: Amount | None = None
     """The same in a minute of the match, all people together [1/min]."""
-    fragmentations: int | None = None
+    fragmentations: Count | None = None
     """Times that a true person is lost and found again."""
-    persons: int | None = None
+    persons: Count | None = None
     """True people."""
-    frames: int | None = None
+    frames: Count | None = None
     """Frames scored."""
     cameras: CameraEvaluation | None = None
     """Errors of cameras."""
@@ -124,7 +124,7 @@ class MethodScore(Record):
     """What was done beyond reading."""
     match_in: str | None
     """Camera in whose picture tracks were matched; None = by distance in the world."""
-    first_frame: int
+    first_frame: Frame
     """Match frame of the method's first picture."""
     settings: dict[str, JsonValue]
     """Settings of the evaluation."""

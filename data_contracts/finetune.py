@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from data_contracts.records import CONTRACT_VERSION, Digest, Record
+from data_contracts.records import CONTRACT_VERSION, Count, Digest, Number, Record
 
 NetKind = Literal["people", "keypoints"]
 """The detector of people, and the estimator of their keypoints."""
@@ -26,19 +26,19 @@ class NetVersion(Record):
     """Name of the weights' file beside this record."""
     labels: Digest
     """SHA-256 of the annotations."""
-    learned: int = Field(ge=1)
+    learned: int = Field(ge=1, le=1 << 53)
     """Pictures learned from."""
     held_out: tuple[str, ...]
     """Pictures that nothing was learned from or chosen by, which the figures are of."""
     figure: str
     """What `before` and `after` are: ap50 of people, pck of keypoints."""
-    before: float
+    before: Number
     """Of the parent, on the held-out pictures [1]."""
-    after: float
+    after: Number
     """Of this version [1]."""
-    steps: int = Field(ge=0)
+    steps: Count
     """Done in training."""
     adopted: bool
     """Is this version better: only then later runs are to use it."""
-    seed: int
+    seed: Count
     trained_at: datetime

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from data_contracts.records import (
     CONTRACT_VERSION,
+    Count,
     Digest,
     Frame,
     FrameOffset,
@@ -141,9 +142,9 @@ class SourceFile(Record):
 
     path: str
     """Relative to the match folder, with forward slashes."""
-    size: int
+    size: Count
     """[byte]"""
-    modified_ns: int
+    modified_ns: int = Field(ge=-(1 << 63), lt=1 << 63)
     """Only a hint that lets an unchanged file's digest be kept; never part of a key."""
     sha256: Digest
 

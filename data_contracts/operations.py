@@ -5,9 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Literal
 
-from pydantic import Field
-
-from data_contracts.records import CONTRACT_VERSION, Record
+from data_contracts.records import CONTRACT_VERSION, Amount, Count, ProcessId, Record
 
 ArrivalState = Literal["arriving", "incomplete", "refused", "taken"]
 """arriving: it changed a moment ago; incomplete: something is missing; refused: it can never be a
@@ -29,12 +27,12 @@ class Arrival(Record):
     priority: Priority = "normal"
     fingerprint: str = ""
     """Digest of the names, sizes and times of all its files as they were last seen."""
-    unchanged_since: float = 0.0
+    unchanged_since: Amount = 0.0
     """When it was first seen like this, on this machine's clock that only goes forward [s]."""
     is_begun: bool = False
     """Whether taking it in has begun and not ended; written before the first of its files is read.
     """
-    deaths: int = Field(default=0, ge=0)
+    deaths: Count = 0
     """How often the process that took it in, as it is now, ended in the middle of that."""
     match_id: str | None = None
     """The match that it became."""
@@ -47,7 +45,7 @@ class Arrival(Record):
 class Service(Record):
     """One process of a served project."""
 
-    pid: int
+    pid: ProcessId
     address: str | None = None
     """Where it answers; None for one that only works."""
 

@@ -40,6 +40,24 @@ PixelCoordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 DetectionIndex = Annotated[int, Field(ge=0, le=100_000)]
 """Place among a camera's detections of a frame."""
 
+Count = Annotated[int, Field(ge=0, le=1 << 53)]
+"""How many; readers of JSON round larger numbers."""
+
+Amount = Annotated[float, Field(ge=0, le=1e15)]
+"""How much, in the unit that the field's docstring names."""
+
+Number = Annotated[float, Field(ge=-1e15, le=1e15)]
+"""A signed value, in the unit that the field's docstring names."""
+
+Positive = Annotated[float, Field(gt=0, le=1e6)]
+"""A size above 0, in the unit that the field's docstring names."""
+
+Share = Annotated[float, Field(ge=0, le=1)]
+"""Of a whole [0..1]."""
+
+ProcessId = Annotated[int, Field(ge=1, le=1 << 32)]
+"""Of the operating system."""
+
 PersonId = Annotated[int, Field(ge=0, le=FRAME_LIMIT)]
 """Id of a person's track in a clip."""
 

@@ -7,7 +7,21 @@ from typing import Literal
 from pydantic import Field, JsonValue
 
 from data_contracts.conventions import CONVENTIONS, Conventions
-from data_contracts.records import CONTRACT_VERSION, Digest, Key, Name, Record
+from data_contracts.records import (
+    CONTRACT_VERSION,
+    Amount,
+    Count,
+    Digest,
+    Frame,
+    FramesPerSecond,
+    ImageLength,
+    Key,
+    Name,
+    Number,
+    PersonId,
+    Record,
+    Share,
+)
 
 
 class ReleasedFile(Record):
@@ -15,7 +29,7 @@ class ReleasedFile(Record):
 
     path: str
     """Relative to the manifest, with forward slashes."""
-    size: int
+    size: Count
     """[byte]"""
     sha256: Digest
 
@@ -23,12 +37,12 @@ class ReleasedFile(Record):
 class ReleasedClip(Record):
     """One clip of a release."""
 
-    first_frame: int
+    first_frame: Frame
     """Match frame of the first row of every array."""
-    frame_count: int
-    person_ids: tuple[int, ...]
+    frame_count: Count
+    person_ids: tuple[PersonId, ...]
     """People in the order of every person dimension."""
-    origins: dict[str, int]
+    origins: dict[str, Count]
     """How many joints are of which origin; each joint's is in origins/<clip>.npz."""
 
 
@@ -42,10 +56,10 @@ class ReleaseManifest(Record):
     formats: tuple[str, ...]
     stage: str | None = None
     """Whose joints were asked for; None = the best there are."""
-    fps: float = Field(gt=0)
+    fps: FramesPerSecond
     """[1/s]"""
     clips: dict[str, ReleasedClip]
-    pictures: dict[str, tuple[int, int]]
+    pictures: dict[str, tuple[ImageLength, ImageLength]]
     """Width and height [px] of every camera's picture."""
     pitch: bool
     """Whether the world is a pitch's; without one it is that of the cameras' calibration."""
@@ -75,23 +89,23 @@ class Finding(Record):
     """Files or clips, and cameras."""
     says: str
     """What was found, in a sentence."""
-    figures: dict[str, float] = {}
+    figures: dict[str, Number] = {}
     """What decided, with the unit in the name."""
 
 
 class ClipFigures(Record):
     """What was measured in one clip."""
 
-    frames: int
-    persons: int
+    frames: Count
+    persons: Count
     sources: tuple[str, ...]
     """Files with 3D points."""
-    cameras: int
-    compared: int
+    cameras: Count
+    compared: Count
     """2D points that were compared with 3D points."""
-    reprojection_median_px: float | None = None
+    reprojection_median_px: Amount | None = None
     """Of the worst pair of a source and a camera; None where there is no 2D, or nothing is seen."""
-    plausible_share: float | None = None
+    plausible_share: Share | None = None
     """Of bodies near the ground, head up, within the pitch's bounds."""
 
 
@@ -113,9 +127,9 @@ class BaselineSettings(Record):
     """Cameras that SLAHMR gets in its variant with true ones."""
     glamr_pictures: Literal["whole video"] = "whole video"
     """GLAMR optimises all pictures of a clip together."""
-    slahmr_max_num_tracks: int = 30
+    slahmr_max_num_tracks: Count = 30
     """MAX_NUM_TRACKS of SLAHMR's preprocessing, 12 as it comes: all players are to be kept."""
-    humans4d_confidence: float = 0.5
+    humans4d_confidence: Share = 0.5
     """Least confidence of 4DHumans' detections [0..1], lowered so that all players are found."""
     slahmr_floor_type: Literal["shared"] = "shared"
     """One floor for everybody."""
@@ -123,21 +137,21 @@ class BaselineSettings(Record):
     """The floor's normal is estimated: the camera looks down a little."""
     slahmr_cameras: Literal["DROID-SLAM over the whole video"] = "DROID-SLAM over the whole video"
     """Where SLAHMR's own cameras come from."""
-    slahmr_chunk_frames: int = 100
+    slahmr_chunk_frames: Count = 100
     """Pictures that SLAHMR optimises at a time, each piece on its own."""
 
 
 class ClipStatistics(Record):
     """How much there is in one clip."""
 
-    frames: int
-    seconds: float
+    frames: Count
+    seconds: Amount
     """[s]"""
-    persons: int
+    persons: Count
     """People who are there in at least one frame."""
-    poses: int
+    poses: Count
     """Bodies of all people in all frames."""
-    trajectories_m: tuple[float, ...]
+    trajectories_m: tuple[Amount, ...]
     """Length of every person's way over the ground [m]."""
     camera: Literal["S", "M", "M+Z"] | None = None
     """Whether the camera of the pictures stands still, moves, or moves and zooms."""
@@ -148,18 +162,18 @@ class DataSetStatistics(Record):
 
     contract: Literal[1] = CONTRACT_VERSION
     clips: dict[str, ClipStatistics]
-    frames: int
+    frames: Count
     """Pictures, several views counted once."""
-    minutes: float
+    minutes: Amount
     """[min]"""
-    poses: int
-    distance_km: float
+    poses: Count
+    distance_km: Amount
     """That all people went, while they are in the data [km]."""
-    subjects_per_frame: float | None
+    subjects_per_frame: Amount | None
     """Mean number of people in a frame; None without frames."""
-    speed_m_s: float | None
+    speed_m_s: Amount | None
     """Mean over all poses of how fast their person goes [m/s]; None without poses."""
-    longest_trajectory_m: float | None
+    longest_trajectory_m: Amount | None
     """[m]"""
     camera: Literal["S", "M", "M+Z"] | None
     """The most that any clip's camera does."""

@@ -269,7 +269,7 @@ class JournalEntry(Record):
 
     contract: Literal[1] = CONTRACT_VERSION
     match_id: Name
-    number: int = Field(ge=1)
+    number: int = Field(ge=1, le=1 << 53)
     """Its place in the journal."""
     previous: Digest | None
     """Checksum of the entry before it, None for the first: a lost or changed one is seen."""

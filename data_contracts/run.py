@@ -5,9 +5,18 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Literal
 
-from pydantic import JsonValue
+from pydantic import Field, JsonValue
 
-from data_contracts.records import CONTRACT_VERSION, Digest, Key, Name, Record
+from data_contracts.records import (
+    CONTRACT_VERSION,
+    Amount,
+    Count,
+    Digest,
+    Key,
+    Name,
+    ProcessId,
+    Record,
+)
 from data_contracts.work import Recipe
 
 
@@ -24,7 +33,7 @@ class StoredFile(Record):
 
     path: str
     """Relative to the result's group."""
-    size: int
+    size: Count
     """[byte]"""
     sha256: Digest
 
@@ -46,7 +55,7 @@ class ResultManifest(Record):
     """What the run tells the user about this result at its end."""
     created_at: datetime
     """When it was published."""
-    seconds: float
+    seconds: Amount
     """How long it took to compute [s]."""
     run_id: Name
     """The run that computed it."""
@@ -76,7 +85,7 @@ class Reservation(Record):
     started_at: datetime
     host: str
     """Name of the machine the run is on."""
-    pid: int
+    pid: ProcessId
     """Its process there."""
 
 
@@ -108,7 +117,7 @@ class RunRecord(Record):
     match_id: Name
     parent: Name | None
     """The run before this one."""
-    iteration: int = 1
+    iteration: int = Field(default=1, ge=1, le=1000)
     """Which pass over the method; from the second on, results of the one before have a say."""
     state: RunState
     """waiting: nothing failed, but a person has to approve results; partial: some units failed, but
@@ -143,5 +152,5 @@ class RunRecord(Record):
     """Python and numeric libraries."""
     started_at: datetime
     finished_at: datetime
-    seconds: float
+    seconds: Amount
     """How long the run took [s]."""

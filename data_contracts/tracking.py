@@ -5,7 +5,7 @@ from __future__ import annotations
 from data_contracts.arrays import ArrayLayout, GroupLayout
 from data_contracts.conventions import COCO17
 from data_contracts.observations import FRAME
-from data_contracts.records import Name, Record
+from data_contracts.records import Amount, Count, Frame, Name, Number, PersonId, Record
 
 PERSON = ArrayLayout(
     name="person",
@@ -64,12 +64,12 @@ TRACKING = GroupLayout(
 class Track(Record):
     """One person's presence in a clip."""
 
-    person: int
-    first_frame: int
-    last_frame: int
-    frames_seen: int
+    person: PersonId
+    first_frame: Frame
+    last_frame: Frame
+    frames_seen: Count
     """Frames with at least one matched detection."""
-    views: float
+    views: Amount
     """Mean number of cameras in those frames."""
     name: Name | None = None
     """Roster id, where known."""
@@ -78,17 +78,17 @@ class Track(Record):
 class Join(Record):
     """Two tracks that are, or may be, one person."""
 
-    before: int
+    before: PersonId
     """Person of the track that stops."""
-    after: int
+    after: PersonId
     """Person of the track that begins; the same where it was decided."""
-    last_frame: int
+    last_frame: Frame
     """Last frame of the first track, counted from the clip's first."""
-    first_frame: int
+    first_frame: Frame
     """First frame of the second."""
-    cost: float
+    cost: Number
     """Minus the logarithm of the odds that they are one person and not two strangers [1]."""
-    margin: float | None
+    margin: Number | None
     """Logarithm of the odds of this join against every other way [1]; None = beyond doubt."""
     decided: bool
     """Whether they were joined; otherwise a person has to say."""

@@ -10,7 +10,7 @@ from typing import Literal
 
 from pydantic import JsonValue
 
-from data_contracts.records import CONTRACT_VERSION, Key, Name, Record
+from data_contracts.records import CONTRACT_VERSION, Amount, Key, Name, Record
 
 
 class Recipe(Record):
@@ -46,5 +46,5 @@ class Work(Record):
     recipe: Recipe
     key: Key
     run_id: Name
-    seconds: float | None = None
+    seconds: Amount | None = None
     """How long it may be at work; None = as long as it takes [s]."""

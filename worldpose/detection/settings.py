@@ -13,6 +13,10 @@ def _one_or_more(value: object) -> object:
     return (value,) if isinstance(value, str) else value
 
 
+Zoom = Annotated[float, Field(gt=0, le=16)]
+"""Factor on the size of an image [1]."""
+
+
 class DetectionSettings(Record):
     """Settings of `detection` (paper: refinement of 2D detection results; D1-D3)."""
 
@@ -30,9 +34,9 @@ class DetectionSettings(Record):
     """Where nets are computed. Named, never guessed: other devices give other bytes."""
     half: bool = False
     """Half precision, on a GPU alone."""
-    batch: int = Field(default=8, ge=1)
+    batch: int = Field(default=8, ge=1, le=1000)
     """Pictures that are looked at together [1]; bounds memory, changes no result."""
-    stride: int = Field(default=1, ge=1)
+    stride: int = Field(default=1, ge=1, le=100)
     """People are looked for in every `stride`-th frame; between, their boxes move evenly [frame].
     Keypoints are found in every frame."""
     fusion: Literal["suppress", "weighted"] = "weighted"
@@ -41,7 +45,7 @@ class DetectionSettings(Record):
     overlap: float = Field(default=0.7, gt=0, lt=1)
     """Two boxes with more of their union in common are of one person [1]. Players in a group reach
     0.6 and more; a second box of one person that is let through shows the same pose."""
-    zooms: tuple[float, ...] = Field(default=(1.0,), max_length=4)
+    zooms: tuple[Zoom, ...] = Field(default=(1.0,), max_length=4)
     """For a detector that looks at views of a fixed size: pictures are scaled by each and cut into
     overlapping views, beside one view of the whole picture [1]."""
     view_overlap: float = Field(default=0.25, ge=0, lt=0.9)
@@ -50,14 +54,14 @@ class DetectionSettings(Record):
     """A box from this score on is a person, and may begin a track [1]."""
     doubtful: float = Field(default=0.1, gt=0, lt=1)
     """A box from this score on is a person where a track expects one (ByteTrack's second look)."""
-    patience: int = Field(default=25, ge=1)
+    patience: int = Field(default=25, ge=1, le=10000)
     """Frames after which a track that nobody confirms is given up."""
-    bridge: int = Field(default=8, ge=0)
+    bridge: int = Field(default=8, ge=0, le=1000)
     """Gaps of a track up to this long are filled with boxes that move evenly [frame]. Pictures are
     held back for as long, which costs memory. A third of a second is a step of a sprint."""
-    sightings: int = Field(default=2, ge=1)
+    sightings: int = Field(default=2, ge=1, le=1000)
     """A track that was seen less often, where there were as many looks, is a flicker [1]."""
-    pitch_margin_m: float = Field(default=2.5, ge=0)
+    pitch_margin_m: float = Field(default=2.5, ge=0, le=1000)
     """People whose feet are farther outside of the pitch than this are crowd (D2) [m]. Throw-ins,
     sprints over the line and assistants, 1.5 m out, stay: a far foot is known to 1 m. Who waits
     behind the lines goes from 2.5 m on, boards stand 3 to 6 m out."""

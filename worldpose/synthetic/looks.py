@@ -36,18 +36,18 @@ class RenderingSettings(Record):
     stand_shadow: float = Field(default=0.45, ge=0, le=1)
     """Share of the light that the shadow of a stand keeps off a part of the pitch [1], if the
     sun shines; 0 = no such shadow."""
-    fog: float = Field(default=0.0, ge=0)
+    fog: float = Field(default=0.0, ge=0, le=100)
     """Extinction [1/m]; at 0.01 a third of the contrast is left at 100 m."""
-    exposure: float = Field(default=1.0, gt=0)
+    exposure: float = Field(default=1.0, gt=0, le=100)
     """Brightness of all [1]."""
     patterns: tuple[Pattern, ...] = PATTERNS
     """What shirts are drawn from."""
-    bystanders: int = Field(default=0, ge=0)
+    bystanders: int = Field(default=0, ge=0, le=100)
     """People who stand 2.5 to 3.3 m behind the lines and do not play [1]: ball boys, stewards,
     photographers. The truth knows nothing of them."""
-    shutter: float = Field(default=0.004, ge=0)
+    shutter: float = Field(default=0.004, ge=0, le=1)
     """How long it is open in every frame [s]: 1/250 s, usual for sport by day."""
-    blur: float = Field(default=0.7, ge=0)
+    blur: float = Field(default=0.7, ge=0, le=100)
     """Standard deviation of the lens's and the codec's blur [px]; a sharp broadcast lens."""
-    noise: float = Field(default=2.0, ge=0)
+    noise: float = Field(default=2.0, ge=0, le=1000)
     """Standard deviation of the sensor's noise [levels of 255], after a broadcast codec."""

@@ -20,17 +20,17 @@ Floats = NDArray[np.float64]
 class MonocularErrors(Record):
     """How such methods err; together 80 mm of mean joint distance after alignment (PA-MPJPE)."""
 
-    turn: float = Field(default=0.135, ge=0)
+    turn: float = Field(default=0.135, ge=0, le=100)
     """Of every joint's turn, standard deviation about each axis [rad]."""
-    facing: float = Field(default=0.2, ge=0)
+    facing: float = Field(default=0.2, ge=0, le=100)
     """Of the pelvis' turn, about each axis [rad]."""
-    time: float = Field(default=0.4, gt=0)
+    time: float = Field(default=0.4, gt=0, le=100)
     """Time in which errors forget themselves by a factor e [s]: pictures hardly change."""
     white: float = Field(default=0.3, ge=0, le=1)
     """Share of the errors' variance that is new in every frame [1]."""
-    size: float = Field(default=0.1, ge=0)
+    size: float = Field(default=0.1, ge=0, le=10)
     """Of the scale in the crop, relative [1]: children look like adults far away."""
-    place: float = Field(default=0.03, ge=0)
+    place: float = Field(default=0.03, ge=0, le=10)
     """Of a box's middle, along each axis of the picture [box side]."""
     missed: float = Field(default=0.1, ge=0, lt=1)
     """Share of bodies in the picture that are not found [1]."""

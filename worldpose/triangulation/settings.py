@@ -17,25 +17,25 @@ class TriangulationSettings(Record):
     factors for its joint and its confidence.
     """
 
-    pixel_noise: float = Field(default=1.5, gt=0)
+    pixel_noise: float = Field(default=1.5, gt=0, le=1000)
     """Standard deviation per image axis that does not depend on distance [px]: the grid
     of a detector."""
-    joint_noise: float = Field(default=0.04, ge=0)
+    joint_noise: float = Field(default=0.04, ge=0, le=10)
     """Standard deviation per axis that scales with the person [m]: what a human labels as a hip
     spreads by 2 to 3 % of body height (COCO's keypoint sigmas)."""
     learn_noise: bool = True
     """Learn the factors from how the clip's views disagree; False takes the noise as stated and
     its variance as one over the confidence."""
-    common_bias: float = Field(default=0.01, ge=0)
+    common_bias: float = Field(default=0.01, ge=0, le=1)
     """Standard deviation per axis of what all views of a joint err in common [m]: a detector's
     labels mean another point than the joint's centre. No residual shows it; it is added to the
     covariance."""
-    max_deviation: float = Field(default=3.5, gt=0)
+    max_deviation: float = Field(default=3.5, gt=0, le=1e6)
     """Observations farther than this from the joint, in standard deviations, are rejected [1]:
     0.2 % of honest ones (chi-square, two degrees of freedom)."""
-    min_views: int = Field(default=2, ge=2)
+    min_views: int = Field(default=2, ge=2, le=1000)
     """Least cameras that must agree [1]; a joint with fewer is missing."""
-    min_angle: float = Field(default=0.1, gt=0)
+    min_angle: float = Field(default=0.1, gt=0, le=10)
     """Least angle between the most different agreeing rays [rad]: below it a pixel moves the
     joint ten times as far along the rays as across them."""
     undo_exchanges: bool = True
@@ -47,12 +47,12 @@ class TriangulationSettings(Record):
     """How calibration errors are kept from a person's pose (T4): "none" takes the cameras as
     exact; "midhip" moves every picture of a person so that the mid-hips meet, as the paper does;
     "body" moves it by what all joints together make probable."""
-    calibration_error: float = Field(default=0.03, gt=0)
+    calibration_error: float = Field(default=0.03, gt=0, le=10)
     """Where "body" starts to learn how far cameras misplace people [m], when they come without
     covariance: what careful calibration from pitch markings leaves in the middle of the pitch."""
-    max_gap: float = Field(default=0.5, ge=0)
+    max_gap: float = Field(default=0.5, ge=0, le=100)
     """Longest time without a triangulated joint that smoothing fills [s]: a stride."""
-    clock_error: float = Field(default=0.05, gt=0)
+    clock_error: float = Field(default=0.05, gt=0, le=10)
     """A camera's clock counts as known when its offset's standard error is below this [frame]."""
     correct_clocks: bool = False
     """Shift every camera's observations in time by the offset that the tracks show."""
