@@ -53,6 +53,8 @@ _POINT_NUMBERS: Final = 2
 _LINE_NUMBERS: Final = 2
 _ARC_NUMBERS: Final = 4
 """Numbers that a click, a straight marking and an arc tell, however long they are drawn [1]."""
+_ALONE: Final = 1e-9
+"""One minus the leverage of a click or marking below which only it observes a parameter [1]."""
 _ENOUGH_NUMBERS: Final = 8
 """Numbers that must be left for a marking to be taken for wrong [1]: four clicks."""
 
@@ -351,10 +353,20 @@ def held_out_error(problem: Problem, fit: Screened) -> float:
         on = evidence.drawn_marking == index
         units.append((rows.drawn[on], rows.by_drawn[on], problem.drawn_noise[on]))
     total, count = 0.0, 0
+    size = np.sqrt(np.diag(fit.tangent_covariance))
+    size[size == 0.0] = 1.0  # parameters that may not move
+    values, axes = np.linalg.eigh(fit.tangent_covariance / np.outer(size, size))
+    root = size[:, None] * axes * np.sqrt(np.maximum(values, 0.0))
     for residual, by_step, noise in units:
+        # A marking has thousands of pixels, but what they share with the fit has rank 12.
         sigma = np.broadcast_to(noise * fit.noise_scale, len(residual))
-        share = by_step @ fit.tangent_covariance @ by_step.T / np.outer(sigma, sigma)
-        predicted = np.linalg.lstsq(np.eye(len(residual)) - share, residual, rcond=1e-9)[0]
+        shared = by_step @ root / sigma[:, None]
+        leverage, along = np.linalg.eigh(shared.T @ shared)
+        is_predicted = np.abs(1.0 - leverage) > _ALONE
+        # What only this unit observes, the rest does not predict: no error counts there.
+        gain = np.where(is_predicted, 1.0, -1.0) / np.where(is_predicted, 1.0 - leverage, leverage)
+        whitened = residual / sigma
+        predicted = sigma * (whitened + shared @ (along @ (gain * (along.T @ shared.T @ whitened))))
         total += float(predicted @ predicted)
         count += len(residual)
     return float(np.sqrt(total / max(count, 1)))

@@ -1,5 +1,8 @@
 """Other people's clicks: noisier than stated, misnamed, drawn densely, in cropped images."""
 
+import tracemalloc
+from dataclasses import replace
+
 import numpy as np
 import opencv_rig as rig
 import pytest
@@ -10,7 +13,7 @@ from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import calibrate
 from worldpose.static_calibration.adjustment import problem_of, row_of
 from worldpose.static_calibration.evidence import gather
-from worldpose.static_calibration.screening import residual_rows
+from worldpose.static_calibration.screening import held_out_error, residual_rows, rest_on
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 
@@ -166,3 +169,60 @@ def test_thousands_of_drawn_pixels_are_thinned_to_two_hundred_a_marking():
     evidence = gather(rig.PITCH, rig.markings(clicked, drawn), rig.SIZE, 0.5, "test")
     assert len(evidence.drawn_image) == 200
     np.testing.assert_allclose(evidence.drawn_image[[0, -1]], drawn["touch_line_near"][[0, -1]])
+
+
+def fit_to_all(clicked, drawn):
+    settings = StaticCalibrationSettings()
+    evidence = gather(rig.PITCH, rig.markings(clicked, drawn), rig.SIZE, 0.5, "test")
+    problem = problem_of(evidence, rig.SIZE, settings)
+    start = row_of(calibrated(clicked, drawn).estimate.camera)
+    every = np.ones(len(clicked), dtype=bool), np.ones(len(evidence.markings), dtype=bool)
+    return problem, rest_on(problem, start, *every)
+
+
+def test_held_out_error_is_that_of_fits_without_each_click():
+    (_, clicked, _), *_ = cameras(1, 12, noise=1.0, focal=(0.6, 0.7))
+    problem, fit = fit_to_all(clicked, {})
+    squared = []
+    for index in range(12):
+        without = rest_on(problem, fit.row, np.arange(12) != index, fit.markings)
+        squared.append((residual_rows(problem, without.row).click[index] ** 2).mean())
+    assert held_out_error(problem, fit) == pytest.approx(np.sqrt(np.mean(squared)), rel=0.01)
+
+
+def test_held_out_error_of_markings_is_that_of_the_dense_press_formula():
+    (camera, clicked, rng), *_ = cameras(1, 12, noise=1.0, focal=(0.6, 0.7))
+    names = ["touch_line_near", "touch_line_far", "halfway_line"]
+    drawn = {name: rig.draw(camera, name, 40, 1.5, rng) for name in names}
+    problem, fit = fit_to_all(clicked, drawn)
+    rows, on = residual_rows(problem, fit.row), problem.evidence.drawn_marking
+    units = [(rows.click[i], rows.by_click[i], problem.click_noise[[i, i]]) for i in range(12)]
+    for k in range(3):
+        units.append((rows.drawn[on == k], rows.by_drawn[on == k], problem.drawn_noise[on == k]))
+    total, count = 0.0, 0
+    for residual, by_step, sigma in units:
+        share = by_step @ fit.tangent_covariance @ by_step.T / np.outer(sigma, sigma)
+        left = sigma * np.linalg.solve(np.eye(len(sigma)) - share, residual / sigma)
+        total, count = total + float(left @ left), count + len(left)
+    assert fit.noise_scale == 1.0
+    assert held_out_error(problem, fit) == pytest.approx(np.sqrt(total / count), rel=1e-6)
+
+
+def test_held_out_error_needs_no_matrix_over_all_pixels_of_a_marking():
+    (camera, clicked, _), *_ = cameras(1, 9, noise=1.0)
+    problem, fit = fit_to_all(clicked, {"touch_line_near": rig.draw(camera, "touch_line_near", 40)})
+    chosen = np.linspace(0, 39, 4000).astype(int)
+    evidence = replace(
+        problem.evidence,
+        drawn_image=problem.evidence.drawn_image[chosen],
+        drawn_marking=problem.evidence.drawn_marking[chosen],
+    )
+    crowded = replace(problem, evidence=evidence, drawn_noise=10.0 * problem.drawn_noise[chosen])
+    tracemalloc.start()
+    try:
+        error = held_out_error(crowded, fit)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert np.isfinite(error)
+    assert peak < 4000 * 4000  # a byte for each pair; their covariances took eight
