@@ -133,6 +133,7 @@ def _open_clip(store: Store, work: Work, people: _People) -> Clip:
         triangulation=settings_before(store, work, next(iter(sources["clips"]))),
         pitch=template,
         on_lines=np.array([camera.attrs["origin"] == "lines" for camera in known]),
+        names=tuple(opened.camera_ids),
     )
 
 

@@ -77,6 +77,7 @@ def players_problem(
         image=observed.image,
         weight=1.0 / variance,
         scale=np.full(len(variance), scale),
+        names=clip.names,
     )
 
 
@@ -130,6 +131,7 @@ def markings_problem(
         image=np.concatenate(image),
         weight=np.full(len(world), settings.click_noise**-2.0),
         scale=np.full(len(world), np.inf),
+        names=clip.names,
     )
 
 

@@ -58,6 +58,7 @@ class Clip:
         triangulation: settings that made the joints.
         pitch: as surveyed; None = not known.
         on_lines: (cameras,) bool, was it calibrated on painted lines; None = nobody was.
+        names: of the cameras, for messages; empty = not known.
     """
 
     cameras: Camera
@@ -73,6 +74,7 @@ class Clip:
     triangulation: TriangulationSettings
     pitch: PitchTemplate | None = None
     on_lines: NDArray[np.bool_] | None = None
+    names: tuple[str, ...] = ()
 
     @cached_property
     def given(self) -> NDArray[np.bool_]:

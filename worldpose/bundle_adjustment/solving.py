@@ -14,24 +14,27 @@ from scipy.linalg.blas import dsyrk
 from data_contracts.records import Record
 from worldpose.bundle_adjustment.elimination import STEPS, Evidence, cost, eliminate, substitute
 from worldpose.cameras import Camera
-from worldpose.errors import InputError
+from worldpose.errors import InputError, InternalError
 from worldpose.static_calibration import stepped
 
 Floats = NDArray[np.float64]
 
 BLOCK: Final = 256
 """Points eliminated at a time: their rows for 18 cameras (1.3 MB) stay in the cache."""
+_MOVING: Final = 0.1
+"""Share of the weakest direction, of what each camera would have of an equal division, from which a
+message names a camera [1]."""
 
 
 class SolverSettings(Record):
     """When the solver stops, and how it begins."""
 
-    iterations: int = Field(default=50, ge=1)
+    iterations: int = Field(default=50, ge=1, le=10000)
     """At most so many steps [1]; a dozen are usual."""
-    cost_change: float = Field(default=1e-8, gt=0)
+    cost_change: float = Field(default=1e-8, gt=0, le=1)
     """Relative gain of a step below which it is the last [1]: two orders below what moves a joint
     by a tenth of a millimetre."""
-    damping: float = Field(default=1e-4, gt=0)
+    damping: float = Field(default=1e-4, gt=0, le=1e6)
     """Marquardt's, at the start [1]: starts are a few pixels off, where plain steps work."""
 
 
@@ -52,6 +55,7 @@ class Problem:
         weight: (n,) [1/px^2], one over the variance per image axis.
         scale: (n,) standard deviations beyond which an observation counts less (Cauchy's loss);
             infinite = plain squares.
+        names: of the cameras, for messages; empty = not known.
     """
 
     cameras: Camera
@@ -64,6 +68,7 @@ class Problem:
     image: NDArray[np.float64]
     weight: NDArray[np.float64]
     scale: NDArray[np.float64]
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +123,8 @@ def solve(
     offset = np.zeros(problem.free.shape) if offset is None else np.where(problem.free, offset, 0.0)
     cameras = stepped(problem.cameras, offset) if offset.any() else problem.cameras
     start_cost = system.cost(cameras, points, offset)
+    if np.isnan(start_cost):
+        raise InternalError("bundle adjustment: start", "a cost that is no number")
     if not np.isfinite(start_cost):
         raise InputError(
             "bundle adjustment: start",
@@ -161,6 +168,7 @@ class _System:
     """The normal equations of a problem, the points eliminated, with scratch arrays."""
 
     def __init__(self, problem: Problem) -> None:
+        self.names = problem.names
         first_of = np.searchsorted(problem.point_of, np.arange(len(problem.points) + 1))
         self.prior = problem.camera_information
         self.evidence = Evidence(
@@ -208,18 +216,36 @@ class _System:
         Raises:
             InputError: the system is singular.
         """
-        scale = 1.0 / np.sqrt(np.diag(matrix))
-        columns = scale if right.ndim == 1 else scale[:, None]
+        diagonal = np.diag(matrix)
+        if not (np.isfinite(matrix).all() and np.isfinite(right).all()):
+            raise InternalError("bundle adjustment", "normal equations that are not finite")
+        scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+        scaled = matrix * scale * scale[:, None]
         try:
-            factor = cho_factor(matrix * scale * scale[:, None])
-        except (LinAlgError, ValueError):
-            raise InputError(
-                "bundle adjustment",
-                expected="cameras that markings or prior knowledge hold in place",
-                found="a camera or the whole scene that can move without any residual",
-                todo="Add clicked markings, or fix what cannot be told.",
-            ) from None
-        return np.asarray(columns * cho_solve(factor, columns * right))
+            factor = cho_factor(scaled, check_finite=False)
+        except LinAlgError:
+            raise self._movable(scaled) from None
+        columns = scale if right.ndim == 1 else scale[:, None]
+        return np.asarray(columns * cho_solve(factor, columns * right, check_finite=False))
+
+    def _movable(self, scaled: Floats) -> InputError:
+        """The error of a singular system: it names the cameras that can move."""
+        weakest = np.linalg.eigh(scaled)[1][:, 0]
+        share = np.zeros(self.columns.shape)
+        share.ravel()[self.free] = weakest**2
+        moving = np.flatnonzero(share.sum(axis=1) > _MOVING / len(share))
+        if len(moving) == len(share):
+            found = "that all of them can move together without any residual"
+        else:
+            known = self.names or tuple(f"number {index}" for index in range(len(share)))
+            listed = ", ".join(known[index] for index in moving)
+            found = f"that {listed} can move without any residual"
+        return InputError(
+            "bundle adjustment",
+            expected="cameras that markings or prior knowledge hold in place",
+            found=found,
+            todo="Add clicked markings of these cameras, or give their calibration.",
+        )
 
     def _assembled(
         self, cameras: Camera, points: Floats, damping: float

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from worldpose.bundle_adjustment import SolverSettings, solve
-from worldpose.errors import InputError
+from worldpose.errors import InputError, InternalError
 from worldpose.static_calibration import PARAMETERS, stepped
 
 DISTURBED = np.array([2e-3, 2e-3, 2e-3, 0.1, 0.1, 0.1, 5e-3, 3.0, 3.0, 0.01, 0.005, 0.0])
@@ -117,3 +117,51 @@ def test_it_stops_when_told_and_says_so(scene):
     solved = solve(disturbed(problem), SolverSettings(iterations=1))
     assert solved.iterations == 1
     assert not solved.converged
+
+
+def test_a_camera_that_nothing_holds_is_named(scene):
+    problem, *_ = scene(joints=0)
+    kept = problem.camera_of != 2
+    names = ("north", "east", "south", "west")
+    lone = replace(
+        problem,
+        point_of=problem.point_of[kept],
+        camera_of=problem.camera_of[kept],
+        image=problem.image[kept],
+        weight=problem.weight[kept],
+        scale=problem.scale[kept],
+    )
+    with pytest.raises(InputError, match="that number 2 can move"):
+        solve(lone)
+    with pytest.raises(InputError, match="that south can move"):
+        solve(replace(lone, names=names))
+
+
+def test_a_point_of_two_parallel_rays_stays_at_its_depth(scene):
+    problem, true, points = scene(joints=6, seen=1.1)
+    # The second camera stands where the first one does: the last point has one ray, twice.
+    twin = true[[0, 0, 2, 3]]
+    kept = (problem.point_of < len(points) - 1) | (problem.camera_of < 2)
+    image = twin.project(points)[problem.camera_of, problem.point_of][kept]
+    twins = replace(
+        problem,
+        cameras=twin,
+        point_of=problem.point_of[kept],
+        camera_of=problem.camera_of[kept],
+        image=image,
+        weight=problem.weight[kept],
+        scale=problem.scale[kept],
+    )
+    solved = solve(disturbed(twins))
+    assert np.isfinite(solved.camera_covariance).all()
+    np.testing.assert_allclose(solved.cameras.center, twin.center, atol=1e-4)
+    np.testing.assert_allclose(solved.points[:-1], points[:-1], atol=1e-4)
+    np.testing.assert_allclose(solved.cameras[0].project(solved.points[-1:]), image[-1:], atol=1e-3)
+
+
+def test_numbers_that_are_not_finite_are_no_fault_of_the_cameras(scene):
+    problem, *_ = scene()
+    information = problem.camera_information.copy()
+    information[1] = np.nan
+    with pytest.raises(InternalError, match="no number"):
+        solve(replace(problem, camera_information=information))
