@@ -60,6 +60,7 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
         "detections": path,
         "detections_sha256": match.registration.digest_of(path),
         **clock,
+        "ranges": [[first, count] for first, count in frames.ranges],
         **edits_of(match, unit),
     }
 

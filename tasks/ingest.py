@@ -80,8 +80,8 @@ def _observations(work: Work) -> Observations:
     """
     sources: dict[str, Any] = work.recipe.sources
     path = Path(work.folder) / sources["detections"]
-    first = sources["first_frame"] + sources["offset_frames"]
-    observations = read_observations(path, first, sources["frame_count"])
+    ranges = [(first + sources["offset_frames"], count) for first, count in sources["ranges"]]
+    observations = read_observations(path, ranges)
     require_registered(path, sources["detections_sha256"])
     return replace(observations, frame=observations.frame - sources["offset_frames"])
 

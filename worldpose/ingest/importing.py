@@ -63,7 +63,7 @@ def import_match(
     }
     spec = validate_record(MatchSpec, content, str(out / "match.yaml"))
     for name, file in files.items():
-        people[name] = on_frames(file, people[name], first, last - first + 1)
+        people[name] = on_frames(file, people[name], [(first, last - first + 1)])
     write_match(out, spec, calibrations=cameras, observations=people)
     return spec
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +14,14 @@ from worldpose.ingest.keypoint_arrays import ARRAY_BYTES, read_keypoint_arrays
 from worldpose.ingest.observations import Observations
 
 
-def read_observations(
-    path: Path, first_frame: int | None = None, frame_count: int | None = None
-) -> Observations:
-    """The people that one camera saw, dense over a range of the camera's own frames.
+def read_observations(path: Path, ranges: Sequence[tuple[int, int]] | None = None) -> Observations:
+    """Return the people that one camera saw, dense over ranges of the camera's own frames.
 
     Args:
         path: `.json` (see `coco_results`) or `.npz` (see `keypoint_arrays`).
-        first_frame: first frame wanted; None = from the first to the last frame in the file.
-        frame_count: number of frames wanted, given together with `first_frame`; frames beyond are
-            left out, frames that the file lacks have no people.
+        ranges: first frame and number of frames of each range, rising and disjoint; None = one
+            range, from the first to the last frame in the file. Frames outside are left out,
+            frames that the file lacks have no people.
 
     Raises:
         InputError: naming file and place: unreadable, not what the form says, or a file whose
@@ -30,35 +29,40 @@ def read_observations(
     """
     people = read_keypoint_arrays(path) if path.suffix == ".npz" else read_coco_results(path)
     seen = people.frame
-    if first_frame is None or frame_count is None:
-        first_frame = int(seen[0]) if len(seen) else 0
-        frame_count = int(seen[-1]) - first_frame + 1 if len(seen) else 0
-    elif len(seen) and (seen[-1] < first_frame or seen[0] >= first_frame + frame_count):
+    if ranges is None:
+        first = int(seen[0]) if len(seen) else 0
+        return on_frames(path, people, [(first, int(seen[-1]) - first + 1 if len(seen) else 0)])
+    if len(seen) and not any(((seen >= first) & (seen < first + n)).any() for first, n in ranges):
+        wanted = [f"{first} to {first + count - 1}" for first, count in ranges]
+        more = f" and {len(wanted) - 5} more ranges" if len(wanted) > 5 else ""
         raise InputError(
             str(path),
-            expected=f"people in frames {first_frame} to {first_frame + frame_count - 1}",
+            expected=f"people in frames {', '.join(wanted[:5])}{more}",
             found=f"frames {seen[0]} to {seen[-1]}",
             todo="Check the frame numbers, the camera's offset_frames and the clips.",
         )
-    return on_frames(path, people, first_frame, frame_count)
+    return on_frames(path, people, ranges)
 
 
-def on_frames(path: Path, people: Observations, first_frame: int, frame_count: int) -> Observations:
-    """The people of `path` on exactly these frames; a frame that was not seen is all NaN.
+def on_frames(path: Path, people: Observations, ranges: Sequence[tuple[int, int]]) -> Observations:
+    """Return the people of `path` on exactly these frames; a frame that was not seen is all NaN.
 
     Raises:
         InputError: the frame numbers are beyond belief, or the arrays too large.
     """
     detections, joints = people.confidence.shape[1:]
     frame_bytes = 8 + 4 * (3 * joints + 5) * detections
-    if frame_count * frame_bytes > ARRAY_BYTES or abs(first_frame) > FRAME_LIMIT:
+    total = sum(count for _, count in ranges)
+    farthest = max(abs(first) for first, _ in ranges)
+    if total * frame_bytes > ARRAY_BYTES or farthest > FRAME_LIMIT:
         raise InputError(
             str(path),
             expected=f"frame numbers up to {FRAME_LIMIT} and arrays up to {ARRAY_BYTES} bytes",
-            found=f"{frame_count} frames from {first_frame} on, with up to {detections} people",
+            found=f"{total} frames from {ranges[0][0]} on, with up to {detections} people",
             todo="Check the frame numbers; cut a long match into clips.",
         )
-    return people.on_frames(first_frame, frame_count)
+    wanted = [np.arange(first, first + count, dtype=np.int64) for first, count in ranges]
+    return people.on_frames(np.concatenate(wanted))
 
 
 def seen_frames(people: Observations) -> tuple[int, int] | None:

@@ -83,7 +83,8 @@ def require_size(path: Path, infos: list[zipfile.ZipInfo], limit: int) -> None:
         InputError: naming the file.
     """
     total = sum(info.file_size for info in infos)
-    packed = sum(info.compress_size for info in infos)
+    # What the archive's directory states may be more than there is.
+    packed = min(sum(info.compress_size for info in infos), path.stat().st_size)
     expected = None
     if total > limit:
         expected = f"at most {limit} bytes of arrays"
@@ -109,6 +110,8 @@ def read_array(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDAr
         with file.open(info) as member:
             array: NDArray[np.generic] = npy.read_array(member, allow_pickle=False)
             return np.ascontiguousarray(array)
+    except MemoryError:
+        raise
     except Exception as error:  # damaged bytes can raise nearly anything, as in read_header
         raise npz_error(f"{path}: {info.filename}", "a whole array", _brief(error)) from error
 

@@ -13,7 +13,7 @@ class Observations:
     """Detected people of one camera, frame by frame; absent ones are NaN.
 
     Attributes:
-        frame: (frames,) int64, frame numbers, rising without gaps.
+        frame: (frames,) int64, frame numbers, rising.
         keypoints: (frames, detections, 17, 2) float32 [px], COCO-17; NaN where not found.
         confidence: (frames, detections, 17) float32 in (0, 1]; NaN where not found.
         boxes: (frames, detections, 4) float32 x0, y0, x1, y1 [px].
@@ -36,17 +36,14 @@ class Observations:
             score=self.score[rows],
         )
 
-    def on_frames(self, first_frame: int, frame_count: int) -> Observations:
-        """The same people on exactly these frames; a frame that was not seen is all NaN."""
-        kept = self.rows(
-            np.flatnonzero((self.frame >= first_frame) & (self.frame < first_frame + frame_count))
-        )
-        row = kept.frame - first_frame
+    def on_frames(self, frame: NDArray[np.int64]) -> Observations:
+        """The same people on exactly these frames (n,), which rise; not seen ones are all NaN."""
+        kept = self.rows(np.flatnonzero(np.isin(self.frame, frame)))
+        row = np.searchsorted(frame, kept.frame)
         padded = {}
         for name, array in kept.arrays().items():
-            padded[name] = np.full((frame_count, *array.shape[1:]), np.nan, dtype=np.float32)
+            padded[name] = np.full((len(frame), *array.shape[1:]), np.nan, dtype=np.float32)
             padded[name][row] = array
-        frame = np.arange(first_frame, first_frame + frame_count, dtype=np.int64)
         return Observations(frame=frame, **padded)
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:

@@ -18,13 +18,16 @@ class UnitFrames:
 
     Attributes:
         first: first match frame.
-        count: number of frames.
+        count: number of frames, those between clips included.
         offset: match frame = camera frame - offset.
+        ranges: first match frame and number of frames of every stretch that clips cover, rising
+            and disjoint: only these hold people.
     """
 
     first: int
     count: int
     offset: int
+    ranges: tuple[tuple[int, int], ...] = ()
 
 
 def unit_frames(spec: MatchSpec, unit_id: str) -> UnitFrames:
@@ -40,9 +43,15 @@ def unit_frames(spec: MatchSpec, unit_id: str) -> UnitFrames:
         offset = round(clip.broadcast_offset_frames) - clip.first_frame
     else:
         offset = int(spec.camera(unit_id).offset_frames)
-    first = min(clip.first_frame for clip in clips)
-    stop = max(clip.first_frame + clip.frame_count for clip in clips)
-    return UnitFrames(first, stop - first, offset)
+    ranges: list[tuple[int, int]] = []
+    for first, stop in sorted((c.first_frame, c.first_frame + c.frame_count) for c in clips):
+        if ranges and first <= sum(ranges[-1]):
+            begin, count = ranges[-1]
+            ranges[-1] = (begin, max(begin + count, stop) - begin)
+        else:
+            ranges.append((first, stop - first))
+    first = ranges[0][0]
+    return UnitFrames(first, sum(ranges[-1]) - first, offset, tuple(ranges))
 
 
 def read_unit(match: MatchFolder, unit_id: str) -> tuple[Observations, CameraCalibration | None]:
@@ -66,7 +75,6 @@ def read_unit(match: MatchFolder, unit_id: str) -> tuple[Observations, CameraCal
             todo="Add the file, or correct the name.",
         )
     frames = unit_frames(match.spec, unit_id)
-    people = read_observations(
-        match.detections[unit_id], frames.first + frames.offset, frames.count
-    )
+    ranges = [(first + frames.offset, count) for first, count in frames.ranges]
+    people = read_observations(match.detections[unit_id], ranges)
     return replace(people, frame=people.frame - frames.offset), match.calibrations.get(unit_id)

@@ -56,7 +56,7 @@ def replay_detections(found: Observations, edits: Iterable[DetectionEdit]) -> De
         objections.append(objection)
         if objection is not None:
             continue
-        at = _row(changed, edit.frame), edit.detection
+        at = np.searchsorted(changed.frame, edit.frame), edit.detection
         if isinstance(edit, DeletedDetection):
             for array in changed.arrays().values():
                 array[at] = np.nan
@@ -78,7 +78,7 @@ def objection_to(found: Observations, edit: DetectionEdit) -> str | None:
     """Why an edit does not apply to what a camera saw; None where it does."""
     place = f"detection {edit.detection} of {edit.camera} in frame {edit.frame}"
     row = _row(found, edit.frame)
-    if not 0 <= row < len(found.frame):
+    if row is None:
         return f"{edit.camera} has no frame {edit.frame}"
     places = found.score.shape[1]
     is_there = 0 <= edit.detection < places and not np.isnan(found.score[row, edit.detection])
@@ -110,5 +110,7 @@ def _with_place(found: Observations, detection: int) -> Observations:
     return Observations(frame=found.frame, **widened)
 
 
-def _row(found: Observations, frame: int) -> int:
-    return frame - int(found.frame[0])
+def _row(found: Observations, frame: int) -> int | None:
+    """Return the row of a match frame; None where the camera has none."""
+    row = int(np.searchsorted(found.frame, frame))
+    return row if row < len(found.frame) and found.frame[row] == frame else None

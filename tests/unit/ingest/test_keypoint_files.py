@@ -29,14 +29,14 @@ def test_without_a_range_the_file_is_dense_from_its_first_to_its_last_frame(npz)
 
 def test_a_range_leaves_out_and_pads(npz):
     path, people = npz
-    read = read_observations(path, 11, 6)
+    read = read_observations(path, [(11, 6)])
     np.testing.assert_array_equal(read.frame, np.arange(11, 17))
     np.testing.assert_array_equal(read.boxes[[0, 3]], people.boxes[1:])
     assert np.all(np.isnan(read.boxes[[1, 2, 4, 5]]))
 
 
 def test_a_range_may_begin_before_frame_zero(npz):
-    read = read_observations(npz[0], -2, 14)
+    read = read_observations(npz[0], [(-2, 14)])
     assert (read.frame[0], read.frame[-1]) == (-2, 11)
     assert np.isfinite(read.score).sum() == 4
 
@@ -67,7 +67,7 @@ def test_both_forms_of_the_same_people_read_alike(tmp_path, npz):
 @pytest.mark.parametrize("first_frame", [0, 15, 2**40, -(10**30)])
 def test_people_outside_the_wanted_frames_are_refused(npz, first_frame):
     with pytest.raises(InputError, match="found frames 10 to 14") as caught:
-        read_observations(npz[0], first_frame, 5)
+        read_observations(npz[0], [(first_frame, 5)])
     assert "offset_frames" in caught.value.todo
 
 
@@ -75,7 +75,7 @@ def test_people_outside_the_wanted_frames_are_refused(npz, first_frame):
 def test_frames_beyond_belief_are_refused(tmp_path, first, count):
     (tmp_path / "empty.json").write_text("[]")
     with pytest.raises(InputError, match="frame numbers up to"):
-        read_observations(tmp_path / "empty.json", first, count)
+        read_observations(tmp_path / "empty.json", [(first, count)])
 
 
 def test_two_people_a_year_apart_do_not_fill_the_memory(tmp_path):
@@ -96,6 +96,6 @@ def test_seen_frames_are_those_with_a_joint(make_people):
 
 
 def test_nobody_is_nobody_on_any_frames(tmp_path, make_people):
-    read = on_frames(tmp_path, make_people(0, 0, 0), 5, 3)
+    read = on_frames(tmp_path, make_people(0, 0, 0), [(5, 3)])
     np.testing.assert_array_equal(read.frame, [5, 6, 7])
     assert read.keypoints.shape == (3, 0, 17, 2)

@@ -10,15 +10,41 @@ from worldpose.ingest.units import UnitFrames, read_unit, unit_frames
 
 def test_units_lie_on_the_matchs_clock(spec):
     # Clips span 5 to 8 and 9 to 11; cam2 runs 10 frames ahead; goal's own video starts at 0.
-    assert unit_frames(spec, "cam1") == UnitFrames(first=5, count=6, offset=0)
-    assert unit_frames(spec, "cam2") == UnitFrames(first=5, count=6, offset=10)
-    assert unit_frames(spec, "goal") == UnitFrames(first=5, count=3, offset=-5)
+    clips = ((5, 3), (9, 2))
+    assert unit_frames(spec, "cam1") == UnitFrames(first=5, count=6, offset=0, ranges=clips)
+    assert unit_frames(spec, "cam2") == UnitFrames(first=5, count=6, offset=10, ranges=clips)
+    assert unit_frames(spec, "goal") == UnitFrames(first=5, count=3, offset=-5, ranges=((5, 3),))
+
+
+def test_clips_that_touch_or_overlap_are_one_range(spec):
+    clip = spec.clips[0].model_copy(update={"broadcast": None})
+    places = {"c": (40, 5), "a": (0, 10), "b": (4, 3), "d": (10, 2), "e": (43, 9)}
+    clips = tuple(
+        clip.model_copy(update={"id": name, "first_frame": first, "frame_count": count})
+        for name, (first, count) in places.items()
+    )
+    frames = unit_frames(spec.model_copy(update={"clips": clips}), "cam1")
+    assert frames.ranges == ((0, 12), (40, 12))
+    assert (frames.first, frames.count) == (0, 52)
+
+
+def test_frames_between_clips_that_are_far_apart_take_no_memory(match_folder, make_people):
+    path = match_folder / "match.yaml"
+    content = yaml.safe_load(path.read_text())
+    content["clips"][1]["first_frame"] = 2_000_000_000
+    path.write_text(yaml.safe_dump(content))
+    people, _ = read_unit(read_match(match_folder), "cam1")
+    count = content["clips"][1]["frame_count"]
+    np.testing.assert_array_equal(people.frame[:3], [5, 6, 7])
+    np.testing.assert_array_equal(people.frame[3:], 2_000_000_000 + np.arange(count))
+    np.testing.assert_array_equal(people.keypoints[:3], make_people(5, 3, seed=1).keypoints)
 
 
 def test_a_static_camera_covers_all_clips_in_match_frames(match_folder, make_people):
     people, calibration = read_unit(read_match(match_folder), "cam1")
-    np.testing.assert_array_equal(people.frame, np.arange(5, 11))
-    np.testing.assert_array_equal(people.keypoints, make_people(5, 6, seed=1).keypoints)
+    np.testing.assert_array_equal(people.frame, [5, 6, 7, 9, 10])
+    there = [0, 1, 2, 4, 5]  # nothing is kept of frame 8, which no clip has
+    np.testing.assert_array_equal(people.keypoints, make_people(5, 6, seed=1).keypoints[there])
     assert calibration is not None
     assert calibration.id == "cam1"
 
@@ -26,8 +52,9 @@ def test_a_static_camera_covers_all_clips_in_match_frames(match_folder, make_peo
 def test_an_offset_is_taken_off_the_cameras_own_frames(match_folder, make_people):
     # Camera frame = match frame + 10: its frames 15 to 20 are the match's 5 to 10.
     people, _ = read_unit(read_match(match_folder), "cam2")
-    np.testing.assert_array_equal(people.frame, np.arange(5, 11))
-    np.testing.assert_array_equal(people.keypoints, make_people(15, 6, seed=2).keypoints)
+    np.testing.assert_array_equal(people.frame, [5, 6, 7, 9, 10])
+    there = [0, 1, 2, 4, 5]
+    np.testing.assert_array_equal(people.keypoints, make_people(15, 6, seed=2).keypoints[there])
 
 
 def test_a_broadcast_camera_covers_its_clip(match_folder, make_people):
@@ -51,14 +78,14 @@ def test_a_broken_broadcast_offset_is_taken_to_the_nearest_frame(match_folder, m
 def test_frames_that_a_camera_lacks_have_no_people(match_folder, make_people):
     write_keypoint_arrays(match_folder / "detections" / "cam1.npz", make_people(6, 2))
     people, _ = read_unit(read_match(match_folder), "cam1")
-    np.testing.assert_array_equal(people.frame, np.arange(5, 11))
+    np.testing.assert_array_equal(people.frame, [5, 6, 7, 9, 10])
     seen = np.isfinite(people.score).any(axis=1)
-    np.testing.assert_array_equal(seen, [False, True, True, False, False, False])
+    np.testing.assert_array_equal(seen, [False, True, True, False, False])
 
 
 def test_a_wrong_offset_is_noticed(match_folder, make_people):
     write_keypoint_arrays(match_folder / "detections" / "cam2.npz", make_people(5, 6))
-    with pytest.raises(InputError, match="people in frames 15 to 20"):
+    with pytest.raises(InputError, match="people in frames 15 to 17, 19 to 20"):
         read_unit(read_match(match_folder), "cam2")
 
 

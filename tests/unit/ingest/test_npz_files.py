@@ -66,3 +66,15 @@ def test_no_archive_is_refused(tmp_path):
     (tmp_path / "a.npz").write_bytes(b"no archive")
     with pytest.raises(InputError, match="expected an npz file"):
         read_npz(tmp_path / "a.npz", 1000)
+
+
+def test_a_packed_size_that_is_more_than_the_file_does_not_excuse_a_bomb(tmp_path):
+    path = written(tmp_path / "a.npz", a=np.zeros((1 << 20, 9)))
+    with pytest.raises(InputError, match="packed at most 200 to 1"):
+        read_npz(path, 1 << 30)
+    content = bytearray(path.read_bytes())
+    directory = content.rindex(b"PK\x01\x02")
+    content[directory + 20 : directory + 24] = (1 << 30).to_bytes(4, "little")
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="packed at most 200 to 1"):
+        read_npz(path, 1 << 30)

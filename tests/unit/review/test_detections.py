@@ -143,3 +143,13 @@ def test_where_all_places_are_taken_an_added_person_makes_one_more():
     assert np.isfinite(found.score).tolist() == [[True] * 4, [True, False, False, False]]
     for name, before in observations().arrays().items():
         assert same(found.arrays()[name][:, :2], before)
+
+
+def test_frames_between_clips_are_no_frames_of_the_camera():
+    people = observations()
+    apart = Observations(np.array([FIRST, FIRST + 1000]), **people.arrays())
+    replay = replay_detections(apart, [keypoint((3.0, 4.0), was=(68.0, 69.0), frame=FIRST + 1000)])
+    assert replay.objections == (None,)
+    np.testing.assert_array_equal(replay.observations.keypoints[1, 0, 0], [3.0, 4.0])
+    (objection,) = replay_detections(apart, [keypoint((3.0, 4.0), frame=FIRST + 1)]).objections
+    assert objection == f"a has no frame {FIRST + 1}"
