@@ -66,9 +66,11 @@ def read_pickled_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[
         content = _Unpickler(io.BytesIO(path.read_bytes()), _NAMES).load()
     except OSError as error:
         raise unreadable(path, f"what cannot be read ({error})") from None
+    except MemoryError:
+        raise
     # A damaged pickle can fail in any way: the documentation of pickle names no closed list.
     except Exception as error:
-        raise unreadable(path, f"what cannot be read as a pickle ({_reason(error)})") from None
+        raise unreadable(path, f"what cannot be read as a pickle ({_reason(error)})") from error
     if not isinstance(content, dict):
         raise unreadable(path, f"a pickled {type(content).__name__.strip('_').lower()}")
     lacking = [key for key in keys if key not in content]

@@ -53,6 +53,8 @@ class OnnxNet:
         options.log_severity_level = 3
         try:
             self._session = runtime.InferenceSession(str(file), options, providers=[provider])
+        except MemoryError:
+            raise
         except Exception as error:  # onnxruntime's own, of no common class
             raise InputError(
                 self.where,

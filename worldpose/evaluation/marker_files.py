@@ -44,10 +44,11 @@ def read_markers(path: Path) -> Markers:
     if path.suffix.lower() == ".c3d":
         return _read_c3d(path)
     try:
-        return _read_trc(path)
+        rate, names, points, unit = _read_trc(path)
     # A line, cell or key that a cut-off file lacks, and text that is no number or no UTF-8.
     except (OSError, LookupError, ValueError) as error:
         raise _wrong(path, "a whole C3D or TRC file", f"{error!r}") from error
+    return _checked(path, rate, names, points, unit)
 
 
 def joints_of_markers(names: tuple[str, ...]) -> dict[str, dict[str, tuple[str, ...]]]:
@@ -127,6 +128,8 @@ def _read_c3d(path: Path) -> Markers:
             # Copies: the reader gives the same array again and again. Residual -1 means missing.
             rows = [points[:, :4].copy() for _, points, _ in reader.read_frames()]
             rate = float(reader.point_rate)
+    except MemoryError:
+        raise
     except Exception as error:  # c3d documents no closed list for damaged files
         raise _wrong(path, "a whole C3D or TRC file", f"{error!r}") from error
     values = np.array(rows, dtype=np.float64).reshape(len(rows), -1, 4)
@@ -134,7 +137,8 @@ def _read_c3d(path: Path) -> Markers:
     return _checked(path, rate, names[: points.shape[1]], points, unit)
 
 
-def _read_trc(path: Path) -> Markers:
+def _read_trc(path: Path) -> tuple[float, tuple[str, ...], NDArray[np.float64], str]:
+    """Return rate [1/s], names, points (samples, markers, 3) in the file's unit, and that unit."""
     lines = path.read_text(encoding="utf-8").splitlines()
     about = dict(zip(lines[1].split("\t"), lines[2].split("\t"), strict=False))
     names = tuple(name for name in lines[3].split("\t")[2:] if name)
@@ -148,7 +152,7 @@ def _read_trc(path: Path) -> Markers:
         if line.strip()
     ]
     points = np.array(rows, dtype=np.float64).reshape(len(rows), len(names), 3)
-    return _checked(path, float(about["DataRate"]), names, points, about["Units"].strip().lower())
+    return float(about["DataRate"]), names, points, about["Units"].strip().lower()
 
 
 def _checked(

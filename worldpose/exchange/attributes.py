@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import TypedDict, get_args
 
 from data_contracts.review import Origin
-from worldpose.exchange.pictures import AnnotatedPerson
+from worldpose.exchange.pictures import AnnotatedPerson, ContentError
 
 
 class Attributes(TypedDict):
@@ -28,17 +28,20 @@ def read_attributes(given: Mapping[str, str]) -> Attributes:
     """The same, read again; names that others gave are passed over, an empty text is nothing.
 
     Raises:
-        ValueError: one is not what it must be.
+        ContentError: one is not what it must be.
     """
     detection, origin, score = (given.get(name) for name in ("detection", "origin", "score"))
     origins: tuple[Origin, ...] = get_args(Origin)
     if detection and not (detection.isdecimal() and detection.isascii() and len(detection) < 10):
-        raise ValueError(f"attribute detection is {detection[:40]!r}")
+        raise ContentError(f"attribute detection is {detection[:40]!r}")
     if origin and origin not in origins:
-        raise ValueError(f"attribute origin is {origin[:40]!r}")
-    value = float(score) if score else None
+        raise ContentError(f"attribute origin is {origin[:40]!r}")
+    try:
+        value = float(score) if score else None
+    except ValueError:
+        raise ContentError(f"attribute score is {str(score)[:40]!r}") from None
     if value is not None and not math.isfinite(value):
-        raise ValueError(f"attribute score is {value}")
+        raise ContentError(f"attribute score is {value}")
     return Attributes(
         detection=int(detection) if detection else None,
         origin=next((each for each in origins if each == origin), None),

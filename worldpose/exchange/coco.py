@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from data_contracts.conventions import COCO17
 from worldpose.exchange.attributes import attributes_of, read_attributes
-from worldpose.exchange.pictures import AnnotatedPerson, AnnotatedPicture
+from worldpose.exchange.pictures import AnnotatedPerson, AnnotatedPicture, ContentError
 
 Scalar = str | int | float | bool | None
 
@@ -64,18 +64,18 @@ def read_coco(content: bytes) -> list[AnnotatedPicture]:
     """The pictures of a COCO keypoints file, in its order.
 
     Raises:
-        ValueError: it is none, of other joints, or contradicts itself.
+        ContentError: it is none, of other joints, or contradicts itself.
     """
     dataset = _Dataset.model_validate_json(content)
     for category in dataset.categories:
         if category.keypoints not in (None, (), COCO17):
-            raise ValueError("the joints are not COCO's 17 in their order")
+            raise ContentError("the joints are not COCO's 17 in their order")
     people: dict[int, list[AnnotatedPerson]] = {image.id: [] for image in dataset.images}
     if len(people) < len(dataset.images):
-        raise ValueError("two images have one id")
+        raise ContentError("two images have one id")
     for given in dataset.annotations:
         if given.image_id not in people:
-            raise ValueError(f"an annotation is of image {given.image_id}, which is not there")
+            raise ContentError(f"an annotation is of image {given.image_id}, which is not there")
         people[given.image_id].append(_read(given))
     return [
         AnnotatedPicture(image.file_name, (image.width, image.height), tuple(people[image.id]))
@@ -100,10 +100,10 @@ def _annotation(person: AnnotatedPerson) -> dict[str, Any]:
 def _read(given: _Person) -> AnnotatedPerson:
     x, y, width, height = given.bbox
     if min(width, height) < 0:
-        raise ValueError("a box of negative size")
+        raise ContentError("a box of negative size")
     triples = np.array(given.keypoints or [0.0] * 51).reshape(17, 3)
     if not np.isin(triples[:, 2], (0, 1, 2)).all():
-        raise ValueError("a keypoint's visibility is not 0, 1 or 2")
+        raise ContentError("a keypoint's visibility is not 0, 1 or 2")
     there = triples[:, 2] > 0
     attributes = {name: str(value) for name, value in given.attributes.items() if value is not None}
     return AnnotatedPerson(

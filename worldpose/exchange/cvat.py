@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17
 from worldpose.exchange.attributes import attributes_of, read_attributes
-from worldpose.exchange.pictures import CORNER, AnnotatedPerson, AnnotatedPicture, Floats, hull
+from worldpose.exchange.pictures import (
+    CORNER,
+    AnnotatedPerson,
+    AnnotatedPicture,
+    ContentError,
+    Floats,
+    hull,
+)
 from worldpose.exchange.xml_reading import read_xml
 
 BOX: Final = "person"
@@ -43,13 +50,13 @@ def read_cvat(content: bytes) -> list[AnnotatedPicture]:
     around its points. Shapes of other kinds or labels are passed over.
 
     Raises:
-        ValueError: it is none, or a shape is not what it must be.
+        ContentError: it is none, or a shape is not what it must be.
     """
     root = read_xml(content)
     if root.tag != "annotations":
-        raise ValueError(f"the root is <{root.tag[:40]}>, not <annotations>")
+        raise ContentError(f"the root is <{root.tag[:40]}>, not <annotations>")
     if root.find("track") is not None:
-        raise ValueError("tracks: export as `CVAT for images`, not `for video`")
+        raise ContentError("tracks: export as `CVAT for images`, not `for video`")
     return [_read_image(image) for image in root.iter("image")]
 
 
@@ -84,13 +91,13 @@ def _read_image(image: Element) -> AnnotatedPicture:
     boxes: dict[tuple[str, str], Element] = {}
     for key, box in _of_label(image, "box", BOX):
         if key in boxes:
-            raise ValueError(f"{name}: two boxes of {' '.join(key)}")
+            raise ContentError(f"{name}: two boxes of {' '.join(key)}")
         boxes[key] = box
     people = []
     taken = set()
     for key, skeleton in _of_label(image, "skeleton", None):
         if key in taken:
-            raise ValueError(f"{name}: two skeletons of {' '.join(key)}")
+            raise ContentError(f"{name}: two skeletons of {' '.join(key)}")
         taken.add(key)
         keypoints, visible = _skeleton(skeleton)
         own = boxes.pop(key, None)
@@ -132,11 +139,11 @@ def _attributes(element: Element) -> dict[str, str]:
 
 def _box(element: Element) -> Floats:
     if element.get("rotation", "0") not in ("0", "0.0", "0.00"):
-        raise ValueError("a box that is rotated")
+        raise ContentError("a box that is rotated")
     given = [_number(_given(element, name)) for name in ("xtl", "ytl", "xbr", "ybr")]
     box = np.array(given) - CORNER
     if (box[2:] < box[:2]).any():
-        raise ValueError("a box of negative size")
+        raise ContentError("a box of negative size")
     return box
 
 
@@ -145,12 +152,12 @@ def _skeleton(element: Element) -> tuple[Floats, NDArray[np.int8]]:
     for point in element.findall("points"):
         joint = _given(point, "label")
         if joint not in COCO17:
-            raise ValueError(f"COCO-17 has no joint {joint[:40]!r}")
+            raise ContentError(f"COCO-17 has no joint {joint[:40]!r}")
         if point.get("outside", "0") == "1":
             continue
         place = _given(point, "points").split(",")
         if len(place) != 2:
-            raise ValueError(f"{joint} has not one place")
+            raise ContentError(f"{joint} has not one place")
         k = COCO17.index(joint)
         keypoints[k] = [_number(value) - CORNER for value in place]
         visible[k] = 1 if point.get("occluded") == "1" else 2
@@ -165,19 +172,22 @@ def _nowhere() -> tuple[Floats, NDArray[np.int8]]:
 def _given(element: Element, name: str) -> str:
     value = element.get(name)
     if not value:
-        raise ValueError(f"<{element.tag}> has no {name}")
+        raise ContentError(f"<{element.tag}> has no {name}")
     return value
 
 
 def _whole(element: Element, name: str) -> int:
     value = _number(_given(element, name))
     if value < 1 or value != int(value):
-        raise ValueError(f"<{element.tag}> has {name} {value}")
+        raise ContentError(f"<{element.tag}> has {name} {value}")
     return int(value)
 
 
 def _number(text: str) -> float:
-    value = float(text[:40])
+    try:
+        value = float(text[:40])
+    except ValueError:
+        raise ContentError(f"{text[:40]!r} for a number") from None
     if not np.isfinite(value):
-        raise ValueError("a number that is not finite")
+        raise ContentError("a number that is not finite")
     return value

@@ -12,7 +12,7 @@ from worldpose.errors import InputError
 from worldpose.exchange.coco import coco_bytes, read_coco
 from worldpose.exchange.cvat import cvat_bytes, read_cvat
 from worldpose.exchange.label_studio import label_studio_bytes, read_label_studio
-from worldpose.exchange.pictures import AnnotatedPicture
+from worldpose.exchange.pictures import AnnotatedPicture, ContentError
 
 Format: TypeAlias = Literal["coco", "cvat", "label-studio"]
 FORMATS: Final[tuple[Format, ...]] = get_args(Format)
@@ -71,18 +71,18 @@ def read_annotations(path: Path, form: Format | None = None) -> list[AnnotatedPi
     try:
         size = path.stat().st_size
         if size > MOST:
-            raise ValueError(f"{size} bytes, more than {MOST}")
+            raise ContentError(f"{size} bytes, more than {MOST}")
         content = path.read_bytes()
         form = form or format_of(content)
         pictures = _CODECS[form].decode(content)
         if len({picture.name for picture in pictures}) < len(pictures):
-            raise ValueError("two pictures of one name")
+            raise ContentError("two pictures of one name")
         return pictures
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         place = ".".join(map(str, first["loc"]))
         raise _refusal(path, form, f"{place}: {first['msg']}" if place else first["msg"]) from None
-    except (OSError, ValueError) as error:
+    except (OSError, ContentError) as error:
         raise _refusal(path, form, str(error)) from error
 
 

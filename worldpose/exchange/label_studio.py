@@ -11,7 +11,13 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from data_contracts.conventions import COCO17
 from worldpose.exchange.attributes import attributes_of, read_attributes
-from worldpose.exchange.pictures import CORNER, AnnotatedPerson, AnnotatedPicture, Floats
+from worldpose.exchange.pictures import (
+    CORNER,
+    AnnotatedPerson,
+    AnnotatedPicture,
+    ContentError,
+    Floats,
+)
 
 HIDDEN: Final = "hidden"
 """Note at a keypoint that cannot be seen: Label Studio has no field for that."""
@@ -89,7 +95,7 @@ def read_label_studio(content: bytes) -> list[AnnotatedPicture]:
     keypoint belongs to the rectangle that it is a child of, or else to the only one around it.
 
     Raises:
-        ValueError: it is none, or a region is not what it must be.
+        ContentError: it is none, or a region is not what it must be.
     """
     return [_read(task) for task in TypeAdapter(tuple[_Task, ...]).validate_json(content)]
 
@@ -155,9 +161,9 @@ def _read(task: _Task) -> AnnotatedPicture:
     ]
     for region in shapes:
         if (region.original_width, region.original_height) != size:
-            raise ValueError(f"{name}: a region of a picture of another size")
+            raise ContentError(f"{name}: a region of a picture of another size")
         if region.image_rotation or region.value.rotation:
-            raise ValueError(f"{name}: a region that is rotated")
+            raise ContentError(f"{name}: a region that is rotated")
     pixels = np.array(size, dtype=np.float64) / 100.0
     boxes: dict[str, tuple[_Region, Floats]] = {}
     for region in shapes:
@@ -166,7 +172,7 @@ def _read(task: _Task) -> AnnotatedPicture:
             begin = np.array([value.x, value.y]) * pixels - CORNER
             box = np.concatenate([begin, begin + np.array([value.width, value.height]) * pixels])
             if region.id in boxes:
-                raise ValueError(f"{name}: two regions have one id")
+                raise ContentError(f"{name}: two regions have one id")
             boxes[region.id] = (region, _rounded(box))
     keypoints = {owner: np.full((17, 2), np.nan) for owner in boxes}
     visible = {owner: np.zeros(17, dtype=np.int8) for owner in boxes}
@@ -174,12 +180,15 @@ def _read(task: _Task) -> AnnotatedPicture:
         if region.type == "keypointlabels":
             place = _rounded(np.array([region.value.x, region.value.y]) * pixels - CORNER)
             owner = _owner(name, region, place, {key: box for key, (_, box) in boxes.items()})
-            (joint,) = region.value.keypointlabels or ("",)
+            labels = region.value.keypointlabels or ("",)
+            if len(labels) > 1:
+                raise ContentError(f"{name}: a point with {len(labels)} labels")
+            joint = labels[0]
             if joint not in COCO17:
-                raise ValueError(f"{name}: COCO-17 has no joint {joint[:40]!r}")
+                raise ContentError(f"{name}: COCO-17 has no joint {joint[:40]!r}")
             k = COCO17.index(joint)
             if visible[owner][k]:
-                raise ValueError(f"{name}: two points are the {joint} of one person")
+                raise ContentError(f"{name}: two points are the {joint} of one person")
             keypoints[owner][k] = place
             visible[owner][k] = 1 if HIDDEN in region.meta.text else 2
     people = (
@@ -203,7 +212,7 @@ def _owner(name: str, region: _Region, place: Floats, boxes: dict[str, Floats]) 
         if (box[:2] <= place).all() and (place <= box[2:]).all()
     ]
     if len(around) != 1:
-        raise ValueError(
+        raise ContentError(
             f"{name}: a point lies in {len(around)} rectangles and is the child of none"
         )
     return around[0]

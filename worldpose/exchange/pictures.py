@@ -18,6 +18,10 @@ SEEN: Final = 0.5
 """Keypoints from this confidence on are written as seen, others as hidden [1]."""
 
 
+class ContentError(ValueError):
+    """What another program wrote is not what its format says; no other error is the file's."""
+
+
 @dataclass(frozen=True, eq=False)
 class AnnotatedPerson:
     """One person in one picture.

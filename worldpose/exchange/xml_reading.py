@@ -6,6 +6,8 @@ from typing import Final
 from xml.etree import ElementTree
 from xml.parsers import expat
 
+from worldpose.exchange.pictures import ContentError
+
 DEEPEST: Final = 16
 """Elements within each other; annotations have five."""
 
@@ -14,7 +16,7 @@ def read_xml(content: bytes) -> ElementTree.Element:
     """The root element of a document without a document type, and so without any entity.
 
     Raises:
-        ValueError: it is no XML, declares a document type, or is nested deeply.
+        ContentError: it is no XML, declares a document type, or is nested deeply.
     """
     parser, builder = expat.ParserCreate(), ElementTree.TreeBuilder()
     depth = 0
@@ -23,7 +25,7 @@ def read_xml(content: bytes) -> ElementTree.Element:
         nonlocal depth
         depth += 1
         if depth > DEEPEST:
-            raise ValueError(f"elements nested more than {DEEPEST} deep")
+            raise ContentError(f"elements nested more than {DEEPEST} deep")
         builder.start(tag, attributes)
 
     def end(tag: str) -> None:
@@ -32,13 +34,16 @@ def read_xml(content: bytes) -> ElementTree.Element:
         builder.end(tag)
 
     def refuse(*_: object) -> None:
-        raise ValueError("a document type declaration, which can hide other files and floods")
+        raise ContentError("a document type declaration, which can hide other files and floods")
 
     parser.StartElementHandler, parser.EndElementHandler = start, end
     parser.CharacterDataHandler = builder.data
     parser.StartDoctypeDeclHandler = refuse
     try:
         parser.Parse(content, True)
-    except expat.ExpatError as error:
-        raise ValueError(f"no XML: {error}") from error
+    except ContentError:
+        raise
+    # ValueError and LookupError: an encoding that expat or Python does not know.
+    except (expat.ExpatError, ValueError, LookupError) as error:
+        raise ContentError(f"no XML: {error}") from error
     return builder.close()

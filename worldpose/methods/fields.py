@@ -80,6 +80,18 @@ def whole(where: str, value: object, count: int | None = None) -> NDArray[np.int
     return array.astype(np.int64)
 
 
+def number(where: str, value: object) -> int:
+    """Return one whole number, also where it is written as text.
+
+    Raises:
+        InputError: it is none.
+    """
+    found = floats(where, value, ())
+    if not np.isfinite(found) or found != np.round(found) or abs(found) > 2**53:
+        raise wrong(where, "a whole number", f"{value}")
+    return int(found)
+
+
 def rising(where: str, frames: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return frames that rise.
 

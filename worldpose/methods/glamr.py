@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from worldpose.body import BodyModel
-from worldpose.methods.fields import floats, part
+from worldpose.methods.fields import floats, number, part
 from worldpose.methods.pickled import read_pickled
 from worldpose.methods.result import MethodResult, Track, around_points, gathered, posed
 
@@ -50,7 +50,7 @@ def read_glamr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult
         points = numbers("kp_2d", count, None, 2)[exists]
         # Joints that HybrIK lacks, and people in frames without a picture of them, are zeros.
         points = np.where((points == 0.0).all(-1, keepdims=True), np.nan, points)
-        people.append((int(name), track.frames, joints))
+        people.append((number(where, name), track.frames, joints))
         boxes.append(around_points(points))
     tracks, around = gathered(people, boxes)
     return MethodResult(tracks, "shared", around, notes={"shape": used})

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from worldpose.body import BodyModel
-from worldpose.methods.fields import floats, part, wrong
+from worldpose.methods.fields import floats, number, part, wrong
 from worldpose.methods.pickled import read_pickled
 from worldpose.methods.result import MethodResult, Track, gathered, posed, rotation_vectors
 
@@ -55,7 +55,7 @@ def read_humans4d(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodRes
 
 def _people(where: str, picture: Any) -> list[tuple[int, _Row]]:  # noqa: ANN401
     """Id and row of everybody who was seen in one picture."""
-    frame = int(part(where, picture, "time"))
+    frame = number(where, part(where, picture, "time"))
     ages = part(where, picture, "tracked_time")
     found = []
     for place, person in enumerate(part(where, picture, "tid")):
@@ -76,5 +76,5 @@ def _people(where: str, picture: Any) -> list[tuple[int, _Row]]:  # noqa: ANN401
             floats(where, part(where, picture, "camera")[place], (3,)),
             np.array([x, y, x + width, y + height]),
         )
-        found.append((int(person), row))
+        found.append((number(where, person), row))
     return found

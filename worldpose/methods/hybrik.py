@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.body import BodyModel
-from worldpose.methods.fields import floats, part, rising, whole, wrong
+from worldpose.methods.fields import floats, number, part, rising, whole, wrong
 from worldpose.methods.pickled import read_pickled
 from worldpose.methods.result import (
     MethodResult,
@@ -67,7 +67,7 @@ def _several(path: Path, content: Any) -> dict[int, tuple[Track, NDArray[np.floa
             part(where, person, "root_trans"),
         )
         points = floats(where, part(where, person, "kp_2d"), (len(frames), None, 2))
-        rows[int(name)] = (track, around_points(points))
+        rows[number(where, name)] = (track, around_points(points))
     return rows
 
 

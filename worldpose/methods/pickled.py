@@ -71,10 +71,12 @@ def read_pickled(path: Path) -> Any:  # noqa: ANN401
         return found
     except OSError as error:
         raise _refused(path, f"what cannot be read ({error})") from None
+    except MemoryError:
+        raise
     # A damaged or hostile pickle can fail in any way: pickle's documentation names no closed list.
     except Exception as error:
         reason = str(error) or type(error).__name__
-        raise _refused(path, f"what cannot be read as such ({reason})") from None
+        raise _refused(path, f"what cannot be read as such ({reason})") from error
 
 
 def _refused(path: Path, found: str) -> InputError:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from worldpose.body import BodyModel
-from worldpose.methods.fields import floats, part, rising, whole
+from worldpose.methods.fields import floats, number, part, rising, whole
 from worldpose.methods.pickled import read_pickled
 from worldpose.methods.result import MethodResult, Track, gathered, posed
 
@@ -36,7 +36,7 @@ def read_prompthmr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodRe
         pose = floats(where, part(where, person, "smplx_world", "pose"), (count, 165))
         place = floats(where, part(where, person, "smplx_world", "trans"), (count, 3))
         joints, used = posed(Track(frames, pose[:, :3], pose[:, 3:66], place), model, "other")
-        people.append((int(name), frames, joints))
+        people.append((number(where, name), frames, joints))
         box = floats(where, part(where, person, "bboxes"), (count, None))
         boxes.append(box[:, :4])
     tracks, around = gathered(people, boxes)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.body import BodyModel
-from worldpose.methods.fields import floats, part, read_arrays, whole, wrong
+from worldpose.methods.fields import floats, number, part, read_arrays, whole, wrong
 from worldpose.methods.result import MethodResult, Track, gathered, posed, seen_boxes
 
 WITH_MOTION_PRIOR: Final = "motion_chunks"
@@ -110,7 +110,7 @@ def _read_run(
     people: dict[int, _Piece] = {}
     used = ""
     for name, track in part(where, content, "tracks").items():
-        row = int(part(where, track, "index"))
+        row = number(where, part(where, track, "index"))
         mask = floats(where, part(where, track, "vis_mask"), (None,)) > 0.5
         if not mask.any():
             continue
@@ -124,7 +124,7 @@ def _read_run(
         )
         relative = np.einsum("fab,fjb->fja", camera[row, rows], joints) + shift[row, rows, None]
         boxes = seen_boxes(relative, focal[rows], center[rows])
-        people[int(name)] = (begin + start + rows, joints, boxes)
+        people[number(where, name)] = (begin + start + rows, joints, boxes)
     centers = -np.einsum("fba,fb->fa", camera[0], shift[0])
     return begin + start, people, centers, used
 

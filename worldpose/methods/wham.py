@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from worldpose.body import BodyModel
-from worldpose.methods.fields import floats, part, rising, whole, wrong
+from worldpose.methods.fields import floats, number, part, rising, whole, wrong
 from worldpose.methods.pickled import read_pickled
 from worldpose.methods.result import MethodResult, Track, gathered, posed, seen_boxes
 
@@ -50,7 +50,7 @@ def read_wham(path: Path, model: BodyModel, picture: tuple[int, int]) -> MethodR
         joints, used = posed(track("_world"), model, "smpl", "mid_hip")
         seen = posed(track(""), model, "smpl")[0]
         focal = np.full(2, np.linalg.norm(size))
-        people.append((int(name), frames, joints))
+        people.append((number(where, name), frames, joints))
         boxes.append(seen_boxes(seen, focal, size / 2.0) if count else None)
     tracks, around = gathered(people, boxes)
     return MethodResult(tracks, "own", around, notes={"shape": used})

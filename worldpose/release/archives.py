@@ -139,6 +139,8 @@ def _array(
         with file.open(info) as stream:
             array = npy.read_array(stream, allow_pickle=False)
             stream.read()  # to the end, where the checksum is compared
+    except MemoryError:
+        raise
     except Exception as error:  # see _check_headers
         raise wrong(f"{path}: {info.filename}", "a whole array", f"{error}") from error
     return np.ascontiguousarray(array, _READ_AS[member.kind])

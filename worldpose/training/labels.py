@@ -6,15 +6,39 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from data_contracts.conventions import COCO17
 from worldpose.errors import InputError
 
 Floats = NDArray[np.float64]
+
+
+class _Given(BaseModel):
+    """Part of a data set that others wrote: what is not needed is passed over."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+
+
+class _Image(_Given):
+    id: int
+    file_name: str = Field(min_length=1)
+
+
+class _Person(_Given):
+    image_id: int
+    bbox: tuple[float, float, float, float]
+    keypoints: Annotated[tuple[float, ...], Field(min_length=51, max_length=51)] | None = None
+    iscrowd: int = 0
+
+
+class _Dataset(_Given):
+    images: tuple[_Image, ...]
+    annotations: tuple[_Person, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,17 +85,20 @@ def read_labels(annotations: Path, pictures: Path | None = None) -> list[Labelle
         )
 
     try:
-        dataset: dict[str, Any] = json.loads(annotations.read_bytes())
-        people: dict[int, list[dict[str, Any]]] = {
-            int(image["id"]): [] for image in dataset["images"]
-        }
-        for person in dataset["annotations"]:
-            people[int(person["image_id"])].append(person)
-        images = sorted(dataset["images"], key=lambda image: int(image["id"]))
-        read = [_picture(folder, image, people[int(image["id"])]) for image in images]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        found = f"{type(error).__name__}: {error}"
+        dataset = _Dataset.model_validate_json(annotations.read_bytes())
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        found = f"{'.'.join(map(str, first['loc']))}: {first['msg']}".removeprefix(": ")
         raise refusal("a COCO keypoints data set", found) from error
+    except OSError as error:
+        raise refusal("a COCO keypoints data set", f"{type(error).__name__}: {error}") from error
+    people: dict[int, list[_Person]] = {image.id: [] for image in dataset.images}
+    for person in dataset.annotations:
+        if person.image_id not in people:
+            raise refusal("an image for each annotation", f"none of id {person.image_id}")
+        people[person.image_id].append(person)
+    images = sorted(dataset.images, key=lambda image: image.id)
+    read = [_picture(folder, image, people[image.id]) for image in images]
     for picture in read:
         if not picture.path.resolve().is_relative_to(folder.resolve()):
             raise refusal("pictures within the data set's folder", str(picture.path))
@@ -120,19 +147,15 @@ def _annotation(box: Floats, keypoints: Floats, visible: NDArray[np.int8]) -> di
     }
 
 
-def _picture(
-    folder: Path, image: dict[str, Any], people: Sequence[dict[str, Any]]
-) -> LabelledPicture:
-    boxes = np.array([person["bbox"] for person in people], dtype=np.float64).reshape(-1, 4)
-    given = [person.get("keypoints") or [0.0] * 51 for person in people]
+def _picture(folder: Path, image: _Image, people: Sequence[_Person]) -> LabelledPicture:
+    boxes = np.array([person.bbox for person in people], dtype=np.float64).reshape(-1, 4)
+    given = [person.keypoints or (0.0,) * 51 for person in people]
     triples = np.array(given, dtype=np.float64).reshape(len(people), 17, 3)
-    if not (np.isfinite(boxes).all() and np.isfinite(triples).all()):
-        raise ValueError("a number that is not finite")
     visible = triples[..., 2].astype(np.int8)
     return LabelledPicture(
-        path=folder / str(image["file_name"]),
+        path=folder / image.file_name,
         boxes=np.column_stack([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]]),
         keypoints=np.where(visible[..., None] > 0, triples[..., :2], np.nan),
         visible=visible,
-        ignored=np.array([bool(person.get("iscrowd", 0)) for person in people], dtype=np.bool_),
+        ignored=np.array([bool(person.iscrowd) for person in people], dtype=np.bool_),
     )

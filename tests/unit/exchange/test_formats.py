@@ -198,3 +198,34 @@ def test_a_file_that_is_not_there_or_is_none_of_text_is_refused(tmp_path):
     for name in ("a", "none"):
         with pytest.raises(InputError):
             read_annotations(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        ('<?xml version="1.0" encoding="utf-7"?><annotations/>', "no XML"),
+        (
+            '<annotations><image name="a" width="x" height="2"/></annotations>',
+            "'x' for a number",
+        ),
+        (json.dumps([task(BOX | {"meta": {"text": ["score=high"]}})]), "score is 'high'"),
+    ],
+)
+def test_numbers_and_encodings_that_are_none_are_refused(tmp_path, content, found):
+    file = tmp_path / "labels.any"
+    file.write_text(content)
+    with pytest.raises(InputError, match=found):
+        read_annotations(file)
+
+
+def test_an_error_of_ours_is_no_fault_of_the_file(tmp_path, monkeypatch):
+    file = tmp_path / "labels.json"
+    write_annotations(file, pictures())
+
+    def broken(*_):
+        raise ValueError("operands could not be broadcast together")
+
+    monkeypatch.setattr("worldpose.exchange.coco._read", broken)
+    with pytest.raises(ValueError, match="broadcast") as error:
+        read_annotations(file)
+    assert not isinstance(error.value, InputError)
