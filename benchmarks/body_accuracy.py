@@ -85,7 +85,8 @@ def whole(seed: int, duration: float) -> dict[str, float]:
     placed = reconstruct_joints(cameras, *arrays, index, scenario.fps, TRIANGULATION).triangulation
     ground = PitchTemplate.from_spec(scene.surveyed).height
     begin = time.process_time()
-    fit = fit_bodies(BODY, placed.joints, placed.covariance, scenario.fps, SETTINGS, ground)
+    given = (BODY, placed.joints, placed.covariance, scenario.fps, SETTINGS, ground)
+    fit = fit_bodies(*given, common_bias=placed.common_bias)
     figures = {"seconds of one core": time.process_time() - begin}
     people = np.arange(index.shape[2])
     for label, joints in (("triangulated", placed.joints), ("fitted", fit.joints)):
@@ -157,7 +158,8 @@ def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
 
     def fitted(views: list, glimpses: object = None) -> BodyFit:
         given = (BODY, joints, covariance, fps, SETTINGS, ground)
-        return fit_bodies(*given, sightings=views, glimpses=glimpses)
+        bias = placed.common_bias
+        return fit_bodies(*given, sightings=views, glimpses=glimpses, common_bias=bias)
 
     first = fitted([static])
     own = recognise_people(scene.broadcast, scene.observations["clip"].keypoints, first.joints)

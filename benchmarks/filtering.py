@@ -22,6 +22,7 @@ from worldpose.filtering import (
     Suspects,
     judge_detections,
     learn_from,
+    perceived_covariance,
     perceived_joints,
     view_bodies,
 )
@@ -78,8 +79,10 @@ def filtered(scenario: Scenario, seed: int) -> tuple[int, int, int, int]:
         how,
         ground,
         sightings=[alone],
+        common_bias=placed.common_bias,
     )
-    views = view_bodies(cameras, perceived_joints(fit.joints, fit.offsets), fit.covariance)
+    sure = perceived_covariance(fit.covariance, placed.common_bias)
+    views = view_bodies(cameras, perceived_joints(fit.joints, fit.offsets), sure)
     suspects = Suspects(
         keypoints,
         confidence,

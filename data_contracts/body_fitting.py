@@ -59,7 +59,8 @@ BODY_FITTING = GroupLayout(
             dtype="float64",
             unit="m^2",
             missing="nan",
-            about="covariance of `joints`: poses, the detector's offsets, and each person's own",
+            about="covariance of `joints`: poses, the detector's offsets, each person's own, and "
+            "what all views err in common",
             chunk_dim="frame",
         ),
         ArrayLayout(

@@ -39,6 +39,15 @@ TRIANGULATION = GroupLayout(
             chunk_dim="frame",
         ),
         ArrayLayout(
+            name="common_bias",
+            dims=("joint",),
+            dtype="float64",
+            unit="m",
+            missing="none",
+            about="standard deviation per axis of what all views of a joint err in common; "
+            "`covariance` contains it",
+        ),
+        ArrayLayout(
             name="views",
             dims=("frame", "person", "joint"),
             dtype="uint8",

@@ -216,7 +216,8 @@ def _score(
         how = BodyFittingSettings()
         floor = PitchTemplate.from_spec(scene.surveyed).height
         model = find_body(how.body_model)
-        joints = fit_bodies(model, joints, placed.covariance, clip.fps, how, floor).joints
+        given = (model, joints, placed.covariance, clip.fps, how, floor)
+        joints = fit_bodies(*given, common_bias=placed.common_bias).joints
     people = np.arange(index.shape[2])
     found, _ = evaluate_joints(JointTracks(clip.frame, people, joints), scene.truth, fps=clip.fps)
     estimated = {name: cameras[c] for c, name in enumerate(names)}

@@ -57,6 +57,7 @@ class ClipPeople:
         person: (persons,) ids.
         joints: (frames, persons, 17, 3) [m], world, triangulated.
         covariance: (frames, persons, 17, 3, 3) [m^2].
+        common_bias: (17,) per axis, of what all views err in common [m]; in `covariance`.
     """
 
     clip: ClipInputs
@@ -65,6 +66,7 @@ class ClipPeople:
     person: NDArray[np.integer]
     joints: Floats
     covariance: Floats
+    common_bias: Floats
 
 
 def open_people(store: Store, work: Work) -> ClipPeople:
@@ -79,6 +81,7 @@ def open_people(store: Store, work: Work) -> ClipPeople:
         placed["person"].values,
         placed["joints"].values,
         placed["covariance"].values,
+        placed["common_bias"].values,
     )
 
 
@@ -117,6 +120,7 @@ def fit_people(
         known=known,
         sightings=[alone, *views],
         glimpses=glimpses,
+        common_bias=people.common_bias,
     )
     return model, fit
 

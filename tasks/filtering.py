@@ -24,6 +24,7 @@ from worldpose.filtering import (
     learn_from,
     learn_habits,
     measure_held_out,
+    perceived_covariance,
     perceived_joints,
     view_bodies,
     watch_motion,
@@ -158,6 +159,7 @@ def _open(store: Store, work: Work) -> _Case:
         for name in (f"refitting/{unit}", f"body_fitting/{unit}")
         if name in work.recipe.inputs
     )
+    placed = open_input(store, work, f"retriangulation/{unit}")
     joints = perceived_joints(bodies["joints"].values, bodies["joint_offsets"].values)
     return _Case(
         clip=open_clip(store, work, filtered=False, shifted=False),
@@ -165,8 +167,8 @@ def _open(store: Store, work: Work) -> _Case:
         index=tracks["detection_index"].values,
         joints=joints,
         step=np.gradient(joints, axis=0) if len(joints) > 1 else np.zeros_like(joints),
-        covariance=bodies["covariance"].values,
-        placed=open_input(store, work, f"retriangulation/{unit}"),
+        covariance=perceived_covariance(bodies["covariance"].values, placed["common_bias"].values),
+        placed=placed,
         dropped=dropped_before(store, work),
         triangulation=settings_before(store, work, unit),
     )

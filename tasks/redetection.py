@@ -30,6 +30,7 @@ from worldpose.filtering import (
     Suspects,
     ViewBias,
     learn_from,
+    perceived_covariance,
     perceived_joints,
     view_bodies,
     watch_motion,
@@ -146,7 +147,8 @@ def _open(store: Store, work: Work) -> _Case:
     placed = open_input(store, work, f"retriangulation/{clip}").isel(camera=[place])
     said = open_input(store, work, f"filtering/{clip}")
     joints = perceived_joints(bodies["joints"].values, bodies["joint_offsets"].values)
-    views = view_bodies(one, joints, bodies["covariance"].values)
+    sure = perceived_covariance(bodies["covariance"].values, placed["common_bias"].values)
+    views = view_bodies(one, joints, sure)
     step = np.gradient(joints, axis=0) if len(joints) > 1 else np.zeros_like(joints)
     habits = Habits(ViewBias(said["view_bias"].values), said["clock_late"].values[[place]])
     shift = habits.shift(watch_motion(one, joints, step), views)

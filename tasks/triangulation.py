@@ -66,7 +66,9 @@ def place_joints(
             changes.append(part.smoothing.changes)
         result.write(
             layout,
-            arrays=spool.arrays() | clock_arrays(model.clocks),
+            arrays=spool.arrays()
+            | clock_arrays(model.clocks)
+            | {"common_bias": model.detector.common_bias},
             coordinates={"frame": clip.frame, "person": tracks["person"].values},
             attributes={"camera": list(clip.camera_ids)},
         )

@@ -34,6 +34,9 @@ Floats = NDArray[np.float64]
 SURE: Final = 0.035
 """Joints are well known where their median standard deviation per axis is below this [m]: 16
 cameras leave 0.02 to 0.03, two 0.04 to 0.1."""
+KEPT_BIAS: Final = 0.01
+"""Of the common bias of joints, what stays in their covariance per axis [m]: the rest is what the
+shared offsets are for."""
 GLIMPSE_TIME: Final = 0.5
 """Time in which an error of a monocular pose stays what it is [s]: pictures hardly change."""
 
@@ -48,7 +51,8 @@ class BodyFit:
         betas_covariance: (persons, shapes, shapes).
         joints: (frames, persons, 17, 3) [m], world: COCO-17 keypoints of the bodies.
         covariance: (frames, persons, 17, 3, 3) [m^2], of `joints`: poses by the objective, the
-            detector's offsets, and each person's own.
+            detector's offsets, each person's own, and what the detector and the body model take
+            for different points: offsets and shape together follow the detector.
         filled: (frames, persons), bodies in frames without any joint of theirs.
         guided: (frames, persons), bodies that a picture of one camera had a say in.
         offsets: (17, 3) [m] forward, left and up: from joints to what the detector takes for them.
@@ -74,6 +78,7 @@ def fit_bodies(
     known: Mapping[int, Shape] | None = None,
     sightings: Sequence[Sightings] = (),
     glimpses: Glimpses | None = None,
+    common_bias: Floats | None = None,
 ) -> BodyFit:
     """Return the bodies that explain everybody's triangulated joints (S1-S3).
 
@@ -92,6 +97,9 @@ def fit_bodies(
         sightings: lines of sight beside what is triangulated, of the same frames and persons; a
             person without joints is there as long as these last.
         glimpses: of the same frames and persons, used where few joints are well known (S4).
+        common_bias: (17,) per axis, what all views err in common [m]; `covariance` contains it.
+            Bodies do not lessen it: fitted to real people (Shelf) their joints are as far from the
+            labels as the triangulated ones. None = none.
 
     Raises:
         InputError: the shapes do not fit together.
@@ -103,6 +111,9 @@ def fit_bodies(
             found=f"{joints.shape} and {covariance.shape}",
             todo="Give triangulated joints with their covariance.",
         )
+    bias = np.zeros(17) if common_bias is None else common_bias
+    modelled = np.maximum(bias**2 - KEPT_BIAS**2, 0.0)
+    covariance = covariance - modelled[:, None, None] * np.eye(3)
     frames, persons = joints.shape[:2]
     solver = Solver(
         ChainedKeypoints.of(fold_keypoints(model, COCO17)), load_pose_prior(), settings, ground
@@ -133,7 +144,7 @@ def fit_bodies(
         known or {},
         fps,
     )
-    result = _Result.empty(model, frames, persons)
+    result = _Result.empty(model, frames, persons, bias)
     for person, span in spans.items():
         pose, factor = solver.poses(evidence[person], shapes.people[person], shapes.offsets, fps)
         result.put(solver, person, span, pose, factor, shapes)
@@ -203,9 +214,10 @@ class _Result:
     covariance: Floats
     filled: NDArray[np.bool_]
     guided: NDArray[np.bool_]
+    common_bias: Floats
 
     @classmethod
-    def empty(cls, model: BodyModel, frames: int, persons: int) -> _Result:
+    def empty(cls, model: BodyModel, frames: int, persons: int, common_bias: Floats) -> _Result:
         def nan(*shape: int) -> Floats:
             return np.full(shape, np.nan)
 
@@ -219,6 +231,7 @@ class _Result:
             nan(frames, persons, 17, 3, 3),
             np.zeros((frames, persons), dtype=bool),
             np.zeros((frames, persons), dtype=bool),
+            common_bias,
         )
 
     def put(
@@ -249,7 +262,7 @@ class _Result:
         axes = body_axes(body.keypoints)[:, None]
         # A joint is what was seen less the offset: what is not known of it is not of the joint.
         habits = axes @ shapes.offsets_covariance @ axes.swapaxes(-1, -2)
-        own = solver.settings.own_bias**2 * np.eye(3)
+        own = (solver.settings.own_bias**2 + self.common_bias**2)[:, None, None] * np.eye(3)
         turned = by_frame.swapaxes(-1, -2)
         self.covariance[span, person] = by_frame @ spread @ turned + habits + own
 

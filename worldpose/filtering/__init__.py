@@ -10,7 +10,12 @@ from worldpose.filtering.judging import Judgement, Suspects, judge_detections, l
 from worldpose.filtering.settings import FilteringSettings
 from worldpose.filtering.spread import Spread
 from worldpose.filtering.view_bias import ViewBias
-from worldpose.filtering.views import BodyViews, perceived_joints, view_bodies
+from worldpose.filtering.views import (
+    BodyViews,
+    perceived_covariance,
+    perceived_joints,
+    view_bodies,
+)
 
 __all__ = [
     "BodyMotion",
@@ -26,6 +31,7 @@ __all__ = [
     "learn_from",
     "learn_habits",
     "measure_held_out",
+    "perceived_covariance",
     "perceived_joints",
     "view_bodies",
     "watch_motion",

@@ -36,6 +36,19 @@ def perceived_joints(joints: Floats, offsets: Floats) -> Floats:
     return moved
 
 
+def perceived_covariance(covariance: Floats, common_bias: Floats) -> Floats:
+    """Return how sure it is where a detector sees the joints of bodies (frames, persons, 17, 3, 3).
+
+    What it takes for a joint is followed by the offsets, however far from the joint that is.
+
+    Args:
+        covariance: (frames, persons, 17, 3, 3) [m^2], of the bodies' joints.
+        common_bias: (17,) per axis, of what all views err in common [m]; in `covariance`.
+    """
+    seen: Floats = covariance - common_bias[:, None, None] ** 2 * np.eye(3)
+    return seen
+
+
 def view_bodies(cameras: Camera, joints: Floats, covariance: Floats) -> BodyViews:
     """Return bodies in all pictures.
 

@@ -12,6 +12,7 @@ from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.cameras import Camera
 from worldpose.triangulation.array_checks import check_arrays
 from worldpose.triangulation.calibration_errors import stated_errors
+from worldpose.triangulation.common_bias import BY_JOINT, learn_common_bias
 from worldpose.triangulation.exchanges import find_exchanges, undo_exchanges
 from worldpose.triangulation.limbs import limb_lengths, mend_limbs
 from worldpose.triangulation.midhip import midhip_shift
@@ -39,11 +40,13 @@ class DetectorModel:
             share, with it, and without the offsets.
         factor: on the variance that calibration is stated to have.
         lengths: (persons, limbs) [m] of everybody's limbs; NaN where nothing tells.
+        common_bias: (joints,) per axis, of what all views err in common [m].
     """
 
     noise: tuple[NoiseModel, ...]
     factor: float
     lengths: Floats
+    common_bias: Floats
 
     def of_person(self, person: int) -> DetectorModel:
         """Return the model for one person alone."""
@@ -69,7 +72,8 @@ class Triangulation:
         offsets: (frames, cameras, persons, 2) [px], by how much the camera sees the person beside
             where all cameras put him; 0 where unknown.
         calibration_covariance: (frames, persons, 17, 3, 3) [m^2], the part of `covariance` that
-            observations of more frames do not lessen: offsets and the shared bias.
+            observations of more frames do not lessen: offsets and the common bias.
+        common_bias: (17,) per axis, of what all views err in common [m]; in `covariance`.
         noise: what the detector's errors were taken to be.
         agreement: what `report` is made of.
     """
@@ -83,6 +87,7 @@ class Triangulation:
     exchanged: NDArray[np.bool_]
     offsets: Floats
     calibration_covariance: Floats
+    common_bias: Floats
     noise: NoiseModel
     agreement: Agreement
 
@@ -136,8 +141,9 @@ def triangulate_joints(
         model = learn_detector(cameras, *some, settings, camera_covariance)
     passes = _passes(cameras, arrays, settings, camera_covariance, model)
     solution, shift, noise = passes.solution, passes.shift, passes.model.noise[-1]
+    bias = passes.model.common_bias
     lasting = np.broadcast_to(
-        passes.further + settings.common_bias**2 * np.eye(3), solution.covariance.shape
+        passes.further + bias[:, None, None] ** 2 * np.eye(3), solution.covariance.shape
     )
     covariance = solution.covariance + lasting
     return Triangulation(
@@ -150,6 +156,7 @@ def triangulate_joints(
         exchanged=passes.exchanged,
         offsets=shift[..., :2] if len(shift) else np.zeros((*detection_index.shape, 2)),
         calibration_covariance=lasting,
+        common_bias=bias,
         noise=noise,
         agreement=_agreement(passes, covariance, detection_index),
     )
@@ -245,7 +252,13 @@ def _passes(
     if settings.mend_limbs:
         seen = (rig, keypoints, models[-1].precision(confidence), index, shift)
         mend_limbs(*seen, settings, solution, lengths)
-    model = DetectorModel(tuple(models), factor, lengths)
+    bias = np.full(confidence.shape[-1], settings.common_bias)
+    if known is not None:
+        bias = known.common_bias
+    elif settings.learn_noise and len(bias) == len(BY_JOINT):
+        seen_noise = solution.covariance + further
+        bias = BY_JOINT * learn_common_bias(solution.joints, seen_noise, settings.common_bias)
+    model = DetectorModel(tuple(models), factor, lengths, bias)
     return _Passes(solution, exchanged, shift, further, model, misplaced)
 
 

