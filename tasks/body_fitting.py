@@ -23,6 +23,7 @@ from worldpose.body_fitting import (
     Pictures,
     Shape,
     Sightings,
+    far_offsets,
     find_sightings,
     fit_bodies,
     report_fit,
@@ -152,6 +153,17 @@ def publish_fit(
         coordinates={"frame": people.clip.frame, "person": people.person},
         attributes={"body_model": model.name},
     )
+    far = far_offsets(fit.offsets, people.common_bias)
+    if far:
+        joints = ", ".join(
+            f"{name} {1e3 * length:.0f} mm (usually below {1e3 * most:.0f})"
+            for name, (length, most) in far.items()
+        )
+        result.warnings.append(
+            f"{layout.stage}: bodies lie far from the triangulated joints for the whole clip: "
+            f"{joints}. One of the two is wrong there: compare both with the images, or export "
+            "--stage retriangulation."
+        )
     pictures = Pictures(people.clip.cameras, people.keypoints, people.index)
     report = report_fit(fit, people.joints, people.clip.fps, pictures)
     result.figures.update(figures_of(report, [f"person{person}" for person in people.person]))

@@ -17,6 +17,7 @@ from worldpose.body_fitting.glimpses import Glimpses, place_glimpses
 from worldpose.body_fitting.monocular import MonocularEstimates, read_monocular
 from worldpose.body_fitting.moving_view import between_frames, recognise_people, sight_people
 from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.body_fitting.shared_bias import far_offsets
 from worldpose.body_fitting.sightings import Sightings, find_sightings
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "Shape",
     "Sightings",
     "between_frames",
+    "far_offsets",
     "find_sightings",
     "fit_bodies",
     "fit_shape",

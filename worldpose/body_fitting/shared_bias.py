@@ -33,6 +33,8 @@ def _basis() -> Floats:
     return np.stack(columns, axis=-1)
 
 
+FAR: Final = 3.0
+"""Offsets beyond this are no detector's usual ones [standard deviations]: one in 34."""
 MIRRORED_OFFSETS: Final = _basis()
 """(17, 3, 26)"""
 
@@ -49,3 +51,25 @@ def body_axes(joints: Floats) -> Floats:
     front /= np.linalg.norm(front, axis=-1, keepdims=True)
     axes: Floats = np.stack([front, left, np.cross(front, left)], axis=-1)
     return axes
+
+
+def far_offsets(offsets: Floats, common_bias: Floats) -> dict[str, tuple[float, float]]:
+    """Return where bodies contradict the joints that they are fitted to.
+
+    Shape and offsets together follow the detector: an offset much larger than a detector's common
+    bias says that one of them is wrong, the joints or the bodies.
+
+    Args:
+        offsets: (17, 3) [m], of joints of bodies.
+        common_bias: (17,) per axis [m]; 0 = not known.
+
+    Returns:
+        By joint, left and right as one: length of the offset and the largest usual one [m].
+    """
+    length = np.linalg.norm(offsets, axis=-1)
+    far = (length > FAR * common_bias) & (common_bias > 0.0)
+    return {
+        COCO17[joint].removeprefix("left_"): (float(length[joint]), FAR * float(common_bias[joint]))
+        for joint in np.flatnonzero(far)
+        if not COCO17[joint].startswith("right")
+    }
