@@ -21,7 +21,6 @@ from worldpose.review import (
     append,
     read_journal,
     replay_corrections,
-    standing_corrections,
     value_now,
     with_was,
 )
@@ -33,7 +32,7 @@ from worldpose.store import Store
 def corrected_match(store: Store, folder: MatchFolder, registration: Registration) -> Match:
     """The match as people have corrected it; no file of its folder changes."""
     journal = read_journal(store, registration.spec.match_id)
-    replay = _replayed(store, folder, standing_corrections(journal.records))
+    replay = _replayed(store, folder, tuple(journal.standing.values()))
     return Match(replay.folder, registration, journal, replay.applied, replay.stale)
 
 
@@ -83,8 +82,8 @@ def new_corrections(
         InputError: an edit that does not apply, because of what it names or of what somebody else
             did in between; nothing is kept of any.
     """
-    standing = standing_corrections(journal.records)
-    if standing != standing_corrections(match.journal.records):
+    standing = tuple(journal.standing.values())
+    if standing != tuple(match.journal.standing.values()):
         raise InputError(
             f"corrections of {match.match_id}",
             expected="those that were there when this was begun",
@@ -138,7 +137,7 @@ def keep_edits(
     """
     while True:
         match = open_match()
-        said = {each.id: each for each in match.journal.records if isinstance(each, Correction)}
+        said = match.journal.corrections
         fresh = {name: edit for name, edit in given.items() if name not in said}
         require_fitting(store, match, [*fresh.values()])
         require_seen(store, match, [*fresh.values()])
@@ -152,9 +151,9 @@ def keep_edits(
             results=store.run(match.match_id).results if runs else {},
             ids=tuple(fresh),
         )
-        said |= {each.id: each for each in corrections}
+        made = {each.id: each for each in corrections}
         if not corrections or append(store, match.journal, corrections) is not None:
-            return [said[name] for name in given]
+            return [made.get(name) or said[name] for name in given]
 
 
 def _require_unchanged(folder: MatchFolder, standing: Sequence[Correction], edit: Edit) -> None:
@@ -193,11 +192,11 @@ def withdrawal(journal: Journal, correction: str, *, who: str, why: str) -> With
     Raises:
         InputError: no such correction stands.
     """
-    standing = [each.id for each in standing_corrections(journal.records)]
-    if correction not in standing:
+    if correction not in journal.standing:
+        last = [*journal.standing][-10:]
         raise InputError(
             f"correction {correction}",
-            expected=f"one of {', '.join(standing) or '(none)'}",
+            expected=f"one that stands, such as the last: {', '.join(last) or '(none)'}",
             found="no such correction",
             todo="List them with `worldpose review show MATCH`.",
         )

@@ -10,6 +10,7 @@ from pydantic import JsonValue
 
 from data_contracts.review import Edit
 from flows.detection import seen_by, seen_in_broadcast
+from flows.ingest import edits_by_camera
 from flows.stage import Match
 from flows.stale import StaleEditError, edits_since
 from worldpose.errors import InputError
@@ -48,12 +49,7 @@ def detections_now(store: Store, match: Match, camera: str, frame: int) -> Obser
         boxes=row["boxes"].values,
         score=row["score"].values,
     )
-    said = [
-        correction.edit
-        for correction in match.corrections
-        if isinstance(correction.edit, DETECTION_EDITS)
-        and (correction.edit.camera, correction.edit.frame) == (camera, frame)
-    ]
+    said = [edit for edit in edits_by_camera(match).get(camera, ()) if edit.frame == frame]
     later = edits_since(said, taken_in, f"{camera}, frame {frame}", match.match_id)
     return replay_detections(found, later).observations
 

@@ -45,7 +45,7 @@ class Gatekeeper:
             if name.partition("/")[0] != stage:
                 continue
             manifest = self._manifest(name, key)
-            decision = decision_on(self.match.journal.records, name, manifest.content)
+            decision = decision_on(self.match.journal.questions, name, manifest.content)
             if decision is None:
                 reasons = self._reasons(gate, manifest)
                 if reasons:
@@ -65,7 +65,7 @@ class Gatekeeper:
         ]
 
         def unasked(journal: Journal) -> list[ReviewRequest]:
-            known = requests_by_id(journal.records)
+            known = requests_by_id(journal.questions)
             return [request for request in requests if request.id not in known]
 
         if requests:
@@ -85,7 +85,7 @@ class Gatekeeper:
     def _has_refusals(self) -> bool:
         return any(
             isinstance(record, ReviewDecision) and record.verdict == "reject"
-            for record in self.match.journal.records
+            for record in self.match.journal.questions
         )
 
     def _request(self, unit: WaitingUnit, key: str, run_id: str) -> ReviewRequest:

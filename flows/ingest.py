@@ -5,13 +5,15 @@ A unit brings in given 2D poses, or else the index of its video, in which `detec
 
 from __future__ import annotations
 
-from pydantic import JsonValue
+from pydantic import JsonValue, TypeAdapter
 
 from data_contracts.records import Record
 from flows.stage import Match, Stage, once_a_match
 from worldpose.ingest import unit_frames
 from worldpose.ingest.footage import footage_clips, footage_size
-from worldpose.review.detections import DETECTION_EDITS
+from worldpose.review.detections import DETECTION_EDITS, DetectionEdit
+
+_EDITS = TypeAdapter(list[DetectionEdit])
 
 
 class IngestSettings(Record):
@@ -67,14 +69,20 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
 
 def edits_of(match: Match, camera: str, first: int = 0, count: int = 2**62) -> dict[str, JsonValue]:
     """What people corrected of whom a camera saw in some frames; nothing where they did not."""
-    said: list[JsonValue] = [
-        correction.edit.model_dump(mode="json")
-        for correction in match.corrections
-        if isinstance(correction.edit, DETECTION_EDITS)
-        and correction.edit.camera == camera
-        and first <= correction.edit.frame < first + count
-    ]
-    return {"edits": said} if said else {}
+    edits = edits_by_camera(match).get(camera, ())
+    said = [edit for edit in edits if first <= edit.frame < first + count]
+    return {"edits": _EDITS.dump_python(said, mode="json")} if said else {}
+
+
+@once_a_match
+def edits_by_camera(match: Match) -> dict[str, list[DetectionEdit]]:
+    """Return the corrections of detections of each camera, in the order they were made."""
+    found: dict[str, list[DetectionEdit]] = {}
+    for correction in match.corrections:
+        edit = correction.edit
+        if isinstance(edit, DETECTION_EDITS):
+            found.setdefault(edit.camera, []).append(edit)
+    return found
 
 
 def video_sources(match: Match, unit: str) -> dict[str, JsonValue]:

@@ -100,7 +100,9 @@ def plan_stage(
         if known.keys() != inputs.keys():
             blocked.append(f"{stage.name}/{unit}")
             continue
-        recipe = Recipe(
+        # Not validated here: all values are ours, `key_of` refuses what is not plain JSON, and
+        # checking thousands of corrections value by value takes longer than all the rest.
+        recipe = Recipe.model_construct(
             match_id=match.match_id,
             stage=stage.name,
             unit=unit,

@@ -61,11 +61,10 @@ def reviews_of(match: Match, latest: RunRecord | None) -> list[Review]:
 
 
 def _reviews(journal: Journal, latest: RunRecord | None) -> list[Review]:
-    records = tuple(journal.records)
     results = {} if latest is None else latest.results
     found = []
-    for request in requests_by_id(records).values():
-        decisions = [decision_on(records, *each) for each in request.contents.items()]
+    for request in requests_by_id(journal.questions).values():
+        decisions = [decision_on(journal.questions, *each) for each in request.contents.items()]
         is_current = any(results.get(unit) == key for unit, key in request.keys.items())
         found.append(Review(request, decisions[0] if decisions else None, is_current))
     return found
@@ -84,8 +83,8 @@ def warnings_of(match: Match) -> list[str]:
 
 def still_waiting(match: Match, latest: RunRecord | None) -> list[WaitingUnit]:
     """What the latest run waits for, without what was approved since."""
-    records = match.journal.records
-    decisions = [each for each in records if isinstance(each, ReviewDecision)]
+    said = match.journal.questions
+    decisions = [each for each in said if isinstance(each, ReviewDecision)]
     verdicts = {decision.request: decision.verdict for decision in decisions}
     waiting = () if latest is None else latest.waiting
     return [unit for unit in waiting if verdicts.get(unit.request) != "approve"]
@@ -212,12 +211,11 @@ def origins_of(store: Store, match: Match, record: RunRecord) -> dict[str, Origi
     """Where each result of a run comes from: automatic, corrected or rejected, by `stage/unit`."""
     made_from: dict[str, tuple[str, ...]] = {}
     rejected = set()
-    records = tuple(match.journal.records)
     for name, key in record.results.items():
         stage, _, unit = name.partition("/")
         manifest = store.manifest(match.match_id, stage, unit, key)
         made_from[name] = tuple(manifest.recipe.inputs)
-        decision = decision_on(records, name, manifest.content)
+        decision = decision_on(match.journal.questions, name, manifest.content)
         if decision is not None and decision.verdict == "reject":
             rejected.add(name)
     return unit_origins(made_from, match.corrections, rejected)

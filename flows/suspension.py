@@ -85,7 +85,7 @@ def take_verdict(store: Store, match_id: str, waiting: Sequence[WaitingUnit]) ->
     def decisions(journal: Journal) -> list[ReviewDecision]:
         # Somebody may have decided with the command line between the resume and now.
         decided = {
-            record.request for record in journal.records if isinstance(record, ReviewDecision)
+            record.request for record in journal.questions if isinstance(record, ReviewDecision)
         }
         return [
             ReviewDecision(

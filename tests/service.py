@@ -37,6 +37,7 @@ class Served:
 
     def __init__(self, folder, webhook):
         self.environment = {}
+        self.launcher = []  # what begins the command: setpriv, nice
         self.project = folder / "project"
         self.webhook = webhook
         self.ports = dict(zip(("prefect", "pages", "metrics"), free_ports(3), strict=True))
@@ -63,7 +64,7 @@ class Served:
         options = [str(each) for pair in arguments.items() for each in pair]
         with self.said.open("ab") as output:
             self.process = subprocess.Popen(
-                [*WORLDPOSE, "serve", *options],
+                [*self.launcher, *WORLDPOSE, "serve", *options],
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 env=environment,

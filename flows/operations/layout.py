@@ -16,6 +16,7 @@ from pydantic import ValidationError
 from data_contracts.operations import Arrival, Priority, Serving
 from worldpose.errors import UsageError
 from worldpose.release import whole_file
+from worldpose.store.blobs import storage_errors
 
 PRIORITIES: Final[tuple[Priority, ...]] = ("urgent", "normal", "background")
 """First to last; `INBOX/urgent` and `INBOX/background` take matches of those."""
@@ -71,7 +72,8 @@ class StateFolder:
 
     def write_arrival(self, arrival: Arrival) -> None:
         """Keep what is known of one entry; its name never becomes a path."""
-        with whole_file(self._arrival_file(arrival.name)) as draft:
+        file = self._arrival_file(arrival.name)
+        with storage_errors(str(file)), whole_file(file) as draft:
             draft.write_text(arrival.model_dump_json(indent=2) + "\n")
 
     def end_orderly(self) -> None:

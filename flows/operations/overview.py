@@ -117,7 +117,7 @@ class Overview:
         return MatchGlance(match_id, latest, at_work[-1] if at_work else None, stages)
 
     def _stages(self, run: RunRecord) -> dict[str, tuple[UnitGlance, ...]]:
-        records = tuple(read_journal(self.store, run.match_id).records)
+        records = read_journal(self.store, run.match_id).questions
         asked = requests_by_id(records)
         units: dict[str, list[UnitGlance]] = {}
         for name, glance in (

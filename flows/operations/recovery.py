@@ -33,6 +33,8 @@ from flows.operations.plan import ServePlan
 
 SILENT: Final = timedelta(seconds=90)
 """A run that gave no sign of life for so long is looked after; they come every 30 s."""
+STARTING: Final = timedelta(minutes=5)
+"""What the process of a run may take until the run is at work, on a machine with too much to do."""
 MOST_BEGINNINGS: Final = 3
 """A run that was killed so often is left crashed, for a person to look at."""
 AT_WORK: Final = (StateType.RUNNING, StateType.PENDING, StateType.CANCELLING)
@@ -57,7 +59,7 @@ async def begin_again(plan: ServePlan, *, at_start: bool = False) -> list[str]:
                 state: State[Any] = Cancelled() if was_cancelled else Crashed(message=KILLED)
                 await client.set_flow_run_state(run.id, state, force=True)
         else:
-            for run in await _runs(client, plan, StateType.RUNNING):
+            for run in await _runs(client, plan, StateType.RUNNING, StateType.PENDING):
                 if await _is_dead(client, plan, run):
                     await client.set_flow_run_state(run.id, Crashed(message=KILLED), force=True)
         for run in await _runs(client, plan, StateType.CRASHED, StateType.FAILED):
@@ -79,8 +81,13 @@ def may_begin_again(run: FlowRun) -> bool:
 
 
 async def _is_dead(client: PrefectClient, plan: ServePlan, run: FlowRun) -> bool:
-    """Whether a run that seems to run has neither a process nor given a sign of life lately."""
-    since = datetime.now(UTC) - SILENT
+    """Whether a run that seems to run or start has no process and gave no sign of life lately.
+
+    A run is left starting if its process was killed while the server could not be told, on a full
+    disk for instance. It would keep its place in the pool from all others.
+    """
+    is_starting = run.state_type == StateType.PENDING
+    since = datetime.now(UTC) - (STARTING if is_starting else SILENT)
     if run.state is None or run.state.timestamp > since:
         return False
     pid = str(run.infrastructure_pid or "").rpartition(":")[2]

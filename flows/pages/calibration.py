@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections import OrderedDict
 from pathlib import Path
 from threading import Lock
@@ -190,6 +191,8 @@ def warm_up(desk: Desk) -> None:
             preview(drawing, clicked, (spec.width, spec.height), settings=_POINTS_ALONE)
         except (OSError, WorldposeError):
             continue  # the queue says what is wrong with it
+    gc.collect()
+    gc.freeze()  # looking through long journals for garbage would hold up requests
 
 
 def _read(match: Match, owner: str, frame: int | None) -> NDArray[np.uint8]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import logging
+
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
@@ -9,9 +12,11 @@ from fastapi.responses import JSONResponse
 from flows.stale import StaleEditError
 from worldpose.errors import InputError, InternalError, WorldposeError
 
+LOG = logging.getLogger("worldpose.pages")
+
 
 def add_answers(app: FastAPI) -> None:
-    """Answer with JSON: 409 and the difference, 422 and what to do, 500 and the reason."""
+    """Answer with JSON: 409 and the difference, 422 and what to do, 500 or 507 and the reason."""
 
     @app.exception_handler(StaleEditError)
     def stale(request: Request, error: StaleEditError) -> JSONResponse:
@@ -39,7 +44,11 @@ def add_answers(app: FastAPI) -> None:
 
     @app.exception_handler(WorldposeError)
     def failed(request: Request, error: WorldposeError) -> JSONResponse:
-        return JSONResponse({"error": str(error)}, status_code=500)
+        said = " ".join(str(error).split())
+        LOG.warning("%s %r failed: %s", request.method, request.url.path, said)
+        cause = error.__cause__
+        is_full = isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT)
+        return JSONResponse({"error": str(error)}, status_code=507 if is_full else 500)
 
     @app.exception_handler(Exception)
     def unforeseen(request: Request, error: Exception) -> JSONResponse:

@@ -56,7 +56,7 @@ def routes(desk: Desk) -> APIRouter:
 
     def evidence_of(match_id: str, request: str) -> Evidence:
         match = desk.match(match_id)
-        asked = requests_by_id(match.journal.records).get(request)
+        asked = requests_by_id(match.journal.questions).get(request)
         if asked is None:
             raise HTTPException(404, "no such review")
         with lock:  # one drawing at a time: they take all the memory of their pictures
@@ -94,7 +94,7 @@ def routes(desk: Desk) -> APIRouter:
         if evidence_of(match_id, request).video is None:
             raise HTTPException(404, "no camera of this clip has a video")
         match = desk.match(match_id)
-        asked = requests_by_id(match.journal.records)[request]
+        asked = requests_by_id(match.journal.questions)[request]
         name = hashlib.sha256(f"{match_id} {request}".encode()).hexdigest()
         file = Path(videos.name) / f"{name}.mp4"
         with filming:

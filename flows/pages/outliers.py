@@ -31,7 +31,7 @@ def routes(desk: Desk) -> APIRouter:
     @router.get("/outliers")
     def outliers(match_id: str, request: str) -> list[dict[str, Any]]:
         match = desk.match(match_id)
-        asked = requests_by_id(match.journal.records).get(request)
+        asked = requests_by_id(match.journal.questions).get(request)
         if asked is None:
             raise HTTPException(404, "no such review")
         run = open_run(desk.store.url, match_id, asked.run_id, complete=True)

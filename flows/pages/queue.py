@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any, Final
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Query
 
 from data_contracts.review import Correction, ReviewRequest
 from flows.cli.review_text import correction_json, in_words, review_json
@@ -16,19 +16,13 @@ from flows.stage import Match
 from worldpose.errors import WorldposeError
 from worldpose.store import Store
 
+CORRECTIONS: Final = 200
+"""Most that one answer has: a match can have many thousand, and a page shows the last ones."""
+
 
 def routes(desk: Desk) -> APIRouter:
     """Routes of the queue and of one match."""
     router = APIRouter(prefix="/api/matches")
-    shown_corrections: dict[str, dict[str, Any]] = {}
-
-    def as_shown(correction: Correction) -> dict[str, Any]:
-        """A correction never changes, and a long journal has many thousand."""
-        name = f"{correction.match_id}/{correction.id}"
-        if name not in shown_corrections:
-            words = in_words(correction)
-            shown_corrections[name] = {**correction_json(correction), "words": words}
-        return shown_corrections[name]
 
     @router.get("")
     def matches() -> dict[str, Any]:
@@ -38,12 +32,11 @@ def routes(desk: Desk) -> APIRouter:
     def match(match_id: str) -> dict[str, Any]:
         opened = desk.match(match_id)
         latest = latest_run(desk.store, match_id)
-        states = [*((each, None) for each in opened.corrections), *opened.stale]
         folder = opened.folder
         return {
             **_glance(desk, opened),
             "reviews": [shown(each) for each in reviews_of(opened, latest)],
-            "corrections": [{**as_shown(each), "objection": why} for each, why in states],
+            **_corrections(opened),
             "cameras": [
                 {
                     "id": camera.id,
@@ -60,7 +53,36 @@ def routes(desk: Desk) -> APIRouter:
             "warnings": [] if latest is None else list(latest.warnings),
         }
 
+    @router.get("/{match_id}/corrections")
+    def corrections(match_id: str, skip: Annotated[int, Query(ge=0)] = 0) -> dict[str, Any]:
+        return _corrections(desk.match(match_id), skip)
+
     return router
+
+
+def _corrections(match: Match, skip: int = 0) -> dict[str, Any]:
+    """Return the last corrections that stand, those that no longer apply after all others.
+
+    Args:
+        match: with the corrections so far.
+        skip: how many of the last ones a page has already.
+    """
+    count = len(match.corrections) + len(match.stale)
+    end = max(0, count - skip)
+    first = max(0, end - CORRECTIONS)
+    applied: list[tuple[Correction, str | None]] = [
+        (each, None) for each in match.corrections[first:end]
+    ]
+    stale = match.stale[
+        max(0, first - len(match.corrections)) : max(0, end - len(match.corrections))
+    ]
+    return {
+        "corrections": [
+            {**correction_json(each), "words": in_words(each), "objection": why}
+            for each, why in [*applied, *stale]
+        ],
+        "corrections_before": first,
+    }
 
 
 def shown(review: Review) -> dict[str, Any]:

@@ -82,7 +82,7 @@ class Told:
 def glance(monkeypatch):
     """A function that gives the match of such a store at a glance."""
     monkeypatch.setattr(overview, "latest_run", lambda store, match: store.latest)
-    journal = lambda store, match: SimpleNamespace(records=store.journal)  # noqa: E731
+    journal = lambda store, match: SimpleNamespace(questions=store.journal)  # noqa: E731
     monkeypatch.setattr(overview, "read_journal", journal)
 
     def look(*told, **more):

@@ -1,11 +1,15 @@
 """Which runs begin again by themselves."""
 
+import asyncio
+from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
 from uuid import uuid4
 
 import pytest
 from prefect.client.schemas.objects import FlowRun
-from prefect.states import Completed, Crashed, Failed
+from prefect.states import Completed, Crashed, Failed, Pending, Running
 
+from flows.operations import recovery
 from flows.operations.recovery import MOST_BEGINNINGS, may_begin_again
 
 LOST = "Flow run encountered an exception: LostMachinesError: the Dask scheduler was lost"
@@ -25,3 +29,44 @@ def test_runs_begin_again_that_ended_by_no_fault_of_their_own(state, again):
     assert may_begin_again(run) is again
     tired = run.model_copy(update={"run_count": MOST_BEGINNINGS})
     assert not may_begin_again(tired)
+
+
+class Server:
+    """A Prefect server with one run, whose process is gone or at work."""
+
+    def __init__(self, run):
+        self.run, self.given = run, []
+
+    async def __aenter__(self):
+        return self
+
+    async def __aexit__(self, *error):
+        pass
+
+    async def read_flow_runs(self, *, flow_run_filter, deployment_filter):
+        return [self.run] if self.run.state_type in flow_run_filter.state.type.any_ else []
+
+    async def set_flow_run_state(self, flow_run_id, state, *, force):
+        self.given.append(state.name)
+        self.run = self.run.model_copy(update={"state": state, "state_type": state.type})
+
+
+@pytest.mark.parametrize("is_alive", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "minutes", "is_due"),
+    [(Running, 1, False), (Running, 2, True), (Pending, 4, False), (Pending, 6, True)],
+)
+def test_a_run_whose_process_is_gone_begins_again_also_while_it_starts(
+    kind, minutes, is_due, is_alive, monkeypatch
+):
+    at = datetime.now(UTC) - timedelta(minutes=minutes)
+    state = kind().model_copy(update={"timestamp": at})
+    run = FlowRun(flow_id=uuid4(), name="inbox", state=state, state_type=state.type, run_count=1)
+    server = Server(run.model_copy(update={"infrastructure_pid": "host:4711"}))
+    monkeypatch.setattr(recovery, "get_client", lambda: server)
+    monkeypatch.setattr(recovery, "is_alive", lambda pid: pid == 4711 and is_alive)
+    plan = SimpleNamespace(owns_prefect=True, name="worldpose")
+    again = asyncio.run(recovery.begin_again(plan))
+    expected = is_due and not is_alive
+    assert again == (["inbox"] if expected else [])
+    assert server.given == (["Crashed", "AwaitingRetry"] if expected else [])

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from data_contracts.conventions import COCO17
 from worldpose.errors import InputError
@@ -68,7 +68,7 @@ def region_counts(
     error = np.where(counts[..., None], error, 0.0)
     covariance = np.where(counts[..., None, None], covariance, np.eye(3))
     squared = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(axis=-1)
-    inside: Flags = np.asarray(counts & (squared <= chi2.ppf(level, 3)))
+    inside: Flags = np.asarray(counts & (squared <= chdtri(3, 1.0 - level)))
     found = {}
     for group, parts in JOINT_GROUPS.items():
         some = [index for index, name in enumerate(COCO17) if any(part in name for part in parts)]

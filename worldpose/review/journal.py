@@ -11,18 +11,24 @@ process added since.
 
 from __future__ import annotations
 
-import json
 import re
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
 
-from data_contracts.review import JournalEntry, ReviewRecord
+from data_contracts.review import (
+    Correction,
+    JournalEntry,
+    ReviewDecision,
+    ReviewRecord,
+    ReviewRequest,
+    Withdrawal,
+)
 from worldpose.errors import CorruptionError
 from worldpose.store import Store
-from worldpose.store.documents import checksum_of, seal, unseal
+from worldpose.store.documents import checksum_of, read_checksum, seal, unseal
 from worldpose.store.paths import checked_name
 
 _ENTRY = re.compile(r"(\d{6,})\.json")
@@ -41,6 +47,10 @@ class Journal:
         entries: the whole entries, first to last.
         last: the highest number taken, by a whole entry or a damaged one.
         damage: a line for each entry that is cut short, ignored, and to be said again.
+        tip: checksum of the last whole entry, on which the next one builds.
+        questions: the requests and decisions among the records, in order.
+        corrections: id to correction, also of those that were taken back.
+        standing: id to correction, in the order they were made, without those that were taken back.
     """
 
     match_id: str
@@ -48,13 +58,47 @@ class Journal:
     last: int = 0
     damage: tuple[str, ...] = ()
     tip: str | None = None
-    """Checksum of the last whole entry, on which the next one builds."""
+    questions: tuple[ReviewRequest | ReviewDecision, ...] = ()
+    corrections: Mapping[str, Correction] = field(default_factory=dict)
+    standing: Mapping[str, Correction] = field(default_factory=dict)
 
     @property
     def records(self) -> Iterator[ReviewRecord]:
         """All that was said, in order."""
         for entry in self.entries:
             yield from entry.records
+
+    def extended(
+        self, entries: Sequence[JournalEntry], last: int, damage: Sequence[str], tip: str | None
+    ) -> Journal:
+        """Return the journal with further entries; what it says is not gathered again.
+
+        Args:
+            entries: the whole ones among them.
+            last: the highest number taken.
+            damage: a line for each further damaged entry.
+            tip: checksum of the last whole entry.
+        """
+        questions = list(self.questions)
+        corrections, standing = dict(self.corrections), dict(self.standing)
+        for entry in entries:
+            for record in entry.records:
+                if isinstance(record, ReviewRequest | ReviewDecision):
+                    questions.append(record)
+                elif isinstance(record, Correction):
+                    corrections[record.id] = standing[record.id] = record
+                elif isinstance(record, Withdrawal):
+                    standing.pop(record.correction, None)
+        return Journal(
+            self.match_id,
+            (*self.entries, *entries),
+            last,
+            (*self.damage, *damage),
+            tip,
+            tuple(questions),
+            corrections,
+            standing,
+        )
 
 
 def read_journal(store: Store, match_id: str) -> Journal:
@@ -134,7 +178,9 @@ def _extended(journal: Journal, found: Sequence[tuple[int, bytes]], folder: str)
     """The journal with further entries: the number of each, and its bytes."""
     if not found:
         return journal
-    entries, damage, tip = list(journal.entries), list(journal.damage), journal.tip
+    entries: list[JournalEntry] = []
+    damage: list[str] = []
+    tip = journal.tip
     for number, data in found:
         where = f"{folder}/{number:06d}.json"
         try:
@@ -145,14 +191,15 @@ def _extended(journal: Journal, found: Sequence[tuple[int, bytes]], folder: str)
         if (entry.match_id, entry.number) != (journal.match_id, number):
             raise CorruptionError(f"{where} is entry {entry.number} of {entry.match_id}")
         if entry.previous != tip:
-            whole = f"entries up to {entries[-1].number}" if entries else "no entries"
+            before = [*journal.entries[-1:], *entries[-1:]]
+            whole = f"entries up to {before[-1].number}" if before else "no entries"
             raise CorruptionError(
                 f"{where} builds on an entry that is gone or damaged; {whole} before it are "
                 f"whole. Restore the folder {folder} from a copy."
             )
         entries.append(entry)
-        tip = json.loads(data)["checksum"]
-    return Journal(journal.match_id, tuple(entries), found[-1][0], tuple(damage), tip)
+        tip = read_checksum(data)
+    return journal.extended(entries, found[-1][0], damage, tip)
 
 
 def append(store: Store, journal: Journal, records: Sequence[ReviewRecord]) -> Journal | None:
@@ -178,8 +225,7 @@ def append(store: Store, journal: Journal, records: Sequence[ReviewRecord]) -> J
     )
     if not store.blobs.put_new(_path(journal.match_id, number), seal(entry)):
         return None
-    entries = (*journal.entries, entry)
-    return Journal(journal.match_id, entries, number, journal.damage, checksum_of(entry))
+    return journal.extended([entry], number, (), checksum_of(entry))
 
 
 def say(

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from worldpose.errors import InputError
 from worldpose.static_calibration.adjustment import (
@@ -430,7 +430,7 @@ class _Noise:
         stated = cls(1.0, np.inf, squared, freedom)
         if freedom < 1.0:
             return stated
-        low, high = chi2.ppf([0.5 * _CLEARLY, 1.0 - 0.5 * _CLEARLY], freedom)
+        low, high = chdtri(freedom, [1.0 - 0.5 * _CLEARLY, 0.5 * _CLEARLY])
         if low <= squared <= high:
             return stated
         worth = _STATED_FREEDOM + freedom

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterable
+from typing import Final
 
 from worldpose.errors import InputError
+
+_CONTAINERS: Final = (dict, list, tuple)
 
 
 def canonical_json(value: object) -> bytes:
@@ -16,10 +20,10 @@ def canonical_json(value: object) -> bytes:
             that is not text, a half surrogate, an array.
     """
     try:
-        _refuse_other_keys(value)
         text = json.dumps(
             value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
         )
+        _refuse_other_keys(value)
         return text.encode("utf-8")
     except (TypeError, ValueError, RecursionError) as error:
         raise InputError(
@@ -31,15 +35,17 @@ def canonical_json(value: object) -> bytes:
 
 
 def _refuse_other_keys(value: object) -> None:
-    # json.dumps turns a key 1 into "1" without a word, and two values would share a digest.
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            if not isinstance(key, str):
-                raise TypeError(f"the key {key!r} of type {type(key).__name__}")
-            _refuse_other_keys(inner)
-    elif isinstance(value, list | tuple):
-        for inner in value:
-            _refuse_other_keys(inner)
+    # json.dumps turns a key 1 into "1" without a word, and two values would share a digest. It
+    # has refused a value that contains itself, so this comes to an end.
+    containers = [value] if isinstance(value, _CONTAINERS) else []
+    for container in containers:
+        inner: Iterable[object] = container
+        if isinstance(container, dict):
+            for key in container:
+                if not isinstance(key, str):
+                    raise TypeError(f"the key {key!r} of type {type(key).__name__}")
+            inner = container.values()
+        containers += [each for each in inner if isinstance(each, _CONTAINERS)]
 
 
 def digest(data: bytes) -> str:

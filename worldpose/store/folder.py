@@ -40,9 +40,10 @@ class LocalBlobs:
 
     def read(self, path: str) -> bytes | None:
         """See `Blobs`."""
-        with storage_errors(str(self._at(path))):
+        target = self._at(path)
+        with storage_errors(str(target)):
             try:
-                return self._at(path).read_bytes()
+                return target.read_bytes()
             except (FileNotFoundError, NotADirectoryError):
                 return None
 
@@ -94,12 +95,7 @@ class LocalBlobs:
         """See `Blobs`."""
         top = self._at(prefix)
         with storage_errors(str(top)):
-            files = (
-                Path(folder, name)
-                for folder, _, names in os.walk(top, onerror=_raise_unless_absent)
-                for name in names
-            )
-            return sorted(filter(None, map(self._entry, files)), key=lambda entry: entry.path)
+            return sorted(_entries_below(str(top), prefix), key=lambda entry: entry.path)
 
     def staging(self) -> Path:
         """See `Blobs`. On the project's own file system, so that a rename can publish it."""
@@ -267,6 +263,26 @@ def _make_folder(path: Path) -> None:
     _sync_folder(path.parent)
 
 
-def _raise_unless_absent(error: OSError) -> None:
-    if not isinstance(error, FileNotFoundError | NotADirectoryError):
-        raise error
+def _entries_below(folder: str, path: str) -> Iterator[Entry]:
+    """Yield all files below a folder, without those that are removed meanwhile.
+
+    Args:
+        folder: where it is on the disk.
+        path: where it is below the root.
+    """
+    try:
+        with os.scandir(folder) as found:
+            inside = list(found)
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    for each in inside:
+        if each.is_dir():
+            if not each.is_symlink():
+                yield from _entries_below(each.path, f"{path}/{each.name}")
+            continue
+        try:
+            status = each.stat(follow_symlinks=False)
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        modified = datetime.fromtimestamp(status.st_mtime, UTC)
+        yield Entry(f"{path}/{each.name}", status.st_size, modified)

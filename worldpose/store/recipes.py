@@ -13,7 +13,7 @@ KEY_LENGTH = 32
 
 def key_of(recipe: Recipe) -> str:
     """The name of the result that `recipe` makes: the first 128 bits of the recipe's SHA-256."""
-    return digest(canonical_json(recipe.model_dump(mode="json")))[:KEY_LENGTH]
+    return digest(canonical_json(dict(recipe)))[:KEY_LENGTH]
 
 
 def explain_difference(old: Recipe, new: Recipe) -> list[str]:

@@ -311,5 +311,25 @@ def test_a_correction_that_was_taken_back_stands_no_more(store):
     say(store, "m", lambda _: [correction("a"), correction("b")])
     back = Withdrawal(match_id="m", correction="a", who="Ada", withdrawn_at=NOW)
     say(store, "m", lambda _: [back])
-    standing = standing_corrections(read_journal(store, "m").records)
+    journal = read_journal(store, "m")
+    standing = standing_corrections(journal.records)
     assert [each.id for each in standing] == ["b"]
+    assert tuple(journal.standing.values()) == standing
+    assert [*journal.corrections] == ["a", "b"]
+
+
+def test_what_a_journal_says_is_gathered_as_it_grows(store):
+    """Read at once, read piece by piece, and as `append` gives it."""
+    journal = read_journal(store, "m")
+    back = Withdrawal(match_id="m", correction="a", who="Ada", withdrawn_at=NOW)
+    for records in (
+        [request("q1", "1" * 64), correction("a")],
+        [correction("b"), decision("q1", "approve")],
+        [back, correction("c")],
+    ):
+        journal = append(store, journal, records)
+        assert read_journal(store, "m") == journal
+    assert read_journal(Store.open(store.url), "m") == journal
+    assert [*journal.standing] == ["b", "c"]
+    assert [*journal.corrections] == ["a", "b", "c"]
+    assert [each.kind for each in journal.questions] == ["request", "decision"]

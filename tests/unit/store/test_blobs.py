@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from contextlib import contextmanager
 
 import pytest
 
@@ -63,15 +63,17 @@ def test_what_goes_while_it_is_listed_is_not_there(
     blobs.put("a/2", b"2")
     staged = blobs.staging()
     (staged / "half").write_bytes(b"half")
-    walk = os.walk
+    scan = os.scandir
 
-    def walk_and_delete(*given: Any, **more: Any) -> Iterator[Any]:
-        for step in walk(*given, **more):
-            blobs.delete("a/1")
-            (staged / "half").unlink(missing_ok=True)
-            yield step
+    @contextmanager
+    def scan_and_delete(folder: str) -> Iterator[list[os.DirEntry[str]]]:
+        with scan(folder) as found:
+            inside = list(found)
+        blobs.delete("a/1")
+        (staged / "half").unlink(missing_ok=True)
+        yield inside
 
-    monkeypatch.setattr(os, "walk", walk_and_delete)
+    monkeypatch.setattr(os, "scandir", scan_and_delete)
     assert [entry.path for entry in blobs.entries("a")] == ["a/2"]
     assert [entry.size for entry in blobs.staged()] == [0]
 

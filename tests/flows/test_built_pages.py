@@ -1,0 +1,40 @@
+"""The review pages that ship are those that their sources make."""
+
+import hashlib
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SOURCES = ROOT / "infra" / "review_pages"
+BUILT = ROOT / "flows" / "pages" / "static"
+
+
+def source_digest():
+    """As `vite.config.js` computes it when it builds."""
+    files = [SOURCES / name for name in ("index.html", "package-lock.json", "vite.config.js")]
+    files += [file for file in (SOURCES / "src").rglob("*") if file.is_file()]
+    sha = hashlib.sha256()
+    for path in sorted(file.relative_to(SOURCES).as_posix() for file in files):
+        sha.update(f"{path}\0".encode() + (SOURCES / path).read_bytes() + b"\0")
+    return sha.hexdigest()
+
+
+def test_the_built_pages_are_of_the_sources_as_they_are():
+    built = (BUILT / "built_from.sha256").read_text().strip()
+    assert built == source_digest(), "build them anew: make pages"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    not (SOURCES / "node_modules" / "vite").is_dir(), reason="no vite: npm ci in infra/review_pages"
+)
+def test_building_the_sources_gives_the_committed_bytes(tmp_path):
+    out = tmp_path / "static"
+    command = [shutil.which("npx"), "vite", "build", "--outDir", str(out)]
+    subprocess.run(command, cwd=SOURCES, check=True, capture_output=True, timeout=300)
+    made = {path.relative_to(out): path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    kept = {file.relative_to(BUILT): file.read_bytes() for file in BUILT.rglob("*.*")}
+    assert made == kept
