@@ -29,12 +29,24 @@ class Gate:
         question: what a person is to decide.
         limits: a record of the largest figures with which `auto` lets a result pass.
         judged: the figures that are held against the limits, from a result's.
+        warned: figures of which a run warns that asks no person: beyond their limit, the result is
+            probably wrong. Beyond others it is less accurate than it could be.
     """
 
     stage: str
     question: str
     limits: Record
     judged: Callable[[Figures], Figures] = _as_they_are
+    warned: tuple[str, ...] = ()
+
+    def warnings(self, figures: Figures) -> tuple[str, ...]:
+        """Return a line for each figure that says that the result is probably wrong."""
+        judged = self.judged(figures) if figures else {}
+        return tuple(
+            _beyond(name, judged[name], limit)
+            for name, limit in self.limits
+            if name in self.warned and judged.get(name, 0.0) > limit
+        )
 
     def objections(self, figures: Figures) -> tuple[str, ...]:
         """A line for each figure beyond its limit; none where `auto` lets the result pass.
@@ -50,7 +62,7 @@ class Gate:
             if name not in judged:
                 lines.append(f"{name} could not be computed")
             elif judged[name] > limit:
-                lines.append(f"{name} is {judged[name]:.4g}, at most {limit:.4g} passes")
+                lines.append(_beyond(name, judged[name], limit))
         return tuple(lines)
 
     def excess(self, figures: Figures) -> float:
@@ -65,6 +77,10 @@ class Gate:
             if name in judged
         ]
         return max([0.0, *beyond])
+
+
+def _beyond(name: str, figure: float, limit: float) -> str:
+    return f"{name} is {figure:.4g}, at most {limit:.4g} passes"
 
 
 class CameraLimits(Record):
@@ -192,8 +208,18 @@ PEOPLE = Gate(
 CONSISTENCY = Gate(
     "camera_consistency", "Are these cameras wrong, for this reason?", ConsistencyLimits()
 )
-IDENTITIES = Gate("tracking", "Is every person one track, from end to end?", IdentityLimits())
-JOINTS = Gate("triangulation", "Are the joints where the pictures show them?", JointLimits())
+IDENTITIES = Gate(
+    "tracking",
+    "Is every person one track, from end to end?",
+    IdentityLimits(),
+    warned=("unmatched_share", "mean_ray_distance_m"),
+)
+JOINTS = Gate(
+    "triangulation",
+    "Are the joints where the pictures show them?",
+    JointLimits(),
+    warned=("standard_deviation_m",),
+)
 ADJUSTMENT = Gate(
     "bundle_adjustment",
     "Did adjustment mend the cameras, and are its outliers outliers?",

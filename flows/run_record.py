@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, Self
@@ -13,7 +13,7 @@ from flows import body_fitting, tracking, triangulation
 from flows.basis import basis_of
 from flows.gatekeeping import Gatekeeper, passed
 from flows.left_out import left_out_cameras, left_out_warnings
-from flows.method import METHOD
+from flows.method import GATES, METHOD
 from flows.planning import PlannedUnit, StagePlan, plan_stage
 from flows.progress import reporter
 from flows.settings import Overrides, settings_of
@@ -161,6 +161,7 @@ class RunLog:
             warnings=(
                 *left_out_warnings(self.match, left_out, tracking.MIN_CAMERAS),
                 *(text for name in self._in_order() for text in self.warnings[name]),
+                *self._doubts(),
             ),
             versions=libraries(),
             started_at=self.started_at,
@@ -170,6 +171,20 @@ class RunLog:
         self.gatekeeper.ask(self.run_id, self.waiting, self.results)
         self.store.finish_run(record)
         return record
+
+    def _doubts(self) -> Iterator[str]:
+        """Yield warnings of results that are probably wrong where no gate asks a person."""
+        if self.gatekeeper.policy != "never":
+            return
+        gates = {gate.stage: gate for gate in GATES}
+        for name in self._in_order():
+            gate = gates.get(name.partition("/")[0])
+            lines = gate.warnings(self.figures[name]) if gate is not None else ()
+            if lines:
+                yield (
+                    f"{name} may be wrong: {'; '.join(lines)}. Look at it on the pages: "
+                    "worldpose run with --gates auto asks for that."
+                )
 
     def _in_order(self) -> list[str]:
         """The units with results, in the order of the method."""

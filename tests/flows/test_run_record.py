@@ -1,10 +1,13 @@
 """What a run's record says when units fail, and when the match is edited under it."""
 
+from dataclasses import replace
+
 import pytest
 from command_line import TINY
 
 from data_contracts.review import MergedTracks
-from flows import iteration
+from flows import iteration, run_record
+from flows.gates import IDENTITIES, IdentityLimits
 from flows.iteration import Iteration, iterate_match
 from flows.method import METHOD
 from flows.registering import open_match
@@ -92,3 +95,12 @@ def test_iterations_begin_again_when_the_match_is_edited_between_two(store, monk
     monkeypatch.setattr(iteration, "_pass", one_pass)
     iterate_match(store, open_match(store, TINY), RunRequest({}), 2)
     assert begun == [(1, 0), (2, 0), (1, 1), (2, 1)]
+
+
+def test_a_run_that_asks_no_person_warns_of_a_result_that_is_probably_wrong(store, monkeypatch):
+    assert not [text for text in recorded(store, METHOD).warnings if "may be wrong" in text]
+    strict = replace(IDENTITIES, limits=IdentityLimits(mean_ray_distance_m=0.0))
+    monkeypatch.setattr(run_record, "GATES", (strict,))
+    (text,) = (text for text in recorded(store, METHOD).warnings if "may be wrong" in text)
+    assert text.startswith("tracking/clip may be wrong: mean_ray_distance_m is 0.")
+    assert "--gates auto" in text

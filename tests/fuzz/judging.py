@@ -164,6 +164,7 @@ def run_match(folder, project, overrides=(), until=None):
     from flows.settings import parse_overrides, selected_stages
     from worldpose.store import Store
 
+    _open_results_once(Store)
     stages = selected_stages(None, until)
     settings = parse_overrides(list(overrides), stages)
     store = Store.open_or_new(str(project))
@@ -186,6 +187,25 @@ def run_match(folder, project, overrides=(), until=None):
             log.finished(unit, failure)
         log.hold(stage)
     return store, match, log.close(), failures
+
+
+def _open_results_once(store_kind):
+    """Keep opened results for the rest of this process: a third of a case's time is to open them.
+
+    Results never change; cases by the command line open them each time.
+    """
+    opened, open_result = {}, store_kind.open_result
+    if hasattr(open_result, "of_fuzz"):
+        return
+
+    def open_once(store, *place, **options):
+        key = (store.url, *place, *options.items())
+        if key not in opened:
+            opened[key] = open_result(store, *place, **options)
+        return opened[key].copy(deep=False)
+
+    open_once.of_fuzz = True
+    store_kind.open_result = open_once
 
 
 def warnings_said(record, match):
