@@ -16,9 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.cameras import Camera
+from worldpose.tracking.camera_gates import CameraGates
 from worldpose.tracking.clip_arrays import ClipArray
-from worldpose.tracking.pair_agreement import Meeting, match_pair
+from worldpose.tracking.pair_agreement import SAMPLES, Meeting, match_pair
+from worldpose.tracking.pair_births import judge_pairs
 from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.visibility import CameraSight
 
 WINDOW: Final = 400
 """Most frames that are looked at."""
@@ -93,6 +96,15 @@ def diagnose_no_people(
     meetings.sort(key=lambda each: (each.agrees, len(each.angle) * each.share), reverse=True)
     agreeing = [each for each in meetings if each.agrees]
     if agreeing:
+        if not births and _all_pairs_have_rivals(cameras, rays, ground, settings):
+            return NoPeople(
+                cause="ambiguous_pairs",
+                message=f"detections of {' and '.join(camera_ids[n] for n in agreeing[0].cameras)} "
+                "fit each other in several ways, and in no frame one way is clearly likelier: two "
+                "cameras at the height of people see all of them on one line. Add a camera, or "
+                "mount one higher.",
+                evidence={"matches": float(len(agreeing[0].angle))},
+            )
         return _limit(cameras, camera_ids, agreeing, settings, ground, births)
     matched = [each for each in meetings if len(each.angle)]
     if matched and max(np.median(each.angle) for each in matched) < settings.min_angle:
@@ -118,6 +130,22 @@ def diagnose_no_people(
         "camera's projection of the scene with its image.",
         evidence={"matches": float(len(best.angle)), "possible": float(best.possible)},
     )
+
+
+def _all_pairs_have_rivals(
+    cameras: Camera, rays: NDArray[np.float64], ground: bool, settings: TrackingSettings
+) -> bool:
+    """Return whether two cameras' detections make people, but always in several likely ways."""
+    sight, gates, some = CameraSight(cameras), CameraGates(len(cameras.focal)), False
+    for frame in np.unique(np.linspace(0, len(rays) - 1, SAMPLES).astype(int)):
+        weights = np.isfinite(rays[frame, ..., 0]).astype(np.float64)
+        pairs = judge_pairs(
+            rays[frame], weights, sight, gates, ground, settings, everything=weights
+        )
+        if pairs.unique.any():
+            return False
+        some |= len(pairs.unique) > 0
+    return some
 
 
 def _usable(keypoints: ClipArray, confidence: ClipArray, least: int) -> NDArray[np.bool_]:
@@ -303,7 +331,8 @@ def _limit(
         cause="too_short",
         message=f"{seen}, but none was seen for long enough: {births} tracks were started and "
         f"dropped; tracking.min_track asks for {settings.min_track:g} s, and frames with fewer "
-        f"than {settings.birth_views} cameras count {settings.pair_evidence:g}.",
+        f"than {settings.birth_views} cameras count at most {settings.pair_evidence:g} where "
+        f"the odds that two detections are one person are below {settings.pair_odds:g}.",
         evidence={**evidence, "tracks": float(births)},
     )
 

@@ -128,10 +128,9 @@ def associate(
         T2. Each detection joins one group at most.
     """
     cameras = len(centers)
-    usual = min(settings.birth_views, max(2, cameras))
-    fewest = 2 if settings.pair_evidence > 0.0 else usual
+    needed = settings.birth_views
     usable = np.count_nonzero(weights > 0.0, axis=-1) >= settings.min_joints
-    if np.count_nonzero(usable.any(axis=1)) < fewest:
+    if np.count_nonzero(usable.any(axis=1)) < needed:
         return []
     camera, detection = np.nonzero(usable)
     origins, rays = centers[camera], directions[camera, detection]
@@ -150,24 +149,22 @@ def associate(
     order = np.argsort(distances[first, second], kind="stable")
     free = np.where(usable[..., None], weights, 0.0)
     groups: list[Sighting] = []
-    # Pairs that no third camera confirms take what the others leave.
-    for needed in sorted({usual, fewest}, reverse=True):
-        for a, b in zip(first[order], second[order], strict=True):
-            if not (usable[camera[a], detection[a]] and usable[camera[b], detection[b]]):
-                continue
-            seed = np.full(cameras, -1)
-            seed[camera[[a, b]]] = detection[[a, b]]
-            group = _grown(seed, centers, directions, free, settings)
-            views = np.count_nonzero(group.index >= 0)
-            if views >= needed and _person(group.joints, ground, settings):
-                groups.append(group)
-                members = np.flatnonzero(group.index >= 0)
-                usable[members, group.index[members]] = False
-                free[members, group.index[members]] = 0.0
+    for a, b in zip(first[order], second[order], strict=True):
+        if not (usable[camera[a], detection[a]] and usable[camera[b], detection[b]]):
+            continue
+        seed = np.full(cameras, -1)
+        seed[camera[[a, b]]] = detection[[a, b]]
+        group = _grown(seed, centers, directions, free, settings)
+        views = np.count_nonzero(group.index >= 0)
+        if views >= needed and is_person(group.joints, ground, settings):
+            groups.append(group)
+            members = np.flatnonzero(group.index >= 0)
+            usable[members, group.index[members]] = False
+            free[members, group.index[members]] = 0.0
     return groups
 
 
-def _person(joints: NDArray[np.float64], ground: bool, settings: TrackingSettings) -> bool:
+def is_person(joints: NDArray[np.float64], ground: bool, settings: TrackingSettings) -> bool:
     """Return whether joints (17, 3) [m] have the size of a person, and stand where people do."""
     known = np.isfinite(joints[:, 2])
     if not plausible(joints, settings.size_range):

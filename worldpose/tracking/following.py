@@ -8,17 +8,24 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from worldpose.cameras import Camera
 from worldpose.tracking.affinity import match_greedily, match_optimally, ray_affinity
 from worldpose.tracking.camera_gates import CameraGates
 from worldpose.tracking.epipolar import associate
 from worldpose.tracking.intersection import intersect_people
 from worldpose.tracking.joining import Candidate, End, decide, ends_of, join_costs
+from worldpose.tracking.pair_births import Pairs, group_pairs, judge_pairs
 from worldpose.tracking.person import Person, separations
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.sightings import Sighting
+from worldpose.tracking.visibility import CameraSight
 
 MIN_AREA = 25.0
 """Least ground on which strangers may appear [m^2]: a room."""
+MAX_DEVIATION = 3.0
+"""Standard deviations by which the rays of two views of one person miss each other at most."""
+LEARN_EVERY = 5
+"""Frames of these in which cameras tell what they show of people who are known."""
 
 
 class Follower:
@@ -35,15 +42,17 @@ class Follower:
 
     def __init__(
         self,
-        centers: NDArray[np.float64],
+        cameras: Camera,
         fps: float,
         ground: bool,
         people: int | None,
         settings: TrackingSettings,
     ) -> None:
-        self.centers, self.fps, self.settings = centers, fps, settings
+        if not ground:
+            settings = settings.model_copy(update={"newcomer_odds": settings.visitor_odds})
+        self.sight = CameraSight(cameras)
+        self.centers, self.fps, self.settings = self.sight.centers, fps, settings
         self.ground, self.people = ground, people
-        self.birth_views = min(settings.birth_views, max(2, len(centers)))
         self.confirmed_after = math.ceil(settings.min_track * fps)
         self.active: list[Person] = []
         self.lost: list[Person] = []
@@ -51,7 +60,7 @@ class Follower:
         self.joins: list[Candidate] = []
         self.near_since: dict[tuple[int, int], int] = {}
         self.born = self.merged = self.detections = 0
-        self.gates = CameraGates(len(centers))
+        self.gates = CameraGates(len(self.centers))
         self.low, self.high = np.full(2, np.inf), np.full(2, -np.inf)
 
     @property
@@ -67,12 +76,57 @@ class Follower:
         self.detections += int(np.count_nonzero(usable))
         for person in self.active:
             person.advance(frame, self.fps, self.settings)
-        taken = self._match(frame, directions, weights)
-        if (usable & ~taken).any():
-            left = np.where(taken[..., None], 0.0, weights)
-            self._add(frame, associate(self.centers, directions, left, self.ground, self.settings))
+        index, distance, joints = self._match(frame, directions, weights)
+        left = _without(weights, index)
+        groups: list[Sighting] = []
+        if (usable & (left > 0.0).any(axis=-1)).any():
+            groups = associate(self.centers, directions, left, self.ground, self.settings)
+        views = np.count_nonzero(index >= 0, axis=0)
+        known = views >= self.settings.birth_views
+        known |= np.array([self._confirmed(person) for person in self.active], dtype=np.bool_)
+        found = _stacked(groups, len(self.centers))
+        self._learn(frame, joints, index, known, groups, directions, weights)
+        pairs: Pairs | None = None
+        left = _without(left, found)
+        if (views[~known] == 2).any() or _two_cameras(left, self.settings.min_joints):
+            free = _without(_without(weights, index[:, known]), found)
+            pairs = judge_pairs(
+                directions,
+                free,
+                self.sight,
+                self.gates,
+                self.ground,
+                self.settings,
+                everything=weights,
+            )
+            groups += group_pairs(pairs, left, self.settings)
+        for n in np.flatnonzero(views).tolist():
+            sighting = Sighting(index[:, n], distance[:, n], joints[n])
+            evidence = self._evidence(sighting, None if known[n] else pairs)
+            self.active[n].see(frame, sighting, self.fps, self.settings, evidence)
+        self._add(frame, groups, pairs)
         self._merge(frame)
         self._end(frame)
+
+    def _learn(
+        self,
+        frame: int,
+        joints: NDArray[np.float64],
+        index: NDArray[np.int64],
+        known: NDArray[np.bool_],
+        groups: list[Sighting],
+        directions: NDArray[np.float64],
+        weights: NDArray[np.float64],
+    ) -> None:
+        """Take in what cameras show of people who are known, now and then."""
+        seen = [(joints[n], index[:, n] >= 0) for n in np.flatnonzero(known).tolist()]
+        seen = seen if frame % LEARN_EVERY == 0 else []
+        seen += [(group.joints, group.index >= 0) for group in groups]
+        seen = [each for each in seen if np.isfinite(each[0]).any()]
+        if seen:
+            bodies = np.stack([each for each, _ in seen])
+            showing = np.stack([each for _, each in seen], axis=1)
+            self.sight.learn(bodies, directions, weights, showing)
 
     def everyone(self) -> list[Person]:
         """Return all people ever started, in order."""
@@ -83,12 +137,17 @@ class Follower:
 
     def _match(
         self, frame: int, directions: NDArray[np.float64], weights: NDArray[np.float64]
-    ) -> NDArray[np.bool_]:
-        """Match the people known so far; return the detections (cameras, detections) they took."""
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+        """Match the people known so far.
+
+        Returns:
+            detections (cameras, persons), their distances [m], and joints (persons, 17, 3) [m].
+        """
         settings = self.settings
         taken = np.zeros(directions.shape[:2], dtype=np.bool_)
         if not self.active:
-            return taken
+            none = np.full((len(self.centers), 0), -1)
+            return none, np.empty(none.shape), np.empty((0, directions.shape[2], 3))
         self.active.sort(key=lambda person: (not self._confirmed(person), person.number))
         confirmed = sum(map(self._confirmed, self.active))
         poses = np.stack([person.pose for person in self.active])
@@ -110,6 +169,7 @@ class Follower:
                 index[:, turn] = match_greedily(left)
             camera, person = np.nonzero(index >= 0)
             taken[camera, index[camera, person]] = True
+        self._drop_strangers(index, directions, affinity)
         distance = -np.take_along_axis(affinity, np.maximum(index, 0)[..., None], axis=2)[..., 0]
         distance[index < 0] = np.nan
         self.gates.learn(distance)
@@ -122,25 +182,57 @@ class Follower:
             settings.gate,
             math.sin(settings.min_angle),
         )
-        views = np.count_nonzero(index >= 0, axis=0)
-        for n in np.flatnonzero(views).tolist():
-            sighting = Sighting(index[:, n], distance[:, n], joints[n])
-            self.active[n].see(frame, sighting, self.fps, settings, self._evidence(views[n]))
-        return taken
+        return index, distance, joints
 
-    def _evidence(self, views: int) -> float:
-        """Return what a frame with that many views says for a person."""
-        return 1.0 if views >= self.birth_views else self.settings.pair_evidence
+    def _drop_strangers(
+        self,
+        index: NDArray[np.int64],
+        directions: NDArray[np.float64],
+        affinity: NDArray[np.float64],
+    ) -> None:
+        """Undo, in `index`, matches of two views whose rays miss each other.
 
-    def _add(self, frame: int, groups: list[Sighting]) -> None:
+        Where a third view is lost, a neighbour's detection within the gate would carry the person
+        away. Of the two, the one nearer to the predicted place stays.
+        """
+        for n in np.flatnonzero(np.count_nonzero(index >= 0, axis=0) == 2).tolist():
+            a, b = np.flatnonzero(index[:, n] >= 0)
+            i, j = index[a, n], index[b, n]
+            apart = ray_distance(
+                self.centers[b] - self.centers[a], directions[a, i], directions[b, j]
+            )
+            limit = MAX_DEVIATION * float(self.gates.pair_noise(np.array([a]), np.array([b]))[0])
+            if apart > max(limit, self.settings.gate_growth * self.active[n].misfit):
+                index[a if affinity[a, n, i] < affinity[b, n, j] else b, n] = -1
+
+    def _evidence(self, sighting: Sighting, pairs: Pairs | None) -> float:
+        """Return what a sighting says for a person [1].
+
+        Two views count in full where the odds are clear, not at all where the detections more
+        likely belong to others, and in part else.
+        """
+        settings = self.settings
+        views = np.count_nonzero(sighting.index >= 0)
+        if views >= settings.birth_views:
+            return 1.0
+        if views < 2 or pairs is None:
+            return settings.pair_evidence
+        pair = pairs.find(sighting.index)
+        if pair is None or not pairs.unique[pair]:
+            return 0.0
+        return 1.0 if pairs.odds[pair] >= settings.pair_odds else settings.pair_evidence
+
+    def _add(self, frame: int, groups: list[Sighting], pairs: Pairs | None) -> None:
         """Give associated groups to lost people within reach, else start new people."""
         seen = [person for person in self.active if person.last_fixed == frame]
-        # A group on a person in view comes from second detections of that person.
-        new = [
-            group
-            for group in groups
-            if not _apart([group.joints], seen).min(initial=np.inf) < self.settings.merge_distance
-        ]
+        # A group on a person in view, or on another group, comes from that person's second
+        # detections.
+        taken, new = [person.pose for person in seen], list[Sighting]()
+        for group in groups:
+            beside = separations(group.joints[None], np.array(taken)) if taken else np.array(np.inf)
+            if not beside.min() < self.settings.merge_distance:
+                new.append(group)
+                taken.append(group.joints)
         found = self._found_again(frame, new) if self.settings.causal and self.lost else []
         back = {join.after: join.before for join in found if join.decided}
         lost = {person.number: person for person in self.lost}
@@ -156,8 +248,8 @@ class Follower:
             ground = np.nanmean(group.joints[:, :2], axis=0)
             self.low, self.high = np.minimum(self.low, ground), np.maximum(self.high, ground)
             self.active.append(person)
-            views = int(np.count_nonzero(group.index >= 0))
-            person.see(frame, group, self.fps, self.settings, self._evidence(views))
+            evidence = self._evidence(group, pairs)
+            person.see(frame, group, self.fps, self.settings, evidence)
         self.joins += [replace(join, after=numbers[join.after]) for join in found]
 
     def _found_again(self, frame: int, groups: list[Sighting]) -> list[Candidate]:
@@ -214,6 +306,37 @@ class Follower:
             if (frame - person.last_fixed) / self.fps > settings.max_lost:
                 self.lost.remove(person)
                 self.ended.append(person)
+
+
+def ray_distance(
+    baseline: NDArray[np.float64], rays: NDArray[np.float64], others: NDArray[np.float64]
+) -> float:
+    """Return the mean distance of two detections' rays (17, 3) [m]; infinite for no joint."""
+    normal = np.cross(rays, others)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        apart = np.abs(normal @ baseline) / np.linalg.norm(normal, axis=-1)
+    known = np.isfinite(apart)
+    return float(apart[known].mean()) if known.any() else math.inf
+
+
+def _without(weights: NDArray[np.float64], index: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return weights (cameras, detections, 17), 0 for detections (cameras, n) that are taken."""
+    left = weights.copy()
+    camera, person = np.nonzero(index >= 0)
+    left[camera, index[camera, person]] = 0.0
+    return left
+
+
+def _stacked(groups: list[Sighting], cameras: int) -> NDArray[np.int64]:
+    """Return the detections (cameras, groups) of groups; -1 = none."""
+    none = np.full((cameras, 0), -1)
+    return np.stack([group.index for group in groups], axis=1) if groups else none
+
+
+def _two_cameras(weights: NDArray[np.float64], min_joints: int) -> bool:
+    """Return whether two cameras have detections with enough joints."""
+    usable = np.count_nonzero(weights > 0.0, axis=-1) >= min_joints
+    return bool(np.count_nonzero(usable.any(axis=1)) >= 2)
 
 
 def _apart(poses: list[NDArray[np.float64]], people: list[Person]) -> NDArray[np.float64]:

@@ -20,6 +20,10 @@ VELOCITY_NOISE = 0.5
 """Standard deviation of a velocity from few frames [m/s]."""
 TOP_SPEED = 9.5
 """Nobody runs faster [m/s]."""
+GROSS_SHARE = 0.1
+"""Share of a track's limb lengths that are gross errors [1]."""
+GROSS_LIMB = 0.3
+"""Standard deviation of such lengths [m]."""
 
 
 @dataclass(frozen=True)
@@ -167,9 +171,22 @@ def _cost(old: End, new: End, gap: float, area: float, settings: TrackingSetting
     known = np.isfinite(difference)
     own = settings.limb_noise**2 + old.limb_variance[known] + new.limb_variance[known]
     other = own + 2.0 * settings.limb_spread**2
-    evidence = 0.5 * difference[known] ** 2 * (1.0 / own - 1.0 / other) + 0.5 * np.log(own / other)
+    evidence = _log_limb(difference[known], other) - _log_limb(difference[known], own)
     # Limbs of one person err and differ together: their mean is worth two of them.
     return cost + (2.0 * float(evidence.mean()) if known.any() else 0.0)
+
+
+def _log_limb(
+    difference: NDArray[np.float64], variance: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the log density of differences of lengths (n,) [m], some of which are gross errors.
+
+    An elbow that two views place at another person's arm makes a limb a metre longer.
+    """
+    wide = variance + GROSS_LIMB**2
+    usual = math.log1p(-GROSS_SHARE) - 0.5 * (difference**2 / variance + np.log(variance))
+    gross = math.log(GROSS_SHARE) - 0.5 * (difference**2 / wide + np.log(wide))
+    return np.asarray(np.logaddexp(usual, gross))
 
 
 def _log_normal(offset: NDArray[np.float64], variance: float) -> float:

@@ -123,8 +123,7 @@ def track_people(
             found=f"{keypoints.shape}, {confidence.shape}, {cameras.batch_shape}",
             todo="Give arrays of the same clip and cameras.",
         )
-    centers = np.ascontiguousarray(cameras.center)
-    follower = Follower(centers, fps, pitch_size is not None, people, settings)
+    follower = Follower(cameras, fps, pitch_size is not None, people, settings)
     frames = confidence.shape[0]
     for start in range(0, frames, BLOCK):
         image = np.asarray(keypoints[start : start + BLOCK], dtype=np.float64)

@@ -83,14 +83,6 @@ def test_two_views_are_not_enough_for_a_birth_among_more_cameras(ring, people):
     assert len(associate(camera.center, directions, weights, False, two)) == 1
 
 
-def test_two_cameras_keep_two_people_apart_from_their_two_ghosts(ring, people):
-    # The rays of two views of two people meet at four places.
-    camera = ring(5)[TWO]
-    joints = people([[-1.5, 0.5], [1.5, 1.0]])
-    groups = associate(camera.center, *rays_of(camera, joints, 5e-4), False, SETTINGS)
-    assert sorted(tuple(group.index) for group in groups) == [(0, 0), (1, 1)]
-
-
 def test_third_camera_leaves_no_ghost_when_detections_are_missing(ring, people):
     # Each camera misses one of three people: each person still has two views, and any ghost
     # two as well. Nobody is born from two views.
@@ -160,13 +152,3 @@ def test_ground_changes_nothing_for_people_on_it_and_refuses_those_above(ring, p
     assert [g.index.tolist() for g in on_ground] == [g.index.tolist() for g in anywhere]
     above = rays_of(camera, joints + [0.0, 0.0, 3.0])
     assert associate(camera.center, *above, True, SETTINGS) == []
-
-
-def test_pair_that_no_third_camera_confirms_comes_after_the_others(ring, people):
-    camera = ring(5)
-    directions, weights = rays_of(camera, people([[0.0, 0.0], [3.0, 0.0]]))
-    weights[2:, 1] = 0.0
-    directions[2:, 1] = np.nan
-    pairs = SETTINGS.model_copy(update={"pair_evidence": 0.2})
-    groups = associate(camera.center, directions, weights, True, pairs)
-    assert [group.index.tolist() for group in groups] == [[0] * 5, [1, 1, -1, -1, -1]]

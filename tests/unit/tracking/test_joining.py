@@ -148,3 +148,16 @@ def test_a_limb_is_the_surer_the_longer_it_was_seen_and_the_steadier_it_was(peop
     assert seen([0.3] * 60) == pytest.approx((0.3, 0.0025 / 4.0))
     # 10 cm to either side of the median in half of the frames and more.
     assert seen([0.2, 0.3, 0.4] * 20) == pytest.approx((0.3, (1.4826 * 0.1) ** 2 / 4.0))
+
+
+def test_grossly_wrong_limb_is_no_proof_of_another_person():
+    # Two views took a neighbour's elbow: the upper arm of one track is a metre longer.
+    length = np.full(11, 0.4)
+    wrong = length.copy()
+    wrong[2] += 1.0
+    same = cost(end(0, 0, (0.0, 0.0), limbs=length), end(1, 25, (0.0, 0.0), limbs=length))
+    off = cost(end(0, 0, (0.0, 0.0), limbs=length), end(1, 25, (0.0, 0.0), limbs=wrong))
+    assert 0.0 < off - same < 1.5
+    # All limbs 5 cm longer: twice what people differ by, and said by every limb.
+    other = cost(end(0, 0, (0.0, 0.0), limbs=length), end(1, 25, (0.0, 0.0), limbs=length + 0.05))
+    assert other - same > 1.5

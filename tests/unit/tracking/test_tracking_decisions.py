@@ -29,14 +29,26 @@ def test_person_found_again_beyond_the_gate_is_counted(ring, people, seen):
     places[70:] = [1.2, 0.0]
     keypoints, confidence = seen(ring(5), people(places))
     keypoints[20:70] = np.nan
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    pitch = {"pitch_size": (105.0, 68.0)}
+    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS, **pitch)
     assert len(result.tracks) == 1
     assert result.report.joined == 1
     (join,) = result.joins
     assert (join.before, join.after, join.decided) == (0, 0, True)
     assert (join.last_frame, join.first_frame) == (19, 70)
     slow = SETTINGS.model_copy(update={"agility": 0.2, "mean_speed": 0.1})
-    assert len(track_people(ring(5), keypoints, confidence, FPS, slow).tracks) == 2
+    assert len(track_people(ring(5), keypoints, confidence, FPS, slow, **pitch).tracks) == 2
+
+
+def test_person_who_appears_in_a_room_is_not_taken_for_somebody_lost_elsewhere(ring, people, seen):
+    # 1.2 m from where the other was lost 1 s ago: in a room, where people come in, a question.
+    places = np.zeros((90, 1, 2))
+    places[70:] = [1.2, 0.0]
+    keypoints, confidence = seen(ring(5), people(places))
+    keypoints[20:70] = np.nan
+    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    assert len(result.tracks) == 2
+    assert (result.report.joined, result.report.undecided) == (0, 1)
 
 
 def test_join_that_may_be_either_way_is_left_to_review(ring, people, seen):
@@ -166,10 +178,10 @@ def test_who_is_unseen_may_be_as_far_beyond_the_gate_as_he_can_have_gone(
     assert result.report.births == births
 
 
-def test_of_two_tracks_on_one_person_the_one_that_was_fixed_more_often_stays(people):
+def test_of_two_tracks_on_one_person_the_one_that_was_fixed_more_often_stays(ring, people):
     pose = people(np.zeros(2))
     younger, older = Person(0, pose, 20), Person(1, pose, 0)
-    follower = Follower(np.zeros((2, 3)), FPS, True, None, SETTINGS)
+    follower = Follower(ring(2), FPS, True, None, SETTINGS)
     follower.active = [younger, older]
     here = Sighting(np.array([0, 0]), np.array([0.1, 0.1]), pose)
     for frame in range(40):
@@ -179,3 +191,21 @@ def test_of_two_tracks_on_one_person_the_one_that_was_fixed_more_often_stays(peo
         follower._merge(frame)
     assert follower.active == [older]
     assert follower.ended == [younger]
+
+
+def test_person_whom_a_camera_loses_is_not_carried_away_by_a_neighbour(ring, people, seen):
+    # Two cameras follow a person; then the second shows only a neighbour 0.45 m beside, within
+    # the gate: its ray misses the other camera's by more than two views of a body do.
+    places = np.broadcast_to([[0.0, 0.0], [0.0, 0.45]], (40, 2, 2))
+    camera = ring(2)
+    keypoints, confidence = seen(camera, people(places), noise=0.5)
+    keypoints[:, :, 1] = np.nan
+    alone = track_people(camera, keypoints, confidence, FPS, SETTINGS)
+    assert owners(alone) == [0]
+    keypoints, confidence = seen(camera, people(places), noise=0.5)
+    keypoints[:, 0, 1] = np.nan
+    keypoints[:20, 1, 1] = np.nan
+    keypoints[20:, 1, 0] = np.nan
+    taken = track_people(camera, keypoints, confidence, FPS, SETTINGS)
+    together = (taken.detection_index[20:] >= 0).all(axis=1)
+    assert not together.any()

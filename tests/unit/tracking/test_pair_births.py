@@ -1,0 +1,244 @@
+"""People whom exactly two cameras show: what speaks for a pair of detections, and what against."""
+
+import numpy as np
+import pytest
+
+from worldpose.cameras import Camera, Rigid
+from worldpose.tracking import TrackingSettings, diagnose_no_people, track_people
+from worldpose.tracking.camera_gates import CameraGates
+from worldpose.tracking.pair_births import group_pairs, judge_pairs
+from worldpose.tracking.visibility import CameraSight, bodies_covered
+
+SETTINGS = TrackingSettings()
+FPS = 25.0
+
+
+def rig(*centers, focal=1500.0):
+    """Cameras at places [m] that look at the point 1 m over the origin, 1920 x 1080."""
+    cameras = []
+    for center in np.asarray(centers, dtype=float):
+        forward = np.array([0.0, 0.0, 1.0]) - center
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        cameras.append(
+            Camera(
+                focal=np.full(2, focal),
+                principal_point=np.array([960.0, 540.0]),
+                distortion=np.zeros(5),
+                cam_from_world=Rigid(rotation, -rotation @ center),
+                image_size=np.array([1920, 1080]),
+            )
+        )
+    return Camera.stack(cameras)
+
+
+HIGH = ((-12.0, 0.0, 9.0), (0.0, -12.0, 9.0))
+LOW = ((-30.0, 0.0, 1.0), (0.0, -30.0, 1.0))
+THIRD = (12.0, 12.0, 9.0)
+
+
+def rays_of(cameras, joints, show=None):
+    """Directions and weights (cameras, people, 17) of people (people, 17, 3).
+
+    `show` (cameras, people) tells which camera detects which person; None = all.
+    """
+    offsets = joints[None] - cameras.center[:, None, None]
+    directions = offsets / np.linalg.norm(offsets, axis=-1, keepdims=True)
+    weights = np.ones(directions.shape[:-1])
+    if show is not None:
+        weights[~np.asarray(show, dtype=bool)] = 0.0
+        directions[~np.asarray(show, dtype=bool)] = np.nan
+    return directions, weights
+
+
+def judge(cameras, directions, weights, sight=None, ground=True):
+    sight = CameraSight(cameras) if sight is None else sight
+    gates = CameraGates(len(sight.centers))
+    return judge_pairs(directions, weights, sight, gates, ground, SETTINGS, everything=weights)
+
+
+def test_two_high_cameras_keep_two_people_apart_from_their_two_ghosts(people):
+    # The rays of two views of two people meet at four places, the ghosts metres apart in height.
+    cameras = rig(*HIGH)
+    directions, weights = rays_of(cameras, people([[-1.5, 0.5], [1.5, 1.0]]))
+    pairs = judge(cameras, directions, weights)
+    groups = group_pairs(pairs, weights, SETTINGS)
+    assert sorted(tuple(group.index) for group in groups) == [(0, 0), (1, 1)]
+    for group in groups:
+        assert pairs.odds[pairs.find(group.index)] > SETTINGS.pair_odds
+        truth = people([[-1.5, 0.5], [1.5, 1.0]])[group.index[0]]
+        np.testing.assert_allclose(group.joints, truth, atol=1e-6)
+
+
+def test_cameras_at_eye_level_cannot_tell_people_from_ghosts(people):
+    # All joints are on one level with both cameras, nearly: every ray meets every other.
+    cameras = rig(*LOW)
+    directions, weights = rays_of(cameras, people([[-0.8, -0.8], [0.8, 0.8]]))
+    pairs = judge(cameras, directions, weights)
+    assert len(pairs.odds) == 4
+    assert not pairs.unique.any() and (pairs.odds < 1.0).all()
+    assert group_pairs(pairs, weights, SETTINGS) == []
+
+
+def test_one_person_at_eye_level_has_no_rival(people):
+    cameras = rig(*LOW)
+    directions, weights = rays_of(cameras, people([[-0.8, -0.8]]))
+    pairs = judge(cameras, directions, weights)
+    assert pairs.unique.tolist() == [True]
+    assert pairs.odds[0] > SETTINGS.pair_odds
+
+
+def test_second_detection_of_the_same_body_is_no_rival(people):
+    cameras = rig(*LOW)
+    body = people([[0.0, 0.0]])
+    directions, weights = rays_of(cameras, np.concatenate([body, body + [0.0, 0.05, 0.0]]))
+    pairs = judge(cameras, directions, weights)
+    assert len(pairs.odds) == 4 and pairs.unique.all()
+    assert len(group_pairs(pairs, weights, SETTINGS)) == 2
+
+
+def test_rays_that_miss_by_much_lower_the_odds(people):
+    # Raised by 0.1 m in one camera, two scales of the unknown noise: odds fall by exp(2) or less.
+    cameras = rig(*LOW)
+    body = people([[0.0, 0.0]])
+    directions, weights = rays_of(cameras, body)
+    moved = directions.copy()
+    moved[1] = rays_of(cameras, body + [0.0, 0.0, 0.1])[0][1]
+    exact, off = judge(cameras, directions, weights), judge(cameras, moved, weights)
+    assert off.distance[0] == pytest.approx(0.1, abs=0.002)
+    ratio = np.log(exact.odds[0] / off.odds[0])
+    assert ratio == pytest.approx(0.5 * (off.distance[0] / 0.05) ** 2, abs=0.1)
+
+
+def test_people_out_of_proportion_have_lower_odds(people):
+    cameras = rig(*HIGH)
+    adult = people([[0.0, 0.0]])
+    stretched = adult.copy()
+    stretched[:, [9, 10]] += 0.5 * np.sign(adult[:, [9, 10]]) * [0.0, 1.0, 0.0]
+    odds = [judge(cameras, *rays_of(cameras, each)).odds[0] for each in (adult, stretched)]
+    assert odds[1] < 0.5 * odds[0]
+    # A giant of three metres is no pair at all.
+    assert len(judge(cameras, *rays_of(cameras, 1.8 * adult)).odds) == 0
+
+
+def known_sight(cameras, frames=98):
+    """What cameras are like that have shown somebody, everywhere they look, in every frame."""
+    sight = CameraSight(cameras)
+    sight.reach[:] = 40.0
+    sight.shown[:], sight.missed[:] = frames, 0.0
+    return sight
+
+
+def test_camera_that_should_see_a_person_and_shows_nothing_is_evidence_against(people):
+    # Missed once in a hundred times (Laplace's rule: 1 / (98 + 2)).
+    cameras = rig(*HIGH, THIRD)
+    body = people([[0.0, 0.0]])
+    missed = rays_of(cameras, body, [[1], [1], [0]])
+    two = rig(*HIGH)
+    free = judge(two, *rays_of(two, body)).odds[0]
+    judged = judge(cameras, *missed, known_sight(cameras))
+    assert judged.odds[0] == pytest.approx(free / 100.0, rel=1e-6)
+    # A camera of which nothing is known, or that showed people only nearer, says nothing.
+    assert judge(cameras, *missed).odds[0] == pytest.approx(free, rel=1e-6)
+
+
+def test_camera_that_looks_elsewhere_says_nothing(people):
+    # The person is 6 m beside the place that the third camera's narrow image shows.
+    cameras = Camera.stack([*rig(*HIGH), rig(THIRD, focal=4500.0)[0]])
+    aside = people([[-4.0, 3.0]])
+    assert known_sight(cameras).should_see(aside)[:, 0].tolist() == [True, True, False]
+    judged = judge(cameras, *rays_of(cameras, aside, [[1], [1], [0]]), known_sight(cameras))
+    two = rig(*HIGH)
+    assert judged.odds[0] == pytest.approx(judge(two, *rays_of(two, aside)).odds[0], rel=1e-6)
+
+
+def test_detection_that_lies_on_the_person_excuses_a_camera(people):
+    # The third camera sees one person before the other: on its line of sight, 3 m nearer.
+    cameras = rig(*HIGH, THIRD)
+    body = people([[0.0, 0.0]])
+    toward = np.array(THIRD) - [0.0, 0.0, 1.0]
+    before = body + 0.1 * toward * [1.0, 1.0, 1.0]
+    directions, weights = rays_of(cameras, np.concatenate([body, before]), [[1, 0], [1, 0], [0, 1]])
+    covered = bodies_covered(body, cameras.center, directions, weights)
+    assert covered[:, 0].tolist() == [True, True, True]
+    two = rig(*HIGH)
+    judged = judge(cameras, directions, weights, known_sight(cameras))
+    pair = judged.find(np.array([0, 0, -1]))
+    free = judge(two, *rays_of(two, body)).odds[0]
+    assert judged.odds[pair] == pytest.approx(free, rel=0.05)
+
+
+def test_sight_learns_how_often_a_camera_misses_and_how_far_it_sees(people):
+    cameras = rig(*HIGH, THIRD)
+    sight = CameraSight(cameras)
+    body = people([[0.0, 0.0]])
+    for frame in range(10):
+        show = [[1], [1], [frame % 2]]
+        directions, weights = rays_of(cameras, body, show)
+        sight.learn(body, directions, weights, np.array(show, dtype=bool))
+    middle = body.mean(axis=1)[0]
+    np.testing.assert_allclose(sight.reach, np.linalg.norm(cameras.center - middle, axis=1))
+    # Until frame 1 the third had shown nobody, so frame 0 does not count.
+    assert sight.shown.tolist() == [10, 10, 9]
+    assert sight.missed.tolist() == [0, 0, 4]
+
+
+def picture(cameras, joints, show):
+    """Keypoints and confidence (frames, cameras, people, 17) of people that are shown."""
+    frames, count = joints.shape[:2]
+    keypoints = cameras.project(joints.reshape(frames, 1, -1, 3)).reshape(frames, -1, count, 17, 2)
+    keypoints[:, ~np.asarray(show, dtype=bool)] = np.nan
+    return keypoints, np.full(keypoints.shape[:-1], 0.9)
+
+
+def test_single_frame_of_two_cameras_is_enough_where_the_pair_is_clear(people):
+    cameras = rig(*HIGH)
+    seen = picture(cameras, people([[[-1.5, 0.5], [1.5, 1.0]]]), np.ones((2, 2)))
+    found = track_people(cameras, *seen, FPS, SETTINGS)
+    assert sorted(map(tuple, found.detection_index[0].T)) == [(0, 0), (1, 1)]
+
+
+def test_person_whom_two_of_three_cameras_can_see_is_found_in_a_single_frame(people):
+    # The third camera sees the other person alone: its image ends before the place.
+    cameras = Camera.stack([*rig(*HIGH), rig(THIRD, focal=4500.0)[0]])
+    joints = people([[[0.0, 0.0], [-4.0, 3.0]]])
+    image = cameras.project(joints.reshape(1, 1, -1, 3)).reshape(1, 3, 2, 17, 2)
+    inside = ((image >= 0.0) & (image <= [1920.0, 1080.0])).all(axis=(-1, -2))[0]
+    assert inside.tolist() == [[True, True], [True, True], [True, False]]
+    found = track_people(cameras, *picture(cameras, joints, inside), FPS, SETTINGS)
+    assert sorted(map(tuple, found.detection_index[0].T)) == [(0, 0, 0), (1, 1, -1)]
+
+
+def test_single_frame_at_eye_level_gives_nobody_rather_than_ghosts(people):
+    cameras = rig(*LOW)
+    seen = picture(cameras, people([[[-0.8, -0.8], [0.8, 0.8]]]), np.ones((2, 2)))
+    found = track_people(cameras, *seen, FPS, SETTINGS)
+    assert len(found.person) == 0 and found.report.births == 0
+
+
+def test_people_whom_two_cameras_cannot_tell_apart_are_the_stated_reason(people):
+    cameras = rig(*LOW)
+    joints = people(np.broadcast_to([[-0.8, -0.8], [0.8, 0.8]], (4, 2, 2)))
+    given = (cameras, ["left", "right"], *picture(cameras, joints, np.ones((2, 2))), FPS, SETTINGS)
+    reason = diagnose_no_people(*given, ground=True, births=0)
+    assert reason.cause == "ambiguous_pairs"
+    assert "detections of left and right fit each other in several ways" in reason.message
+
+
+def test_people_at_eye_level_are_found_once_they_stand_apart(people):
+    # The second comes into view after a second, when the first is known.
+    cameras = rig(*LOW)
+    joints = people(np.broadcast_to([[-0.8, -0.8], [0.8, 0.8]], (60, 2, 2)))
+    keypoints, confidence = picture(cameras, joints, np.ones((2, 2)))
+    keypoints[:25, :, 1] = np.nan
+    found = track_people(cameras, keypoints, confidence, FPS, SETTINGS)
+    assert sorted(map(tuple, found.detection_index[-1].T)) == [(0, 0), (1, 1)]
+
+
+def test_second_detections_of_a_person_start_no_second_person_in_one_frame(people):
+    cameras = rig(*HIGH)
+    body = people([[[0.0, 0.0], [0.03, 0.0]]])
+    found = track_people(cameras, *picture(cameras, body, np.ones((2, 2))), FPS, SETTINGS)
+    assert len(found.person) == 1

@@ -1,0 +1,200 @@
+"""Evidence for people whom exactly two cameras show: the odds that both show one person.
+
+Two rays nearly meet wherever two cameras look at people of one height, so a small distance between
+rays is not enough. The odds of a pair weigh its rays' distance, the size and proportions of the
+skeleton that they determine, cameras that should see a person there and have no detection, and
+every other pair that one of the two detections could form instead.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.tracking.camera_gates import CameraGates
+from worldpose.tracking.epipolar import is_person, pair_distances
+from worldpose.tracking.intersection import intersect_people
+from worldpose.tracking.limbs import LIMB_LENGTHS, LIMBS
+from worldpose.tracking.person import separations
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.sightings import Sighting
+from worldpose.tracking.visibility import CameraSight
+
+SIZE_SPREAD: Final = 0.15
+"""Standard deviation of the logarithm of a person's size from one frame [1]."""
+LIMB_SCATTER: Final = 0.2
+"""Standard deviation of the logarithms of limb lengths of one person in one frame [1]."""
+SAME_PLACE: Final = 0.3
+"""Two skeletons whose joints are nearer than this on average are one body [m]."""
+NO_PARTNER: Final = -6.3
+"""Score of having no partner [nat]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """All pairs that the free detections of a frame could form.
+
+    Attributes:
+        cameras: (pairs, 2) places of the two cameras, the first before the second.
+        detections: (pairs, 2) places among their detections.
+        joints: (pairs, 17, 3) [m], world, where their rays meet.
+        distance: (pairs,) mean distance of their rays [m].
+        odds: (pairs,) odds against all other explanations of the two detections [1].
+        unique: (pairs,) whether it is likelier than all rival pairs together.
+    """
+
+    cameras: NDArray[np.int64]
+    detections: NDArray[np.int64]
+    joints: NDArray[np.float64]
+    distance: NDArray[np.float64]
+    odds: NDArray[np.float64]
+    unique: NDArray[np.bool_]
+
+    def find(self, index: NDArray[np.int64]) -> int | None:
+        """Return which pair two detections (cameras,) are, -1 = not seen; None if they are none."""
+        cameras = np.flatnonzero(index >= 0)
+        same = (self.cameras == cameras) & (self.detections == index[cameras])
+        found = np.flatnonzero(same.all(axis=1))
+        return int(found[0]) if len(found) else None
+
+
+def judge_pairs(
+    directions: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    sight: CameraSight,
+    gates: CameraGates,
+    ground: bool,
+    settings: TrackingSettings,
+    *,
+    everything: NDArray[np.float64],
+) -> Pairs:
+    """Return the odds of every pair of detections of two cameras.
+
+    Args:
+        directions: (cameras, detections, 17, 3) unit rays, world; NaN where not seen.
+        weights: (cameras, detections, 17), of the squared angle; 0 where not seen, or where other
+            views explain the detection.
+        sight: what the cameras see.
+        gates: how far detections of people pass from each other; learns it.
+        ground: whether people stand on z = 0.
+        settings: gates and accepted sizes.
+        everything: the weights of all detections, explained or not.
+    """
+    centers = sight.centers
+    usable = np.count_nonzero(weights > 0.0, axis=-1) >= settings.min_joints
+    camera, detection = np.nonzero(usable)
+    rays = directions[camera, detection]
+    anywhere = np.tile([0.0, 0.0, np.inf], (len(camera), 1))
+    distances = pair_distances(
+        centers[camera],
+        rays,
+        camera,
+        anywhere,
+        settings.min_joints,
+        math.sin(settings.min_angle),
+        settings.epipolar_gate,
+    )
+    first, second = np.nonzero(distances < np.inf)
+    index = np.full((len(centers), len(first)), -1)
+    number = np.arange(len(first))
+    index[camera[first], number] = detection[first]
+    index[camera[second], number] = detection[second]
+    joints = intersect_people(
+        centers,
+        directions,
+        weights,
+        index,
+        np.full((len(first), directions.shape[2], 3), np.nan),
+        settings.gate,
+        math.sin(settings.min_angle),
+    )
+    keep = np.array([is_person(each, ground, settings) for each in joints], dtype=np.bool_)
+    first, second, joints = first[keep], second[keep], joints[keep]
+    distance = distances[first, second]
+    gates.learn_pairs(distance[_mutual(first, second, distance, len(camera))])
+    noise = gates.pair_noise(camera[first], camera[second])
+    with np.errstate(invalid="ignore"):
+        score = -0.5 * (distance / noise) ** 2 + _body_score(joints)
+    own = np.zeros((len(centers), len(first)), dtype=np.bool_)
+    own[camera[first], np.arange(len(first))] = own[camera[second], np.arange(len(first))] = True
+    score += sight.misses_score(joints, directions, everything, own)
+    likelihood, rivals = np.exp(score), _rivals(first, second, joints, score)
+    return Pairs(
+        np.stack([camera[first], camera[second]], axis=-1),
+        np.stack([detection[first], detection[second]], axis=-1),
+        joints,
+        distance,
+        likelihood / (math.exp(NO_PARTNER) + rivals),
+        likelihood >= rivals,
+    )
+
+
+def group_pairs(
+    pairs: Pairs, weights: NDArray[np.float64], settings: TrackingSettings
+) -> list[Sighting]:
+    """Return the pairs that are likelier than their rivals, the likeliest first.
+
+    Args:
+        pairs: of a frame.
+        weights: (cameras, detections, 17); 0 for detections that are taken.
+        settings: least joints.
+
+    Note:
+        Each detection joins one pair at most.
+    """
+    free = np.count_nonzero(weights > 0.0, axis=-1) >= settings.min_joints
+    groups = []
+    for n in np.argsort(-pairs.odds, kind="stable").tolist():
+        camera, detection = pairs.cameras[n], pairs.detections[n]
+        if not pairs.unique[n] or not free[camera, detection].all():
+            continue
+        free[camera, detection] = False
+        index = np.full(len(weights), -1)
+        index[camera] = detection
+        distance = np.where(index >= 0, 0.5 * pairs.distance[n], np.nan)
+        groups.append(Sighting(index, distance, pairs.joints[n]))
+    return groups
+
+
+def _mutual(
+    first: NDArray[np.int64],
+    second: NDArray[np.int64],
+    distance: NDArray[np.float64],
+    detections: int,
+) -> NDArray[np.bool_]:
+    """Return which pairs (pairs,) are the nearest of both their detections."""
+    nearest = np.full(detections, np.inf)
+    np.minimum.at(nearest, first, distance)
+    np.minimum.at(nearest, second, distance)
+    return np.asarray((distance <= nearest[first]) & (distance <= nearest[second]))
+
+
+def _body_score(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how well limbs (n, 17, 3) [m] have an adult's size and proportions (n,) [nat]."""
+    limbs = np.linalg.norm(joints[:, LIMBS[:, 0]] - joints[:, LIMBS[:, 1]], axis=-1)
+    size = np.log(limbs / LIMB_LENGTHS)
+    middle = np.nanmedian(size, axis=1)
+    scatter = np.nanmean(np.square(size - middle[:, None]), axis=1)
+    return np.asarray(-0.5 * (middle / SIZE_SPREAD) ** 2 - 0.5 * scatter / LIMB_SCATTER**2)
+
+
+def _rivals(
+    first: NDArray[np.int64],
+    second: NDArray[np.int64],
+    joints: NDArray[np.float64],
+    score: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the summed likelihood (pairs,) of each pair's rivals.
+
+    A pair that shares a detection and has its body elsewhere is a rival; one that has it at the
+    same place is a second detection of that body.
+    """
+    shared = (first[:, None] == first) | (second[:, None] == second)
+    shared |= (first[:, None] == second) | (second[:, None] == first)
+    np.fill_diagonal(shared, False)
+    rival = shared & (separations(joints, joints) > SAME_PLACE)
+    return np.asarray(np.where(rival, np.exp(score)[None], 0.0).sum(axis=1))
