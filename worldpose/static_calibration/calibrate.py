@@ -53,6 +53,9 @@ _STEPS: Final = 12
 """Iterations of a start before the best are chosen [1]."""
 _CROPPED: Final = 0.15
 """Of the principal point of a cropped image, in widths [1]: wherever a crop of half its size is."""
+_FARTHEST_CROP: Final = 0.5
+"""How far the principal point of a cropped image lies from its center at most, in widths and in
+heights [1]: a corner of an image of twice its size."""
 _FOR_CROP: Final = 7
 """Fewest clicked points, or markings, that tell a crop from wrong names [1]."""
 _MOST_LEFT_OUT: Final = 16
@@ -160,6 +163,9 @@ def _agreed(
         try:
             found = screen_at_best_noise(other, _start(other, stated), stated)
         except InputError:
+            continue
+        shift = np.abs(found[1].row[2:4] - problem.prior[2:4])
+        if np.any(shift > _FARTHEST_CROP * np.array(problem.image_size)):
             continue
         factor = found[2].click_noise / stated.click_noise
         own = improbability(*found, factor=factor, with_prior=True)
