@@ -6,12 +6,14 @@ import asyncio
 import logging
 import resource
 import socket
+import sys
 import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 from threading import Lock
 from typing import Any, Final
 
+import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
@@ -133,6 +135,7 @@ class _Protocol(H11Protocol):
     connections_open: Connections
     _address: object = None
     _phase: object = None
+    _is_upgraded = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -142,6 +145,12 @@ class _Protocol(H11Protocol):
     def data_received(self, data: bytes) -> None:
         super().data_received(data)
         self._note()
+
+    def handle_websocket_upgrade(self, event: h11.Request) -> None:
+        """Hand the connection on; a WebSocket may be silent for as long as it wants."""
+        super().handle_websocket_upgrade(event)
+        self._is_upgraded = True
+        self.connections_open.work(self._address)
 
     def on_response_complete(self) -> None:
         super().on_response_complete()
@@ -158,6 +167,8 @@ class _Protocol(H11Protocol):
 
     def _note(self) -> None:
         """Begin a deadline where a phase begins; further bytes of the same do not prolong it."""
+        if self._is_upgraded:
+            return
         cycle = self.cycle
         is_answering = cycle is not None and not cycle.response_complete
         is_working = is_answering and not cycle.more_body
@@ -190,32 +201,43 @@ class _Server(uvicorn.Server):
         return await super().on_tick(counter)
 
 
-def serve_http(app: Any, *, host: str, port: int, **options: Any) -> None:  # noqa: ANN401
+def serve_http(
+    app: Any,  # noqa: ANN401
+    *,
+    host: str,
+    port: int,
+    max_connections: int = MAX_CONNECTIONS,
+    **options: Any,  # noqa: ANN401
+) -> None:
     """Serve an ASGI application until this process is told to end.
 
     Args:
         app: the application.
         host: name or address to listen at.
         port: 0 = one that is free.
+        max_connections: open at a time, and no more than a quarter of the files that this process
+            may open.
         options: further ones of `uvicorn.Config`.
 
     Raises:
         UsageError: the port is taken, or the host is none of this machine.
     """
-    connections = Connections()
+    connections = Connections(max_connections)
     protocol = type("Protocol", (_Protocol,), {"connections_open": connections})
     config = uvicorn.Config(
         app,
         http=protocol,
-        ws="none",
         loop="asyncio",
         backlog=max(1, connections.limit // ACCEPTED_SHARE),
         access_log=False,
         log_level="error",  # a line for each request that is none would fill the disk
-        **options,
+        **{"ws": "none", **options},
     )
     listeners = _listeners(host, port, connections)
-    _Server(config, connections).run(sockets=listeners)
+    server = _Server(config, connections)
+    server.run(sockets=listeners)
+    if not server.started:
+        sys.exit(f"{host}, port {port}: the server did not start; its log says why")
 
 
 def _listeners(host: str, port: int, connections: Connections) -> list[socket.socket]:

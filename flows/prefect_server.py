@@ -9,18 +9,23 @@ from __future__ import annotations
 import argparse
 import gc
 import os
+import resource
 import socket
 import sys
 import threading
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from flows.host_guard import HostGuard
+from flows.http_server import serve_http
 from flows.prefect_environment import SERVER_LOGIN
 from worldpose.errors import UsageError
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp
+
+MAX_CONNECTIONS: Final = 1000
+"""Open at a time: every run and every one of its workers has several."""
 
 
 def guarded_app(names: Iterable[str], *, is_embedded: bool = False) -> ASGIApp:
@@ -58,13 +63,14 @@ def serve(host: str, port: int, names: Iterable[str]) -> None:
         port: of it.
         names: of this machine in clients elsewhere.
     """
-    import uvicorn
-
-    uvicorn.run(
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # each client has some connections
+    serve_http(
         guarded_app({*names, host} - {"0.0.0.0", "::"}),
         host=host,
         port=port,
-        log_level="error",
+        max_connections=MAX_CONNECTIONS,
+        ws="auto",
         server_header=False,
         timeout_graceful_shutdown=2,
     )

@@ -14,6 +14,7 @@ import pytest
 from command_line import WORLDPOSE
 from page_client import TOKEN
 from service import free_ports
+from websockets.sync.client import connect
 
 from worldpose.store import Store
 
@@ -22,6 +23,26 @@ HALF_BODY = (
     b"POST /api/login HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\n"
     b"Content-Length: 1000\r\n\r\n{"
 )
+
+ECHO = """
+import sys
+from flows.http_server import serve_http
+
+async def app(scope, receive, send):
+    if scope["type"] == "http":
+        while (await receive()).get("more_body"):
+            pass
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await send({"type": "http.response.body"})
+        return
+    await receive()
+    await send({"type": "websocket.accept"})
+    while (message := await receive())["type"] == "websocket.receive":
+        await send({"type": "websocket.send", "text": message["text"]})
+
+options = {"ws": "auto", "lifespan": "off", "max_connections": 32}
+serve_http(app, host="127.0.0.1", port=int(sys.argv[1]), **options)
+"""
 
 
 @contextmanager
@@ -144,6 +165,24 @@ def test_a_body_that_comes_byte_by_byte_is_not_waited_for(tmp_path):
             except OSError:
                 break
         assert 8.0 < time.monotonic() - began < 45.0
+
+
+def test_a_web_socket_may_be_silent_beside_slow_connections(tmp_path):
+    (port,) = free_ports(1)
+    server = subprocess.Popen([sys.executable, "-c", ECHO, str(port)])
+    try:
+        deadline = time.monotonic() + 120
+        while ask(port) != 200:
+            assert time.monotonic() < deadline
+            time.sleep(0.2)
+        with connect(f"ws://127.0.0.1:{port}/") as web_socket:
+            _, left = attack(port, 100, 13.0)
+            assert left <= 32
+            web_socket.send("still here")
+            assert web_socket.recv(30) == "still here"
+    finally:
+        server.terminate()
+        server.wait(60)
 
 
 @pytest.mark.slow

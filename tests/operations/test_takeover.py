@@ -5,8 +5,6 @@ import http.client
 import json
 import shutil
 import signal
-import socket
-import ssl
 import subprocess
 import time
 from contextlib import contextmanager
@@ -16,6 +14,7 @@ from threading import Thread
 import psutil
 import pytest
 from chromium import CHROMIUM
+from listeners import listening, says_nothing
 from service import TOKEN, Served, fetch, wait_until
 from websockets.sync.client import connect
 
@@ -256,20 +255,6 @@ def test_a_run_chooses_neither_command_nor_code_nor_environment(served, pwned):
     assert not file.exists(), file.read_text()
 
 
-def listening(process):
-    """Port to the process that listens to it."""
-    found = {}
-    for each in [process, *process.children(recursive=True)]:
-        try:
-            for connection in each.net_connections("inet"):
-                if connection.status == psutil.CONN_LISTEN:
-                    assert connection.laddr.ip == "127.0.0.1", each.cmdline()
-                    found[connection.laddr.port] = each
-        except psutil.NoSuchProcess:
-            continue
-    return found
-
-
 def arguments_of(process):
     try:
         return process.cmdline()
@@ -283,33 +268,6 @@ def secrets_in(process):
     except psutil.Error:
         return set()
     return {secret for secret in (TOKEN, ALERT, CLOUD, OTHER) if secret in values}
-
-
-def says_nothing(port):
-    """Whether a port that is not for people gives those without its certificate no answer."""
-    with socket.create_connection(("127.0.0.1", port), 10) as plain:
-        plain.settimeout(10)
-        plain.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-        try:
-            said = plain.recv(100)
-        except OSError:
-            said = b""
-    # TLS answers with an alert; nothing that speaks HTTP or Dask's protocol does.
-    is_alert = said[:1] == b"\x15"
-    if said and not is_alert:
-        return False
-    if not is_alert:
-        return True
-    context = ssl.create_default_context()
-    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    try:
-        with (
-            socket.create_connection(("127.0.0.1", port), 10) as raw,
-            context.wrap_socket(raw) as wrapped,
-        ):
-            return wrapped.recv(100) == b""
-    except OSError:
-        return True
 
 
 def test_nothing_that_listens_answers_a_stranger_also_while_a_match_runs(served, small_match):
