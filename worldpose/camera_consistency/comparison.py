@@ -38,6 +38,8 @@ SAME_PIXELS: Final = 1.5
 """Distance between keypoints of two videos that counts as none [px]: compression moves them."""
 SAME_SHARE: Final = 0.015
 """The same as a share of a person's height in the image."""
+UNCERTAIN: Final = 2.0
+"""Standard deviations of a camera's rays by which the gate around a person is wider."""
 IN_VIEW: Final = 0.7
 """Share of a person's joints in the image from which on a camera should find the person."""
 
@@ -317,6 +319,9 @@ class Comparison:
             if at[n] < 0:
                 continue
             rays = view.rays[n][None]
+            # An uncertain pose may put all people beside their detections.
+            distance = np.linalg.norm(np.nanmean(joints, axis=1) - view.center, axis=-1)
+            gates = gate + UNCERTAIN * float(view.spread[n].max(initial=0.0)) * distance
             weights = np.isfinite(rays[..., 0]).astype(np.float64)
             detections += int((weights.sum(axis=-1) >= MIN_JOINTS).sum())
             if not len(joints):
@@ -326,7 +331,7 @@ class Comparison:
                 view.center[None],
                 rays,
                 weights,
-                np.full((1, len(joints)), gate),
+                gates[None],
                 MIN_JOINTS,
             )
             index = match_greedily(affinity)[0]

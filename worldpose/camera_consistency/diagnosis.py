@@ -30,6 +30,8 @@ Floats = NDArray[np.float64]
 
 PARTNERS: Final = 4
 """Cameras that a camera which agrees is compared with more closely."""
+PARTNERS_OF_GROSS: Final = 6
+"""The same for a camera that agrees with less than half: those that the others confirm most."""
 GIVEN_TILT: Final = 0.003
 """How far a given camera may be turned without being wrong [rad]."""
 MIN_FOCAL_ERROR: Final = 0.03
@@ -232,9 +234,9 @@ class _Diagnosis:
             found = self.explain(c, core, gross=True)
             if found is not None:
                 self.blame(c, found[0], core)
-            else:
-                self.unexplained(c, core)
         self.complete_swaps(core)
+        for c in [c for c in range(count) if c not in core and c not in self.faulty and core]:
+            self.unexplained(c, core)
         self.peel(core)
         return Consistency(
             tuple(self.faults),
@@ -274,9 +276,14 @@ class _Diagnosis:
             found = []
             for c in suspects:
                 partners = [p for p in core if p != c and p not in self.faulty]
-                partners.sort(key=lambda p: -self.agreement[c, p])
                 gross = bool(share[c].max() < CLEAR)
-                trials = self.explain(c, partners[:PARTNERS], gross)
+                if gross:  # those that agree with it by chance would not test it
+                    support = {p: sum(share[p, q] for q in partners) for p in partners}
+                    partners.sort(key=lambda p: -support[p])
+                else:
+                    partners.sort(key=lambda p: -self.agreement[c, p])
+                most = PARTNERS_OF_GROSS if gross else PARTNERS
+                trials = self.explain(c, partners[:most], gross)
                 if trials is not None:
                     found.append((trials[0].matches - trials[1].matches, c, trials[0]))
             if not found:
@@ -418,8 +425,9 @@ class _Diagnosis:
                 continue
             if now is None:
                 now = comparison.trial(c, self.polished(c, STATED, partners), partners)
-            turns = hypothesis.kind in ("lens", "focal")
-            tried = self.polished(c, hypothesis, partners) if turns else hypothesis
+            # The camera as stated was turned to fit best; its small corrections get the same.
+            fine = hypothesis.kind in FINE
+            tried = self.polished(c, hypothesis, partners) if fine else hypothesis
             trial = comparison.trial(c, tried, partners)
             if trial.matches < need * now.matches or not self.certain(trial, now):
                 continue
