@@ -48,7 +48,9 @@ class ClipSpec(Record):
     id: Name
     first_frame: Frame = 0
     """First match frame."""
-    frame_count: int = Field(gt=0, le=10_000_000)
+    frame_count: int = Field(gt=0, le=200_000)
+    """Tracks and joints of a clip are in memory as a whole: half of a match at 60 frames/s is
+    170,000 frames."""
     broadcast: Name | None = None
     """The broadcast camera that filmed this clip, if any."""
     broadcast_offset_frames: FrameOffset = 0.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import traceback
+from typing import Final
 
 
 class WorldposeError(Exception):
@@ -16,17 +17,29 @@ class InputError(WorldposeError):
     Args:
         where: file, and key or place in it: `match.yaml: cameras[2].kind`.
         expected: what is needed there.
-        found: what is there instead.
+        found: what is there instead; the middle of a long text is left out.
         todo: what the user can do about it.
     """
 
     def __init__(self, where: str, *, expected: str, found: str, todo: str) -> None:
-        self.where, self.expected, self.found, self.todo = where, expected, found, todo
-        super().__init__(f"{where}: expected {expected}, found {found}. {todo}")
+        self.where, self.expected = _shortened(where), expected
+        self.found, self.todo = _shortened(found), todo
+        super().__init__(f"{self.where}: expected {expected}, found {self.found}. {todo}")
 
     def __reduce__(self) -> tuple[object, ...]:
         # Keyword-only arguments: without this the error cannot travel back from a worker.
         return _input_error, (type(self), self.where, self.expected, self.found, self.todo)
+
+
+_LONGEST: Final = 600
+"""Characters that a message repeats of what was given: a name may have a million."""
+
+
+def _shortened(text: str) -> str:
+    if len(text) <= _LONGEST:
+        return text
+    half = _LONGEST // 2 - 20  # with what stands between, it is not shortened again
+    return f"{text[:half]}...[{len(text) - 2 * half} characters]...{text[-half:]}"
 
 
 def _input_error(

@@ -37,3 +37,12 @@ def test_errors_travel_back_from_a_worker(error):
     assert type(copy) is type(error)
     assert isinstance(copy, WorldposeError)
     assert str(copy) == str(error)
+
+
+def test_a_long_name_is_shortened_in_the_middle():
+    error = InputError("m" * 5000, expected="a", found="v" * 999 + "end", todo="Do b.")
+    assert len(str(error)) < 1500
+    assert "...[442 characters]..." in error.found
+    assert error.found.endswith("vend")
+    assert InputError("m", expected="a", found="v" * 600, todo="Do b.").found == "v" * 600
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)

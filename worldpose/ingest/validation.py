@@ -81,6 +81,8 @@ def _input_error(model: type[Record], detail: ErrorDetails, file: str, others: i
     elif kind == "value_error":
         expected, found = "entries that agree", str(context.get("error"))
         todo = "Correct the entries that are named."
+    elif place.endswith("frame_count") and kind == "less_than_equal":
+        todo = "Cut a longer recording into several clips."
     elif place == "contract":
         todo = "Use the version of worldpose that this file was written for."
     if others:

@@ -68,6 +68,11 @@ class Follower:
         """The ground on which people were seen so far [m^2]."""
         return max(MIN_AREA, float(np.prod(self.high - self.low)) if self.born else 0.0)
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether a frame without detections changes nothing: no person is followed or lost."""
+        return not (self.active or self.lost)
+
     def step(
         self, frame: int, directions: NDArray[np.float64], weights: NDArray[np.float64]
     ) -> None:

@@ -135,8 +135,10 @@ def track_people(
         weights *= (cameras.focal**2).mean(axis=-1)[:, None, None]
         weights[~seen] = 0.0
         directions = np.where(seen[..., None], directions, np.nan)
+        is_empty = ~np.asarray(seen.any(axis=(1, 2, 3)))
         for offset in range(len(image)):
-            follower.step(start + offset, directions[offset], weights[offset])
+            if not (is_empty[offset] and follower.is_idle):
+                follower.step(start + offset, directions[offset], weights[offset])
             if progress is not None:
                 progress(start + offset + 1, frames)
     return _result(follower, frames, pitch_size)

@@ -47,6 +47,14 @@ def test_frame_rates_lie_between_1_and_1000(tmp_path, fps):
     assert str(fps) in refused.found
 
 
+def test_a_clip_that_does_not_fit_into_memory_is_to_be_cut(tmp_path):
+    content = spec() | {"clips": [{"id": "clip", "frame_count": 1_000_000}]}
+    refused = refusal_of(tmp_path, content)
+    assert refused.where == f"{tmp_path / 'match.yaml'}: clips[0].frame_count"
+    assert "200000" in refused.expected
+    assert "several clips" in refused.todo
+
+
 @pytest.mark.parametrize("fps", [1.0, 23.976, 25, 240, 1000.0])
 def test_usual_frame_rates_are_taken(fps):
     assert MatchSpec.model_validate({**spec(), "fps": fps}).fps == fps

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from worldpose.errors import InputError
 from worldpose.tracking import TrackingSettings, track_people
+from worldpose.tracking.following import Follower
 
 SETTINGS = TrackingSettings()
 FPS = 50.0
@@ -132,6 +133,29 @@ def test_track_ends_when_a_person_is_unseen_for_longer(ring, people, seen):
         result = track_people(ring(5), keypoints, confidence, FPS, setting)
         assert sorted(owners(result)) == [0, 0, 1, 1, 2, 2, 3, 3]
         assert result.report.losses == 4
+
+
+def test_frames_without_any_detection_cost_no_step_and_change_nothing(
+    ring, people, seen, monkeypatch
+):
+    keypoints, confidence = seen(ring(5), still(people, 40))
+    long = np.full((2000, *keypoints.shape[1:]), np.nan)
+    long[900:940] = keypoints
+    told = np.full(long.shape[:-1], np.nan)
+    told[900:940] = confidence
+    steps = []
+    step = Follower.step
+
+    def counted(follower, frame, *rays):
+        steps.append(frame)
+        step(follower, frame, *rays)
+
+    monkeypatch.setattr(Follower, "step", counted)
+    result = track_people(ring(5), long, told, FPS, SETTINGS)
+    assert steps[0] == 900
+    assert steps[-1] < 940 + FPS * max(SETTINGS.max_lost, SETTINGS.max_coast) + 2
+    alone = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    np.testing.assert_array_equal(result.detection_index[900:940], alone.detection_index)
 
 
 def test_person_who_leaves_ends_and_the_others_go_on(ring, people, seen):
