@@ -21,7 +21,7 @@ class Footage:
 
     Attributes:
         index: all its pictures.
-        frame: (frames,) match frames.
+        frame: (frames,) match frames of all clips, rising.
         picture: (frames,) number of the picture that shows each; -1 where the video lacks it.
     """
 
@@ -63,13 +63,15 @@ def read_footage(
             todo="Correct width and height in match.yaml, or give the video in that size.",
         )
     clock = index.on_clock(fps, str(path))
-    frame = np.arange(frames.first, frames.first + frames.count)
+    wanted = [np.arange(first, first + count, dtype=np.int64) for _, first, count in clips]
+    frame = np.unique(np.concatenate(wanted))
     number = frame + frames.offset
     inside = (number >= 0) & (number < len(clock))
     picture = np.full(len(frame), -1, dtype=np.int64)
     picture[inside] = clock[number[inside]]
     for clip, first, count in clips:
-        if (picture[first - frames.first : first - frames.first + count] < 0).all():
+        row = int(np.searchsorted(frame, first))
+        if (picture[row : row + count] < 0).all():
             begin = first + frames.offset
             raise InputError(
                 f"{path}: clip {clip}",

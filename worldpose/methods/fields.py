@@ -41,16 +41,25 @@ def part(where: str, content: object, *keys: object) -> Any:  # noqa: ANN401
     return content
 
 
+def as_floats(where: str, value: object) -> Floats:
+    """Return numbers as an array of whatever shape they have.
+
+    Raises:
+        InputError: they are no numbers.
+    """
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise wrong(where, "numbers", f"a {type(value).__name__}") from None
+
+
 def floats(where: str, value: object, shape: tuple[int | None, ...]) -> Floats:
     """Return numbers of a shape, None for any length; ones as dimensions more do not count.
 
     Raises:
         InputError: no numbers, or another shape.
     """
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise wrong(where, "numbers", f"a {type(value).__name__}") from None
+    array = as_floats(where, value)
     while array.ndim > len(shape) and 1 in array.shape:
         # The first one of those that the shape does not want.
         lone = next(

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.body import BodyModel
-from worldpose.methods.fields import floats, number, part, rising, whole, wrong
+from worldpose.methods.fields import as_floats, floats, number, part, rising, whole, wrong
 from worldpose.methods.pickled import read_pickled
 from worldpose.methods.result import (
     MethodResult,
@@ -58,11 +58,11 @@ def _several(path: Path, content: Any) -> dict[int, tuple[Track, NDArray[np.floa
     for name, person in content.items():
         where = f"{path}: person {name}"
         frames = rising(where, whole(where, part(where, person, "frames")))
-        turns = np.asarray(part(where, person, "smpl_pose_quat_wroot"), dtype=np.float64)
+        turns = as_floats(where, part(where, person, "smpl_pose_quat_wroot"))
         track = _track(
             where,
             frames,
-            turns.reshape(len(frames), -1) if len(turns) == len(frames) else turns,
+            turns.reshape(len(frames), -1) if turns.shape[:1] == (len(frames),) else turns,
             part(where, person, "smpl_beta"),
             part(where, person, "root_trans"),
         )

@@ -87,7 +87,7 @@ def _read_run(
     where = str(info)
     try:
         content: Any = json.loads(info.read_bytes())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise wrong(where, "JSON", str(error)) from None
     files = sorted((info.parent / phase).glob("*_world_results.npz"))
     if not files:
@@ -137,7 +137,7 @@ def _intrinsics(results: Path, length: int) -> tuple[NDArray[np.float64], NDArra
         raise wrong(results.parent, f"<clip>_cameras_{iteration}.json", "none")
     try:
         rows = json.loads(files[0].read_bytes())["intrinsics"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise wrong(files[0], "intrinsics in JSON", f"{error!r}") from None
     numbers = floats(f"{files[0]}: intrinsics", rows, (None, 4))
     if len(numbers) < length:

@@ -141,7 +141,7 @@ def read_coco(path: Path, ids: tuple[int, ...], frames: int) -> Floats:
                 continue
             points = np.array(row["keypoints"], dtype=np.float64).reshape(len(COCO17), 3)
             pixels[frame, person] = np.where(points[:, 2:] > 0, points[:, :2], np.nan)
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise wrong(str(path), "COCO keypoints with track_id", f"{error!r}") from error
     return pixels
 

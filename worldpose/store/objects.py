@@ -119,9 +119,13 @@ class ObjectBlobs:
     def download(self, path: str, file: Path) -> None:
         """Writes the object at `path` to a new file, piece by piece: it may be a video."""
         file.parent.mkdir(parents=True, exist_ok=True)
-        with self._errors(path), file.open("xb") as content:
-            for piece in obstore.get(self._s3, checked_path(path)).stream():
+        with file.open("xb") as content:
+            for piece in self._pieces(path):
                 content.write(piece)
+
+    def _pieces(self, path: str) -> Iterator[obstore.Bytes]:
+        with self._errors(path):
+            yield from obstore.get(self._s3, checked_path(path)).stream()
 
     def _listed(self, prefix: str | None) -> list[Entry]:
         with self._errors(prefix or ""):

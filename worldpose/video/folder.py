@@ -17,6 +17,8 @@ from worldpose.video.images import decode_image
 from worldpose.video.reading import VideoReader
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg")
+_DIGITS: Final = 18
+"""Longest number of an image [digits]: 64 bits hold no longer one."""
 
 
 class ImageFolder:
@@ -110,6 +112,14 @@ def numbered_images(folder: Path) -> list[tuple[int, Path]]:
         if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
     )
     ends = [re.search(r"\d+$", file.stem) for file in files]
+    too_long = next((end.group() for end in ends if end and len(end.group()) > _DIGITS), None)
+    if too_long is not None:
+        raise InputError(
+            str(folder),
+            expected=f"images whose names end in numbers of at most {_DIGITS} digits",
+            found=too_long,
+            todo="Name them in order, for example 000123.jpg.",
+        )
     numbers = [int(end.group()) for end in ends if end]
     if not files or len(set(numbers)) < len(files):
         raise InputError(

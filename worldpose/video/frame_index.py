@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from worldpose.errors import InputError
 
+MOST_FRAMES: Final = 10_000_000
+"""Frames of a video's clock, two days at 60 frames/s: one odd number would fill the memory."""
 RATE_SLACK: Final = 0.1
 """Share of a clock's frames that a video may lack or double before it is one of another rate."""
 
@@ -68,12 +70,19 @@ class FrameIndex:
             where: the video, for messages.
 
         Raises:
-            InputError: the video has another rate.
+            InputError: the video has another rate, or pictures beyond belief.
         """
         if self.time_base is None:
             exact = (self.stamps - self.stamps[0]).astype(np.float64)
         else:
             exact = self.times * fps
+        if exact[-1] >= MOST_FRAMES:
+            raise InputError(
+                where,
+                expected=f"pictures within {MOST_FRAMES} frames, as numbers and time stamps say",
+                found=f"the last one {exact[-1]:.0f} frames after the first",
+                todo="Correct the numbers of the images, or write the video anew.",
+            )
         slot = np.rint(exact).astype(np.int64)
         late = np.abs(exact - slot)
         # By frame, and within a frame the nearest last, so that it is what stays.

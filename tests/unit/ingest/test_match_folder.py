@@ -180,7 +180,9 @@ def test_a_name_that_is_not_plainly_inside_the_folder_is_refused(match_folder, e
 @pytest.mark.parametrize("name", ["absent.mp4", "detections/cam1.npz/x", "a" * 5000, "\x00"])
 def test_a_name_of_nothing_is_refused(match_folder, edit, name):
     edit(lambda content: content["cameras"][0].update(video=name))
-    assert refusal(match_folder).found == f"no {name!r}"
+    found = refusal(match_folder).found
+    assert found.startswith(f"no {name!r}"[:200])
+    assert len(found) <= 600
 
 
 def test_a_pitch_outside_the_folder_is_refused(match_folder, edit):

@@ -12,7 +12,7 @@ import pytest
 
 from worldpose.errors import InputError
 from worldpose.methods import read_pickled
-from worldpose.methods.fields import number
+from worldpose.methods.fields import as_floats, number
 
 rng = np.random.default_rng(0)
 CONTENT = {
@@ -178,3 +178,9 @@ def test_too_little_memory_is_no_fault_of_the_file(tmp_path, monkeypatch):
     monkeypatch.setattr("worldpose.methods.pickled.plain", full)
     with pytest.raises(MemoryError):
         read_pickled(tmp_path / "a.pkl")
+
+
+@pytest.mark.parametrize("value", ["left", {"a": 1}, [[1.0], [1.0, 2.0]], [10**400]])
+def test_what_are_no_numbers_is_refused_with_its_place(value):
+    with pytest.raises(InputError, match="a: turns"):
+        as_floats("a: turns", value)

@@ -6,10 +6,12 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
-from worldpose.store import Store
+from worldpose.errors import StoreError
+from worldpose.store import Store, objects
 
 
 def test_what_is_put_is_read(store: Store) -> None:
@@ -86,3 +88,28 @@ def test_tree_is_removed_with_the_first_file_first(store: Store) -> None:
     assert store.blobs.entries("tree") == []
     assert store.blobs.exists("tree2/a")
     assert store.blobs.staged() == []
+
+
+def test_a_local_disk_that_fails_a_download_is_not_blamed_on_the_bucket(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pieces = [b"ab", b"cd"]
+
+    class Answer:
+        def stream(self) -> Iterator[bytes]:
+            return iter(pieces)
+
+    monkeypatch.setattr(objects.obstore, "get", lambda *_: Answer())
+    blobs = objects.ObjectBlobs.at("s3://bucket/project")
+    (tmp_path / "there").write_bytes(b"")
+    with pytest.raises(FileExistsError, match="there"):
+        blobs.download("a/b", tmp_path / "there")
+    blobs.download("a/b", tmp_path / "new")
+    assert (tmp_path / "new").read_bytes() == b"abcd"
+
+    def broken(*_: object) -> None:
+        raise OSError("connection reset")
+
+    monkeypatch.setattr(objects.obstore, "get", broken)
+    with pytest.raises(StoreError, match="Check the bucket"):
+        blobs.download("a/b", tmp_path / "other")

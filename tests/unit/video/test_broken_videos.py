@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
+from worldpose.ingest import UnitFrames
+from worldpose.ingest.footage import read_footage
 from worldpose.ingest.stills import write_still
 from worldpose.video import index_video, open_video
 
@@ -127,4 +129,30 @@ def test_images_count_by_their_numbers_and_a_gap_is_a_missing_frame(tmp_path):
 def test_images_without_numbers_are_refused(tmp_path):
     write_still(tmp_path / "first.png", numbered(1)[0])
     with pytest.raises(InputError, match="end in numbers"):
+        index_video(tmp_path)
+
+
+def test_one_odd_number_of_an_image_does_not_fill_the_memory(tmp_path):
+    for name in ("0", "2000000000"):
+        write_still(tmp_path / f"{name}.png", numbered(1)[0])
+    with pytest.raises(InputError, match="2000000000 frames after the first"):
+        index_video(tmp_path).on_clock(25.0, "images")
+
+
+def test_clips_that_are_far_apart_take_only_their_own_frames_of_a_video(tmp_path):
+    path = encode(tmp_path / "a.mp4", 40 * np.arange(50))
+    size = index_video(path).size
+    clips = [("late", 40, 5), ("far", 2_000_000_000, 3), ("early", 3, 4)]
+    frames = UnitFrames(3, 2_000_000_000, 0)
+    with pytest.raises(InputError, match="clip far"):
+        read_footage(path, 25.0, size, frames, clips)
+    footage = read_footage(path, 25.0, size, frames, [clips[0], clips[2]])
+    assert footage.frame.tolist() == [3, 4, 5, 6, 40, 41, 42, 43, 44]
+    assert footage.picture.tolist() == footage.frame.tolist()
+    assert footage.missing == []
+
+
+def test_numbers_of_images_that_no_integer_holds_are_refused(tmp_path):
+    write_still(tmp_path / f"{'9' * 40}.png", numbered(1)[0])
+    with pytest.raises(InputError, match="at most 18 digits"):
         index_video(tmp_path)
