@@ -71,6 +71,7 @@ SERVED = {
     "PREFECT_SERVER_METRICS_ENABLED": "true",
     "PREFECT_SERVER_DATABASE_TIMEOUT": "60",  # SQLite takes one writer at a time
     "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",
+    "PREFECT_LOGGING_TO_API_WHEN_MISSING_FLOW": "ignore",  # what serves is no run
     # Dask closes what begins a lost worker anew if that takes longer: 15 s, a slow machine's start.
     "DASK_DISTRIBUTED__DEPLOY__LOST_WORKER_TIMEOUT": str(START_SECONDS),
 }
