@@ -11,7 +11,19 @@ import time
 from pathlib import Path
 
 from .cases import base_of, build
-from .judging import DEFECTS, REFUSED, RIGHT, UNJUDGED, WARNED, score, visible_truth
+from .judging import (
+    COVERAGE,
+    DEFECTS,
+    MEAN_ERROR,
+    REFUSED,
+    RIGHT,
+    STATED,
+    STATED_ERROR,
+    UNJUDGED,
+    WARNED,
+    score,
+    visible_truth,
+)
 from .scene import write
 
 SECONDS = 600
@@ -75,11 +87,14 @@ def _judge(draft, work, done):
         ended = json.loads(done.stdout)
     except ValueError:
         return answer | {"class": "message", "message": f"no JSON: {done.stdout[-300:]}"}
-    coverage, error, _ = _score(draft, work, ended["run"])
-    answer |= {"coverage": coverage, "error_m": error}
-    if coverage >= 0.85 and (error or 0.0) < 0.12:
+    coverage, error, _, stated = _score(draft, work, ended["run"])
+    answer |= {"coverage": coverage, "error_m": error, "stated_error_m": stated}
+    if coverage >= COVERAGE and (error or 0.0) < MEAN_ERROR:
         return answer | {"class": RIGHT}
-    return answer | {"class": WARNED if warned else "nonsense"}
+    if warned:
+        return answer | {"class": WARNED}
+    is_stated = coverage >= COVERAGE and error <= STATED_ERROR * (stated or 0.0)
+    return answer | {"class": STATED if is_stated else "nonsense"}
 
 
 def _score(draft, work, run_id):

@@ -24,9 +24,13 @@ NEAR = 0.5
 """A person is found within this distance [m]."""
 COVERAGE, MEAN_ERROR = 0.85, 0.12
 """Least share of people found, and largest mean error of their joints [m], of a right result."""
+STATED_ERROR = 2.0
+"""Largest mean error in stated standard deviations of a joint's place: what the result says itself
+that it does not know is no silent error [1]."""
 MIN_JOINTS = 10
 
-RIGHT, WARNED, GATED, REFUSED, UNJUDGED = "right", "warned", "gated", "refused", "unjudged"
+RIGHT, WARNED, STATED, GATED = "right", "warned", "stated", "gated"
+REFUSED, UNJUDGED = "refused", "unjudged"
 DEFECTS = (
     "traceback",
     "internal",
@@ -35,11 +39,12 @@ DEFECTS = (
     "hang",
     "crash",
     "nonsense",
+    "gated",
     "half-written",
 )
 """Classes of defects: an error that is none of worldpose's; one that says that worldpose is wrong;
 an array contract's; a refusal without its parts; too slow; a dead process; a wrong result that
-nothing tells of; leftovers in the store."""
+nothing tells of, or that only `--gates auto` would; leftovers in the store."""
 
 
 def forked(work, *arguments):
@@ -234,8 +239,13 @@ def gate_objections(record):
 
 
 def score(store, match_id, record, truth):
-    """Share of people found, mean error of their joints [m], and people that are not there."""
-    joints, frames = None, None
+    """Return how a result compares with the truth.
+
+    Returns:
+        Share of people found, mean error of their joints [m], people that are not there, and the
+        mean of what the result states for that error [m].
+    """
+    joints, frames, stated = None, None, None
     for stage in ("body_fitting", "retriangulation", "triangulation"):
         names = [name for name in record.results if name.startswith(f"{stage}/")]
         if names:
@@ -245,15 +255,21 @@ def score(store, match_id, record, truth):
             ]
             joints = [part["joints"].values.astype(float) for part in parts]
             frames = [part["frame"].values for part in parts]
+            # Of an isotropic error of this covariance the mean length is 0.92 of the root.
+            stated = [
+                0.92 * np.sqrt(np.trace(part["covariance"].values, axis1=-2, axis2=-1))
+                for part in parts
+            ]
             break
     if joints is None:
-        return 0.0, None, 0
-    expected, found, errors, extra = 0, 0, [], 0
-    for there, numbers in zip(joints, frames, strict=True):
+        return 0.0, None, 0, None
+    expected, found, errors, extra, known = 0, 0, [], 0, []
+    for there, numbers, deviation in zip(joints, frames, stated, strict=True):
         for row, frame in enumerate(numbers):
             true = truth.get(int(frame), np.empty((0, 17, 3)))
             expected += len(true)
-            people = there[row][np.isfinite(there[row][..., 0]).sum(axis=-1) >= MIN_JOINTS]
+            whole = np.isfinite(there[row][..., 0]).sum(axis=-1) >= MIN_JOINTS
+            people = there[row][whole]
             if not len(people):
                 continue
             extra += len(people)
@@ -265,7 +281,9 @@ def score(store, match_id, record, truth):
             found += int((near < NEAR).sum())
             extra -= int((near < NEAR).sum())
             errors += near[near < NEAR].tolist()
-    return found / max(expected, 1), (float(np.mean(errors)) if errors else None), extra
+            known += np.nanmean(deviation[row][whole][rows], axis=-1)[near < NEAR].tolist()
+    mean = [float(np.mean(values)) if values else None for values in (errors, known)]
+    return found / max(expected, 1), mean[0], extra, mean[1]
 
 
 def visible_truth(draft):
@@ -303,14 +321,17 @@ def judge(draft, store, match, record, failures):
         for frame in range(clip.first_frame, min(clip.first_frame + clip.frame_count, 10**6))
     }
     truth = {frame: people for frame, people in truth.items() if frame in frames}
-    coverage, error, extra = score(store, match.match_id, record, truth)
+    coverage, error, extra, stated = score(store, match.match_id, record, truth)
     answer |= {"coverage": round(coverage, 3), "error_m": error, "extra": extra}
+    answer["stated_error_m"] = stated
     people = sum(map(len, truth.values()))
-    is_right = (coverage >= COVERAGE or not people) and (error or 0.0) < MEAN_ERROR
-    if is_right and extra <= 0.3 * max(people, 1):
+    is_found = (coverage >= COVERAGE or not people) and extra <= 0.3 * max(people, 1)
+    if is_found and (error or 0.0) < MEAN_ERROR:
         return answer | {"class": RIGHT}
     if said:
         return answer | {"class": WARNED}
+    if is_found and error <= STATED_ERROR * (stated or 0.0):
+        return answer | {"class": STATED}
     if gated:
         return answer | {"class": GATED}
     return answer | {
