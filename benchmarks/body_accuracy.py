@@ -35,8 +35,8 @@ from worldpose.body_fitting import (
 from worldpose.body_fitting.monocular import monocular_of
 from worldpose.cameras import Camera
 from worldpose.evaluation import evaluate_joints
+from worldpose.formats import JointTracks
 from worldpose.pitch import PitchTemplate
-from worldpose.release import JointTracks
 from worldpose.synthetic import SCENARIOS, Scene, simulate_scene
 from worldpose.synthetic.monocular import MonocularErrors, estimate_bodies
 from worldpose.tracking import TrackingSettings, track_people

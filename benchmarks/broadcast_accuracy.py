@@ -34,9 +34,9 @@ from worldpose.broadcast_calibration.normal_equations import point_row
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
 from worldpose.broadcast_calibration.weights import roughness
 from worldpose.cameras import Rigid
+from worldpose.formats import read_camera, read_joints
 from worldpose.ingest import MatchFolder, read_match, read_unit
 from worldpose.pitch import PitchTemplate
-from worldpose.release import read_camera, read_joints
 from worldpose.video import VideoReader
 
 Floats = NDArray[np.float64]

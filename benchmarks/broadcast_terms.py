@@ -27,10 +27,10 @@ from worldpose.broadcast_calibration.fit import misses
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, follow_lines
 from worldpose.broadcast_calibration.players import match as match_players
 from worldpose.broadcast_calibration.players import player_evidence
+from worldpose.formats import JointTracks, read_joints
 from worldpose.ingest import read_match
 from worldpose.pitch import PitchTemplate
-from worldpose.release import JointTracks, read_joints
-from worldpose.release.broadcast_pictures import before_after_picture, most_moved
+from worldpose.reports.broadcast import before_after_picture, most_moved
 from worldpose.synthetic import SCENARIOS, simulate_match
 from worldpose.video import VideoReader
 

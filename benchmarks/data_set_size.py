@@ -24,8 +24,8 @@ def write(folder: Path, clips: int, frames: int, people: int):
     """Write clips of people who run in circles at 2.4 m/s before a panning, zooming camera."""
     from worldpose.body import OPEN_BODY, BodyParameters, find_body
     from worldpose.cameras import Camera, Rigid
-    from worldpose.release.camera_file import write_moving_camera
-    from worldpose.release.pose_file import write_poses
+    from worldpose.formats.camera_file import write_moving_camera
+    from worldpose.formats.pose_file import write_poses
 
     model = find_body(OPEN_BODY)
     height = 0.95  # of a standing body's pelvis [m]

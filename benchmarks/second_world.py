@@ -45,8 +45,8 @@ from flows.settings import selected_stages
 from worldpose.evaluation import evaluate_joints
 from worldpose.evaluation.matching import joint_distances, match_people
 from worldpose.evaluation.regions import JOINT_GROUPS, region_counts
+from worldpose.formats import JointTracks, read_joints
 from worldpose.ingest import read_match
-from worldpose.release import JointTracks, read_joints
 from worldpose.store import Store, open_run
 from worldpose.synthetic import SCENARIOS, simulate_match
 from worldpose.synthetic.foreign import FOREIGN_SCENARIOS, simulate_foreign_match

@@ -21,7 +21,7 @@ from types import ModuleType
 
 import numpy as np
 
-from worldpose.release import read_joints
+from worldpose.formats import read_joints
 
 WORLDPOSE = Path(sys.executable).with_name("worldpose")
 

@@ -28,7 +28,7 @@ from flows.fan_out import task_of
 from flows.method import METHOD
 from flows.planning import PlannedUnit, plan_run
 from flows.registering import register
-from worldpose.release import read_joints, write_archive
+from worldpose.formats import read_joints, write_archive
 from worldpose.store import Store, key_of
 from worldpose.synthetic import SCENARIOS
 from worldpose.synthetic.matches import simulate_match

@@ -18,7 +18,7 @@ import numpy as np
 
 from worldpose.cameras import Camera
 from worldpose.evaluation import evaluate_joints
-from worldpose.release import JointTracks
+from worldpose.formats import JointTracks
 from worldpose.synthetic import SCENARIOS, Scenario, Scene, read_trajectories, simulate_scene
 from worldpose.tracking import TrackingSettings, track_people
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from worldpose.cameras import Camera
 from worldpose.evaluation import evaluate_joints
-from worldpose.release import JointTracks
+from worldpose.formats import JointTracks
 from worldpose.synthetic import SCENARIOS, CalibrationErrors, Scene, simulate_scene
 from worldpose.synthetic.calibrating import misjudge
 from worldpose.tracking import TrackingSettings, track_people

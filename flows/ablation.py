@@ -21,8 +21,8 @@ from worldpose.bundle_adjustment import (
 from worldpose.cameras import Camera
 from worldpose.errors import InputError
 from worldpose.evaluation import evaluate_cameras, evaluate_joints
+from worldpose.formats import JointTracks
 from worldpose.pitch import PitchTemplate
-from worldpose.release import JointTracks
 from worldpose.static_calibration import (
     StaticCalibration,
     StaticCalibrationSettings,

@@ -21,17 +21,13 @@ from flows.release import (
 from flows.stage import Match
 from worldpose.broadcast_calibration import camera_before
 from worldpose.cameras.stored import camera_from_arrays
+from worldpose.formats import JointTracks, whole_file
 from worldpose.ingest import unit_frames
-from worldpose.release import JointTracks, Picture, whole_file
-from worldpose.release.broadcast_pictures import (
-    angles_of,
-    before_after_picture,
-    course_picture,
-    most_moved,
-)
-from worldpose.release.html_page import Table
-from worldpose.release.overlay_video import overlay_frames
-from worldpose.release.stadium_pictures import camera_picture
+from worldpose.reports import Picture
+from worldpose.reports.broadcast import angles_of, before_after_picture, course_picture, most_moved
+from worldpose.reports.clips import camera_picture
+from worldpose.reports.html_page import Table
+from worldpose.reports.overlay_video import overlay_frames
 from worldpose.store import Run
 from worldpose.video import open_video, write_video
 

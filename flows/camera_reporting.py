@@ -12,9 +12,14 @@ from data_contracts.match import MatchSpec
 from flows.stage import Match
 from worldpose.cameras import Camera
 from worldpose.ingest.stills import read_still
-from worldpose.release import CameraSummary, Picture
-from worldpose.release.calibration_pictures import Click, ErrorMap, calibration_picture
-from worldpose.release.paint_pictures import NEAR, paint_picture
+from worldpose.reports import CameraSummary, Picture
+from worldpose.reports.static_cameras import (
+    NEAR,
+    Click,
+    ErrorMap,
+    calibration_picture,
+    paint_picture,
+)
 from worldpose.store import Run, Store
 
 SHOWN = 2

@@ -6,11 +6,10 @@ from pathlib import Path
 
 from data_contracts.release import CheckReport, Finding
 from worldpose.body import OPEN_BODY, find_body
-from worldpose.release.check import check_clip
-from worldpose.release.check_reading import clips_in, read_clip
-from worldpose.release.check_settings import CheckSettings
-from worldpose.release.frame_rates import frame_rate_of, read_frame_rates
-from worldpose.release.manifest import changed_files, read_manifest
+from worldpose.dataset.check import check_clip
+from worldpose.dataset.manifest import changed_files, frame_rate_of, read_frame_rates, read_manifest
+from worldpose.dataset.reading import clips_in, read_clip
+from worldpose.dataset.settings import CheckSettings
 
 USUAL_FPS = 50.0
 """Frames in a second where neither an export nor a person says it: the released clips'."""

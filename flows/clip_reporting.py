@@ -17,12 +17,12 @@ from flows.release import (
 )
 from flows.stage import Match
 from worldpose.cameras import Camera
-from worldpose.release import JointTracks, Picture, Scene
-from worldpose.release.body_paint import BodyTracks
-from worldpose.release.body_pictures import bodies_picture
-from worldpose.release.detection_pictures import detections_picture
-from worldpose.release.pictures import paths_picture
-from worldpose.release.stadium_pictures import camera_picture, stadium_picture
+from worldpose.formats import JointTracks
+from worldpose.reports import Picture, Scene
+from worldpose.reports.bodies import bodies_picture
+from worldpose.reports.body_rendering import BodyTracks
+from worldpose.reports.clips import camera_picture, paths_picture, stadium_picture
+from worldpose.reports.detections import detections_picture
 from worldpose.store import Run, Store
 
 

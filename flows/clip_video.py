@@ -20,7 +20,7 @@ from flows.release import (
 )
 from flows.stage import Match
 from worldpose.cameras import Camera
-from worldpose.release.overlay_video import overlay_frames
+from worldpose.reports.overlay_video import overlay_frames
 from worldpose.store import Run, Store
 from worldpose.video import write_video
 

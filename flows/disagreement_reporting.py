@@ -11,8 +11,9 @@ from flows.match_pictures import frame_picture
 from flows.redetection import seen_in
 from flows.release import clip_title, joint_tracks, static_cameras
 from flows.stage import Match
-from worldpose.release import JointTracks, Picture
-from worldpose.release.detection_pictures import detections_picture
+from worldpose.formats import JointTracks
+from worldpose.reports import Picture
+from worldpose.reports.detections import detections_picture
 from worldpose.store import Run, Store
 
 SHOWN: Final = 2

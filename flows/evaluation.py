@@ -27,9 +27,9 @@ from worldpose.evaluation.marker_files import (
     read_markers,
 )
 from worldpose.evaluation.marker_reference import ReferenceAlignment, lay_over
+from worldpose.formats import JointTracks, read_camera, read_joints
 from worldpose.ingest import MatchFolder, read_match
 from worldpose.pitch import PitchTemplate
-from worldpose.release import JointTracks, read_camera, read_joints
 from worldpose.store import Store, open_run
 
 

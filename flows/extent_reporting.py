@@ -8,15 +8,15 @@ from data_contracts.evaluation import Evaluation
 from data_contracts.release import DataSetStatistics
 from flows.release import broadcast_cameras, clips_of, joint_tracks
 from flows.stage import Match
-from worldpose.release import Section
-from worldpose.release.data_set_page import counted_section
-from worldpose.release.statistics import clip_statistics, data_set_statistics, kind_of
+from worldpose.dataset.statistics import clip_statistics, data_set_statistics, kind_of
+from worldpose.reports import Section
+from worldpose.reports.data_set import counted_section
 from worldpose.store import Run
 
 
 def extent_of(run: Run, match: Match) -> DataSetStatistics:
     """Clips, frames, poses and distances of a run: the middle of the hips is where people are."""
-    from worldpose.release.drawing import HIPS  # late: loads matplotlib
+    from worldpose.reports.drawing import HIPS
 
     broadcast = broadcast_cameras(run)
     clips = {}

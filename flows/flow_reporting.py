@@ -13,8 +13,8 @@ from worldpose.broadcast_calibration.optical_flow import follow
 from worldpose.broadcast_calibration.turning import modified_z_scores
 from worldpose.cameras import Camera
 from worldpose.ingest import unit_frames
-from worldpose.release import Picture
-from worldpose.release.broadcast_pictures import flow_picture
+from worldpose.reports import Picture
+from worldpose.reports.broadcast import flow_picture
 from worldpose.store import Run
 from worldpose.video import open_video
 

@@ -23,26 +23,26 @@ from worldpose.body import BodyModel, BodyParameters, find_body
 from worldpose.cameras import Camera
 from worldpose.cameras.stored import camera_from_arrays
 from worldpose.errors import WorldposeError
-from worldpose.ingest import read_match
-from worldpose.pitch import PitchTemplate
-from worldpose.release import coco_dataset, write_coco, write_joints
-from worldpose.release.baseline_inputs import (
+from worldpose.formats import coco_dataset, write_coco, write_joints
+from worldpose.formats.baseline_inputs import (
     write_baseline_settings,
     write_slahmr_cameras,
     write_tracks,
 )
-from worldpose.release.camera_file import write_moving_camera, write_static_camera
-from worldpose.release.challenge import ChallengeClip, challenge_truth
-from worldpose.release.challenge_files import (
+from worldpose.formats.camera_file import write_moving_camera, write_static_camera
+from worldpose.formats.challenge import (
+    ChallengeClip,
     Edition,
+    challenge_truth,
     write_challenge,
     write_challenge_camera,
     write_pitch_points,
     write_submission,
 )
-from worldpose.release.marker_file import write_markers
-from worldpose.release.motion_file import stretches, write_motion
-from worldpose.release.pose_file import write_poses
+from worldpose.formats.motion_capture import stretches, write_markers, write_motion
+from worldpose.formats.pose_file import write_poses
+from worldpose.ingest import read_match
+from worldpose.pitch import PitchTemplate
 from worldpose.store import Run
 
 PITCH_SPACING = 0.5
@@ -247,7 +247,7 @@ def export_slahmr_cameras(origin: Origin, out: Path) -> list[Path]:
 def export_recording(origin: Origin, out: Path) -> list[Path]:
     """Writes `rerun/<clip>.rrd` for the rerun viewer."""
     # Late: it draws with matplotlib's colours, which cost half a second to load.
-    from worldpose.release.recording import write_recording
+    from worldpose.reports.rerun_recording import write_recording
 
     written = []
     for clip in origin.clips:

@@ -15,9 +15,9 @@ from worldpose.cameras import Camera
 from worldpose.errors import UsageError
 from worldpose.evaluation import EvaluationSettings, evaluate_joints
 from worldpose.evaluation.method_table import meaningful
+from worldpose.formats import JointTracks
+from worldpose.formats.camera_file import RELEASE_SIZE
 from worldpose.methods import MethodResult, find_method, resampled
-from worldpose.release import JointTracks
-from worldpose.release.camera_file import RELEASE_SIZE
 
 
 def score_methods(

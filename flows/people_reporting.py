@@ -7,8 +7,8 @@ import xarray as xr
 
 from data_contracts.conventions import COCO17
 from flows.release import ADJUSTED, bodies_unit, clip_title
-from worldpose.release.html_page import Table
-from worldpose.release.meanings import shown_number
+from worldpose.reports.html_page import Table
+from worldpose.reports.score_names import shown_number
 from worldpose.store import Run
 
 MOST = 20

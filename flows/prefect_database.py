@@ -14,7 +14,7 @@ from contextlib import closing, suppress
 from importlib.metadata import version
 from pathlib import Path
 
-from worldpose.release import whole_file
+from worldpose.formats import whole_file
 from worldpose.store.blobs import storage_errors
 
 DATABASE = "prefect.db"

@@ -12,8 +12,8 @@ from worldpose.body import BodyParameters, find_body
 from worldpose.cameras import Camera
 from worldpose.cameras.stored import camera_from_arrays
 from worldpose.errors import UsageError, WorldposeError
-from worldpose.release import JointTracks
-from worldpose.release.body_paint import BodyTracks
+from worldpose.formats import JointTracks
+from worldpose.reports.body_rendering import BodyTracks
 from worldpose.store import Run
 
 if TYPE_CHECKING:

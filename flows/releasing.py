@@ -12,15 +12,15 @@ from data_contracts.pin import Pin
 from data_contracts.release import ReleasedClip, ReleaseManifest
 from flows.formats import EXPORTS, Origin
 from flows.release import bodies_unit, joint_tracks, static_cameras
-from worldpose.errors import UsageError
-from worldpose.ingest.pitch_file import NO_PITCH
-from worldpose.release.frame_rates import write_frame_rates
-from worldpose.release.manifest import (
+from worldpose.dataset.manifest import (
     read_manifest,
     released_files,
+    write_frame_rates,
     write_manifest,
 )
-from worldpose.release.origins import ORIGINS, origins_of, write_origins
+from worldpose.dataset.origins import ORIGINS, origins_of, write_origins
+from worldpose.errors import UsageError
+from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.store import Store, pin_run
 
 CLASHING = {"worldpose", "challenge", "challenge-2025"}

@@ -22,8 +22,9 @@ from flows.release import clips_of, static_cameras
 from flows.review_reporting import review_table
 from flows.stage import Match
 from worldpose.errors import UsageError
-from worldpose.release import Section, report_page, whole_file
-from worldpose.release.report import camera_table
+from worldpose.formats import whole_file
+from worldpose.reports import Section, report_page
+from worldpose.reports.run_report import camera_table
 from worldpose.store import Run, Store, open_run
 
 

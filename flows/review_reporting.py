@@ -5,7 +5,7 @@ from __future__ import annotations
 from data_contracts.review import Correction, ReviewDecision, ReviewRequest, Withdrawal
 from flows.cli.review_text import in_words, when
 from flows.stage import Match
-from worldpose.release import Table
+from worldpose.reports import Table
 
 MOST = 200
 """Rows: the last ones."""

@@ -7,13 +7,13 @@ from pathlib import Path
 
 from data_contracts.release import DataSetStatistics
 from flows.checking import USUAL_FPS, stated_rates
-from worldpose.errors import UsageError
-from worldpose.release.statistics import (
+from worldpose.dataset.statistics import (
     camera_kind,
     clip_statistics,
     data_set_statistics,
     read_places,
 )
+from worldpose.errors import UsageError
 
 
 def count(folders: Sequence[Path], *, fps: float | None = None) -> DataSetStatistics:

@@ -126,7 +126,7 @@ def evaluate(
             todo="Name what is scored and the truth, or ask for --ablation 10.",
         )
     from flows.evaluation import score
-    from worldpose.release.meanings import score_rows
+    from worldpose.reports.score_names import score_rows
 
     scores = score(
         prediction,

@@ -237,11 +237,11 @@ def import_command(
 
 def import_pitch(survey: Path, out: Path, *, left_handed: bool, as_json: bool) -> None:
     """Lay a survey onto the world frame, write pitch.json and say how it fits."""
+    from worldpose.formats import whole_file
     from worldpose.ingest.pitch_file import refuse_unread_pitch
     from worldpose.pitch.survey import fit_survey
     from worldpose.pitch.survey_file import read_survey
     from worldpose.pitch.survey_settings import SurveySettings
-    from worldpose.release import whole_file
 
     file = out / "pitch.json"
     if file.exists():

@@ -55,8 +55,8 @@ def clips(
     shots = list(find_shots(_pictures(programme), index.fps))
     proposed = [shot for shot in shots if not shot.unfit]
     if sheet is not None:
-        from worldpose.release import whole_file
-        from worldpose.release.programme_sheet import programme_sheet
+        from worldpose.formats import whole_file
+        from worldpose.reports.clip_sheet import programme_sheet
 
         with whole_file(sheet) as draft:
             draft.write_bytes(programme_sheet(proposed))
@@ -112,7 +112,7 @@ def _pictures(programme: Path) -> Iterator[tuple[int, NDArray[np.uint8] | None]]
 
 def _take(programme: Path, take: str, out: Path, *, as_json: bool) -> None:
     """Cut pictures out, and say what match.yaml is to say of them."""
-    from worldpose.release import whole_file
+    from worldpose.formats import whole_file
     from worldpose.video.cutting import cut_video
 
     first, _, stop = take.partition(":")

@@ -39,15 +39,15 @@ def statistics(
         tell_unstated_rate(folder, fps)
     found = count(folders, fps=fps)
     if picture is not None:
-        from worldpose.release.files import whole_file
-        from worldpose.release.statistics_pictures import statistics_picture
+        from worldpose.formats.files import whole_file
+        from worldpose.reports.data_set import statistics_picture
 
         with whole_file(picture) as draft:
             draft.write_bytes(statistics_picture(found))
     if page is not None:
         from flows.checking import check
-        from worldpose.release.data_set_page import data_set_page
-        from worldpose.release.files import whole_file
+        from worldpose.formats.files import whole_file
+        from worldpose.reports.data_set import data_set_page
 
         checks = {str(folder): check(folder, fps=fps) for folder in folders}
         title = ", ".join(folder.resolve().name for folder in folders)

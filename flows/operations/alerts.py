@@ -16,7 +16,7 @@ from flows.operations.layout import StateFolder
 from flows.operations.overview import MatchGlance, age
 from flows.operations.plan import ServePlan
 from flows.operations.senders import Sender
-from worldpose.release import whole_file
+from worldpose.formats import whole_file
 
 AlertKind = Literal["run_failed", "gate_waiting", "quality", "disk_low", "arrival_refused"]
 

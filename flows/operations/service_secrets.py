@@ -14,7 +14,7 @@ from flows.operations.plan import ServePlan
 from flows.pages.access import TOKEN_LENGTH
 from flows.prefect_environment import CLIENT_LOGIN, CLOUD_LOGIN, DATABASE, SERVER_LOGIN, new_login
 from worldpose.errors import UsageError
-from worldpose.release import whole_file
+from worldpose.formats import whole_file
 
 ALERTS: Final = ("WORLDPOSE_ALERT_URL", "WORLDPOSE_ALERT_MAIL")
 PAGES_TOKEN: Final = "WORLDPOSE_REVIEW_TOKEN"

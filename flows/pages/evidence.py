@@ -24,9 +24,10 @@ from flows.pages.desk import Desk
 from flows.people_reporting import adjustment_tables, body_tables
 from flows.release import placed_joints, static_cameras
 from flows.stage import Match
-from worldpose.release import JointTracks, Picture
-from worldpose.release.html_page import Table
-from worldpose.release.pictures import paths_picture
+from worldpose.formats import JointTracks
+from worldpose.reports import Picture
+from worldpose.reports.clips import paths_picture
+from worldpose.reports.html_page import Table
 from worldpose.review import requests_by_id
 from worldpose.review.curves import Curve, clip_curves
 from worldpose.store import Run, Store, open_run

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from worldpose.body_fitting.pose_space import COORDINATES, GATHER, SIZE
+from worldpose.formats import write_archive
 from worldpose.pitch import PitchTemplate
-from worldpose.release import write_archive
 from worldpose.synthetic import SCENARIOS
 from worldpose.synthetic.crowd import gather
 

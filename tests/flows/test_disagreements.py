@@ -8,7 +8,7 @@ import xarray as xr
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.disagreement_reporting import worst_views
 from worldpose.cameras import Camera
-from worldpose.release import JointTracks
+from worldpose.formats import JointTracks
 from worldpose.synthetic.stadium import looking
 
 FRAMES = np.arange(20, 24)

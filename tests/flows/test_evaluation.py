@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from command_line import succeed, worldpose
 
-from worldpose.release import JointTracks
-from worldpose.release.marker_file import write_markers
+from worldpose.formats import JointTracks
+from worldpose.formats.motion_capture import write_markers
 
 
 def changed(source, target, **changes):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from command_line import succeed
 
-from worldpose.release import read_camera
+from worldpose.formats import read_camera
 from worldpose.store import Store, open_run
 
 PEOPLE = 5

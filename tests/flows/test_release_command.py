@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from command_line import TINY, succeed, worldpose
 
+from worldpose.dataset.origins import read_origins
 from worldpose.errors import InputError
-from worldpose.release.origins import read_origins
 from worldpose.store import Store, list_pins
 from worldpose.store.garbage import plan_gc
 from worldpose.synthetic.bvh import read_bvh

@@ -13,9 +13,9 @@ from flows.formats import EXPORTS, Origin
 from worldpose.body import BodyParameters, fold_keypoints, load_open_body
 from worldpose.body.skeletons import CHALLENGE15
 from worldpose.errors import InputError, WorldposeError
-from worldpose.release import read_camera
-from worldpose.release.challenge_files import read_challenge, read_submission
-from worldpose.release.pose_file import read_poses
+from worldpose.formats import read_camera
+from worldpose.formats.challenge import read_challenge, read_submission
+from worldpose.formats.pose_file import read_poses
 
 FRAMES = np.arange(100, 104)
 

@@ -19,8 +19,8 @@ from tasks.triangulation import camera_errors
 from tasks.unit import unit_task
 from worldpose.cameras.stored import camera_from_arrays
 from worldpose.errors import CorruptionError, InputError, StoreError, WorldposeError
+from worldpose.formats import read_camera
 from worldpose.ingest.stills import write_still
-from worldpose.release import read_camera
 from worldpose.store import Store, explain_difference, key_of
 
 

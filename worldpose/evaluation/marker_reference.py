@@ -14,7 +14,7 @@ from worldpose.errors import DegenerateError
 from worldpose.evaluation.alignment import Similarity, align
 from worldpose.evaluation.matching import joint_distances, match_people, taken
 from worldpose.evaluation.registration import register_world
-from worldpose.release import JointTracks
+from worldpose.formats import JointTracks
 
 Floats = NDArray[np.float64]
 

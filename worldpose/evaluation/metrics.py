@@ -22,7 +22,7 @@ from worldpose.evaluation.trajectories import (
     drift_per_meter,
     path_lengths,
 )
-from worldpose.release import JointTracks
+from worldpose.formats import JointTracks
 
 
 class PersonScore(Record):

@@ -12,7 +12,7 @@ from data_contracts.conventions import COCO17
 from worldpose.errors import InputError
 from worldpose.evaluation.matching import joint_distances, match_people, taken
 from worldpose.evaluation.settings import EvaluationSettings
-from worldpose.release import JointTracks
+from worldpose.formats import JointTracks
 
 Flags = NDArray[np.bool_]
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from worldpose.formats import JointTracks
 from worldpose.methods.result import MethodResult
-from worldpose.release import JointTracks
 
 Floats = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from data_contracts.conventions import COCO17
 from worldpose.body import OPEN_BODY, BodyModel, BodyParameters, fold_keypoints
 from worldpose.cameras import Rigid
 from worldpose.errors import InputError
-from worldpose.release import JointTracks
+from worldpose.formats import JointTracks
 
 Floats = NDArray[np.float64]
 World = Literal["shared", "own", "camera"]

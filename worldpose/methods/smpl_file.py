@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from worldpose.body import OPEN_BODY, BodyModel
+from worldpose.formats.pose_file import read_poses
 from worldpose.methods.result import MethodResult, Track, gathered, posed
-from worldpose.release.pose_file import read_poses
 
 
 def read_smpl(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from worldpose.formats import write_archive
 from worldpose.ingest.stills import write_still
 from worldpose.pitch import PitchTemplate
-from worldpose.release import write_archive
 from worldpose.synthetic.broadcast_rendering import film_broadcast
 from worldpose.synthetic.casting import Cast, dress_people, roles_of, stand_by
 from worldpose.synthetic.exposing import Moment, RenderedFrame

@@ -14,15 +14,10 @@ from data_contracts.broadcast_calibration import KeyFrames
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from worldpose.body import OPEN_BODY
 from worldpose.cameras import Camera
+from worldpose.formats import write_archive, write_joints, write_moving_camera, write_static_camera
+from worldpose.formats.pose_file import write_poses
 from worldpose.ingest import write_calibration_toml, write_match
 from worldpose.pitch import PitchTemplate
-from worldpose.release import (
-    write_archive,
-    write_joints,
-    write_moving_camera,
-    write_static_camera,
-)
-from worldpose.release.pose_file import write_poses
 from worldpose.synthetic.broadcast_rendering import render_broadcast
 from worldpose.synthetic.clips import read_clip
 from worldpose.synthetic.footage import Advance, film_scene
@@ -60,11 +55,11 @@ def simulate_match(
     Besides what a match folder to be calibrated has (match.yaml, pitch.json, detections/,
     annotations/, stills/) it holds, under reference/:
 
-    - joints.npz (`worldpose.release.write_joints`);
+    - joints.npz (`worldpose.formats.write_joints`);
     - poses/clip.npz, the bodies that these joints are keypoints of, as the WorldPose release has
       them: betas (N, 10), global_orient (N, T, 3), body_pose (N, T, 69), transl (N, T, 3) in single
       precision, and the name of the `body_model`;
-    - calibration.toml and cameras/<camera>.npz (`worldpose.release.write_static_camera`) and, with
+    - calibration.toml and cameras/<camera>.npz (`worldpose.formats.write_static_camera`) and, with
       a row a frame, cameras/clip.npz of the broadcast camera;
     - pitch.json as it is painted;
     - clicks.json: of every static camera, `wrong` clicks (`Clicks.wrong`), and whether they are

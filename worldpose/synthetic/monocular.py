@@ -11,7 +11,7 @@ from pydantic import Field
 from data_contracts.records import Record
 from worldpose.body import BodyModel, BodyParameters, load_open_body
 from worldpose.cameras import Camera, Rigid
-from worldpose.release import write_archive
+from worldpose.formats import write_archive
 from worldpose.synthetic.processes import drift
 
 Floats = NDArray[np.float64]

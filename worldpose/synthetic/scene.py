@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from data_contracts.pitch import PitchSpec
 from worldpose.body import BodyParameters
 from worldpose.cameras import Camera
+from worldpose.formats import JointTracks
 from worldpose.ingest import Observations
 from worldpose.pitch import PitchTemplate
-from worldpose.release import JointTracks
 from worldpose.synthetic.broadcast import film
 from worldpose.synthetic.bvh import Clip
 from worldpose.synthetic.calibrating import misjudge

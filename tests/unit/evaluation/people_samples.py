@@ -3,7 +3,7 @@
 import numpy as np
 
 from worldpose.evaluation import EvaluationSettings, evaluate_joints
-from worldpose.release import JointTracks
+from worldpose.formats import JointTracks
 
 SIDES = {1: 0.03, 3: 0.07, 5: 0.20, 7: 0.20, 9: 0.20, 11: 0.11, 13: 0.11, 15: 0.11}
 HEIGHTS = (1.70, 1.72, 1.70, 1.45, 1.15, 0.89, 0.90, 0.50, 0.10)

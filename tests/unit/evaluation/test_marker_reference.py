@@ -15,8 +15,8 @@ from worldpose.evaluation.marker_files import (
 )
 from worldpose.evaluation.marker_reference import lay_over, sampled
 from worldpose.evaluation.metrics import evaluate_joints
-from worldpose.release import JointTracks
-from worldpose.release.marker_file import Y_UP, write_markers
+from worldpose.formats import JointTracks
+from worldpose.formats.motion_capture import Y_UP, write_markers
 
 FPS, RATE, OFFSET = 50.0, 100.0, 0.7313
 TURN = Rotation.from_rotvec([0.0, 0.0, 2.1])

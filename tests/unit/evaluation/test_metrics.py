@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from people_samples import crowd, person, score, tracks
 
 from worldpose.evaluation import evaluate_joints
-from worldpose.release import JointTracks
+from worldpose.formats import JointTracks
 
 # Sums of a few hundred rounded distances of some metres: 1e-9 mm is a thousand times their error.
 MM = 1e-9

@@ -6,7 +6,7 @@ import pytest
 from data_contracts.conventions import COCO17
 from worldpose.errors import InputError
 from worldpose.evaluation.regions import JOINT_GROUPS, region_counts
-from worldpose.release import JointTracks
+from worldpose.formats import JointTracks
 
 
 def people(frames=60, persons=4, spread=0.03, stated=0.03, seed=0):

@@ -11,7 +11,7 @@ from data_contracts.conventions import COCO17
 from worldpose.body import BodyParameters, fold_keypoints, load_open_body
 from worldpose.cameras import Camera, Rigid
 from worldpose.evaluation.boxes import joint_boxes
-from worldpose.release import JointTracks
+from worldpose.formats import JointTracks
 
 FRAMES, PEOPLE, WALK = 16, 2, 8.0
 FIRST = 40
@@ -340,7 +340,7 @@ def write_prompthmr(folder, bodies, camera):
 
 
 def write_smpl(folder, bodies, camera):
-    from worldpose.release.pose_file import write_poses
+    from worldpose.formats.pose_file import write_poses
 
     path = folder / "poses.npz"
     write_poses(path, y_up(bodies), model.name)

@@ -25,8 +25,8 @@ from flows.methods import score_methods
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation.method_table import table_csv, table_latex, table_rows
 from worldpose.evaluation.selected_joints import paper_joints
+from worldpose.formats import JointTracks, write_joints, write_moving_camera
 from worldpose.methods import METHODS
-from worldpose.release import JointTracks, write_joints, write_moving_camera
 
 LOCAL, ALONE = ("hybrik", "4dhumans"), ("wham", "gvhmr")
 NOT_SEEN = "smpl"

@@ -8,8 +8,8 @@ from flows.cli.methods import named_rates
 from flows.methods import score_methods
 from worldpose.body import BodyParameters
 from worldpose.errors import UsageError
+from worldpose.formats import JointTracks, write_joints, write_moving_camera
 from worldpose.methods import MethodResult, resampled
-from worldpose.release import JointTracks, write_joints, write_moving_camera
 
 
 def straight(frames, speed, persons=1):

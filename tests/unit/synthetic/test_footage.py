@@ -5,9 +5,9 @@ import cv2
 import numpy as np
 import pytest
 
+from worldpose.formats import read_joints
 from worldpose.ingest import read_match
 from worldpose.pitch import PitchTemplate
-from worldpose.release import read_joints
 from worldpose.synthetic import SCENARIOS, simulate_match
 from worldpose.synthetic.casting import stand_by
 

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from worldpose.formats import read_camera, read_joints
 from worldpose.ingest import read_match
 from worldpose.pitch import PitchTemplate
-from worldpose.release import read_camera, read_joints
 from worldpose.synthetic.foreign import (
     FOREIGN_SCENARIOS,
     simulate_foreign_match,

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from worldpose.body import OPEN_BODY, SKELETONS, BodyParameters, fold_keypoints, load_open_body
-from worldpose.release import read_joints
+from worldpose.formats import read_joints
 from worldpose.synthetic import SCENARIOS, simulate_match
 
 TINY = SCENARIOS["tiny"]

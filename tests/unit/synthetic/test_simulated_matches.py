@@ -6,10 +6,10 @@ import pytest
 from data_contracts.pitch import PitchSpec
 from worldpose.cameras import Camera
 from worldpose.errors import InputError
+from worldpose.formats import read_joints
 from worldpose.ingest import read_calibration, read_match, read_unit
 from worldpose.ingest.stills import read_still
 from worldpose.pitch import PitchTemplate
-from worldpose.release import read_joints
 from worldpose.synthetic import SCENARIOS, Scenario, simulate_match, simulate_scene
 
 TINY = SCENARIOS["tiny"]

@@ -5,8 +5,8 @@ import pytest
 
 from worldpose.cameras import Camera
 from worldpose.evaluation import evaluate_joints
+from worldpose.formats import JointTracks
 from worldpose.pitch import PitchTemplate
-from worldpose.release import JointTracks
 from worldpose.static_calibration import StaticCalibrationSettings, calibrate
 from worldpose.synthetic import SCENARIOS, simulate_scene
 from worldpose.tracking import TrackingSettings, track_people

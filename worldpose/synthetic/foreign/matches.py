@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from worldpose.formats import JointTracks, write_archive, write_joints, write_static_camera
 from worldpose.ingest import Observations, write_calibration_toml, write_match
-from worldpose.release import JointTracks, write_archive, write_joints, write_static_camera
 from worldpose.synthetic.foreign.recordings import read_recordings
 from worldpose.synthetic.foreign.scenarios import ForeignScenario
 from worldpose.synthetic.foreign.scenes import ForeignScene, simulate_foreign_scene

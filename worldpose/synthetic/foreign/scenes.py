@@ -11,8 +11,8 @@ from scipy.interpolate import make_interp_spline
 
 from data_contracts.cameras import CameraCalibration
 from data_contracts.static_calibration import ClickedMarkings
+from worldpose.formats import JointTracks
 from worldpose.pitch import PitchTemplate
-from worldpose.release import JointTracks
 from worldpose.synthetic.foreign.detectors import (
     Report,
     defined_joints,

@@ -1,0 +1,195 @@
+"""Every broken convention of cameras and poses is named, and a sound data set is left alone."""
+
+import numpy as np
+import pytest
+from faulty_data_sets import (
+    FRAMES,
+    PERSONS,
+    Y_DOWN,
+    about_origin,
+    camera_to_world,
+    center_for_translation,
+    edit,
+    edit_cameras,
+    edit_poses,
+    findings,
+    in_degrees,
+    late_poses,
+    looking,
+    scaled,
+    transpose_rotation,
+    turn_poses,
+    zeros_for_missing,
+)
+
+from worldpose.dataset.reading import clips_in
+from worldpose.errors import InputError
+from worldpose.formats.camera_file import write_static_camera
+from worldpose.formats.challenge import read_submission, write_submission
+
+
+def test_a_sound_data_set_passes(written, model):
+    for kind, compared in (("static", True), ("plain", False), ("challenge", True)):
+        figures, found = findings(written / kind, model)
+        assert found == []
+        assert (figures.frames, figures.persons) == (FRAMES, PERSONS)
+        assert figures.plausible_share == 1.0
+        assert (figures.reprojection_median_px is not None) == compared
+        if compared:
+            # COCO is rounded to a hundredth of a pixel, poses and submissions to single precision.
+            assert figures.reprojection_median_px < 0.05
+
+
+CAMERA = {
+    "transposed_rotation": transpose_rotation,
+    "translation_is_center": center_for_translation,
+    "camera_to_world": camera_to_world,
+    "negated_translation": scaled("t", -1.0),
+    "camera_in_millimetres": scaled("t", 1000.0),
+}
+
+
+@pytest.mark.parametrize("kind", ["static", "plain", "challenge"])
+@pytest.mark.parametrize("fault", CAMERA)
+def test_a_fault_of_cameras_is_named(data_set, model, kind, fault):
+    folder = data_set(kind)
+    edit_cameras(folder, CAMERA[fault])
+    _, found = findings(folder, model)
+    assert {each.fault for each in found} == {fault}
+    places = {place for each in found for place in each.where if place.startswith("cameras/")}
+    expected = {f"cameras/{path.stem}" for path in (folder / "cameras").glob("*.npz")}
+    if kind == "plain":
+        # Looking straight along -y, R is nearly symmetric, and without 2D nothing is amiss.
+        expected -= {"cameras/north"} - places
+    assert places == expected
+
+
+def test_a_camera_of_a_part_of_the_pitch_where_nobody_comes_is_sound(data_set, model):
+    folder = data_set("plain")
+    corner = looking([60.0, 40.0, 12.0], [50.0, 32.0, 0.0], 4000.0)
+    write_static_camera(folder / "cameras" / "corner.npz", corner.to_calibration("corner"))
+    assert findings(folder, model)[1] == []
+    # Turned by half a turn about the vertical it looks out of the stadium.
+    half = np.diag([-1.0, -1.0, 1.0])
+    edit(
+        folder / "cameras" / "corner.npz",
+        lambda a: a.update(
+            R=a["R"] @ half, t=a["t"] + (a["R"] @ half - a["R"])[0] @ [-60.0, -40.0, -12.0]
+        ),
+    )
+    (found,) = findings(folder, model)[1]
+    assert (found.fault, found.where) == ("sees_nobody", ("cameras/corner",))
+
+
+def test_the_one_camera_that_is_wrong_is_named(data_set, model):
+    folder = data_set("static")
+    edit(folder / "cameras" / "east.npz", transpose_rotation)
+    _, found = findings(folder, model)
+    assert {each.fault for each in found} == {"transposed_rotation"}
+    assert {p for f in found for p in f.where if p.startswith("cameras/")} == {"cameras/east"}
+
+
+@pytest.mark.parametrize("order", [[0, 1, 4, 2, 3], [2, 3, 0, 1, 4]])
+def test_a_lens_in_the_wrong_order_is_named(data_set, model, order):
+    folder = data_set("static")
+    edit_cameras(folder, lambda a: a.update(k=a["k"][:, order]))
+    assert {each.fault for each in findings(folder, model)[1]} == {"distortion_order"}
+
+
+def test_a_lens_of_two_coefficients_in_the_place_of_others_is_named(data_set, model):
+    folder = data_set("challenge")
+    edit_cameras(folder, lambda a: a.update(k=a["k"][:, [2, 3, 0, 1, 4]]))
+    found = findings(folder, model)[1]
+    assert {each.fault for each in found} == {"distortion_order"}
+    assert {each.says[:19] for each in found} == {"k is p1 p2 k1 k2 k3"}
+
+
+POSES = {
+    "millimetres": lambda a, model: scaled("transl", 1000.0)(a),
+    "centimetres": lambda a, model: scaled("transl", 100.0)(a),
+    "y_down_world": lambda a, model: turn_poses(a, Y_DOWN, model),
+    "y_up_world": lambda a, model: turn_poses(a, Y_DOWN.T, model),
+    "root_about_origin": about_origin,
+    "degrees": lambda a, model: in_degrees(a),
+    "zeros_for_missing": lambda a, model: zeros_for_missing(a),
+}
+
+
+@pytest.mark.parametrize("kind", ["static", "plain", "challenge"])
+@pytest.mark.parametrize("fault", POSES)
+def test_a_fault_of_poses_is_named(data_set, model, kind, fault):
+    folder = data_set(kind)
+    edit_poses(folder, lambda arrays: POSES[fault](arrays, model))
+    _, found = findings(folder, model)
+    assert {each.fault for each in found} == {fault}
+    assert all(each.where[0].startswith("poses/A_1.npz") for each in found)
+
+
+@pytest.mark.parametrize("kind", ["static", "challenge"])
+def test_a_slip_of_one_frame_is_named(data_set, model, kind):
+    folder = data_set(kind)
+    edit_poses(folder, late_poses)
+    _, found = findings(folder, model)
+    assert {each.fault for each in found} == {"frame_offset"}
+    assert "3D is 1 frame late" in found[0].says
+
+
+@pytest.mark.parametrize("late", [-2, 0, 1])
+def test_a_slip_is_named_where_the_camera_has_the_pose_of_the_first_frame_alone(
+    data_set, model, late
+):
+    folder = data_set("challenge")
+    edit_cameras(folder, lambda a: a.update(R=a["R"][:1], t=a["t"][:1]))
+    (folder / "poses" / "A_1.npz").unlink()
+    joints = np.roll(read_submission(folder / "submission.zip")["A_1"], late, axis=1)
+    gone = slice(0, late) if late > 0 else slice(FRAMES + late, FRAMES)
+    joints[:, gone] = np.nan
+    write_submission(folder / "submission.zip", {"A_1": joints})
+    found = findings(folder, model)[1]
+    expected = {1: "the 3D is 1 frame late", -2: "the 3D is 2 frames early"}
+    assert [each.says[: len(expected[late])] for each in found] == (
+        [expected[late]] if late else []
+    )
+
+
+def test_a_slip_of_the_moving_camera_is_named(data_set, model):
+    folder = data_set("challenge")
+
+    def late(arrays):
+        for name in "KkRt":
+            arrays[name] = np.roll(arrays[name], 2, axis=0)
+
+    edit_cameras(folder, late)
+    _, found = findings(folder, model)
+    assert {each.fault for each in found} == {"frame_offset"}
+    assert "the camera is 2 frames late" in found[0].says
+
+
+DAMAGE = {
+    "rotation_not_orthonormal": lambda f: edit_cameras(f, scaled("R", 1.01)),
+    "moving_center": lambda f: edit(
+        f / "cameras" / "A_1.npz", lambda a: a["t"].__setitem__((20, 0), a["t"][20, 0] + 0.5)
+    ),
+    "missing_values_disagree": lambda f: edit_poses(
+        f, lambda a: a["body_pose"].__setitem__((2, 5), np.nan)
+    ),
+    "limb_length": lambda f: edit_poses(f, lambda a: a["betas"].__setitem__((0, 0), 40.0)),
+    "speed": lambda f: edit_poses(
+        f, lambda a: a["transl"].__setitem__((0, 7, 0), a["transl"][0, 7, 0] + 2.0)
+    ),
+    "feet_off_the_ground": lambda f: edit_poses(
+        f, lambda a: a["transl"].__setitem__((..., 2), a["transl"][..., 2] - 0.7)
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", DAMAGE)
+def test_what_is_implausible_is_named(data_set, model, fault):
+    folder = data_set("plain")
+    DAMAGE[fault](folder)
+    assert fault in {each.fault for each in findings(folder, model)[1]}
+
+
+def test_a_folder_without_data_is_refused(tmp_path):
+    with pytest.raises(InputError, match="an exported data set"):
+        clips_in(tmp_path)

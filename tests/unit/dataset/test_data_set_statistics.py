@@ -1,0 +1,198 @@
+"""Counting a data set: the paper's own arithmetic, and a count of another kind on made clips."""
+
+import io
+import itertools
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from typer.testing import CliRunner
+
+from data_contracts.release import ClipStatistics
+from flows.checking import check
+from flows.cli.app import app
+from flows.statistics import count
+from worldpose.body import BodyParameters
+from worldpose.cameras import Camera, Rigid
+from worldpose.dataset.manifest import frame_rate_of, read_frame_rates, write_frame_rates
+from worldpose.dataset.statistics import clip_statistics, data_set_statistics
+from worldpose.errors import InputError, UsageError
+from worldpose.formats import JointTracks, write_joints, write_moving_camera
+from worldpose.formats.challenge import write_submission
+from worldpose.formats.pose_file import write_poses
+from worldpose.reports.data_set import bin_edges, statistics_picture
+
+
+def test_definitions_give_the_papers_own_arithmetic():
+    # 88 clips; 49.7 min at 50 frames/s are 149,100 frames; 2.5 million poses; 120 km.
+    clips = {
+        f"{n}": ClipStatistics(
+            frames=frames,
+            seconds=frames / 50.0,
+            persons=20,
+            poses=poses,
+            trajectories_m=(120_000.0 / 88,),
+        )
+        for n, (frames, poses) in enumerate(
+            zip(
+                np.diff(np.linspace(0, 149_100, 89).round()).astype(int).tolist(),
+                np.diff(np.linspace(0, 2_500_000, 89).round()).astype(int).tolist(),
+                strict=True,
+            )
+        )
+    }
+    found = data_set_statistics(clips)
+    assert (found.frames, found.poses) == (149_100, 2_500_000)
+    assert found.minutes == pytest.approx(49.7)
+    assert found.distance_km == pytest.approx(120.0)
+    # 2.5 million poses at 50 Hz are 50,000 s of play.
+    assert found.speed_m_s == pytest.approx(2.4, rel=1e-4)
+    # The paper's 16.7 people are of its rounded 150k frames.
+    assert found.subjects_per_frame == pytest.approx(16.77, abs=0.005)
+    assert found.poses / 150_000 == pytest.approx(16.7, abs=0.05)
+
+
+def made(rng, frames, persons):
+    """Ways of people who come and go, in single precision as files have them."""
+    steps = rng.normal(0.0, 0.05, (persons, frames, 3))
+    places = (rng.uniform(-20.0, 20.0, (persons, 1, 3)) + steps.cumsum(1)).astype(np.float32)
+    for person in range(persons):
+        first = int(rng.integers(0, frames // 2))
+        places[person, first : first + int(rng.integers(1, frames // 3))] = np.nan
+    return places
+
+
+def panning(frames, focal, angle):
+    turn = Rigid.from_rotvec(np.linspace(0, angle, frames)[:, None] * [0, 0, 1], np.zeros(3))
+    return Camera(
+        focal=np.repeat(np.linspace(3000.0, focal, frames)[:, None], 2, axis=1),
+        principal_point=np.zeros((frames, 2)) + [960.0, 540.0],
+        distortion=np.zeros((frames, 5)),
+        cam_from_world=turn,
+        image_size=np.array([1920, 1080]),
+    )
+
+
+def test_ten_made_clips_are_counted_as_plain_loops_count_them(tmp_path):
+    rng = np.random.default_rng(4)
+    frames = poses = 0
+    metres, seconds, ways = 0.0, 0.0, []
+    for number in range(10):
+        length, persons = int(rng.integers(40, 90)), int(rng.integers(3, 8))
+        places = made(rng, length, persons)
+        write_poses(
+            tmp_path / "poses" / f"C_{number}.npz",
+            BodyParameters(np.zeros(10), np.zeros(3), np.zeros(69), places.astype(np.float64)),
+            "open-neutral/2",
+        )
+        kind = panning(length, (3000.0, 3000.0, 4000.0)[number % 3], (0.0, 0.1, 0.1)[number % 3])
+        write_moving_camera(tmp_path / "cameras" / f"C_{number}.npz", kind)
+        frames += length
+        seconds += length / 25.0
+        for person in places.astype(np.float64):
+            way = 0.0
+            for here, there in itertools.pairwise(person):
+                if not math.isnan(here[0]) and not math.isnan(there[0]):
+                    way += math.hypot(there[0] - here[0], there[1] - here[1])
+            poses += sum(not math.isnan(place[0]) for place in person)
+            ways.append(way)
+            metres += way
+    found = count([tmp_path], fps=25.0)
+    assert (len(found.clips), found.frames, found.poses) == (10, frames, poses)
+    assert found.minutes == pytest.approx(seconds / 60)
+    assert found.distance_km == pytest.approx(metres / 1000)
+    assert found.subjects_per_frame == pytest.approx(poses / frames)
+    assert found.speed_m_s == pytest.approx(metres / (poses / 25.0))
+    assert found.longest_trajectory_m == pytest.approx(max(ways))
+    assert found.camera == "M+Z"
+    assert [found.clips[f"C_{n}"].camera for n in range(3)] == ["S", "M", "M+Z"]
+    picture = imread(io.BytesIO(statistics_picture(found)))
+    assert picture.shape[:2] == (462, 1540)
+
+
+def test_the_command_counts_as_the_library_does(tmp_path):
+    places = made(np.random.default_rng(2), 50, 4)
+    bodies = BodyParameters(np.zeros(10), np.zeros(3), np.zeros(69), places.astype(np.float64))
+    write_poses(tmp_path / "poses" / "C.npz", bodies, "open-neutral/2")
+    picture = tmp_path / "lengths.png"
+    page = tmp_path / "page.html"
+    asked = ["statistics", str(tmp_path), "--fps", "25", "--picture", str(picture), "--json"]
+    asked += ["--page", str(page)]
+    answer = CliRunner().invoke(app, asked)
+    assert answer.exit_code == 0
+    found = count([tmp_path], fps=25.0)
+    assert json.loads(answer.stdout) == found.model_dump(mode="json")
+    assert imread(picture).shape[:2] == (462, 1540)
+    text = page.read_text()
+    assert f"<b>{found.poses:,}</b><span>3D poses</span>" in text
+    assert text.count('src="data:image/') == 1
+    # These people lie about in the air.
+    faults = re.findall('<td class="bad">([a-z_]+)</td>', text)
+    assert faults == [finding.fault for finding in check(tmp_path, fps=25.0).findings]
+    assert faults
+
+
+def test_a_gap_adds_no_way_and_heights_do_not_count():
+    nan = np.nan
+    places = np.array([[0.0, 0.0, 1.0], [3.0, 4.0, 9.0], [nan] * 3, [50.0, 0.0, 1.0], [50.0, 1, 1]])
+    found = clip_statistics(np.stack([places, np.full((5, 3), nan)], axis=1), 50.0)
+    assert found.trajectories_m == (6.0,)
+    assert (found.persons, found.poses, found.frames, found.seconds) == (1, 4, 5, 0.1)
+
+
+def test_joints_and_submissions_count_like_poses(tmp_path):
+    places = made(np.random.default_rng(1), 40, 3).astype(np.float64)
+    joints = np.tile(places.swapaxes(0, 1)[:, :, None], (1, 1, 17, 1))
+    write_joints(tmp_path / "a" / "joints.npz", JointTracks(np.arange(40), np.arange(3), joints))
+    (tmp_path / "b").mkdir()
+    write_submission(tmp_path / "b" / "submission.zip", {"C": joints[:, :, :15].swapaxes(0, 1)})
+    one, other = (count([tmp_path / name]) for name in "ab")
+    assert one.poses == other.poses
+    assert one.distance_km == pytest.approx(other.distance_km, rel=1e-5)  # single precision
+    both = count([tmp_path / "a", tmp_path / "b"])
+    assert set(both.clips) == {"a/clip", "b/C"}
+    assert both.poses == 2 * one.poses
+    with pytest.raises(UsageError, match="twice"):
+        count([tmp_path / "a", tmp_path / "a"])
+
+
+def test_nothing_at_all_is_counted_as_nothing(tmp_path):
+    found = data_set_statistics({})
+    assert (found.frames, found.subjects_per_frame, found.speed_m_s) == (0, None, None)
+    statistics_picture(found)
+    with pytest.raises(InputError, match="no such folder"):
+        count([tmp_path / "nowhere"])
+
+
+@pytest.mark.parametrize(("top", "width"), [(199.0, 10.0), (0.7, 0.05), (35.0, 2.0), (61.0, 5.0)])
+def test_bins_are_round_and_reach_beyond_the_largest(top, width):
+    edges = bin_edges([0.0, top])
+    assert np.diff(edges) == pytest.approx(width)
+    assert edges[-2] <= top < edges[-1] + 1e-12
+
+
+@pytest.mark.parametrize("command", ["statistics", "check"])
+def test_a_frame_rate_that_nobody_stated_is_said_and_an_export_s_is_taken(tmp_path, command):
+    places = made(np.random.default_rng(3), 50, 2).astype(np.float64)
+    joints = np.tile(places.swapaxes(0, 1)[:, :, None], (1, 1, 17, 1))
+    write_joints(tmp_path / "joints.npz", JointTracks(np.arange(50), np.arange(2), joints))
+    told = "frames a second not stated: taken as 50 (--fps)"
+    assert told in CliRunner().invoke(app, [command, str(tmp_path)]).stderr
+    assert told not in CliRunner().invoke(app, [command, str(tmp_path), "--fps", "30"]).stderr
+    write_frame_rates(tmp_path, {"A_1": 25.0})
+    assert told not in CliRunner().invoke(app, [command, str(tmp_path)]).stderr
+    assert count([tmp_path]).clips["clip"].seconds == pytest.approx(2.0)
+    assert count([tmp_path], fps=50.0).clips["clip"].seconds == pytest.approx(1.0)
+
+
+def test_clips_of_several_exports_keep_their_frame_rates(tmp_path):
+    write_frame_rates(tmp_path, {"A": 25.0})
+    write_frame_rates(tmp_path, {"B": 50.0})
+    rates = read_frame_rates(tmp_path)
+    assert [frame_rate_of(rates, clip) for clip in ("A", "B", "clip")] == [25.0, 50.0, None]
+    (tmp_path / "frame_rates.json").write_text('{"A": "fast"}')
+    with pytest.raises(InputError, match=r"frame_rates\.json"):
+        read_frame_rates(tmp_path)

@@ -1,0 +1,106 @@
+import cv2
+import numpy as np
+import pytest
+
+from data_contracts.cameras import CameraCalibration
+from worldpose.cameras import Camera
+from worldpose.errors import InputError
+from worldpose.formats import read_camera, write_archive, write_static_camera
+
+CALIBRATION = CameraCalibration(
+    id="north",
+    image_size=(1920, 1080),
+    focal_px=(2000.0, 2010.0),
+    principal_point_px=(955.0, 541.0),
+    distortion=(-0.1, 0.02, 0.001, -0.002, 0.003),
+    rotation=((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+    translation=(1.0, 5.0, 60.0),
+)
+
+
+def test_shapes_and_types_are_those_of_the_release(tmp_path):
+    write_static_camera(tmp_path / "north.npz", CALIBRATION)
+    with np.load(tmp_path / "north.npz", allow_pickle=False) as file:
+        assert {name: (file[name].shape, file[name].dtype.str) for name in file} == {
+            "K": ((1, 3, 3), "<f8"),
+            "k": ((1, 5), "<f8"),
+            "R": ((1, 3, 3), "<f8"),
+            "t": ((1, 3), "<f8"),
+        }
+
+
+def test_opencv_projects_with_it_as_the_camera_does(tmp_path):
+    write_static_camera(tmp_path / "north.npz", CALIBRATION)
+    points = np.array([[0.0, 0.0, 0.0], [10.0, 5.0, 1.8], [-12.0, -8.0, 1.0]])
+    with np.load(tmp_path / "north.npz", allow_pickle=False) as file:
+        rotation = cv2.Rodrigues(file["R"][0])[0]
+        pixels = cv2.projectPoints(points, rotation, file["t"][0], file["K"][0], file["k"][0])[0]
+    # Two float64 implementations of one formula, with values of a thousand pixels.
+    np.testing.assert_allclose(
+        pixels[:, 0], Camera.from_calibration(CALIBRATION).project(points), atol=1e-9
+    )
+
+
+def test_what_was_written_is_read_again(tmp_path):
+    write_static_camera(tmp_path / "north.npz", CALIBRATION)
+    camera = read_camera(tmp_path / "north.npz", (1920, 1080))
+    assert camera.batch_shape == ()
+    assert camera.to_calibration("north") == CALIBRATION
+
+
+def moving(rows=3):
+    """Arrays of a camera that zooms."""
+    k = np.tile(np.eye(3), (rows, 1, 1))
+    k[:, 0, 0] = k[:, 1, 1] = 2000.0 + 10.0 * np.arange(rows)
+    k[:, :2, 2] = 960.0, 540.0
+    return {
+        "K": k,
+        "k": np.zeros((rows, 5)),
+        "R": np.tile(np.array(CALIBRATION.rotation), (rows, 1, 1)),
+        "t": np.tile(np.array([1.0, 5.0, 60.0]), (rows, 1)),
+    }
+
+
+def test_a_moving_camera_has_one_row_a_frame(tmp_path):
+    write_archive(tmp_path / "clip.npz", moving())
+    camera = read_camera(tmp_path / "clip.npz")
+    assert camera.batch_shape == (3,)
+    assert camera.focal[:, 1].tolist() == [2000.0, 2010.0, 2020.0]
+    assert camera.image_size[0].tolist() == [1920, 1080]
+
+
+def test_a_row_with_a_nan_is_a_frame_without_a_camera(tmp_path):
+    arrays = moving()
+    arrays["R"][1, 0, 0] = np.nan
+    write_archive(tmp_path / "clip.npz", arrays)
+    pixels = read_camera(tmp_path / "clip.npz").project(np.zeros((1, 3)))
+    assert np.isfinite(pixels[[0, 2]]).all()
+    assert np.isnan(pixels[1]).all()
+
+
+@pytest.mark.parametrize(
+    ("member", "index", "value", "message"),
+    [
+        ("K", (1, 0, 1), 3.0, r"K\[1\]: expected \[\[fx, 0, cx\]"),
+        ("K", (2, 1, 1), -5.0, r"K\[2\]: .* positive focal lengths"),
+        ("K", (0, 2, 2), 2.0, r"K\[0\]"),
+        ("R", (1, 0, 0), 1.1, r"R\[1\]: expected an orthonormal matrix"),
+    ],
+)
+def test_numbers_that_are_no_camera_are_refused(tmp_path, member, index, value, message):
+    arrays = moving()
+    arrays[member][index] = value
+    write_archive(tmp_path / "clip.npz", arrays)
+    with pytest.raises(InputError, match=message):
+        read_camera(tmp_path / "clip.npz")
+
+
+def test_rows_must_agree_and_exist(tmp_path):
+    write_archive(
+        tmp_path / "clip.npz", {**moving(), "R": moving()["R"][:1], "t": np.zeros((1, 3))}
+    )
+    with pytest.raises(InputError, match=r"clip\.npz: R: expected shape"):
+        read_camera(tmp_path / "clip.npz")
+    write_archive(tmp_path / "clip.npz", moving(0))
+    with pytest.raises(InputError, match="one row, or one a frame"):
+        read_camera(tmp_path / "clip.npz")

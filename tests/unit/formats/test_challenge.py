@@ -1,0 +1,251 @@
+"""The challenge's layouts: what others would read, and what others have written."""
+
+import tracemalloc
+import zipfile
+
+import cv2
+import numpy as np
+import pytest
+
+from worldpose.body import BODY25, CHALLENGE15, BodyParameters, fold_keypoints, load_open_body
+from worldpose.cameras import Camera, Rigid
+from worldpose.errors import InputError
+from worldpose.formats.camera_rows import read_camera_rows
+from worldpose.formats.challenge import (
+    challenge_truth,
+    read_challenge,
+    read_submission,
+    submission_clips,
+    write_challenge,
+    write_challenge_camera,
+    write_pitch_points,
+    write_submission,
+)
+
+FRAMES = 3
+K1 = 0.2
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load_open_body()
+
+
+@pytest.fixture(scope="module")
+def camera():
+    """The main camera, panning; x_cam = R x + t with the centre at (0, -70, 14)."""
+    pan = np.radians([0.0, 0.2, 0.4])
+    tilted = cv2.Rodrigues(np.array([np.pi / 2 + np.arctan2(14.0, 70.0), 0.0, 0.0]))[0]
+    rotation = np.array([tilted @ cv2.Rodrigues(np.array([0.0, 0.0, a]))[0] for a in pan])
+    translation = -rotation @ np.array([0.0, -70.0, 14.0])
+    return Camera(
+        focal=np.full((FRAMES, 2), 4000.0),
+        principal_point=np.tile([960.0, 540.0], (FRAMES, 1)),
+        distortion=np.tile([K1, 0.0, 0.0, 0.0, 0.0], (FRAMES, 1)),
+        cam_from_world=Rigid(rotation, translation),
+        image_size=np.tile([1920, 1080], (FRAMES, 1)),
+    )
+
+
+@pytest.fixture(scope="module")
+def poses():
+    """Three people: at the centre spot, far out of the picture, and missing in one frame."""
+    transl = np.zeros((3, FRAMES, 3)) + [0.0, 0.0, 1.1]
+    transl[1, :, 0] = 45.0
+    transl[2, :, 0] = 3.0
+    transl[2, 1] = np.nan
+    upright = np.array([np.pi / 2, 0.0, 0.0])
+    return BodyParameters(np.zeros((3, 1, 10)), upright, np.zeros(69), transl)
+
+
+@pytest.fixture(scope="module")
+def truth(model, poses, camera):
+    return challenge_truth(model, poses, camera)
+
+
+def test_only_people_who_are_ever_in_the_picture_have_rows(truth):
+    assert truth.persons.tolist() == [0, 2]
+    assert truth.clip.boxes.shape == (FRAMES, 2, 4)
+    assert truth.clip.skel_2d.shape == (FRAMES, 2, 25, 2)
+    assert truth.clip.skel_3d.shape == (FRAMES, 2, 25, 3)
+    assert truth.submission.shape == (2, FRAMES, 15, 3)
+
+
+def test_absent_is_nan_everywhere(truth):
+    absent = np.array([[False, False], [False, True], [False, False]])
+    for array in (truth.clip.boxes, truth.clip.skel_2d, truth.clip.skel_3d):
+        np.testing.assert_array_equal(np.isnan(array.reshape(FRAMES, 2, -1)).all(-1), absent)
+        np.testing.assert_array_equal(np.isnan(array.reshape(FRAMES, 2, -1)).any(-1), absent)
+    np.testing.assert_array_equal(np.isnan(truth.submission).any((2, 3)), absent.T)
+
+
+def test_skeletons_are_where_opencv_projects_the_bodies(model, poses, camera, truth):
+    joints = fold_keypoints(model, BODY25)(poses)
+    for frame in range(FRAMES):
+        pose = camera.cam_from_world[frame]
+        matrix = np.array([[4000.0, 0.0, 960.0], [0.0, 4000.0, 540.0], [0.0, 0.0, 1.0]])
+        pixels, _ = cv2.projectPoints(
+            joints[0, frame],
+            cv2.Rodrigues(np.array(pose.rotation))[0],
+            np.array(pose.translation),
+            matrix,
+            np.array([K1, 0.0, 0.0, 0.0, 0.0]),
+        )
+        # Two float64 implementations of one formula.
+        np.testing.assert_allclose(truth.clip.skel_2d[frame, 0], pixels[:, 0], atol=1e-8)
+        x0, y0, x1, y1 = truth.clip.boxes[frame, 0]
+        assert (pixels[:, 0] > [x0, y0]).all()
+        assert (pixels[:, 0] < [x1, y1]).all()
+
+
+def test_a_skeleton_put_back_by_the_camera_is_the_submission(truth, camera):
+    # The starter kit's own way to the world: rows times R, then a shift.
+    world = truth.clip.skel_3d[0, 0] @ camera.cam_from_world.rotation[0]
+    places = [BODY25.index(name) for name in CHALLENGE15]
+    hips = truth.submission[0, 0, [7, 8]].mean(0)
+    shift = truth.submission[0, 0] - world[places]
+    np.testing.assert_allclose(shift, np.broadcast_to(shift[0], shift.shape), atol=1e-9)
+    # The origin is the pelvis joint, which is near the middle of the hips: 10 cm at most.
+    assert np.linalg.norm(shift[0] - hips) < 0.1
+
+
+def test_a_box_is_cut_at_the_pictures_edge(model, camera):
+    edge = BodyParameters(np.zeros(10), np.array([np.pi / 2, 0, 0]), np.zeros(69), np.zeros(3))
+    # 4000 px / 71 m is 56 px a metre: the picture's edge lies 17 m beside the centre spot.
+    shifted = BodyParameters(
+        edge.betas, edge.global_orient, edge.body_pose, np.array([[[17.0, 0.0, 1.1]] * FRAMES])
+    )
+    boxes = challenge_truth(model, shifted, camera).clip.boxes
+    assert boxes[0, 0, 2] == 1919.5
+    assert boxes[0, 0, 0] < 1919.5
+
+
+@pytest.mark.parametrize("edition", [2025, 2026])
+def test_both_editions_come_back(truth, camera, tmp_path, edition):
+    files = write_challenge(tmp_path, {"A_1": truth.clip, "B_2": truth.clip}, edition)
+    names = {path.relative_to(tmp_path).as_posix() for path in files}
+    if edition == 2025:
+        assert names == {"boxes.npz", "skel_2d.npz", "skel_3d.npz"}
+        with np.load(tmp_path / "boxes.npz") as file:
+            assert sorted(file.files) == ["A_1", "B_2"]
+    else:
+        kinds = ("boxes", "skel_2d", "skel_3d")
+        assert names == {f"{kind}/{clip}.npy" for kind in kinds for clip in ("A_1", "B_2")}
+        assert np.load(tmp_path / "boxes" / "A_1.npy").dtype == np.float64
+    back = read_challenge(tmp_path)
+    assert sorted(back) == ["A_1", "B_2"]
+    for kind in ("boxes", "skel_2d", "skel_3d"):
+        np.testing.assert_array_equal(getattr(back["B_2"], kind), getattr(truth.clip, kind))
+
+
+@pytest.mark.parametrize("edition", [2025, 2026])
+def test_a_camera_file_has_the_pose_of_the_first_frame_alone(camera, tmp_path, edition):
+    path = tmp_path / "cameras" / "A_1.npz"
+    write_challenge_camera(path, camera, edition)
+    with np.load(path) as file:
+        shapes = {name: file[name].shape for name in file.files}
+        if edition == 2025:
+            np.testing.assert_array_equal(
+                file["Rt"][0], np.column_stack([file["R"][0], file["t"][0]])
+            )
+    assert shapes.pop("Rt", (1, 3, 4)) == (1, 3, 4)
+    assert shapes == {"K": (FRAMES, 3, 3), "k": (FRAMES, 5), "R": (1, 3, 3), "t": (1, 3)}
+    rows = read_camera_rows(path)
+    np.testing.assert_array_equal(rows.rotation[0], camera.cam_from_world.rotation[0])
+    assert np.isnan(rows.rotation[1:]).all()
+    points = np.zeros((1, 3))
+    np.testing.assert_allclose(rows.camera().project(points)[0], camera.project(points)[0])
+
+
+def test_a_clip_without_a_camera_in_its_first_frame_is_refused(camera, tmp_path):
+    lost = Camera(
+        focal=np.where(np.arange(FRAMES)[:, None] == 0, np.nan, camera.focal),
+        principal_point=camera.principal_point,
+        distortion=camera.distortion,
+        cam_from_world=camera.cam_from_world,
+        image_size=camera.image_size,
+    )
+    with pytest.raises(InputError, match="first frame"):
+        write_challenge_camera(tmp_path / "A_1.npz", lost, 2026)
+
+
+def test_a_submission_is_a_zip_with_one_array_a_clip(truth, tmp_path):
+    write_submission(tmp_path / "submission.zip", {"A_1": truth.submission})
+    with zipfile.ZipFile(tmp_path / "submission.zip") as file:
+        assert file.namelist() == ["submission.npz"]
+        with file.open("submission.npz") as inner, np.load(inner) as arrays:
+            assert (arrays["A_1"].shape, arrays["A_1"].dtype) == ((2, FRAMES, 15, 3), np.float32)
+    for path in (tmp_path / "submission.zip", _bare(tmp_path, truth.submission)):
+        back = read_submission(path)
+        np.testing.assert_array_equal(back["A_1"], truth.submission.astype(np.float32))
+
+
+def test_one_clip_of_a_submission_comes_into_memory_alone(tmp_path):
+    clip = np.ones((2, 1000, 15, 3))
+    write_submission(tmp_path / "submission.zip", {f"C_{n}": n * clip for n in range(12)})
+    assert submission_clips(tmp_path / "submission.zip") == tuple(f"C_{n}" for n in range(12))
+    tracemalloc.start()
+    back = read_submission(tmp_path / "submission.zip", ("C_7",))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert list(back) == ["C_7"]
+    np.testing.assert_array_equal(back["C_7"], 7 * clip)
+    # The clip as in the file, in half the width, and as it is given back; all are 12.
+    assert peak < 3 * clip.nbytes
+
+
+def test_one_clip_of_a_challenge_is_read_alone(tmp_path):
+    good = {kind: np.ones((4, 2, *tail)) for kind, tail in TAILS.items()}
+    for kind, array in good.items():
+        (tmp_path / kind).mkdir()
+        np.save(tmp_path / kind / "A_1.npy", array)
+        (tmp_path / kind / "B_1.npy").write_bytes(b"no array")
+    assert list(read_challenge(tmp_path, "A_1")) == ["A_1"]
+    assert read_challenge(tmp_path, "C_1") == {}
+    with pytest.raises(InputError, match="B_1"):
+        read_challenge(tmp_path)
+
+
+TAILS = {"boxes": (4,), "skel_2d": (25, 2), "skel_3d": (25, 3)}
+
+
+def _bare(folder, joints):
+    np.savez_compressed(folder / "mine.npz", A_1=joints.astype(np.float32))
+    return folder / "mine.npz"
+
+
+def test_fifteen_points_are_read_as_well(truth, tmp_path):
+    for kind, width in (("boxes", None), ("skel_2d", 2), ("skel_3d", 3)):
+        shape = (4, 2, 4) if width is None else (4, 2, 15, width)
+        (tmp_path / kind).mkdir()
+        np.save(tmp_path / kind / "A_1.npy", np.ones(shape))
+    assert read_challenge(tmp_path)["A_1"].skel_2d.shape == (4, 2, 15, 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("boxes", np.ones((4, 2, 5)), r"boxes/A_1\.npy: expected float numbers of shape"),
+        ("skel_2d", np.ones((5, 2, 25, 2)), r"skel_2d of A_1: expected shape \(4, 2\)"),
+        ("skel_3d", np.array({"a": 1}, dtype=object), r"skel_3d/A_1\.npy: expected an npy array"),
+    ],
+)
+def test_what_is_no_challenge_is_refused_by_file(tmp_path, name, content, message):
+    arrays = {
+        "boxes": np.ones((4, 2, 4)),
+        "skel_2d": np.ones((4, 2, 25, 2)),
+        "skel_3d": np.ones((4, 2, 25, 3)),
+        name: content,
+    }
+    for kind, array in arrays.items():
+        (tmp_path / kind).mkdir()
+        np.save(tmp_path / kind / "A_1.npy", array, allow_pickle=True)
+    with pytest.raises(InputError, match=message):
+        read_challenge(tmp_path)
+
+
+def test_pitch_points_load_as_rows_of_three(tmp_path):
+    points = np.array([[52.5, -34.0, -0.2], [0.0, 9.15, -0.0145]])
+    write_pitch_points(tmp_path / "pitch_points.txt", points)
+    # Written to a tenth of a millimetre.
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "pitch_points.txt"), points, atol=5.1e-5)

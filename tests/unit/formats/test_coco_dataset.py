@@ -1,0 +1,106 @@
+import json
+
+import numpy as np
+import pytest
+
+from data_contracts.conventions import COCO17
+from worldpose.cameras import Camera, Rigid
+from worldpose.formats import JointTracks, coco_dataset, write_coco
+
+
+@pytest.fixture
+def camera():
+    """Looks along world z from the origin: a point (x, y, 10) is at pixel (10x + 50, 10y + 40)."""
+    return Camera(
+        focal=np.array([100.0, 100.0]),
+        principal_point=np.array([50.0, 40.0]),
+        distortion=np.zeros(5),
+        cam_from_world=Rigid.identity(),
+        image_size=np.array([100, 80]),
+    )
+
+
+def missing():
+    return np.full((17, 3), np.nan)
+
+
+def two_joints():
+    """Nose at pixel (50, 40), left eye at (60, 20)."""
+    person = missing()
+    person[0] = (0.0, 0.0, 10.0)
+    person[1] = (1.0, -2.0, 10.0)
+    return person
+
+
+def dataset(camera, frames_of_people, observed=None, **more):
+    joints = np.array(frames_of_people)
+    tracks = JointTracks(np.arange(5, 5 + len(joints)), np.array([7, 3])[: joints.shape[1]], joints)
+    if observed is None:
+        observed = np.zeros(joints.shape[:3], dtype=bool)
+    return coco_dataset("north", camera, tracks, observed, **more)
+
+
+def test_annotation_of_two_joints(camera):
+    observed = np.zeros((1, 1, 17), dtype=bool)
+    observed[0, 0, 1] = True
+    (annotation,) = dataset(camera, [[two_joints()]], observed)["annotations"]
+    assert annotation == {
+        "id": 1,
+        "image_id": 5,
+        "category_id": 1,
+        "track_id": 7,
+        "iscrowd": 0,
+        "keypoints": [50.0, 40.0, 1, 60.0, 20.0, 2] + [0.0, 0.0, 0] * 15,
+        "num_keypoints": 2,
+        "bbox": [50.0, 20.0, 10.0, 20.0],
+        "area": 200.0,
+    }
+
+
+def test_images_are_the_cameras_own_frames(camera):
+    made = dataset(camera, [[missing()], [two_joints()]], offset_frames=-2)
+    assert made["images"] == [
+        {"id": 3, "file_name": "north/000003", "width": 100, "height": 80},
+        {"id": 4, "file_name": "north/000004", "width": 100, "height": 80},
+    ]
+    assert [annotation["image_id"] for annotation in made["annotations"]] == [4]
+
+
+def test_joints_outside_the_picture_and_behind_the_camera_are_not_labelled(camera):
+    person = two_joints()
+    person[2] = (4.949, 0.0, 10.0)  # u = 99.49: on the last pixel
+    person[3] = (4.951, 0.0, 10.0)  # u = 99.51: beyond its edge
+    person[4] = (0.0, 0.0, -10.0)
+    observed = np.ones((1, 1, 17), dtype=bool)
+    (annotation,) = dataset(camera, [[person]], observed)["annotations"]
+    assert annotation["keypoints"][2::3] == [2, 2, 2] + [0] * 14
+    assert annotation["keypoints"][9:15] == [0.0, 0.0, 0] * 2
+
+
+def test_people_who_are_not_in_the_picture_have_no_annotation(camera):
+    far = missing()
+    far[0] = (100.0, 0.0, 10.0)
+    assert dataset(camera, [[far, missing()]])["annotations"] == []
+
+
+def test_ids_are_unique_and_people_keep_theirs(camera):
+    annotations = dataset(camera, [[two_joints(), two_joints()]] * 3)["annotations"]
+    assert [annotation["id"] for annotation in annotations] == [1, 2, 3, 4, 5, 6]
+    assert [annotation["track_id"] for annotation in annotations] == [7, 3] * 3
+
+
+def test_the_category_is_cocos_person(camera):
+    (category,) = dataset(camera, [[missing()]])["categories"]
+    assert (category["id"], category["name"]) == (1, "person")
+    assert category["keypoints"] == list(COCO17)
+    names = {frozenset(category["keypoints"][i - 1] for i in bone) for bone in category["skeleton"]}
+    assert frozenset(("left_knee", "left_ankle")) in names
+    assert min(i for bone in category["skeleton"] for i in bone) == 1
+
+
+def test_the_file_is_plain_json_and_always_the_same(tmp_path, camera):
+    made = dataset(camera, [[two_joints(), missing()]])
+    write_coco(tmp_path / "a.json", made)
+    write_coco(tmp_path / "b.json", dataset(camera, [[two_joints(), missing()]]))
+    assert json.loads((tmp_path / "a.json").read_text()) == made
+    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()

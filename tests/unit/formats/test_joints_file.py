@@ -1,0 +1,181 @@
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from worldpose.errors import InputError
+from worldpose.formats import JointTracks, read_joints, write_joints
+
+
+@pytest.fixture
+def tracks():
+    rng = np.random.default_rng(0)
+    joints = rng.normal(0.0, 10.0, (3, 2, 17, 3))
+    joints[1, 0, 4] = np.nan
+    return JointTracks(
+        frames=np.array([10, 11, 13]),
+        person_ids=np.array([4, 2]),
+        joints=joints,
+        covariance=rng.random((3, 2, 17, 3, 3)),
+        views=rng.integers(0, 18, (3, 2, 17)),
+    )
+
+
+def same(a, b):
+    for name in ("frames", "person_ids", "joints", "covariance", "views"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def test_what_is_written_is_read(tmp_path, tracks):
+    write_joints(tmp_path / "joints.npz", tracks)
+    same(read_joints(tmp_path / "joints.npz"), tracks)
+
+
+def test_numpy_alone_reads_it_with_the_documented_types(tmp_path, tracks):
+    write_joints(tmp_path / "joints.npz", tracks)
+    with np.load(tmp_path / "joints.npz", allow_pickle=False) as file:
+        assert {name: file[name].dtype.str for name in file} == {
+            "frames": "<i8",
+            "person_ids": "<i8",
+            "joints": "<f8",
+            "covariance": "<f8",
+            "views": "|u1",
+        }
+
+
+def test_covariance_and_views_may_be_absent(tmp_path, tracks):
+    write_joints(tmp_path / "joints.npz", replace(tracks, covariance=None, views=None))
+    read = read_joints(tmp_path / "joints.npz")
+    assert read.covariance is None
+    assert read.views is None
+
+
+def test_nobody_is_a_valid_file(tmp_path):
+    nobody = JointTracks(np.arange(5), np.arange(0), np.empty((5, 0, 17, 3)))
+    write_joints(tmp_path / "joints.npz", nobody)
+    assert read_joints(tmp_path / "joints.npz").joints.shape == (5, 0, 17, 3)
+
+
+def test_files_of_savez_and_of_narrower_numbers_are_read(tmp_path, tracks):
+    np.savez_compressed(
+        tmp_path / "other.npz",
+        frames=tracks.frames.astype(np.int32),
+        person_ids=tracks.person_ids.astype(np.uint8),
+        joints=np.asfortranarray(tracks.joints.astype(np.float32)),
+    )
+    read = read_joints(tmp_path / "other.npz")
+    assert read.joints.dtype == np.float64
+    assert read.joints.flags["C_CONTIGUOUS"]
+    # float32 keeps 24 bits: 10 m to 1e-6.
+    np.testing.assert_allclose(read.joints, tracks.joints, rtol=1e-6)
+
+
+def test_the_same_tracks_give_the_same_bytes(tmp_path, tracks):
+    write_joints(tmp_path / "a.npz", tracks)
+    write_joints(tmp_path / "b.npz", replace(tracks, joints=np.asfortranarray(tracks.joints)))
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_every_truncation_is_refused(tmp_path, tracks):
+    path = tmp_path / "joints.npz"
+    write_joints(path, tracks)
+    whole = path.read_bytes()
+    for length in (0, 1, 30, 200, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:length])
+        with pytest.raises(InputError, match=r"joints\.npz.*whole npz file"):
+            read_joints(path)
+
+
+def test_a_flipped_bit_is_refused(tmp_path, tracks):
+    path = tmp_path / "joints.npz"
+    write_joints(path, tracks)
+    broken = bytearray(path.read_bytes())
+    broken[len(broken) // 2] ^= 1
+    path.write_bytes(bytes(broken))
+    with pytest.raises(InputError, match="CRC"):
+        read_joints(path)
+
+
+def test_an_absent_file_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"absent\.npz: expected an npz file, found nothing"):
+        read_joints(tmp_path / "absent.npz")
+
+
+def arrays(**changes):
+    plain = {
+        "frames": np.arange(3),
+        "person_ids": np.arange(2),
+        "joints": np.zeros((3, 2, 17, 3)),
+    }
+    return {name: value for name, value in {**plain, **changes}.items() if value is not None}
+
+
+INFINITE = np.zeros((3, 2, 17, 3))
+INFINITE[2, 1, 9, 0] = np.inf
+HALF_MISSING = np.zeros((3, 2, 17, 3))
+HALF_MISSING[0, 1, 0, 2] = np.nan
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"joints": None},
+            "expected the members frames, person_ids, joints .*found frames, person",
+        ),
+        ({"joint": np.zeros(3)}, "expected the members"),
+        (
+            {"joints": np.zeros((3, 2, 15, 3))},
+            r"joints: expected shape \(3, 2, 17, 3\), found \(3, 2",
+        ),
+        ({"joints": np.zeros((3, 2, 17))}, r"found \(3, 2, 17\)"),
+        ({"joints": np.zeros((2, 3, 17, 3))}, r"expected shape \(3, 2, 17, 3\)"),
+        ({"joints": np.zeros((3, 2, 17, 3), dtype=int)}, "expected float numbers, found <i8"),
+        ({"frames": np.arange(3.0)}, "frames: expected int numbers"),
+        ({"frames": np.array([0, 2, 1])}, "frames: expected frame numbers that rise"),
+        ({"frames": np.array([0, 0, 1])}, "frames: expected frame numbers that rise"),
+        ({"person_ids": np.array([1, 1])}, "person_ids: expected each id once"),
+        ({"joints": INFINITE}, r"joints\[frame 2, person 1, left_wrist\]: expected finite metres"),
+        ({"joints": HALF_MISSING}, r"joints\[frame 0, person 1, nose\]: expected all of x, y, z"),
+        ({"views": np.full((3, 2, 17), -1)}, "views.*expected counts from 0"),
+        ({"views": np.zeros((3, 2))}, "views: expected int numbers"),
+        ({"covariance": np.full((3, 2, 17, 3, 3), np.inf)}, "covariance.*expected finite"),
+        ({"covariance": np.zeros((3, 2, 17, 3))}, "covariance: expected shape"),
+        ({"joints": np.array([{}], dtype=object)}, "joints: expected"),
+    ],
+)
+def test_what_does_not_fit_is_named(tmp_path, changes, message):
+    np.savez(tmp_path / "bad.npz", **arrays(**changes))
+    with pytest.raises(InputError, match=message) as caught:
+        read_joints(tmp_path / "bad.npz")
+    assert str(tmp_path / "bad.npz") in str(caught.value)
+
+
+def test_a_header_that_claims_more_than_the_file_holds_allocates_nothing(tmp_path):
+    path = tmp_path / "bomb.npz"
+    np.savez(path, **arrays())
+    with zipfile.ZipFile(path) as file:
+        members = {name: file.read(name) for name in file.namelist()}
+    # The same length of header, but 3 billion frames.
+    few, many = b"(3,), }" + 8 * b" ", b"(3000000000,),}"
+    assert few in members["frames.npy"]
+    members["frames.npy"] = members["frames.npy"].replace(few, many)
+    with zipfile.ZipFile(path, "w") as file:
+        for name, content in members.items():
+            file.writestr(name, content)
+    message = r"frames: expected the bytes of shape \(3000000000,\), found 24 bytes"
+    with pytest.raises(InputError, match=message):
+        read_joints(path)
+
+
+def test_a_pickle_is_never_opened(tmp_path):
+    path = tmp_path / "pickle.npz"
+    np.savez(path, **arrays(frames=np.array([print, print, print], dtype=object)))
+    with pytest.raises(InputError, match=r"frames: expected int numbers, found .O"):
+        read_joints(path)
+
+
+def test_tracks_refuse_shapes_that_disagree(tracks):
+    with pytest.raises(InputError, match=r"joints: expected shape \(3, 3, 17, 3\)"):
+        replace(tracks, person_ids=np.arange(3))

@@ -1,0 +1,131 @@
+"""Markings and people drawn over pictures, where their camera has them."""
+
+import numpy as np
+
+from data_contracts.conventions import COCO17
+from data_contracts.pitch import PitchSpec
+from worldpose.body import BodyParameters, fold_keypoints, load_open_body
+from worldpose.cameras import Camera
+from worldpose.formats import JointTracks
+from worldpose.reports.body_rendering import BodyTracks
+from worldpose.reports.overlay_video import overlay_frames
+from worldpose.synthetic.stadium import looking
+
+SIZE = (322, 182)
+
+
+def camera(frames, focal=600.0):
+    pose = looking(np.array([0.0, -60.0, 20.0]), np.array([0.0, 0.0, 0.0]), 0.0)
+    one = Camera(
+        focal=np.array([focal, focal]),
+        principal_point=np.array([160.5, 90.5]),
+        distortion=np.zeros(5),
+        cam_from_world=pose,
+        image_size=np.array(SIZE),
+    )
+    return Camera.stack([one] * frames)
+
+
+def tracks(frames):
+    joints = np.full((frames, 1, 17, 3), np.nan)
+    # A bone of 2 m, upright, on the centre mark: from the left shoulder to the left elbow.
+    joints[0, 0, 5], joints[0, 0, 7] = [4.0, 0.0, 0.0], [4.0, 0.0, 2.0]
+    return JointTracks(
+        frames=np.arange(10, 10 + frames),
+        person_ids=np.array([3]),
+        joints=joints,
+        covariance=np.full((frames, 1, 17, 3, 3), np.nan),
+        views=np.zeros((frames, 1, 17), dtype=np.int64),
+    )
+
+
+def drawn(frames, pitch=None, people=None, bodies=None, focal=600.0):
+    black = [np.zeros((SIZE[1], SIZE[0], 3), dtype=np.uint8) for _ in frames]
+    people = tracks(2) if people is None else people
+    return list(
+        overlay_frames(black, camera(len(frames), focal), people, np.array(frames), pitch, bodies)
+    )
+
+
+def test_pictures_have_half_the_size_and_even_sides():
+    # 161 x 91 loses a row and a column.
+    assert [picture.shape for picture in drawn([10, 11])] == [(90, 160, 3)] * 2
+
+
+def test_a_bone_is_where_the_camera_has_it():
+    picture = drawn([10])[0]
+    rows, columns = np.nonzero(picture.any(axis=-1))
+    ends = camera(1)[0].project(np.array([[4.0, 0.0, 0.0], [4.0, 0.0, 2.0]]))
+    low, high = 0.5 * ends.min(axis=0) - 0.25, 0.5 * ends.max(axis=0) - 0.25
+    # A line one pixel wide with soft borders.
+    np.testing.assert_allclose([columns.min(), rows.min()], low, atol=1.6)
+    np.testing.assert_allclose([columns.max(), rows.max()], high, atol=1.6)
+
+
+def test_people_are_drawn_in_their_own_frames_only():
+    assert not drawn([11])[0].any()
+    assert not drawn([300])[0].any()
+
+
+def test_markings_are_drawn_where_there_is_a_pitch():
+    picture = drawn([11], pitch=PitchSpec())[0]
+    mark = 0.5 * camera(1)[0].project(np.array([[0.0, 5.0, 0.0]]))[0] - 0.25
+    # The halfway line, 5 m beyond the centre mark.
+    x, y = np.rint(mark).astype(int)
+    assert picture[y - 1 : y + 2, x - 1 : x + 2].any()
+
+
+def standing(places, ids):
+    """People who stand at places (persons, 2) [m] in frame 10 and are gone in frame 11."""
+    model = load_open_body()
+    transl = np.full((2, len(ids), 3), np.nan)
+    transl[0] = np.concatenate([places, np.full((len(ids), 1), 1.2)], axis=1)
+    upright = np.tile([np.pi / 2, 0.0, 0.0], (2, len(ids), 1))
+    poses = BodyParameters(np.zeros(10), upright, np.zeros(69), transl)
+    frames, ids = np.array([10, 11]), np.array(ids)
+    joints = fold_keypoints(model, COCO17)(poses)
+    return JointTracks(frames, ids, joints), BodyTracks(frames, ids, poses, model)
+
+
+CLOSE = 3000.0
+"""Focal length [px] at which people are 40 px tall in the half picture."""
+
+
+def middle(place):
+    """Pixel of the half picture where somebody's chest is."""
+    x, y = 0.5 * camera(1, CLOSE)[0].project(np.array([[*place, 1.35]]))[0] - 0.25
+    return round(y), round(x)
+
+
+def test_bodies_are_seen_through_and_replace_bones():
+    people, bodies = standing([[0.0, 0.0]], [3])
+    skin = drawn([10], people=people, bodies=bodies, focal=CLOSE)[0]
+    bones = drawn([10], people=people, focal=CLOSE)[0]
+    # Between the sides of the trunk there is no bone.
+    assert bones[middle([0.0, 0.0])].max() == 0
+    assert 40 < skin[middle([0.0, 0.0])].max() < 0.75 * 255
+    assert not drawn([11], people=people, bodies=bodies, focal=CLOSE)[0].any()
+
+
+def test_the_nearer_of_two_bodies_is_seen():
+    # The camera looks along +y; person 0 is blue, person 1 red.
+    for ids in ([0, 1], [1, 0]):
+        people, bodies = standing([[0.0, 0.0], [0.0, 1.0]], ids)
+        picture = drawn([10], people=people, bodies=bodies, focal=CLOSE)[0]
+        red, _, blue = picture[middle([0.0, 0.0])].tolist()
+        assert (blue > red) == (ids[0] == 0)
+
+
+def test_who_has_no_body_keeps_his_bones():
+    people, bodies = standing([[1.3, 0.0], [-1.3, 0.0]], [0, 1])
+    lost = bodies.poses.transl.copy()
+    lost[:, 1] = np.nan
+    poses = BodyParameters(
+        bodies.poses.betas, bodies.poses.global_orient, bodies.poses.body_pose, lost
+    )
+    one = BodyTracks(bodies.frames, bodies.person_ids, poses, bodies.model)
+    picture = drawn([10], people=people, bodies=one, focal=CLOSE)[0].astype(int)
+    expected = drawn([10], people=people, focal=CLOSE)[0].astype(int)
+    np.testing.assert_array_equal(picture[:, :80], expected[:, :80])
+    assert picture[:, :80].any()
+    assert (picture[:, 80:] != expected[:, 80:]).any()

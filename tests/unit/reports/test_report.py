@@ -1,0 +1,177 @@
+import base64
+import hashlib
+import re
+from datetime import UTC, datetime
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+import pytest
+
+from data_contracts.evaluation import Evaluation
+from data_contracts.run import RunRecord, UnitFailure
+from worldpose.formats import JointTracks
+from worldpose.reports import CameraSummary, Picture, Scene, Section, report_page
+from worldpose.reports.html_page import small_enough
+from worldpose.reports.run_report import camera_table
+from worldpose.reports.score_names import MEANINGS
+
+PNG = base64.b64decode(
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJg"
+)
+
+
+def run(**changes):
+    plain = {
+        "run_id": "0003",
+        "match_id": "tiny-1",
+        "parent": "0002",
+        "state": "partial",
+        "results": {"ingest/cam00": "0" * 32, "tracking/clip": "1" * 32},
+        "settings": {},
+        "overrides": {},
+        "executed": ("tracking/clip",),
+        "reused": ("ingest/cam00",),
+        "failed": (
+            UnitFailure(unit="triangulation/clip", error="E", message="<script>no</script>"),
+        ),
+        "blocked": (),
+        "figures": {"tracking/clip": {"persons": 5.0, "mean_views": 5.8125}},
+        "versions": {"numpy": "2.4.0"},
+        "started_at": datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC),
+        "finished_at": datetime(2025, 1, 2, 3, 4, 15, tzinfo=UTC),
+        "seconds": 10.0,
+    }
+    return RunRecord(**{**plain, **changes})
+
+
+class Page(HTMLParser):
+    """Rows of cells, addresses and unbalanced tags of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.rows, self.addresses, self.open = [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        if tag not in ("meta", "img", "input"):
+            self.open.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+        self.addresses += [value for name, value in attributes if name in ("src", "href")]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] in ("td", "th"):
+            self.rows[-1][-1] += data
+
+
+def test_units_say_what_happened_to_them():
+    page = Page(report_page("A run", run(), seconds={"tracking/clip": 1.234}))
+    assert ["ingest/cam00", "reused", ""] in page.rows
+    assert ["tracking/clip", "computed", "1.23"] in page.rows
+    assert ["triangulation/clip", "failed: <script>no</script>", ""] in page.rows
+    assert page.open == []
+
+
+def test_figures_are_shown_by_unit():
+    rows = Page(report_page("A run", run(), seconds={})).rows
+    assert ["tracking/clip", "persons", "5"] in rows
+    assert ["", "mean_views", "5.812"] in rows
+
+
+def test_scores_come_with_unit_and_meaning_and_shares_in_per_cent():
+    scores = Evaluation(mpjpe_mm=23.456, coverage=0.5, frames=100)
+    rows = Page(report_page("A run", run(), seconds={}, scores=scores)).rows
+    assert ["Mean joint error", "23.46 mm", MEANINGS["mpjpe_mm"][2]] in rows
+    assert ["People found", "50 %", MEANINGS["coverage"][2]] in rows
+    assert ["Frames scored", "100", MEANINGS["frames"][2]] in rows
+    assert not any("Correct limbs" in row for row in rows)
+
+
+def test_every_score_has_a_meaning():
+    assert set(MEANINGS) == set(Evaluation.model_fields)
+
+
+def test_without_truth_there_is_no_table_of_scores():
+    assert "Against the truth" not in report_page("A run", run(), seconds={})
+
+
+def pictured(*pictures, heading="Seen"):
+    return [Section(heading, tuple(pictures))]
+
+
+def test_text_is_escaped():
+    hostile = pictured(Picture('"><img', PNG), heading="<script>1</script>")
+    tiles = [("<i>3</i>", "<u>")]
+    text = report_page("<b>bold</b> & more", run(), seconds={}, sections=hostile, tiles=tiles)
+    for tag in ("<b>bold", "<script>", "<i>", "<u>"):
+        assert tag not in text
+    assert "&lt;b&gt;bold&lt;/b&gt; &amp; more" in text
+    assert Page(text).open == []
+
+
+def test_nothing_is_asked_from_outside():
+    text = report_page("A run", run(), seconds={}, sections=pictured(Picture("from above", PNG)))
+    page = Page(text)
+    jumps = [address for address in page.addresses if address.startswith("#")]
+    assert jumps == ["#part1", "#last"]
+    (data,) = [address for address in page.addresses if address not in jumps]
+    assert data[:22] == "data:image/png;base64,"
+    assert base64.b64decode(data[22:]) == PNG
+    assert not re.search(r"https?:|url\(|@import", text)
+    assert "default-src 'none'" in text
+    assert "<script" not in text
+    assert "script-src" not in text
+
+
+def test_a_scene_brings_the_one_script_that_the_page_may_run():
+    joints = np.full((2, 1, 17, 3), np.nan)
+    scene = Scene("</script>", JointTracks(np.arange(2), np.arange(1), joints), 50.0, {})
+    text = report_page("A run", run(), seconds={}, sections=[Section("In space", (scene,))])
+    (script,) = re.findall(r"<script>(.*?)</script>", text, re.S)
+    allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"script-src 'sha256-{allowed}'" in text
+    assert text.count("<script") == 2  # the other one is data
+    assert Page(text).open == []
+
+
+def test_parts_without_content_are_left_out():
+    empty = [Section("Nothing", ()), *pictured(Picture("from above", PNG))]
+    text = report_page("A run", run(), seconds={}, sections=empty)
+    assert "Nothing" not in text
+    assert '<a href="#part1">Seen</a>' in text
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_only_settings_that_were_asked_for_are_listed(shown):
+    overrides = {"tracking": {"gate": 0.5}} if shown else {}
+    text = report_page("A run", run(overrides=overrides), seconds={})
+    assert (["tracking", "gate", "0.5"] in Page(text).rows) == shown
+
+
+def test_static_cameras_are_listed_with_what_is_wrong_with_them():
+    cameras = [
+        CameraSummary("cam0", "given"),
+        CameraSummary("cam1", "clicks", 0.0213, 0.35, 1.128, 9, ("corner_left_far",), ("few",)),
+    ]
+    shown = [Section("Static cameras", (camera_table(cameras),))]
+    rows = Page(report_page("A run", run(), seconds={}, sections=shown)).rows
+    assert ["cam0", "given", "-", "-", "-", "-", "", ""] in rows
+    assert ["cam1", "clicks", "21.3", "350.0", "1.13", "9", "corner_left_far", "few"] in rows
+
+
+def test_photographs_are_made_smaller_and_curves_stay_as_they_are():
+    rng = np.random.default_rng(0)
+    photograph = rng.integers(0, 255, (400, 300, 3)).astype(np.uint8)
+    large = cv2.imencode(".png", photograph)[1].tobytes()
+    kind, content, size = small_enough(large)
+    assert (kind, size) == ("webp", (300, 400))
+    assert len(content) < len(large) / 2
+    shown = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    assert shown.shape == photograph.shape
+    assert small_enough(PNG) == ("png", PNG, (1, 1))

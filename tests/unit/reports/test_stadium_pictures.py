@@ -1,0 +1,110 @@
+import cv2
+import numpy as np
+import pytest
+
+from data_contracts.pitch import PitchSpec
+from worldpose.cameras import Camera, Rigid
+from worldpose.formats import JointTracks
+from worldpose.reports.clips import REACH, camera_picture, ground_seen, stadium_picture
+from worldpose.reports.drawing import PALETTE
+from worldpose.reports.static_cameras import ACCEPTED, REFUSED, Click, ErrorMap, calibration_picture
+
+
+def decoded(png):
+    image = cv2.imdecode(np.frombuffer(png, dtype=np.uint8), cv2.IMREAD_COLOR)
+    return image[:, :, ::-1].astype(int)
+
+
+def pixels_of(image, color):
+    wanted = [int(color[i : i + 2], 16) for i in (1, 3, 5)]
+    return np.argwhere(np.abs(image - wanted).max(axis=-1) <= 2)
+
+
+def looking(down, height=20.0):
+    """Stands at y = -50, looks along y and down by an angle, x to the right; 90 degrees wide."""
+    c, s = np.cos(down), np.sin(down)
+    rotation = np.array([[1.0, 0.0, 0.0], [0.0, -s, -c], [0.0, c, -s]])
+    return Camera(
+        focal=np.array([960.0, 960.0]),
+        principal_point=np.array([959.5, 539.5]),
+        distortion=np.zeros(5),
+        cam_from_world=Rigid(rotation, -rotation @ np.array([0.0, -50.0, height])),
+        image_size=np.array([1920, 1080]),
+    )
+
+
+@pytest.fixture
+def people():
+    """Person 0 stands at the far left, person 1 at the near right."""
+    joints = np.zeros((1, 2, 17, 3))
+    joints[0, 0] += (-20.0, 20.0, 1.0)
+    joints[0, 1] += (20.0, -20.0, 1.0)
+    return JointTracks(np.arange(1), np.arange(2), joints)
+
+
+def test_straight_down_the_ground_is_the_picture_s_rectangle():
+    # 20 m up, focal length 960 px: a pixel is 20 / 960 m.
+    corners = ground_seen(looking(np.pi / 2))
+    np.testing.assert_allclose(corners.min(axis=0), [-20.0, -50.0 - 11.25], atol=1e-9)
+    np.testing.assert_allclose(corners.max(axis=0), [20.0, -50.0 + 11.25], atol=1e-9)
+
+
+def test_over_the_horizon_the_ground_ends_at_the_reach():
+    corners = ground_seen(looking(0.0))
+    assert np.isfinite(corners).all()
+    far = np.linalg.norm(corners - (0.0, -50.0), axis=-1)
+    assert far.max() == pytest.approx(REACH)
+    # The lower edge looks down by atan(540 / 960): 20 m up that is 35.6 m away, straight ahead.
+    assert far.min() == pytest.approx(20.0 * 960.0 / 540.0, rel=0.01)
+
+
+def test_from_above_people_are_where_they_are_and_near_is_below(people):
+    png = stadium_picture({"south": looking(0.3)}, "frame 0", people, 0, pitch=PitchSpec())
+    far, near = (pixels_of(decoded(png), color).mean(axis=0) for color in PALETTE[:2])
+    assert far[0] < near[0] - 100  # rows run down
+    assert far[1] < near[1] - 100
+
+
+def test_a_camera_s_picture_has_its_still_beneath(people):
+    still = np.full((1080, 1920, 3), (10, 200, 30), dtype=np.uint8)
+    with_still = decoded(camera_picture(looking(0.3), "south", people, 0, still=still))
+    without = decoded(camera_picture(looking(0.3), "south", people, 0, pitch=PitchSpec()))
+    assert len(pixels_of(with_still, "#0ac81e")) > 0.8 * with_still[..., 0].size
+    assert len(pixels_of(without, "#0ac81e")) == 0
+    for image in (with_still, without):
+        far, near = (pixels_of(image, color).mean(axis=0) for color in PALETTE[:2])
+        assert far[0] < near[0] - 20
+        assert far[1] < near[1] - 100
+
+
+def test_nobody_and_no_pitch_are_still_pictures():
+    nobody = JointTracks(np.arange(1), np.arange(0), np.empty((1, 0, 17, 3)))
+    assert decoded(stadium_picture({"a": looking(0.3)}, "", nobody, 0)).shape[2] == 3
+    assert decoded(camera_picture(looking(0.3), "", nobody, 0)).shape[2] == 3
+
+
+def test_wrong_clicks_are_marked_where_they_were_made():
+    clicks = [
+        Click("corner_left_far", np.array([480.0, 270.0]), inlier=True),
+        Click("corner_right_near", np.array([1440.0, 810.0]), inlier=False),
+    ]
+    image = decoded(calibration_picture(looking(0.3), "south", PitchSpec(), clicks=clicks))
+    accepted = pixels_of(image, ACCEPTED).mean(axis=0)
+    refused = np.median(pixels_of(image, REFUSED), axis=0)
+    assert accepted[1] / image.shape[1] == pytest.approx(0.25, abs=0.02)
+    assert accepted[0] < refused[0] - 300
+    assert accepted[1] < refused[1] - 300
+
+
+def test_the_coverage_map_is_added_below_and_has_the_same_bytes_every_time():
+    x, y = np.linspace(-54.0, 54.0, 10), np.linspace(-36.0, 36.0, 7)
+    expected = np.full((7, 10), 0.02)
+    expected[:, :3] = np.nan
+    error_map = ErrorMap(x, y, expected)
+    pictures = [
+        calibration_picture(looking(0.3), "south", PitchSpec(), error_map=each)
+        for each in (None, error_map, error_map)
+    ]
+    heights = [decoded(png).shape[0] for png in pictures]
+    assert heights[1] > heights[0] + 300
+    assert pictures[1] == pictures[2]

@@ -1,0 +1,1 @@
+"""A released data set: its manifest, its statistics, and the check of its content."""

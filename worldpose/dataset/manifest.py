@@ -1,0 +1,109 @@
+"""manifest.json: what a release is, what it was made from, and how to prove that it is whole."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Final
+
+from pydantic import PositiveFloat, TypeAdapter, ValidationError
+
+from data_contracts.records import CONTRACT_VERSION
+from data_contracts.release import ReleasedFile, ReleaseManifest
+from worldpose.errors import InputError
+from worldpose.formats.files import whole_file
+
+MANIFEST: Final = "manifest.json"
+
+
+def released_files(folder: Path, paths: Iterable[Path]) -> tuple[ReleasedFile, ...]:
+    """Sizes and checksums of files in `folder`, by name."""
+    files = []
+    for path in sorted(paths):
+        with path.open("rb") as file:
+            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        name = path.relative_to(folder).as_posix()
+        files.append(ReleasedFile(path=name, size=path.stat().st_size, sha256=sha256))
+    return tuple(files)
+
+
+def write_manifest(folder: Path, manifest: ReleaseManifest) -> Path:
+    """Write manifest.json, whole or not at all; returns it."""
+    with whole_file(folder / MANIFEST) as draft:
+        draft.write_text(manifest.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    return folder / MANIFEST
+
+
+def read_manifest(folder: Path) -> ReleaseManifest | None:
+    """The manifest of a release; None where the folder has none.
+
+    Raises:
+        InputError: it is no manifest, or one of another contract.
+    """
+    path = folder / MANIFEST
+    if not path.is_file():
+        return None
+    try:
+        return ReleaseManifest.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        raise InputError(
+            str(path),
+            expected=f"the manifest of a release, contract {CONTRACT_VERSION}",
+            found=str(error.errors()[0]["msg"]),
+            todo="Take the release anew from its origin.",
+        ) from error
+
+
+def changed_files(folder: Path, manifest: ReleaseManifest) -> list[str]:
+    """Names of released files that are gone or have other bytes."""
+    changed = []
+    for file in manifest.files:
+        path = folder / file.path
+        if not path.is_file() or released_files(folder, [path])[0] != file:
+            changed.append(file.path)
+    return changed
+
+
+FRAME_RATES: Final = "frame_rates.json"
+_RATES = TypeAdapter(dict[str, PositiveFloat])
+
+
+def write_frame_rates(folder: Path, rates: Mapping[str, float]) -> Path:
+    """Add clips' frames a second [1/s] to those that the folder says already; returns the file.
+
+    Raises:
+        InputError: what is there is no such file.
+    """
+    known = {**read_frame_rates(folder), **rates}
+    with whole_file(folder / FRAME_RATES) as draft:
+        draft.write_text(json.dumps(known, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+    return folder / FRAME_RATES
+
+
+def read_frame_rates(folder: Path) -> dict[str, float]:
+    """Frames a second [1/s] by clip; empty where the folder does not say.
+
+    Raises:
+        InputError: the file is not clips and numbers.
+    """
+    path = folder / FRAME_RATES
+    if not path.is_file():
+        return {}
+    try:
+        return _RATES.validate_json(path.read_bytes())
+    except ValidationError as error:
+        raise InputError(
+            str(path),
+            expected="clips and their frames a second",
+            found=str(error.errors()[0]["msg"]),
+            todo="Export the data set again.",
+        ) from error
+
+
+def frame_rate_of(rates: Mapping[str, float], clip: str) -> float | None:
+    """Frames a second of a clip; one that no file names (`joints.npz`) has the rate of all."""
+    if clip in rates:
+        return rates[clip]
+    return next(iter(rates.values())) if len(set(rates.values())) == 1 else None

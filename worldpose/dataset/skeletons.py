@@ -1,0 +1,164 @@
+"""Whether the challenge's boxes and skeletons about the mid-hip agree with its 2D skeletons."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.release import Finding
+from worldpose.dataset.faults import axis_orders
+from worldpose.dataset.plausibility import BONES
+from worldpose.dataset.settings import CheckSettings
+from worldpose.formats.camera_rows import CameraRows
+
+Floats = NDArray[np.float64]
+
+_BODIES: Final = 400
+"""Bodies that are looked at."""
+_OVERLAP: Final = 0.35
+"""Least median intersection over union of sound boxes and those around 2D skeletons [1]: skin
+reaches beyond joints, which leaves 0.5 to 0.7."""
+_AS_SHIPPED: Final = "the camera's x, y, z"
+
+
+def box_findings(boxes: Floats, skel_2d: Floats, clip: str) -> Iterator[Finding]:
+    """Boxes that do not hold their skeletons, and whether another order of numbers explains it.
+
+    Args:
+        boxes: (frames, persons, 4) as the file has them.
+        skel_2d: (frames, persons, points, 2) [px].
+        clip: its name.
+    """
+    shipped = _overlap(boxes, skel_2d)
+    if shipped >= _OVERLAP:
+        return
+    start, rest = boxes[..., :2], boxes[..., 2:]
+    others = {
+        "x y width height": np.concatenate([start, start + rest], axis=-1),
+        "the middle's x y, width height": np.concatenate(
+            [start - 0.5 * rest, start + 0.5 * rest], axis=-1
+        ),
+        "y0 x0 y1 x1": boxes[..., [1, 0, 3, 2]],
+    }
+    overlaps = {name: _overlap(other, skel_2d) for name, other in others.items()}
+    best = max(overlaps, key=lambda name: overlaps[name])
+    known = overlaps[best] >= _OVERLAP
+    yield Finding(
+        fault="box_format" if known else "boxes",
+        kind="convention" if known else "damage",
+        where=(f"boxes of {clip}",),
+        says=f"boxes are {best} and not x0 y0 x1 y1"
+        if known
+        else "boxes are not around the 2D skeletons",
+        figures={"overlap": shipped, "explained_overlap": overlaps[best]},
+    )
+
+
+def skeleton_findings(
+    skel_3d: Floats,
+    skel_2d: Floats,
+    skeleton: tuple[str, ...],
+    rows: CameraRows,
+    clip: str,
+    settings: CheckSettings,
+) -> Iterator[Finding]:
+    """3D skeletons in camera axes that no place before the camera brings onto their 2D.
+
+    Every body is put where its points come nearest to the 2D; what is then left has other axes.
+    The size of a body says nothing there, so units are told from thighs.
+
+    Args:
+        skel_3d: (frames, persons, points, 3) as the file has them.
+        skel_2d: (frames, persons, points, 2) [px].
+        skeleton: what the points are.
+        rows: the clip's camera; a frame without a pose has K and k.
+        clip: its name.
+        settings: what counts as an explanation.
+    """
+    where = (f"skel_3d of {clip}",)
+    count = len(rows.intrinsics) if len(rows.intrinsics) > 1 else len(skel_3d)
+    known = np.isfinite(skel_3d[:count]).all((-1, -2)) & np.isfinite(skel_2d[:count]).all((-1, -2))
+    frame, person = np.nonzero(known)
+    if not len(frame):
+        return
+    picked = np.unique(np.linspace(0, len(frame) - 1, _BODIES).round().astype(np.int64))
+    frame, person = frame[picked], person[picked]
+    bodies, pixels = skel_3d[frame, person], skel_2d[frame, person]
+    upper, lower = (skeleton.index(f"left_{name}") for name in BONES["thighs"])
+    thigh = float(np.median(np.linalg.norm(bodies[:, upper] - bodies[:, lower], axis=-1)))
+    for unit, size in (("millimetres", 1000.0), ("centimetres", 100.0)):
+        if settings.bones[0] <= thigh / size <= settings.bones[1]:
+            yield Finding(
+                fault=unit,
+                kind="convention",
+                where=where,
+                says=f"skeletons are in {unit} and not in metres",
+                figures={"thigh": thigh},
+            )
+            bodies = bodies / size
+    row = frame if len(rows.intrinsics) > 1 else np.zeros_like(frame)
+    lens = rows.lens()[row]
+    plane, focal = lens.normalize(pixels), lens.focal
+    told = np.isfinite(plane).all((-1, -2))
+    if not told.any():
+        return
+    row, bodies, plane, focal = row[told], bodies[told], plane[told], focal[told]
+    guesses = {_AS_SHIPPED: bodies}
+    for name, axes in axis_orders():
+        guesses[f"the camera's {name}"] = bodies @ axes
+    turned = rows.rotation[row]
+    posed = np.isfinite(turned).all((-1, -2))
+    left = {name: _left(guess, plane, focal) for name, guess in guesses.items()}
+    if posed.any():
+        in_world = np.einsum("nab,njb->nja", turned[posed], bodies[posed])
+        left["the world's x, y, z"] = _left(in_world, plane[posed], focal[posed])
+    best = min(left, key=lambda name: left[name])
+    shipped, least = left[_AS_SHIPPED], left[best]
+    if shipped - least > settings.least_gain_px and least < settings.explained * shipped:
+        yield Finding(
+            fault="skeleton_axes",
+            kind="convention",
+            where=where,
+            says=f"x, y, z of the skeletons are {best} and not the camera's",
+            figures={"shipped_median_px": min(shipped, 1e6), "explained_median_px": least},
+        )
+
+
+def _overlap(boxes: Floats, skel_2d: Floats) -> float:
+    """Median intersection over union with the boxes around the 2D points; 1 without any."""
+    known = np.isfinite(skel_2d).all((-1, -2)) & np.isfinite(boxes).all(-1)
+    if not np.any(known):
+        return 1.0
+    box, points = boxes[known], skel_2d[known]
+    low, high = points.min(1), points.max(1)
+    both = np.minimum(high, box[:, 2:]) - np.maximum(low, box[:, :2])
+    shared = np.maximum(both, 0.0).prod(-1)
+    whole = np.maximum(box[:, 2:] - box[:, :2], 0.0).prod(-1) + (high - low).prod(-1) - shared
+    return float(np.median(shared / np.maximum(whole, 1e-9)))
+
+
+def _left(bodies: Floats, plane: Floats, focal: Floats) -> float:
+    """Median distance [px] from the 2D of bodies at the places that bring them nearest to it.
+
+    Args:
+        bodies: (n, points, 3) [m], camera axes.
+        plane: (n, points, 2), the 2D without the lens, at depth 1.
+        focal: (n, 2) [px].
+    """
+    # x (Z + tz) = X + tx, and the same for y: linear in the place.
+    ones, zeros = np.ones_like(plane[..., 0]), np.zeros_like(plane[..., 0])
+    across = np.stack([ones, zeros, -plane[..., 0]], axis=-1)
+    down = np.stack([zeros, ones, -plane[..., 1]], axis=-1)
+    rows = np.concatenate([across, down], axis=1)
+    deep = plane * bodies[..., 2:] - bodies[..., :2]
+    given = np.concatenate([deep[..., 0], deep[..., 1]], axis=1)
+    normal = np.einsum("nki,nkj->nij", rows, rows)
+    place = np.linalg.solve(normal, np.einsum("nki,nk->ni", rows, given)[..., None])
+    seen = bodies + place.swapaxes(-1, -2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        away = (seen[..., :2] / seen[..., 2:] - plane) * focal[:, None]
+    far = np.linalg.norm(away, axis=-1)
+    return float(np.median(np.where(seen[..., 2] > 0.0, far, np.inf)))

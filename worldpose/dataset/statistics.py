@@ -1,0 +1,138 @@
+"""How much there is in a data set: clips, frames, poses, distances (X1, X2)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17
+from data_contracts.release import ClipStatistics, DataSetStatistics
+from worldpose.errors import InputError
+from worldpose.formats.camera_rows import read_camera_rows
+from worldpose.formats.challenge import read_submission
+from worldpose.formats.joints_file import read_joints
+from worldpose.formats.pose_file import read_poses
+
+Floats = NDArray[np.float64]
+CameraKind = Literal["S", "M", "M+Z"]
+KINDS: Final[tuple[CameraKind, ...]] = ("S", "M", "M+Z")
+"""Cameras that stand still, move, or move and zoom, as the paper's table has them."""
+
+_TURN: Final = 1e-3
+"""A camera whose rotation differs by less [rad] stands still: a pixel in a broadcast picture."""
+_ZOOM: Final = 1e-2
+"""A camera whose focal length changes by less than this share does not zoom."""
+
+
+def read_places(folder: Path, clip: str) -> Floats:
+    """Return where everybody is (frames, persons, 3) [m]; NaN where a person is missing.
+
+    The pelvis of poses, up to a shift of each person, or the middle of the hips.
+
+    Args:
+        folder: the data set.
+        clip: one of `clips_in`.
+
+    Raises:
+        InputError: a file is damaged, or the clip has none.
+    """
+    poses = folder / "poses" / f"{clip}.npz"
+    if poses.is_file():
+        found, _ = read_poses(poses)
+        angles = np.concatenate([found.global_orient, found.body_pose], axis=-1)
+        gone = np.isnan(angles).any(-1, keepdims=True)
+        return np.where(gone, np.nan, found.transl).swapaxes(0, 1)
+    for name in (f"{clip}.joints.npz", "joints.npz"):
+        if (folder / name).is_file():
+            hips = [COCO17.index("left_hip"), COCO17.index("right_hip")]
+            return np.asarray(read_joints(folder / name).joints[:, :, hips].mean(2))
+    for name in ("submission.zip", "submission.npz"):
+        if (folder / name).is_file():
+            # Of the challenge's 15 joints, 7 and 8 are the hips.
+            joints = read_submission(folder / name, (clip,))[clip]
+            return np.asarray(joints[:, :, 7:9].mean(2)).swapaxes(0, 1)
+    raise InputError(
+        f"{folder}: {clip}",
+        expected="poses, joints or a submission",
+        found="none",
+        todo="Give the folder that worldpose export wrote.",
+    )
+
+
+def clip_statistics(places: Floats, fps: float, camera: CameraKind | None = None) -> ClipStatistics:
+    """Return how much there is in one clip.
+
+    A person's way is that over the ground, from frame to frame; where a person is missing in
+    between, nothing is added.
+
+    Args:
+        places: (frames, persons, 3) [m], world; NaN where a person is missing.
+        fps: frames in a second [1/s].
+        camera: what the camera of the pictures does.
+    """
+    there = np.asarray(np.isfinite(places).all(-1))
+    steps = np.linalg.norm(np.diff(places[..., :2], axis=0), axis=-1)
+    ways = np.where(there[1:] & there[:-1], steps, 0.0).sum(0)
+    return ClipStatistics(
+        frames=len(places),
+        seconds=len(places) / fps,
+        persons=int(there.any(0).sum()),
+        poses=int(there.sum()),
+        trajectories_m=tuple(ways[there.any(0)].tolist()),
+        camera=camera,
+    )
+
+
+def data_set_statistics(clips: Mapping[str, ClipStatistics]) -> DataSetStatistics:
+    """Return how much there is in all clips together."""
+    frames = sum(clip.frames for clip in clips.values())
+    poses = sum(clip.poses for clip in clips.values())
+    ways = [way for clip in clips.values() for way in clip.trajectories_m]
+    # Of every pose, the time until the next one.
+    seconds = sum(clip.poses * clip.seconds / clip.frames for clip in clips.values() if clip.frames)
+    kinds = [clip.camera for clip in clips.values() if clip.camera is not None]
+    return DataSetStatistics(
+        clips=dict(clips),
+        frames=frames,
+        minutes=sum(clip.seconds for clip in clips.values()) / 60.0,
+        poses=poses,
+        distance_km=sum(ways) / 1000.0,
+        subjects_per_frame=poses / frames if frames else None,
+        speed_m_s=sum(ways) / seconds if seconds else None,
+        longest_trajectory_m=max(ways, default=None),
+        camera=max(kinds, key=KINDS.index, default=None),
+    )
+
+
+def camera_kind(path: Path) -> CameraKind | None:
+    """Return what the camera of a file does; None where there is no such file, or it tells not.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    if not path.is_file():
+        return None
+    rows = read_camera_rows(path)
+    return kind_of(rows.intrinsics[:, (0, 1), (0, 1)].mean(-1), rows.rotation)
+
+
+def kind_of(focal: Floats, rotation: Floats) -> CameraKind | None:
+    """Return what a camera does; None where its turns are not known.
+
+    Args:
+        focal: (frames,) [px].
+        rotation: (frames, 3, 3), or (1, 3, 3) where only the first one is known.
+    """
+    known = np.isfinite(focal)
+    if known.any() and np.ptp(focal[known]) > _ZOOM * focal[known].mean():
+        return "M+Z"
+    turns = rotation[np.isfinite(rotation).all((-1, -2))]
+    if len(turns) < 2 <= len(focal):
+        return None
+    # The angle of R1^T R2 is below a when the trace is above 1 + 2 cos a.
+    traces = np.einsum("fab,ab->f", turns, turns[0]) if len(turns) else np.empty(0)
+    return "M" if (traces < 1.0 + 2.0 * np.cos(_TURN)).any() else "S"

@@ -1,0 +1,26 @@
+"""Files that carry results between tools: written from plain arrays, and read back.
+
+Joints, cameras, body poses, COCO keypoints, the FIFA skeletal tracking challenge, motion capture
+(TRC, BVH); docs/formats.md describes each of them.
+"""
+
+from worldpose.formats.archives import Member, read_archive, write_archive
+from worldpose.formats.camera_file import read_camera, write_moving_camera, write_static_camera
+from worldpose.formats.coco import coco_dataset, write_coco
+from worldpose.formats.files import whole_file
+from worldpose.formats.joints_file import JointTracks, read_joints, write_joints
+
+__all__ = [
+    "JointTracks",
+    "Member",
+    "coco_dataset",
+    "read_archive",
+    "read_camera",
+    "read_joints",
+    "whole_file",
+    "write_archive",
+    "write_coco",
+    "write_joints",
+    "write_moving_camera",
+    "write_static_camera",
+]

@@ -1,0 +1,146 @@
+"""npz archives: bytes that depend on the arrays alone, and reading that trusts nothing."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from worldpose.errors import InputError
+from worldpose.formats.files import whole_file
+
+ARRAY_BYTES: Final = 16 << 30
+"""Most that the arrays of one file may fill [byte]: two hours of 25 people with covariance at
+50 frames/s are 13 GB."""
+
+_KINDS: Final = {"float": "f", "int": "iu", "text": "U"}
+_MEANINGS: Final = {"float": "float numbers", "int": "int numbers", "text": "text"}
+_READ_AS: Final[Mapping[str, type]] = {"float": np.float64, "int": np.int64, "text": np.str_}
+
+
+@dataclass(frozen=True)
+class Member:
+    """One array of an archive: what it must look like."""
+
+    dims: tuple[str | int, ...]
+    """Lengths, or names of lengths that must agree between members."""
+    kind: Literal["float", "int", "text"]
+    """Read as float64, int64 or str, whatever the width in the file."""
+    required: bool = True
+
+
+def write_archive(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays as npz, whole or not at all; the same arrays give the same bytes."""
+    with whole_file(path) as draft, zipfile.ZipFile(draft, "w") as file:
+        for name, array in arrays.items():
+            little = np.asarray(array, array.dtype.newbyteorder("<"), order="C")
+            # A ZipInfo made by name alone carries the fixed date 1980-01-01.
+            with file.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+                npy.write_array(member, little, version=(1, 0), allow_pickle=False)
+
+
+def read_archive(
+    path: Path, members: Mapping[str, Member], only: Collection[str] | None = None
+) -> dict[str, NDArray[Any]]:
+    """Read the arrays of an npz file after their types, shapes and sizes were checked.
+
+    Args:
+        path: the file.
+        members: what it must hold; nothing else may be in it.
+        only: members that are wanted; None = all. The others do not come into memory.
+
+    Returns:
+        float64, int64 and str arrays by name; optional members that are absent are left out.
+
+    Raises:
+        InputError: naming file and member: absent, truncated, no npz, members missing or unknown,
+            another type or shape, too large.
+    """
+    if not path.is_file():
+        raise wrong(str(path), "an npz file", "nothing", "Check the path.")
+    try:
+        with zipfile.ZipFile(path) as file:
+            infos = _infos(path, file, members)
+            _check_headers(path, file, infos, members)
+            return {
+                name: _array(path, file, info, members[name])
+                for name, info in infos.items()
+                if only is None or name in only
+            }
+    except (zipfile.BadZipFile, OSError, NotImplementedError) as error:
+        raise wrong(str(path), "a whole npz file", f"{error}") from error
+
+
+def wrong(where: str, expected: str, found: str, todo: str = "Write the file anew.") -> InputError:
+    """The error about one place of a file."""
+    return InputError(where, expected=expected, found=found, todo=todo)
+
+
+def _infos(
+    path: Path, file: zipfile.ZipFile, members: Mapping[str, Member]
+) -> dict[str, zipfile.ZipInfo]:
+    found = [info.filename for info in file.infolist()]
+    names = [name.removesuffix(".npy") for name in found]
+    needed = {name for name, member in members.items() if member.required}
+    if not needed <= set(names) or not set(names) <= set(members) or len(set(names)) < len(names):
+        optional = [name for name, member in members.items() if not member.required]
+        expected = f"the members {', '.join(name for name in members if name in needed)}"
+        if optional:
+            expected += f" (and, where known, {', '.join(optional)})"
+        raise wrong(str(path), expected, ", ".join(names[:8]) or "nothing")
+    total = sum(info.file_size for info in file.infolist())
+    if total > ARRAY_BYTES:
+        raise wrong(str(path), f"at most {ARRAY_BYTES} bytes of arrays", f"{total}")
+    return {name: file.getinfo(f"{name}.npy") for name in members if f"{name}.npy" in found}
+
+
+def _check_headers(
+    path: Path,
+    file: zipfile.ZipFile,
+    infos: Mapping[str, zipfile.ZipInfo],
+    members: Mapping[str, Member],
+) -> None:
+    """Compare every declared shape before anything of its size is allocated."""
+    sizes: dict[str, int] = {}
+    for name, info in infos.items():
+        where, member = f"{path}: {name}", members[name]
+        try:
+            with file.open(info) as stream:
+                if npy.read_magic(stream) != (1, 0):
+                    raise ValueError("another version than npy 1.0")  # others allow 4 GB headers
+                shape, _, dtype = npy.read_array_header_1_0(stream)
+                start = stream.tell()
+        except Exception as error:  # a hostile header can raise nearly anything
+            raise wrong(where, "an npy array", f"{error}" or type(error).__name__) from error
+        if dtype.kind not in _KINDS[member.kind]:
+            raise wrong(where, _MEANINGS[member.kind], dtype.str)
+        fits = len(shape) == len(member.dims) and all(
+            n == (sizes.setdefault(dim, n) if isinstance(dim, str) else dim)
+            for n, dim in zip(shape, member.dims, strict=True)
+        )
+        if not fits:
+            known = ", ".join(str(sizes.get(str(dim), dim)) for dim in member.dims)
+            raise wrong(where, f"shape ({known})", f"{shape}")
+        if start + math.prod(shape) * dtype.itemsize != info.file_size:
+            raise wrong(where, f"the bytes of shape {shape}", f"{info.file_size - start} bytes")
+
+
+def _array(
+    path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo, member: Member
+) -> NDArray[Any]:
+    try:
+        with file.open(info) as stream:
+            array = npy.read_array(stream, allow_pickle=False)
+            stream.read()  # to the end, where the checksum is compared
+    except MemoryError:
+        raise
+    except Exception as error:  # see _check_headers
+        raise wrong(f"{path}: {info.filename}", "a whole array", f"{error}") from error
+    return np.ascontiguousarray(array, _READ_AS[member.kind])

@@ -1,0 +1,102 @@
+"""Cameras in the form of the WorldPose release: K, k, R, t over time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from data_contracts.cameras import CameraCalibration
+from worldpose.cameras import Camera, Rigid
+from worldpose.cameras.rigid import nearest_rotation
+from worldpose.formats.archives import Member, read_archive, write_archive, wrong
+
+MEMBERS: Final = {
+    "K": Member(("rows", 3, 3), "float"),
+    "k": Member(("rows", 5), "float"),
+    "R": Member(("rows", 3, 3), "float"),
+    "t": Member(("rows", 3), "float"),
+}
+"""Arrays of a camera file; one row for a camera that never moves, else one a frame."""
+
+RELEASE_SIZE: Final = (1920, 1080)
+"""Picture of every released camera [px]; the files do not hold it."""
+
+
+def write_static_camera(path: Path, calibration: CameraCalibration) -> None:
+    """Write a camera that never moves as npz with one row.
+
+    Members, float64: `K` (1, 3, 3) [px], `k` (1, 5) k1 k2 p1 p2 k3, `R` (1, 3, 3) and `t` (1, 3)
+    [m] of x_cam = R x_world + t.
+
+    Note:
+        X3: the names and shapes are those of the released files, which have one row a frame.
+    """
+    (fx, fy), (cx, cy) = calibration.focal_px, calibration.principal_point_px
+    arrays = {
+        "K": [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
+        "k": calibration.distortion,
+        "R": calibration.rotation,
+        "t": calibration.translation,
+    }
+    write_archive(
+        path, {name: np.array(value, dtype=np.float64)[None] for name, value in arrays.items()}
+    )
+
+
+def write_moving_camera(path: Path, camera: Camera) -> None:
+    """Write a camera that moves as npz with one row a frame, in the same layout.
+
+    Args:
+        path: the file.
+        camera: a batch (frames,); a frame with a NaN is one without a camera.
+    """
+    intrinsics = np.zeros((len(camera.focal), 3, 3))
+    intrinsics[:, (0, 1), (0, 1)] = camera.focal
+    intrinsics[:, :2, 2] = camera.principal_point
+    intrinsics[:, 2, 2] = 1.0
+    pose = camera.cam_from_world
+    write_archive(
+        path,
+        {"K": intrinsics, "k": camera.distortion, "R": pose.rotation, "t": pose.translation},
+    )
+
+
+def read_camera(path: Path, image_size: tuple[int, int] = RELEASE_SIZE) -> Camera:
+    """The camera of a file: a single one where it has one row, else a batch (frames,).
+
+    A row with a NaN is a frame without a camera.
+
+    Args:
+        path: the file.
+        image_size: width and height [px].
+
+    Raises:
+        InputError: naming file and place: absent, members missing or unknown, wrong shapes, no
+            rows, a K with skew or without focal length, an R that is no rotation.
+    """
+    arrays = read_archive(path, MEMBERS)
+    k, rotation = arrays["K"], arrays["R"].copy()
+    if not len(k):
+        raise wrong(f"{path}: K", "one row, or one a frame", "none")
+    known = np.all([np.isfinite(a.reshape(len(a), -1)).all(-1) for a in arrays.values()], axis=0)
+    shape = np.isclose(k[:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0.0, 0.0, 0.0, 0.0, 1.0])
+    good = shape.all(-1) & (k[:, [0, 1], [0, 1]] > 0.0).all(-1)
+    for row in np.flatnonzero(known):
+        if not good[row]:
+            raise wrong(
+                f"{path}: K[{row}]",
+                "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal lengths",
+                f"{k[row].tolist()}",
+            )
+        rotation[row] = nearest_rotation(f"{path}: R[{row}]", rotation[row])
+    missing = ~known[:, None]
+    camera = Camera(
+        focal=np.where(missing, np.nan, k[:, [0, 1], [0, 1]]),
+        principal_point=k[:, :2, 2],
+        distortion=arrays["k"],
+        cam_from_world=Rigid(rotation, arrays["t"]),
+        image_size=np.array(image_size, dtype=np.int64),
+    )
+    return camera if len(k) > 1 else camera[0]

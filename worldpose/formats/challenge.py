@@ -1,0 +1,303 @@
+"""Fitted bodies as the FIFA skeletal tracking challenge has players: boxes and skeletons."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+import zipfile
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from worldpose.body import BODY25, CHALLENGE15, BodyModel, BodyParameters, fold_keypoints
+from worldpose.cameras import Camera
+from worldpose.errors import InputError
+from worldpose.formats.archives import Member, read_archive, write_archive, wrong
+from worldpose.formats.files import whole_file
+
+Floats = NDArray[np.float64]
+
+_FRAMES: Final = 8
+"""Frames whose surfaces are held at a time; 33 MB for 25 people."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChallengeClip:
+    """Players of one clip in the moving camera's picture, as the challenge gives them."""
+
+    boxes: Floats
+    """(frames, persons, 4) x0, y0, x1, y1 [px]; NaN when absent."""
+    skel_2d: Floats
+    """(frames, persons, 15 or 25, 2) [px]; NaN when absent."""
+    skel_3d: Floats
+    """(frames, persons, 15 or 25, 3) [m], camera axes, about the mid-hip; NaN when absent."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChallengeTruth:
+    """A clip of the challenge, and what its participants are to find."""
+
+    clip: ChallengeClip
+    persons: NDArray[np.int64]
+    """(persons,) places in the poses that it was made from: those ever in the picture."""
+    submission: Floats
+    """(persons, frames, 15, 3) [m], world; NaN where there is no body."""
+
+
+def challenge_truth(model: BodyModel, poses: BodyParameters, camera: Camera) -> ChallengeTruth:
+    """Return what the moving camera shows of fitted bodies.
+
+    A box holds the part of a body that is in the picture; whoever is out of the picture has
+    neither box nor skeleton in that frame. Skeletons are BODY25 and go on beyond the picture's
+    edges. `skel_3d` is what a single-view estimator would give at best: the skeleton turned into
+    the camera's axes, with the mid-hip as origin.
+
+    Args:
+        model: the body that the parameters belong to.
+        poses: (persons, frames).
+        camera: (frames,); a frame with a NaN is one without a camera.
+    """
+    persons, frames = poses.batch_shape
+    points = fold_keypoints(model, BODY25)
+    joints = np.empty((frames, persons, len(BODY25), 3))
+    boxes = np.empty((frames, persons, 4))
+    for start in range(0, frames, _FRAMES):
+        part = slice(start, min(start + _FRAMES, frames))
+        some = poses[:, part]
+        joints[part] = points(some).swapaxes(0, 1)
+        boxes[part] = _boxes(camera[part], model.vertices(some).swapaxes(0, 1))
+    seen = np.all(np.isfinite(boxes), axis=-1)[..., None, None]
+    pixels = _project(camera, joints)
+    turned = np.einsum("fab,fpjb->fpja", camera.cam_from_world.rotation, joints)
+    relative = turned - turned[:, :, BODY25.index("mid_hip"), None]
+    clip = ChallengeClip(boxes, np.where(seen, pixels, np.nan), np.where(seen, relative, np.nan))
+    kept = np.flatnonzero(seen.any((0, 2, 3)))
+    places = [BODY25.index(name) for name in CHALLENGE15]
+    return ChallengeTruth(
+        ChallengeClip(clip.boxes[:, kept], clip.skel_2d[:, kept], clip.skel_3d[:, kept]),
+        kept,
+        joints[:, kept][:, :, places].swapaxes(0, 1),
+    )
+
+
+def _project(camera: Camera, points: Floats) -> Floats:
+    """Pixels (frames, persons, n, 2) of points (frames, persons, n, 3)."""
+    frames, persons, count = points.shape[:3]
+    return camera.project(points.reshape(frames, -1, 3)).reshape(frames, persons, count, 2)
+
+
+def _boxes(camera: Camera, surface: Floats) -> Floats:
+    """Boxes (frames, persons, 4) of points (frames, persons, n, 3), cut at the picture's edges."""
+    pixels = _project(camera, surface)
+    edge = camera.image_size[:, None, None] - 0.5
+    missing = np.isnan(pixels).any(-1, keepdims=True)
+    low = np.where(missing, np.inf, pixels).min(2)
+    high = np.where(missing, -np.inf, pixels).max(2)
+    low, high = np.maximum(low, -0.5), np.minimum(high, edge[:, 0])
+    boxes = np.concatenate([low, high], axis=-1)
+    boxes[~(low < high).all(-1)] = np.nan
+    return boxes
+
+
+Edition = Literal[2025, 2026]
+
+SUBMISSION: Final = "submission.npz"
+"""Member of a submission's zip."""
+KINDS: Final = {"boxes": (4,), "skel_2d": ("points", 2), "skel_3d": ("points", 3)}
+"""Arrays of a clip, and their dimensions after frames and persons."""
+
+
+def write_challenge_camera(path: Path, camera: Camera, edition: Edition) -> None:
+    """Write cameras/<clip>.npz: every frame's K and k, and R and t of the first frame alone.
+
+    Args:
+        path: the file.
+        camera: (frames,).
+        edition: 2025 repeats R and t as Rt.
+
+    Raises:
+        InputError: the first frame has no camera.
+    """
+    pose = camera.cam_from_world[:1]
+    if np.isnan(camera.numbers[0]).any():
+        raise wrong(
+            str(path),
+            "a camera in the clip's first frame, whose pose the layout gives",
+            "none",
+            "Calibrate the first frame, or export another format.",
+        )
+    intrinsics = np.zeros((len(camera.focal), 3, 3))
+    intrinsics[:, (0, 1), (0, 1)] = camera.focal
+    intrinsics[:, :2, 2] = camera.principal_point
+    intrinsics[:, 2, 2] = 1.0
+    arrays = {
+        "K": intrinsics,
+        "k": np.array(camera.distortion),
+        "R": np.array(pose.rotation),
+        "t": np.array(pose.translation),
+    }
+    if edition == 2025:
+        arrays["Rt"] = np.concatenate([pose.rotation, pose.translation[..., None]], axis=-1)
+    write_archive(path, arrays)
+
+
+def write_challenge(
+    folder: Path, clips: Mapping[str, ChallengeClip], edition: Edition
+) -> list[Path]:
+    """Write boxes and skeletons of clips; returns the files."""
+    written = []
+    for kind in KINDS:
+        arrays = {clip: getattr(data, kind).astype(np.float64) for clip, data in clips.items()}
+        if edition == 2025:
+            written.append(folder / f"{kind}.npz")
+            write_archive(written[-1], arrays)
+            continue
+        for clip, array in arrays.items():
+            written.append(folder / kind / f"{clip}.npy")
+            with whole_file(written[-1]) as draft, draft.open("wb") as file:
+                npy.write_array(file, np.ascontiguousarray(array, "<f8"), version=(1, 0))
+    return written
+
+
+def write_submission(path: Path, joints: Mapping[str, Floats]) -> None:
+    """Write a submission: (persons, frames, 15, 3) [m, world] by clip, in single precision."""
+    single = {clip: array.astype(np.float32) for clip, array in joints.items()}
+    with tempfile.TemporaryDirectory() as workshop:
+        inner = Path(workshop) / SUBMISSION
+        write_archive(inner, single)
+        with whole_file(path) as draft, zipfile.ZipFile(draft, "w") as file:
+            file.writestr(zipfile.ZipInfo(SUBMISSION), inner.read_bytes(), zipfile.ZIP_DEFLATED)
+
+
+def write_pitch_points(path: Path, points: Floats) -> None:
+    """Write points (n, 3) [m, world] along the markings, one a line."""
+    with whole_file(path) as draft:
+        np.savetxt(draft, points, fmt="%.4f")
+
+
+def read_challenge(folder: Path, only: str | None = None) -> dict[str, ChallengeClip]:
+    """The clips of a challenge folder of either edition, by name.
+
+    Args:
+        folder: the folder.
+        only: the clip that is wanted, if it is there; None = all. No other comes into memory.
+
+    Raises:
+        InputError: naming file and place: absent, wrong types or shapes, kinds that disagree.
+    """
+    kinds: dict[str, dict[str, Floats]] = {}
+    for kind in KINDS:
+        together = folder / f"{kind}.npz"
+        files = sorted((folder / kind).glob("*.npy"))
+        if together.is_file():
+            dims = ("frames", "persons", *KINDS[kind])
+            kinds[kind] = _by_clip(together, dims, None if only is None else (only,))
+        elif files:
+            kinds[kind] = {
+                file.stem: _read_npy(file, kind) for file in files if only in (None, file.stem)
+            }
+        else:
+            raise wrong(
+                str(folder), f"{kind}/<clip>.npy or {kind}.npz", "neither", "Check the path."
+            )
+    clips = {}
+    for clip, boxes in kinds["boxes"].items():
+        arrays = {"boxes": boxes}
+        for kind in ("skel_2d", "skel_3d"):
+            array = kinds[kind].get(clip)
+            if array is None or array.shape[:2] != boxes.shape[:2]:
+                raise wrong(
+                    f"{folder}: {kind} of {clip}",
+                    f"shape {boxes.shape[:2]} of frames and persons, as the boxes have",
+                    "nothing" if array is None else f"{array.shape[:2]}",
+                )
+            arrays[kind] = array
+        clips[clip] = ChallengeClip(**arrays)
+    return clips
+
+
+def submission_clips(path: Path) -> tuple[str, ...]:
+    """Names of the clips of a submission, zipped or bare; none of them comes into memory.
+
+    Raises:
+        InputError: no such file, or no submission in it.
+    """
+    with _npz_of(path) as file:
+        return _clips_of(file)
+
+
+def read_submission(path: Path, only: Collection[str] | None = None) -> dict[str, Floats]:
+    """The joints (persons, frames, 15, 3) [m, world] of a submission by clip, zipped or bare.
+
+    Args:
+        path: the file.
+        only: clips that are wanted; None = all. The others do not come into memory.
+
+    Raises:
+        InputError: no such file, no submission in it, or arrays of another type or shape.
+    """
+    with _npz_of(path) as file:
+        return _by_clip(file, ("persons", "frames", 15, 3), only)
+
+
+@contextmanager
+def _npz_of(path: Path) -> Iterator[Path]:
+    """The npz file of a submission; that of a zipped one lies on the disk meanwhile."""
+    if not path.is_file():
+        raise wrong(str(path), "a submission", "nothing", "Check the path.")
+    try:
+        with zipfile.ZipFile(path) as file:
+            if SUBMISSION not in file.namelist():
+                yield path
+                return
+            with tempfile.TemporaryDirectory() as workshop:
+                yield Path(file.extract(SUBMISSION, workshop))
+    except (zipfile.BadZipFile, OSError, RuntimeError) as error:
+        raise wrong(str(path), f"a zip with {SUBMISSION}", f"{error}") from error
+
+
+def _clips_of(path: Path) -> tuple[str, ...]:
+    try:
+        with zipfile.ZipFile(path) as file:
+            return tuple(name.removesuffix(".npy") for name in file.namelist())
+    except zipfile.BadZipFile as error:
+        raise wrong(str(path), "a whole npz file", f"{error}") from error
+
+
+def _by_clip(
+    path: Path, dims: tuple[str | int, ...], only: Collection[str] | None = None
+) -> dict[str, Floats]:
+    """Arrays of an npz file by clip; lengths that are named may differ between clips."""
+    members = {
+        name: Member(tuple(f"{d} of {name}" if isinstance(d, str) else d for d in dims), "float")
+        for name in _clips_of(path)
+    }
+    found: dict[str, Any] = read_archive(path, members, only)
+    return found
+
+
+def _read_npy(path: Path, kind: str) -> Floats:
+    """A clip's array of one kind, checked."""
+    try:
+        array = npy.read_array(io.BytesIO(path.read_bytes()), allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise wrong(str(path), "an npy array", f"{error}") from error
+    tail = KINDS[kind]
+    fits = array.ndim == 2 + len(tail) and array.dtype.kind == "f"
+    fits = fits and all(
+        isinstance(d, str) or n == d for n, d in zip(array.shape[2:], tail, strict=True)
+    )
+    if not fits:
+        raise InputError(
+            str(path),
+            expected=f"float numbers of shape (frames, persons, {', '.join(map(str, tail))})",
+            found=f"{array.dtype} of shape {array.shape}",
+            todo="Write the file anew.",
+        )
+    return array.astype(np.float64)

@@ -1,0 +1,171 @@
+"""A person's joints as markers in a TRC file, which OpenSim and motion capture tools read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17
+from worldpose.body import SKELETONS, BodyModel, BodyParameters
+from worldpose.cameras import Rigid
+from worldpose.errors import InputError
+from worldpose.formats.files import whole_file
+from worldpose.formats.joints_file import JointTracks
+
+Y_UP: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""Takes world points into the axes of OpenSim and of animation tools: x stays, y is up."""
+MILLIMETRES: Final = 1000.0
+"""In a metre: TRC files are in millimetres, and say so."""
+TRC_DECIMALS: Final = 3
+"""Of all coordinates: a micrometre."""
+
+
+def write_markers(path: Path, tracks: JointTracks, person: int, fps: float) -> None:
+    """Write the joints of one person as a TRC file, whole or not at all.
+
+    Rows go from the first to the last frame in which the person has a joint, none left out; a
+    missing joint has empty cells. `Frame#` is the match frame plus one, as such files count from
+    one, and `Time` is that of the match frame [s]. Coordinates are y up, in millimetres.
+
+    Args:
+        path: the file.
+        tracks: joints of several people.
+        person: place of the person in `tracks`.
+        fps: frames in a second.
+    """
+    first, markers = _rows(tracks, person)
+    count = len(COCO17)
+    values = markers.reshape(len(markers), 3 * count)
+    cells = np.char.mod(f"%.{TRC_DECIMALS}f", values)
+    cells[np.isnan(values)] = ""
+    lines = [
+        f"PathFileType\t4\t(X/Y/Z)\t{path.name}",
+        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits"
+        "\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
+        f"{fps:g}\t{fps:g}\t{len(markers)}\t{count}\tmm\t{fps:g}\t1\t{len(markers)}",
+        "Frame#\tTime\t" + "\t\t\t".join(COCO17) + "\t\t",
+        "\t\t" + "\t".join(f"X{n}\tY{n}\tZ{n}" for n in range(1, count + 1)),
+        "",
+    ]
+    for frame, row in enumerate(cells.tolist(), start=first):
+        lines.append("\t".join([str(frame + 1), f"{frame / fps:.6f}", *row]))
+    with whole_file(path) as draft:
+        draft.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _rows(tracks: JointTracks, person: int) -> tuple[int, NDArray[np.float64]]:
+    """The first match frame, and markers (frames, 17, 3) [mm, y up] of every frame from there."""
+    seen = np.flatnonzero(np.isfinite(tracks.joints[:, person]).any((-1, -2)))
+    if not len(seen):
+        return 0, np.empty((0, len(COCO17), 3))
+    numbers = tracks.frames[seen]
+    first = int(numbers[0])
+    markers = np.full((int(numbers[-1]) - first + 1, len(COCO17), 3), np.nan)
+    markers[numbers - first] = tracks.joints[seen, person] @ Y_UP.T * MILLIMETRES
+    return first, markers
+
+
+Floats = NDArray[np.float64]
+
+CENTIMETRES: Final = 100.0
+"""In a metre: animation tools take the numbers of a BVH file for centimetres."""
+BVH_DECIMALS: Final = 6
+"""Of all numbers: a hundredth of a micrometre, and as many degrees as move a hand by that."""
+_LOCKED: Final = 1e-7
+"""Cosine of the middle angle below which the outer two turn about one axis [1]."""
+
+
+def write_motion(path: Path, model: BodyModel, poses: BodyParameters, fps: float) -> None:
+    """Write one person's motion as a BVH file, whole or not at all.
+
+    The skeleton is that of the model's 24 joints in T-pose, with the bone lengths of the person's
+    betas; the last joints end in half of their bone, which only shows. The root has its place
+    and rotation, every other joint its rotation relative to its parent; angles are in degrees and
+    apply in the order z, x, y of the file's axes. Lengths are centimetres and y is up.
+
+    Args:
+        path: the file.
+        model: the body that the parameters belong to.
+        poses: (frames,) of one person, nothing missing; the betas are those of the first frame.
+        fps: frames in a second.
+
+    Raises:
+        InputError: there are no frames, or a parameter is missing.
+    """
+    angles = np.concatenate([poses.global_orient, poses.body_pose], axis=-1)
+    if not len(angles) or not np.isfinite([angles.sum(), poses.transl.sum()]).all():
+        raise InputError(
+            str(path),
+            expected="frames that all have a body",
+            found=f"{len(angles)} frames, some without" if len(angles) else "no frames",
+            todo="Write a file for each uninterrupted stretch.",
+        )
+    betas = poses.betas[0]
+    rest = model.joint_template + model.joint_directions @ betas
+    turns = Rigid.from_rotvec(angles.reshape(len(angles), -1, 3), np.zeros(3)).rotation.copy()
+    turns[:, 0] = Y_UP @ turns[:, 0]
+    roots = (rest[0] + poses.transl) @ Y_UP.T * CENTIMETRES
+    channels = np.unwrap(np.degrees(_zxy(turns)), axis=0, period=360.0)
+    # Depth first, as the file names its joints.
+    order = list(_depth_first(model.parents, 0))
+    rows = np.concatenate([roots, channels[:, order].reshape(len(roots), -1)], axis=1)
+    lines = ["HIERARCHY", *_joint(rest * CENTIMETRES, model.parents, 0, "")]
+    lines += ["MOTION", f"Frames: {len(rows)}", f"Frame Time: {1.0 / fps:.9f}"]
+    lines += [" ".join(row) for row in np.char.mod(f"%.{BVH_DECIMALS}f", rows).tolist()]
+    with whole_file(path) as draft:
+        draft.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def stretches(poses: BodyParameters) -> list[slice]:
+    """Return the uninterrupted runs of frames in which a person (frames,) has a body."""
+    parts = (poses.betas, poses.global_orient, poses.body_pose, poses.transl)
+    there = np.all([np.isfinite(part).all(-1) for part in parts], axis=0)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]])))
+    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _depth_first(parents: NDArray[np.int64], joint: int) -> Iterator[int]:
+    yield joint
+    for child in np.flatnonzero(parents == joint):
+        yield from _depth_first(parents, int(child))
+
+
+def _joint(rest: Floats, parents: NDArray[np.int64], joint: int, indent: str) -> list[str]:
+    """The lines of a joint and all below it; `rest` (24, 3) is in the file's unit."""
+    parent, children = int(parents[joint]), np.flatnonzero(parents == joint)
+    offset = rest[joint] - rest[parent] if parent >= 0 else np.zeros(3)
+    places = "" if parent >= 0 else "Xposition Yposition Zposition "
+    inner = indent + "  "
+    lines = [
+        f"{indent}{'JOINT' if parent >= 0 else 'ROOT'} {SKELETONS['smpl24'][joint]}",
+        f"{indent}{{",
+        f"{inner}OFFSET {_numbers(offset)}",
+        f"{inner}CHANNELS {6 if places else 3} {places}Zrotation Xrotation Yrotation",
+    ]
+    for child in children:
+        lines += _joint(rest, parents, int(child), inner)
+    if not len(children):
+        lines += [f"{inner}End Site", f"{inner}{{"]
+        lines += [f"{inner}  OFFSET {_numbers(0.5 * offset)}", f"{inner}}}"]
+    return [*lines, f"{indent}}}"]
+
+
+def _numbers(vector: Floats) -> str:
+    return " ".join(f"{value:.{BVH_DECIMALS}f}" for value in vector)
+
+
+def _zxy(rotation: Floats) -> Floats:
+    """Angles (..., 3) [rad] with rotation = Rz(first) Rx(second) Ry(third)."""
+    cosine = np.hypot(rotation[..., 2, 0], rotation[..., 2, 2])
+    locked = cosine < _LOCKED
+    about_z = np.where(
+        locked,
+        np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0]),
+        np.arctan2(-rotation[..., 0, 1], rotation[..., 1, 1]),
+    )
+    about_y = np.where(locked, 0.0, np.arctan2(-rotation[..., 2, 0], rotation[..., 2, 2]))
+    return np.stack([about_z, np.arctan2(rotation[..., 2, 1], cosine), about_y], axis=-1)

@@ -1,0 +1,10 @@
+"""Reports that people read: HTML pages, plots, overlays and videos.
+
+The modules that draw load matplotlib; `html_page` and `run_report` do not.
+"""
+
+from worldpose.reports.html_page import Picture, Section, Table
+from worldpose.reports.run_report import CameraSummary, report_page
+from worldpose.reports.scene import Scene
+
+__all__ = ["CameraSummary", "Picture", "Scene", "Section", "Table", "report_page"]

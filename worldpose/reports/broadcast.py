@@ -1,0 +1,227 @@
+"""How a broadcast camera moves over a clip, and how surely that is known."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from data_contracts.pitch import PitchSpec
+from worldpose.cameras import Camera
+from worldpose.formats.joints_file import JointTracks
+from worldpose.reports.drawing import (
+    INK,
+    PALETTE,
+    TEMPLATE,
+    draw_skeleton,
+    markings,
+    person_color,
+    png,
+    style,
+)
+
+Floats = NDArray[np.float64]
+
+_STEP: Final = {"rx": 0, "ry": 1, "rz": 2, "log_focal": 3, "k1": 4, "k2": 5}
+"""Places in the covariance of a frame's step."""
+
+
+def course_picture(
+    frame: NDArray[np.int64],
+    camera: Camera,
+    covariance: Floats,
+    before: Camera | None = None,
+) -> bytes:
+    """Return a PNG of focal length, pan, tilt, roll, k1 and k2 over a clip.
+
+    Bands are two standard deviations to either side; frames without a camera are left open.
+
+    Args:
+        frame: (frames,) match frames.
+        camera: a batch (frames,).
+        covariance: (frames, 7, 7) of a step, in the order of
+            `data_contracts.broadcast_calibration.FRAME_STEP`.
+        before: the same frames, each on its own, without smoothing; drawn beneath.
+    """
+    curves = _curves(camera)
+    rough = {} if before is None else _curves(before)
+    tilt = curves["tilt [deg]"]
+    with np.errstate(invalid="ignore"):
+        spread = {name: np.sqrt(covariance[:, k, k]) for name, k in _STEP.items()}
+        turned = np.degrees(spread["ry"]) / np.cos(np.radians(tilt))
+    focal = camera.focal[:, 0]
+    deviations = (
+        focal * spread["log_focal"],
+        turned,
+        np.degrees(spread["rx"]),
+        np.degrees(spread["rz"]),
+        spread["k1"],
+        spread["k2"],
+    )
+    figure = Figure(figsize=(14.0, 6.4), dpi=110, layout="constrained", facecolor="white")
+    panels = figure.subplots(2, 3, sharex=True).ravel()
+    for axes, (name, values), deviation in zip(panels, curves.items(), deviations, strict=True):
+        if name in rough:
+            axes.plot(frame, rough[name], color=PALETTE[1], linewidth=1.0)
+        low, high = values - 2.0 * deviation, values + 2.0 * deviation
+        axes.fill_between(frame, low, high, color=PALETTE[0], alpha=0.25, linewidth=0)
+        axes.plot(frame, values, color=PALETTE[0], linewidth=1.6)
+        axes.set_title(name, color=INK, loc="left", fontsize=12)
+        axes.margins(x=0.01)
+        axes.ticklabel_format(useOffset=False)
+        style(axes)
+    for axes in panels[3:]:
+        axes.set_xlabel("frame", color=INK)
+    return png(figure)
+
+
+def _curves(camera: Camera) -> dict[str, Floats]:
+    pan, tilt, roll = angles_of(camera)
+    return {
+        "focal length [px]": camera.focal[:, 0],
+        "pan [deg]": pan,
+        "tilt [deg]": tilt,
+        "roll [deg]": roll,
+        "k1": camera.distortion[:, 0],
+        "k2": camera.distortion[:, 1],
+    }
+
+
+def most_moved(before: Camera, after: Camera, tracks: JointTracks) -> tuple[int, int]:
+    """Return the place in the clip and the person whom two cameras see farthest apart.
+
+    Among people well inside the picture; (0, 0) where there are none.
+
+    Args:
+        before: a batch (frames,).
+        after: another.
+        tracks: people in the same frames.
+    """
+    frames, persons = tracks.joints.shape[:2]
+    one, two = (
+        camera.project(tracks.joints.reshape(frames, -1, 3)).reshape(frames, persons, -1, 2)
+        for camera in (before, after)
+    )
+    width, height = (int(n) for n in after.image_size.reshape(-1, 2)[0])
+    with np.errstate(invalid="ignore"):
+        inside = ((two > 0.1 * height) & (two < np.array([width, height]) - 0.1 * height)).all(-1)
+        apart = np.linalg.norm((one - two).mean(axis=2), axis=-1)
+    apart = np.where(inside.all(axis=-1) & np.isfinite(apart), apart, -1.0)
+    frame, person = np.unravel_index(int(apart.argmax()), apart.shape)
+    return (int(frame), int(person)) if apart.max() >= 0.0 else (0, 0)
+
+
+def before_after_picture(
+    before: Camera,
+    after: Camera,
+    tracks: JointTracks,
+    frame: int,
+    person: int,
+    *,
+    still: NDArray[np.uint8],
+    seen: Floats,
+    pitch: PitchSpec | None = None,
+) -> bytes:
+    """Return a PNG of a person and who is about, as two cameras put them and the markings.
+
+    Crosses are where keypoints were seen, which neither camera moves.
+
+    Args:
+        before: a single camera.
+        after: another.
+        tracks: people, one colour each.
+        frame: place in `tracks`.
+        person: place in `tracks` of whom the picture is about.
+        still: the picture (height, width, 3), RGB, beneath.
+        seen: keypoints of a detector in it (detections, 17, 2) [px].
+        pitch: its markings are drawn; None where there is no pitch.
+    """
+    shown = after.project(tracks.joints[frame, person])
+    middle = np.nan_to_num(shown[np.isfinite(shown).all(axis=-1)].mean(axis=0))
+    tall = max(float(np.ptp(shown[np.isfinite(shown[:, 1]), 1])), 30.0)
+    gone = shown - before.project(tracks.joints[frame, person])
+    moved = float(np.nanmean(np.linalg.norm(gone, axis=-1)))
+    titles = ("before", f"after, {moved:.1f} px beside")
+    figure = Figure(figsize=(14.0, 5.6), dpi=110, layout="constrained", facecolor="white")
+    for axes, camera, title in zip(figure.subplots(1, 2), (before, after), titles, strict=True):
+        axes.imshow(still, zorder=0, interpolation="nearest")
+        for line in markings(pitch) if pitch is not None else ():
+            axes.plot(*camera.project(line).T, color=TEMPLATE, linewidth=1.3, zorder=1)
+        for person_id, joints in zip(tracks.person_ids, tracks.joints[frame], strict=True):
+            draw_skeleton(axes, camera.project(joints), person_color(int(person_id)), 1.6, zorder=3)
+        axes.plot(*seen.reshape(-1, 2).T, "x", color="white", markersize=5.0, zorder=4)
+        axes.set(
+            xlim=(middle[0] - 1.3 * tall, middle[0] + 1.3 * tall),
+            ylim=(middle[1] + 0.85 * tall, middle[1] - 0.85 * tall),
+        )
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(title, color=INK, loc="left", fontsize=12)
+    return png(figure)
+
+
+def angles_of(camera: Camera) -> tuple[Floats, Floats, Floats]:
+    """Return pan, tilt and roll (frames,) of a camera [deg].
+
+    Pan is from the world's y axis towards x, tilt from the horizon upwards, roll clockwise about
+    the view: a camera that rolls so shows a horizon that turns the other way.
+
+    Args:
+        camera: a batch (frames,).
+    """
+    right, down, ahead = np.moveaxis(camera.cam_from_world.rotation, 1, 0)
+    pan = np.degrees(np.arctan2(ahead[:, 0], ahead[:, 1]))
+    tilt = np.degrees(np.arcsin(np.clip(ahead[:, 2], -1.0, 1.0)))
+    roll = np.degrees(np.arctan2(-right[:, 2], -down[:, 2]))
+    return pan, tilt, roll
+
+
+def flow_picture(
+    still: NDArray[np.uint8],
+    start: Floats,
+    end: Floats,
+    rejected: NDArray[np.bool_],
+    predicted: Floats,
+) -> bytes:
+    """Return a PNG of how points of a picture move on, and of those that no camera moves so.
+
+    Args:
+        still: the picture (height, width, 3), RGB.
+        start: (n, 2) points of it [px].
+        end: (n, 2) where they are found in the next one [px].
+        rejected: (n,) which ones do not move with the camera.
+        predicted: (n, 2) where the found camera says that they go [px].
+    """
+    height, width = still.shape[:2]
+    figure = Figure(figsize=(14.0, 14.0 * height / width + 0.5), dpi=110, facecolor="white")
+    figure.set_layout_engine("constrained")
+    axes = figure.subplots()
+    axes.imshow(still, zorder=0)
+    longest = float(np.linalg.norm(end - start, axis=-1).max(initial=1e-6))
+    # The longest arrow is 6 % of the picture's width: motion from one frame to the next is small.
+    stretch = max(1.0, 0.06 * width / longest)
+    for chosen, color, label in (
+        (~rejected, PALETTE[5], f"{int((~rejected).sum())} move with the camera"),
+        (rejected, PALETTE[1], f"{int(rejected.sum())} rejected"),
+    ):
+        away = (end - start)[chosen] * stretch
+        axes.quiver(
+            *start[chosen].T,
+            *away.T,
+            angles="xy",
+            scale_units="xy",
+            scale=1.0,
+            color=color,
+            width=0.0016,
+            headwidth=4.0,
+            label=label,
+            zorder=3,
+        )
+    goes = start + (predicted - start) * stretch
+    axes.plot(*goes.T, "o", color=TEMPLATE, markersize=2.6, label="found camera", zorder=2)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
+    style(axes)
+    axes.legend(loc="lower right", framealpha=0.85, fontsize=11)
+    axes.set_title(f"motion, {stretch:.0f} times as long", color=INK, loc="left", fontsize=12)
+    return png(figure)

@@ -1,0 +1,237 @@
+"""Pictures of a reconstruction: everybody's way seen from above, and one camera's view."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
+
+from data_contracts.pitch import PitchSpec
+from worldpose.cameras import Camera
+from worldpose.formats.joints_file import JointTracks
+from worldpose.reports.drawing import (
+    GRASS,
+    HIPS,
+    INK,
+    LINE,
+    PALE,
+    TEMPLATE,
+    draw_label,
+    draw_pitch,
+    draw_skeleton,
+    markings,
+    person_color,
+    png,
+    style,
+)
+
+
+def paths_picture(
+    tracks: JointTracks,
+    *,
+    truth: JointTracks | None = None,
+    cameras: Mapping[str, Camera] | None = None,
+    pitch: PitchSpec | None = None,
+) -> bytes:
+    """Return a PNG of everybody's way over the ground: the whole place, and people close up.
+
+    Args:
+        tracks: a dot a frame and person, with the person's id at the end of its way.
+        truth: true ways, as broad grey lines under the dots.
+        cameras: single cameras by id, as triangles.
+        pitch: its markings are drawn; None where there is no pitch.
+    """
+    ways = _ground(tracks)
+    true_ways = _ground(truth) if truth is not None else np.empty((0, 0, 2))
+    everywhere = np.concatenate([ways.reshape(-1, 2), true_ways.reshape(-1, 2)])
+    everywhere = everywhere[np.isfinite(everywhere[:, 0])]
+    if not len(everywhere):
+        everywhere = np.zeros((1, 2))
+    close = _frame(everywhere, 2.0)
+    centers = {name: camera.center[:2] for name, camera in (cameras or {}).items()}
+    corners = [everywhere, *(center[None] for center in centers.values())]
+    if pitch is not None:
+        corners.append(0.5 * np.array([[-pitch.length, -pitch.width], [pitch.length, pitch.width]]))
+    whole = _frame(np.concatenate(corners), 6.0)
+
+    figure = Figure(figsize=(14.0, 5.7), dpi=110, layout="constrained", facecolor="white")
+    overview, detail = figure.subplots(1, 2)
+    for axes, (low, high) in ((overview, whole), (detail, close)):
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+        axes.set_xlabel("x, along the touch line [m]", color=INK)
+        axes.set_ylabel("y, across [m]", color=INK)
+        style(axes)
+        if pitch is not None:
+            draw_pitch(axes, pitch)
+    for way in true_ways.swapaxes(0, 1):
+        overview.plot(*way.T, color="#c9c9c9", linewidth=2.0, zorder=3)
+        detail.plot(*way.T, color="#cfcfcf", linewidth=6.0, solid_capstyle="round", zorder=3)
+    for person_id, way in zip(tracks.person_ids, ways.swapaxes(0, 1), strict=True):
+        color = person_color(int(person_id))
+        overview.plot(*way.T, color=color, linewidth=1.2, zorder=4)
+        detail.plot(*way.T, ".", color=color, markersize=4.0, zorder=4)
+        last = way[np.isfinite(way[:, 0])][-1:]
+        detail.plot(*last.T, "o", color=color, markersize=9.0, markeredgecolor="white", zorder=5)
+        for x, y in last:
+            draw_label(detail, f"{person_id}", (x, y), (7, 7), color)
+    for name, center in centers.items():
+        overview.plot(*center, "^", color=INK, markersize=8.0, zorder=5)
+        draw_label(overview, name, (center[0], center[1]), (6, 6), INK)
+    (x0, y0), (x1, y1) = close
+    overview.add_patch(
+        Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, color=PALE, linewidth=1.0, linestyle=":")
+    )
+    overview.set_title("The whole place, cameras as triangles", color=INK, loc="left", fontsize=12)
+    shown = "dots: found, grey: true" if truth is not None else "a dot a frame"
+    detail.set_title(
+        f"People close up ({shown}, id at the end)", color=INK, loc="left", fontsize=12
+    )
+    return png(figure)
+
+
+def _ground(tracks: JointTracks) -> NDArray[np.float64]:
+    """Mid-hips on the ground (frames, persons, 2) [m]."""
+    middle: NDArray[np.float64] = tracks.joints[..., HIPS, :2].mean(axis=-2)
+    return middle
+
+
+def _frame(
+    points: NDArray[np.float64], margin: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Corners of a box around points, widened to 4:3 so that both halves fill their place."""
+    low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
+    half = 0.5 * (high - low)
+    half = np.maximum(half, [half[1] * 4.0 / 3.0, half[0] * 3.0 / 4.0])
+    middle = 0.5 * (low + high)
+    return middle - half, middle + half
+
+
+REACH: Final = 130.0
+"""How far a field of view is drawn [m]: a little more than a pitch is long."""
+
+
+def camera_picture(
+    camera: Camera,
+    title: str,
+    tracks: JointTracks,
+    frame: int,
+    *,
+    still: NDArray[np.uint8] | None = None,
+    pitch: PitchSpec | None = None,
+) -> bytes:
+    """Return a PNG of all that one camera shows: markings and people as it projects them.
+
+    Args:
+        camera: a single camera.
+        title: says which camera and frame.
+        tracks: people, one colour each.
+        frame: place in `tracks` of the frame that is drawn.
+        still: the camera's picture (height, width, 3), RGB, beneath; None = plain ground.
+        pitch: its markings are drawn; None where there is no pitch.
+    """
+    width, height = (int(n) for n in camera.image_size)
+    figure = Figure(figsize=(14.0, 14.0 * height / width + 0.4), dpi=110, facecolor="white")
+    figure.set_layout_engine("constrained")
+    axes = figure.subplots()
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+    axes.set_facecolor(GRASS)
+    axes.set(xticks=[], yticks=[])
+    style(axes)
+    if still is not None:
+        axes.imshow(still, zorder=0)
+    line_color = LINE if still is None else TEMPLATE
+    for line in markings(pitch) if pitch is not None else ():
+        axes.plot(*camera.project(line).T, color=line_color, linewidth=1.3, zorder=1)
+    for person_id, joints in zip(tracks.person_ids, tracks.joints[frame], strict=True):
+        draw_skeleton(axes, camera.project(joints), person_color(int(person_id)), 1.6, zorder=3)
+    axes.set_title(title, color=INK, loc="left", fontsize=12)
+    return png(figure)
+
+
+def stadium_picture(
+    cameras: Mapping[str, Camera],
+    title: str,
+    tracks: JointTracks,
+    frame: int,
+    *,
+    pitch: PitchSpec | None = None,
+) -> bytes:
+    """Return a PNG of the stadium from above in one frame: cameras, what they see, people.
+
+    The ground that a camera sees is shaded, on and beside the pitch where there is one: the more
+    cameras see a place, the darker it is.
+
+    Args:
+        cameras: single cameras by id.
+        title: says which frame.
+        tracks: people, one colour each, with their ids.
+        frame: place in `tracks` of the frame that is drawn.
+        pitch: its markings are drawn; None where there is no pitch.
+    """
+    hips = tracks.joints[frame][:, HIPS, :2].mean(axis=1)
+    places = [camera.center[None, :2] for camera in cameras.values()] + [hips]
+    if pitch is not None:
+        places.append(0.5 * np.array([[-pitch.length, -pitch.width], [pitch.length, pitch.width]]))
+    everything = np.concatenate(places)
+    everything = everything[np.isfinite(everything[:, 0])]
+    low, high = everything.min(axis=0) - 8.0, everything.max(axis=0) + np.array([14.0, 8.0])
+    proportion = float((high - low)[1] / (high - low)[0])
+    figure = Figure(figsize=(14.0, 14.0 * proportion + 0.8), dpi=110, facecolor="white")
+    figure.set_layout_engine("constrained")
+    axes = figure.subplots()
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    axes.set_xlabel("x, along the touch line [m]", color=INK)
+    axes.set_ylabel("y, across [m]", color=INK)
+    style(axes)
+    ground = None
+    if pitch is not None:
+        draw_pitch(axes, pitch)
+        corner = (-0.5 * pitch.length - 5.0, -0.5 * pitch.width - 5.0)
+        ground = Rectangle(
+            corner, pitch.length + 10.0, pitch.width + 10.0, transform=axes.transData
+        )
+    for name, camera in cameras.items():
+        shade = axes.fill(
+            *ground_seen(camera).T, color="#4a7fb5", alpha=0.06, linewidth=0, zorder=1
+        )[0]
+        if ground is not None:
+            shade.set_clip_path(ground)
+        center = camera.center[:2]
+        width, height = camera.image_size
+        sides = camera.unproject(np.array([[-0.5, 0.5 * height], [width - 0.5, 0.5 * height]]))
+        for x, y in sides.directions[:, :2]:  # a stretch of both sides says where it looks
+            toward = 18.0 * np.array([x, y]) / np.hypot(x, y)
+            axes.plot(*np.stack([center, center + toward]).T, color=PALE, linewidth=1.2)
+        axes.plot(*center, "^", color=INK, markersize=8.0, zorder=5)
+        draw_label(axes, name, (center[0], center[1]), (6, 6), INK)
+    for person_id, place in zip(tracks.person_ids, hips, strict=True):
+        if np.isfinite(place).all():
+            color = person_color(int(person_id))
+            axes.plot(*place, "o", color=color, markersize=8.0, markeredgecolor="white", zorder=5)
+            draw_label(axes, f"{person_id}", (place[0], place[1]), (5, 5), color)
+    axes.set_title(title, color=INK, loc="left", fontsize=12)
+    return png(figure)
+
+
+def ground_seen(camera: Camera) -> NDArray[np.float64]:
+    """Return corners (n, 2) [m] of the ground in a camera's picture, up to `REACH` away.
+
+    The ground is the plane z = 0, world.
+    """
+    width, height = (float(n) for n in camera.image_size)
+    share = np.linspace(0.0, 1.0, 25)[:-1]
+    corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]]) - 0.5
+    sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    border = np.concatenate([a + share[:, None] * (b - a) for a, b in sides])
+    directions = camera.unproject(border).directions
+    directions = directions[np.isfinite(directions[:, 0])]
+    flat = np.linalg.norm(directions[:, :2], axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = -camera.center[2] / directions[:, 2] * flat
+        # Rays that go up never meet the ground: they see as far as is drawn.
+        distance = np.where((directions[:, 2] < 0.0) & (distance < REACH), distance, REACH)
+        return np.asarray(camera.center[:2] + directions[:, :2] / flat[:, None] * distance[:, None])

@@ -1,0 +1,162 @@
+"""One HTML page about a data set: how much there is, clip by clip, and what its check found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from data_contracts.release import CheckReport, DataSetStatistics
+from worldpose.reports.drawing import INK, PALE, png, style
+from worldpose.reports.html_page import Failure, Picture, Section, Table, whole_page
+
+
+def data_set_page(title: str, found: DataSetStatistics, checks: Mapping[str, CheckReport]) -> str:
+    """Return a whole HTML page that needs nothing beside itself.
+
+    Args:
+        title: heading of the page.
+        found: what was counted.
+        checks: what was found wrong in each folder.
+    """
+    people = "-" if found.subjects_per_frame is None else f"{found.subjects_per_frame:.1f}"
+    wrong = sum(len(report.findings) for report in checks.values())
+    tiles = (
+        (f"{found.minutes:.1f} min", f"{found.frames:,} frames"),
+        (f"{len(found.clips)}", "clip" if len(found.clips) == 1 else "clips"),
+        (people, "people in a frame"),
+        (f"{found.poses:,}", "3D poses"),
+        (f"{found.distance_km:.1f} km", "run and walked by all"),
+        ("passed" if not wrong else f"{wrong} wrong", "check of cameras, poses and 2D"),
+    )
+    about = f"Data set of {', '.join(checks)}"
+    return whole_page(title, about, (counted_section(found), _checked(checks)), tiles=tiles)
+
+
+def counted_section(found: DataSetStatistics) -> Section:
+    """Return the row of the paper's table of data sets, its histograms, and each clip's share."""
+    row = (
+        found.camera or "-",
+        _number(found.subjects_per_frame, ".1f"),
+        f"{found.frames:,}",
+        f"{found.poses:,}",
+        f"{found.minutes:.2f}",
+        f"{found.distance_km:.3f}",
+        _number(found.speed_m_s, ".2f"),
+        _number(found.longest_trajectory_m, ".1f"),
+    )
+    columns = (
+        "camera",
+        ">people in a frame",
+        ">frames",
+        ">poses",
+        ">minutes",
+        ">distance km",
+        ">mean speed m/s",
+        ">longest way m",
+    )
+    blocks: list[Table | Picture] = [Table("", columns, (row,))]
+    blocks.append(Picture("How far people go, and how long clips are.", statistics_picture(found)))
+    if len(found.clips) > 1:
+        rows = tuple(
+            (
+                name,
+                clip.camera or "-",
+                f"{clip.frames:,}",
+                f"{clip.seconds:.1f}",
+                f"{clip.persons}",
+                f"{clip.poses:,}",
+                f"{sum(clip.trajectories_m):,.0f}",
+            )
+            for name, clip in found.clips.items()
+        )
+        titles = ("clip", "camera", ">frames", ">seconds", ">people", ">poses", ">distance m")
+        blocks.append(Table("Clips", titles, rows))
+    lead = (
+        "Camera: S stands still, M turns, M+Z also zooms. A pose is one person in one frame. "
+        "Distances are those over the ground, from frame to frame."
+    )
+    return Section("How much there is", tuple(blocks), lead)
+
+
+def _checked(checks: Mapping[str, CheckReport]) -> Section:
+    """What is wrong, then the figures of every clip."""
+    findings = tuple(
+        (folder, Failure(finding.fault), finding.says, ", ".join(finding.where))
+        for folder, report in checks.items()
+        for finding in report.findings
+    )
+    clips = tuple(
+        (
+            name if len(checks) == 1 else f"{folder}/{name}",
+            f"{clip.persons}",
+            f"{clip.cameras}",
+            f"{clip.compared:,}",
+            _number(clip.reprojection_median_px, ".3f"),
+            _number(None if clip.plausible_share is None else 100 * clip.plausible_share, ".1f"),
+        )
+        for folder, report in checks.items()
+        for name, clip in report.clips.items()
+    )
+    titles = ("clip", ">people", ">cameras", ">2D points", ">reprojection px", ">plausible %")
+    found = Table("What is wrong", ("folder", "fault", "what it says", "where"), findings)
+    lead = (
+        "3D is projected into the cameras and compared with the 2D, where there is any; people "
+        "must be of human size and speed, stand on the pitch and be in sight."
+    )
+    tables = [found] if findings else []
+    return Section("Check", (*tables, Table("Clips", titles, clips)), lead)
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+BINS = 20
+"""Bars of a histogram, of one round width."""
+_BAR = "#3d6fa3"
+
+
+def statistics_picture(statistics: DataSetStatistics) -> bytes:
+    """Return a PNG with the histograms of trajectory lengths and of clip lengths."""
+    ways = [way for clip in statistics.clips.values() for way in clip.trajectories_m]
+    lengths = [clip.seconds for clip in statistics.clips.values()]
+    figure = Figure(figsize=(14.0, 4.2), dpi=110, layout="constrained", facecolor="white")
+    left, right = figure.subplots(1, 2)
+    _histogram(left, ways, "length of a player's trajectory [m]", "trajectories")
+    _histogram(right, lengths, "length of a clip [s]", "clips")
+    people = statistics.subjects_per_frame
+    figure.suptitle(
+        f"{len(statistics.clips)} {'clip' if len(statistics.clips) == 1 else 'clips'}, "
+        f"{statistics.minutes:.1f} min, {statistics.frames:,} frames, {statistics.poses:,} poses, "
+        f"{statistics.distance_km:.1f} km"
+        + (f", {people:.1f} people in a frame" if people is not None else ""),
+        color=INK,
+        fontsize=12,
+    )
+    return png(figure)
+
+
+def bin_edges(values: Sequence[float]) -> NDArray[np.float64]:
+    """Return edges from 0 to beyond the largest value, 1, 2 or 5 times a power of ten apart."""
+    top = max(values, default=0.0)
+    if top <= 0.0:
+        return np.array([0.0, 1.0])
+    power = 10.0 ** np.floor(np.log10(top / BINS))
+    width = next(power * step for step in (1.0, 2.0, 5.0, 10.0) if power * step * BINS >= top)
+    edges: NDArray[np.float64] = np.arange(np.floor(top / width) + 2.0) * width
+    return edges
+
+
+def _histogram(axes: Axes, values: Sequence[float], title: str, count: str) -> None:
+    style(axes)
+    axes.hist(values, bins=bin_edges(values).tolist(), color=_BAR, edgecolor="white")
+    axes.set_xlabel(title, color=INK)
+    axes.set_ylabel(count, color=INK)
+    axes.grid(axis="y", color=PALE, linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))

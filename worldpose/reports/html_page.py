@@ -1,0 +1,209 @@
+"""Whole HTML pages from pictures, tables and scenes: nothing beside them, nothing from outside."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from itertools import count
+from typing import Final
+
+import numpy as np
+
+from worldpose.reports.scene import Scene, scene_html
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG and what it shows."""
+
+    caption: str
+    png: bytes
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with a heading.
+
+    Attributes:
+        heading: what it is about.
+        columns: their titles; ">" before one aligns numbers.
+        rows: of text.
+    """
+
+    heading: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page that can be jumped to.
+
+    Attributes:
+        heading: also in the page's bar.
+        blocks: in this order.
+        lead: what a reader should know first.
+    """
+
+    heading: str
+    blocks: tuple[Picture | Table | Scene, ...]
+    lead: str = ""
+
+
+class Failure(str):
+    """Text of a table's cell that is shown as a failure."""
+
+
+@dataclass(frozen=True)
+class Folded:
+    """Tables at a page's end, for those who ask; all but the first are folded.
+
+    Attributes:
+        heading: also in the page's bar.
+        tables: those without rows are left out.
+    """
+
+    heading: str
+    tables: tuple[Table, ...]
+
+
+def whole_page(
+    title: str,
+    about: str,
+    sections: Sequence[Section],
+    *,
+    tiles: Sequence[tuple[str, str]] = (),
+    last: Folded | None = None,
+) -> str:
+    """Return a whole HTML page.
+
+    Args:
+        title: its heading.
+        about: a line beneath.
+        sections: what there is to see; those without blocks are left out.
+        tiles: the few figures at the top, each with what it is.
+        last: what comes after the sections.
+    """
+    shown = [section for section in sections if section.blocks]
+    script = _part("scene.js") if any(map(_has_scene, shown)) else ""
+    allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+    policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+    policy += f"; script-src 'sha256-{allowed}'" if script else ""
+    numbers = count(1)
+    parts = "\n".join(_section(section, next(numbers)) for section in shown)
+    links = "".join(
+        f'<a href="#part{number}">{escape(section.heading)}</a>'
+        for number, section in enumerate(shown, 1)
+    )
+    end = ""
+    if last is not None:
+        links += f'<a href="#last">{escape(last.heading)}</a>'
+        end = f'\n<section id="last"><h2>{escape(last.heading)}</h2>\n{_folded(last)}</section>'
+    marks = "".join(
+        f"<div><b>{escape(value)}</b><span>{escape(what)}</span></div>" for value, what in tiles
+    )
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{escape(title)}</title>\n<style>{_part('report.css')}</style>\n</head>\n<body>\n"
+        f"<header><div><h1>{escape(title)}</h1><p>{escape(about)}</p>"
+        f'<div class="tiles">{marks}</div></div></header>\n'
+        f'<nav aria-label="Parts of this page"><div>{links}</div></nav>\n'
+        f"<main>\n{parts}{end}\n</main>\n"
+        + (f"<script>{script}</script>\n" if script else "")
+        + "</body>\n</html>\n"
+    )
+
+
+def _part(name: str) -> str:
+    """A file that pages are made of."""
+    return (files("worldpose.reports") / "page" / name).read_text(encoding="utf-8")
+
+
+def _has_scene(section: Section) -> bool:
+    return any(isinstance(block, Scene) for block in section.blocks)
+
+
+def _section(section: Section, number: int) -> str:
+    lead = f'<p class="lead">{escape(section.lead)}</p>\n' if section.lead else ""
+    blocks = "\n".join(map(_block, section.blocks))
+    return (
+        f'<section id="part{number}"><h2>{escape(section.heading)}</h2>\n{lead}{blocks}</section>'
+    )
+
+
+def _block(block: Picture | Table | Scene) -> str:
+    if isinstance(block, Scene):
+        return scene_html(block)
+    if isinstance(block, Picture):
+        return _figure(block)
+    heading = f"<h3>{escape(block.heading)}</h3>\n" if block.heading else ""
+    return heading + _table(block.columns, block.rows)
+
+
+def _folded(last: Folded) -> str:
+    return "\n".join(
+        f"<details{' open' if table is last.tables[0] else ''}><summary>{escape(table.heading)}"
+        f"</summary>{_table(table.columns, table.rows)}</details>"
+        for table in last.tables
+        if table.rows
+    )
+
+
+def _figure(picture: Picture) -> str:
+    kind, content, (width, height) = small_enough(picture.png)
+    data = base64.b64encode(content).decode("ascii")
+    caption = escape(picture.caption)
+    return (
+        f'<figure><img alt="{caption}" width="{width}" height="{height}" decoding="async" '
+        f'src="data:image/{kind};base64,{data}">'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
+
+
+def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table of plain text; columns from ">" on hold numbers."""
+    kinds = [' class="number"' if column.startswith(">") else "" for column in columns]
+    lines = []
+    if any(columns):
+        cells = (
+            f"<th{kind}>{escape(column.removeprefix('>'))}</th>"
+            for kind, column in zip(kinds, columns, strict=True)
+        )
+        lines.append(f"<tr>{''.join(cells)}</tr>")
+    for row in rows:
+        cells = (
+            f'<td class="bad">{escape(cell)}</td>'
+            if isinstance(cell, Failure)
+            else f"<td{kind}>{escape(cell)}</td>"
+            for kind, cell in zip(kinds, row, strict=True)
+        )
+        lines.append(f"<tr>{''.join(cells)}</tr>")
+    return '<div class="table"><table>\n' + "\n".join(lines) + "\n</table></div>"
+
+
+LARGE: Final = 200_000
+"""Bytes of a PNG from which it holds a photograph, and not curves."""
+QUALITY: Final = 88
+"""Of WebP, at which lines a pixel wide stay sharp."""
+
+
+def small_enough(png: bytes) -> tuple[str, bytes, tuple[int, int]]:
+    """Return kind, content and size (width, height) [px] of a picture: WebP where that is smaller.
+
+    Args:
+        png: a PNG.
+    """
+    size = (int.from_bytes(png[16:20], "big"), int.from_bytes(png[20:24], "big"))
+    if len(png) < LARGE:
+        return "png", png, size
+    import cv2  # late: pages without large pictures need none of it
+
+    picture = np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR), np.uint8)
+    _, webp = cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
+    return ("webp", webp.tobytes(), size) if webp.size < len(png) else ("png", png, size)

@@ -1,0 +1,111 @@
+"""A camera's video with markings and people drawn over it, as the camera has them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17_BONES
+from data_contracts.pitch import PitchSpec
+from worldpose.cameras import Camera
+from worldpose.formats.joints_file import JointTracks
+from worldpose.reports.body_rendering import BodyTracks, paint_bodies, zoomed
+from worldpose.reports.drawing import TEMPLATE, markings, person_color
+
+Floats = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+_PARTS: Final = 16
+"""A line's place is told to this part of a pixel."""
+_FAR: Final = 4.0
+"""Beyond so many widths of the picture nothing is drawn [1]."""
+_OPACITY: Final = 0.6
+"""Of bodies [1]: the player behind still tells whether the body lies on him."""
+_MARGIN: Final = 0.1
+"""A body may reach into the picture from so many of its widths beside it [1]."""
+
+
+def overlay_frames(
+    pictures: Iterable[Picture],
+    camera: Camera,
+    tracks: JointTracks,
+    frames: NDArray[np.int64],
+    pitch: PitchSpec | None = None,
+    bodies: BodyTracks | None = None,
+) -> Iterator[Picture]:
+    """Yield pictures at half their size with what the camera puts where.
+
+    Args:
+        pictures: (height, width, 3) RGB, one for each of `frames`.
+        camera: a batch (frames,), theirs.
+        tracks: people, one colour each.
+        frames: (n,) match frames; people are drawn where `tracks` has them.
+        pitch: its markings are drawn; None where there is no pitch.
+        bodies: surfaces, drawn instead of bones for people who have them.
+    """
+    lines = markings(pitch) if pitch is not None else []
+    rows = {int(frame): row for row, frame in enumerate(tracks.frames)}
+    for place, (frame, picture) in enumerate(zip(frames, pictures, strict=True)):
+        small = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        # What is encoded has even sides.
+        even = small[: small.shape[0] & ~1, : small.shape[1] & ~1]
+        canvas = np.asarray(even, dtype=np.uint8, order="C")
+        half = zoomed(camera[place], np.full(2, -0.5), 0.5, (canvas.shape[1], canvas.shape[0]))
+        for line in lines:
+            _draw(canvas, half.project(line), _rgb(TEMPLATE))
+        if frame in rows:
+            joints = tracks.joints[rows[frame]]
+            drawn = _paint(canvas, half, joints, tracks.person_ids, int(frame), bodies)
+            for person_id, own in zip(tracks.person_ids, joints, strict=True):
+                if int(person_id) not in drawn:
+                    pixels = half.project(own)
+                    for bone in COCO17_BONES:
+                        _draw(canvas, pixels[list(bone)], _rgb(person_color(int(person_id))))
+        yield np.asarray(canvas, dtype=np.uint8)
+
+
+def _paint(
+    canvas: Picture,
+    camera: Camera,
+    joints: Floats,
+    person_ids: NDArray[np.int64],
+    frame: int,
+    bodies: BodyTracks | None,
+) -> set[int]:
+    """Paint the bodies that are in the picture, and return the ids of all who have one."""
+    if bodies is None or frame not in bodies.frames:
+        return set()
+    poses = bodies.poses[int(np.searchsorted(bodies.frames, frame))]
+    embodied = set(bodies.person_ids[np.isfinite(poses.transl).all(axis=-1)].tolist())
+    size = np.asarray(camera.image_size)
+    pixels = camera.project(joints)
+    with np.errstate(invalid="ignore"):
+        near = (pixels > -_MARGIN * size[0]) & (pixels < size + _MARGIN * size[0])
+    seen = embodied & set(person_ids[near.all(axis=-1).any(axis=-1)].tolist())
+    who = np.flatnonzero(np.isin(bodies.person_ids, list(seen)))
+    if len(who):
+        colors = np.array([_rgb(person_color(int(n))) for n in bodies.person_ids[who]]) / 255.0
+        surfaces = bodies.model.vertices(poses[who])
+        paint_bodies(canvas, camera, surfaces, bodies.model.faces, colors, opacity=_OPACITY)
+    return embodied
+
+
+def _draw(canvas: Picture, pixels: Floats, color: tuple[int, int, int]) -> None:
+    """Draw a polyline (n, 2) [px] where it is known."""
+    with np.errstate(invalid="ignore"):
+        near = (np.abs(pixels) < _FAR * canvas.shape[1]).all(axis=-1)
+    begins = np.flatnonzero(near & ~np.append(False, near[:-1]))
+    ends = np.flatnonzero(near & ~np.append(near[1:], False)) + 1
+    for begin, end in zip(begins, ends, strict=True):
+        whole = np.rint(_PARTS * pixels[begin:end]).astype(np.int32)
+        shift = _PARTS.bit_length() - 1
+        cv2.polylines(canvas, [whole], False, color, 1, cv2.LINE_AA, shift)
+
+
+def _rgb(color: str) -> tuple[int, int, int]:
+    """Return `#rrggbb` as numbers."""
+    return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)

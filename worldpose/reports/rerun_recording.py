@@ -1,0 +1,105 @@
+"""A clip as a recording for the rerun viewer: people, markings and cameras over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.colors import to_rgb
+
+from data_contracts.conventions import COCO17_BONES
+from data_contracts.pitch import PitchSpec
+from worldpose.cameras import Camera
+from worldpose.errors import UsageError
+from worldpose.formats.files import whole_file
+from worldpose.formats.joints_file import JointTracks
+from worldpose.reports.drawing import markings, person_color
+
+NAME: Final = "worldpose"
+_WHITE: Final = (235, 235, 235)
+_BONE: Final = 0.025
+"""Radius of a bone [m]."""
+
+
+def write_recording(
+    path: Path,
+    tracks: JointTracks,
+    fps: float,
+    *,
+    cameras: Mapping[str, Camera] | None = None,
+    broadcast: Camera | None = None,
+    pitch: PitchSpec | None = None,
+) -> None:
+    """Write a recording (.rrd), whole or not at all, with timelines `frame` and `time`.
+
+    Args:
+        path: the file.
+        tracks: everybody's joints; what is missing is not there.
+        fps: frames in a second [1/s].
+        cameras: single cameras by id.
+        broadcast: one camera for each frame of the tracks; NaN where there is none.
+        pitch: its markings.
+
+    Raises:
+        UsageError: rerun-sdk is not installed.
+    """
+    try:
+        import rerun as rr
+    except ImportError:
+        raise UsageError(
+            "format rerun",
+            expected="the package rerun-sdk",
+            found="none installed",
+            todo="Install worldpose with the extra rerun.",
+        ) from None
+    with whole_file(path) as draft:
+        stream = rr.RecordingStream(NAME, recording_id=path.stem)
+        stream.save(draft)
+        stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        if pitch is not None:
+            lines = [line.tolist() for line in markings(pitch)]
+            stream.log(
+                "world/pitch", rr.LineStrips3D(lines, colors=[_WHITE], radii=[0.06]), static=True
+            )
+        for name, camera in (cameras or {}).items():
+            _log_camera(rr, stream, f"world/cameras/{name}", camera, static=True)
+        for row, frame in enumerate(tracks.frames):
+            stream.set_time("frame", sequence=int(frame))
+            stream.set_time("time", duration=float(frame) / fps)
+            if broadcast is not None and not np.isnan(broadcast.numbers[row]).any():
+                _log_camera(rr, stream, "world/cameras/broadcast", broadcast[row], static=False)
+            stream.log("world/people", _skeletons(rr, tracks, row))
+        stream.flush()
+        stream.disconnect()
+
+
+def _skeletons(rr: Any, tracks: JointTracks, row: int) -> Any:  # noqa: ANN401
+    """The bones of everybody in one frame."""
+    ends = tracks.joints[row][:, np.array(COCO17_BONES)]
+    people, bones = np.nonzero(np.isfinite(ends).all((-1, -2)))
+    shades = {
+        person: tuple(round(255 * part) for part in to_rgb(person_color(int(number))))
+        for person, number in enumerate(tracks.person_ids)
+    }
+    return rr.LineStrips3D(
+        ends[people, bones],
+        colors=[shades[person] for person in people.tolist()],
+        radii=[_BONE] * len(people),
+    )
+
+
+def _log_camera(rr: Any, stream: Any, place: str, camera: Camera, *, static: bool) -> None:  # noqa: ANN401
+    """One camera's place, orientation and picture; the viewer knows no distortion."""
+    pose = camera.cam_from_world.inverse()
+    transform = rr.Transform3D(translation=pose.translation, mat3x3=pose.rotation)
+    pinhole = rr.Pinhole(
+        focal_length=np.array(camera.focal),
+        principal_point=np.array(camera.principal_point),
+        resolution=np.array(camera.image_size),
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=8.0,
+    )
+    stream.log(place, transform, static=static)
+    stream.log(place, pinhole, static=static)

@@ -1,0 +1,231 @@
+"""Pictures of how well a static camera is known: clicks on its still, and expected error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure, SubFigure
+from numpy.typing import NDArray
+
+from data_contracts.pitch import PitchSpec
+from worldpose.cameras import Camera
+from worldpose.reports.drawing import (
+    GRASS,
+    HALO,
+    INK,
+    LINE,
+    TEMPLATE,
+    draw_label,
+    markings,
+    png,
+    style,
+)
+
+ACCEPTED: Final = "#0072b2"
+REFUSED: Final = "#d55e00"
+
+ERROR_RANGE: Final = (0.005, 1.0)
+"""Expected ground errors between which colours change [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Click:
+    """A clicked point as a camera explains it.
+
+    Attributes:
+        name: of the pitch template.
+        place: (2,) where it was clicked [px].
+        inlier: whether the camera rests on it.
+    """
+
+    name: str
+    place: NDArray[np.float64]
+    inlier: bool
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorMap:
+    """Expected ground error over the pitch.
+
+    Attributes:
+        x: (columns,) [m], world.
+        y: (rows,) [m], world.
+        expected: (rows, columns) [m]; NaN where the camera does not see.
+    """
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    expected: NDArray[np.float64]
+
+
+def calibration_picture(
+    camera: Camera,
+    title: str,
+    pitch: PitchSpec,
+    *,
+    clicks: Sequence[Click] = (),
+    still: NDArray[np.uint8] | None = None,
+    error_map: ErrorMap | None = None,
+) -> bytes:
+    """Return a PNG: above, the template over the still with all clicks; below, the coverage map.
+
+    Args:
+        camera: a single camera.
+        title: says which camera.
+        pitch: its markings, projected.
+        clicks: circles; those the camera does not rest on are crosses with their names.
+        still: the camera's picture (height, width, 3), RGB; None = plain ground.
+        error_map: None leaves the map out.
+    """
+    width, height = (int(n) for n in camera.image_size)
+    heights = [14.0 * height / width + 0.4] + ([] if error_map is None else [7.2])
+    figure = Figure(figsize=(14.0, sum(heights)), dpi=110, facecolor="white")
+    figure.set_layout_engine("constrained")
+    parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
+    if error_map is not None:
+        _draw_error_map(parts[1], error_map, pitch)
+    axes = parts[0].subplots()
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+    axes.set(xticks=[], yticks=[])
+    axes.set_facecolor(GRASS)
+    style(axes)
+    if still is not None:
+        axes.imshow(still, zorder=0)
+    for line in markings(pitch):
+        color = TEMPLATE if still is not None else LINE
+        axes.plot(*camera.project(line).T, color=color, linewidth=1.2, zorder=1)
+    for click in clicks:
+        sign, color = ("o", ACCEPTED) if click.inlier else ("x", REFUSED)
+        axes.plot(
+            *click.place,
+            sign,
+            color=color,
+            markersize=11.0,
+            markerfacecolor="none",
+            markeredgewidth=2.2,
+            path_effects=HALO,
+            zorder=4,
+        )
+        if not click.inlier:
+            x, y = click.place
+            draw_label(axes, click.name, (float(x), float(y)), (9, 7), REFUSED)
+    axes.set_title(title, color=INK, loc="left", fontsize=12)
+    return png(figure)
+
+
+def _draw_error_map(figure: SubFigure, error_map: ErrorMap, pitch: PitchSpec) -> None:
+    axes = figure.subplots()
+    axes.set_aspect("equal")
+    axes.set_facecolor("#ececec")
+    shades = axes.pcolormesh(
+        error_map.x,
+        error_map.y,
+        np.ma.masked_invalid(error_map.expected),
+        norm=LogNorm(*ERROR_RANGE),
+        cmap="viridis_r",
+        shading="nearest",
+        zorder=0,
+    )
+    for line in markings(pitch):
+        axes.plot(line[:, 0], line[:, 1], color="white", linewidth=1.0, zorder=1)
+    axes.set_xlabel("x, along the touch line [m]", color=INK)
+    axes.set_ylabel("y, across [m]", color=INK)
+    style(axes)
+    bar = figure.colorbar(shades, ax=axes, extend="both", shrink=0.9)
+    bar.set_label("expected ground error [m]", color=INK)
+    bar.set_ticks([0.01, 0.03, 0.1, 0.3, 1.0], labels=["0.01", "0.03", "0.1", "0.3", "1"])
+    axes.set_title("Grey: not in the picture", color=INK, loc="left", fontsize=11)
+
+
+Picture = NDArray[np.uint8]
+
+CONTRAST: Final = 18
+"""Brightness of paint above what is on both sides, at least [levels of 255]."""
+WIDEST: Final = 15
+"""Bright stripes wider than this are no lines [px]."""
+LONGEST: Final = 300.0
+"""Distance from which the map is white [px]."""
+ON: Final = 1.5
+"""A sample of a marking is on paint when some is this near [px]."""
+NEAR: Final = 12.0
+"""Samples of markings farther than this from any paint are hidden, or their paint is faint [px]."""
+
+
+def paint_of(still: Picture) -> NDArray[np.bool_]:
+    """Return where (height, width) a picture is as bright as paint against both sides.
+
+    Args:
+        still: (height, width, 3), RGB.
+    """
+    grey = cv2.GaussianBlur(cv2.cvtColor(still, cv2.COLOR_RGB2GRAY), (3, 3), 0)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (WIDEST, WIDEST))
+    bright = np.asarray(cv2.morphologyEx(grey, cv2.MORPH_TOPHAT, disc)) > CONTRAST
+    # Paint is colourless; shirts and boards mostly are not.
+    spread = still.max(-1).astype(np.int16) - still.min(-1)
+    found: NDArray[np.bool_] = bright & (spread < 70) & (grey > 90)
+    # Specks are no lines.
+    _, labels, sizes, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8))
+    long = np.maximum(sizes[:, cv2.CC_STAT_WIDTH], sizes[:, cv2.CC_STAT_HEIGHT]) >= 2 * WIDEST
+    long[0] = False
+    return np.asarray(long[labels])
+
+
+def distance_to(paint: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return the distance (height, width) of every pixel to the nearest paint [px]."""
+    if not paint.any():
+        return np.full(paint.shape, np.inf, dtype=np.float32)
+    away = cv2.distanceTransform((~paint).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(away, dtype=np.float32)
+
+
+def marking_distances(
+    camera: Camera, pitch: PitchSpec, distance: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """Return how far samples of the projected markings are from paint (n,) [px].
+
+    Those that no paint is near are left out: somebody stands there, or it is out of the picture.
+
+    Args:
+        camera: a single camera.
+        pitch: whose markings.
+        distance: as `distance_to` gives it.
+    """
+    height, width = distance.shape
+    pixels = np.concatenate([camera.project(line) for line in markings(pitch)])
+    with np.errstate(invalid="ignore"):
+        inside = ((pixels > -0.5) & (pixels < np.array([width, height]) - 0.5)).all(-1)
+    u, v = np.rint(pixels[inside]).astype(int).T
+    found: NDArray[np.float64] = distance[v, u].astype(np.float64)
+    return np.asarray(found[found < NEAR])
+
+
+def paint_picture(camera: Camera, still: Picture, pitch: PitchSpec) -> tuple[bytes, float]:
+    """Return a PNG of paint and of distances to it, and the share of markings on paint [1].
+
+    Args:
+        camera: a single camera; its markings are drawn over the distances.
+        still: its picture (height, width, 3), RGB.
+        pitch: whose markings.
+    """
+    paint = paint_of(still)
+    distance = distance_to(paint)
+    off = marking_distances(camera, pitch, distance)
+    height, width = paint.shape
+    figure = Figure(figsize=(14.0, 7.0 * height / width + 0.4), dpi=110, facecolor="white")
+    figure.set_layout_engine("constrained")
+    left, right = figure.subplots(1, 2)
+    left.imshow(np.where(paint, 255, 18).astype(np.uint8), cmap="gray", vmin=0, vmax=255)
+    # Of the root, so that a few pixels can be told from none.
+    right.imshow(np.sqrt(np.minimum(distance, LONGEST)), cmap="gray", vmin=0.0)
+    for line in markings(pitch):
+        right.plot(*camera.project(line).T, color=TEMPLATE, linewidth=0.8)
+    for axes, title in ((left, "paint"), (right, "distance to it: the brighter, the farther")):
+        axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
+        style(axes)
+        axes.set_title(title, color=INK, loc="left", fontsize=12)
+    return png(figure), float((off < ON).mean()) if len(off) else float("nan")
