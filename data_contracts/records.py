@@ -49,7 +49,7 @@ Amount = Annotated[float, Field(ge=0, le=1e15)]
 Number = Annotated[float, Field(ge=-1e15, le=1e15)]
 """A signed value, in the unit that the field's docstring names."""
 
-Positive = Annotated[float, Field(gt=0, le=1e6)]
+Positive = Annotated[float, Field(ge=1e-9, le=1e6)]
 """A size above 0, in the unit that the field's docstring names."""
 
 Share = Annotated[float, Field(ge=0, le=1)]

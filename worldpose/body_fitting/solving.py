@@ -22,6 +22,7 @@ from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shared_bias import body_axes
 from worldpose.body_fitting.starting import bridged, start_poses
 from worldpose.cameras import Rigid
+from worldpose.errors import DegenerateError
 
 Floats = NDArray[np.float64]
 
@@ -141,11 +142,19 @@ def led(pose: Pose, guidance: Guidance) -> Pose:
 
 
 def factor(blocks: Floats) -> BandedFactor:
-    """Return the factor of blocks with a little damping."""
+    """Return the factor of blocks with a little damping.
+
+    Raises:
+        DegenerateError: rounding leaves no positive definite system.
+    """
     places = np.arange(UNKNOWNS)
     blocks[0][:, places, places] *= 1.0 + 1e-4
     # 10 m and 10 rad: only a lone joint leaves a direction that free.
     blocks[0][:, places, places] += 0.01
     solved = BandedFactor.of(blocks)
-    assert solved.determined
+    if not solved.determined:
+        raise DegenerateError(
+            "body fitting: the joints' weights differ by more than double precision holds. Give "
+            "the settings of body_fitting and triangulation values nearer to their defaults."
+        )
     return solved

@@ -33,18 +33,18 @@ _UNLIKE: Final = 30.0
 class ProgrammeSettings(Record):
     """What a shot of a programme must be to be proposed as a clip."""
 
-    rate: float = Field(default=25.0, gt=0, le=10000)
+    rate: float = Field(default=25.0, ge=1e-6, le=10000)
     """Pictures a second that are looked at, about [1/s]; a cut is found to one of them."""
     cut_share: float = Field(default=0.25, gt=0, lt=1)
     """As in calibration: within a shot at least this share of the points moves together [1]."""
-    transition: float = Field(default=0.1, gt=0, le=10)
+    transition: float = Field(default=0.1, ge=1e-6, le=10)
     """Between two shots without a cut, such as a wipe or a dissolve, at least [s]: a shot between
     two of them is a replay."""
-    shortest: float = Field(default=4.0, gt=0, le=1000)
+    shortest: float = Field(default=4.0, ge=1e-6, le=1000)
     """Of a clip [s]."""
     grass: float = Field(default=0.5, gt=0, lt=1)
     """Least share of grass in the picture of a main camera, in the median [1]."""
-    tallest: float = Field(default=0.35, gt=0, le=100)
+    tallest: float = Field(default=0.35, ge=1e-6, le=100)
     """Of what stands on the grass there, in heights of the picture, in the median [1]: people of a
     main camera are a tenth, those of other cameras half and more."""
     pan: float = Field(default=0.25, ge=0, le=100)

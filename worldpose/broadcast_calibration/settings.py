@@ -25,19 +25,19 @@ class BroadcastPrior(Record):
     """From the picture's middle, in widths of the picture [1]; 2022: 0, and -35 px of 1920."""
     principal_point_spread: tuple[Positive, Positive] = (0.01, 0.012)
     """In widths [1]; 2022: 19 and 23 px of 1920."""
-    focal: float = Field(default=2.1, gt=0, le=1000)
+    focal: float = Field(default=2.1, ge=1e-6, le=1000)
     """In widths of the picture [1]; 2022: 1.25 to 3.7."""
-    focal_spread: float = Field(default=0.4, gt=0, le=100)
+    focal_spread: float = Field(default=0.4, ge=1e-6, le=100)
     """Of the focal length's logarithm [1]."""
     k1: float = Field(default=0.4, ge=-100, le=100)
     """At a focal length of 2.19 widths [1]; it grows with the focal length to the power 1.6."""
-    k1_spread: float = Field(default=0.25, gt=0, le=100)
+    k1_spread: float = Field(default=0.25, ge=1e-6, le=100)
     """As `k1`, growing alike [1]; 2022: 0.08. Wide enough for a lens without distortion."""
     k2: float = Field(default=1.5, ge=-100, le=100)
     """At a focal length of 2.19 widths [1]; it grows with the focal length."""
-    k2_spread: float = Field(default=0.8, gt=0, le=100)
+    k2_spread: float = Field(default=0.8, ge=1e-6, le=100)
     """As `k2`, growing alike [1]; 2022: 0.5 to 0.8."""
-    k3_spread: float = Field(default=0.5, gt=0, le=100)
+    k3_spread: float = Field(default=0.5, ge=1e-6, le=100)
     """As `k2_spread`, about zero [1]: the released cameras have none (trap 3)."""
     center: tuple[Coordinate, Coordinate, Coordinate] = (0.0, -75.0, 17.0)
     """World [m]: on the main stand, at the halfway line."""
@@ -50,18 +50,18 @@ class BroadcastCalibrationSettings(Record):
 
     prior: BroadcastPrior = BroadcastPrior()
     """What the clip cannot tell."""
-    click_noise: float = Field(default=1.0, gt=0, le=100)
+    click_noise: float = Field(default=1.0, ge=1e-6, le=100)
     """Standard deviation of a clicked point, each axis [px]."""
     survey_error: float = Field(default=0.006, ge=0, le=1)
     """Of the template's markings from the painted ones, each axis, standard deviation [m]."""
-    field_weight: float = Field(default=1.0, gt=0, le=100)
+    field_weight: float = Field(default=1.0, ge=1e-6, le=100)
     """Factor on the loss of markings (M3; the paper's 1)."""
     player_weight: float = Field(default=0.5, ge=0, le=100)
     """Factor on the loss of players' keypoints (M4; the paper's 0.5): with residuals in standard
     deviations, two keypoints of a person are worth one; a detector errs alike for many at once."""
-    loss: float = Field(default=3.0, gt=0, le=1000)
+    loss: float = Field(default=3.0, ge=1e-6, le=1000)
     """Scale of the Geman-McClure losses [standard deviations]; the paper gives none."""
-    line_noise: float = Field(default=0.3, gt=0, le=100)
+    line_noise: float = Field(default=0.3, ge=1e-6, le=100)
     """Least standard deviation of a painted line's sample across it [px]: the survey's error and
     the paint's edge, which the picture's noise does not show."""
     line_shift: float = Field(default=0.05, ge=0, le=10)
@@ -73,18 +73,18 @@ class BroadcastCalibrationSettings(Record):
     0.05 is 3 mm on a person."""
     line_samples: int = Field(default=240, ge=20, le=100_000)
     """Samples of painted lines in one frame, at most, about [1]."""
-    line_reach: float = Field(default=12.0, gt=0, le=10000)
+    line_reach: float = Field(default=12.0, ge=1e-6, le=10000)
     """Lines are looked for this far from their projection at most [px]."""
     flow_points: int = Field(default=400, ge=30, le=100_000)
     """Points followed from frame to frame, about [1]."""
-    flow_noise: float = Field(default=0.1, gt=0, le=10)
+    flow_noise: float = Field(default=0.1, ge=1e-6, le=10)
     """Least standard deviation of a followed point's motion [px]; what the clip shows is taken
     where that is more."""
-    flow_outlier: float = Field(default=3.5, gt=0, le=1000)
+    flow_outlier: float = Field(default=3.5, ge=1e-6, le=1000)
     """Largest modified z-score of a followed point (M6; Iglewicz and Hoaglin's cut)."""
     flow_weight: float = Field(default=1.0, ge=0, le=100)
     """Factor on the loss of followed points (M6); 0 = without."""
-    flow_drift: float = Field(default=0.15, gt=0, le=100)
+    flow_drift: float = Field(default=0.15, ge=1e-6, le=100)
     """What tracking misses by after one frame, growing with the square root of the frames [px];
     where two key frames or more tell it, that is taken."""
     smooth: bool = True
@@ -103,7 +103,7 @@ class BroadcastCalibrationSettings(Record):
     cut_share: float = Field(default=0.25, gt=0, lt=1)
     """Between two frames of one shot at least this share of the followed points moves as a turning
     and zooming camera moves them [1]."""
-    weak_error: float = Field(default=3.0, gt=0, le=1000)
+    weak_error: float = Field(default=3.0, ge=1e-6, le=1000)
     """A clip is weak where more than a twentieth of its frames expect a larger error of players'
     places in the picture [px]."""
 

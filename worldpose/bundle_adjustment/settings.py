@@ -18,12 +18,12 @@ class GivenCameraPrior(Record):
     them together. Lens coefficients and principal point are taken as they are.
     """
 
-    rotation: float = Field(default=0.0005, gt=0, le=0.1)
+    rotation: float = Field(default=0.0005, ge=1e-12, le=0.1)
     """About each axis [rad]: a pixel at a focal length of 2000 px."""
-    center: float = Field(default=0.0025, gt=0, le=1)
+    center: float = Field(default=0.0025, ge=1e-6, le=1)
     """Along each axis, relative to the distance between camera and people [1]: 1 cm in a room,
     0.15 m in a stadium."""
-    focal: float = Field(default=0.002, gt=0, le=1)
+    focal: float = Field(default=0.002, ge=1e-6, le=1)
     """Relative [1]: five zoom steps of a survey's rounding, 2 px at the picture's border."""
     min_gain: float = Field(default=0.4, ge=0, le=100)
     """Part by which the loss of left-out people in given cameras must fall, times the number of
@@ -49,7 +49,7 @@ class BundleAdjustmentSettings(Record):
     min_views: int = Field(default=3, ge=2, le=1000)
     """Least agreeing cameras of a joint that cameras are adjusted to [1]: two views hardly
     contradict each other."""
-    robust_scale: float = Field(default=3.0, gt=0, le=1000)
+    robust_scale: float = Field(default=3.0, ge=1e-6, le=1000)
     """Standard deviations of an observation beyond which it counts less (Cauchy's loss) [1]: a few
     per cent of efficiency for honest ones."""
     folds: int = Field(default=4, ge=2, le=1000)
@@ -59,9 +59,9 @@ class BundleAdjustmentSettings(Record):
     """Least left-out keypoints in a camera that can accept its change [1]: six people once."""
     given: GivenCameraPrior = GivenCameraPrior()
     """Of cameras that a file gives."""
-    clicks_uncertainty: float = Field(default=1.0, gt=0, le=100)
+    clicks_uncertainty: float = Field(default=1.0, ge=1e-6, le=100)
     """Factor on the standard deviations that calibration from clicks states [1]."""
-    lines_uncertainty: float = Field(default=1.0, gt=0, le=100)
+    lines_uncertainty: float = Field(default=1.0, ge=1e-6, le=100)
     """Factor on the standard deviations that calibration on painted lines states [1]."""
     min_significance: float = Field(default=3.0, ge=0, le=1000)
     """Standard errors by which the loss of left-out people must fall for given cameras, and for
@@ -69,12 +69,12 @@ class BundleAdjustmentSettings(Record):
     survey_error: float = Field(default=SURVEY_ERROR, ge=0, le=1)
     """How far the ends of painted lines are from the surveyed ones, standard deviation along each
     axis [m]: all cameras share it."""
-    click_noise: float = Field(default=1.0, gt=0, le=100)
+    click_noise: float = Field(default=1.0, ge=1e-6, le=100)
     """Standard deviation of a clicked point, each axis [px]: a careful click in a zoomed view."""
-    wrong_click: float = Field(default=4.2, gt=0, le=1000)
+    wrong_click: float = Field(default=4.2, ge=1e-6, le=1000)
     """Standard deviations from which a click is proposed for removal [1]: 0.015 % of honest ones
     (chi-square, two degrees of freedom)."""
-    wrong_keypoint: float = Field(default=4.2, gt=0, le=1000)
+    wrong_keypoint: float = Field(default=4.2, ge=1e-6, le=1000)
     """Standard deviations from which a keypoint is on the review list [1]."""
     review: int = Field(default=1000, ge=0, le=100_000)
     """Longest review list of keypoints and people [1]; the worst come first."""

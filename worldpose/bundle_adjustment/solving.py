@@ -31,10 +31,10 @@ class SolverSettings(Record):
 
     iterations: int = Field(default=50, ge=1, le=10000)
     """At most so many steps [1]; a dozen are usual."""
-    cost_change: float = Field(default=1e-8, gt=0, le=1)
+    cost_change: float = Field(default=1e-8, ge=1e-12, le=1)
     """Relative gain of a step below which it is the last [1]: two orders below what moves a joint
     by a tenth of a millimetre."""
-    damping: float = Field(default=1e-4, gt=0, le=1e6)
+    damping: float = Field(default=1e-4, ge=1e-12, le=1e6)
     """Marquardt's, at the start [1]: starts are a few pixels off, where plain steps work."""
 
 

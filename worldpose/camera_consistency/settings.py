@@ -16,5 +16,5 @@ class ConsistencySettings(Record):
     """Frames at which cameras are compared [1]."""
     stretch_frames: int = Field(default=500, ge=2, le=100_000)
     """Longest stretch of frames in which clocks are compared [frame]."""
-    pixel_noise: float = Field(default=1.5, gt=0, le=1000)
+    pixel_noise: float = Field(default=1.5, ge=1e-6, le=1000)
     """Standard deviation of a keypoint that is the same for people of every size [px]."""

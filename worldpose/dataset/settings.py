@@ -12,14 +12,14 @@ class CheckSettings(Record):
 
     sample: int = Field(default=3000, ge=100, le=1_000_000)
     """2D points of a camera that faults are tried on: their median is sure to a few percent."""
-    tolerated: float = Field(default=0.06, gt=0, le=10)
+    tolerated: float = Field(default=0.06, ge=1e-6, le=10)
     """Median reprojection error that needs no reason [height of a person in the picture]: detected
     keypoints are within this; a convention that is broken is beyond it or explains itself."""
     explained: float = Field(default=0.7, gt=0, lt=1)
     """A fault is named where undoing it leaves at most this part of the median error [1]."""
-    least_gain_px: float = Field(default=0.3, gt=0, le=100)
+    least_gain_px: float = Field(default=0.3, ge=1e-6, le=100)
     """And takes away at least this much [px]: files with rounded pixels are not accused."""
-    left: float = Field(default=0.2, gt=0, le=100)
+    left: float = Field(default=0.2, ge=1e-6, le=100)
     """And leaves no more than this [height of a person in the picture]: garbage has no reason."""
     ground_low: float = Field(default=-0.4, ge=-100, le=0)
     """Lowest median height of the lower foot [m]: a pitch falls by 0.2 m to its edges, and fits

@@ -71,7 +71,7 @@ class DetectionSettings(Record):
     poses take twice as long. Not with `mirrored`."""
     least_keypoint: float = Field(default=0.05, ge=0, lt=1)
     """A keypoint below this confidence was not found [1]."""
-    same_pose: float = Field(default=0.85, gt=0, le=1)
+    same_pose: float = Field(default=0.85, ge=1e-6, le=1)
     """Two poses of one frame more alike than this are one person, whose better box stays [1, COCO's
     object keypoint similarity]."""
     most_people: int = Field(default=64, ge=1, le=1024)

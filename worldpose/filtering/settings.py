@@ -10,7 +10,7 @@ from data_contracts.records import Record
 class FilteringSettings(Record):
     """What counts as a contradiction between a body and a detection."""
 
-    max_deviation: float = Field(default=2.5, gt=0, le=1e6)
+    max_deviation: float = Field(default=2.5, ge=1e-6, le=1e6)
     """Keypoints farther from their body, in standard deviations, are rejected [1]. Keypoints
     that are put 4 to 10 of the detector's own deviations off are found to more than nine tenths,
     and one to two in a hundred honest ones are lost; at 3.5, eight tenths and one in a thousand."""

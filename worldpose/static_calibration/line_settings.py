@@ -15,21 +15,21 @@ SURVEY_ERROR: Final = 0.006
 class LineRefinementSettings(Record):
     """What is looked for, how far off, and what is believed."""
 
-    line_width: float = Field(default=0.12, gt=0, le=100)
+    line_width: float = Field(default=0.12, ge=1e-6, le=100)
     """Of the paint [m]: Law 1 allows no more, and most pitches have it."""
     line_shift: float = Field(default=0.05, ge=0, le=10)
     """Standard deviation of what moves a whole marking in the picture [px], such as sharpening or
     a rest of the lens that k1 and k2 leave."""
     samples: int = Field(default=2000, ge=100, le=1_000_000)
     """Samples in the picture at most, about [1]."""
-    spacing: float = Field(default=4.0, gt=0, le=1000)
+    spacing: float = Field(default=4.0, ge=1e-6, le=1000)
     """Between neighbouring samples in the picture [px]."""
-    reach: float = Field(default=40.0, gt=0, le=10000)
+    reach: float = Field(default=40.0, ge=1e-6, le=10000)
     """A sample is looked for where its projection is known to within this [px], three standard
     deviations; others wait until nearer ones have been found."""
-    contrast: float = Field(default=6.0, gt=0, le=1000)
+    contrast: float = Field(default=6.0, ge=1e-6, le=1000)
     """Least brightness of paint above the grass on either side [levels of 255]."""
-    loss: float = Field(default=3.0, gt=0, le=1000)
+    loss: float = Field(default=3.0, ge=1e-6, le=1000)
     """Scale of the robust loss in the end [standard deviations]."""
     least_found: int = Field(default=30, ge=1, le=10000)
     """Fewer samples found make no line [1]."""

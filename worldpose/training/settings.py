@@ -14,13 +14,13 @@ class TrainingSettings(Record):
     """Batches."""
     planned: int | None = Field(default=None, ge=1, le=1_000_000)
     """Batches over which the rate rises and falls; `steps` if None. A training may end earlier."""
-    rate: float = Field(default=1e-3, gt=0, le=0.1)
+    rate: float = Field(default=1e-3, ge=1e-12, le=0.1)
     """Highest learning rate of AdamW [1]; it falls as a cosine."""
     decay: float = Field(default=0.02, ge=0, le=10)
     """Weight decay of AdamW [1]."""
     memory: float = Field(default=0.998, ge=0, lt=1)
     """Share of the running mean of the weights that a step keeps [1]; less at first."""
-    clip: float = Field(default=5.0, gt=0, le=1000)
+    clip: float = Field(default=5.0, ge=1e-6, le=1000)
     """Longest gradient [1]."""
     check_every: int = Field(default=250, ge=1, le=100_000)
     """Steps between checks against held-out pictures, each with a checkpoint."""
@@ -36,7 +36,7 @@ class Refinement(TrainingSettings):
 
     steps: int = Field(default=1500, ge=1, le=1_000_000)
     """Batches."""
-    rate: float = Field(default=1e-3, gt=0, le=0.1)
+    rate: float = Field(default=1e-3, ge=1e-12, le=0.1)
     """Highest learning rate of AdamW [1]: two thirds of that which the nets began with."""
     check_every: int = Field(default=250, ge=1, le=100_000)
     """Steps between checks against held-out pictures, each with a checkpoint: a check takes as long

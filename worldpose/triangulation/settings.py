@@ -17,7 +17,7 @@ class TriangulationSettings(Record):
     factors for its joint and its confidence.
     """
 
-    pixel_noise: float = Field(default=1.5, gt=0, le=1000)
+    pixel_noise: float = Field(default=1.5, ge=1e-6, le=1000)
     """Standard deviation per image axis that does not depend on distance [px]: the grid
     of a detector."""
     joint_noise: float = Field(default=0.04, ge=0, le=10)
@@ -32,12 +32,12 @@ class TriangulationSettings(Record):
     to the covariance. With `learn_noise` every joint has a factor (`common_bias.BY_JOINT`), and
     the proportions of a clip's people say how far its detector goes. Joints of real people are 27
     mm per axis from hand-made labels (Shelf), of which the views' own noise is 10."""
-    max_deviation: float = Field(default=3.5, gt=0, le=1e6)
+    max_deviation: float = Field(default=3.5, ge=1e-6, le=1e6)
     """Observations farther than this from the joint, in standard deviations, are rejected [1]:
     0.2 % of honest ones (chi-square, two degrees of freedom)."""
     min_views: int = Field(default=2, ge=2, le=1000)
     """Least cameras that must agree [1]; a joint with fewer is missing."""
-    min_angle: float = Field(default=0.1, gt=0, le=10)
+    min_angle: float = Field(default=0.1, ge=1e-6, le=10)
     """Least angle between the most different agreeing rays [rad]: below it a pixel moves the
     joint ten times as far along the rays as across them."""
     undo_exchanges: bool = True
@@ -49,12 +49,12 @@ class TriangulationSettings(Record):
     """How calibration errors are kept from a person's pose (T4): "none" takes the cameras as
     exact; "midhip" moves every picture of a person so that the mid-hips meet, as the paper does;
     "body" moves it by what all joints together make probable."""
-    calibration_error: float = Field(default=0.03, gt=0, le=10)
+    calibration_error: float = Field(default=0.03, ge=1e-6, le=10)
     """Where "body" starts to learn how far cameras misplace people [m], when they come without
     covariance: what careful calibration from pitch markings leaves in the middle of the pitch."""
     max_gap: float = Field(default=0.5, ge=0, le=100)
     """Longest time without a triangulated joint that smoothing fills [s]: a stride."""
-    clock_error: float = Field(default=0.05, gt=0, le=10)
+    clock_error: float = Field(default=0.05, ge=1e-6, le=10)
     """A camera's clock counts as known when its offset's standard error is below this [frame]."""
     correct_clocks: bool = False
     """Shift every camera's observations in time by the offset that the tracks show."""

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 from worldpose.body_fitting.banded import BandedFactor
+from worldpose.body_fitting.objective import UNKNOWNS
+from worldpose.body_fitting.solving import factor
+from worldpose.errors import DegenerateError
 
 
 def banded(frames, size, rng):
@@ -53,3 +56,10 @@ def test_the_given_blocks_stay_as_they_are():
     before = blocks.copy()
     BandedFactor.of(blocks)
     np.testing.assert_array_equal(blocks, before)
+
+
+def test_a_system_that_rounding_spoils_is_degenerate_and_no_error_of_ours():
+    blocks = np.zeros((3, 2, UNKNOWNS, UNKNOWNS))
+    blocks[0] = -1e300 * np.eye(UNKNOWNS)
+    with pytest.raises(DegenerateError, match="settings of body_fitting"):
+        factor(blocks)
