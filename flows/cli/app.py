@@ -1,52 +1,136 @@
-"""All commands of `worldpose`."""
+"""The commands of `worldpose`; each is imported when it is called."""
 
 from __future__ import annotations
 
-import typer
+import ast
+from difflib import get_close_matches
+from importlib import import_module
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from flows.cli import (
-    body,
-    check,
-    evaluate,
-    finetune,
-    lineage,
-    matches,
-    pins,
-    programme,
-    project,
-    reprocess,
-    results,
-    review,
-    run,
-    serve,
-    statistics,
-    times,
-)
+import typer
+from typer.core import TyperGroup
+
+if TYPE_CHECKING:
+    from typer._click.core import Command, Context
+    from typer._click.formatting import HelpFormatter
+    from typer._click.shell_completion import CompletionItem
+
+COMMANDS: Final = {
+    "init": "project:init",
+    "status": "project:status",
+    "verify": "project:verify",
+    "gc": "project:gc",
+    "simulate": "matches:simulate",
+    "import": "matches:import_command",
+    "ingest": "matches:ingest",
+    "clips": "programme:clips",
+    "run": "run:run",
+    "reprocess": "reprocess:reprocess",
+    "serve": "serve:serve",
+    "diff": "lineage:diff",
+    "why": "lineage:why",
+    "times": "times:times",
+    "pin": "pins:pin",
+    "unpin": "pins:unpin",
+    "export": "results:export",
+    "report": "results:report",
+    "evaluate": "evaluate:evaluate",
+    "check": "check:check",
+    "statistics": "statistics:statistics",
+    "label": "finetune:label",
+    "finetune": "finetune:finetune",
+    "review": "review",
+    "body": "body",
+}
+"""Command to `module:function` in flows.cli; a module alone is a group with `commands`."""
+
+
+class Commands(TyperGroup):
+    """All commands, in the order of the table.
+
+    Estimators and stores take seconds to import, so that only the command that is called is.
+    """
+
+    def get_command(self, ctx: Context, cmd_name: str) -> Command | None:
+        """Import and return a command; None for an unknown name."""
+        if cmd_name not in COMMANDS:
+            return None
+        module, _, function = COMMANDS[cmd_name].partition(":")
+        loaded = import_module(f"flows.cli.{module}")
+        parent = typer.Typer(add_completion=False, rich_markup_mode=None)
+        if not function:  # inside another group, a group of one command stays a group
+            parent.add_typer(loaded.commands, name=cmd_name)
+            return typer.main.get_group(parent).commands[cmd_name]
+        parent.command(cmd_name)(getattr(loaded, function))
+        return typer.main.get_command(parent)
+
+    def list_commands(self, ctx: Context) -> list[str]:
+        """Return the names of all commands."""
+        return list(COMMANDS)
+
+    def resolve_command(
+        self, ctx: Context, args: list[str]
+    ) -> tuple[str | None, Command | None, list[str]]:
+        """Return the command that was called, or say which one may be meant."""
+        name = args[0]
+        if name not in COMMANDS and not name.startswith("-"):
+            near = get_close_matches(name, COMMANDS)
+            meant = f" Did you mean {' or '.join(near)}?" if near else ""
+            ctx.fail(f"No such command {name!r}.{meant} worldpose --help lists them.")
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: Context, formatter: HelpFormatter) -> None:
+        """Write every command with the first sentence of its help."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, summary(name)) for name in COMMANDS])
+
+    def shell_complete(self, ctx: Context, incomplete: str) -> list[CompletionItem]:
+        """Return the commands and options that begin with what was typed."""
+        from typer._click.shell_completion import CompletionItem
+
+        options = super(TyperGroup, self).shell_complete(ctx, incomplete)
+        names = (name for name in COMMANDS if name.startswith(incomplete))
+        return [*(CompletionItem(name, help=summary(name)) for name in names), *options]
+
+
+def summary(command: str) -> str:
+    """Return the first paragraph of a command's docstring, read without importing it."""
+    module, _, function = COMMANDS[command].partition(":")
+    place = find_spec(f"flows.cli.{module}")
+    assert place is not None and place.origin is not None
+    tree = ast.parse(Path(place.origin).read_text(encoding="utf-8"))
+    node: Any = tree
+    if function:
+        named = (each for each in tree.body if isinstance(each, ast.FunctionDef))
+        node = next(each for each in named if each.name == function)
+    return " ".join((ast.get_docstring(node) or "").partition("\n\n")[0].split())
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(version("worldpose"))
+        raise typer.Exit
+
 
 app = typer.Typer(
     name="worldpose",
-    help="Metric 3D poses of every player from many cameras: a data factory.",
+    cls=Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    add_completion=False,
     rich_markup_mode=None,  # help names units in brackets
 )
-for module in (
-    project,
-    matches,
-    programme,
-    run,
-    reprocess,
-    serve,
-    review,
-    lineage,
-    times,
-    pins,
-    results,
-    evaluate,
-    check,
-    statistics,
-    finetune,
-    body,
-):
-    module.add_to(app)
+
+
+@app.callback()
+def worldpose(
+    _version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
+    ] = False,
+) -> None:
+    """Metric 3D poses of every player from many cameras: a data factory."""

@@ -1,4 +1,4 @@
-"""Commands on body models: body install."""
+"""Body models: bring your own."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import typer
 from flows.cli.console import JsonOption, line, print_json
 from worldpose.body import BODY_FOLDER, body_path, install_body
 
-body = typer.Typer(help="Body models: bring your own.", no_args_is_help=True)
+commands = typer.Typer(name="body", help=__doc__, no_args_is_help=True, rich_markup_mode=None)
 
 
-@body.command()
+@commands.command()
 def install(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="SMPL's .pkl or .npz.")],
     name: Annotated[
@@ -34,8 +34,3 @@ def install(
         print_json({"body_model": model.name, "file": str(path)})
     else:
         line(f"installed body model {model.name} as {path}")
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register these commands."""
-    app.add_typer(body, name="body")

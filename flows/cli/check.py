@@ -73,8 +73,3 @@ def tell_unstated_rate(folder: Path, fps: float | None) -> None:
 
 def _shown(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g}"
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register this command."""
-    app.command()(check)

@@ -191,8 +191,3 @@ def _print_rows(kind: str, columns: Mapping[str, str], rows: Mapping[str, object
         values = (getattr(record, column) for column in columns)
         shown.append((name, *("-" if value is None else f"{value:.3g}" for value in values)))
     print_table("", (kind, *(f">{title}" for title in columns.values())), shown)
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register this command."""
-    app.command()(evaluate)

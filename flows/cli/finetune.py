@@ -191,9 +191,3 @@ def _settings(assignments: list[str]) -> FineTuningSettings:
             found=repr(first["input"]),
             todo="Its settings are those of FineTuningSettings.",
         ) from None
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register these commands."""
-    app.command()(label)
-    app.command()(finetune)

@@ -124,9 +124,3 @@ def why(
     line(f"{answer.unit}: {answer.state}")
     for reason in answer.reasons:
         line(f"  {reason}")
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register these commands."""
-    for command in (diff, why):
-        app.command()(command)

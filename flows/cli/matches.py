@@ -328,10 +328,3 @@ def _tell_unclicked(match: Match) -> None:
         )
     elif missing:
         line(f"to be clicked first: {', '.join(missing)}; worldpose review serve shows the pages")
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register these commands."""
-    app.command()(simulate)
-    app.command("import")(import_command)
-    app.command()(ingest)

@@ -70,9 +70,3 @@ def _say(kept: Pin, verb: str, as_json: bool) -> None:
         print_json(kept.model_dump(mode="json"))
     else:
         line(f"{verb} run {kept.run_id} of {kept.match_id} as {kept.name}")
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register these commands."""
-    for command in (pin, unpin):
-        app.command()(command)

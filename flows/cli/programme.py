@@ -141,8 +141,3 @@ def _take(programme: Path, take: str, out: Path, *, as_json: bool) -> None:
     said = ", ".join(f"{key}: {value}" for key, value in entry.items())
     line(f"wrote {out}; for match.yaml, first_frame being its match frame:")
     line(f"  - {{{said}}}")
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register this command."""
-    app.command()(clips)

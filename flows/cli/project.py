@@ -236,9 +236,3 @@ def gc(
         line(reason)
     verb = "removed" if delete else "no run reaches"
     line(f"{verb} {len(plan.garbage)} things, {plan.size / 1e6:.1f} MB")
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register these commands."""
-    for command in (init, status, verify, gc):
-        app.command()(command)

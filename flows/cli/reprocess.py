@@ -142,8 +142,3 @@ def _as_json(each: Reprocessed) -> dict[str, JsonValue]:
             for unit in (() if touched is None else touched.units)
         ],
     }
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register this command."""
-    app.command()(reprocess)

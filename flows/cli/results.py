@@ -123,9 +123,3 @@ def report(
         for film in films:
             line(f"video:   {film.resolve()}")
         line(f"results: {store.url}/results/{known.match_id}")
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register these commands."""
-    for command in (export, report):
-        app.command()(command)

@@ -1,4 +1,4 @@
-"""Commands of people in the loop: review list, show, approve, reject, correct, withdraw, resume."""
+"""List pending reviews, decide on them, and correct results."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from worldpose.store import Store
 
 commands = typer.Typer(
     name="review",
-    help="See what waits for a person, decide on it, correct it.",
+    help=__doc__,
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -288,8 +288,5 @@ def _tell_damage(match: Match) -> None:
         line(f"warning: {text}", to=errors)
 
 
-def add_to(app: typer.Typer) -> None:
-    """Register these commands."""
-    commands.command()(serve)
-    review_exchange.add_to(commands)
-    app.add_typer(commands)
+commands.command()(serve)
+review_exchange.add_to(commands)

@@ -206,8 +206,3 @@ def _print_waiting(record: RunRecord) -> None:
         f"next: worldpose review list {record.match_id}, then approve or reject what it lists, "
         "and give this command again"
     )
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register this command."""
-    app.command()(run)

@@ -184,8 +184,3 @@ def _check(folder: StateFolder, *, as_json: bool) -> None:
             line(f"          mend: {finding.mend}")
     if not all(finding.is_well for finding in findings):
         raise typer.Exit(1)
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register this command."""
-    app.command()(serve)

@@ -82,8 +82,3 @@ def statistics(
     for written in (picture, page):
         if written is not None:
             line(f"wrote {written}")
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register this command."""
-    app.command()(statistics)

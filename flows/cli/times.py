@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-import typer
-
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -54,8 +52,3 @@ def times(
     print_table(f"run {found.run_id}, {found.seconds:.1f} s", columns, rows)
     if not found.stages:
         line("nothing was computed by this run; --run names another")
-
-
-def add_to(app: typer.Typer) -> None:
-    """Register this command."""
-    app.command()(times)

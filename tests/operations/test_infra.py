@@ -13,7 +13,7 @@ import pytest
 import typer
 import yaml
 
-from flows.cli.serve import add_to
+from flows.cli.app import app
 from flows.private_cluster import write_certificate
 
 INFRA = Path(__file__).parents[2] / "infra"
@@ -23,10 +23,8 @@ SERVICES = COMPOSE["services"]
 
 
 def options_of_serve():
-    app = typer.Typer()
-    add_to(app)
-    app.callback()(lambda: None)
-    command = typer.main.get_command(app).commands["serve"]
+    commands = typer.main.get_command(app)
+    command = commands.get_command(typer.Context(commands), "serve")
     return {option for parameter in command.params for option in parameter.opts}
 
 

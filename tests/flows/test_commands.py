@@ -1,0 +1,50 @@
+"""The table of commands: every entry loads, and listing them imports none."""
+
+import subprocess
+import sys
+from importlib.metadata import version
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from flows.cli.app import COMMANDS, app, summary
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_loads_and_is_listed_with_its_help(name):
+    commands = typer.main.get_command(app)
+    command = commands.get_command(typer.Context(commands), name)
+    assert command.name == name
+    first = " ".join(command.help.partition("\n\n")[0].split())
+    assert first == summary(name)
+    listed = CliRunner().invoke(app, ["--help"]).output
+    assert f"\n  {name} " in listed
+
+
+def test_the_list_of_commands_and_the_version_import_no_estimator():
+    script = (
+        "import sys\n"
+        "from flows.cli.app import app\n"
+        "for option in ('--help', '--version'):\n"
+        "    app([option], standalone_mode=False)\n"
+        "loaded = {'numpy', 'pydantic', 'zarr', 'cv2', 'prefect', 'dask'} & set(sys.modules)\n"
+        "assert not loaded, loaded\n"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
+
+
+def test_the_version_is_that_of_the_installed_package():
+    assert CliRunner().invoke(app, ["--version"]).output.strip() == version("worldpose")
+
+
+def test_a_misspelt_command_names_the_one_that_may_be_meant():
+    answer = CliRunner().invoke(app, ["simualte"])
+    assert answer.exit_code == 2
+    assert "No such command 'simualte'. Did you mean simulate?" in answer.output
+
+
+def test_a_group_lists_its_commands():
+    answer = CliRunner().invoke(app, ["body", "--help"])
+    assert answer.exit_code == 0
+    assert "install" in answer.output.partition("Commands:")[2]
