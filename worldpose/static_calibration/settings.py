@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
-from data_contracts.records import Positive, Record
+from data_contracts.records import Record
 from worldpose.static_calibration.line_settings import SURVEY_ERROR, LineRefinementSettings
+
+_AddedSpread = Annotated[float, Field(ge=0, le=10)]
 
 
 class CameraPrior(Record):
@@ -35,9 +37,9 @@ class CameraPrior(Record):
     the clicks: on drawn broadcast lines 0.005 predicts worse than 0.0015."""
     k3_spread: float = Field(default=0.005, ge=1e-6, le=1)
     """As `k1_spread`, of k3 where it is solved for [1]."""
-    lens_spread: tuple[Positive, Positive, Positive] = (0.1, 0.02, 0.01)
+    lens_spread: tuple[_AddedSpread, _AddedSpread, _AddedSpread] = (0.1, 0.02, 0.01)
     """Of k1, k2, k3 themselves [1], added in squares to what the corner's displacement allows: wide
-    lenses bend their corners more (C5)."""
+    lenses bend their corners more (C5); zero adds nothing."""
     height: float = Field(default=18.0, ge=1e-6, le=10000)
     """Above the pitch [m]: stands and roofs are 8 to 40 m up."""
     height_spread: float = Field(default=0.4, ge=1e-6, le=100)
