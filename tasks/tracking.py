@@ -18,7 +18,12 @@ from worldpose.review.identities import (
     stored_identities,
 )
 from worldpose.store import Store, key_of
-from worldpose.tracking import TrackingSettings, diagnose_no_people, track_people
+from worldpose.tracking import (
+    TrackingSettings,
+    describe_doubts,
+    diagnose_no_people,
+    track_people,
+)
 
 
 @unit_task
@@ -104,4 +109,9 @@ def _tracked(store: Store, work: Work) -> Tracked:
             births=tracks.report.births,
         )
         warnings = (f"{work.recipe.name} found no person: {reason.message}",)
+    doubts = describe_doubts(
+        np.asarray(found.frame, dtype=np.int64), len(tracks.person), tracks.takeovers, tracks.joins
+    )
+    if doubts is not None:
+        warnings = (f"{work.recipe.name}: {doubts}.",)
     return found, figures_of(tracks.report, clip.camera_ids), warnings

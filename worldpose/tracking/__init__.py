@@ -5,6 +5,7 @@ every frame and camera, quick joints [m], and a summary of each track.
 """
 
 from worldpose.tracking.diagnosis import NoPeople, diagnose_no_people
+from worldpose.tracking.doubts import describe_doubts
 from worldpose.tracking.rosters import people_allowed
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import Tracking, TrackingReport, track_people
@@ -14,6 +15,7 @@ __all__ = [
     "Tracking",
     "TrackingReport",
     "TrackingSettings",
+    "describe_doubts",
     "diagnose_no_people",
     "people_allowed",
     "track_people",

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from worldpose.cameras import Camera
 from worldpose.tracking.affinity import match_greedily, match_optimally, ray_affinity
 from worldpose.tracking.camera_gates import CameraGates
+from worldpose.tracking.doubts import Takeover, find_takeovers
 from worldpose.tracking.epipolar import associate
 from worldpose.tracking.intersection import intersect_people
 from worldpose.tracking.joining import Candidate, End, decide, ends_of, join_costs
@@ -36,6 +37,7 @@ class Follower:
         lost: whom nobody saw for a while; only in causal mode, where they may come back.
         ended: whose track is over.
         joins: causal decisions about who came back.
+        takeovers: frames in which a track may have passed to another person.
         merged: tracks that turned out to be on another's person.
         detections: detections with enough joints to be matched.
     """
@@ -58,6 +60,7 @@ class Follower:
         self.lost: list[Person] = []
         self.ended: list[Person] = []
         self.joins: list[Candidate] = []
+        self.takeovers: list[Takeover] = []
         self.near_since: dict[tuple[int, int], int] = {}
         self.born = self.merged = self.detections = 0
         self.gates = CameraGates(len(self.centers))
@@ -175,6 +178,7 @@ class Follower:
             camera, person = np.nonzero(index >= 0)
             taken[camera, index[camera, person]] = True
         self._drop_strangers(index, directions, affinity)
+        self.takeovers += find_takeovers(self.active, frame, index, affinity)
         distance = -np.take_along_axis(affinity, np.maximum(index, 0)[..., None], axis=2)[..., 0]
         distance[index < 0] = np.nan
         self.gates.learn(distance)

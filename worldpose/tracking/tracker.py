@@ -15,6 +15,7 @@ from data_contracts.tracking import Join, Track
 from worldpose.cameras import Camera
 from worldpose.errors import InputError
 from worldpose.tracking.clip_arrays import ClipArray
+from worldpose.tracking.doubts import Takeover, lasting_takeovers
 from worldpose.tracking.following import Follower
 from worldpose.tracking.joining import Candidate
 from worldpose.tracking.person import Person
@@ -41,6 +42,8 @@ class TrackingReport(Record):
     """Tracks that go on an earlier person's [1]."""
     undecided: int
     """Joins left to review [1]."""
+    takeovers: int
+    """Frames in which a track may have passed to another person [1]."""
     losses: int
     """People whose track ended before the clip did [1]."""
     detections: int
@@ -66,6 +69,7 @@ class Tracking:
         tracks: one summary a person.
         joins: where one track went on as another or may have: the undecided first, then the
             dearest.
+        takeovers: frames in which a track may have passed to another person.
         report: figures for the whole clip.
     """
 
@@ -75,6 +79,7 @@ class Tracking:
     joints: NDArray[np.float32]
     tracks: tuple[Track, ...]
     joins: tuple[Join, ...]
+    takeovers: tuple[Takeover, ...]
     report: TrackingReport
 
 
@@ -174,6 +179,7 @@ def _result(follower: Follower, frames: int, pitch_size: tuple[float, float] | N
     matched = np.isfinite(distance)
     count = int(np.count_nonzero(matched))
     joins = _joins(candidates, chains, everyone)
+    takeovers = lasting_takeovers(follower.takeovers, lasting, chains)
     report = TrackingReport(
         people=len(chains),
         births=len(everyone),
@@ -181,13 +187,14 @@ def _result(follower: Follower, frames: int, pitch_size: tuple[float, float] | N
         merged=follower.merged,
         joined=sum(join.decided for join in joins),
         undecided=sum(not join.decided for join in joins),
+        takeovers=len(takeovers),
         losses=sum(track.last_frame < frames - 1 for track in tracks),
         detections=follower.detections,
         unmatched_share=1.0 - count / follower.detections if follower.detections else None,
         mean_ray_distance_m=float(distance[matched].mean(dtype=np.float64)) if count else None,
     )
     ids = np.arange(len(chains), dtype=np.int32)
-    return Tracking(ids, index, distance, joints, tuple(tracks), joins, report)
+    return Tracking(ids, index, distance, joints, tuple(tracks), joins, takeovers, report)
 
 
 def _summary(person: int, index: NDArray[np.int16]) -> Track:

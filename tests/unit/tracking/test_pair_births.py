@@ -6,6 +6,7 @@ import pytest
 from worldpose.cameras import Camera, Rigid
 from worldpose.tracking import TrackingSettings, diagnose_no_people, track_people
 from worldpose.tracking.camera_gates import CameraGates
+from worldpose.tracking.following import Follower
 from worldpose.tracking.pair_births import group_pairs, judge_pairs
 from worldpose.tracking.visibility import CameraSight, bodies_covered
 
@@ -242,3 +243,16 @@ def test_second_detections_of_a_person_start_no_second_person_in_one_frame(peopl
     body = people([[[0.0, 0.0], [0.03, 0.0]]])
     found = track_people(cameras, *picture(cameras, body, np.ones((2, 2))), FPS, SETTINGS)
     assert len(found.person) == 1
+
+
+def test_detections_that_three_cameras_explain_are_left_to_them(people):
+    # Three cameras see one person, two of them another: of the pairs that the two cameras could
+    # form, only the one without the first person's detections is judged.
+    cameras = rig(*HIGH, THIRD)
+    joints = people([[0.0, 0.0], [2.0, 1.0]])
+    show = [[1, 1], [1, 1], [1, 0]]
+    directions, weights = rays_of(cameras, joints, show)
+    follower = Follower(cameras, FPS, True, None, SETTINGS)
+    follower.step(0, directions, weights)
+    found = sorted(tuple(person.sightings[0].index.tolist()) for person in follower.active)
+    assert found == [(0, 0, 0), (1, 1, -1)]

@@ -1,0 +1,102 @@
+"""Where nothing tells who is who: takeovers, undecided joins, and what a run says of them."""
+
+import numpy as np
+import pytest
+
+from data_contracts.tracking import Join
+from worldpose.tracking import TrackingSettings, describe_doubts, track_people
+from worldpose.tracking.doubts import Takeover
+
+FRAMES = np.arange(300, 400)
+FPS = 50.0
+LOST, BACK, END = 20, 24, 60
+
+
+def join(before, after, last_frame, first_frame, decided=False):
+    return Join(
+        before=before,
+        after=after,
+        last_frame=last_frame,
+        first_frame=first_frame,
+        cost=0.0,
+        margin=0.5,
+        decided=decided,
+    )
+
+
+@pytest.fixture
+def hidden(ring, people, seen):
+    """Two people on nearly one ray of camera 0; from `LOST` on, cameras 0 and 1 alone see them.
+
+    Camera 0 misses the first of them from `LOST` to `BACK`.
+    """
+    cameras = ring(5)
+    toward = cameras.center[0, :2] / np.linalg.norm(cameras.center[0, :2])
+    aside = np.array([-toward[1], toward[0]])
+    places = np.array([0.0 * toward, 1.2 * toward + 0.15 * aside])
+    keypoints, confidence = seen(cameras, people(np.broadcast_to(places, (END, 2, 2))), noise=0.3)
+    keypoints[LOST:, 2:] = np.nan
+    keypoints[LOST:BACK, 0, 0] = np.nan
+    return cameras, keypoints, confidence
+
+
+def test_person_who_takes_the_detection_that_another_loses_is_a_takeover(hidden):
+    cameras, keypoints, confidence = hidden
+    keypoints[BACK:, 0, 1] = np.nan  # one detection is left to the two of them
+    result = track_people(cameras, keypoints, confidence, FPS, TrackingSettings())
+    hidden_one, other = np.argsort(result.detection_index[0, 0])
+    assert result.takeovers == (Takeover(BACK, hidden_one, other),)
+    assert result.report.takeovers == 1
+
+
+def test_person_who_is_seen_again_beside_the_other_is_no_takeover(hidden):
+    result = track_people(*hidden, FPS, TrackingSettings())
+    assert len(result.person) == 2
+    assert result.takeovers == ()
+
+
+def test_other_who_is_placed_again_makes_it_no_takeover(hidden):
+    cameras, keypoints, confidence = hidden
+    keypoints[BACK : BACK + 3, 0, 1] = np.nan
+    result = track_people(cameras, keypoints, confidence, FPS, TrackingSettings())
+    assert len(result.person) == 2
+    assert result.takeovers == ()
+
+
+def test_takeover_of_a_track_too_short_to_be_a_person_is_left_out(hidden):
+    cameras, keypoints, confidence = hidden
+    keypoints[BACK:, 0, 1] = np.nan
+    keypoints[: LOST - 4, :, 1] = np.nan  # 4 frames of 0.02 s; min_track is 0.2 s
+    result = track_people(cameras, keypoints, confidence, FPS, TrackingSettings())
+    assert len(result.person) == 1
+    assert result.takeovers == ()
+
+
+def test_takeovers_are_named_by_person_and_frame_of_the_clip():
+    text = describe_doubts(FRAMES, 4, [Takeover(25, 0, 2), Takeover(99, 3, -1)], [])
+    assert text == (
+        "2 tracks may have passed from one person to another where a camera hid one of them "
+        "(person 0 and person 2 in frame 325; person 3 in frame 399). Look at these frames on the "
+        "pages, and split or join the tracks there"
+    )
+
+
+def test_undecided_joins_are_named_where_they_are_many_for_the_people():
+    joins = [join(0, 3, 10, 40), join(1, 1, 5, 20, decided=True)]
+    assert describe_doubts(FRAMES, 5, [], joins) is None  # one of five people
+    assert describe_doubts(FRAMES, 4, [], joins) == (
+        "1 pair of tracks may each be one person (person 0 until frame 310 and person 3 from frame "
+        "340). Look at these frames on the pages, and split or join the tracks there"
+    )
+
+
+def test_warning_names_three_doubts_and_counts_the_others():
+    text = describe_doubts(FRAMES, 9, [Takeover(n, n, 8) for n in range(5)], [])
+    assert text.startswith("5 tracks may have passed")
+    assert "person 2 and person 8 in frame 302; and 2 more)" in text
+    assert "person 3" not in text
+
+
+def test_clip_without_doubts_says_nothing():
+    assert describe_doubts(FRAMES, 0, [], []) is None
+    assert describe_doubts(FRAMES, 3, [], [join(0, 0, 1, 9, decided=True)]) is None
