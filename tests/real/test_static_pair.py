@@ -12,6 +12,7 @@ from static_pair import CROWN, read_clicks, write_static_pair
 
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
+from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import calibrate
 
@@ -44,7 +45,22 @@ def test_wrong_labels_and_no_others_are_rejected():
         assert swapped <= rejected <= misplaced | swapped
         # One wrong corner of the left camera lies 12 px off, and its clicks err by 3 px: at four
         # standard deviations it stays.
-        assert len(misplaced - rejected) <= 1
+        assert misplaced - rejected <= {"stripe.16.5.14.84"}
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_pitch_in_yards_is_told_by_hand_clicks_of_points_of_the_laws(side):
+    _, pixels = read_clicks(DATA, side)
+    for unit in (1.0, 0.9144):
+        size = PitchSpec(length=105.0 / unit, width=68.0 / unit, crown=CROWN)
+        pitch = PitchTemplate.from_spec(size)
+        clicked = [{"name": name, "xy": xy} for name, xy in pixels.items() if name in pitch.points]
+        markings = ClickedMarkings.model_validate({"points": clicked})
+        if unit == 1.0:
+            assert calibrate(pitch, markings, (3072, 1728)).report.wrong == ()
+            continue
+        with pytest.raises(InputError, match="in yards"):
+            calibrate(pitch, markings, (3072, 1728))
 
 
 @pytest.mark.usefixtures("server")

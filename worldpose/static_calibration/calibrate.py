@@ -24,6 +24,7 @@ from worldpose.static_calibration.checks import (
     check_amount,
     check_determined,
     check_mirrored,
+    check_unit,
     has_enough_points,
     is_suspicious,
 )
@@ -139,14 +140,16 @@ def _agreed(
         stated: as they were given.
 
     Raises:
-        InputError: the names are mirrored, the pitch has another size, or no camera explains most
-            of the clicks.
+        InputError: the names are mirrored, the pitch has another size or unit, or no camera
+            explains most of the clicks.
     """
     factor = settings.click_noise / stated.click_noise
+    as_stated = at_noise(problem, 1.0 / factor, settings)[0]
     if not is_suspicious(fit, factor):
+        if not fit.inliers.all() or factor * fit.noise_scale > 1.0:
+            check_unit(as_stated, (problem, fit, settings), pitch, stated)
         return problem, fit, settings, ()
     check_mirrored(problem, fit, settings)
-    as_stated = at_noise(problem, 1.0 / factor, settings)[0]
     least = improbability(problem, fit, settings, factor=factor, with_prior=True) - CLEAR_GAIN
     best: tuple[Problem, Screened, StaticCalibrationSettings, tuple[str, ...]]
     best = problem, fit, settings, ()
@@ -172,6 +175,7 @@ def _agreed(
         if own < least:
             least, best = own, _explained(as_stated, other, found, factor, assumed)
     check_agreement(*best[:2], pitch, best[2], stated)
+    check_unit(as_stated, best[:3], pitch, stated)
     return best
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
@@ -14,7 +15,13 @@ from worldpose.static_calibration.adjustment import Problem, adjust, camera_of_r
 from worldpose.static_calibration.advice import most_helpful, off_the_line
 from worldpose.static_calibration.evidence import Evidence
 from worldpose.static_calibration.parameters import CameraEstimate
-from worldpose.static_calibration.screening import Screened, at_noise, screen
+from worldpose.static_calibration.screening import (
+    Screened,
+    at_noise,
+    improbability,
+    screen,
+    screen_at_best_noise,
+)
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 from worldpose.static_calibration.starts import from_homographies, plausible_cameras
 
@@ -47,6 +54,9 @@ _CLOSE: Final = 4.0
 """Mean loss of an observation [1] up to which it is: twice the stated noise."""
 _SAME_SIZE: Final = 0.5
 """Difference in length or width that clicks do not tell [m]."""
+_UNIT_GAIN: Final = 14.0
+"""Twice the logarithm of how much more probable clicks must be on a pitch in yards [1]: a thousand
+times, for few files have that fault."""
 YARD: Final = 0.9144
 """[m]"""
 
@@ -147,14 +157,7 @@ def check_agreement(
     if is_suspicious(fit, factor):
         fitting = _fitting_size(at_noise(problem, 1.0 / factor, settings)[0], pitch, stated)
         if fitting is not None:
-            length, width, about = fitting
-            raise InputError(
-                "pitch.json: length, width",
-                expected=f"the size of the pitch in metres; the clicks of {problem.where} fit "
-                f"{length:.1f} x {width:.1f} m",
-                found=f"{pitch.length:g} x {pitch.width:g}",
-                todo=f"Correct the size: {about}.",
-            )
+            raise _other_size(problem, pitch, *fitting)
     if wrong > settings.max_wrong_share:
         kept = [n for n, inlier in zip(evidence.points, fit.inliers, strict=True) if inlier]
         raise InputError(
@@ -166,6 +169,52 @@ def check_agreement(
         )
 
 
+def check_unit(
+    problem: Problem,
+    best: tuple[Problem, Screened, StaticCalibrationSettings],
+    pitch: PitchTemplate,
+    settings: StaticCalibrationSettings,
+) -> None:
+    """Raise InputError when a pitch whose size is in yards explains the clicks far better.
+
+    A camera bends its lens and calls a click or two wrong until the others fit a pitch that is
+    9 % too large.
+
+    Args:
+        problem: what was clicked, at the stated noise.
+        best: its best explanation in metres, which may assume a cropped image.
+        pitch: the template.
+        settings: as they were given.
+    """
+    size = YARD * pitch.length, YARD * pitch.width
+    other = _start_on_size(problem, *size, settings)
+    # A score of points alone tells nothing where drawn markings decide as well.
+    if other is None or problem.evidence.markings:
+        return
+    try:
+        found = screen_at_best_noise(*other, settings)
+    except InputError:
+        return
+    in_yards, given = (
+        improbability(*each, factor=each[2].click_noise / settings.click_noise, with_prior=True)
+        for each in (found, best)
+    )
+    if in_yards < given - _UNIT_GAIN and _wrong_share(found[1]) <= _BELIEVED:
+        raise _other_size(problem, pitch, *size, "it seems to be in yards")
+
+
+def _other_size(
+    problem: Problem, pitch: PitchTemplate, length: float, width: float, about: str
+) -> InputError:
+    return InputError(
+        "pitch.json: length, width",
+        expected=f"the size of the pitch in metres; the clicks of {problem.where} fit "
+        f"{length:.1f} x {width:.1f} m",
+        found=f"{pitch.length:g} x {pitch.width:g}",
+        todo=f"Correct the size: {about}.",
+    )
+
+
 def _wrong_share(fit: Screened) -> float:
     return 1.0 - float(fit.inliers.mean()) if len(fit.inliers) else 0.0
 
@@ -174,33 +223,57 @@ def _fitting_size(
     problem: Problem, pitch: PitchTemplate, settings: StaticCalibrationSettings
 ) -> tuple[float, float, str] | None:
     """Return length and width [m] that explain the clicked points, and what then is wrong."""
-    evidence = problem.evidence
     sizes = [
         (YARD * pitch.length, YARD * pitch.width, "it seems to be in yards"),
         (105.0, 68.0, "it seems to be another pitch's"),
     ]
-    none = np.zeros(len(evidence.markings), dtype=np.bool_)
-    points = problem.only(np.ones(len(evidence.points), dtype=np.bool_), none)
     for length, width, about in sizes:
         if abs(length - pitch.length) < _SAME_SIZE and abs(width - pitch.width) < _SAME_SIZE:
             continue
-        laws = law_points(length, width)
-        if not set(evidence.points) <= laws.keys() or not has_enough_points(evidence):
-            return None
-        world = np.array([laws[name] for name in evidence.points])
-        world[:, 2] = evidence.points_world[:, 2]
-        other = replace(points, evidence=replace(points.evidence, points_world=world))
-        rows = from_homographies(other, settings.prior, leave_out=False)
-        if not len(rows):
+        found = _start_on_size(problem, length, width, settings)
+        if found is None:
             continue
-        start = adjust(other, rows, click_loss=_MANY)
         try:
-            fit = screen(other, start.rows[np.argmin(start.cost)], settings)
+            fit = screen(*found, settings)
         except InputError:
             continue
         if _explains(fit):
             return length, width, about
     return None
+
+
+def _start_on_size(
+    problem: Problem, length: float, width: float, settings: StaticCalibrationSettings
+) -> tuple[Problem, NDArray[np.float64]] | None:
+    """Return the clicked points on a pitch of another size, and a camera (22,) near the answer.
+
+    Args:
+        problem: what was clicked.
+        length: of the other pitch [m].
+        width: of it [m].
+        settings: with the prior of cameras.
+
+    Returns:
+        None where a point is not of the Laws, or the points determine no camera.
+    """
+    evidence, laws = problem.evidence, law_points(length, width)
+    if not set(evidence.points) <= laws.keys() or not has_enough_points(evidence):
+        return None
+    world = np.array([laws[name] for name in evidence.points])
+    world[:, 2] = evidence.points_world[:, 2]
+    points = _points_alone(problem)
+    other = replace(points, evidence=replace(points.evidence, points_world=world))
+    rows = from_homographies(other, settings.prior, leave_out=False)
+    if not len(rows):
+        return None
+    start = adjust(other, rows, click_loss=_MANY)
+    return other, start.rows[np.argmin(start.cost)]
+
+
+def _points_alone(problem: Problem) -> Problem:
+    evidence = problem.evidence
+    none = np.zeros(len(evidence.markings), dtype=np.bool_)
+    return problem.only(np.ones(len(evidence.points), dtype=np.bool_), none)
 
 
 def check_determined(

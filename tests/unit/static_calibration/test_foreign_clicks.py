@@ -41,15 +41,15 @@ def test_honest_clicks_of_three_pixels_stated_as_one_are_believed():
         report = calibrated(clicked).report
         wrong += len(report.wrong)
         scales.append(report.noise_scale)
-    assert wrong <= 1  # of 180; stated noise alone calls about one in eight wrong
+    assert wrong == 0  # of 180; stated noise alone calls about one in eight wrong
     # Nine clicks have about 9 degrees of freedom left, which tell noise to a quarter.
     assert np.median(scales) == pytest.approx(3.0, rel=0.3)
 
 
 def test_honest_clicks_as_stated_leave_the_stated_noise_alone():
     reports = [calibrated(clicked).report for _, clicked, _ in cameras(20, 9, noise=1.0)]
-    assert sum(len(report.wrong) for report in reports) <= 1
-    assert sum(report.noise_scale == 1.0 for report in reports) >= 18
+    assert sum(len(report.wrong) for report in reports) == 0
+    assert all(report.noise_scale == 1.0 for report in reports)
 
 
 @pytest.mark.parametrize("words", [("left", "right"), ("near", "far")])
@@ -64,14 +64,15 @@ def test_a_click_with_the_name_of_another_end_is_never_believed(words):
         named = {other if n == name else n: xy for n, xy in clicked.items()}
         try:
             result = calibrated(named)
-        except InputError:  # eight clicks close together may not tell which is wrong
+        except InputError as error:  # eight clicks close together may not tell which is wrong
+            assert "degrees of freedom open" in str(error)
             refused += 1
             continue
         assert result.report.wrong == (other,)
         # Nor did the lens bend for it.
         assert result.estimate.camera.focal[0] == pytest.approx(camera[0][0, 0], rel=0.1)
-    assert planted >= 8
-    assert refused <= 1
+    assert planted == 20
+    assert refused <= (words[0] == "left")
 
 
 def test_a_point_beyond_the_fold_has_its_image_outwards_not_back_in_the_picture():
@@ -131,10 +132,10 @@ def test_an_image_that_is_cropped_off_its_center_is_told_from_wrong_names():
     said = 0
     for camera, clicked, _ in cameras(8, 12, noise=1.0, center=(1152.0, 378.0), first=1700):
         result = calibrated(clicked)
-        assert len(result.report.wrong) <= 1
+        assert result.report.wrong == ()
         said += any("cropped" in text for text in result.report.decisions)
         assert result.estimate.camera.focal[0] == pytest.approx(camera[0][0, 0], rel=0.1)
-    assert said >= 4
+    assert said >= 5
 
 
 def test_a_camera_with_near_and_far_exchanged_is_refused_by_file_and_reason():
@@ -148,14 +149,16 @@ def test_a_camera_with_near_and_far_exchanged_is_refused_by_file_and_reason():
 
 def test_a_pitch_in_yards_is_told_from_wrong_clicks():
     pitch = PitchTemplate.from_spec(PitchSpec(length=114.8, width=74.4))
-    told = 0
     for _, clicked, _ in cameras(6, 12, noise=1.0, first=2500):
-        try:
+        with pytest.raises(InputError, match=r"fit 105\.0 x 68\.0 m.*in yards"):
             calibrated(clicked, pitch=pitch)
-        except InputError as error:
-            told += "yards" in str(error)
-            assert "fit 105.0 x 68.0 m" in str(error)
-    assert told >= 3
+
+
+def test_a_slip_among_clicks_in_metres_is_never_taken_for_yards():
+    for _, clicked, _ in cameras(10, 9, noise=1.0, first=8000):
+        name = next(iter(clicked))
+        slipped = np.clip(np.add(clicked[name], [24.0, 32.0]), 0.0, np.array(rig.SIZE) - 1.0)
+        calibrated({**clicked, name: tuple(slipped)})
 
 
 def test_thousands_of_drawn_pixels_are_thinned_to_two_hundred_a_marking():
