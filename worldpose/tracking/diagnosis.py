@@ -126,8 +126,8 @@ def diagnose_no_people(
         cause="cameras_contradict",
         message=f"no two cameras agree on their people: of the best pair, {a} and {b}, "
         f"{len(best.angle)} of {best.possible} detections have a partner on their epipolar lines. "
-        "Camera poses or lenses are wrong, or files belong to other cameras: compare each "
-        "camera's projection of the scene with its image.",
+        "Camera poses or lenses are wrong, files belong to other cameras, or the cameras show "
+        "different people: compare each camera's projection of the scene with its image.",
         evidence={"matches": float(len(best.angle)), "possible": float(best.possible)},
     )
 
