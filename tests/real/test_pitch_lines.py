@@ -35,7 +35,7 @@ def bench():
     [
         # Seen on this half: 98.7, 98.9, 98.9.
         ("wc14", (98.4, 98.6, 98.6)),
-        # Seen on this half: 94.9, 96.3, 96.5, all pictures kept.
+        # Seen on this half: 94.8, 96.4, 96.5, all pictures kept.
         ("sn22", (94.6, 96.0, 96.2)),
     ],
 )
