@@ -103,10 +103,15 @@ def test_a_change_needs_the_form_secret_json_and_this_origin(ada, project_copy):
     assert "access-control-allow-origin" not in ada.get("/api/matches").headers
 
 
-def test_nothing_is_changed_by_getting(app):
-    changing = {path for method, path in every_route(app) if method == "POST"}
-    getting = {path for method, path in every_route(app) if method == "GET"}
-    assert changing.isdisjoint(getting)
+def test_nothing_is_changed_by_getting(app, ada, project_copy):
+    files = [path for path in Path(str(project_copy)).rglob("*") if path.is_file()]
+    before = {path: path.read_bytes() for path in files}
+    answers = {
+        path: ada.get(path).status_code for method, path in every_route(app) if method == "GET"
+    }
+    assert answers[MATCH] == answers[f"{MATCH}/corrections"] == 200
+    after = [path for path in Path(str(project_copy)).rglob("*") if path.is_file()]
+    assert {path: path.read_bytes() for path in after} == before
 
 
 @pytest.mark.parametrize(
