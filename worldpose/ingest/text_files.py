@@ -118,7 +118,8 @@ def _parsed(path: Path, form: str, parse: Callable[[str], Any], text: str) -> An
             str(path), expected=form, found="nesting without end", todo="Write the file anew."
         ) from error
     # ValueError: json and tomllib, and numbers or dates that Python's constructors refuse.
-    except (yaml.YAMLError, ValueError, OverflowError) as error:
+    # The others: PyYAML, where a tag such as !!int or !!bool stands before text that is none.
+    except (yaml.YAMLError, ValueError, OverflowError, LookupError, AttributeError) as error:
         found = " ".join(str(error).replace('"<unicode string>", ', "").split())
         raise InputError(
             str(path), expected=form, found=found, todo="Correct the place that is named."

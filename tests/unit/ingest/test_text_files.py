@@ -62,6 +62,14 @@ def test_hostile_or_broken_yaml_is_refused(refused, content, words):
     refused(read_yaml, content, words)
 
 
+@pytest.mark.parametrize("text", ['!!int ""', '!!float ""', "!!bool maybe", "!!timestamp soon"])
+def test_a_tag_before_text_that_is_none_is_refused(tmp_path, text):
+    file = tmp_path / "match.yaml"
+    file.write_text(f"fps: {text}\n")
+    with pytest.raises(InputError, match=r"match.yaml"):
+        read_yaml(file)
+
+
 def test_a_flood_of_entries_is_refused_before_it_is_built(refused, monkeypatch):
     monkeypatch.setattr(text_files, "EVENTS", 1000)
     refused(read_yaml, "- a\n" * 1001, "more than 1000 entries")
