@@ -113,5 +113,5 @@ def _tracked(store: Store, work: Work) -> Tracked:
         np.asarray(found.frame, dtype=np.int64), len(tracks.person), tracks.takeovers, tracks.joins
     )
     if doubts is not None:
-        warnings = (f"{work.recipe.name}: {doubts}.",)
+        warnings += (f"{work.recipe.name}: {doubts}.",)
     return found, figures_of(tracks.report, clip.camera_ids), warnings

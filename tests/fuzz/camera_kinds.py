@@ -416,7 +416,8 @@ def _move_world(draft, rotation, shift):
         turned = cv2.Rodrigues(np.array(table["rotation"]))[0]
         table["translation"] = (table["translation"] - turned @ rotation.T @ shift).tolist()
         table["rotation"] = cv2.Rodrigues(turned @ rotation.T)[0].ravel().tolist()
-    draft.truth = draft.people @ rotation.T + shift
+    if draft.truth is not None:
+        draft.truth = draft.truth @ rotation.T + shift
 
 
 @kind("toml", base="given", harmless=True)

@@ -220,6 +220,8 @@ class _Adjuster:
         stranger, settings = self.stranger, self.settings
         for _ in range(_ROUNDS):
             observed = _only(self.everybody, ~stranger[self.everybody.camera_of])
+            if not len(observed.points):
+                return  # No two cameras that agree show one person: nothing to learn from.
             problem = players_problem(
                 self.clip, observed, self.noise, stranger, settings, self.doubt
             )

@@ -52,7 +52,10 @@ def most_helpful(
         best, gain, best_update = "", 0.0, np.zeros_like(covariance)
         for name, rows in candidates.items():
             through = covariance @ rows.T
-            update = through @ np.linalg.solve(np.eye(len(rows)) + rows @ through, through.T)
+            # A camera that its clicks barely determine has variances beyond the reach of float64:
+            # the matrix is then singular.
+            inverse = np.linalg.pinv(np.eye(len(rows)) + rows @ through, hermitian=True)
+            update = through @ inverse @ through.T
             if float((update * merit).sum()) > gain:
                 best, gain, best_update = name, float((update * merit).sum()), update
         if not best:

@@ -42,10 +42,13 @@ def list_runs(blobs: Blobs, match_id: str) -> tuple[list[str], list[str]]:
 
 def reserve_run(blobs: Blobs, match_id: str) -> str:
     """A run number that no other run of the match has or gets: `0001`, `0002`, ..."""
+    number = 0
     while True:
-        # A record that was set aside keeps its number: reviews may name the run.
+        # A record that was set aside keeps its number: reviews may name the run. A number that
+        # could not be reserved, for whatever lies in its place, is not tried again.
         taken = set[str]().union(*_files(blobs, match_id))
-        run_id = f"{max((run_order(name)[0] for name in taken), default=0) + 1:04d}"
+        number = max([number, *(run_order(name)[0] for name in taken)]) + 1
+        run_id = f"{number:04d}"
         path = reservation_path(match_id, run_id)
         reservation = Reservation(
             run_id=run_id,

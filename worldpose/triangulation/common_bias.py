@@ -82,11 +82,11 @@ STATURE: Final = (1.72, 0.12)
 """Of the people of a clip, mean and standard deviation [m]: men, women or children."""
 PERSONAL: Final = 0.035
 """Standard deviation of a person's proportion relative to the mean [1] (Drillis, Contini 1966)."""
-WITNESSES: Final = 8.0
-"""Squared offsets that the usual size is worth before a clip tells [1]. Proportions that fit by
-chance make no detector perfect, while those that do not fit make it bad: inverse chi-square."""
-FEWEST: Final = 5
-"""Frames that tell how long a person's bone is."""
+PRIOR_DEGREES_OF_FREEDOM: Final = 8.0
+"""Of the inverse chi-square prior of the bias's variance [1]. Proportions that fit by chance barely
+lower the estimate, proportions that do not fit raise it."""
+MIN_FRAMES: Final = 5
+"""Frames needed to estimate the length of a person's bone."""
 
 
 def learn_common_bias(joints: Floats, covariance: Floats, usual: float) -> float:
@@ -105,7 +105,7 @@ def learn_common_bias(joints: Floats, covariance: Floats, usual: float) -> float
     measured = [_length(joints, covariance, each) for each in PROPORTIONS]
     known = [index for index, (length, _, _) in enumerate(measured) if length > 0.0]
     factors = np.geomspace(0.2, 5.0, 121)
-    posterior = -WITNESSES * (np.log(factors) + 0.5 / factors**2)
+    posterior = -PRIOR_DEGREES_OF_FREEDOM * (np.log(factors) + 0.5 / factors**2)
     if known:
         length, variance, people = np.array([measured[index] for index in known]).T
         some = [PROPORTIONS[index] for index in known]
@@ -139,10 +139,10 @@ def _length(joints: Floats, covariance: Floats, what: Proportion) -> tuple[float
     lengths, noises = [], []
     for person in range(square.shape[1]):
         there = np.isfinite(square[:, person])
-        middle = float(np.median(square[there, person])) if there.sum() >= FEWEST else 0.0
+        middle = float(np.median(square[there, person])) if there.sum() >= MIN_FRAMES else 0.0
         if middle > 0.0:
             lengths.append(np.sqrt(middle))
-            # Errors of a detector last for many frames: all of them are one witness.
+            # Detector errors persist over many frames, so all frames count as one observation.
             noises.append(float(np.median(trace[there, person])) / 3.0)
     if not lengths:
         return 0.0, 0.0, 0

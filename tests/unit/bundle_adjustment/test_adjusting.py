@@ -11,6 +11,7 @@ from worldpose.bundle_adjustment import (
     SolverSettings,
     adjust_cameras,
 )
+from worldpose.bundle_adjustment import adjusting
 from worldpose.static_calibration import stepped
 from worldpose.triangulation import triangulate_joints
 
@@ -165,3 +166,13 @@ def test_too_few_judges_refuse(clip):
     adjusted = adjust_cameras(made, QUICK.model_copy(update={"min_judges": 10**6}))
     assert not adjusted.accepted.any()
     assert "1000000 are asked for" in adjusted.reasons[0]
+
+
+def test_nothing_is_learned_where_every_camera_contradicts_the_others(clip, monkeypatch):
+    made, _, _ = clip()
+    found = adjusting.Contradictions.none(len(made.clicks))
+    found = replace(found, stranger=np.ones(len(made.clicks), dtype=np.bool_))
+    monkeypatch.setattr(adjusting, "find_contradictions", lambda *_: found)
+    adjusted = adjust_cameras(made, QUICK)
+    assert not adjusted.accepted.any()
+    np.testing.assert_array_equal(adjusted.cameras.numbers, made.cameras.numbers)

@@ -44,6 +44,13 @@ def test_unfinished_run_is_seen_and_is_not_the_latest(store: Store) -> None:
         store.run("final", "0002")
 
 
+def test_number_with_a_folder_in_its_place_is_passed_over(folder_store: Store, tmp_path) -> None:
+    run_once(folder_store)
+    (record,) = tmp_path.rglob("runs/final/0001.json")
+    record.with_name("0002.json").mkdir()
+    assert folder_store.reserve_run("final") == "0003"
+
+
 def test_match_without_runs_says_what_to_run(folder_store: Store) -> None:
     with pytest.raises(InputError, match="worldpose run final"):
         folder_store.run("final")
