@@ -28,7 +28,7 @@ from worldpose.body_fitting import (
     BodyFittingSettings,
     find_sightings,
     fit_bodies,
-    place_glimpses,
+    place_monocular_poses,
     recognise_people,
     sight_people,
 )
@@ -40,7 +40,7 @@ from worldpose.pitch import PitchTemplate
 from worldpose.synthetic import SCENARIOS, Scene, simulate_scene
 from worldpose.synthetic.monocular import MonocularErrors, estimate_bodies
 from worldpose.tracking import TrackingSettings, track_people
-from worldpose.triangulation import TriangulationSettings, put_right, reconstruct_joints
+from worldpose.triangulation import TriangulationSettings, reconstruct_joints, unswap
 
 Floats = NDArray[np.float64]
 BODY = load_open_body()
@@ -152,7 +152,7 @@ def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
     dark = thinned(scene, index, left, seed)
     placed = reconstruct_joints(cameras, *arrays, index, fps, TRIANGULATION).triangulation
     joints, covariance = placed.joints, placed.covariance
-    right = put_right(seen.keypoints, index, placed.exchanged)
+    right = unswap(seen.keypoints, index, placed.exchanged)
     static = find_sightings(cameras, right, index, joints)
     ground = PitchTemplate.from_spec(scene.surveyed).height
 
@@ -173,7 +173,7 @@ def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
     rng = np.random.default_rng(seed)
     drawn = estimate_bodies(BODY, bodies, scene.broadcast, fps, MonocularErrors(), rng)
     estimates = monocular_of(drawn, Path("estimates"))
-    glimpses = place_glimpses(estimates, scene.broadcast, frames, first.joints)
+    glimpses = place_monocular_poses(estimates, scene.broadcast, frames, first.joints)
     fits = {
         "static cameras alone": first,
         "+ estimates": fitted([static], glimpses),

@@ -30,7 +30,7 @@ from worldpose.broadcast_calibration.players import player_evidence
 from worldpose.formats import JointTracks, read_joints
 from worldpose.ingest import read_match
 from worldpose.pitch import PitchTemplate
-from worldpose.reports.broadcast import before_after_picture, most_moved
+from worldpose.reports.broadcast import before_after_picture, largest_pose_changes
 from worldpose.synthetic import SCENARIOS, simulate_match
 from worldpose.video import VideoReader
 
@@ -89,7 +89,7 @@ def rows_of(
         before, after = fits["all"].before.camera, fits["all"].camera.camera
         number = np.arange(joints.shape[1])
         tracks = JointTracks(np.arange(len(joints)), number, joints)
-        frame, person = most_moved(before, after, tracks)
+        frame, person = largest_pose_changes(before, after, tracks)
         with VideoReader(match.videos[clip]) as video:
             still = video.frame(frame)
         seen = people.keypoints[frame, :, :, :2]

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from worldpose.detection import People
-from worldpose.detection.embedded import embedded_detector, embedded_pose
+from worldpose.detection.bundled import embedded_detector, embedded_pose
 from worldpose.detection.interfaces import Picture
 from worldpose.pitch import PitchTemplate
 from worldpose.synthetic import SCENARIOS

@@ -31,7 +31,7 @@ from worldpose.synthetic.scenarios import SCENARIOS
 from worldpose.synthetic.scene import simulate_scene
 from worldpose.synthetic.settings import Scenario
 from worldpose.tracking import TrackingSettings, track_people
-from worldpose.triangulation import TriangulationSettings, put_right, reconstruct_joints
+from worldpose.triangulation import TriangulationSettings, reconstruct_joints, unswap
 
 PLANTED = 0.06
 """Share of joints put far off."""
@@ -69,7 +69,7 @@ def filtered(scenario: Scenario, seed: int) -> tuple[int, int, int, int]:
     given = (cameras, keypoints, confidence, tracks.detection_index)
     placed = reconstruct_joints(*given, scenario.fps, settings).triangulation
     ground = PitchTemplate.from_spec(scene.surveyed).height
-    right = put_right(keypoints, tracks.detection_index, placed.exchanged)
+    right = unswap(keypoints, tracks.detection_index, placed.exchanged)
     alone = find_sightings(cameras, right, tracks.detection_index, placed.joints)
     fit = fit_bodies(
         find_body(how.body_model),

@@ -19,7 +19,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from worldpose.detection.embedded import embedded_detector, embedded_pose
+from worldpose.detection.bundled import embedded_detector, embedded_pose
 from worldpose.training import FineTuningSettings, read_labels, write_labels
 from worldpose.training.fine_tuning import split
 from worldpose.training.pictures import PictureCache

@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 from worldpose.cameras import Camera
 from worldpose.detection import DetectionSettings, PeopleFinder, Place
 from worldpose.detection.boxes import overlaps
-from worldpose.detection.embedded import embedded_detector, embedded_pose
+from worldpose.detection.bundled import embedded_detector, embedded_pose
 from worldpose.detection.interfaces import Picture
 from worldpose.pitch import PitchTemplate
 from worldpose.synthetic import SCENARIOS
 from worldpose.synthetic.casting import dress_people, roles_of, stand_by
-from worldpose.synthetic.exposing import RenderedFrame
 from worldpose.synthetic.filming import open_view, render_frame
+from worldpose.synthetic.image_formation import RenderedFrame
 from worldpose.synthetic.scene import simulate_scene
 from worldpose.synthetic.settings import Scenario
 

@@ -25,7 +25,7 @@ from worldpose.triangulation import TriangulationSettings, triangulate_joints
 CAMERAS, PEOPLE, JOINTS = 16, 22, 17
 PART = 17 * 60
 # The points are no bodies, which have a left and a right.
-STATED = TriangulationSettings(learn_noise=False, offsets="none", undo_exchanges=False)
+STATED = TriangulationSettings(learn_noise=False, offsets="none", undo_swaps=False)
 
 
 def rig(rng: np.random.Generator) -> Camera:

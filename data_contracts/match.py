@@ -22,7 +22,6 @@ from data_contracts.records import (
     Record,
 )
 
-
 MAX_UNIT_LENGTH: Final = 63
 """A result of one camera in one clip is named by both ids with a dot between them."""
 

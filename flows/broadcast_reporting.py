@@ -24,7 +24,12 @@ from worldpose.cameras.stored import camera_from_arrays
 from worldpose.formats import JointTracks, whole_file
 from worldpose.ingest import unit_frames
 from worldpose.reports import Picture
-from worldpose.reports.broadcast import angles_of, before_after_picture, course_picture, most_moved
+from worldpose.reports.broadcast import (
+    angles_of,
+    before_after_picture,
+    course_picture,
+    largest_pose_changes,
+)
 from worldpose.reports.clips import camera_picture
 from worldpose.reports.html_page import Table
 from worldpose.reports.overlay_video import overlay_frames
@@ -99,7 +104,7 @@ def _before_and_after(run: Run, match: Match, clip: str, tracks: JointTracks) ->
     )
     joints = tracks.joints[np.searchsorted(tracks.frames, both)]
     shared = JointTracks(both, tracks.person_ids, joints)
-    place, person = most_moved(before, after, shared)
+    place, person = largest_pose_changes(before, after, shared)
     number = int(both[place])
     (detected,) = seen_in_broadcast(match, clip)
     with open_video(match.folder.videos[clip]) as video:

@@ -10,9 +10,9 @@ from weakref import WeakKeyDictionary
 from data_contracts.match import Registration
 from data_contracts.review import Correction, Edit, MovedPoint, RedrawnMarking, Withdrawal
 from flows.detections import require_seen
+from flows.edit_conflicts import StaleEditError
 from flows.identities import require_fitting
 from flows.stage import Match
-from flows.stale import StaleEditError
 from worldpose.errors import InputError
 from worldpose.ingest import MatchFolder
 from worldpose.review import (

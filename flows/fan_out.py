@@ -15,7 +15,7 @@ from prefect.context import FlowRunContext
 from prefect.futures import as_completed
 
 from data_contracts.work import Work
-from flows.lost_machines import require_machines
+from flows.cluster_errors import require_workers
 from flows.planning import PlannedUnit
 from flows.stage import Stage
 
@@ -31,7 +31,7 @@ def compute(
     """Each unit as its task ends, with what it failed of.
 
     Raises:
-        LostMachinesError: the Prefect server or Dask scheduler is gone.
+        LostWorkersError: the Prefect server or Dask scheduler is gone.
     """
     with _placed(stage) if units else nullcontext():
         if len(units) <= MOST_TASKS:
@@ -54,7 +54,7 @@ def _each_alone(
         try:
             future.result()
         except Exception as failure:  # recorded with the run: siblings go on
-            require_machines(failure)
+            require_workers(failure)
             yield submitted[future], failure
         else:
             yield submitted[future], None
@@ -81,7 +81,7 @@ def _in_batches(
             failures = [failure] * len(some)
         for unit, each in zip(some, failures, strict=True):
             if each is not None:
-                require_machines(each)
+                require_workers(each)
             yield unit, each
 
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pydantic import JsonValue
 
 from data_contracts.review import Edit
+from flows.edit_conflicts import StaleEditError, edits_since
 from flows.stage import Match
-from flows.stale import StaleEditError, edits_since
 from worldpose.errors import InputError
 from worldpose.review.identities import (
     IDENTITY_EDITS,

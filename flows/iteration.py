@@ -12,6 +12,7 @@ from typing import Final
 
 from data_contracts.run import RunRecord
 from flows.basis import basis_of
+from flows.edit_conflicts import EditedMeanwhileError
 from flows.gatekeeping import Gatekeeper
 from flows.method import METHOD
 from flows.outlook import Outlook, look_ahead
@@ -21,7 +22,6 @@ from flows.registering import open_match
 from flows.run_record import latest_run
 from flows.running import RunRequest, run_match, shared_machines
 from flows.stage import Match
-from flows.stale import EditedMeanwhileError
 from worldpose.errors import UsageError
 from worldpose.store import Store
 

@@ -67,7 +67,7 @@ def process_match(
 
     Raises:
         IncompleteRunError: some units failed or wait; the others have their results.
-        LostMachinesError: the Prefect server or Dask scheduler is gone; run again goes on.
+        LostWorkersError: the Prefect server or Dask scheduler is gone; run again goes on.
     """
     logging.getLogger("worldpose").setLevel(logging.INFO)
     store = Store.open(project)

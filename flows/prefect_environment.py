@@ -159,11 +159,11 @@ def served_cluster() -> dict[str, Any]:
         return {"address": address}
     return {
         "cluster_class": "flows.private_cluster.PrivateCluster",
-        "cluster_kwargs": local_cluster(int(os.environ.get("WORLDPOSE_WORKERS") or 0)),
+        "cluster_kwargs": local_cluster_options(int(os.environ.get("WORLDPOSE_WORKERS") or 0)),
     }
 
 
-def local_cluster(workers: int) -> dict[str, Any]:
+def local_cluster_options(workers: int) -> dict[str, Any]:
     """How Dask makes so many worker processes on this machine; 0 = one a core."""
     return {
         "n_workers": workers or os.cpu_count() or 1,

@@ -10,11 +10,11 @@ from typing import Literal
 from data_contracts.review import Correction, Edit, Origin, ReviewDecision, ReviewRequest
 from data_contracts.run import RunRecord, WaitingUnit
 from flows.corrections import new_corrections, withdrawal
+from flows.edit_conflicts import StaleEditError
 from flows.method import GATES
 from flows.prefect_environment import has_server
 from flows.run_record import latest_run
 from flows.stage import Match
-from flows.stale import StaleEditError
 from worldpose.errors import InputError
 from worldpose.review import Journal, decision_on, requests_by_id, say, unit_origins
 from worldpose.store import Store

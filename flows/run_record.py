@@ -11,6 +11,7 @@ from typing import Any, Self
 from data_contracts.run import GatePolicy, RunRecord, RunState, UnitFailure, WaitingUnit
 from flows import body_fitting, tracking, triangulation
 from flows.basis import basis_of
+from flows.edit_conflicts import EditedMeanwhileError
 from flows.gatekeeping import Gatekeeper, passed
 from flows.left_out import left_out_cameras, left_out_warnings
 from flows.method import GATES, METHOD
@@ -18,7 +19,6 @@ from flows.planning import PlannedUnit, StagePlan, plan_stage
 from flows.progress import reporter
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
-from flows.stale import EditedMeanwhileError
 from worldpose.store import Store, libraries
 
 

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, cast
 
 from data_contracts.run import GatePolicy, RunRecord
 from flows.basis import basis_of
+from flows.cluster_errors import require_room, require_workers
 from flows.gatekeeping import Gatekeeper
-from flows.lost_machines import require_machines, require_room
+from flows.local_cluster import kept_complete, starting_cluster, workers_for
 from flows.outlook import look_ahead
-from flows.own_workers import kept_complete, starting_cluster, workers_for
 from flows.planning import PlannedUnit
 from flows.prefect_environment import START_SECONDS, has_server, prefect_server
 from flows.progress import reporter
@@ -78,7 +78,7 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
     Raises:
         UsageError: no such stage, or no results to start `from_stage` from.
         InputError: the Dask scheduler or Prefect server that was named does not answer.
-        LostMachinesError: it did, and does no more.
+        LostWorkersError: it did, and does no more.
     """
     stages = selected_stages(request.from_stage, request.until_stage)
     latest = latest_run(store, match.match_id)
@@ -144,7 +144,7 @@ def _with_prefect(
             run_id = failure.run_id
         except Exception as failure:
             require_room(failure, store.url)
-            require_machines(failure)
+            require_workers(failure)
             raise
         finally:
             APILogHandler().flush()  # while the server is there to take the last lines

@@ -19,7 +19,7 @@ from worldpose.body import BodyModel, digest_of_body, find_body
 from worldpose.body_fitting import (
     BodyFit,
     BodyFittingSettings,
-    Glimpses,
+    MonocularPoses,
     Pictures,
     Shape,
     Sightings,
@@ -31,7 +31,7 @@ from worldpose.body_fitting import (
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.store import ResultWriter, Store
-from worldpose.triangulation import put_right
+from worldpose.triangulation import unswap
 
 Floats = NDArray[np.float64]
 
@@ -77,7 +77,7 @@ def open_people(store: Store, work: Work) -> ClipPeople:
     index = open_input(store, work, f"tracking/{work.recipe.unit}")["detection_index"].values
     return ClipPeople(
         clip,
-        put_right(clip.keypoints[:], index, placed["exchanged"].values),
+        unswap(clip.keypoints[:], index, placed["exchanged"].values),
         index,
         placed["person"].values,
         placed["joints"].values,
@@ -91,7 +91,7 @@ def fit_people(
     recipe: Recipe,
     *,
     views: Sequence[Sightings] = (),
-    glimpses: Glimpses | None = None,
+    glimpses: MonocularPoses | None = None,
     known: Mapping[int, Shape] | None = None,
 ) -> tuple[BodyModel, BodyFit]:
     """The bodies of a clip.

@@ -22,7 +22,7 @@ from worldpose.filtering import (
     Suspects,
     judge_detections,
     learn_from,
-    learn_habits,
+    learn_systematic_errors,
     measure_held_out,
     perceived_covariance,
     perceived_joints,
@@ -45,7 +45,7 @@ def filtering(work: Work) -> str:
         case = _open(store, work)
         chosen = _evenly(len(case.clip.frame), settings.held_out_frames)
         views, motion, suspects = case.at(chosen)
-        habits = learn_habits(
+        systematic = learn_systematic_errors(
             case.clip.cameras,
             case.joints[chosen],
             views,
@@ -56,15 +56,15 @@ def filtering(work: Work) -> str:
         )
         held = np.zeros(len(case.clip.camera_ids))
         if case.first:
-            held = habits.late_in_offsets(suspects.offsets, motion)
+            held = systematic.late_in_offsets(suspects.offsets, motion)
         placed = suspects.less_clocks(held, motion.way)
-        spread = learn_from(views, placed.without(habits.shift(motion, views)))
+        spread = learn_from(views, placed.without(systematic.shift(motion, views)))
         counts = np.zeros(5)
         rejected = np.zeros((2, len(case.clip.camera_ids)))
         for first in range(0, len(case.clip.frame), PART):
             frames = np.arange(first, min(first + PART, len(case.clip.frame)))
             views, motion, suspects = case.at(frames)
-            shift = habits.shift(motion, views)
+            shift = systematic.shift(motion, views)
             placed = suspects.less_clocks(held, motion.way)
             judged = judge_detections(views, placed.without(shift), spread, settings)
             counts += _counts(judged, suspects)
@@ -85,7 +85,7 @@ def filtering(work: Work) -> str:
         result.write(
             FILTERING,
             arrays=spool.arrays()
-            | {"view_bias": habits.view_bias.coefficient, "clock_late": habits.late},
+            | {"view_bias": systematic.view_bias.coefficient, "clock_late": systematic.late},
             coordinates={"frame": case.clip.frame, "person": case.person},
             attributes={"camera": list(case.clip.camera_ids)},
         )
@@ -93,8 +93,8 @@ def filtering(work: Work) -> str:
         figures = {name: float(count) for name, count in zip(names, counts, strict=True)}
         for c, camera in enumerate(case.clip.camera_ids):
             figures[f"rejected_share.{camera}"] = float(rejected[0, c] / max(rejected[1, c], 1.0))
-            figures[f"clock_late_frames.{camera}"] = float(habits.late[c])
-        figures["view_bias_m"] = float(np.sqrt((habits.view_bias.coefficient**2).mean()))
+            figures[f"clock_late_frames.{camera}"] = float(systematic.late[c])
+        figures["view_bias_m"] = float(np.sqrt((systematic.view_bias.coefficient**2).mean()))
         result.figures.update(figures | _held_out(store, work, case, chosen))
     return work.key
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from prefect import task
 
 from data_contracts.finetune import NetKind, NetVersion
-from worldpose.detection.embedded import EMBEDDED
+from worldpose.detection.bundled import EMBEDDED
 from worldpose.training import FineTuningSettings, read_labels
 
 LOG = logging.getLogger("worldpose.finetune")

@@ -25,9 +25,9 @@ from worldpose.detection import DetectionSettings, Place, load_pose
 from worldpose.detection.interfaces import Picture
 from worldpose.filtering import (
     BodyViews,
-    Habits,
     Spread,
     Suspects,
+    SystematicErrors,
     ViewBias,
     learn_from,
     perceived_covariance,
@@ -150,8 +150,10 @@ def _open(store: Store, work: Work) -> _Case:
     sure = perceived_covariance(bodies["covariance"].values, placed["common_bias"].values)
     views = view_bodies(one, joints, sure)
     step = np.gradient(joints, axis=0) if len(joints) > 1 else np.zeros_like(joints)
-    habits = Habits(ViewBias(said["view_bias"].values), said["clock_late"].values[[place]])
-    shift = habits.shift(watch_motion(one, joints, step), views)
+    systematic = SystematicErrors(
+        ViewBias(said["view_bias"].values), said["clock_late"].values[[place]]
+    )
+    shift = systematic.shift(watch_motion(one, joints, step), views)
     offsets = placed["offsets"].values.astype(np.float64)
     beside = shift[:, 0] + offsets[:, 0, :, None]
 

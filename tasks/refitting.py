@@ -15,11 +15,11 @@ from tasks.body_fitting import fit_people, open_people, publish_fit
 from tasks.unit import open_input, require_registered, unit_task
 from worldpose.body_fitting import (
     BodyFittingSettings,
-    Glimpses,
+    MonocularPoses,
     Shape,
     Sightings,
     between_frames,
-    place_glimpses,
+    place_monocular_poses,
     pool_shapes,
     read_monocular,
     recognise_people,
@@ -48,7 +48,7 @@ def refitting(work: Work) -> str:
         people = open_people(store, work)
         joints = open_input(store, work, f"body_fitting/{unit}")["joints"].values
         views: list[Sightings] = []
-        glimpses: Glimpses | None = None
+        glimpses: MonocularPoses | None = None
         if f"broadcast_calibration/{unit}" in work.recipe.inputs:
             pictures = _pictures(store, work, people.clip.frame)
             views = [_view(store, work, pictures, joints)]
@@ -124,7 +124,7 @@ def _view(store: Store, work: Work, pictures: _Pictures, joints: Floats) -> Sigh
     )
 
 
-def _glimpses(work: Work, pictures: _Pictures, joints: Floats) -> Glimpses | None:
+def _glimpses(work: Work, pictures: _Pictures, joints: Floats) -> MonocularPoses | None:
     """The bodies that were estimated from the pictures, where any were."""
     sources: dict[str, Any] = work.recipe.sources
     if sources["estimates"] is None:
@@ -133,9 +133,9 @@ def _glimpses(work: Work, pictures: _Pictures, joints: Floats) -> Glimpses | Non
     estimates = read_monocular(path)
     require_registered(path, sources["estimates_sha256"])
     then = between_frames(joints, pictures.late)
-    seen = place_glimpses(estimates, pictures.camera, pictures.number, then)
+    seen = place_monocular_poses(estimates, pictures.camera, pictures.number, then)
     whole = -round(pictures.late)
-    return Glimpses(between_frames(seen.orient, whole), between_frames(seen.angles, whole))
+    return MonocularPoses(between_frames(seen.orient, whole), between_frames(seen.angles, whole))
 
 
 def _known(

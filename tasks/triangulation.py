@@ -23,7 +23,7 @@ from worldpose.triangulation import (
     Triangulation,
     TriangulationSettings,
     learn_clip,
-    reconstruct_parts,
+    reconstruct_chunks,
 )
 
 
@@ -60,7 +60,7 @@ def place_joints(
     model, detections = learn_clip(clip.cameras, detections, *given)
     agreements, changes = [], []
     with spooling(store) as spool:
-        for part in reconstruct_parts(clip.cameras, detections, model, *given):
+        for part in reconstruct_chunks(clip.cameras, detections, model, *given):
             spool.add(part_arrays(part.triangulation, part.smoothing))
             agreements.append(part.triangulation.agreement)
             changes.append(part.smoothing.changes)

@@ -15,7 +15,7 @@ from prefect.client.schemas.objects import State, TaskRun
 
 from data_contracts.records import Record
 from data_contracts.work import Work
-from tasks.beginnings import survivable
+from tasks.watchdog import kill_on_timeout
 from worldpose.errors import (
     CorruptionError,
     InputError,
@@ -41,7 +41,7 @@ def unit_task(compute: Callable[[Work], str]) -> Task[[Work], str]:
         # A log line that Prefect's server does not take (a full disk) is no output of a worker.
         logging.raiseExceptions = False
         require_same_code(work)
-        with survivable(work):
+        with kill_on_timeout(work):
             try:
                 return compute(work)
             except WorldposeError:

@@ -104,8 +104,8 @@ def evaluate(
         print_ablation(ablation, as_json=as_json)
         return
     if method and reference is not None and prediction is None:
+        from flows.baselines import score_methods
         from flows.cli.methods import named_rates, print_methods
-        from flows.methods import score_methods
 
         found = score_methods(
             method,

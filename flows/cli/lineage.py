@@ -17,7 +17,7 @@ from flows.cli.console import (
 )
 from flows.comparison import KINDS, SubjectChange, compare_runs, count_marks
 from flows.lineage import explain_unit, find_run, run_difference
-from flows.moved import most_moved
+from flows.pose_diff import largest_pose_changes
 from flows.settings import parse_overrides
 from worldpose.store import Store
 
@@ -41,7 +41,7 @@ def diff(
     changes = run_difference(store, a, b)
     is_one_match = a.match_id == b.match_id
     compared = compare_runs(store, a, b) if is_one_match else []
-    pictures = most_moved(store, a, b) if is_one_match else []
+    pictures = largest_pose_changes(store, a, b) if is_one_match else []
     if as_json:
         found = {
             "units": [asdict(each) for each in changes],

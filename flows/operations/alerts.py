@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 
 from data_contracts.operations import Arrival
 from flows.operations.layout import StateFolder
-from flows.operations.overview import MatchGlance, age
+from flows.operations.overview import MatchStatus, age
 from flows.operations.plan import ServePlan
 from flows.operations.senders import Sender
 from worldpose.formats import whole_file
@@ -59,7 +59,7 @@ class FailedRun:
 
 def alerts_now(
     plan: ServePlan,
-    matches: Iterable[MatchGlance],
+    matches: Iterable[MatchStatus],
     arrivals: Iterable[Arrival],
     failed: Iterable[FailedRun],
 ) -> list[Alert]:
@@ -93,7 +93,7 @@ def alerts_now(
     return found
 
 
-def _of_match(plan: ServePlan, match: MatchGlance) -> Iterator[Alert]:
+def _of_match(plan: ServePlan, match: MatchStatus) -> Iterator[Alert]:
     run = "" if match.latest is None else match.latest.run_id
     link = f"{plan.pages}/#/match/{match.match_id}"
     for stage, unit in match.units:
@@ -107,7 +107,7 @@ def _of_match(plan: ServePlan, match: MatchGlance) -> Iterator[Alert]:
             yield Alert(f"quality/{name}/{text}", "quality", text, link, match.match_id)
 
 
-class Teller:
+class AlertDispatcher:
     """Tells of each alert once, as long as it holds; what could not be told is told later.
 
     Each sender has its own pace: `hold` says what there is to be told, and never waits; `deliver`

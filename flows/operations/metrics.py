@@ -23,7 +23,7 @@ from flows.host_guard import LOOPBACK, host_name
 from flows.http_server import Connections
 from flows.method import GATES
 from flows.operations.layout import StateFolder
-from flows.operations.overview import MatchGlance, Overview, UnitGlance, age
+from flows.operations.overview import MatchStatus, Overview, UnitGlance, age
 from flows.operations.plan import ServePlan
 from worldpose.store import Store
 
@@ -161,7 +161,7 @@ class _MetricsServer(ThreadingHTTPServer):
 
 
 def _counts(
-    name: str, about: str, label: str, states: tuple[str, ...], matches: list[MatchGlance]
+    name: str, about: str, label: str, states: tuple[str, ...], matches: list[MatchStatus]
 ) -> GaugeMetricFamily:
     found = Counter(match.state for match in matches)
     family = GaugeMetricFamily(name, about, labels=[label])
@@ -170,7 +170,7 @@ def _counts(
     return family
 
 
-def _unit_figures(matches: list[MatchGlance]) -> Iterator[Metric]:
+def _unit_figures(matches: list[MatchStatus]) -> Iterator[Metric]:
     units = GaugeMetricFamily(
         "worldpose_units", "Units of latest runs by stage and state", labels=["stage", "state"]
     )
@@ -201,7 +201,7 @@ def _unit_figures(matches: list[MatchGlance]) -> Iterator[Metric]:
     yield from (units, seconds, waits, run)
 
 
-def _quality(matches: list[MatchGlance]) -> Iterator[Metric]:
+def _quality(matches: list[MatchStatus]) -> Iterator[Metric]:
     """The figures that gates judge: the worst of a match's units, and the limit."""
     worst = GaugeMetricFamily(
         "worldpose_quality",

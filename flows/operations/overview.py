@@ -45,7 +45,7 @@ class UnitGlance:
 
 
 @dataclass(frozen=True)
-class MatchGlance:
+class MatchStatus:
     """One match.
 
     Attributes:
@@ -85,14 +85,14 @@ class Overview:
         self._manifests: dict[tuple[str, str, str], ResultManifest] = {}
         self._poses: dict[tuple[str, str], tuple[datetime, float]] = {}
 
-    def look(self) -> list[MatchGlance]:
+    def look(self) -> list[MatchStatus]:
         """Every match as it is now; one that cannot be read hides no other."""
         glances = []
         for match_id in self.store.matches():
             try:
                 glances.append(self._match(match_id))
             except (OSError, WorldposeError) as error:
-                glances.append(MatchGlance(match_id, problem=str(error)))
+                glances.append(MatchStatus(match_id, problem=str(error)))
         return glances
 
     def poses(self) -> list[tuple[datetime, float]]:
@@ -108,13 +108,13 @@ class Overview:
         self._poses = found
         return list(found.values())
 
-    def _match(self, match_id: str) -> MatchGlance:
+    def _match(self, match_id: str) -> MatchStatus:
         latest = latest_run(self.store, match_id)
         begun = self.store.unfinished_runs(match_id)
         last = "" if latest is None else latest.run_id
         at_work = [each.started_at for each in begun if each.run_id > last]
         stages = {} if latest is None else self._stages(latest)
-        return MatchGlance(match_id, latest, at_work[-1] if at_work else None, stages)
+        return MatchStatus(match_id, latest, at_work[-1] if at_work else None, stages)
 
     def _stages(self, run: RunRecord) -> dict[str, tuple[UnitGlance, ...]]:
         records = read_journal(self.store, run.match_id).questions

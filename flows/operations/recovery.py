@@ -27,7 +27,7 @@ from prefect.events.filters import (
 )
 from prefect.states import Cancelled, Crashed, Scheduled
 
-from flows.lost_machines import LostMachinesError
+from flows.cluster_errors import LostWorkersError
 from flows.operations.layout import is_alive
 from flows.operations.plan import ServePlan
 
@@ -76,7 +76,7 @@ def may_begin_again(run: FlowRun) -> bool:
     """Whether a run ended by no fault of its own: it was killed, or its machines were lost."""
     if run.state is None or run.run_count >= MOST_BEGINNINGS:
         return False
-    was_lost = LostMachinesError.__name__ in (run.state.message or "")
+    was_lost = LostWorkersError.__name__ in (run.state.message or "")
     return run.state_type == StateType.CRASHED or (run.state_type == StateType.FAILED and was_lost)
 
 

@@ -15,8 +15,8 @@ from fastapi.responses import HTMLResponse, Response
 from data_contracts.operations import Arrival
 from flows.method import METHOD
 from flows.operations.layout import served_state
-from flows.operations.overview import MatchGlance, Overview, UnitGlance, age
-from flows.pages.desk import Desk
+from flows.operations.overview import MatchStatus, Overview, UnitGlance, age
+from flows.pages.app_context import Desk
 from flows.progress import in_short
 
 WORST_FIRST: Final = ("failed", "waiting", "blocked", "done")
@@ -76,7 +76,7 @@ def routes(desk: Desk) -> APIRouter:
     return router
 
 
-def status_html(matches: Sequence[MatchGlance], arrivals: Iterable[Arrival], dashboard: str) -> str:
+def status_html(matches: Sequence[MatchStatus], arrivals: Iterable[Arrival], dashboard: str) -> str:
     """The page; every name and message is escaped.
 
     Args:
@@ -111,7 +111,7 @@ def status_html(matches: Sequence[MatchGlance], arrivals: Iterable[Arrival], das
 
 
 def _row(
-    match: MatchGlance, stages: Sequence[str], arrived: Mapping[str, Arrival], dashboard: str
+    match: MatchStatus, stages: Sequence[str], arrived: Mapping[str, Arrival], dashboard: str
 ) -> str:
     name = escape(match.match_id)
     review = f'<a href="/#/match/{quote(match.match_id, safe="")}">{name}</a>'
@@ -145,7 +145,7 @@ def _cell(units: Sequence[UnitGlance]) -> str:
     return f'<td class="{worst}">{words}{waits}{took}</td>'
 
 
-def _details(match: MatchGlance) -> str:
+def _details(match: MatchStatus) -> str:
     """Every camera and clip of a match, stage by stage."""
     rows = "".join(
         f"<tr><td>{escape(stage.replace('_', ' '))}</td><td>{escape(unit.unit)}</td>"
@@ -182,7 +182,7 @@ def _inbox(arrivals: Iterable[Arrival]) -> str:
     return f'<h2>Inbox</h2><div class="wide"><table><tr>{heads}</tr>{rows}</table></div>'
 
 
-def _as_json(match: MatchGlance) -> dict[str, Any]:
+def _as_json(match: MatchStatus) -> dict[str, Any]:
     return {
         "match": match.match_id,
         "state": match.state,

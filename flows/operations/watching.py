@@ -26,7 +26,7 @@ from prefect.client.schemas.filters import (
 from prefect.client.schemas.objects import State, StateType
 from prefect.deployments import arun_deployment
 
-from flows.operations.alerts import FailedRun, Teller, alerts_now
+from flows.operations.alerts import AlertDispatcher, FailedRun, alerts_now
 from flows.operations.arrivals import watch_once
 from flows.operations.metrics import ProjectFigures, metrics_server
 from flows.operations.overview import Overview
@@ -64,7 +64,7 @@ def watch(plan: ServePlan) -> None:
 
 
 async def _watch(plan: ServePlan, store: Store) -> None:
-    teller = Teller(plan.state_folder, senders_of(os.environ))
+    teller = AlertDispatcher(plan.state_folder, senders_of(os.environ))
     await asyncio.gather(  # each at its own pace: none waits for what another waits for
         _watch_bucket(plan),
         _watch_inbox(plan),
@@ -147,7 +147,7 @@ async def _begin_lost_runs_again(plan: ServePlan) -> None:
             await begin_again(plan)
 
 
-async def _watch_alerts(plan: ServePlan, store: Store, teller: Teller) -> None:
+async def _watch_alerts(plan: ServePlan, store: Store, teller: AlertDispatcher) -> None:
     overview = Overview(store)
     at_prefect = Trouble("asking Prefect for failed runs")
     trouble = Trouble("looking for alerts")
@@ -162,7 +162,7 @@ async def _watch_alerts(plan: ServePlan, store: Store, teller: Teller) -> None:
             await asyncio.to_thread(teller.hold, alerts_now(plan, matches, arrivals, failed))
 
 
-async def _deliver(teller: Teller, sender: Sender) -> None:
+async def _deliver(teller: AlertDispatcher, sender: Sender) -> None:
     """Hand alerts to one sender, in a thread of its own: however long it takes, nobody waits."""
     pool = ThreadPoolExecutor(1, thread_name_prefix=sender.name)
     while True:

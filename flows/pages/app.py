@@ -25,7 +25,7 @@ from flows.pages import (
     views,
 )
 from flows.pages.access import NAME_LENGTH, SESSION_SECONDS, Access
-from flows.pages.desk import Desk, Person
+from flows.pages.app_context import Desk, Person
 from flows.pages.errors import add_answers
 from flows.pages.guard import Guard
 from worldpose.store import Store

@@ -12,7 +12,7 @@ from data_contracts.review import Edit
 from data_contracts.run import GatePolicy
 from flows.cli.review_text import correction_json
 from flows.corrections import keep_edits
-from flows.pages.desk import Desk, Person
+from flows.pages.app_context import Desk, Person
 from flows.review import decide, still_waiting, withdraw
 from flows.run_record import latest_run
 

@@ -15,7 +15,7 @@ from data_contracts.records import Record
 from flows.acceptance import accept, left_to_look_at
 from flows.detections import detections_now
 from flows.match_pictures import frame_picture
-from flows.pages.desk import Desk, Person
+from flows.pages.app_context import Desk, Person
 from flows.stage import Match
 from worldpose.errors import InputError
 from worldpose.ingest import Observations

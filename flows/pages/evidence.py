@@ -20,7 +20,7 @@ from flows.broadcast_reporting import broadcast_pictures, broadcast_tables
 from flows.camera_reporting import camera_evidence
 from flows.clip_reporting import clip_pictures, detection_pictures
 from flows.clip_video import clip_view, write_clip_video
-from flows.pages.desk import Desk
+from flows.pages.app_context import Desk
 from flows.people_reporting import adjustment_tables, body_tables
 from flows.release import placed_joints, static_cameras
 from flows.stage import Match

@@ -10,7 +10,7 @@ from fastapi.responses import Response
 from numpy.typing import NDArray
 
 from flows.identities import identities_now
-from flows.pages.desk import Desk
+from flows.pages.app_context import Desk
 from flows.release import static_cameras
 from flows.stage import Match
 from worldpose.ingest import unit_frames

@@ -12,7 +12,7 @@ from fastapi import APIRouter, HTTPException
 from data_contracts.conventions import COCO17
 from data_contracts.review import DeletedDetection, MovedKeypoint, MovedPoint
 from flows.detection import seen_by
-from flows.pages.desk import Desk
+from flows.pages.app_context import Desk
 from flows.release import ADJUSTED
 from flows.stage import Match
 from worldpose.review import requests_by_id, value_now

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from data_contracts.conventions import COCO17
 from flows.detections import detections_now
 from flows.identities import identities_now
-from flows.pages.desk import Desk
+from flows.pages.app_context import Desk
 from flows.release import static_cameras
 from flows.stage import Match
 from worldpose.cameras import Camera

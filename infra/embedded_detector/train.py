@@ -21,9 +21,9 @@ import torch
 from scenes import CHECKING, CROWDS, HELD_OUT, TRAINING, VARIETY, read_set, render_set
 
 from worldpose.detection import DetectionSettings
-from worldpose.detection.embedded import EmbeddedDetector, EmbeddedPose
-from worldpose.detection.embedded_nets import KeypointNet, PeopleNet
-from worldpose.detection.embedded_weights import load_weights, save_weights
+from worldpose.detection.bundled import EmbeddedDetector, EmbeddedPose
+from worldpose.detection.bundled_nets import KeypointNet, PeopleNet
+from worldpose.detection.bundled_weights import load_weights, save_weights
 from worldpose.training import LabelledPicture, PictureCache, TrainingSettings
 from worldpose.training.nets import LEAST_HEIGHT, train_keypoint_net, train_people_net
 from worldpose.training.scoring import HEIGHTS, apart, found_people, score_keypoints, score_people

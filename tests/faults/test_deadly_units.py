@@ -16,8 +16,8 @@ UNIT = "ingest/cam01"
     ("how", "error", "said"),
     [
         # A worker's first unit took 5 s on two busy cores.
-        ("hang", "OvertimeError", "stopped 2 times, each time after 0.5 minutes"),
-        ("die", "DeadlyUnitError", "its process ended 3 times"),
+        ("hang", "TaskTimeoutError", "stopped 2 times, each time after 0.5 minutes"),
+        ("die", "WorkerCrashError", "its process ended 3 times"),
     ],
 )
 def test_a_deadly_unit_is_given_up_and_named_and_the_others_finish(

@@ -9,7 +9,7 @@ import pytest
 from command_line import worldpose
 
 from flows import prefect_database
-from flows.lost_machines import require_room
+from flows.cluster_errors import require_room
 from flows.prefect_database import begin_database
 from worldpose.errors import MemoryLimitError, StoreError, require_memory
 from worldpose.synthetic import SCENARIOS, simulate_match

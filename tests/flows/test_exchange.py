@@ -9,9 +9,9 @@ import pytest
 from command_line import TINY
 
 from flows.detections import detections_now
+from flows.edit_conflicts import StaleEditError
 from flows.exchange import export_people, import_people
 from flows.registering import open_match
-from flows.stale import StaleEditError
 from worldpose.errors import InputError, UsageError
 from worldpose.exchange import FORMATS, read_annotations, write_annotations
 from worldpose.store import Store

@@ -28,7 +28,7 @@ from flows.prefect_environment import (
     CLIENT_LOGIN,
     SERVER_LOGIN,
     authorization,
-    local_cluster,
+    local_cluster_options,
     one_authority,
     prefect_server,
     require_login,
@@ -226,7 +226,7 @@ def listening():
 
 def test_own_workers_serve_their_run_alone():
     before = listening()
-    with PrivateCluster(**local_cluster(1)) as cluster, Client(cluster) as client:
+    with PrivateCluster(**local_cluster_options(1)) as cluster, Client(cluster) as client:
         assert client.submit(sum, [1, 2]).result() == 3
         address = cluster.scheduler_address
         plain = {"timeout": 5, "set_as_default": False}

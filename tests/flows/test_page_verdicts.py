@@ -13,8 +13,8 @@ from page_client import MATCH
 from data_contracts.review import ReviewRequest
 from flows.clip_video import clip_view
 from flows.pages import continuing
+from flows.pages.app_context import Desk
 from flows.pages.continuing import Continuing
-from flows.pages.desk import Desk
 from flows.registering import open_match
 from flows.running import RunRequest, run_match
 from worldpose.review import say

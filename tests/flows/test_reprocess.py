@@ -14,13 +14,13 @@ from data_contracts.run import UnitFailure
 from flows import planning, reprocessing
 from flows.cli.app import app
 from flows.cli.reprocess import exit_code
+from flows.edit_conflicts import edits_since
 from flows.method import METHOD
 from flows.registering import open_match, register
 from flows.reprocess import UnprocessedError, reprocess
 from flows.reprocessing import Reprocessed, reprocess_matches
 from flows.review import correct
 from flows.running import RunRequest
-from flows.stale import edits_since
 from flows.touched import find_touched
 from flows.tracking import STAGE
 from worldpose.errors import InputError

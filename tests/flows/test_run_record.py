@@ -7,6 +7,7 @@ from command_line import TINY
 
 from data_contracts.review import MergedTracks
 from flows import iteration, run_record
+from flows.edit_conflicts import EditedMeanwhileError
 from flows.gates import IDENTITIES, IdentityLimits
 from flows.iteration import Iteration, iterate_match
 from flows.method import METHOD
@@ -14,7 +15,6 @@ from flows.registering import open_match
 from flows.review import correct
 from flows.run_record import RunLog
 from flows.running import RunRequest
-from flows.stale import EditedMeanwhileError
 from flows.touched import find_touched
 from worldpose.store import Store
 

@@ -9,7 +9,7 @@ from threading import Thread
 
 import pytest
 
-from flows.operations.alerts import Alert, Teller
+from flows.operations.alerts import Alert, AlertDispatcher
 from flows.operations.layout import StateFolder
 from flows.operations.senders import Mail, Webhook, senders_of
 from worldpose.errors import UsageError
@@ -91,8 +91,8 @@ def post_office():
 def test_an_alert_is_a_letter_to_all_who_are_named(post_office, tmp_path):
     server = post_office()
     mail = Mail.at(f"smtp://127.0.0.1:{server.port}/?to=ann@example.org&to=bo@example.org")
-    assert Teller(StateFolder(tmp_path), [mail]).tell([ALERT, ALERT]) == [ALERT]
-    assert Teller(StateFolder(tmp_path), [mail]).tell([ALERT]) == []
+    assert AlertDispatcher(StateFolder(tmp_path), [mail]).tell([ALERT, ALERT]) == [ALERT]
+    assert AlertDispatcher(StateFolder(tmp_path), [mail]).tell([ALERT]) == []
     (letter,) = server.letters
     assert letter["to"] == ["ann@example.org", "bo@example.org"]
     assert letter["from"] == "ann@example.org"
@@ -121,7 +121,7 @@ def test_a_password_goes_under_tls_alone(post_office, localhost_tls, tmp_path, m
     secure, plain = post_office(tls), post_office()
     who = "ann:a%40secret@localhost"
     mail = Mail.at(f"smtps://{who}:{secure.port}/?to=ann@example.org&from=worldpose@example.org")
-    teller = Teller(StateFolder(tmp_path / "one"), [mail], pause=0.0)
+    teller = AlertDispatcher(StateFolder(tmp_path / "one"), [mail], pause=0.0)
     assert teller.tell([ALERT]) == []
     assert secure.logins == [], "a certificate that nobody vouches for was taken"
     monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
@@ -129,7 +129,7 @@ def test_a_password_goes_under_tls_alone(post_office, localhost_tls, tmp_path, m
     assert secure.logins == [("ann", "a@secret")]
     assert secure.letters[0]["from"] == "worldpose@example.org"
     bare = Mail.at(f"smtp://{who}:{plain.port}/?to=ann@example.org")
-    assert Teller(StateFolder(tmp_path / "two"), [bare]).tell([ALERT]) == []
+    assert AlertDispatcher(StateFolder(tmp_path / "two"), [bare]).tell([ALERT]) == []
     assert (plain.logins, plain.letters) == ([], [])
     assert "secret" not in caplog.text
 
@@ -140,7 +140,7 @@ def test_a_server_that_offers_starttls_gets_log_in_and_letter_under_it(
     tls, certificate = localhost_tls
     server = post_office(tls, is_asked_for_tls=True)
     mail = Mail.at(f"smtp://ann:a%40secret@localhost:{server.port}/?to=ann@example.org")
-    teller = Teller(StateFolder(tmp_path), [mail], pause=0.0)
+    teller = AlertDispatcher(StateFolder(tmp_path), [mail], pause=0.0)
     assert teller.tell([ALERT]) == []
     # A certificate that nobody vouches for was refused: nothing was said after it.
     assert server.verbs == ["EHLO", "STARTTLS"]
@@ -158,7 +158,7 @@ def test_each_way_is_told_once_though_another_fails(post_office, tmp_path):
     server.answers += ["451 later"]
     mail = Mail.at(f"smtp://127.0.0.1:{server.port}/?to=ann@example.org")
     senders = [Webhook("http://127.0.0.1:9/"), mail]
-    teller = Teller(StateFolder(tmp_path), senders, pause=0.0)
+    teller = AlertDispatcher(StateFolder(tmp_path), senders, pause=0.0)
     assert teller.tell([ALERT]) == []
     assert server.letters == []
     assert teller.tell([ALERT]) == []

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import pytest
 
 from data_contracts.operations import Arrival
-from flows.operations.alerts import Alert, FailedRun, Teller, alerts_now
+from flows.operations.alerts import Alert, AlertDispatcher, FailedRun, alerts_now
 from flows.operations.layout import StateFolder
-from flows.operations.overview import MatchGlance, UnitGlance
+from flows.operations.overview import MatchStatus, UnitGlance
 from flows.operations.plan import ServePlan
 from flows.operations.senders import Webhook, senders_of
 from flows.operations.watching import Trouble
@@ -36,7 +36,7 @@ def kinds(alerts):
 
 
 def test_each_matter_is_posted_once_as_json_with_text(webhook, tmp_path):
-    teller = Teller(StateFolder(tmp_path), [Webhook(webhook.address)])
+    teller = AlertDispatcher(StateFolder(tmp_path), [Webhook(webhook.address)])
     alert = Alert("disk_low", "disk_low", "3.0 GB are free", "http://127.0.0.1:8571/status")
     assert teller.tell([alert]) == [alert]
     assert teller.tell([alert]) == []
@@ -46,7 +46,7 @@ def test_each_matter_is_posted_once_as_json_with_text(webhook, tmp_path):
         {"alert": "disk_low", "match": "", "text": "3.0 GB are free", "link": alert.link},
     )
     # A restart repeats nothing; what was over and is again is a new matter.
-    again = Teller(StateFolder(tmp_path), [Webhook(webhook.address)])
+    again = AlertDispatcher(StateFolder(tmp_path), [Webhook(webhook.address)])
     assert again.tell([alert]) == []
     assert again.tell([]) == []
     assert again.tell([alert]) == [alert]
@@ -56,12 +56,19 @@ def test_each_matter_is_posted_once_as_json_with_text(webhook, tmp_path):
 def test_what_the_webhook_did_not_take_is_posted_again(webhook, tmp_path, caplog):
     alert = Alert("disk_low", "disk_low", "little")
     webhook.codes += [500]
-    teller = Teller(StateFolder(tmp_path), [Webhook(webhook.address)])
+    teller = AlertDispatcher(StateFolder(tmp_path), [Webhook(webhook.address)])
     assert teller.tell([alert]) == []
-    assert Teller(StateFolder(tmp_path), [Webhook("http://127.0.0.1:9/secret")]).tell([alert]) == []
-    assert Teller(StateFolder(tmp_path), [Webhook("no address")]).tell([alert]) == []
-    assert Teller(StateFolder(tmp_path), [Webhook("file:///etc/passwd")]).tell([alert]) == []
-    assert Teller(StateFolder(tmp_path), [Webhook(webhook.address)]).tell([alert]) == [alert]
+    assert (
+        AlertDispatcher(StateFolder(tmp_path), [Webhook("http://127.0.0.1:9/secret")]).tell([alert])
+        == []
+    )
+    assert AlertDispatcher(StateFolder(tmp_path), [Webhook("no address")]).tell([alert]) == []
+    assert (
+        AlertDispatcher(StateFolder(tmp_path), [Webhook("file:///etc/passwd")]).tell([alert]) == []
+    )
+    assert AlertDispatcher(StateFolder(tmp_path), [Webhook(webhook.address)]).tell([alert]) == [
+        alert
+    ]
     assert len(webhook.posted) == 2
     assert "secret" not in caplog.text
 
@@ -86,7 +93,7 @@ def test_a_silent_webhook_is_asked_once_and_then_left_for_a_while(
     monkeypatch.setattr(
         "flows.operations.alerts.time", SimpleNamespace(monotonic=lambda: clock.now)
     )
-    teller = Teller(StateFolder(tmp_path), [Webhook(silent)])
+    teller = AlertDispatcher(StateFolder(tmp_path), [Webhook(silent)])
     for _ in range(2880):  # a day of looks
         clock.now += 30.0
         teller.tell(many(60))
@@ -104,7 +111,7 @@ def test_a_silent_webhook_keeps_no_mail_from_being_sent(silent, tmp_path):
             self.taken.append(content["text"])
 
     box, hook = Box(), Webhook(silent)
-    teller = Teller(StateFolder(tmp_path), [hook, box])
+    teller = AlertDispatcher(StateFolder(tmp_path), [hook, box])
     teller.hold(many(60))
     waiting = Thread(target=teller.deliver, args=[hook], daemon=True)
     waiting.start()
@@ -115,7 +122,7 @@ def test_a_silent_webhook_keeps_no_mail_from_being_sent(silent, tmp_path):
 
 
 def test_delivery_stops_at_the_first_failure_and_goes_on_after_it(webhook, tmp_path, caplog):
-    teller = Teller(StateFolder(tmp_path), [Webhook(webhook.address)], pause=0.0)
+    teller = AlertDispatcher(StateFolder(tmp_path), [Webhook(webhook.address)], pause=0.0)
     webhook.codes += [204, 500]
     assert [each.key for each in teller.tell(many(5))] == ["0"]
     assert len(webhook.posted) == 2
@@ -128,7 +135,7 @@ def test_delivery_stops_at_the_first_failure_and_goes_on_after_it(webhook, tmp_p
 
 def test_a_redirect_is_a_failure_and_is_not_followed(webhook, tmp_path):
     webhook.codes += [302, 307]
-    teller = Teller(StateFolder(tmp_path), [Webhook(webhook.address)], pause=0.0)
+    teller = AlertDispatcher(StateFolder(tmp_path), [Webhook(webhook.address)], pause=0.0)
     assert teller.tell(many(1)) == []
     assert teller.tell(many(1)) == []
     assert len(webhook.posted) == 2
@@ -147,7 +154,7 @@ def test_an_address_that_is_no_web_address_is_refused_at_start(address):
 
 def test_damaged_notes_of_what_was_told_are_begun_anew(webhook, tmp_path):
     (tmp_path / "alerts.json").write_text('{"disk_low": ')
-    teller = Teller(StateFolder(tmp_path), [Webhook(webhook.address)])
+    teller = AlertDispatcher(StateFolder(tmp_path), [Webhook(webhook.address)])
     assert len(teller.tell(many(1))) == 1
 
 
@@ -169,7 +176,7 @@ def test_a_question_is_no_alert_before_its_time(plan):
     def waiting(hours):
         since = datetime.now(UTC) - timedelta(hours=hours)
         unit = UnitGlance("cam04", "waiting", waiting_since=since, why="clicks_wrong is 1")
-        return [MatchGlance("m", stages={"static_calibration": (unit,)})]
+        return [MatchStatus("m", stages={"static_calibration": (unit,)})]
 
     assert alerts_now(plan, waiting(0.9), [], []) == []
     (alert,) = alerts_now(plan, waiting(1.1), [], [])
@@ -181,7 +188,7 @@ def test_a_question_is_no_alert_before_its_time(plan):
 
 def test_quality_refusals_failed_runs_and_a_full_disk_are_alerts(plan):
     unit = UnitGlance("clip", "done", objections=("offset_rms_m is 0.05, at most 0.03 passes",))
-    match = MatchGlance("m", stages={"body_fitting": (unit,)})
+    match = MatchStatus("m", stages={"body_fitting": (unit,)})
     assert kinds(alerts_now(plan, [match], [], [])) == ["quality"]
     arrivals = [
         Arrival(name=state, state=state, reason="it is a link", changed_at=NOW)
@@ -197,4 +204,4 @@ def test_quality_refusals_failed_runs_and_a_full_disk_are_alerts(plan):
 
 def test_a_good_match_raises_nothing(plan):
     unit = UnitGlance("clip", "done", 1.0, {"offset_rms_m": 0.01})
-    assert alerts_now(plan, [MatchGlance("m", stages={"body_fitting": (unit,)})], [], []) == []
+    assert alerts_now(plan, [MatchStatus("m", stages={"body_fitting": (unit,)})], [], []) == []

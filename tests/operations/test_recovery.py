@@ -12,7 +12,7 @@ from prefect.states import Completed, Crashed, Failed, Pending, Running
 from flows.operations import recovery
 from flows.operations.recovery import MOST_BEGINNINGS, may_begin_again
 
-LOST = "Flow run encountered an exception: LostMachinesError: the Dask scheduler was lost"
+LOST = "Flow run encountered an exception: LostWorkersError: the Dask scheduler was lost"
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from command_line import TINY
 from prometheus_client.parser import text_string_to_metric_families
 
 from data_contracts.operations import Arrival
-from flows.operations.alerts import Alert, Teller
+from flows.operations.alerts import Alert, AlertDispatcher
 from flows.operations.layout import StateFolder
 from flows.operations.metrics import ProjectFigures, exposition, metrics_server
 from flows.operations.overview import Overview
@@ -39,7 +39,7 @@ def served(project_copy):
     now = datetime.now(UTC)
     for name, known in (("a", "taken"), ("b", "refused"), ("c", "refused")):
         state.write_arrival(Arrival(name=name, state=known, changed_at=now))
-    Teller(state, []).tell([Alert("disk_low", "disk_low", "little")])
+    AlertDispatcher(state, []).tell([Alert("disk_low", "disk_low", "little")])
     plan = ServePlan(
         project=str(project_copy),
         inbox=project_copy / "inbox",

@@ -8,7 +8,7 @@ from command_line import TINY
 
 from data_contracts.operations import Arrival
 from flows.operations.layout import StateFolder
-from flows.operations.overview import MatchGlance, Overview, UnitGlance
+from flows.operations.overview import MatchStatus, Overview, UnitGlance
 from flows.operations.status_page import STYLE, status_html
 from flows.pages.access import access_for
 from flows.pages.app import create_app
@@ -66,7 +66,7 @@ def test_a_match_that_cannot_be_read_hides_no_other(project_copy):
     damaged.write_bytes(damaged.read_bytes().replace(b"complete", b"complote"))
     (match,) = Overview(store).look()
     assert match.state == "unreadable"
-    text = status_html([match, MatchGlance("other")], [], "")
+    text = status_html([match, MatchStatus("other")], [], "")
     assert "other" in text
     assert "0001.json" in text
 
@@ -77,7 +77,7 @@ def test_the_worst_state_of_a_stage_is_what_is_seen():
         UnitGlance("cam01", "waiting", 2.0, waiting_since=datetime.now(UTC)),
         UnitGlance("cam02", "failed", why=EVIL),
     )
-    match = MatchGlance("m", stages={"ingest": units[:1], "static_calibration": units})
+    match = MatchStatus("m", stages={"ingest": units[:1], "static_calibration": units})
     run = "1f2e"
     text = status_html([match], [arrival(match_id="m", flow_run=run)], "http://127.0.0.1:4200")
     assert '<td class="failed">1/3 done<br>1 failed<br>1 waiting' in text

@@ -13,20 +13,20 @@ from worldpose.body_fitting.bones import (
 )
 from worldpose.body_fitting.figures import BodyFittingReport, Pictures, report_fit
 from worldpose.body_fitting.fitting import BodyFit, fit_bodies
-from worldpose.body_fitting.glimpses import Glimpses, place_glimpses
 from worldpose.body_fitting.monocular import MonocularEstimates, read_monocular
+from worldpose.body_fitting.monocular_poses import MonocularPoses, place_monocular_poses
 from worldpose.body_fitting.moving_view import between_frames, recognise_people, sight_people
+from worldpose.body_fitting.ray_constraints import Sightings, find_sightings
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shared_bias import far_offsets
-from worldpose.body_fitting.sightings import Sightings, find_sightings
 
 __all__ = [
     "BodyFit",
     "BodyFittingReport",
     "BodyFittingSettings",
     "BoneLengths",
-    "Glimpses",
     "MonocularEstimates",
+    "MonocularPoses",
     "Pictures",
     "Shape",
     "Sightings",
@@ -36,7 +36,7 @@ __all__ = [
     "fit_bodies",
     "fit_shape",
     "measure_bones",
-    "place_glimpses",
+    "place_monocular_poses",
     "pool_shapes",
     "read_monocular",
     "recognise_people",

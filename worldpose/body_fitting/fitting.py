@@ -18,14 +18,19 @@ from worldpose.body_fitting.banded import BandedFactor
 from worldpose.body_fitting.bones import Shape
 from worldpose.body_fitting.evidence import Evidence
 from worldpose.body_fitting.feet import Ground
-from worldpose.body_fitting.glimpses import Glimpses
-from worldpose.body_fitting.guidance import Guidance, carry_errors, deviations, learn_precision
+from worldpose.body_fitting.monocular_poses import MonocularPoses
+from worldpose.body_fitting.monocular_prior import (
+    Guidance,
+    carry_errors,
+    deviations,
+    learn_precision,
+)
 from worldpose.body_fitting.objective import Pose
 from worldpose.body_fitting.pose_space import GATHER, SPREAD, load_pose_prior
+from worldpose.body_fitting.ray_constraints import Sightings
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shaping import Shapes, fit_shapes
 from worldpose.body_fitting.shared_bias import body_axes
-from worldpose.body_fitting.sightings import Sightings
 from worldpose.body_fitting.solving import Solver
 from worldpose.errors import InputError
 
@@ -77,7 +82,7 @@ def fit_bodies(
     ground: Ground | None = None,
     known: Mapping[int, Shape] | None = None,
     sightings: Sequence[Sightings] = (),
-    glimpses: Glimpses | None = None,
+    glimpses: MonocularPoses | None = None,
     common_bias: Floats | None = None,
 ) -> BodyFit:
     """Return the bodies that explain everybody's triangulated joints (S1-S3).
@@ -167,7 +172,7 @@ def _guide(
     result: _Result,
     joint_seen: NDArray[np.bool_],
     covariance: Floats,
-    glimpses: Glimpses,
+    glimpses: MonocularPoses,
     spans: Mapping[int, slice],
     fps: float,
 ) -> dict[int, Guidance]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from worldpose.body_fitting.sightings import Sightings, lines_of_sight
+from worldpose.body_fitting.ray_constraints import Sightings, lines_of_sight
 from worldpose.cameras import Camera
 
 Floats = NDArray[np.float64]

@@ -19,7 +19,7 @@ from worldpose.body import BodyParameters
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body_fitting.evidence import Evidence
 from worldpose.body_fitting.feet import ANKLES, Contacts
-from worldpose.body_fitting.guidance import Guidance
+from worldpose.body_fitting.monocular_prior import Guidance
 from worldpose.body_fitting.pose_space import HIGHEST, LOWEST, SIZE, SPREAD, PosePrior
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shared_bias import MIRRORED_OFFSETS, body_axes

@@ -15,7 +15,7 @@ from worldpose.body_fitting.banded import BandedFactor
 from worldpose.body_fitting.bones import Shape
 from worldpose.body_fitting.evidence import Evidence
 from worldpose.body_fitting.feet import Ground, ankle_height, find_contacts, level_feet
-from worldpose.body_fitting.guidance import Guidance
+from worldpose.body_fitting.monocular_prior import Guidance
 from worldpose.body_fitting.objective import LIVELINESS, UNKNOWNS, Pose, Track
 from worldpose.body_fitting.pose_space import PosePrior
 from worldpose.body_fitting.settings import BodyFittingSettings

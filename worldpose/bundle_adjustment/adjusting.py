@@ -20,7 +20,7 @@ from worldpose.bundle_adjustment.clip import Clip, Observed, observe, with_learn
 from worldpose.bundle_adjustment.contradictions import Contradictions, find_contradictions
 from worldpose.bundle_adjustment.frames import propose_frames
 from worldpose.bundle_adjustment.gauge import align_points, relative_covariance
-from worldpose.bundle_adjustment.guard import (
+from worldpose.bundle_adjustment.held_out_validation import (
     Evidence,
     HeldOut,
     Verdict,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from worldpose.bundle_adjustment.building import camera_knowledge, known_covariance
 from worldpose.bundle_adjustment.clip import Clip, keypoints_of, predict
-from worldpose.bundle_adjustment.guard import HeldOut, joints_without
+from worldpose.bundle_adjustment.held_out_validation import HeldOut, joints_without
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.bundle_adjustment.solving import Adjusted, Problem, solve
 from worldpose.errors import InputError

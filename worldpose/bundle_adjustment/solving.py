@@ -12,7 +12,13 @@ from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
 from scipy.linalg.blas import dsyrk
 
 from data_contracts.records import Record
-from worldpose.bundle_adjustment.elimination import STEPS, Evidence, cost, eliminate, substitute
+from worldpose.bundle_adjustment.schur_complement import (
+    STEPS,
+    Evidence,
+    cost,
+    eliminate,
+    substitute,
+)
 from worldpose.cameras import Camera
 from worldpose.errors import InputError, InternalError
 from worldpose.static_calibration import stepped

@@ -39,7 +39,7 @@ def load_pose(settings: DetectionSettings) -> PoseEstimator:
 def _pose(settings: DetectionSettings) -> PoseEstimator:
     kind, path = _parted(settings.pose)
     if kind == "embedded":
-        from worldpose.detection.embedded import embedded_pose
+        from worldpose.detection.bundled import embedded_pose
 
         return embedded_pose(path, settings.device, settings.half)
     assert path is not None  # as parted
@@ -55,7 +55,7 @@ def _pose(settings: DetectionSettings) -> PoseEstimator:
 def _detector(name: str, settings: DetectionSettings) -> Detector:
     kind, path = _parted(name)
     if kind == "embedded":
-        from worldpose.detection.embedded import embedded_detector
+        from worldpose.detection.bundled import embedded_detector
 
         return embedded_detector(path, settings.device, settings.half)
     assert path is not None  # as parted

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17, COCO17_BONES
 from data_contracts.triangulation import EXCHANGED_PARTS
-from worldpose.filtering.misses import Misses
+from worldpose.filtering.residuals import Residuals
 from worldpose.filtering.settings import FilteringSettings
 from worldpose.filtering.spread import Spread, learn_spread
 from worldpose.filtering.views import BodyViews
@@ -143,9 +143,9 @@ def learn_from(views: BodyViews, suspects: Suspects) -> Spread:
     return learn_spread(rows.squared, rows.stated, rows.known, rows.confidence)
 
 
-def misses_of(
+def body_residuals(
     views: BodyViews, suspects: Suspects, judged: Judgement, spread: Spread, repeated: float
-) -> Misses:
+) -> Residuals:
     """Return by how much keypoints miss the bodies of those they were taken for, if these fit.
 
     What a camera sees people beside of is not taken off: clocks are in it.
@@ -164,7 +164,7 @@ def misses_of(
     wrong |= (judged.fits[frame, camera, place] != person)[:, None]
     missed = np.where(wrong[..., None], np.nan, rows.pixels - rows.image)
     variance = spread.factor(rows.confidence) * rows.stated + rows.known
-    return Misses(frame, camera, person, missed, variance, repeated)
+    return Residuals(frame, camera, person, missed, variance, repeated)
 
 
 def judge_detections(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from worldpose.body_fitting.shared_bias import body_axes
 from worldpose.cameras import Camera
-from worldpose.filtering.misses import Misses
+from worldpose.filtering.residuals import Residuals
 
 Floats = NDArray[np.float64]
 
@@ -71,17 +71,17 @@ def find_azimuths(cameras: Camera, joints: Floats) -> Floats:
     return np.asarray(np.arctan2(left, ahead))
 
 
-def learn_view_bias(misses: Misses, azimuth: Floats, scale: Floats) -> ViewBias:
+def learn_view_bias(residuals: Residuals, azimuth: Floats, scale: Floats) -> ViewBias:
     """Return the bias that goes with the direction of the view, by linear least squares.
 
     Args:
-        misses: of bodies.
+        residuals: of bodies.
         azimuth: (n,) [rad], of each row.
         scale: (n,) [px/m].
     """
-    weight = misses.weight * (np.isfinite(azimuth) & np.isfinite(scale))[:, None]
+    weight = residuals.weight * (np.isfinite(azimuth) & np.isfinite(scale))[:, None]
     waves = np.nan_to_num(_waves(azimuth) * scale[:, None])
-    missed = np.where(weight[..., None] > 0.0, misses.missed, 0.0)
+    missed = np.where(weight[..., None] > 0.0, residuals.missed, 0.0)
     matrix = np.einsum("nw,nj,nv->jwv", waves, weight, waves, optimize=True)
     right = np.einsum("nw,nj,nja->jwa", waves, weight, missed, optimize=True)
     matrix = matrix + np.eye(TERMS) / EXPECTED**2

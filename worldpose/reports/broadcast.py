@@ -89,7 +89,7 @@ def _curves(camera: Camera) -> dict[str, Floats]:
     }
 
 
-def most_moved(before: Camera, after: Camera, tracks: JointTracks) -> tuple[int, int]:
+def largest_pose_changes(before: Camera, after: Camera, tracks: JointTracks) -> tuple[int, int]:
     """Return the place in the clip and the person whom two cameras see farthest apart.
 
     Among people well inside the picture; (0, 0) where there are none.

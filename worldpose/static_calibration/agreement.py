@@ -13,10 +13,7 @@ from numpy.typing import NDArray
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.adjustment import Problem, camera_of_row, row_of
-from worldpose.static_calibration.bending import tangent_at
-from worldpose.static_calibration.line_refinement import LineRefinement, refine_on_lines
-from worldpose.static_calibration.parameters import CameraEstimate
-from worldpose.static_calibration.screening import (
+from worldpose.static_calibration.click_outliers import (
     Screened,
     at_noise,
     noise_of,
@@ -24,8 +21,11 @@ from worldpose.static_calibration.screening import (
     screen,
     surprise_at,
 )
+from worldpose.static_calibration.curvature_correction import tangent_at
+from worldpose.static_calibration.ill_conditioned import fit_and_bends
+from worldpose.static_calibration.line_refinement import LineRefinement, refine_on_lines
+from worldpose.static_calibration.parameters import CameraEstimate
 from worldpose.static_calibration.settings import StaticCalibrationSettings
-from worldpose.static_calibration.valley import fit_and_bends
 
 _WIDER: Final = (2.0, 4.0)
 """Factors on the noise of clicks that do not lead to the lines [1]; none is believed to be worse

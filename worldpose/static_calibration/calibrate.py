@@ -28,11 +28,7 @@ from worldpose.static_calibration.checks import (
     has_enough_points,
     is_suspicious,
 )
-from worldpose.static_calibration.evidence import gather
-from worldpose.static_calibration.parameters import PARAMETERS, CameraEstimate
-from worldpose.static_calibration.report import StaticCalibration
-from worldpose.static_calibration.reporting import report_of
-from worldpose.static_calibration.screening import (
+from worldpose.static_calibration.click_outliers import (
     CLEAR_GAIN,
     Screened,
     at_noise,
@@ -41,8 +37,12 @@ from worldpose.static_calibration.screening import (
     screen,
     screen_at_best_noise,
 )
+from worldpose.static_calibration.evidence import gather
+from worldpose.static_calibration.initialization import from_homographies, plausible_cameras
+from worldpose.static_calibration.parameters import PARAMETERS, CameraEstimate
+from worldpose.static_calibration.report import StaticCalibration
+from worldpose.static_calibration.reporting import report_of
 from worldpose.static_calibration.settings import StaticCalibrationSettings
-from worldpose.static_calibration.starts import from_homographies, plausible_cameras
 
 _COARSE: Final = 60.0
 """Cauchy scale of all residuals while starts compete [standard deviations]: the pull of what is

@@ -12,18 +12,18 @@ from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.pitch.laws import law_points
 from worldpose.static_calibration.adjustment import Problem, adjust, camera_of_row
-from worldpose.static_calibration.advice import most_helpful, off_the_line
-from worldpose.static_calibration.evidence import Evidence
-from worldpose.static_calibration.parameters import CameraEstimate
-from worldpose.static_calibration.screening import (
+from worldpose.static_calibration.click_outliers import (
     Screened,
     at_noise,
     improbability,
     screen,
     screen_at_best_noise,
 )
+from worldpose.static_calibration.evidence import Evidence
+from worldpose.static_calibration.initialization import from_homographies, plausible_cameras
+from worldpose.static_calibration.next_click import most_helpful, off_the_line
+from worldpose.static_calibration.parameters import CameraEstimate
 from worldpose.static_calibration.settings import StaticCalibrationSettings
-from worldpose.static_calibration.starts import from_homographies, plausible_cameras
 
 _POINTS: Final = 4
 """Fewest clicked points without a drawn marking [1]: a homography's."""

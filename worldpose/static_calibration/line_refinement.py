@@ -18,8 +18,8 @@ from scipy.special import chdtrc
 from worldpose.cameras import Camera
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration.bars import Bars
 from worldpose.static_calibration.edges import brightness
+from worldpose.static_calibration.line_profiles import Bars
 from worldpose.static_calibration.line_samples import (
     sample_markings,
     thinned,

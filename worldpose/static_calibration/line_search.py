@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from worldpose.cameras import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.bar_fits import fit_bars
-from worldpose.static_calibration.bars import Bars
 from worldpose.static_calibration.clearance import clear, whites_of
 from worldpose.static_calibration.edges import BESIDE, CANDIDATES, find_bars
 from worldpose.static_calibration.line_adjustment import Adjusted, adjust
+from worldpose.static_calibration.line_profiles import Bars
 from worldpose.static_calibration.line_samples import LineSamples, SeenLines, see_lines
 from worldpose.static_calibration.line_settings import LineRefinementSettings
 from worldpose.static_calibration.parameters import CameraEstimate, stepped

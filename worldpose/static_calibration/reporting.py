@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from worldpose.cameras import Camera, RayStatus
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.adjustment import Problem, row_of
-from worldpose.static_calibration.advice import most_helpful
+from worldpose.static_calibration.click_outliers import Screened, residual_rows
 from worldpose.static_calibration.ground_error import ground_error_map
 from worldpose.static_calibration.line_refinement import LineRefinement
+from worldpose.static_calibration.next_click import most_helpful
 from worldpose.static_calibration.parameters import PARAMETERS, CameraEstimate
 from worldpose.static_calibration.report import (
     CalibrationReport,
@@ -20,7 +21,6 @@ from worldpose.static_calibration.report import (
     PointResidual,
 )
 from worldpose.static_calibration.residuals import SIZE, drawn_residuals
-from worldpose.static_calibration.screening import Screened, residual_rows
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 _CANNOT_IMAGE: Final = {

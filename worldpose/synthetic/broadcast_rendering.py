@@ -19,7 +19,7 @@ from worldpose.cameras import Camera
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.synthetic.capsules import draw_things, goal_capsules, person_capsules
-from worldpose.synthetic.exposing import Moment, RenderedFrame, expose, sensor_grain
+from worldpose.synthetic.image_formation import Moment, RenderedFrame, expose, sensor_grain
 from worldpose.synthetic.looks import RenderingSettings
 from worldpose.synthetic.venues import Venue, build_venue, paint_venue
 

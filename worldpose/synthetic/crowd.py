@@ -16,10 +16,10 @@ from worldpose.synthetic.bodies import Body, draw_body
 from worldpose.synthetic.bvh import Clip
 from worldpose.synthetic.clips import clip_path
 from worldpose.synthetic.contests import run_through, take_corner
-from worldpose.synthetic.embodying import Embodied, embody
 from worldpose.synthetic.football import play
 from worldpose.synthetic.gait import tread
 from worldpose.synthetic.idling import stand_about
+from worldpose.synthetic.inverse_kinematics import Embodied, embody
 from worldpose.synthetic.paths import GroundPath, wander
 from worldpose.synthetic.settings import Scenario
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17, COCO17_SIGMAS
 from worldpose.synthetic.noise import ObservationNoise
+from worldpose.synthetic.occlusion import Flags, Floats, Sight, facing
 from worldpose.synthetic.processes import bursts, drift
-from worldpose.synthetic.sight import Flags, Floats, Sight, facing
 
 DIFFICULTY: Final = np.array(COCO17_SIGMAS) / 0.08
 """Spread of each joint relative to an average one: COCO's sigmas over their mean of 0.08."""

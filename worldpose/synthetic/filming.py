@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from worldpose.cameras import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.synthetic.casting import Cast
-from worldpose.synthetic.exposing import (
+from worldpose.synthetic.image_formation import (
     Moment,
     RenderedFrame,
     expose,

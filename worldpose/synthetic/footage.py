@@ -19,8 +19,8 @@ from worldpose.ingest.stills import write_still
 from worldpose.pitch import PitchTemplate
 from worldpose.synthetic.broadcast_rendering import film_broadcast
 from worldpose.synthetic.casting import Cast, dress_people, roles_of, stand_by
-from worldpose.synthetic.exposing import Moment, RenderedFrame
 from worldpose.synthetic.filming import open_view, render_frame
+from worldpose.synthetic.image_formation import Moment, RenderedFrame
 from worldpose.synthetic.props import BALL, Prop, ball, goals
 from worldpose.synthetic.scene import Scene
 from worldpose.synthetic.settings import Scenario

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from worldpose.ingest import Observations
 from worldpose.synthetic.detecting import Detections
-from worldpose.synthetic.sight import Flags, Floats
+from worldpose.synthetic.occlusion import Flags, Floats
 
 ROOM: Final = 0.06
 """Of a box around the keypoints, for head, hands and feet [person height]."""

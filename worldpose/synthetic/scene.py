@@ -26,12 +26,12 @@ from worldpose.synthetic.detecting import (
     draw_habits,
     perceived_bias,
 )
+from worldpose.synthetic.false_positives import PHANTOMS, draw_false_positives
+from worldpose.synthetic.occlusion import Bodies, Sight, see
 from worldpose.synthetic.paths import GroundPath
-from worldpose.synthetic.phantoms import PHANTOMS, draw_phantoms
 from worldpose.synthetic.processes import bursts
 from worldpose.synthetic.reporting import Report, report
 from worldpose.synthetic.settings import Scenario
-from worldpose.synthetic.sight import Bodies, Sight, see
 from worldpose.synthetic.stadium import place_camera
 from worldpose.synthetic.surveying import survey
 
@@ -234,7 +234,7 @@ def _reported(world: _World, camera: Camera, sight: Sight, seeds: list[Seed]) ->
     frames, persons = sight.size.shape
     real = detect(sight, noise, world.habits, scenario.fps, _rngs(errors.spawn(persons)))
     figures, *figure_errors = deception.spawn(1 + PHANTOMS)
-    deceit = see(camera, draw_phantoms(scenario, world.pitch, frames, _rng(figures)))
+    deceit = see(camera, draw_false_positives(scenario, world.pitch, frames, _rng(figures)))
     false = detect(deceit, noise, world.habits, scenario.fps, _rngs(figure_errors))
     merged = np.where(false.merged_into >= 0, false.merged_into + persons, -1)
     together = Detections(

@@ -1,6 +1,6 @@
 """Training: the embedded nets learn from labelled pictures, rendered or reviewed (D5).
 
-Input: COCO keypoints data sets. Output: safetensors weights that `worldpose.detection.embedded`
+Input: COCO keypoints data sets. Output: safetensors weights that `worldpose.detection.bundled`
 takes, and figures (AP50, PCK) before and after. Needs torch where nets are named.
 """
 

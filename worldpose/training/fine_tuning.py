@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from data_contracts.finetune import NetKind
-from worldpose.detection.embedded import EMBEDDED
-from worldpose.detection.embedded_nets import KeypointNet, PeopleNet
-from worldpose.detection.embedded_weights import load_weights, save_weights
+from worldpose.detection.bundled import EMBEDDED
+from worldpose.detection.bundled_nets import KeypointNet, PeopleNet
+from worldpose.detection.bundled_weights import load_weights, save_weights
 from worldpose.errors import InputError
+from worldpose.training.augmentation import AugmentationSettings
 from worldpose.training.keypoint_training import KeypointCrops
 from worldpose.training.labels import LabelledPicture
-from worldpose.training.looks import LookSettings
 from worldpose.training.nets import (
     keypoint_figure,
     people_figure,
@@ -31,7 +31,9 @@ Pictures = Sequence[LabelledPicture]
 
 FIGURES: dict[NetKind, str] = {"people": "ap50", "keypoints": "pck"}
 """What each net is judged by: boxes at an overlap of a half, keypoints within 0.2 torsos."""
-MILD = LookSettings(strength=0.4, recoloured=0.1, grey=0.0, fog=0.0, soft=0.1, coded=0.1, grain=0.3)
+MILD = AugmentationSettings(
+    strength=0.4, recoloured=0.1, grey=0.0, fog=0.0, soft=0.1, coded=0.1, grain=0.3
+)
 """Looks of the pictures that nets are fine-tuned on: these show the footage that a version is for,
 and the air, light and kits of others are not asked for."""
 BLOCKS = 20

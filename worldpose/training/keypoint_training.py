@@ -15,13 +15,13 @@ from torch.nn import functional
 from data_contracts.conventions import COCO17
 from data_contracts.records import Record
 from worldpose.detection.boxes import overlaps
-from worldpose.detection.embedded_crops import crops_of_boxes, cut, picture_from_crop
-from worldpose.detection.embedded_nets import CELL, CROP, KeypointNet, normalised, peaks
-from worldpose.detection.embedded_surroundings import CELL as AROUND
-from worldpose.detection.embedded_surroundings import MAPS, SAME, surroundings
+from worldpose.detection.bundled_crops import crops_of_boxes, cut, picture_from_crop
+from worldpose.detection.bundled_nets import CELL, CROP, KeypointNet, normalised, peaks
+from worldpose.detection.bundled_surroundings import CELL as AROUND
+from worldpose.detection.bundled_surroundings import MAPS, SAME, surroundings
+from worldpose.training.augmentation import AugmentationSettings, augment
 from worldpose.training.box_overlap import shared
 from worldpose.training.labels import LabelledPicture
-from worldpose.training.looks import LookSettings, changed_look
 from worldpose.training.pictures import PictureCache
 
 Floats = NDArray[np.float64]
@@ -78,7 +78,7 @@ class KeypointCrops(Record):
     """Most that a side of another's box is off, as a share of the box's [1]."""
     imagined: float = 0.1
     """Share of crops with somebody told of who is not there [1]."""
-    looks: LookSettings = LookSettings()
+    looks: AugmentationSettings = AugmentationSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +184,7 @@ def keypoint_batch(
             boxes[index] = np.nan if beside else there[person]
         if index and rng.random() < settings.hidden:
             _cover(seen, crops[index - 1], pixels, sight, rng)
-        crops[index] = changed_look(seen, settings.looks, rng)
+        crops[index] = augment(seen, settings.looks, rng)
         keypoints[index], visible[index] = pixels, sight
         tolerance[index] = RIGHT * tall / crop[2]
     return KeypointBatch(crops, around, keypoints, visible, tolerance, boxes, everybody, ignored)

@@ -9,8 +9,8 @@ from typing import Final
 
 import torch
 
-from worldpose.detection.embedded import EmbeddedDetector, EmbeddedPose
-from worldpose.detection.embedded_nets import KeypointNet, PeopleNet
+from worldpose.detection.bundled import EmbeddedDetector, EmbeddedPose
+from worldpose.detection.bundled_nets import KeypointNet, PeopleNet
 from worldpose.training.keypoint_training import (
     KeypointCrops,
     keypoint_batch,

@@ -13,12 +13,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from data_contracts.records import Record
-from worldpose.detection.embedded_crops import cut, picture_from_crop
-from worldpose.detection.embedded_nets import STRIDE, PeopleNet, normalised
-from worldpose.detection.embedded_peaks import cell_middles
+from worldpose.detection.bundled_crops import cut, picture_from_crop
+from worldpose.detection.bundled_nets import STRIDE, PeopleNet, normalised
+from worldpose.detection.bundled_peaks import cell_middles
+from worldpose.training.augmentation import AugmentationSettings, augment
 from worldpose.training.box_overlap import shared
 from worldpose.training.labels import LabelledPicture
-from worldpose.training.looks import LookSettings, changed_look
 from worldpose.training.pictures import PictureCache
 
 Floats = NDArray[np.float64]
@@ -44,7 +44,7 @@ class PeopleWindows(Record):
     """Shortest and tallest people that windows are scaled to [px]."""
     aimed: float = 0.75
     """Share of windows put around somebody [1]; the others lie anywhere."""
-    looks: LookSettings = LookSettings()
+    looks: AugmentationSettings = AugmentationSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ def people_batch(
         picture = cache[labelled.path]
         crop = _window(labelled, picture.shape, settings, rng)
         mapping = picture_from_crop(crop, (side, side), 0.0, bool(rng.random() < 0.5))
-        seen[index] = changed_look(cut(picture, mapping, (side, side)), settings.looks, rng)
+        seen[index] = augment(cut(picture, mapping, (side, side)), settings.looks, rng)
         inside, ignored = boxes_in_window(labelled, picture.shape, mapping, side)
         draw_targets(inside, ignored, target[index], weight[index], boxes[index])
     return PeopleBatch(seen, target, weight, boxes)

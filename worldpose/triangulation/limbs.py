@@ -73,7 +73,7 @@ def limb_lengths(found: Solution) -> Floats:
     return lengths
 
 
-def mend_limbs(
+def repair_limb_lengths(
     rig: Rig,
     keypoints: NDArray[np.floating],
     precision: Floats,

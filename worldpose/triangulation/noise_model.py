@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.compiled import compiled
-from worldpose.triangulation.consensus import consensus
-from worldpose.triangulation.lanes import (
+from worldpose.triangulation.batched_gauss_newton import (
     EXTRA,
     LANES,
     LEVERAGE,
@@ -22,6 +21,7 @@ from worldpose.triangulation.lanes import (
     USED,
     weigh,
 )
+from worldpose.triangulation.consensus import consensus
 from worldpose.triangulation.observations import Rig, gather, linearize
 
 Floats = NDArray[np.float64]

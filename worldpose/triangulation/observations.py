@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from worldpose.cameras import Camera, fold_radius, projection
 from worldpose.cameras.distortion import distort
 from worldpose.compiled import compiled
-from worldpose.triangulation.lanes import (
+from worldpose.triangulation.batched_gauss_newton import (
     EXTRA,
     LANES,
     PRECISION,

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from worldpose.cameras import Camera
 from worldpose.triangulation.array_checks import check_arrays
+from worldpose.triangulation.chunking import ClipDetections, learn_clip, reconstruct_chunks
 from worldpose.triangulation.clocks import CameraClocks
 from worldpose.triangulation.robust import Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.smoothing import Smoothing
-from worldpose.triangulation.windows import ClipDetections, learn_clip, reconstruct_parts
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def reconstruct_joints(
     check_arrays(cameras, keypoints, confidence, detection_index, camera_covariance)
     detections = ClipDetections(keypoints, confidence, detection_index)
     model, detections = learn_clip(cameras, detections, fps, settings, camera_covariance)
-    (whole,) = reconstruct_parts(
+    (whole,) = reconstruct_chunks(
         *(cameras, detections, model, fps, settings, camera_covariance, len(keypoints))
     )
     return Reconstruction(whole.triangulation, whole.smoothing, model.clocks)

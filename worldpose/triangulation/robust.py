@@ -13,8 +13,8 @@ from worldpose.cameras import Camera
 from worldpose.triangulation.array_checks import check_arrays
 from worldpose.triangulation.calibration_errors import stated_errors
 from worldpose.triangulation.common_bias import BY_JOINT, learn_common_bias
-from worldpose.triangulation.exchanges import find_exchanges, undo_exchanges
-from worldpose.triangulation.limbs import limb_lengths, mend_limbs
+from worldpose.triangulation.left_right_swaps import find_swaps, undo_swaps
+from worldpose.triangulation.limbs import limb_lengths, repair_limb_lengths
 from worldpose.triangulation.midhip import midhip_shift
 from worldpose.triangulation.noise_model import NoiseModel, learn_noise
 from worldpose.triangulation.observations import Rig
@@ -134,7 +134,7 @@ def triangulate_joints(
     check_arrays(cameras, keypoints, confidence, detection_index, camera_covariance)
     arrays = (keypoints, confidence, detection_index)
     if model is None and (
-        settings.learn_noise or settings.offsets == "body" or settings.mend_limbs
+        settings.learn_noise or settings.offsets == "body" or settings.repair_limb_lengths
     ):
         chosen = sample_frames(detection_index.shape, confidence.shape[-1])
         some = (keypoints[chosen], confidence[chosen], detection_index[chosen])
@@ -223,10 +223,10 @@ def _passes(
     solution = solved(shift)
     calibration = None if settings.offsets == "midhip" else camera_covariance
     exchanged = np.zeros((*index.shape, len(EXCHANGED_PARTS)), np.bool_)
-    if settings.undo_exchanges:
+    if settings.undo_swaps:
         seen = (rig, keypoints, models[-1].precision(confidence), index, shift)
-        exchanged = find_exchanges(*seen, settings.noise, limit, solution)
-        keypoints, confidence = undo_exchanges(keypoints, confidence, index, exchanged)
+        exchanged = find_swaps(*seen, settings.noise, limit, solution)
+        keypoints, confidence = undo_swaps(keypoints, confidence, index, exchanged)
         if exchanged.any() and calibration is None:
             precision = models[-1].precision(confidence)
             solution = solve(rig, keypoints, precision, index, shift, settings)
@@ -249,9 +249,9 @@ def _passes(
         misplaced = stated.misplaced(factor)
         solution = solved(shift)
     lengths = limb_lengths(solution) if known is None else known.lengths
-    if settings.mend_limbs:
+    if settings.repair_limb_lengths:
         seen = (rig, keypoints, models[-1].precision(confidence), index, shift)
-        mend_limbs(*seen, settings, solution, lengths)
+        repair_limb_lengths(*seen, settings, solution, lengths)
     bias = np.full(confidence.shape[-1], settings.common_bias)
     if known is not None:
         bias = known.common_bias

@@ -40,9 +40,9 @@ class TriangulationSettings(Record):
     min_angle: float = Field(default=0.1, ge=1e-6, le=10)
     """Least angle between the most different agreeing rays [rad]: below it a pixel moves the
     joint ten times as far along the rays as across them."""
-    undo_exchanges: bool = True
+    undo_swaps: bool = True
     """Put right detections whose left and right the other views show to be exchanged."""
-    mend_limbs: bool = True
+    repair_limb_lengths: bool = True
     """Where few views carry the end of a limb of strange length, choose those that keep its length,
     or leave it out."""
     offsets: Literal["none", "midhip", "body"] = "body"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.cameras import Camera
-from worldpose.triangulation.exchanges import undo_exchanges
+from worldpose.triangulation.left_right_swaps import undo_swaps
 from worldpose.triangulation.motion_model import MotionModel, choose_stretches, learn_motion
 from worldpose.triangulation.observations import Rig, person_observations
 from worldpose.triangulation.reports import Changes, Histogram, SmoothingReport
@@ -72,7 +72,7 @@ def smooth_joints(
         core: frames to return; the others only lend them support.
     """
     rig = Rig.of(cameras)
-    keypoints, confidence = undo_exchanges(keypoints, confidence, detection_index, raw.exchanged)
+    keypoints, confidence = undo_swaps(keypoints, confidence, detection_index, raw.exchanged)
     precision = raw.noise.precision(confidence)
     joints, covariance = np.full_like(raw.joints, np.nan), np.full_like(raw.covariance, np.nan)
     arrays = (keypoints, precision, detection_index, raw.offsets)

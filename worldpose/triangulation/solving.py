@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.compiled import compiled
-from worldpose.triangulation.consensus import consensus
-from worldpose.triangulation.lanes import (
+from worldpose.triangulation.batched_gauss_newton import (
     LANES,
     MATRIX,
     POINT,
@@ -20,6 +19,7 @@ from worldpose.triangulation.lanes import (
     USED,
     measure,
 )
+from worldpose.triangulation.consensus import consensus
 from worldpose.triangulation.observations import Rig, gather, linearize
 from worldpose.triangulation.settings import TriangulationSettings
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.compiled import compiled
-from worldpose.triangulation.lanes import (
+from worldpose.triangulation.batched_gauss_newton import (
     LANES,
     MATRIX,
     POINT,

@@ -7,7 +7,7 @@ from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body import BodyParameters
 from worldpose.body_fitting import BodyFittingSettings, fit_bodies
-from worldpose.body_fitting.sightings import find_sightings
+from worldpose.body_fitting.ray_constraints import find_sightings
 
 CAMERA = broadcast(1)
 

@@ -10,8 +10,8 @@ from worldpose.bundle_adjustment import (
     Clicks,
     SolverSettings,
     adjust_cameras,
+    adjusting,
 )
-from worldpose.bundle_adjustment import adjusting
 from worldpose.static_calibration import stepped
 from worldpose.triangulation import triangulate_joints
 

@@ -1,8 +1,8 @@
 import numpy as np
 import torch
 
-from worldpose.detection.embedded_places import likely_places
-from worldpose.detection.embedded_surroundings import surroundings
+from worldpose.detection.bundled_places import likely_places
+from worldpose.detection.bundled_surroundings import surroundings
 from worldpose.detection.rival_joints import shared_out
 
 AS_IS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

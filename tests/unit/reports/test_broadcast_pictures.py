@@ -14,7 +14,7 @@ from worldpose.reports.broadcast import (
     before_after_picture,
     course_picture,
     flow_picture,
-    most_moved,
+    largest_pose_changes,
 )
 from worldpose.reports.drawing import PALETTE
 
@@ -79,7 +79,7 @@ def test_whom_a_refinement_moves_most_is_shown_before_and_after():
     before = cameras(turned(), turned(tilt=0.5))
     # The third stands where the picture ends, and is not shown.
     tracks = people((0.0, 80.0), (9.0, 80.0), (18.2, 80.0))
-    assert most_moved(before, after, tracks) == (1, 1)
+    assert largest_pose_changes(before, after, tracks) == (1, 1)
     still = np.full((1080, 1920, 3), 90, np.uint8)
     seen = after[1].project(tracks.joints[1])
     picture = before_after_picture(before[1], after[1], tracks, 1, 1, still=still, seen=seen)
@@ -100,7 +100,7 @@ def test_whom_a_refinement_moves_most_is_shown_before_and_after():
 
 def test_nobody_in_the_picture_is_moved_most():
     some = cameras(turned(), turned())
-    assert most_moved(some, some, people((200.0, 80.0))) == (0, 0)
+    assert largest_pose_changes(some, some, people((200.0, 80.0))) == (0, 0)
 
 
 def painted(png, color):

@@ -12,8 +12,8 @@ from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import calibrate
 from worldpose.static_calibration.adjustment import problem_of, row_of
+from worldpose.static_calibration.click_outliers import held_out_error, residual_rows, rest_on
 from worldpose.static_calibration.evidence import gather
-from worldpose.static_calibration.screening import held_out_error, residual_rows, rest_on
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from clicking_people import PITCH, seat, visible
 
-from worldpose.static_calibration.advice import most_helpful
+from worldpose.static_calibration.next_click import most_helpful
 from worldpose.static_calibration.parameters import CameraEstimate
 
 

@@ -12,8 +12,8 @@ from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.synthetic.broadcast_rendering import film_broadcast, render_broadcast
 from worldpose.synthetic.casting import dress_people
-from worldpose.synthetic.exposing import Moment
 from worldpose.synthetic.filming import open_view, render_frame
+from worldpose.synthetic.image_formation import Moment
 from worldpose.synthetic.props import goals
 from worldpose.synthetic.rendering import RenderingSettings, render_pitch
 from worldpose.synthetic.stadium import looking

@@ -12,7 +12,7 @@ from worldpose.synthetic.detecting import (
     draw_habits,
     perceived_bias,
 )
-from worldpose.synthetic.sight import Bodies, facing, see
+from worldpose.synthetic.occlusion import Bodies, facing, see
 
 FPS = 25.0
 FRAMES = 2000

@@ -8,8 +8,8 @@ from worldpose.body import BodyParameters, load_open_body
 from worldpose.cameras import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.synthetic.casting import dress_people
-from worldpose.synthetic.exposing import clusters
 from worldpose.synthetic.filming import open_view, render_frame
+from worldpose.synthetic.image_formation import clusters
 from worldpose.synthetic.looks import RenderingSettings
 from worldpose.synthetic.mannequins import open_mannequin, pose_people, shape_people
 from worldpose.synthetic.stadium import looking

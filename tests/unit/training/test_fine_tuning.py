@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 import torch
 
-from worldpose.detection.embedded_nets import KeypointNet, PeopleNet
-from worldpose.detection.embedded_weights import load_weights, save_weights
+from worldpose.detection.bundled_nets import KeypointNet, PeopleNet
+from worldpose.detection.bundled_weights import load_weights, save_weights
 from worldpose.errors import InputError
 from worldpose.training import FineTuningSettings, LabelledPicture, fine_tuning
 from worldpose.training.fine_tuning import MILD, fine_tune, split

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from worldpose.detection.boxes import overlaps
-from worldpose.detection.embedded_nets import CROP, KeypointNet, PeopleNet
+from worldpose.detection.bundled_nets import CROP, KeypointNet, PeopleNet
 from worldpose.training import LabelledPicture, PictureCache
+from worldpose.training.augmentation import AugmentationSettings
 from worldpose.training.box_overlap import shared
 from worldpose.training.keypoint_training import (
     KeypointCrops,
@@ -17,7 +18,6 @@ from worldpose.training.keypoint_training import (
     keypoint_loss,
     people_of,
 )
-from worldpose.training.looks import LookSettings
 from worldpose.training.people_training import (
     PeopleWindows,
     boxes_in_window,
@@ -26,7 +26,7 @@ from worldpose.training.people_training import (
     people_loss,
 )
 
-AS_IS = LookSettings(strength=0, recoloured=0, grey=0, fog=0, soft=0, coded=0, grain=0)
+AS_IS = AugmentationSettings(strength=0, recoloured=0, grey=0, fog=0, soft=0, coded=0, grain=0)
 NOSE, LEFT_EAR, RIGHT_EAR = 0, 3, 4
 
 

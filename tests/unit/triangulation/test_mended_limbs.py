@@ -9,7 +9,7 @@ from worldpose.triangulation.solving import no_shift, solve
 
 # Noise as stated: exact views do not make the least disagreement count.
 SETTINGS = TriangulationSettings(learn_noise=False, offsets="none")
-AS_THEY_AGREE = SETTINGS.model_copy(update={"mend_limbs": False})
+AS_THEY_AGREE = SETTINGS.model_copy(update={"repair_limb_lengths": False})
 ANKLE, WRIST, ELBOW = (COCO17.index(f"left_{name}") for name in ("ankle", "wrist", "elbow"))
 SHANK = 0.4
 BAD = 7

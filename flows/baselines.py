@@ -1,0 +1,154 @@
+"""Scores of other methods' results, by the paper's protocol (E1-E5)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.evaluation import MethodScore
+from flows.evaluation import cameras_of, reference_side
+from worldpose.baselines import MethodResult, find_method, resampled
+from worldpose.body import OPEN_BODY, find_body
+from worldpose.cameras import Camera
+from worldpose.errors import UsageError
+from worldpose.evaluation import EvaluationSettings, evaluate_joints
+from worldpose.evaluation.method_table import meaningful
+from worldpose.formats import JointTracks
+from worldpose.formats.camera_file import RELEASE_SIZE
+
+
+def score_methods(
+    named: Sequence[str],
+    reference: str,
+    *,
+    match_in: str | None = None,
+    body: str | None = None,
+    first_frame: int | None = None,
+    fps: float | None = None,
+    seen_fps: Mapping[str, float] | None = None,
+    settings: EvaluationSettings | None = None,
+) -> tuple[MethodScore, ...]:
+    """The scores of methods' results, each with the settings under which it came about.
+
+    Args:
+        named: NAME=PATH of each.
+        reference: the truth, as for `worldpose evaluate`.
+        match_in: the reference's camera in whose picture tracks are matched (E3).
+        body: body that poses are put on; None = the open body.
+        first_frame: match frame of the methods' first picture; None = the reference's first.
+        fps: frames in a second; None = the match's, where there is one.
+        seen_fps: name of a method to the frames in a second of the video that it saw, where that is
+            not the clip's; its result is put on the clip's frames.
+        settings: the defaults if None.
+
+    Raises:
+        UsageError: an unknown method, no such camera, or a method that needs one to be matched.
+        InputError: a file is not what the method writes.
+    """
+    settings = settings or EvaluationSettings()
+    truth = reference_side(reference)
+    spec = None if truth.match is None else truth.match.spec
+    cameras = cameras_of(reference, truth, spec)
+    if truth.joints is None or (match_in is not None and match_in not in cameras):
+        raise UsageError(
+            f"--reference {reference}",
+            expected="joints.npz" + (f" and cameras/{match_in}.npz" if match_in else ""),
+            found=f"cameras {', '.join(cameras)}" if cameras else "no cameras",
+            todo="Name the folder that holds them.",
+        )
+    camera = None if match_in is None else cameras[match_in]
+    frames = truth.joints.frames
+    first = first_frame if first_frame is not None else int(frames[0]) if len(frames) else 0
+    model = find_body(body or OPEN_BODY)
+    rate = fps or (None if spec is None else spec.fps)
+    _require_scored(named, seen_fps or {})
+    scores = []
+    for item in named:
+        name, found, path = item.partition("=")
+        method = find_method(name)
+        if not found or not Path(path).exists():
+            raise UsageError(
+                f"--method {item}",
+                expected=f"{name}=PATH of its result",
+                found=f"{path or 'no path'}, which does not exist",
+                todo="Name the file or folder that the method wrote.",
+            )
+        result = method.read(Path(path), model, _picture(camera))
+        if name in (seen_fps or {}):
+            result = resampled(result, (seen_fps or {})[name], _clip_fps(rate, name))
+        if result.world != "shared" and (camera is None or result.boxes is None):
+            raise UsageError(
+                f"--method {item}",
+                expected="--match-in CAMERA: its people have no common world",
+                found=f"--match-in {match_in}",
+                todo="Name the reference's camera that the method saw.",
+            )
+        joints = JointTracks(
+            result.joints.frames + first, result.joints.person_ids, result.joints.joints
+        )
+        evaluation, _ = evaluate_joints(
+            joints,
+            truth.joints,
+            settings,
+            fps=rate,
+            camera=camera,
+            boxes=_boxes(result, camera),
+        )
+        scores.append(
+            MethodScore(
+                method=method.name,
+                title=method.title,
+                source=Path(path).name,
+                world=result.world,
+                body_model=model.name,
+                notes=dict(result.notes),
+                match_in=match_in,
+                first_frame=first,
+                settings=settings.model_dump(mode="json"),
+                evaluation=meaningful(evaluation, result.world),
+            )
+        )
+    return tuple(scores)
+
+
+def _require_scored(named: Sequence[str], seen_fps: Mapping[str, float]) -> None:
+    """Refuse a frame rate of a method that is not scored."""
+    names = [item.partition("=")[0] for item in named]
+    for name in seen_fps:
+        if name not in names:
+            raise UsageError(
+                f"--method-fps {name}",
+                expected=f"one of {', '.join(names)}",
+                found=repr(name),
+                todo="Name it as --method does.",
+            )
+
+
+def _clip_fps(fps: float | None, name: str) -> float:
+    if fps is None:
+        raise UsageError(
+            f"--method-fps {name}",
+            expected="--fps, the clip's own frames in a second",
+            found="neither that nor a match that says it",
+            todo="Give --fps.",
+        )
+    return fps
+
+
+def _picture(camera: Camera | None) -> tuple[int, int]:
+    """Width and height of the video [px]."""
+    if camera is None:
+        return RELEASE_SIZE
+    width, height = (int(side) for side in camera.image_size.reshape(-1, 2)[0])
+    return width, height
+
+
+def _boxes(result: MethodResult, camera: Camera | None) -> NDArray[np.float64] | None:
+    """The method's boxes in the picture of the camera [px]."""
+    if result.boxes is None or camera is None or result.picture is None:
+        return result.boxes
+    width, height = np.array(_picture(camera)) / np.array(result.picture)
+    return np.asarray(result.boxes * np.array([width, height, width, height]))

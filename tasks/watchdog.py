@@ -1,0 +1,117 @@
+"""How often a unit may be begun: one that hangs or ends its worker's process is given up in time.
+
+What hangs or crashes in a library cannot be caught, only survived: its process ends, Dask begins a
+new one and gives it the unit again. A mark beside Dask's own scratch files tells how that went.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from data_contracts.work import Work
+from worldpose.errors import WorldposeError
+
+MOST_STOPPED: Final = 2
+"""A unit that was stopped so often, as it took too long, is given up."""
+MOST_DEATHS: Final = 3
+"""So is one whose process ended so often: fewer than Dask takes from units beside it."""
+FRAMES_SHOWN: Final = 3
+"""Of the stack of what hung."""
+BEGUN: Final = "begun"
+
+
+class TaskTimeoutError(WorldposeError):
+    """A unit was at work for longer than it may be, each time that it was begun."""
+
+
+class WorkerCrashError(WorldposeError):
+    """A unit ended its process, each time that it was begun."""
+
+
+@contextmanager
+def kill_on_timeout(work: Work) -> Iterator[None]:
+    """End this worker if the block takes longer than the work may.
+
+    Outside of Dask's workers nothing is watched: there the process is somebody's own.
+
+    Raises:
+        TaskTimeoutError: it was stopped often enough.
+        WorkerCrashError: it ended its process often enough.
+    """
+    mark = _mark_of(work)
+    if mark is None:
+        yield
+        return
+    before = mark.read_text().splitlines() if mark.exists() else []
+    stopped = [line for line in before if line != BEGUN]
+    deaths = len(before) - 2 * len(stopped)  # a line as it began, and one as it was stopped
+    if len(stopped) >= MOST_STOPPED or deaths >= MOST_DEATHS:
+        mark.unlink(missing_ok=True)
+        _give_up(work, stopped, deaths)
+    _append(mark, BEGUN)
+    is_done = threading.Event()
+    thread = threading.get_ident()
+    threading.Thread(target=_watch, args=(is_done, work, mark, thread), daemon=True).start()
+    try:
+        yield
+    finally:
+        is_done.set()
+        mark.unlink(missing_ok=True)
+
+
+def _give_up(work: Work, stopped: list[str], deaths: int) -> None:
+    name = work.recipe.name
+    if len(stopped) >= MOST_STOPPED and work.seconds is not None:
+        raise TaskTimeoutError(
+            f"{name} was stopped {len(stopped)} times, each time after {work.seconds / 60.0:g} "
+            f"minutes, at {stopped[-1]}. If it only needs longer, run again with a higher "
+            "--time-limit."
+        )
+    raise WorkerCrashError(
+        f"{name}: its process ended {deaths} times while it was at work, killed or by a crash. "
+        "The system's log says which (out of memory?), the worker's log what came before; other "
+        "units are not affected. Run again to try it once more."
+    )
+
+
+def _watch(is_done: threading.Event, work: Work, mark: Path, thread: int) -> None:
+    if is_done.wait(work.seconds):
+        return
+    frames = traceback.extract_stack(sys._current_frames().get(thread))[-FRAMES_SHOWN:]
+    try:
+        _append(mark, ", ".join(f"{each.name} ({each.filename}:{each.lineno})" for each in frames))
+    finally:  # a full disk leaves it hanging no longer either
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _append(mark: Path, line: str) -> None:
+    with mark.open("a") as file:
+        file.write(f"{line}\n")
+
+
+def _mark_of(work: Work) -> Path | None:
+    """Where a run's workers on this machine note that this was begun; None outside of Dask's.
+
+    All runs of a machine share the folder, and killed ones leave their marks. Another project, or
+    the same one made anew, has runs of the same number and results of the same key.
+    """
+    # Late: what computes without Dask never imports it.
+    from distributed import get_worker
+
+    try:
+        worker = get_worker()
+    except ValueError:
+        return None
+    run = f"{work.project} {work.run_id} {worker.scheduler.address}"
+    digest = hashlib.sha256(run.encode()).hexdigest()[:16]
+    name = f"worldpose-{work.recipe.match_id}-{work.key}-{digest}"
+    return Path(worker.local_directory).parent / name

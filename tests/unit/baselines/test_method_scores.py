@@ -1,0 +1,175 @@
+"""Results in each method's layout, with a known error, give the row that this error is."""
+
+import csv
+import io
+import json
+
+import numpy as np
+import pytest
+from method_files import (
+    FIRST,
+    FRAMES,
+    PATTERN,
+    STEP,
+    WALK,
+    WRITERS,
+    scene,
+    truth_of,
+    wobbled,
+    write_hybrik_one,
+)
+from typer.testing import CliRunner
+
+from flows.baselines import score_methods
+from flows.cli.app import app
+from worldpose.baselines import METHODS
+from worldpose.errors import InputError, UsageError
+from worldpose.evaluation.method_table import table_csv, table_latex, table_rows
+from worldpose.evaluation.selected_joints import paper_joints
+from worldpose.formats import JointTracks, write_joints, write_moving_camera
+
+LOCAL, ALONE = ("hybrik", "4dhumans"), ("wham", "gvhmr")
+NOT_SEEN = "smpl"
+"""Its file says nothing about the picture: it is matched by its paths."""
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("reference")
+    bodies, camera = scene()
+    write_joints(folder / "joints.npz", truth_of(bodies))
+    write_moving_camera(folder / "cameras" / "clip.npz", camera)
+    return folder
+
+
+def scored(name, path, truth, match_in="clip"):
+    match_in = None if name == NOT_SEEN else match_in
+    return score_methods([f"{name}={path}"], str(truth), match_in=match_in)[0]
+
+
+def test_every_method_has_a_writer():
+    assert set(WRITERS) == set(METHODS)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_known_error_gives_the_known_row(name, truth, tmp_path):
+    bodies, camera = scene()
+    score = scored(name, WRITERS[name](tmp_path, wobbled(bodies), camera), truth)
+    found = score.evaluation
+    assert (score.method, score.first_frame, found.track_coverage) == (name, FIRST, 1.0)
+    # Files hold single precision: at 70 m from the camera a few micrometres.
+    assert found.pa_mpjpe_mm == pytest.approx(0.0, abs=0.05)
+    # Everybody is 1 cm too high or too low. Scale takes up s - 1 = STEP^2 / variance of the
+    # places, 5.3 m^2 and more: at 4 m from the middle 0.08 mm.
+    whole, path = 1000.0 * STEP, 100.0 * STEP / WALK
+    if name in LOCAL:
+        assert found.per_person_g_mpjpe_mm is None
+    else:
+        assert found.per_person_g_mpjpe_mm == pytest.approx(whole, abs=0.1)
+        # The path is the mid-hip's, which sways a little about the straight line.
+        assert found.per_person_drift_cm_per_m == pytest.approx(path, rel=0.1)
+    if name in (*LOCAL, *ALONE):
+        assert found.g_mpjpe_mm is None
+        assert found.mpjpe_mm is None
+    else:
+        assert found.g_mpjpe_mm == pytest.approx(whole, abs=0.1)
+        assert found.per_meter_drift_cm_per_m == pytest.approx(path, rel=0.1)
+        # Alone or not: every person's error is the same.
+        assert found.g_scale == pytest.approx(1.0, abs=1e-4)
+
+
+def test_one_wrong_wrist_gives_the_error_that_is_left_to_first_order(truth, tmp_path):
+    bodies, camera = scene()
+    step = 0.001
+    exact = truth_of(bodies)
+    joints = exact.joints.copy()
+    joints[:, :, 9, 0] += step
+    write_joints(tmp_path / "joints.npz", JointTracks(exact.frames, exact.person_ids, joints))
+    write_moving_camera(tmp_path / "cameras" / "clip.npz", camera)
+    expected = []
+    for body in paper_joints(exact.joints).reshape(-1, 14, 3):
+        offset = body - body.mean(0)
+        # Columns: three shifts, three turns, scale. What they do not span is left.
+        turns = [np.cross(axis, offset) for axis in np.eye(3)]
+        shifts = [np.tile(axis, (14, 1)) for axis in np.eye(3)]
+        moves = np.stack([m.ravel() for m in (*shifts, *turns, offset)], axis=1)
+        wrong = np.zeros((14, 3))
+        wrong[6, 0] = step  # the left wrist among the paper's joints
+        left = wrong.ravel() - moves @ np.linalg.lstsq(moves, wrong.ravel(), rcond=None)[0]
+        expected.append(np.linalg.norm(left.reshape(14, 3), axis=1).mean())
+    score = scored("hybrik", WRITERS["hybrik"](tmp_path, bodies, camera), tmp_path)
+    # Second order is step / size of a body: a thousandth.
+    assert score.evaluation.pa_mpjpe_mm == pytest.approx(1000 * np.mean(expected), rel=0.01)
+
+
+def test_one_person_of_two_is_half_the_coverage(truth, tmp_path):
+    bodies, camera = scene()
+    score = scored("hybrik", write_hybrik_one(tmp_path, bodies, camera), truth)
+    assert score.evaluation.track_coverage == 0.5
+    assert score.evaluation.pa_mpjpe_mm == pytest.approx(0.0, abs=0.05)
+
+
+def test_table_has_the_papers_rows_and_says_where_a_figure_means_nothing(truth, tmp_path):
+    bodies, camera = scene()
+    scores = []
+    for name in ("hybrik", "wham", "glamr"):
+        (tmp_path / name).mkdir()
+        path = WRITERS[name](tmp_path / name, wobbled(bodies), camera)
+        scores.append(scored(name, path, truth))
+    rows = table_rows(scores)
+    assert [row[0] for row in rows] == [
+        "HybrIK",
+        "WHAM",
+        "GLAMR",
+        "WHAM (per-person)",
+        "GLAMR (per-person)",
+    ]
+    assert rows[0][1:] == ("N/A", "0.0", "N/A", "100.0")
+    assert rows[1][1:] == ("N/A", "0.0", "N/A", "100.0")
+    assert rows[2][1:] == ("10.0", "0.0", "0.1", "100.0")
+    assert rows[3][1:] == rows[4][1:] == rows[2][1:]
+    cells = list(csv.reader(io.StringIO(table_csv(scores))))
+    assert cells[1] == ["HybrIK", "", "0.0", "", "100.0"]
+    latex = table_latex(scores)
+    assert latex.count("\\midrule") == 3
+    assert "GLAMR & 10.0 & 0.0 & 0.1 & 100.0 \\\\" in latex
+    far = scores[2].model_copy(
+        update={"evaluation": scores[2].evaluation.model_copy(update={"g_mpjpe_mm": 18888.9})}
+    )
+    assert "18\\,888.9" in table_latex([far])
+
+
+def test_the_command_prints_the_table_with_the_settings_that_gave_it(truth, tmp_path):
+    bodies, camera = scene()
+    path = WRITERS["glamr"](tmp_path, wobbled(bodies), camera)
+    asked = ("--method", f"glamr={path}", "--reference", str(truth), "--match-in", "clip")
+    table = CliRunner().invoke(app, ["evaluate", *asked, "--table", "csv"])
+    assert list(csv.reader(io.StringIO(table.stdout)))[1] == [
+        "GLAMR",
+        "10.0",
+        "0.0",
+        "0.1",
+        "100.0",
+    ]
+    told = json.loads(CliRunner().invoke(app, ["evaluate", *asked, "--json"]).stdout)
+    (score,) = told["methods"]
+    assert (score["match_in"], score["settings"]["min_overlap"]) == ("clip", 0.5)
+
+
+def test_method_without_a_common_world_needs_a_camera(truth, tmp_path):
+    bodies, camera = scene()
+    path = WRITERS["hybrik"](tmp_path, bodies, camera)
+    with pytest.raises(UsageError, match="--match-in CAMERA"):
+        scored("hybrik", path, truth, match_in=None)
+    with pytest.raises(UsageError, match="expected one of hybrik"):
+        scored("nobody", path, truth)
+    with pytest.raises(UsageError, match="does not exist"):
+        scored("hybrik", tmp_path / "nothing", truth)
+    with pytest.raises(InputError, match="person_data"):
+        scored("glamr", path, truth)
+
+
+def test_pattern_cannot_be_aligned_away():
+    time = np.arange(FRAMES)
+    assert abs(PATTERN.sum()) < 1e-12
+    assert abs((PATTERN * time).sum()) < 1e-12

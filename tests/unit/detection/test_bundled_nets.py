@@ -1,0 +1,209 @@
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save
+
+from worldpose.detection.bundled import EmbeddedDetector, EmbeddedPose
+from worldpose.detection.bundled_crops import crops_of_boxes, cut, picture_from_crop
+from worldpose.detection.bundled_looks import Look
+from worldpose.detection.bundled_nets import CROP, KeypointNet, PeopleNet, edges, peaks
+from worldpose.detection.bundled_peaks import boxes_at_peaks
+from worldpose.detection.bundled_weights import FORMAT, load_weights, save_weights
+from worldpose.errors import InputError
+
+
+def shaken(net):
+    """The net with normalisations that are not trivial."""
+    torch.manual_seed(1)
+    for module in net.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.running_mean.normal_(0.0, 0.1)
+            module.running_var.uniform_(0.5, 1.5)
+    return net.eval()
+
+
+def test_a_crop_shows_its_box_and_goes_back_to_the_picture():
+    picture = np.zeros((200, 300, 3), dtype=np.uint8)
+    picture[50:150, 100:140] = 255
+    box = np.array([[99.5, 49.5, 139.5, 149.5]])
+    for turn, mirrored in ((0.0, False), (0.3, True)):
+        mapping = picture_from_crop(crops_of_boxes(box, CROP)[0], CROP, turn, mirrored)
+        crop = cut(picture, mapping, CROP, outside=0)
+        rows, columns = np.nonzero(crop[..., 0] > 127)
+        middle = np.array([columns.mean(), rows.mean()])
+        np.testing.assert_allclose(middle, (np.array(CROP) - 1) / 2, atol=0.05)
+        np.testing.assert_allclose(mapping[:, :2] @ middle + mapping[:, 2], [119.5, 99.5], atol=0.1)
+        # The box fills the crop but for its margin: its height is the tighter side.
+        area = np.abs(np.linalg.det(mapping[:, :2]))
+        # Its outline of 280 px is known to a quarter of a pixel.
+        assert len(rows) * area == pytest.approx(40 * 100, abs=140)
+        assert np.sqrt(area) == pytest.approx(1.25 * 100 / CROP[1])
+
+
+def test_a_crop_of_a_large_box_is_smooth_and_in_its_place():
+    picture = np.zeros((900, 900, 3), dtype=np.uint8)
+    picture[:, ::2] = 200  # stripes that every second pixel alone would make white or black
+    picture[400:, :] = 100
+    mapping = picture_from_crop(np.array([450.0, 450.0, 7.3]), CROP)
+    crop = cut(picture, mapping, CROP)
+    edge = (399.5 - mapping[1, 2]) / mapping[1, 1]
+    # Rows at both ends are outside of the picture; a crop pixel covers 7 stripes, one more or less.
+    assert np.all(np.abs(crop[3 : int(edge) - 1, :, 0].astype(int) - 100) < 15)
+    assert np.all(crop[int(edge) + 2 : -3, :, 0] == 100)
+
+
+def test_the_peak_of_a_bump_is_found_within_a_cell():
+    y, x = np.mgrid[:64, :48]
+    said = np.array([20.3, 41.6])
+    bump = -0.5 * (((x - said[0]) / 0.8) ** 2 + ((y - said[1]) / 0.8) ** 2)
+    at, mass = peaks(torch.tensor(bump, dtype=torch.float32)[None, None])
+    # Cells are 2 px, the first one's middle is at 0.5; five cells lose a little of one tail.
+    np.testing.assert_allclose(at[0, 0], 2 * said + 0.5, atol=0.05)
+    assert float(mass) > 0.97
+
+
+def test_edges_are_read_along_their_own_axis():
+    rows, columns = 32, 24
+    maps = torch.full((1, 4, rows, columns), -40.0)
+    # The left edge in column 3 of some rows, the right one between columns 20 and 21 of one row.
+    maps[0, 0, 5:9, 3] = maps[0, 2, 30, 20] = maps[0, 2, 30, 21] = 0.0
+    maps[0, 1, 2, :] = maps[0, 3, 28, 7] = 0.0
+    boxes, spread = edges(maps)
+    # Cells of 4 px whose first middle is at 1.5.
+    torch.testing.assert_close(boxes, torch.tensor([[13.5, 9.5, 83.5, 113.5]]))
+    torch.testing.assert_close(spread, torch.tensor([[1e-3, 1e-3, 0.5, 1e-3]]), atol=1e-3, rtol=0)
+
+
+def test_boxes_stand_at_peaks_best_first():
+    logits, sides = torch.full((8, 10), -9.0), torch.full((4, 8, 10), 5.0)
+    logits[2, 3], logits[2, 4], logits[6, 8] = 1.0, 0.5, 2.0
+    boxes, scores = boxes_at_peaks(logits, sides, 0.05, 300)
+    # Cells of 4 px whose first middle is at 1.5; the neighbour of a better cell is no peak.
+    np.testing.assert_allclose(boxes, [[28.5, 20.5, 38.5, 30.5], [8.5, 4.5, 18.5, 14.5]])
+    np.testing.assert_allclose(scores, torch.sigmoid(torch.tensor([2.0, 1.0])))
+    assert len(boxes_at_peaks(logits, sides, 0.05, 1)[0]) == 1
+
+
+def test_people_and_poses_do_not_depend_on_the_batch():
+    rng = np.random.default_rng(0)
+    picture = rng.integers(0, 255, (90, 130, 3), dtype=np.uint8)
+    # The second has no neighbour: whoever else is asked for, his pose is the same.
+    boxes = np.array(
+        [[85.0, 5.0, 110.0, 80.0], [-8.0, 20.0, 40.0, 120.0], [90.0, 1.0, 112.0, 60.0]]
+    )
+    pose = EmbeddedPose(shaken(KeypointNet()))
+    together, alone = pose.estimate(picture, boxes), pose.estimate(picture, boxes[1:2])
+    np.testing.assert_array_equal(together.keypoints[1:2], alone.keypoints)
+    np.testing.assert_array_equal(together.confidence[1:2], alone.confidence)
+    np.testing.assert_array_equal(together.boxes[1:2], alone.boxes)
+    np.testing.assert_array_equal(together.fit[1:2], alone.fit)
+    assert np.all((together.fit > 0) & (together.fit < 1))
+    assert np.all((together.confidence > 0) & (together.confidence <= 1))
+    nobody = pose.estimate(picture, np.empty((0, 4)))
+    assert nobody.keypoints.shape == (0, 17, 2) and nobody.confidence.shape == (0, 17)
+    net = shaken(PeopleNet())
+    with torch.no_grad():
+        net.head[-1].bias[0] = 0.0
+    both = EmbeddedDetector(net).detect([picture, picture[::-1].copy()])
+    assert len(both[0].boxes) > 0
+    inside = (both[0].boxes >= -0.5) & (both[0].boxes <= np.array([130, 90, 130, 90]) - 0.5)
+    assert inside.all()
+
+
+def looks(monkeypatch, seen_of):
+    """A pose estimator that sees what `seen_of` makes of boxes, and what it was asked."""
+    pose, asked = EmbeddedPose(shaken(KeypointNet())), []
+
+    def look(picture, boxes, others):
+        asked.append((boxes, others))
+        places = np.full((len(boxes), 17, 4, 2), float(len(asked)))
+        mass = np.tile([0.9, 0.0, 0.0, 0.0], (len(boxes), 17, 1))
+        return Look(places, mass, np.full(mass.shape, 0.9), seen_of(boxes), np.ones(len(boxes)))
+
+    monkeypatch.setattr(pose, "_look", look)
+    return pose, asked
+
+
+def test_whose_box_is_another_than_the_one_given_is_looked_at_again(monkeypatch):
+    # Everybody fills his box from 40 px on; the keypoints tell how often it was looked at.
+    pose, asked = looks(
+        monkeypatch, lambda b: np.concatenate([np.maximum(b[:, :1], 40.0), b[:, 1:]], axis=1)
+    )
+    boxes = np.array([[45.0, 5.0, 80.0, 80.0], [0.0, 100.0, 80.0, 180.0], [0.0, 5.0, 30.0, 80.0]])
+    poses = pose.estimate(np.zeros((190, 130, 3), dtype=np.uint8), boxes)
+    # The first is as given; of the third nothing is left in which to look.
+    np.testing.assert_array_equal(asked[1][0], [[40.0, 100.0, 80.0, 180.0]])
+    assert poses.keypoints[:, 0, 0].tolist() == [1.0, 2.0, 1.0]
+
+
+def test_who_has_a_neighbour_is_looked_at_again_and_told_of_him(monkeypatch):
+    pose, asked = looks(monkeypatch, lambda boxes: boxes)
+    # Two who share a third, a second box of the first, and somebody apart.
+    boxes = np.array(
+        [[0.0, 0.0, 40.0, 80.0], [20.0, 0.0, 60.0, 80.0], [2.0, 0.0, 42.0, 80.0], [90, 0, 130, 80]]
+    )
+    pose.estimate(np.zeros((90, 130, 3), dtype=np.uint8), boxes)
+    np.testing.assert_array_equal(asked[1][0], boxes[:3])
+    first, second, double = (others.tolist() for others in asked[1][1])
+    assert boxes[1].tolist() in first and boxes[0].tolist() not in first
+    assert boxes[0].tolist() in second and boxes[1].tolist() not in second
+    assert double == first
+
+
+def test_weights_come_back_and_give_equal_bytes(tmp_path):
+    net, file = shaken(PeopleNet()), tmp_path / "people.safetensors"
+    about = {name: name for name in "fedcba"}
+    save_weights(file, net, about)
+    first = file.read_bytes()
+    save_weights(file, load_weights(file, PeopleNet()), about)
+    assert file.read_bytes() == first
+
+
+def _tensors(net, change):
+    tensors = {name: value.contiguous() for name, value in net.state_dict().items()}
+    change(tensors)
+    return tensors
+
+
+def _poison(tensors):
+    tensors["head.1.bias"] = tensors["head.1.bias"] * float("nan")
+
+
+def _cut_off(tensors):
+    tensors["head.1.bias"] = tensors["head.1.bias"][:-1].contiguous()
+
+
+def _stranger(tensors):
+    tensors["more"] = torch.zeros(1)
+
+
+@pytest.mark.parametrize("change", [_poison, _cut_off, _stranger])
+def test_weights_with_other_content_are_refused(tmp_path, change):
+    file = tmp_path / "people.safetensors"
+    file.write_bytes(save(_tensors(PeopleNet(), change), {FORMAT: "PeopleNet"}))
+    with pytest.raises(InputError, match=r"people\.safetensors"):
+        load_weights(file, PeopleNet())
+
+
+def test_files_that_are_no_weights_are_refused_and_run_nothing(tmp_path):
+    file, trap = tmp_path / "people.safetensors", tmp_path / "sprung"
+
+    class Trap:
+        def __reduce__(self):
+            return open, (str(trap), "w")
+
+    torch.save({"net": Trap()}, file)
+    with pytest.raises(InputError, match="cannot be read"):
+        load_weights(file, PeopleNet())
+    assert not trap.exists()
+    file.write_bytes(b"")
+    with pytest.raises(InputError, match="cannot be read"):
+        load_weights(file, PeopleNet())
+    with pytest.raises(InputError, match="no file"):
+        load_weights(tmp_path / "none.safetensors", PeopleNet())
+    save_weights(file, KeypointNet())
+    with pytest.raises(InputError, match="weights of KeypointNet"):
+        load_weights(file, PeopleNet())
+    file.write_bytes(save(PeopleNet().state_dict()))  # of another program
+    with pytest.raises(InputError, match="weights of something else"):
+        load_weights(file, PeopleNet())

@@ -1,0 +1,200 @@
+"""Lasting errors of keypoints: what is planted is found, told apart from what looks like it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planted_errors import plant
+
+from data_contracts.conventions import COCO17
+from worldpose.cameras import Rigid
+from worldpose.filtering import FilteringSettings, judge_detections, learn_from
+from worldpose.filtering.clock_offsets import ClockEquations
+from worldpose.filtering.residuals import Residuals
+from worldpose.filtering.systematic_errors import (
+    SystematicErrors,
+    learn_systematic_errors,
+    watch_motion,
+)
+from worldpose.filtering.view_bias import TERMS, ViewBias, find_azimuths, learn_view_bias
+from worldpose.synthetic.occlusion import facing
+
+ROWS = 3000
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return plant(44, duration=0.6)
+
+
+def seen_from_all_sides(shift, noise=1.0):
+    """Residuals of one joint after another, with a direction and a size for each row."""
+    rng = np.random.default_rng(2)
+    azimuth, scale = rng.uniform(-np.pi, np.pi, ROWS), rng.uniform(30.0, 80.0, ROWS)
+    missed = shift(azimuth, scale) + noise * rng.normal(size=(ROWS, 17, 2))
+    zero = np.zeros(ROWS, dtype=np.int64)
+    variance = np.full((ROWS, 17), noise**2)
+    return Residuals(zero, zero, zero, missed, variance, 1.0), azimuth, scale
+
+
+def test_a_bias_that_goes_with_the_side_is_found():
+    bias = ViewBias(np.random.default_rng(1).normal(0.0, 0.02, (17, 2, TERMS)))
+    misses, *seen = seen_from_all_sides(bias.shift)
+    misses.missed[:1000, 3] = np.nan
+    found = learn_view_bias(misses, *seen)
+    # 1 px at 55 px a metre over 3,000 rows: 0.5 mm; five of these.
+    np.testing.assert_allclose(found.coefficient, bias.coefficient, atol=0.0025)
+
+
+def test_a_point_beside_the_joint_is_no_bias_of_sides():
+    def beside(azimuth, scale):
+        # 5 cm to the front, seen from the level, and 3 cm above.
+        way = np.stack([0.05 * np.sin(azimuth), np.full_like(azimuth, -0.03)], axis=-1)
+        return (scale[:, None] * way)[:, None]
+
+    found = learn_view_bias(*seen_from_all_sides(beside))
+    # By chance alone, as above; directions are uneven by a fiftieth.
+    assert np.abs(found.coefficient).max() < 0.004
+
+
+def test_azimuths_are_those_that_detectors_see(scene):
+    joints = scene.joints[::10]
+    front, left = facing(joints)
+    away = scene.cameras.center[:, None] - joints[..., (5, 6, 11, 12), :].mean(axis=-2)[:, None]
+    level = np.arctan2(
+        np.einsum("fcpa,fpa->fcp", away, left), np.einsum("fcpa,fpa->fcp", away, front)
+    )
+    off = np.angle(np.exp(1j * (find_azimuths(scene.cameras, joints) - level)))
+    # Of level axes and of those of a trunk that leans forward.
+    assert np.abs(off).mean() < 0.1
+
+
+def missed_by(scene, late, noise=0.5):
+    """Residuals in cameras that are late, and that were moved a little since."""
+    cameras, joints = scene.cameras, scene.joints
+    rng = np.random.default_rng(3)
+    motion = watch_motion(cameras, joints, np.gradient(joints, axis=0))
+    # As adjustment would: people all together stand a little beside where they are.
+    turns = Rigid.from_rotvec(rng.normal(0.0, 0.0005, (len(late), 3)), np.zeros(3)).rotation
+    pose = cameras.cam_from_world
+    moved = replace(
+        cameras,
+        cam_from_world=Rigid(turns @ pose.rotation, (turns @ pose.translation[..., None])[..., 0]),
+    )
+    shape = (len(joints), len(late), *joints.shape[1:3], 2)
+    seen, foreseen = (
+        each.project(joints.reshape(len(joints), 1, -1, 3)).reshape(shape)
+        for each in (cameras, moved)
+    )
+    seen = seen + late[:, None, None, None] * motion.way + noise * rng.normal(size=shape)
+    frame, camera, person = np.nonzero(np.isfinite(seen[..., 0, 0]))
+    at = frame, camera, person
+    missed = (seen - foreseen)[at]
+    variance = np.full(missed.shape[:2], noise**2)
+    return moved, joints, motion.way[at], Residuals(*at, missed, variance, 1.0)
+
+
+def test_clocks_are_told_from_the_places_of_cameras(scene):
+    late = np.array([0.4, -0.3, 0.1, -0.5, 0.3, 0.0])
+    *bodies, misses = missed_by(scene, late)
+    found = ClockEquations.of(*bodies, misses).learn_lateness(misses)
+    # Six cameras over 0.6 s, five people: some hundredths of a frame.
+    np.testing.assert_allclose(found, late - late.mean(), atol=0.06)
+
+
+def test_exact_clocks_come_out_equal(scene):
+    *bodies, misses = missed_by(scene, np.zeros(6))
+    assert np.abs(ClockEquations.of(*bodies, misses).learn_lateness(misses)).max() < 0.03
+
+
+def test_equations_of_clocks_hold_for_what_is_left_of_the_misses(scene):
+    *bodies, misses = missed_by(scene, np.array([0.4, -0.3, 0.1, -0.5, 0.3, 0.0]))
+    left = misses.less(0.3 * bodies[-1])
+    found = ClockEquations.of(*bodies, misses).learn_lateness(left)
+    np.testing.assert_array_equal(found, ClockEquations.of(*bodies, left).learn_lateness(left))
+
+
+def with_a_late_camera(scene, frames, held):
+    """The scene's systematic, and what was detected there with a camera of which that is late.
+
+    Args:
+        held: share of the lateness that people's offsets hold.
+    """
+    motion = watch_motion(scene.cameras, scene.joints, np.gradient(scene.joints, axis=0))
+    late = np.array([0.0, frames, 0.0, 0.0, 0.0, 0.0])
+    at = np.nonzero(scene.suspects.index >= 0)
+    keypoints = scene.suspects.keypoints.copy()
+    shift = late[:, None, None, None] * motion.way
+    keypoints[(*at[:2], scene.suspects.index[at])] += shift[at]
+    offsets = held * np.nan_to_num(shift.mean(axis=-2))
+    suspects = replace(scene.suspects, keypoints=keypoints, offsets=offsets)
+    return SystematicErrors(ViewBias.none(), late), motion, suspects
+
+
+def test_a_late_clock_is_learned_beside_sides_and_its_shift_brings_keypoints_back():
+    scene = plant(31, duration=2.0)
+    true, motion, suspects = with_a_late_camera(scene, 0.6, held=0.0)
+    people = (scene.cameras, scene.joints, scene.views, motion, suspects)
+    systematic = learn_systematic_errors(*people, FilteringSettings(), 25.0)
+    # What leans to the sides' account, or to the clocks', leaves less than a tenth of a frame.
+    late = true.late - true.late.mean()
+    np.testing.assert_allclose(systematic.late - systematic.late.mean(), late, atol=0.07)
+    right = suspects.without(systematic.shift(motion, scene.views))
+    exact = replace(systematic, late=np.zeros(6)).shift(motion, scene.views)
+    on_time = scene.suspects.without(exact).keypoints
+    at = np.nonzero(scene.suspects.index >= 0)
+    place = (*at[:2], scene.suspects.index[at])
+    here = at[1] == 1
+    honest = ~scene.displaced[place][here]
+
+    def beside(found):
+        return np.linalg.norm((found - on_time)[place][here][honest], axis=-1)
+
+    assert np.nanmean(beside(right.keypoints)) < 0.4 * np.nanmean(
+        beside(suspects.without(exact).keypoints)
+    )
+
+
+def test_a_clock_in_the_offsets_is_not_taken_off_twice():
+    scene = plant(31, duration=2.0)
+    systematic, motion, suspects = with_a_late_camera(scene, 0.8, held=0.7)
+    held = systematic.late_in_offsets(suspects.offsets, motion)
+    np.testing.assert_allclose(held, 0.7 * systematic.late, atol=1e-9)
+    shift = systematic.shift(motion, scene.views)
+    honest = ~scene.displaced[:, 1]
+
+    def rejected(suspects):
+        right = suspects.without(shift)
+        spread = learn_from(scene.views, right)
+        judged = judge_detections(scene.views, right, spread, FilteringSettings())
+        return judged.rejected[:, 1][honest].mean()
+
+    twice = rejected(suspects)
+    once = rejected(suspects.less_clocks(held, motion.way))
+    on_time = rejected(replace(suspects, offsets=np.zeros_like(suspects.offsets)))
+    assert once == pytest.approx(on_time, abs=1e-3)
+    assert twice > 1.5 * once
+
+
+@pytest.mark.parametrize(("held", "share"), [(-0.4, 0.0), (1.7, 1.0)])
+def test_no_more_is_of_clocks_in_offsets_than_cameras_are_late(scene, held, share):
+    systematic, motion, suspects = with_a_late_camera(scene, -0.5, held)
+    found = systematic.late_in_offsets(suspects.offsets, motion)
+    np.testing.assert_allclose(found, share * systematic.late, atol=1e-9)
+
+
+def test_shifts_go_with_the_joint_that_a_keypoint_is(scene):
+    suspects = scene.suspects
+    frame, camera, person = np.argwhere(suspects.index >= 0)[0]
+    exchanged = suspects.exchanged.copy()
+    exchanged[frame, camera, person, 2] = True  # the legs
+    suspects = replace(suspects, exchanged=exchanged)
+    shift = np.full((*suspects.index.shape, 17, 2), np.nan)
+    shift[frame, camera, person] = np.arange(34.0).reshape(17, 2)
+    found = suspects.by_detection(shift)
+    own = found[frame, camera, suspects.index[frame, camera, person]]
+    left, right = COCO17.index("left_hip"), COCO17.index("right_hip")
+    np.testing.assert_array_equal(own[left], [2.0 * right, 2.0 * right + 1.0])
+    assert np.count_nonzero(found.any(axis=(-1, -2))) == 1
+    kept = suspects.without(shift).keypoints
+    np.testing.assert_allclose(kept, suspects.keypoints - found)

@@ -1,0 +1,152 @@
+"""Cameras of clicks and lines that leave distance and focal length nearly open."""
+
+import clicking_people as people
+import numpy as np
+import pytest
+
+from data_contracts.pitch import PitchSpec
+from worldpose.static_calibration import StaticCalibrationSettings, calibrate
+from worldpose.static_calibration.adjustment import problem_of, row_of
+from worldpose.static_calibration.evidence import gather
+from worldpose.static_calibration.ill_conditioned import ClicksAndBars, fit_and_bends
+from worldpose.static_calibration.line_profiles import Bars
+from worldpose.static_calibration.line_samples import sample_markings, see_lines
+from worldpose.static_calibration.parameters import stepped
+from worldpose.synthetic.rendering import render_pitch
+from worldpose.synthetic.scenarios import SCENARIOS
+from worldpose.synthetic.stadium import place_camera
+
+SETTINGS = StaticCalibrationSettings()
+
+
+def corner_camera():
+    """A camera that sees one corner of a penalty area, and the touch line beyond it."""
+    rng = np.random.default_rng(3)
+    return place_camera(SCENARIOS["sparse-corner"].rig, 3, np.zeros(3), PitchSpec(), rng)
+
+
+def evidence(camera, noise=0.02):
+    """The corner clicked, and exact bars on all that is seen."""
+    clicked = people.points(people.visible(camera, ["penalty_area_left_near_front"]))
+    problem = problem_of(
+        gather(people.PITCH, clicked, people.SIZE, 0.5, "test"), people.SIZE, SETTINGS
+    )
+    samples = sample_markings(people.PITCH, 0.5)
+    seen = see_lines(camera, samples, 0.12, 0.006, 0.05)
+    here = seen.visible
+    bars = Bars(
+        samples[here],
+        seen.places[here],
+        np.full(int(here.sum()), noise),
+        seen.by_paint[here],
+        seen.unknowns[here],
+    )
+    return ClicksAndBars(problem, 1.0, bars)
+
+
+def test_derivatives_are_those_of_the_residuals():
+    camera = corner_camera()
+    given = evidence(camera)
+    _, rows = given.residuals(camera)
+    for column, parameter in enumerate(np.flatnonzero(given.problem.free)):
+        step = np.zeros(12)
+        step[parameter] = 1e-5 if parameter in (0, 1, 2, 6) else 1e-3
+        ahead, behind = (given.residuals(stepped(camera, sign * step))[0] for sign in (1.0, -1.0))
+        slope = (ahead - behind) / (2.0 * step[parameter])
+        # Exact bars: residuals are zero, and so is what the turning normals would add.
+        scale = np.abs(rows[:, column]).max()
+        assert rows[:, column] == pytest.approx(slope, rel=1e-3, abs=1e-4 * scale)
+
+
+def test_bars_slide_along_their_line_for_nothing():
+    camera = corner_camera()
+    bars = evidence(camera).bars
+    arc = bars.samples.bend_world.any(axis=1)
+    moved = Bars(
+        bars.samples,
+        camera.project(bars.samples.beside(0.4)),
+        bars.noise,
+        bars.by_paint,
+        bars.unknowns,
+    )
+    off = np.abs(moved.whitened(camera)[0][: len(arc)]) * bars.noise
+    # Forty centimetres are 25 px; lenses bend by a hundredth of a pixel on the way.
+    assert off[~arc].max() < 0.02
+
+
+def test_shared_survey_is_taken_off_once():
+    camera = corner_camera()
+    bars = evidence(camera).bars
+    off, _ = bars.whitened(camera)
+    assert np.abs(off).max() < 1e-9
+    # A surveyed point that is two deviations off costs four, however many samples show it.
+    point = bars.unknowns[0, 1]
+    shift = 2.0 * np.where(bars.unknowns == point, bars.by_paint, 0.0).sum(axis=1)
+    seen = see_lines(camera, bars.samples, 0.12, 0.006, 0.05)
+    other = Bars(
+        bars.samples,
+        bars.pixels + shift[:, None] * seen.normals,
+        bars.noise,
+        bars.by_paint,
+        bars.unknowns,
+    )
+    cost = float((other.whitened(camera)[0] ** 2).sum())
+    assert 0.0 < cost <= 4.0 + 1e-6
+
+
+def test_best_camera_is_found_from_metres_away():
+    camera = corner_camera()
+    given = evidence(camera)
+    best = given.fit(camera)
+    step = np.zeros(12)
+    step[5], step[6] = 0.5, 0.01  # half a metre back, a hundredth longer
+    again = given.fit(stepped(camera, step))
+    lowest = float((given.residuals(best)[0] ** 2).sum())
+    # A hundredth of a deviation ends the search.
+    assert float((given.residuals(again)[0] ** 2).sum()) == pytest.approx(lowest, abs=1e-3)
+
+
+def test_valley_widens_the_covariance_and_is_the_same_each_time():
+    camera = corner_camera()
+    given = evidence(camera)
+    wide = fit_and_bends(given.problem, camera, given.bars, 1.0)
+    free = np.flatnonzero(given.problem.free)
+    rows = given.residuals(wide.camera)[1]
+    added = wide.covariance[np.ix_(free, free)] - np.linalg.inv(rows.T @ rows)
+    size = np.sqrt(np.diag(wide.covariance)[free])
+    assert np.linalg.eigvalsh(added / np.outer(size, size)).min() > -1e-6
+    again = fit_and_bends(given.problem, camera, given.bars, 1.0)
+    assert (again.covariance == wide.covariance).all()
+    assert (row_of(again.camera) == row_of(wide.camera)).all()
+
+
+def test_stills_without_lines_make_a_camera_weak():
+    camera, rng = people.seat(0)
+    clicked = people.click(camera, rng).clicked
+    picture = np.full((1080, 1920), 90, np.uint8)
+    found = calibrate(people.PITCH, clicked, people.SIZE, picture=picture)
+    assert found.report.stage == "points"
+    assert found.report.weak
+    assert any("no painted lines" in reason for reason in found.report.reasons)
+    assert not calibrate(people.PITCH, clicked, people.SIZE).report.weak
+
+
+@pytest.mark.parametrize("index", [2, 4])
+def test_lines_tell_which_of_few_clicks_is_wrong(index):
+    camera, rng = people.seat(index)
+    few = people.click(camera, rng, count=5, noise=3.0, wrong=150.0)
+    picture = render_pitch(camera, people.PITCH, None, 0)
+    found = calibrate(people.PITCH, few.clicked, people.SIZE, picture=picture)
+    assert found.report.stage == "lines"
+    assert found.report.wrong == (few.first,)
+
+
+def test_lines_find_the_wrong_one_of_five_clicks_of_three_times_the_noise():
+    camera, rng = people.seat(0)
+    few = people.click(camera, rng, count=5, noise=3.0, wrong=150.0)
+    picture = render_pitch(camera, people.PITCH, None, 0)
+    found = calibrate(people.PITCH, few.clicked, people.SIZE, picture=picture)
+    places = people.on_the_pitch(np.random.default_rng(0))
+    assert found.report.stage == "lines"
+    assert found.report.wrong == (few.first,)
+    assert np.median(people.ground_errors(found.estimate.camera, camera, places)) < 0.02

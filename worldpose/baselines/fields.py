@@ -1,0 +1,138 @@
+"""Parts of what a method wrote, checked as they are taken."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.baselines.pickled import FILE_BYTES
+from worldpose.errors import InputError
+
+Floats = NDArray[np.float64]
+
+
+def wrong(where: object, expected: str, found: str) -> InputError:
+    """The error about one place of a method's file."""
+    return InputError(
+        str(where),
+        expected=expected,
+        found=found,
+        todo="Take the file that the method's own code wrote, or name another method.",
+    )
+
+
+def part(where: str, content: object, *keys: object) -> Any:  # noqa: ANN401
+    """Return what lies under keys of nested dictionaries.
+
+    Raises:
+        InputError: naming the first key that is not there.
+    """
+    for key in keys:
+        if not isinstance(content, Mapping) or key not in content:
+            known = ", ".join(map(str, list(content)[:8])) if isinstance(content, Mapping) else ""
+            raise wrong(where, f"{key}", known or f"a {type(content).__name__}")
+        content = content[key]
+        where = f"{where}: {key}"
+    return content
+
+
+def as_floats(where: str, value: object) -> Floats:
+    """Return numbers as an array of whatever shape they have.
+
+    Raises:
+        InputError: they are no numbers.
+    """
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise wrong(where, "numbers", f"a {type(value).__name__}") from None
+
+
+def floats(where: str, value: object, shape: tuple[int | None, ...]) -> Floats:
+    """Return numbers of a shape, None for any length; ones as dimensions more do not count.
+
+    Raises:
+        InputError: no numbers, or another shape.
+    """
+    array = as_floats(where, value)
+    while array.ndim > len(shape) and 1 in array.shape:
+        # The first one of those that the shape does not want.
+        lone = next(
+            (
+                i
+                for i, n in enumerate(array.shape)
+                if n == 1 and _fits(np.delete(array.shape, i), shape)
+            ),
+            array.shape.index(1),
+        )
+        array = array.squeeze(lone)
+    if not _fits(array.shape, shape):
+        wanted = ", ".join("any" if n is None else str(n) for n in shape)
+        raise wrong(where, f"numbers of shape ({wanted})", f"{array.shape}")
+    return array
+
+
+def whole(where: str, value: object, count: int | None = None) -> NDArray[np.int64]:
+    """Return whole numbers (count,), such as frames.
+
+    Raises:
+        InputError: no whole numbers, or another number of them.
+    """
+    array = floats(where, value, (count,))
+    if not np.array_equal(array, np.round(array)):
+        raise wrong(where, "whole numbers", f"{array[:4]}")
+    return array.astype(np.int64)
+
+
+def number(where: str, value: object) -> int:
+    """Return one whole number, also where it is written as text.
+
+    Raises:
+        InputError: it is none.
+    """
+    found = floats(where, value, ())
+    if not np.isfinite(found) or found != np.round(found) or abs(found) > 2**53:
+        raise wrong(where, "a whole number", f"{value}")
+    return int(found)
+
+
+def rising(where: str, frames: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return frames that rise.
+
+    Raises:
+        InputError: they do not, or count from below 0.
+    """
+    if np.any(np.diff(frames) <= 0) or np.any(frames < 0):
+        raise wrong(where, "frames that rise from 0", f"{frames[:8]}")
+    return frames
+
+
+def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    """Return some arrays of an npz file; others in it are not looked at, pickled ones refused.
+
+    Raises:
+        InputError: it is no npz file, is too large, or lacks one.
+    """
+    try:
+        with zipfile.ZipFile(path) as file:
+            size = sum(file.getinfo(f"{name}.npy").file_size for name in names)
+        if size > FILE_BYTES:
+            raise wrong(path, f"at most {FILE_BYTES} bytes of arrays", f"{size}")
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in names}
+    except KeyError as error:
+        raise wrong(path, f"the arrays {', '.join(names)}", str(error.args[0])) from None
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise wrong(path, "a whole npz file", str(error)) from None
+
+
+def _fits(found: object, shape: tuple[int | None, ...]) -> bool:
+    lengths = tuple(np.asarray(found).tolist())
+    return len(lengths) == len(shape) and all(
+        wanted in (None, n) for n, wanted in zip(lengths, shape, strict=True)
+    )

@@ -1,0 +1,88 @@
+"""Bodies of one camera's pictures, turned into the world and given to tracks (S4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from worldpose.body_fitting.monocular import MonocularEstimates
+from worldpose.body_fitting.pose_space import GATHER
+from worldpose.body_fitting.starting import bridged
+from worldpose.cameras import Camera, Rigid
+
+Floats = NDArray[np.float64]
+
+GATE: Final = 0.35
+"""Farthest that an estimate is from its person in the picture [person height]."""
+
+
+@dataclass(frozen=True, eq=False)
+class MonocularPoses:
+    """What one camera's pictures say of people's poses."""
+
+    orient: Floats
+    """(frames, persons, 3, 3), world from body; NaN where nothing is said."""
+    angles: Floats
+    """(frames, persons, 30) [rad], of `pose_space`; NaN where nothing is said."""
+
+
+def place_monocular_poses(
+    estimates: MonocularEstimates, camera: Camera, frame: NDArray[np.int64], joints: Floats
+) -> MonocularPoses:
+    """Return what estimates say of tracked people, in the world.
+
+    A method that looks at a crop takes the crop's middle for straight ahead; through the calibrated
+    camera that is a ray, and turning the picture's axis onto it turns the body, 10 degrees near the
+    border of a broadcast picture. Who is who is decided frame by frame by the least distance to the
+    middle of the projected joints.
+
+    Args:
+        estimates: in pictures of the camera.
+        camera: batch (frames,).
+        frame: (frames,), the numbers of the frames.
+        joints: (frames, persons, 17, 3) [m], world; gaps are bridged.
+    """
+    frames, persons = joints.shape[:2]
+    orient = np.full((frames, persons, 3, 3), np.nan)
+    angles = np.full((frames, persons, GATHER.shape[0]), np.nan)
+    if not persons:
+        return MonocularPoses(orient, angles)
+    full = np.stack([bridged(joints[:, person]) for person in range(persons)], axis=1)
+    image = camera.project(full.reshape(frames, -1, 3)).reshape(frames, persons, -1, 2)
+    known = np.isfinite(image)
+    low = np.where(known, image, np.inf).min(axis=2, initial=np.inf)
+    high = np.where(known, image, -np.inf).max(axis=2, initial=-np.inf)
+    middle, height = 0.5 * (low + high), high[..., 1] - low[..., 1]
+    for place in np.flatnonzero(np.isin(frame, estimates.frame)):
+        rows = np.flatnonzero(estimates.frame == frame[place])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            away = np.linalg.norm(estimates.center[rows, None] - middle[place], axis=-1)
+            away = away / height[place]
+        away = np.where(np.isfinite(away), away, np.inf)
+        row, person = linear_sum_assignment(np.minimum(away, GATE))
+        near = away[row, person] < GATE
+        row, person = rows[row[near]], person[near]
+        at = camera[int(place)]
+        turned = estimates.rotations[row, 0]
+        if estimates.cropped:
+            turned = _towards(at.normalize(estimates.center[row])) @ turned
+        orient[place, person] = at.cam_from_world.rotation.T @ turned
+        turns = Rigid(estimates.rotations[row, 1:], np.zeros(3)).rotvec
+        angles[place, person] = turns.reshape(len(row), GATHER.shape[1]) @ GATHER.T
+    bad = ~(np.isfinite(orient).all((-1, -2)) & np.isfinite(angles).all(-1))
+    orient[bad], angles[bad] = np.nan, np.nan
+    return MonocularPoses(orient, angles)
+
+
+def _towards(plane: Floats) -> Floats:
+    """The least turns (n, 3, 3) from straight ahead to points (n, 2) of the plane z = 1."""
+    ahead = np.concatenate([plane, np.ones((len(plane), 1))], axis=-1)
+    ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
+    across = np.cross([0.0, 0.0, 1.0], ahead)
+    sine = np.linalg.norm(across, axis=-1, keepdims=True)
+    angle = np.arctan2(sine, ahead[:, 2:])
+    return Rigid.from_rotvec(across / np.maximum(sine, 1e-12) * angle, np.zeros(3)).rotation

@@ -1,0 +1,248 @@
+"""The two small nets that ship with the project: people in a picture, keypoints in a crop.
+
+Needs torch. Nothing else of worldpose imports this file before it is asked to. Both nets are plain
+residual pyramids of 3 x 3 convolutions, which CPUs compute fastest; they differ in their heads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Final, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from worldpose.detection.bundled_surroundings import MAPS
+
+Net = TypeVar("Net", bound=nn.Module)
+
+STRIDE: Final = 4
+"""Pixels of the picture a cell of the people map [px]."""
+COARSEST: Final = 32
+"""Pictures are padded to multiples of this [px]."""
+CROP: Final = (96, 128)
+"""Width, height of the crops that the keypoint net takes [px]."""
+CELL: Final = 2
+"""Pixels of the crop a cell of the keypoint maps [px]."""
+EDGE_CELL: Final = 4
+"""Pixels of the crop a cell of the maps of edges [px]."""
+JOINTS: Final = 17
+_SCALE: Final = 16.0
+"""A box side of logarithm 0 lies this far from its cell [px]: that of a person of about 60 px."""
+
+
+class Block(nn.Sequential):
+    """Convolution, batch normalisation and rectification."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> None:
+        padding = (kernel - stride + 1) // 2 if kernel > 1 else 0
+        super().__init__(
+            nn.Conv2d(inputs, outputs, kernel, stride, padding, bias=False),
+            nn.BatchNorm2d(outputs),
+            nn.ReLU(inplace=True),
+        )
+
+
+class Residual(nn.Module):
+    """Two convolutions beside the identity."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first, self.second = Block(width, width), Block(width, width)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(batch, width, height, width) of the same shape."""
+        changed: Tensor = self.second(self.first(features))
+        return features + changed
+
+
+class Pyramid(nn.Module):
+    """Features of a finest map that know what all coarser ones see.
+
+    Args:
+        stem: layers from the picture to the finest map.
+        widths: channels of the maps, each of half the size of the one before it.
+        depths: residual blocks on each map.
+    """
+
+    def __init__(self, stem: nn.Module, widths: Sequence[int], depths: Sequence[int]) -> None:
+        super().__init__()
+        self.stem = stem
+        stages, laterals, merged = [], [], []
+        for index, (width, depth) in enumerate(zip(widths, depths, strict=True)):
+            down = [Block(widths[index - 1], width, stride=2)] if index else []
+            stages.append(nn.Sequential(*down, *(Residual(width) for _ in range(depth))))
+        for fine, coarse in pairwise(widths):
+            laterals.append(nn.Conv2d(coarse, fine, 1, bias=False))
+            merged.append(Block(fine, fine))
+        self.stages, self.laterals = nn.ModuleList(stages), nn.ModuleList(laterals)
+        self.merged = nn.ModuleList(merged)
+
+    def forward(self, picture: Tensor, added: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """The finest map, and the coarsest; `added` to what the stem makes of the picture."""
+        stem = self.stem(picture)
+        maps = [self.stages[0](stem if added is None else stem + added)]
+        for stage in self.stages[1:]:
+            maps.append(stage(maps[-1]))
+        features = maps[-1]
+        for index in reversed(range(len(self.laterals))):
+            above = functional.interpolate(self.laterals[index](features), scale_factor=2.0)
+            features = self.merged[index](maps[index] + above)
+        return features, maps[-1]
+
+
+class PeopleNet(nn.Module):
+    """Where the middles of people are, and how far the sides of their boxes are from there."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.pyramid = Pyramid(Block(3, 24, kernel=6, stride=4), (24, 40, 80, 128), (1, 2, 2, 1))
+        last = nn.Conv2d(32, 5, 1)
+        # Few cells are the middle of anybody: training begins from a chance of 1 %.
+        last.bias = nn.Parameter(torch.tensor([-4.6, 0.0, 0.0, 0.0, 0.0]))
+        self.head = nn.Sequential(Block(24, 32), last)
+
+    def forward(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the maps of pictures whose sides are multiples of `COARSEST`.
+
+        Args:
+            pictures: (batch, 3, height, width) `normalised`.
+
+        Returns:
+            Logits that a cell is the middle of somebody (batch, rows, columns), and distances from
+            the cell's middle to left, top, right and bottom (batch, 4, rows, columns) [px].
+        """
+        features, _ = self.pyramid(pictures)
+        maps = self.head(features).float()
+        return maps[:, 0], _SCALE * torch.exp(maps[:, 1:].clamp(-4.0, 4.0))
+
+
+class Seen(NamedTuple):
+    """What the keypoint net says of crops.
+
+    Attributes:
+        maps: logits of where each joint is (batch, 17, rows, columns), to be compared over the
+            cells of a map.
+        doubt: what the crop as a whole says of each joint's certainty (batch, 17).
+        boxes: x0, y0, x1, y1 of the person (batch, 4) [px of the crop].
+        fit: logits of how much of their union these and the true boxes share (batch,).
+    """
+
+    maps: Tensor
+    doubt: Tensor
+    boxes: Tensor
+    fit: Tensor
+
+
+class KeypointNet(nn.Module):
+    """Where the 17 joints and the box of the person in a crop are, and how sure that is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        stem = nn.Sequential(Block(3, 16, stride=2), Block(16, 32, stride=2))
+        self.pyramid = Pyramid(stem, (32, 64, 128), (2, 2, 2))
+        self.around = nn.Conv2d(MAPS, 32, 3, padding=1, bias=False)
+        nn.init.zeros_(self.around.weight)
+        self.head = nn.Sequential(Block(32, 64), nn.Conv2d(64, 4 * JOINTS, 1))
+        self.doubt = nn.Linear(128, JOINTS)
+        self.trust = nn.Parameter(torch.ones(JOINTS))
+        self.outline = nn.Sequential(Block(32, 32), nn.Conv2d(32, 4, 1))
+        self.fit = nn.Sequential(nn.Linear(128 + 4, 32), nn.ReLU(), nn.Linear(32, 1))
+
+    def forward(self, crops: Tensor, surroundings: Tensor) -> Seen:
+        """Return what is seen in crops.
+
+        Args:
+            crops: (batch, 3, height, width) `normalised`.
+            surroundings: (batch, 3, rows, columns) who is asked for and who is about.
+        """
+        features, coarsest = self.pyramid(crops, self.around(surroundings))
+        maps = functional.pixel_shuffle(self.head(features), CELL)
+        # How sure a joint is must not bend the features that find it.
+        whole = coarsest.float().mean(dim=(2, 3))
+        boxes, spread = edges(self.outline(features).float())
+        fit = self.fit(torch.cat([whole, spread], dim=1))[:, 0]
+        return Seen(maps.float(), self.doubt(whole.detach()), boxes, fit)
+
+    def sureness(self, doubt: Tensor, mass: Tensor) -> Tensor:
+        """Logits that joints are right, from `doubt` and their peaks' mass.
+
+        Args:
+            doubt: (batch, 17)
+            mass: (batch, 17) or, of several places each, (batch, 17, places).
+        """
+        places = (1,) * (mass.ndim - 2)
+        trusted = self.trust.view(-1, *places) * torch.logit(mass, eps=1e-4)
+        return doubt.view(*doubt.shape, *places) + trusted
+
+
+def normalised(pictures: Tensor) -> Tensor:
+    """Pictures (batch, height, width, 3) of bytes as the nets take them (batch, 3, ...)."""
+    return pictures.permute(0, 3, 1, 2).float().sub_(115.0).div_(58.0)
+
+
+def peaks(maps: Tensor) -> tuple[Tensor, Tensor]:
+    """Where joints are, finer than cells, and the probability about that place.
+
+    The place is the mean over the 5 x 5 cells about the most likely one.
+
+    Args:
+        maps: (batch, joints, rows, columns) logits.
+
+    Returns:
+        Keypoints (batch, joints, 2) [px of the crop], and mass (batch, joints).
+    """
+    rows, columns = maps.shape[-2:]
+    chance = functional.softmax(maps.flatten(2), dim=-1)
+    best = chance.argmax(dim=-1)
+    row, column = best // columns, best % columns
+    around = torch.arange(-2, 3, device=maps.device)
+    y = (row[..., None, None] + around[:, None]).expand(*best.shape, 5, 5)
+    x = (column[..., None, None] + around[None, :]).expand(*best.shape, 5, 5)
+    inside = (y >= 0) & (y < rows) & (x >= 0) & (x < columns)
+    cell = (y.clamp(0, rows - 1) * columns + x.clamp(0, columns - 1)).flatten(2)
+    near = chance.gather(-1, cell) * inside.flatten(2)
+    mass = near.sum(dim=-1)
+    at = torch.stack([(near * x.flatten(2)).sum(-1), (near * y.flatten(2)).sum(-1)], dim=-1)
+    return CELL * (at / mass[..., None]) + 0.5 * (CELL - 1), mass
+
+
+def edges(maps: Tensor) -> tuple[Tensor, Tensor]:
+    """Where the edges of a box are, and how far their probability spreads.
+
+    Every map is read along one axis alone, as an edge's probability over columns or rows.
+
+    Args:
+        maps: (batch, 4, rows, columns) logits of left, top, right and bottom.
+
+    Returns:
+        Edges and their standard deviations, both (batch, 4) [px of the crop, cells].
+    """
+    places, spreads = [], []
+    for side in range(4):
+        logits = torch.logsumexp(maps[:, side], dim=1 + side % 2)
+        chance = functional.softmax(logits, dim=1)
+        cell = torch.arange(chance.shape[1], device=maps.device, dtype=maps.dtype)
+        place = chance @ cell
+        places.append(EDGE_CELL * place + 0.5 * (EDGE_CELL - 1))
+        spreads.append(((chance @ cell.square()) - place.square()).clamp(min=1e-6).sqrt())
+    return torch.stack(places, dim=1), torch.stack(spreads, dim=1)
+
+
+def folded(net: Net) -> Net:
+    """Return `net` for computing alone: its normalisations are part of its convolutions.
+
+    Args:
+        net: with its weights, changed in place.
+    """
+    for module in net.modules():
+        if isinstance(module, Block):
+            convolution, normalisation = module[0], module[1]
+            assert isinstance(convolution, nn.Conv2d)
+            assert isinstance(normalisation, nn.BatchNorm2d)
+            module[0] = fuse_conv_bn_eval(convolution, normalisation)
+            module[1] = nn.Identity()
+    return net

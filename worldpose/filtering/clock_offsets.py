@@ -1,0 +1,130 @@
+"""Clocks of the cameras, told apart from where they stand.
+
+Cameras that were adjusted to people have taken in much of what their clocks are late: people who
+all run one way look shifted. So clocks and cameras are estimated together here, with every joint
+free to follow both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.cameras import Camera
+from worldpose.filtering.residuals import Places, Residuals
+from worldpose.static_calibration.parameters import by_step
+
+Floats = NDArray[np.float64]
+
+STEP: Final = 7
+"""Rotation, shift and focal length, of a camera's step."""
+EXPECTED: Final = np.array([*(0.003,) * 3, *(0.5,) * 3, 0.005])
+"""Standard deviation of a camera's turns [rad], shift [m] and focal length [1]: ten times what
+careful calibration leaves."""
+LEAST: Final = 1e-6
+"""Added to the information of a point [1/m^2]."""
+ROUNDS: Final = 40
+"""Of learning how far clocks are apart: exact ones then come out 0.02 frames apart."""
+LEAST_SPREAD: Final = 0.005
+"""Of clocks [frame]."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What one camera saw, an entry for each joint of each row that counts."""
+
+    row: Places
+    joint: Places
+    place: Places
+    """Which point it is."""
+    held: Floats
+    """(n, 2, 1 + STEP) how its unknowns move the keypoint, weighted."""
+    held_points: Floats
+    """(n, 2, 3) how the point does."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClockEquations:
+    """Normal equations of clocks and cameras, with every joint solved for (Schur complement)."""
+
+    seen: tuple[_Seen, ...]
+    """By camera."""
+    used: NDArray[np.bool_]
+    """(points,) that anybody saw."""
+    follow: Floats
+    """(3 used, cameras (1 + STEP)) how these go along with the unknowns."""
+    matrix: Floats
+    """(cameras (1 + STEP),) twice."""
+
+    @classmethod
+    def of(
+        cls, cameras: Camera, joints: Floats, way: Floats, residuals: Residuals
+    ) -> ClockEquations:
+        """Return the equations; which keypoints count is all that they take from `residuals`.
+
+        Args:
+            cameras: batch (cameras,).
+            joints: (frames, persons, 17, 3) [m], world, of bodies.
+            way: (n, 17, 2) [px], of each row's joints in its picture within a frame; NaN = unknown.
+            residuals: of these joints, whose `frame` are theirs.
+        """
+        persons, joint_count = joints.shape[1:3]
+        count, width = cameras.batch_shape[0], 1 + STEP
+        points = joints.reshape(-1, 3)
+        weight = residuals.weight * np.isfinite(way).all(axis=-1)
+        normal = np.tile(LEAST * np.eye(3), (len(points), 1, 1))
+        mixed = np.zeros((len(points), 3, count, width))
+        matrix = np.zeros((count, width, count, width))
+        seen = []
+        for camera in range(count):
+            row, joint = np.nonzero((weight > 0.0) & (residuals.camera == camera)[:, None])
+            place = (residuals.frame[row] * persons + residuals.person[row]) * joint_count + joint
+            by_points = cameras[camera].project_with_jacobians(points[place])
+            by_camera = by_step(cameras[camera], by_points)[..., :STEP]
+            by_all = np.concatenate([way[row, joint][..., None], by_camera], axis=-1)
+            held = weight[row, joint, None, None] * by_all
+            held_points = weight[row, joint, None, None] * by_points.d_points
+            matrix[camera, :, camera] = np.einsum("nak,nal->kl", held, by_all)
+            # A camera sees a joint of a person at most once in a frame.
+            normal[place] += np.einsum("nai,naj->nij", held_points, by_points.d_points)
+            mixed[place, :, camera] = np.einsum("nai,nak->nik", held_points, by_all)
+            seen.append(_Seen(row, joint, place, held, held_points))
+        used = normal[:, 0, 0] > LEAST
+        flat = mixed[used].reshape(-1, 3, count * width)
+        follow = np.asarray(np.linalg.solve(normal[used], flat), np.float64)
+        follow = follow.reshape(-1, count * width)
+        whole = matrix.reshape(count * width, -1) - flat.reshape(-1, count * width).T @ follow
+        return cls(tuple(seen), used, follow, whole)
+
+    def learn_lateness(self, residuals: Residuals) -> Floats:
+        """Return by how many frames each camera shows people later than the mean (cameras,).
+
+        Args:
+            residuals: with the keypoints that count in the equations, as far as they still miss.
+        """
+        right = np.zeros((len(self.seen), 1 + STEP))
+        pulled = np.zeros((len(self.used), 3))
+        for camera, seen in enumerate(self.seen):
+            missed = residuals.missed[seen.row, seen.joint]
+            right[camera] = np.einsum("nak,na->k", seen.held, missed)
+            pulled[seen.place] += np.einsum("nai,na->ni", seen.held_points, missed)
+        side = right.reshape(-1) - self.follow.T @ pulled[self.used].reshape(-1)
+        return _late(self.matrix, side, len(self.seen))
+
+
+def _late(matrix: Floats, right: Floats, count: int) -> Floats:
+    """The first unknown of every camera; how far these differ is learnt (expectation-maximisation).
+
+    Where nothing tells clocks from cameras, or all agree, they come out equal.
+    """
+    spread = 1.0
+    for _ in range(ROUNDS):
+        prior = np.tile(np.concatenate([[spread**-2], EXPECTED**-2]), count)
+        inverse = np.linalg.inv(matrix + np.diag(prior))
+        late = (inverse @ right).reshape(count, -1)[:, 0]
+        variance = np.diagonal(inverse).reshape(count, -1)[:, 0]
+        spread = max(LEAST_SPREAD, float(np.sqrt(np.mean(late**2 + variance))))
+    return np.asarray(late - late.mean())

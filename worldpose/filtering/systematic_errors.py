@@ -1,0 +1,139 @@
+"""What keypoints are beside bodies by for reasons that last: sides seen, and clocks.
+
+Both are learned from all people of a clip together. What they come to for each keypoint is taken
+off in the next iteration; nobody's own error is in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.cameras import Camera
+from worldpose.filtering.clock_offsets import ClockEquations
+from worldpose.filtering.judging import Suspects, body_residuals, judge_detections, learn_from
+from worldpose.filtering.settings import FilteringSettings
+from worldpose.filtering.view_bias import ViewBias, find_azimuths, learn_view_bias
+from worldpose.filtering.views import BodyViews
+
+Floats = NDArray[np.float64]
+
+LASTING: Final = 0.3
+"""Time in which a detector's error forgets itself by a factor e [s]."""
+ROUNDS: Final = 2
+"""Of judging and learning: the second judges by what the first has learnt."""
+TURNS: Final = 3
+"""Of learning sides and clocks after each other, within a round."""
+
+
+@dataclass(frozen=True, eq=False)
+class SystematicErrors:
+    """What a clip's detector and clocks always get wrong.
+
+    Attributes:
+        view_bias: by the side that a body is seen from.
+        late: (cameras,) by how much each camera shows people later than the cameras' mean [frame].
+    """
+
+    view_bias: ViewBias
+    late: Floats
+
+    @classmethod
+    def none(cls, cameras: int) -> SystematicErrors:
+        """Nothing."""
+        return cls(ViewBias.none(), np.zeros(cameras))
+
+    def shift(self, motion: BodyMotion, views: BodyViews) -> Floats:
+        """Return by how far keypoints are beside joints (frames, cameras, persons, 17, 2) [px].
+
+        NaN where a body, or its motion, is not known.
+        """
+        sides = self.view_bias.shift(motion.azimuth, _scale(views))
+        return np.asarray(sides + self.late[:, None, None, None] * motion.way)
+
+    def late_in_offsets(self, offsets: Floats, motion: BodyMotion) -> Floats:
+        """Return which part of the lateness people's offsets hold already (cameras,) [frame].
+
+        They are of joints placed before anybody knew of clocks, so that a camera seems to see
+        people beside where they are along their way.
+
+        Args:
+            offsets: (frames, cameras, persons, 2) [px], as of `Suspects`.
+            motion: of the bodies.
+        """
+        way = np.nan_to_num(motion.way.mean(axis=-2))
+        along = (np.nan_to_num(offsets) * way).sum(axis=(0, 2, 3))
+        held = along / np.maximum((way**2).sum(axis=(0, 2, 3)), 1e-12)
+        return np.asarray(np.clip(held, np.minimum(self.late, 0.0), np.maximum(self.late, 0.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class BodyMotion:
+    """How bodies are turned and move in all pictures."""
+
+    azimuth: Floats
+    """(frames, cameras, persons) of the camera, seen from the body [rad]."""
+    way: Floats
+    """(frames, cameras, persons, 17, 2) that joints go in a frame [px]."""
+
+
+def watch_motion(cameras: Camera, joints: Floats, step: Floats) -> BodyMotion:
+    """Return how bodies are turned and move in all pictures.
+
+    Args:
+        cameras: batch (cameras,).
+        joints: (frames, persons, 17, 3) [m], world.
+        step: (frames, persons, 17, 3) [m], their way in a frame.
+    """
+    ends = [
+        cameras.project((joints + part * step).reshape(len(joints), 1, -1, 3))
+        for part in (-0.5, 0.5)
+    ]
+    shape = (len(joints), cameras.batch_shape[0], *joints.shape[1:3], 2)
+    return BodyMotion(find_azimuths(cameras, joints), (ends[1] - ends[0]).reshape(shape))
+
+
+def learn_systematic_errors(
+    cameras: Camera,
+    joints: Floats,
+    views: BodyViews,
+    motion: BodyMotion,
+    suspects: Suspects,
+    settings: FilteringSettings,
+    fps: float,
+) -> SystematicErrors:
+    """Return what keypoints that fit their bodies are beside them by.
+
+    Args:
+        cameras: batch (cameras,).
+        joints: (frames, persons, 17, 3) [m], world, of the bodies, as the detector sees them.
+        views: these in all pictures.
+        motion: of these.
+        suspects: what was detected there.
+        settings: what counts as a contradiction.
+        fps: of these frames [1/s].
+    """
+    systematic = SystematicErrors.none(cameras.batch_shape[0])
+    repeated = max(1.0, 2.0 * LASTING * fps)
+    for _ in range(ROUNDS):
+        corrected = suspects.without(systematic.shift(motion, views))
+        spread = learn_from(views, corrected)
+        judged = judge_detections(views, corrected, spread, settings)
+        residuals = body_residuals(views, suspects, judged, spread, repeated)
+        at = residuals.frame, residuals.camera, residuals.person
+        azimuth, way, scale = motion.azimuth[at], motion.way[at], _scale(views)[at]
+        clocks = ClockEquations.of(cameras, joints, way, residuals)
+        for _ in range(TURNS):
+            late = systematic.late[residuals.camera, None, None]
+            bias = learn_view_bias(residuals.less(late * np.nan_to_num(way)), azimuth, scale)
+            sides = np.nan_to_num(bias.shift(azimuth, scale))
+            systematic = SystematicErrors(bias, clocks.learn_lateness(residuals.less(sides)))
+    return systematic
+
+
+def _scale(views: BodyViews) -> Floats:
+    """How large a metre is at a body's hips (frames, cameras, persons) [px/m]."""
+    return np.asarray(views.scale[..., (11, 12)].mean(axis=-1))

@@ -1,0 +1,84 @@
+"""Other looks of the same picture: light, colours, fog, lens and codec."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.records import Record
+
+Levels = NDArray[np.float32]
+
+
+class AugmentationSettings(Record):
+    """How often, and how far, training pictures differ from those on disk."""
+
+    strength: float = 1.0
+    """Of changes of light and colour [1]; 0 = none."""
+    recoloured: float = 0.3
+    """Share of pictures whose colour channels change places [1]: kits and skins of any colour."""
+    grey: float = 0.04
+    """Share without colour [1]."""
+    fog: float = 0.15
+    """Share seen through haze [1]."""
+    soft: float = 0.35
+    """Share blurred or shrunk and enlarged again [1]."""
+    coded: float = 0.2
+    """Share that went through a codec [1]."""
+    grain: float = 0.5
+    """Share with a sensor's noise [1]."""
+
+
+def augment(
+    picture: NDArray[np.uint8], settings: AugmentationSettings, rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """Return the picture (height, width, 3) as another camera, light or kit would show it."""
+    mixing, offset = _colours(picture[::8, ::8].mean(), settings, rng)
+    levels: Levels = np.asarray(
+        cv2.transform(picture.astype(np.float32), np.column_stack([mixing, offset])), np.float32
+    )
+    if rng.random() < settings.soft:
+        levels = _softened(levels, rng)
+    if rng.random() < settings.grain:
+        grain = rng.standard_normal((*levels.shape[:2], 1), dtype=np.float32)
+        levels = levels + np.float32(rng.uniform(1.0, 10.0)) * grain
+    seen = np.clip(levels, 0.0, 255.0).astype(np.uint8)
+    if rng.random() < settings.coded:
+        quality = int(rng.integers(25, 90))
+        _, code = cv2.imencode(".jpg", seen, [cv2.IMWRITE_JPEG_QUALITY, quality])
+        seen = np.asarray(cv2.imdecode(code, cv2.IMREAD_COLOR), dtype=np.uint8)
+    return seen
+
+
+def _colours(
+    middle: float, settings: AugmentationSettings, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What light, camera and air make of colours: a matrix (3, 3) and levels to add (3,)."""
+    strength = settings.strength
+    mixing = np.eye(3)
+    if rng.random() < settings.recoloured:
+        mixing = mixing[rng.permutation(3)]
+    if rng.random() < settings.grey:
+        mixing = np.full((3, 3), 1.0 / 3.0)
+    vivid = 1.0 + 0.5 * strength * rng.uniform(-1, 1)
+    mixing = (vivid * np.eye(3) + (1.0 - vivid) / 3.0) @ mixing
+    mixing *= np.exp(0.4 * strength * rng.uniform(-1, 1))
+    mixing *= 1.0 + 0.15 * strength * rng.uniform(-1, 1, (3, 1))
+    offset = middle + 40.0 * strength * rng.uniform(-1, 1) - mixing.sum(axis=1) * middle
+    if rng.random() < settings.fog:
+        haze = rng.uniform(0.1, 0.6)
+        mixing, offset = (1.0 - haze) * mixing, (1.0 - haze) * offset
+        offset = offset + haze * rng.uniform(120, 220)
+    return mixing, offset
+
+
+def _softened(levels: Levels, rng: np.random.Generator) -> Levels:
+    if rng.random() < 0.5:
+        return np.asarray(cv2.GaussianBlur(levels, (0, 0), rng.uniform(0.4, 1.6)), np.float32)
+    height, width = levels.shape[:2]
+    share = rng.uniform(0.4, 0.9)
+    small = cv2.resize(
+        levels, (int(share * width), int(share * height)), interpolation=cv2.INTER_AREA
+    )
+    return np.asarray(cv2.resize(small, (width, height)), dtype=np.float32)
