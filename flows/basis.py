@@ -69,7 +69,7 @@ def _made_of(store: Store, match: Match, latest: RunRecord) -> dict[str, str]:
     for stage in METHOD:
         for unit in stage.units(match):
             name = f"{stage.name}/{unit}"
-            taken = stage.again(match, unit)
+            taken = stage.previous_pass_inputs(match, unit)
             if not taken or name not in latest.results:
                 continue
             try:

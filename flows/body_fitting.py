@@ -39,7 +39,7 @@ STAGE = Stage(
     units=tracking.units,
     inputs=inputs,
     sources=sources,
-    again=tracking.filtered,
-    later=tracking.found_again,
-    outside=outside,
+    previous_pass_inputs=tracking.filtered,
+    late_inputs=tracking.found_again,
+    external_inputs=outside,
 )

@@ -53,6 +53,6 @@ STAGE = Stage(
     units=units,
     inputs=inputs,
     sources=sources,
-    again=again,
-    later=later,
+    previous_pass_inputs=again,
+    late_inputs=later,
 )

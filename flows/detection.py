@@ -103,6 +103,6 @@ STAGE = Stage(
     units=units,
     inputs=inputs,
     sources=sources,
-    outside=outside,
-    prefers="GPU",
+    external_inputs=outside,
+    worker_tag="GPU",
 )

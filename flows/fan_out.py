@@ -93,7 +93,7 @@ def task_of(stage: Stage) -> Task[..., Any]:
 
 def _placed(stage: Stage) -> AbstractContextManager[Any]:
     client = _client()
-    return nullcontext() if client is None else on_workers_with(stage.prefers, client)
+    return nullcontext() if client is None else on_workers_with(stage.worker_tag, client)
 
 
 def _client() -> Client | None:

@@ -22,6 +22,6 @@ STAGE = Stage(
     units=tracking.units,
     inputs=inputs,
     sources=tracking.clip_sources,
-    again=tracking.filtered,
-    later=tracking.found_again,
+    previous_pass_inputs=tracking.filtered,
+    late_inputs=tracking.found_again,
 )

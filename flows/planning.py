@@ -78,7 +78,7 @@ def plan_stage(
         results: `stage/unit` to key of what earlier stages have, or will have, computed.
         before: the same of the iteration before; None in the first.
     """
-    if before is None and stage.since > 1:
+    if before is None and stage.first_pass > 1:
         return StagePlan((), ())
     earlier = METHOD[: METHOD.index(stage)]
     left_out = left_out_cameras(store, match, earlier, results)
@@ -89,13 +89,13 @@ def plan_stage(
         blocked_units = tuple(f"{stage.name}/{unit}" for unit in stage.units(match))
         return StagePlan((), blocked_units, lacks_cameras=True)
     settings = settings_of(stage, overrides)
-    outside = stage.outside(settings)
+    outside = stage.external_inputs(settings)
     units, blocked = [], []
     for unit in stage.units(match):
         inputs = {name: results.get(name) for name in stage.inputs(match, unit)}
         if before is not None:
-            inputs |= {name: results.get(name) for name in stage.later(match, unit)}
-            inputs |= {name: before.get(name) for name in stage.again(match, unit)}
+            inputs |= {name: results.get(name) for name in stage.late_inputs(match, unit)}
+            inputs |= {name: before.get(name) for name in stage.previous_pass_inputs(match, unit)}
         known = {name: key for name, key in inputs.items() if key is not None}
         if known.keys() != inputs.keys():
             blocked.append(f"{stage.name}/{unit}")

@@ -70,7 +70,7 @@ STAGE = Stage(
     units=units,
     inputs=inputs,
     sources=sources,
-    again=again,
-    since=2,
-    prefers="GPU",
+    previous_pass_inputs=again,
+    first_pass=2,
+    worker_tag="GPU",
 )

@@ -77,6 +77,6 @@ STAGE = Stage(
     units=units,
     inputs=inputs,
     sources=sources,
-    again=tracking.filtered,
-    later=tracking.found_again,
+    previous_pass_inputs=tracking.filtered,
+    late_inputs=tracking.found_again,
 )

@@ -242,7 +242,10 @@ def _require_there(
 ) -> None:
     """Refuse an iteration if the one before has other results than it would be made of."""
     used = {
-        name for each in stages for unit in each.units(match) for name in each.again(match, unit)
+        name
+        for each in stages
+        for unit in each.units(match)
+        for name in each.previous_pass_inputs(match, unit)
     }
     lost = []
     for name in sorted(used & before.keys()):

@@ -10,6 +10,7 @@ from pydantic import JsonValue, ValidationError
 
 from data_contracts.records import Record
 from flows.method import METHOD
+from flows.renames import SETTINGS
 from flows.stage import Stage
 from worldpose.errors import UsageError
 
@@ -59,6 +60,7 @@ def parse_overrides(assignments: list[str], stages: tuple[Stage, ...] = METHOD) 
                 todo="For example: --set triangulation.min_views=3.",
             )
         _place(f"--set {assignment}", stage_name, list(by_name))
+        _refuse_former_name(assignment, stage_name, field)
         _place(f"--set {assignment}", field, list(by_name[stage_name].settings.model_fields))
         try:
             value = json.loads(text)
@@ -86,6 +88,17 @@ def settings_of(stage: Stage, overrides: Overrides) -> Record:
             found=repr(first["input"]),
             todo="See worldpose run MATCH --set list.",
         ) from None
+
+
+def _refuse_former_name(assignment: str, stage: str, field: str) -> None:
+    present = SETTINGS.get(stage, {}).get(field)
+    if present is not None:
+        raise UsageError(
+            f"--set {assignment}",
+            expected=f"the present name of the setting, {present}",
+            found=f"its former name {field}",
+            todo=f"Write --set {stage}.{present}=VALUE.",
+        )
 
 
 def _place(where: str, name: str, names: list[str]) -> int:

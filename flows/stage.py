@@ -94,12 +94,11 @@ class Stage:
         units: names of the pieces that are computed, retried and stored on their own.
         inputs: for a unit, the `stage/unit` names of the results it is made from.
         sources: for a unit, everything the match folder contributes to its result.
-        again: for a unit, the results of the iteration before that it is made from too.
-        later: for a unit, the results of its own iteration that it is made from too, from the
-            second on.
-        since: the first iteration that it is a part of.
-        outside: for its settings, what they name outside of the match: digests of those files.
-        prefers: tag of the workers that compute it, where the cluster has such.
+        previous_pass_inputs: for a unit, the inputs from the iteration before.
+        late_inputs: for a unit, further inputs from its own iteration, from the second one on.
+        first_pass: the first iteration in which the stage runs.
+        external_inputs: digests of the files outside the match that its settings name.
+        worker_tag: tag of the workers that compute it, if the cluster has such.
         leaves_out: its results may leave static cameras out of all later stages.
         min_cameras: static cameras that it needs once some are left out.
     """
@@ -110,10 +109,10 @@ class Stage:
     units: Callable[[Match], tuple[str, ...]]
     inputs: Callable[[Match, str], tuple[str, ...]]
     sources: Callable[[Match, str], dict[str, JsonValue]]
-    again: Callable[[Match, str], tuple[str, ...]] = _no_results
-    later: Callable[[Match, str], tuple[str, ...]] = _no_results
-    since: Literal[1, 2] = 1
-    outside: Callable[[Any], dict[str, JsonValue]] = _nothing
-    prefers: str | None = None
+    previous_pass_inputs: Callable[[Match, str], tuple[str, ...]] = _no_results
+    late_inputs: Callable[[Match, str], tuple[str, ...]] = _no_results
+    first_pass: Literal[1, 2] = 1
+    external_inputs: Callable[[Any], dict[str, JsonValue]] = _nothing
+    worker_tag: str | None = None
     leaves_out: bool = False
     min_cameras: int = 0

@@ -86,7 +86,7 @@ STAGE = Stage(
     units=units,
     inputs=inputs,
     sources=sources,
-    again=again,
-    later=found_again,
+    previous_pass_inputs=again,
+    late_inputs=found_again,
     min_cameras=MIN_CAMERAS,
 )

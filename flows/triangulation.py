@@ -19,6 +19,6 @@ STAGE = Stage(
     units=tracking.units,
     inputs=inputs,
     sources=tracking.clip_sources,
-    again=tracking.again,
-    later=tracking.found_again,
+    previous_pass_inputs=tracking.again,
+    late_inputs=tracking.found_again,
 )

@@ -50,8 +50,8 @@ class Served:
             "--prefect-port": self.ports["prefect"],
             "--port": self.ports["pages"],
             "--metrics-port": self.ports["metrics"],
-            "--quiet": 3,
-            "--sweep": 1,
+            "--settle-time": 3,
+            "--poll-interval": 1,
             "--disk-gb": 1e9,  # more than there is: an alert that is sure to come
         }
         environment = {

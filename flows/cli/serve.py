@@ -39,7 +39,9 @@ def serve(
     check: Annotated[
         bool, typer.Option("--check", help="Say what is unhealthy and how to mend it, and end.")
     ] = False,
-    at_once: Annotated[int, typer.Option(min=1, help="Matches that run at the same time.")] = 1,
+    max_concurrent: Annotated[
+        int, typer.Option(min=1, help="Matches that run at the same time.")
+    ] = 1,
     dask: DaskOption = None,
     workers: WorkersOption = None,
     time_limits: TimeLimitOption = None,
@@ -57,10 +59,10 @@ def serve(
     names: NamesOption = None,
     certificate: CertificateOption = None,
     key: KeyOption = None,
-    quiet: Annotated[
+    settle_time: Annotated[
         float, typer.Option(min=0, help="A match has arrived when unchanged for so long [s].")
     ] = 30.0,
-    sweep: Annotated[
+    poll_interval: Annotated[
         float, typer.Option(min=0.1, help="How often the inbox is gone through on schedule [min].")
     ] = 15.0,
     gate_hours: Annotated[
@@ -118,7 +120,7 @@ def serve(
         name=name,
         prefect=(given or f"http://127.0.0.1:{prefect_port}/api").rstrip("/"),
         owns_prefect=not given,
-        at_once=at_once,
+        max_concurrent=max_concurrent,
         dask=dask,
         workers=workers,
         time_limits=dict(parse_time_limits(time_limits or ())),
@@ -128,8 +130,8 @@ def serve(
         metrics_port=metrics_port,
         certificate=certificate,
         key=key,
-        quiet_seconds=quiet,
-        sweep_minutes=sweep,
+        settle_seconds=settle_time,
+        poll_minutes=poll_interval,
         gate_hours=gate_hours,
         disk_gb=disk_gb,
     )

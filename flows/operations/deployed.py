@@ -53,7 +53,7 @@ def ingest(plan: dict[str, Any]) -> list[str]:
         Store.create(served.project),
         served.state_folder,
         served.inbox,
-        served.quiet_seconds,
+        served.settle_seconds,
         begin,
     )
     for arrival in decided:

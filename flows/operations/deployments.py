@@ -71,7 +71,7 @@ DEPLOYED: Final = (
         "Take in the matches that have arrived in the inbox.",
         None,
         lambda plan: {"plan": plan.model_dump(mode="json")},
-        lambda plan: Interval(timedelta(minutes=plan.sweep_minutes)),
+        lambda plan: Interval(timedelta(minutes=plan.poll_minutes)),
         fixed=("plan",),
     ),
     Deployed(
@@ -110,7 +110,7 @@ async def install(plan: ServePlan) -> dict[UUID, Installed]:
     async with get_client() as client:
         await _refuse_other_project(client, plan)
         matches, arrivals = pools(plan)
-        await _pool(client, matches, plan.at_once, "Matches, urgent ones first")
+        await _pool(client, matches, plan.max_concurrent, "Matches, urgent ones first")
         await _pool(client, arrivals, 1, "What arrives, while matches run")
         for rank, queue in enumerate(PRIORITIES, 1):
             await _queue(client, matches, queue, rank)

@@ -31,7 +31,7 @@ class ServePlan(Record):
     """Address of Prefect's API."""
     owns_prefect: bool = True
     """Whether the Prefect server is started and ended with this."""
-    at_once: int = Field(default=1, ge=1)
+    max_concurrent: int = Field(default=1, ge=1)
     """Matches that run at the same time; what waits for people does not count."""
     dask: str | None = None
     """Address of a running Dask scheduler; None: workers on this machine for each run."""
@@ -51,9 +51,9 @@ class ServePlan(Record):
     """PEM file of the pages' certificate."""
     key: Path | None = None
     """PEM file of its private key."""
-    quiet_seconds: float = Field(default=30.0, ge=0)
+    settle_seconds: float = Field(default=30.0, ge=0)
     """A match has arrived when nothing of it has changed for so long [s]."""
-    sweep_minutes: float = Field(default=15.0, gt=0)
+    poll_minutes: float = Field(default=15.0, gt=0)
     """How often the inbox is gone through on schedule, besides on arrival [min]."""
     gate_hours: float = Field(default=24.0, gt=0)
     """A result that waits longer for a person raises an alert [h]."""

@@ -285,7 +285,7 @@ def environment_of(plan: ServePlan) -> dict[str, str]:
     """What every part of a served project has in its environment; secrets are not among it."""
     home = plan.state / "prefect" if plan.owns_prefect else None
     values = served_environment(plan.prefect, home)
-    workers = plan.workers or max(1, (os.cpu_count() or 1) // plan.at_once)
+    workers = plan.workers or max(1, (os.cpu_count() or 1) // plan.max_concurrent)
     values["WORLDPOSE_STATE"] = str(plan.state)
     values["WORLDPOSE_WORKERS"] = str(workers)
     if plan.dask is not None:

@@ -113,7 +113,7 @@ async def _watch_bucket(plan: ServePlan) -> None:
     trouble = Trouble("looking at the bucket")
     while True:
         with trouble.told():
-            await asyncio.to_thread(bucket.fetch, time.monotonic(), plan.quiet_seconds)
+            await asyncio.to_thread(bucket.fetch, time.monotonic(), plan.settle_seconds)
         await asyncio.sleep(BUCKET_SECONDS)
 
 
@@ -123,7 +123,7 @@ async def _watch_inbox(plan: ServePlan) -> None:
         began = time.monotonic()
         with trouble.told():
             ready = await asyncio.to_thread(
-                watch_once, plan.state_folder, plan.inbox, plan.quiet_seconds
+                watch_once, plan.state_folder, plan.inbox, plan.settle_seconds
             )
             if ready:
                 await _ingest(plan, ready)

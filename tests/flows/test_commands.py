@@ -8,7 +8,11 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from flows import renames
 from flows.cli.app import COMMANDS, app, summary
+from flows.method import METHOD
+from flows.settings import parse_overrides
+from worldpose.errors import UsageError
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -48,3 +52,37 @@ def test_a_group_lists_its_commands():
     answer = CliRunner().invoke(app, ["body", "--help"])
     assert answer.exit_code == 0
     assert "install" in answer.output.partition("Commands:")[2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "present"),
+    [
+        (["times", "m"], "worldpose times is now worldpose timings"),
+        (["serve", "--quiet=3"], "--quiet is now --settle-time"),
+        (["serve", "--at-once", "2"], "--at-once is now --max-concurrent"),
+    ],
+)
+def test_a_former_name_is_refused_with_the_present_one(arguments, present):
+    answer = CliRunner().invoke(app, arguments)
+    assert answer.exit_code == 2
+    assert present in answer.output
+
+
+def test_a_former_setting_is_refused_with_the_present_one():
+    with pytest.raises(UsageError, match="repair_limb_lengths=VALUE"):
+        parse_overrides(["triangulation.mend_limbs=false"])
+
+
+def test_every_present_name_exists():
+    for stage in METHOD:
+        fields = stage.settings.model_fields
+        for former, present in renames.SETTINGS.get(stage.name, {}).items():
+            assert present in fields, (stage.name, present)
+            assert former not in fields, (stage.name, former)
+    assert set(renames.COMMANDS.values()) <= set(COMMANDS)
+    assert not set(renames.COMMANDS) & set(COMMANDS)
+    for command, options in renames.OPTIONS.items():
+        known = CliRunner().invoke(app, [command, "--help"]).output
+        for former, present in options.items():
+            assert present in known
+            assert former not in known

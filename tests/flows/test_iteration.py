@@ -47,10 +47,10 @@ def reached(match, number, *starts):
     """What is made from `starts`, found by walking the stages' declared inputs alone."""
     found = set()
     for each in range(1, number + 1):
-        for stage in (stage for stage in METHOD if stage.since <= each):
+        for stage in (stage for stage in METHOD if stage.first_pass <= each):
             for unit in stage.units(match):
-                again = stage.again(match, unit) if each > 1 else ()
-                later = stage.later(match, unit) if each > 1 else ()
+                again = stage.previous_pass_inputs(match, unit) if each > 1 else ()
+                later = stage.late_inputs(match, unit) if each > 1 else ()
                 name = (each, f"{stage.name}/{unit}")
                 sources = {(each, up) for up in (*stage.inputs(match, unit), *later)}
                 sources |= {(each - 1, up) for up in again}

@@ -32,7 +32,12 @@ def plan(server, tmp_path_factory):
     """A plan whose deployments are installed."""
     folder = tmp_path_factory.mktemp("served")
     plan = ServePlan(
-        project=str(folder), inbox=folder, state=folder, prefect=server, name="ops", at_once=2
+        project=str(folder),
+        inbox=folder,
+        state=folder,
+        prefect=server,
+        name="ops",
+        max_concurrent=2,
     )
     # Prefect has read its settings when this file imported it, before the server was there.
     login = {PREFECT_API_AUTH_STRING: os.environ["PREFECT_API_AUTH_STRING"]}
@@ -158,7 +163,7 @@ def test_a_release_lies_in_the_project_under_a_name_that_leads_nowhere_else(tmp_
 
 
 def test_installed_again_changes_limits_and_another_project_is_refused(plan):
-    more = plan.model_copy(update={"at_once": 3})
+    more = plan.model_copy(update={"max_concurrent": 3})
     asyncio.run(install(more))
 
     async def limit():

@@ -21,7 +21,8 @@ pytestmark = pytest.mark.skipif(not SHELF.is_dir(), reason="WORLDPOSE_TEST_DATA 
 
 
 def test_adjustment_of_four_given_cameras_harms_no_joints(tmp_path, monkeypatch):
-    # With a loose prior on given cameras, adjustment took the mean error from 52 to 69 mm here.
+    # With a prior of 5 % of the distance and no gain asked for, adjustment raises the mean error
+    # from 51.9 to 55.1 mm here and lowers PCP3D from 98.7 to 98.3.
     monkeypatch.syspath_prepend(BENCHMARK.parent)  # it imports its neighbour
     spec = importlib.util.spec_from_file_location("shelf_subsets", BENCHMARK)
     subsets = importlib.util.module_from_spec(spec)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from flows import times
+from flows import timings
 
 BEGUN = datetime(2026, 5, 1, 12, tzinfo=UTC)
 
@@ -33,7 +33,7 @@ class Told:
 
 
 def test_what_elapsed_counts_units_side_by_side_once():
-    found = times.run_time(Told(), "m", "0001")
+    found = timings.run_time(Told(), "m", "0001")
     ingest, tracking = found.stages
     assert (ingest.stage, ingest.units, ingest.work, ingest.longest) == ("ingest", 2, 4.0, 2.0)
     # 10 to 13 s of the run; then 15 to 20 s.

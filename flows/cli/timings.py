@@ -1,4 +1,4 @@
-"""Command times: where the time of a run went."""
+"""Command timings: where the time of a run went."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from flows.cli.console import (
     print_table,
 )
 from flows.registering import find_registration
-from flows.times import run_time
+from flows.timings import run_time
 from worldpose.store import Store
 
 
-def times(
+def timings(
     match: MatchArgument,
     run: RunOption = "latest",
     project: ProjectOption = DEFAULT_PROJECT,
@@ -27,7 +27,7 @@ def times(
 ) -> None:
     """Say how long each stage of a run took, and how long none was at work.
 
-    Example: worldpose times matches/tiny
+    Example: worldpose timings matches/tiny
     """
     store = Store.open(project)
     found = run_time(store, find_registration(store, match).spec.match_id, run)
