@@ -27,8 +27,8 @@ from data_contracts.run import WaitingUnit
 from worldpose.errors import WorldposeError
 from worldpose.review import Journal, say
 from worldpose.store import Store
-from worldpose.store.blobs import open_blobs
 from worldpose.store.canonical import canonical_json, digest
+from worldpose.store.store import open_blobs
 
 PATIENCE: Final = timedelta(days=90)
 """Prefect cannot resume a run that has been suspended for longer; a new run goes on as well."""

@@ -89,7 +89,7 @@ def serve(
     # Late: no other command needs them.
     from flows.operations.layout import state_folder
     from flows.operations.plan import ServePlan
-    from worldpose.store.blobs import open_blobs
+    from worldpose.store.store import open_blobs
 
     url = open_blobs(project).url
     folder = state_folder(url, state)

@@ -14,9 +14,14 @@ import ast
 import statistics
 import sys
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import cached_property
+from graphlib import TopologicalSorter
 from pathlib import Path
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("data_contracts", "worldpose", "tasks", "flows")
@@ -104,15 +109,27 @@ class Structure:
 
     def cycles(self) -> list[str]:
         """Return the groups of modules that import each other in a circle."""
-        return [", ".join(sorted(group)) for group in components(self.imports) if len(group) > 1]
+        names = list(self.imports)
+        place = {name: index for index, name in enumerate(names)}
+        edges = [(place[name], place[each]) for name in names for each in self.imports[name]]
+        rows, columns = zip(*edges, strict=True) if edges else ((), ())
+        graph = csr_array((np.ones(len(edges)), (rows, columns)), shape=(len(names), len(names)))
+        _, group = connected_components(graph, connection="strong")
+        members: dict[int, list[str]] = defaultdict(list)
+        for name, number in zip(names, group.tolist(), strict=True):
+            members[number].append(name)
+        return [", ".join(sorted(each)) for each in members.values() if len(each) > 1]
 
     def chain(self) -> list[str]:
-        """Return the longest chain of modules of which each imports the next."""
+        """Return the longest chain of modules of which each imports the next.
+
+        Raises:
+            graphlib.CycleError: modules import each other in a circle.
+        """
         longest: dict[str, list[str]] = {}
-        for group in components(self.imports):  # imported groups come first
-            for name in sorted(group):
-                after = [longest[each] for each in self.imports[name] if each not in group]
-                longest[name] = [name, *max(after, key=len, default=[])]
+        for name in TopologicalSorter(self.imports).static_order():  # imported modules come first
+            after = [longest[each] for each in sorted(self.imports[name])]
+            longest[name] = [name, *max(after, key=len, default=[])]
         return max(longest.values(), key=len, default=[])
 
     def parameters(self) -> list[str]:
@@ -158,41 +175,6 @@ def module_name(path: Path) -> str:
 def package_of(module: str) -> str:
     """Return the package that a module lies in."""
     return module.rpartition(".")[0]
-
-
-def components(graph: Mapping[str, set[str]]) -> list[set[str]]:
-    """Return the strongly connected components of a graph, those that others reach first.
-
-    Source: R. Tarjan, Depth-first search and linear graph algorithms, 1972, without recursion.
-    """
-    index: dict[str, int] = {}
-    low: dict[str, int] = {}
-    stack: list[str] = []
-    found: list[set[str]] = []
-    for start in graph:
-        if start in index:
-            continue
-        work = [(start, iter(sorted(graph[start])))]
-        index[start] = low[start] = len(index)
-        stack.append(start)
-        while work:
-            node, edges = work[-1]
-            following = next(edges, None)
-            if following is None:
-                work.pop()
-                if work:
-                    low[work[-1][0]] = min(low[work[-1][0]], low[node])
-                if low[node] == index[node]:
-                    place = stack.index(node)
-                    found.append(set(stack[place:]))
-                    del stack[place:]
-            elif following not in index:
-                index[following] = low[following] = len(index)
-                stack.append(following)
-                work.append((following, iter(sorted(graph[following]))))
-            elif following in stack:
-                low[node] = min(low[node], index[following])
-    return found
 
 
 def print_table(structure: Structure) -> None:

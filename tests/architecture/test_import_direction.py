@@ -44,7 +44,7 @@ ORDER_IN_WORLDPOSE = (
     "filtering",
     "redetection",
     "evaluation",
-    "methods",
+    "baselines",
     "dataset",
     "reports",
     "synthetic",

@@ -10,7 +10,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Protocol
 
-from worldpose.errors import InputError, StoreError
+from worldpose.errors import StoreError
 
 
 @dataclass(frozen=True)
@@ -63,29 +63,6 @@ class Blobs(Protocol):
 
         False when something is published there already; nothing is changed then.
         """
-
-
-def open_blobs(url: str) -> Blobs:
-    """The disk or object storage at `url`: a folder, or `s3://bucket/prefix`.
-
-    Raises:
-        InputError: another scheme, or no bucket.
-    """
-    if url.startswith("s3://"):
-        # Late: object storage is an extra, and needs obstore.
-        from worldpose.store.objects import ObjectBlobs
-
-        return ObjectBlobs.at(url)
-    if "://" in url:
-        raise InputError(
-            f"project {url}",
-            expected="a folder or s3://bucket/prefix",
-            found=f"the scheme {url.split('://')[0]!r}",
-            todo="Name a folder, or an S3-compatible store with AWS_ENDPOINT_URL set.",
-        )
-    from worldpose.store.folder import LocalBlobs
-
-    return LocalBlobs(Path(url).expanduser().absolute())
 
 
 _TODO = {

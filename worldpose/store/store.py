@@ -7,16 +7,18 @@ import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from data_contracts.match import Registration
 from data_contracts.run import Project, Reservation, ResultManifest, RunRecord
 from data_contracts.work import Work
 from worldpose.errors import CorruptionError, InputError, NondeterminismError, StoreError
-from worldpose.store.blobs import Blobs, open_blobs
+from worldpose.store.blobs import Blobs
 from worldpose.store.commit_points import reached
 from worldpose.store.documents import seal, unseal, unseal_repairable
 from worldpose.store.fingerprint import STORE_FORMAT
+from worldpose.store.folder import LocalBlobs
 from worldpose.store.paths import MANIFEST, PROJECT, ResultId, is_name, registration_path
 from worldpose.store.published import read_published
 from worldpose.store.recipes import key_of
@@ -284,3 +286,24 @@ class Store:
                 "must give the same bytes: report the stage. The published result stays."
             )
         return theirs
+
+
+def open_blobs(url: str) -> Blobs:
+    """The disk or object storage at `url`: a folder, or `s3://bucket/prefix`.
+
+    Raises:
+        InputError: another scheme, or no bucket.
+    """
+    if url.startswith("s3://"):
+        # Late: object storage is an extra, and needs obstore.
+        from worldpose.store.objects import ObjectBlobs
+
+        return ObjectBlobs.at(url)
+    if "://" in url:
+        raise InputError(
+            f"project {url}",
+            expected="a folder or s3://bucket/prefix",
+            found=f"the scheme {url.split('://')[0]!r}",
+            todo="Name a folder, or an S3-compatible store with AWS_ENDPOINT_URL set.",
+        )
+    return LocalBlobs(Path(url).expanduser().absolute())
