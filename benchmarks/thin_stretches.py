@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from flows import refitting
 from flows.fan_out import task_of
 from flows.method import METHOD
 from flows.planning import PlannedUnit, plan_run
 from flows.registering import register
+from flows.stages import refitting
 from worldpose.formats import read_joints, write_archive
 from worldpose.store import Store, key_of
 from worldpose.synthetic import SCENARIOS

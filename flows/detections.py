@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from pydantic import JsonValue
 
 from data_contracts.review import Edit
-from flows.detection import seen_by, seen_in_broadcast
 from flows.edit_conflicts import StaleEditError, edits_since
-from flows.ingest import edits_by_camera
 from flows.stage import Match
+from flows.stages.detection import seen_by, seen_in_broadcast
+from flows.stages.ingest import edits_by_camera
 from worldpose.errors import InputError
 from worldpose.ingest import Observations
 from worldpose.review.detections import (

@@ -13,7 +13,7 @@ import numpy as np
 from data_contracts.review import Correction, Edit
 from flows.corrections import keep_edits
 from flows.detections import detections_now
-from flows.match_pictures import frame_picture
+from flows.reports.match_pictures import frame_picture
 from flows.stage import Match
 from worldpose.errors import UsageError
 from worldpose.exchange import (

@@ -99,7 +99,7 @@ def process_match(
 
 
 def _shown(store: Store, match_id: str) -> AbstractContextManager[None]:
-    from flows.operations.artifacts import shown_at_prefect  # late: only deployments show them
+    from flows.service.artifacts import shown_at_prefect  # late: only deployments show them
 
     return shown_at_prefect(store, match_id)
 

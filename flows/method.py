@@ -6,7 +6,10 @@ hold the places of those to come, with their units and checklist ids.
 
 from __future__ import annotations
 
-from flows import (
+from flows import gates
+from flows.gates import Gate
+from flows.stage import Stage
+from flows.stages import (
     body_fitting,
     broadcast_calibration,
     broadcast_pooling,
@@ -14,7 +17,6 @@ from flows import (
     camera_consistency,
     detection,
     filtering,
-    gates,
     ingest,
     redetection,
     refitting,
@@ -23,8 +25,6 @@ from flows import (
     tracking,
     triangulation,
 )
-from flows.gates import Gate
-from flows.stage import Stage
 
 METHOD: tuple[Stage, ...] = (
     ingest.STAGE,  # [camera]

@@ -16,9 +16,9 @@ import threading
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final
 
-from flows.host_guard import HostGuard
-from flows.http_server import serve_http
 from flows.prefect_environment import SERVER_LOGIN
+from flows.web.host_guard import HostGuard
+from flows.web.http_server import serve_http
 from worldpose.errors import UsageError
 
 if TYPE_CHECKING:

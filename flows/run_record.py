@@ -9,7 +9,6 @@ from datetime import UTC, datetime
 from typing import Any, Self
 
 from data_contracts.run import GatePolicy, RunRecord, RunState, UnitFailure, WaitingUnit
-from flows import body_fitting, tracking, triangulation
 from flows.basis import basis_of
 from flows.edit_conflicts import EditedMeanwhileError
 from flows.gatekeeping import Gatekeeper, passed
@@ -19,6 +18,7 @@ from flows.planning import PlannedUnit, StagePlan, plan_stage
 from flows.progress import reporter
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
+from flows.stages import body_fitting, tracking, triangulation
 from worldpose.store import Store, libraries
 
 

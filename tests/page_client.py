@@ -11,8 +11,8 @@ from contextlib import contextmanager
 
 from command_line import TINY, WORLDPOSE
 
-from flows.pages.access import access_for
-from flows.pages.app import create_app
+from flows.web.access import access_for
+from flows.web.app import create_app
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # of the web framework, about its own test client

@@ -108,7 +108,7 @@ def report(
     Example: worldpose report tiny-1 --out report.html
     """
     from flows.registering import find_match
-    from flows.reporting import write_report
+    from flows.reports.report import write_report
 
     store = Store.open(project)
     known = find_match(store, match)

@@ -32,9 +32,9 @@ def serve(
     Example: worldpose review serve --port 8571
     """
     # Late: the server takes half a second to import, which no other command needs.
-    from flows.pages.access import access_for
-    from flows.pages.serving import address
-    from flows.pages.serving import serve as serve_pages
+    from flows.web.access import access_for
+    from flows.web.serving import address
+    from flows.web.serving import serve as serve_pages
 
     tls = certificate_and_key(certificate, key)
     access = access_for(host, token=token, names=names or (), secure=tls is not None)

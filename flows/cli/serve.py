@@ -24,7 +24,7 @@ from flows.time_limits import parse_time_limits
 from worldpose.errors import UsageError
 
 if TYPE_CHECKING:
-    from flows.operations.layout import StateFolder
+    from flows.service.layout import StateFolder
 
 
 def serve(
@@ -87,8 +87,8 @@ def serve(
     Example: worldpose serve --inbox /data/arriving
     """
     # Late: no other command needs them.
-    from flows.operations.layout import state_folder
-    from flows.operations.plan import ServePlan
+    from flows.service.layout import state_folder
+    from flows.service.plan import ServePlan
     from worldpose.store.store import open_blobs
 
     url = open_blobs(project).url
@@ -96,11 +96,11 @@ def serve(
     if check:
         _check(folder, as_json=as_json)
         return
-    from flows.operations.senders import senders_of
-    from flows.operations.service_secrets import METRICS_TOKEN, secrets_of
-    from flows.operations.serving import serve as serve_all
-    from flows.pages.access import access_for
     from flows.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN
+    from flows.service.senders import senders_of
+    from flows.service.service_secrets import METRICS_TOKEN, secrets_of
+    from flows.service.serving import serve as serve_all
+    from flows.web.access import access_for
 
     senders_of(os.environ)  # refused now, not where nobody looks
     tls = certificate_and_key(certificate, key)
@@ -162,7 +162,7 @@ def serve(
 
 
 def _check(folder: StateFolder, *, as_json: bool) -> None:
-    from flows.operations.health import check
+    from flows.service.health import check
 
     findings = check(folder)
     if as_json:

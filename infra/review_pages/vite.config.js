@@ -24,7 +24,7 @@ const builtFrom = {
 export default defineConfig({
   plugins: [svelte(), builtFrom],
   build: {
-    outDir: "../../flows/pages/static",
+    outDir: "../../flows/web/static",
     emptyOutDir: true,
     modulePreload: { polyfill: false },
     rollupOptions: {

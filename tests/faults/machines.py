@@ -15,9 +15,9 @@ from pathlib import Path
 
 import psutil
 
-from flows.operations.plan import ServePlan
-from flows.operations.serving import answers
 from flows.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN, new_login, served_environment
+from flows.service.plan import ServePlan
+from flows.service.serving import answers
 
 START_SECONDS = 300.0
 """What a part may take to begin: machines are busy."""
@@ -191,7 +191,7 @@ class Machines:
         if self.preload is not None:
             worker += ["--preload", str(self.preload)]
         return {
-            "prefect": [*python, "flows.operations.child", "prefect", plan.model_dump_json()],
+            "prefect": [*python, "flows.service.child", "prefect", plan.model_dump_json()],
             "scheduler": [*python, *scheduler, "--no-dashboard"],
             **{
                 f"worker {number}": self.link.inside([*python, *worker])

@@ -94,9 +94,9 @@ def forgetful(keep):
 
 
 def serve_and_die(project, port, last, spoiled):
-    from flows.pages import calibration, decisions
-    from flows.pages.access import access_for
-    from flows.pages.serving import serve
+    from flows.web import calibration, decisions
+    from flows.web.access import access_for
+    from flows.web.serving import serve
 
     Disk(last, syncs=spoiled != "unsynced").install()
     if spoiled in ("early", "forgetful"):

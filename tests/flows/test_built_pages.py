@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 SOURCES = ROOT / "infra" / "review_pages"
-BUILT = ROOT / "flows" / "pages" / "static"
+BUILT = ROOT / "flows" / "web" / "static"
 
 
 def source_digest():

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from flows.disagreement_reporting import worst_views
+from flows.reports.disagreements import worst_views
 from worldpose.cameras import Camera
 from worldpose.formats import JointTracks
 from worldpose.synthetic.stadium import looking

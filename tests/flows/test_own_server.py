@@ -18,10 +18,6 @@ import pytest
 from distributed import Client, Security
 
 from flows import prefect_database
-from flows.operations.child import PARTS
-from flows.operations.plan import ServePlan
-from flows.operations.service_secrets import METRICS_TOKEN, secrets_of
-from flows.operations.serving import environment_of
 from flows.prefect_database import DATABASE, begin_database, keep_database
 from flows.prefect_environment import (
     AUTHORITIES,
@@ -35,6 +31,10 @@ from flows.prefect_environment import (
     without_secrets,
 )
 from flows.private_cluster import PrivateCluster
+from flows.service.child import PARTS
+from flows.service.plan import ServePlan
+from flows.service.service_secrets import METRICS_TOKEN, secrets_of
+from flows.service.serving import environment_of
 from worldpose.errors import InputError, StoreError
 
 

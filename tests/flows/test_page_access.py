@@ -11,9 +11,9 @@ from command_line import TINY
 from page_client import HERE, MATCH, TOKEN, a_click, moved
 
 from flows import corrections
-from flows.pages.access import SESSION_SECONDS, WRONG_SECONDS, WRONG_TOKENS, access_for
-from flows.pages.app import create_app
-from flows.pages.guard import BODY_BYTES, OPEN
+from flows.web.access import SESSION_SECONDS, WRONG_SECONDS, WRONG_TOKENS, access_for
+from flows.web.app import create_app
+from flows.web.guard import BODY_BYTES, OPEN
 from worldpose.errors import UsageError
 from worldpose.review import read_journal
 from worldpose.store import Store

@@ -11,12 +11,12 @@ from command_line import TINY
 from page_client import MATCH
 
 from data_contracts.review import ReviewRequest
-from flows.clip_video import clip_view
-from flows.pages import continuing
-from flows.pages.app_context import Desk
-from flows.pages.continuing import Continuing
 from flows.registering import open_match
+from flows.reports.clip_video import clip_view
 from flows.running import RunRequest, run_match
+from flows.web import continuing
+from flows.web.app_context import Desk
+from flows.web.continuing import Continuing
 from worldpose.review import say
 from worldpose.store import Store, open_run
 from worldpose.video import VideoReader

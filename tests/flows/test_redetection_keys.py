@@ -5,8 +5,8 @@ from filmed import write_filmed
 from test_iteration import LATER, keys, reached
 from test_refitting import halves
 
-from flows.redetection import STAGE
 from flows.registering import register
+from flows.stages.redetection import STAGE
 from worldpose.store import Store
 
 

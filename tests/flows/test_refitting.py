@@ -9,8 +9,8 @@ import yaml
 from flows.fan_out import task_of
 from flows.method import METHOD
 from flows.planning import plan_run
-from flows.refitting import STAGE
 from flows.registering import open_match, register
+from flows.stages.refitting import STAGE
 from worldpose.errors import InputError
 from worldpose.store import Store
 
@@ -99,9 +99,11 @@ def test_the_camera_at_its_clips_common_place_is_what_bodies_are_fitted_with(
     tiny, tmp_path, monkeypatch
 ):
     match, _ = register(Store.create(tmp_path / "project"), tiny)
-    monkeypatch.setattr("flows.broadcast_calibration.units", lambda match: ("clip",))
-    monkeypatch.setattr("flows.detection.seen_in_broadcast", lambda match, unit: ("ingest/clip",))
+    monkeypatch.setattr("flows.stages.broadcast_calibration.units", lambda match: ("clip",))
+    monkeypatch.setattr(
+        "flows.stages.detection.seen_in_broadcast", lambda match, unit: ("ingest/clip",)
+    )
     assert "broadcast_calibration/clip" in STAGE.inputs(match, "clip")
     assert "broadcast_pooling/clip" not in STAGE.inputs(match, "clip")
-    monkeypatch.setattr("flows.broadcast_pooling.units", lambda match: ("clip",))
+    monkeypatch.setattr("flows.stages.broadcast_pooling.units", lambda match: ("clip",))
     assert "broadcast_pooling/clip" in STAGE.inputs(match, "clip")

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from flows.reporting import write_report
+from flows.reports.report import write_report
 from worldpose.errors import UsageError
 
 

@@ -21,8 +21,8 @@ from flows.reprocess import UnprocessedError, reprocess
 from flows.reprocessing import Reprocessed, reprocess_matches
 from flows.review import correct
 from flows.running import RunRequest
+from flows.stages.tracking import STAGE
 from flows.touched import find_touched
-from flows.tracking import STAGE
 from worldpose.errors import InputError
 from worldpose.store import ResultId, Store
 from worldpose.store.paths import record_path

@@ -216,8 +216,8 @@ def prepare(template):
     shutil.copytree(template / "warm-True" / "project", template / "project")
     for file in (template / "project" / "matches").glob("*.json"):
         service_kinds._move(file, str(template / "warm-True" / "match"), str(template / "match"))
-    from flows.pages.access import access_for
-    from flows.pages.app import create_app
+    from flows.web.access import access_for
+    from flows.web.app import create_app
 
     access = access_for("127.0.0.1", token=service_kinds.TOKEN, names=(), secure=False)
     app = create_app(str(template / "project"), access)

@@ -511,8 +511,8 @@ def ask_all(project):
     """Answers of the pages to what is asked: method, path, status and the answer's beginning."""
     from fastapi.testclient import TestClient
 
-    from flows.pages.access import access_for
-    from flows.pages.app import create_app
+    from flows.web.access import access_for
+    from flows.web.app import create_app
 
     app = create_app(
         str(project.root), access_for("127.0.0.1", token=TOKEN, names=(), secure=False)

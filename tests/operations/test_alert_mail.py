@@ -9,9 +9,9 @@ from threading import Thread
 
 import pytest
 
-from flows.operations.alerts import Alert, AlertDispatcher
-from flows.operations.layout import StateFolder
-from flows.operations.senders import Mail, Webhook, senders_of
+from flows.service.alerts import Alert, AlertDispatcher
+from flows.service.layout import StateFolder
+from flows.service.senders import Mail, Webhook, senders_of
 from worldpose.errors import UsageError
 
 ALERT = Alert(

@@ -8,12 +8,12 @@ from types import SimpleNamespace
 import pytest
 
 from data_contracts.operations import Arrival
-from flows.operations.alerts import Alert, AlertDispatcher, FailedRun, alerts_now
-from flows.operations.layout import StateFolder
-from flows.operations.overview import MatchStatus, UnitGlance
-from flows.operations.plan import ServePlan
-from flows.operations.senders import Webhook, senders_of
-from flows.operations.watching import Trouble
+from flows.service.alerts import Alert, AlertDispatcher, FailedRun, alerts_now
+from flows.service.layout import StateFolder
+from flows.service.overview import MatchStatus, UnitGlance
+from flows.service.plan import ServePlan
+from flows.service.senders import Webhook, senders_of
+from flows.service.watching import Trouble
 from worldpose.errors import UsageError
 
 NOW = datetime.now(UTC)
@@ -88,11 +88,9 @@ def test_a_silent_webhook_is_asked_once_and_then_left_for_a_while(
     silent, tmp_path, caplog, monkeypatch
 ):
     """Sixty alerts were sixty times ten seconds, and a line of the log each, for ever."""
-    monkeypatch.setattr("flows.operations.senders.ANSWER_SECONDS", 0.2)
+    monkeypatch.setattr("flows.service.senders.ANSWER_SECONDS", 0.2)
     clock = SimpleNamespace(now=1000.0)
-    monkeypatch.setattr(
-        "flows.operations.alerts.time", SimpleNamespace(monotonic=lambda: clock.now)
-    )
+    monkeypatch.setattr("flows.service.alerts.time", SimpleNamespace(monotonic=lambda: clock.now))
     teller = AlertDispatcher(StateFolder(tmp_path), [Webhook(silent)])
     for _ in range(2880):  # a day of looks
         clock.now += 30.0

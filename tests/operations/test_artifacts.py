@@ -12,9 +12,9 @@ from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary
 
 from data_contracts.operations import Service, Serving
 from flows.method import METHOD
-from flows.operations.artifacts import shown_at_prefect
-from flows.operations.layout import StateFolder
 from flows.progress import reporter
+from flows.service.artifacts import shown_at_prefect
+from flows.service.layout import StateFolder
 from worldpose.store import Store
 
 

@@ -5,8 +5,8 @@ from datetime import UTC, datetime
 
 import pytest
 
-from flows.operations.bucket import BucketInbox
-from flows.operations.layout import StateFolder
+from flows.service.bucket import BucketInbox
+from flows.service.layout import StateFolder
 from worldpose.errors import UsageError
 from worldpose.store.blobs import Entry
 from worldpose.store.objects import ObjectBlobs

@@ -16,13 +16,13 @@ from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary
 from prefect.states import Cancelling, Completed, Crashed, Running, Suspended
 from prefect.workers.process import ProcessWorker
 
-from flows.operations import recovery
-from flows.operations.deployed import release_folder
-from flows.operations.deployments import DEPLOYED, install
-from flows.operations.plan import FLOWS, ServePlan
-from flows.operations.recovery import begin_again
-from flows.operations.served_worker import RefusedRunError, require_installed
-from flows.operations.watching import failed_runs
+from flows.service import recovery
+from flows.service.deployed import release_folder
+from flows.service.deployments import DEPLOYED, install
+from flows.service.plan import FLOWS, ServePlan
+from flows.service.recovery import begin_again
+from flows.service.served_worker import RefusedRunError, require_installed
+from flows.service.watching import failed_runs
 from worldpose.errors import InputError, UsageError
 from worldpose.store import Store
 
@@ -68,7 +68,7 @@ def test_deployments_have_queues_by_priority_and_limits(plan):
     match = deployments["match"]
     assert (match.work_pool_name, match.work_queue_name) == ("ops", "normal")
     assert match.parameters == {"project": plan.project, "settings": {}, "time_limits": {}}
-    assert match.entrypoint == "flows.operations.deployed.match"
+    assert match.entrypoint == "flows.service.deployed.match"
     for each in deployments.values():  # what the worker will load
         module, _, name = each.entrypoint.rpartition(".")
         assert isinstance(getattr(importlib.import_module(module), name), Flow)
@@ -99,7 +99,7 @@ def test_pools_and_deployments_that_were_changed_are_put_right(plan):
     template, match = asyncio.run(look())
     assert set(template["variables"]["properties"]) == {"stream_output"}
     assert not template["variables"]["additionalProperties"]
-    assert (match.entrypoint, match.pull_steps) == ("flows.operations.deployed.match", [])
+    assert (match.entrypoint, match.pull_steps) == ("flows.service.deployed.match", [])
     assert installed[match.id].entrypoint == match.entrypoint
     assert len(installed) == len(DEPLOYED)
 

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import pytest
 
 from data_contracts.operations import Arrival, Service, Serving
-from flows.operations import health
-from flows.operations.health import check
-from flows.operations.layout import StateFolder
-from flows.operations.plan import FLOWS
+from flows.service import health
+from flows.service.health import check
+from flows.service.layout import StateFolder
+from flows.service.plan import FLOWS
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from flows.operations.arrivals import take_in, watch_once
-from flows.operations.inbox import MOST_FILES, RefusalError, entries, fingerprint_of, missing_of
-from flows.operations.layout import StateFolder, state_folder
+from flows.service.arrivals import take_in, watch_once
+from flows.service.inbox import MOST_FILES, RefusalError, entries, fingerprint_of, missing_of
+from flows.service.layout import StateFolder, state_folder
 from worldpose.errors import UsageError
 from worldpose.store import Store
 
@@ -50,7 +50,7 @@ def clock(monkeypatch):
     """The machine's clock that only goes forward, as a test sets it [s]."""
     clock = SimpleNamespace(now=1000.0)
     read = SimpleNamespace(monotonic=lambda: clock.now)
-    monkeypatch.setattr("flows.operations.arrivals.time", read)
+    monkeypatch.setattr("flows.service.arrivals.time", read)
     return clock
 
 
@@ -210,7 +210,7 @@ def test_a_match_that_moves_to_another_queue_is_known(desk, drop):
 
 def take_in_and_die(folder, poisoned):
     """A process that dies, as from the system's out-of-memory killer, when it reads one match."""
-    from flows.operations import arrivals
+    from flows.service import arrivals
 
     register = arrivals.register
 
@@ -268,7 +268,7 @@ def test_what_was_ended_on_purpose_or_by_an_error_is_no_death(desk, drop, monkey
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("flows.operations.arrivals.register", interrupt)
+        patch.setattr("flows.service.arrivals.register", interrupt)
         for _ in range(3):
             with pytest.raises(KeyboardInterrupt):
                 desk.take_in()
@@ -433,7 +433,7 @@ def test_more_files_than_any_match_has_are_refused(drop, monkeypatch):
     folder = drop()
     fingerprint_of(folder)
     assert MOST_FILES > 1_000_000
-    monkeypatch.setattr("flows.operations.inbox.MOST_FILES", 3)
+    monkeypatch.setattr("flows.service.inbox.MOST_FILES", 3)
     with pytest.raises(RefusalError, match="more than 3 files"):
         fingerprint_of(folder)
 

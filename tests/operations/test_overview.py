@@ -7,8 +7,8 @@ import pytest
 
 from data_contracts.review import ReviewDecision, ReviewRequest
 from data_contracts.run import RunRecord, WaitingUnit
-from flows.operations import overview
-from flows.operations.overview import Overview
+from flows.service import overview
+from flows.service.overview import Overview
 
 UNIT = "static_calibration/cam03"
 REQUEST = "static_calibration.cam03.1f2e3d4c5b6a"

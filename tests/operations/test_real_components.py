@@ -9,9 +9,9 @@ import uuid
 import pytest
 from command_line import TINY, succeed
 
-from flows.operations.plan import ServePlan
-from flows.operations.serving import answers
 from flows.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN, new_login, served_environment
+from flows.service.plan import ServePlan
+from flows.service.serving import answers
 from worldpose.store import Store, compare_stores, verify
 
 LOGIN = new_login()
@@ -27,7 +27,7 @@ def prefect_on_postgres(postgres, tmp_path):
     environment = served_environment(api, tmp_path / "prefect")
     environment["PREFECT_API_DATABASE_CONNECTION_URL"] = postgres[0]
     environment[SERVER_LOGIN] = LOGIN
-    program = [sys.executable, "-m", "flows.operations.child", "prefect", plan.model_dump_json()]
+    program = [sys.executable, "-m", "flows.service.child", "prefect", plan.model_dump_json()]
     server = subprocess.Popen(program, stdin=subprocess.PIPE, env=environment)
     wait_until(lambda: answers(f"{api}/health"))
     yield api

@@ -9,8 +9,8 @@ import pytest
 from prefect.client.schemas.objects import FlowRun
 from prefect.states import Completed, Crashed, Failed, Pending, Running
 
-from flows.operations import recovery
-from flows.operations.recovery import MOST_BEGINNINGS, may_begin_again
+from flows.service import recovery
+from flows.service.recovery import MOST_BEGINNINGS, may_begin_again
 
 LOST = "Flow run encountered an exception: LostWorkersError: the Dask scheduler was lost"
 

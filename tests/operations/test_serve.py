@@ -135,7 +135,7 @@ def test_prefect_keeps_runs_that_wait_in_postgres(served, postgres, tmp_path):
 
 
 def test_a_second_service_of_a_project_and_an_absent_server_are_refused(tmp_path):
-    from flows.operations.layout import StateFolder
+    from flows.service.layout import StateFolder
 
     project = tmp_path / "project"
     state = StateFolder(project / "operations")

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-from flows.operations import serving
+from flows.service import serving
 
 
 def test_a_log_is_set_aside_while_its_process_writes_on(tmp_path, monkeypatch):

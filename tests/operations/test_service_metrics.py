@@ -12,11 +12,11 @@ from command_line import TINY
 from prometheus_client.parser import text_string_to_metric_families
 
 from data_contracts.operations import Arrival
-from flows.operations.alerts import Alert, AlertDispatcher
-from flows.operations.layout import StateFolder
-from flows.operations.metrics import ProjectFigures, exposition, metrics_server
-from flows.operations.overview import Overview
-from flows.operations.plan import ServePlan
+from flows.service.alerts import Alert, AlertDispatcher
+from flows.service.layout import StateFolder
+from flows.service.metrics import ProjectFigures, exposition, metrics_server
+from flows.service.overview import Overview
+from flows.service.plan import ServePlan
 from worldpose.store import Store
 
 INFRA = Path(__file__).parents[2] / "infra"

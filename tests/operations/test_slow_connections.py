@@ -26,7 +26,7 @@ HALF_BODY = (
 
 ECHO = """
 import sys
-from flows.http_server import serve_http
+from flows.web.http_server import serve_http
 
 async def app(scope, receive, send):
     if scope["type"] == "http":

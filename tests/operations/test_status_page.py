@@ -7,11 +7,11 @@ import pytest
 from command_line import TINY
 
 from data_contracts.operations import Arrival
-from flows.operations.layout import StateFolder
-from flows.operations.overview import MatchStatus, Overview, UnitGlance
-from flows.operations.status_page import STYLE, status_html
-from flows.pages.access import access_for
-from flows.pages.app import create_app
+from flows.service.layout import StateFolder
+from flows.service.overview import MatchStatus, Overview, UnitGlance
+from flows.service.status_page import STYLE, status_html
+from flows.web.access import access_for
+from flows.web.app import create_app
 from worldpose.store import Store
 
 with warnings.catch_warnings():

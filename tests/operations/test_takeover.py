@@ -218,7 +218,7 @@ def test_a_run_chooses_neither_command_nor_code_nor_environment(served, pwned):
     shell = {"prefect.deployments.steps.run_shell_script": {"script": command}}
     for number, other in enumerate(
         (
-            {"pull_steps": [shell], "entrypoint": "flows.operations.deployed.ingest"},
+            {"pull_steps": [shell], "entrypoint": "flows.service.deployed.ingest"},
             {"entrypoint": "subprocess.getoutput", "parameters": {"cmd": command}},
             {"entrypoint": f"{file.parent}/evil.py:evil"},
         )
@@ -472,7 +472,7 @@ def test_a_service_begun_again_puts_the_pools_right_and_keeps_its_login(served):
         chosen = [set(pool["base_job_template"]["variables"]["properties"]) for pool in pools]
         deployment = deployment_of(served)
         code = (deployment["entrypoint"], deployment["pull_steps"])
-        installed = ("flows.operations.deployed.ingest", [])
+        installed = ("flows.service.deployed.ingest", [])
         return chosen == [{"stream_output"}] * 2 and code == installed
 
     wait_until(is_right, served.explain)

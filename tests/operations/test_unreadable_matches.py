@@ -11,8 +11,8 @@ import pytest
 from command_line import WORLDPOSE, worldpose
 from page_client import log_in, served
 
-from flows.operations.overview import Overview
 from flows.registering import register
+from flows.service.overview import Overview
 from worldpose.errors import InputError
 from worldpose.ingest import read_match
 from worldpose.store import Store

@@ -12,9 +12,9 @@ from data_contracts.broadcast_calibration import FRAME_STATUS, KeyFrame, KeyFram
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
-from flows.broadcast_pooling import STAGE as POOLING
 from flows.planning import plan_run
 from flows.registering import register
+from flows.stages.broadcast_pooling import STAGE as POOLING
 from tasks.broadcast_calibration import broadcast_calibration
 from tasks.broadcast_pooling import broadcast_pooling
 from tasks.ingest import ingest

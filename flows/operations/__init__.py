@@ -1,5 +1,0 @@
-"""Operations: a project served day and night.
-
-Input: a project and an inbox folder. Output: a Prefect server with deployments, a worker, the
-pages, figures for Prometheus and alerts; `flows.operations.serving` starts them.
-"""

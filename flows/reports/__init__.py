@@ -1,0 +1,1 @@
+"""The report of a run: images, plots and tables that people judge it by."""

@@ -1,0 +1,240 @@
+"""What the page about a run says of the broadcast camera."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from data_contracts.broadcast_calibration import FRAME_STATUS
+from flows.release import (
+    body_tracks,
+    broadcast_cameras,
+    broadcast_unit,
+    clip_title,
+    joint_tracks,
+)
+from flows.reports.flow import flow_pictures
+from flows.stage import Match
+from flows.stages.detection import seen_in_broadcast
+from worldpose.broadcast_calibration import camera_before
+from worldpose.cameras.stored import camera_from_arrays
+from worldpose.formats import JointTracks, whole_file
+from worldpose.ingest import unit_frames
+from worldpose.reports import Picture
+from worldpose.reports.broadcast import (
+    angles_of,
+    before_after_picture,
+    course_picture,
+    largest_pose_changes,
+)
+from worldpose.reports.clips import camera_picture
+from worldpose.reports.html_page import Table
+from worldpose.reports.overlay_video import overlay_frames
+from worldpose.store import Run
+from worldpose.video import open_video, write_video
+
+WORST: Final = 2
+"""Frames that are shown of those whose cameras are known least [1]."""
+FRAME_RATE: Final = 25.0
+"""Of overlay videos, at most about [1/s]."""
+LENGTH: Final = 30.0
+"""Of overlay videos, at most [s]."""
+
+
+def broadcast_pictures(run: Run, match: Match) -> list[Picture]:
+    """The course of each clip's broadcast camera, and its pictures where it is known least."""
+    pictures = []
+    for clip, camera in broadcast_cameras(run).items():
+        result = run[f"broadcast_calibration/{clip}"]
+        frame, expected = result["frame"].values, result["reprojection_error"].values
+        pictures.append(
+            Picture(
+                f"{clip_title(clip)}: the broadcast camera over its frames, smoothed (blue, with "
+                "bands of two standard deviations) and each frame on its own (orange).",
+                course_picture(
+                    frame,
+                    camera,
+                    run[broadcast_unit(run, clip)]["covariance"].values,
+                    camera_before(result.data_vars),
+                ),
+            )
+        )
+        if not np.isfinite(expected).any():
+            continue
+        tracks = joint_tracks(run, clip)
+        pictures += _before_and_after(run, match, clip, tracks)
+        pictures += flow_pictures(run, match, clip, camera)
+        offset = unit_frames(match.folder.spec, clip).offset
+        for video_number in result.attrs["pick_next"][:WORST]:
+            number = video_number - offset
+            place = int(np.searchsorted(frame, number))
+            with open_video(match.folder.videos[clip]) as video:
+                still = video.frame(video_number)
+            pictures.append(
+                Picture(
+                    f"{clip_title(clip)}, frame {number}, {video_number} of its video, among those "
+                    f"where the broadcast camera is known least ({expected[place]:.2g} px): "
+                    "markings and people as it projects them.",
+                    camera_picture(
+                        camera[place],
+                        f"broadcast camera, frame {number}",
+                        tracks,
+                        int(np.searchsorted(tracks.frames, number)),
+                        still=still,
+                        pitch=match.folder.pitch,
+                    ),
+                )
+            )
+    return pictures
+
+
+def _before_and_after(run: Run, match: Match, clip: str, tracks: JointTracks) -> list[Picture]:
+    """Zooms of the person whom the refinement by players moved most; none without players."""
+    result = run[f"broadcast_calibration/{clip}"]
+    if result.attrs["players_off"][1] is None:
+        return []
+    frame = result["frame"].values
+    both = np.intersect1d(frame, tracks.frames)
+    before, after = (
+        whole[np.searchsorted(frame, both)]
+        for whole in (camera_before(result.data_vars), camera_from_arrays(result.data_vars))
+    )
+    joints = tracks.joints[np.searchsorted(tracks.frames, both)]
+    shared = JointTracks(both, tracks.person_ids, joints)
+    place, person = largest_pose_changes(before, after, shared)
+    number = int(both[place])
+    (detected,) = seen_in_broadcast(match, clip)
+    with open_video(match.folder.videos[clip]) as video:
+        still = video.frame(number + unit_frames(match.folder.spec, clip).offset)
+    markings, players = (
+        "{:.2f} and {:.2f}".format(*result.attrs[name]) for name in ("markings_off", "players_off")
+    )
+    return [
+        Picture(
+            f"{clip_title(clip)}, frame {number}: before and after players and all frames "
+            "together. Crosses: keypoints that were seen. In the median, markings are "
+            f"{markings} px off, people {players} px.",
+            before_after_picture(
+                before[place],
+                after[place],
+                shared,
+                place,
+                person,
+                still=still,
+                seen=run[detected].sel(frame=number)["keypoints"].values,
+                pitch=match.folder.pitch,
+            ),
+        )
+    ]
+
+
+def write_broadcast_videos(
+    run: Run, match: Match, page: Path, *, clips: Collection[str] | None = None
+) -> list[Path]:
+    """Writes each clip's broadcast video with markings and people over it; returns the files.
+
+    At half the size and at most 25 frames a second; of a longer clip, the 30 s about the frame
+    whose camera is known least.
+
+    Args:
+        run: the run.
+        match: the match.
+        page: beside this file, and named after it.
+        clips: which clips; None = all.
+    """
+    files = []
+    fps = match.folder.spec.fps
+    every = max(1, round(fps / FRAME_RATE))
+    for clip, camera in broadcast_cameras(run).items():
+        if clips is not None and clip not in clips:
+            continue
+        result = run[f"broadcast_calibration/{clip}"]
+        expected = np.nan_to_num(result["reprojection_error"].values)
+        most = round(LENGTH * fps)
+        begin = int(np.clip(int(expected.argmax()) - most // 2, 0, max(0, len(expected) - most)))
+        chosen = np.arange(begin, min(begin + most, len(expected)), every)
+        frames = result["frame"].values[chosen]
+        start = int(frames[0]) + unit_frames(match.folder.spec, clip).offset
+        stop = start + int(chosen[-1] - chosen[0]) + 1
+        file = page.with_name(f"{page.stem}-{clip}.mp4")
+        with open_video(match.folder.videos[clip]) as video, whole_file(file) as draft:
+            pictures = (
+                picture
+                for number, picture in video.frames(start, stop)
+                if (number - start) % every == 0
+            )
+            drawn = overlay_frames(
+                pictures,
+                camera[chosen],
+                joint_tracks(run, clip),
+                frames,
+                match.folder.pitch,
+                body_tracks(run, clip),
+            )
+            write_video(draft, drawn, fps / every, quality=23)
+        files.append(file)
+    return files
+
+
+def broadcast_tables(run: Run, match: Match) -> list[Table]:
+    """What the frames of each clip rest on, and what a person should look at."""
+    tables = []
+    for clip in broadcast_cameras(run):
+        result = run[f"broadcast_calibration/{clip}"]
+        status = np.bincount(result["status"].values, minlength=len(FRAME_STATUS))
+        rows = [
+            *(
+                (f"frames that rest on: {name.replace('_', ' ')}", str(count))
+                for name, count in zip(FRAME_STATUS, status, strict=True)
+                if count
+            ),
+            ("key frames used, of its video", ", ".join(map(str, result.attrs["key_frames"]))),
+            *(
+                (f"key frame {frame} is not used", why)
+                for frame, why in result.attrs["refused_key_frames"].items()
+            ),
+            *_motion(run, clip, match.folder.spec.fps),
+            *(
+                (f"{name} miss by, before and after players [px]", _numbers(result.attrs[key]))
+                for name, key in (("markings", "markings_off"), ("people", "players_off"))
+                if None not in result.attrs[key]
+            ),
+            ("tracking missed the next key frame by [px]", _numbers(result.attrs["drift"])),
+            ("frames of its video to click next", ", ".join(map(str, result.attrs["pick_next"]))),
+            *(("chosen", decision) for decision in result.attrs["decisions"]),
+            *_pooled(run, clip),
+            *(("look at it", reason) for reason in result.attrs["reasons"]),
+        ]
+        tables.append(Table(clip_title(clip), ("", ""), tuple(rows)))
+    return tables
+
+
+def _motion(run: Run, clip: str, fps: float) -> list[tuple[str, str]]:
+    """How long the clip is, and how far it pans."""
+    camera = broadcast_cameras(run)[clip]
+    pan, _, _ = angles_of(camera)
+    return [
+        ("length [s]", f"{len(pan) / fps:.1f}"),
+        ("pan, from leftmost to rightmost [deg]", f"{np.nanmax(pan) - np.nanmin(pan):.1f}"),
+    ]
+
+
+def _pooled(run: Run, clip: str) -> list[tuple[str, str]]:
+    """What the camera's other clips say of its place, where there are any."""
+    unit = broadcast_unit(run, clip)
+    if "distance" not in run[unit].attrs:
+        return []
+    pooled = run[unit].attrs
+    apart = ", ".join(
+        f"{name} {distance:.1f}"
+        for name, distance in zip(pooled["clips"], pooled["distance"], strict=True)
+    )
+    said = "one place" if pooled["agree"] else "no common place: each clip keeps its own"
+    return [("the camera's clips have", f"{said}; from it [standard deviations]: {apart}")]
+
+
+def _numbers(values: list[float]) -> str:
+    return ", ".join(f"{value:.2g}" for value in values) or "-"

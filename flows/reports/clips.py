@@ -1,0 +1,139 @@
+"""What the page about a run shows of a clip: people in cameras, from above, and in space."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flows.release import (
+    body_tracks,
+    broadcast_cameras,
+    clip_title,
+    joint_tracks,
+    placed_joints,
+    static_cameras,
+)
+from flows.reports.cameras import still_of
+from flows.reports.match_pictures import frame_picture
+from flows.stage import Match
+from flows.stages.redetection import seen_in
+from worldpose.cameras import Camera
+from worldpose.formats import JointTracks
+from worldpose.reports import Picture, Scene
+from worldpose.reports.bodies import bodies_picture
+from worldpose.reports.body_rendering import BodyTracks
+from worldpose.reports.clips import camera_picture, paths_picture, stadium_picture
+from worldpose.reports.detections import detections_picture
+from worldpose.store import Run, Store
+
+
+def clip_pictures(
+    run: Run, match: Match, clip: str, truth: JointTracks | None = None
+) -> list[Picture]:
+    """The stadium from a camera and from above, bodies, and everybody's way."""
+    cameras = static_cameras(run, match.folder.spec)
+    tracks = joint_tracks(run, clip)
+    pitch = match.folder.pitch
+    seen = placed_joints(run, clip)["inliers"].any("joint").sum("person").values
+    pictures = []
+    if len(tracks.frames):
+        first = int(tracks.frames[0])
+        widest = list(cameras)[int(seen[0].argmax())]
+        still = still_of(match, widest)
+        here = f"{clip_title(clip)}, frame {first}"
+        beneath = "" if still is None else ", over its still"
+        pictures = [
+            Picture(
+                f"{here}, from camera {widest}: markings and people as the found cameras and "
+                f"joints put them{beneath}.",
+                camera_picture(
+                    cameras[widest], f"camera {widest}", tracks, 0, still=still, pitch=pitch
+                ),
+            ),
+            Picture(
+                f"{here}, from above. The more cameras see a place, the darker it is.",
+                stadium_picture(cameras, "", tracks, 0, pitch=pitch),
+            ),
+        ]
+        bodies = body_tracks(run, clip)
+        if bodies is not None:
+            pictures.append(_bodies(bodies, match, clip, widest, cameras[widest]))
+    above = paths_picture(tracks, truth=truth, cameras=cameras, pitch=pitch)
+    pictures.append(Picture(f"{clip_title(clip)}: everybody's way.", above))
+    return pictures
+
+
+def _bodies(bodies: BodyTracks, match: Match, clip: str, camera_id: str, camera: Camera) -> Picture:
+    """The bodies of a clip's first frame over a camera's still."""
+    frame, still = int(bodies.frames[0]), still_of(match, camera_id)
+    png = bodies_picture(
+        camera,
+        f"camera {camera_id}, frame {frame}",
+        bodies.model.vertices(bodies.poses[0]),
+        bodies.model.faces,
+        bodies.person_ids,
+        still=still,
+        pitch=match.folder.pitch,
+    )
+    return Picture(
+        f"{clip_title(clip)}, frame {frame}: fitted bodies ({bodies.model.name}) where camera "
+        f"{camera_id} shows most people{'' if still is None else ', over its still'}.",
+        png,
+    )
+
+
+def detection_pictures(store: Store, run: Run, match: Match, clip: str) -> list[Picture]:
+    """The view with most people: what its detector said, and what became of it."""
+    placed = placed_joints(run, clip)
+    seen = placed["inliers"].any("joint").sum("person").values
+    if not seen.any():
+        return []
+    cameras = static_cameras(run, match.folder.spec)
+    tracks = joint_tracks(run, clip)
+    frame, index = (int(n) for n in np.unravel_index(int(seen.argmax()), seen.shape))
+    name = list(cameras)[index]
+    number = int(tracks.frames[frame])
+    detected = run[seen_in(run, match, name, clip)].sel(frame=number)
+    tracked = run[f"tracking/{clip}"].sel(frame=number)["detection_index"].values[index]
+    still = frame_picture(store, match, name, number)
+    if still is None and frame == 0:
+        still = still_of(match, name)
+    png = detections_picture(
+        cameras[name],
+        boxes=detected["boxes"].values,
+        keypoints=detected["keypoints"].values,
+        used=tracked[tracked >= 0],
+        joints=tracks.joints[frame],
+        person_ids=tracks.person_ids,
+        seen=placed["inliers"].values[frame, index].any(-1),
+        still=still,
+        pitch=match.folder.pitch,
+    )
+    return [
+        Picture(
+            f"Camera {name}, frame {number}, before: what its detector said; orange belongs to "
+            "nobody. After: people of all cameras as this one sees them; dashed boxes are those "
+            "that its own detector does not carry.",
+            png,
+        )
+    ]
+
+
+def clip_scene(run: Run, match: Match, clip: str) -> Scene:
+    """A clip in space, with the broadcast camera where all its frames have one."""
+    tracks = joint_tracks(run, clip)
+    broadcast = broadcast_cameras(run).get(clip)
+    if broadcast is not None:
+        frames = run[f"broadcast_calibration/{clip}"]["frame"].values
+        both = np.intersect1d(frames, tracks.frames)
+        if len(both):
+            broadcast = broadcast[np.searchsorted(frames, both)]
+            here = np.searchsorted(tracks.frames, both)
+            tracks = JointTracks(both, tracks.person_ids, tracks.joints[here])
+    return Scene(
+        clip_title(clip),
+        tracks,
+        match.folder.spec.fps,
+        static_cameras(run, match.folder.spec),
+        broadcast,
+        match.folder.pitch,
+    )

@@ -1,0 +1,96 @@
+"""What the page about a run shows of the views in which people and detections differ most."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from flows.release import clip_title, joint_tracks, static_cameras
+from flows.reports.cameras import still_of
+from flows.reports.match_pictures import frame_picture
+from flows.stage import Match
+from flows.stages.redetection import seen_in
+from worldpose.formats import JointTracks
+from worldpose.reports import Picture
+from worldpose.reports.detections import detections_picture
+from worldpose.store import Run, Store
+
+SHOWN: Final = 2
+"""Views that are shown: the worst, each of another person."""
+FRAMES: Final = 300
+"""Frames of a clip that are looked at, evenly spread."""
+KNOWN: Final = 8
+"""Joints of a person that a view needs."""
+_AROUND: Final = 2.5
+"""Side of the part that is shown [height of the person]."""
+
+
+def worst_views(run: Run, match: Match, clip: str, tracks: JointTracks) -> list[tuple[int, ...]]:
+    """Views with the largest median distance between keypoints and found joints, worst first.
+
+    Distances are in heights of the person in the picture, over the keypoints that are tracked as
+    the person's; each person comes once.
+
+    Returns:
+        Row among the frames, camera and person of each, and their median distance in percent.
+    """
+    rows = np.unique(np.linspace(0, len(tracks.frames) - 1, FRAMES).round().astype(np.int64))
+    numbers = tracks.frames[rows]
+    tracked = run[f"tracking/{clip}"]["detection_index"].sel(frame=numbers)
+    place = tracked.reindex(person=tracks.person_ids, fill_value=-1).values
+    away = np.full(place.shape, np.nan)
+    for c, (name, camera) in enumerate(static_cameras(run, match.folder.spec).items()):
+        seen = run[seen_in(run, match, name, clip)]["keypoints"].reindex(frame=numbers).values
+        own = np.take_along_axis(seen, np.maximum(place[:, c], 0)[..., None, None], axis=1)
+        found = camera.project(tracks.joints[rows].reshape(-1, 3)).reshape(own.shape)
+        off = np.linalg.norm(own - found, axis=-1)
+        height = np.ptp(found[..., 1], axis=-1)
+        enough = (np.isfinite(off).sum(-1) >= KNOWN) & (place[:, c] >= 0)
+        away[:, c][enough] = np.nanmedian(off[enough], axis=-1) / height[enough]
+    worst: list[tuple[int, ...]] = []
+    for _ in range(SHOWN):
+        if not np.isfinite(away).any():
+            break
+        row, camera_place, person = np.unravel_index(int(np.nanargmax(away)), away.shape)
+        percent = round(100.0 * float(away[row, camera_place, person]))
+        worst.append((int(rows[row]), int(camera_place), int(person), percent))
+        away[:, :, person] = np.nan
+    return worst
+
+
+def disagreement_pictures(store: Store, run: Run, match: Match, clip: str) -> list[Picture]:
+    """Zooms on the people whose detections and found joints differ most, before and after."""
+    tracks = joint_tracks(run, clip)
+    cameras = static_cameras(run, match.folder.spec)
+    pictures = []
+    for row, place, person, percent in worst_views(run, match, clip, tracks):
+        name, number = list(cameras)[place], int(tracks.frames[row])
+        camera, detected = cameras[name], run[seen_in(run, match, name, clip)].sel(frame=number)
+        index = run[f"tracking/{clip}"].sel(frame=number)["detection_index"].values[place]
+        still = frame_picture(store, match, name, number)
+        if still is None and number == int(tracks.frames[0]):
+            still = still_of(match, name)
+        pixels = camera.project(tracks.joints[row, person])
+        side = _AROUND * float(np.ptp(pixels[:, 1])) * np.array([1.6, 1.0])
+        png = detections_picture(
+            camera,
+            boxes=detected["boxes"].values,
+            keypoints=detected["keypoints"].values,
+            used=index[index >= 0],
+            joints=tracks.joints[row],
+            person_ids=tracks.person_ids,
+            seen=index >= 0,
+            still=still,
+            pitch=match.folder.pitch,
+            part=(pixels.mean(axis=0) - 0.5 * side, side),
+        )
+        pictures.append(
+            Picture(
+                f"{clip_title(clip)}, frame {number}, camera {name}: person "
+                f"{tracks.person_ids[person]}, whose keypoints differ most from what all cameras "
+                f"together found: by {percent} % of the person's height in the median.",
+                png,
+            )
+        )
+    return pictures

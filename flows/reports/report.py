@@ -1,0 +1,156 @@
+"""The page about a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from data_contracts.evaluation import Evaluation
+from data_contracts.run import RunRecord
+from flows.evaluation import load_reference, score
+from flows.release import clips_of, static_cameras
+from flows.reports.broadcast import (
+    broadcast_pictures,
+    broadcast_tables,
+    write_broadcast_videos,
+)
+from flows.reports.cameras import camera_pictures, camera_summaries, paint_pictures
+from flows.reports.clip_video import static_view, write_clip_video
+from flows.reports.clips import clip_pictures, clip_scene, detection_pictures
+from flows.reports.disagreements import disagreement_pictures
+from flows.reports.extents import extent_section, tiles_of
+from flows.reports.people import adjustment_tables, body_tables
+from flows.reports.review import review_table
+from flows.stage import Match
+from worldpose.errors import UsageError
+from worldpose.formats import whole_file
+from worldpose.reports import Section, report_page
+from worldpose.reports.run_report import camera_table
+from worldpose.store import Run, Store, open_run
+
+
+def write_report(
+    store: Store,
+    match: Match,
+    out: Path,
+    *,
+    run_id: str = "latest",
+    reference: str | None = None,
+    videos: bool = True,
+    camera: str | None = None,
+) -> list[Path]:
+    """Writes the HTML page of one run, and returns the videos written beside it.
+
+    Args:
+        store: the project's store.
+        match: the match.
+        out: the file to write.
+        run_id: number of the run.
+        reference: truth; None = `reference/` of the match folder, where there is one.
+        videos: write each clip's broadcast video, and that of a static camera, with what was found
+            drawn over them.
+        camera: which static camera's; None = the one that sees most people.
+
+    Raises:
+        UsageError: no static camera of that name has a video.
+    """
+    if camera is not None:
+        _check_film(match, camera)
+    run = open_run(store.url, match.match_id, run_id, complete=True)
+    source = reference or _own_reference(match)
+    scores: Evaluation | None = None
+    if source is not None and len(clips_of(run.record)) == 1:
+        scores = score(match.match_id, source, store.url, run_id=run_id).evaluation
+    page = report_page(
+        match.match_id,
+        run.record,
+        seconds=_seconds(store, run.record),
+        scores=scores,
+        sections=_sections(store, run, match, source),
+        tiles=tiles_of(run, match, scores),
+    )
+    with whole_file(out) as draft:
+        draft.write_text(page, encoding="utf-8")
+    return _write_videos(store, run, match, out, camera) if videos else []
+
+
+def _check_film(match: Match, camera: str) -> None:
+    names = {each.id for each in match.folder.spec.static_cameras} & set(match.folder.videos)
+    if camera not in names:
+        raise UsageError(
+            f"--camera {camera}",
+            expected="a static camera that has a video",
+            found=f"these have one: {', '.join(sorted(names)) or 'none'}",
+            todo="Name one of them, or leave --camera out.",
+        )
+
+
+def _write_videos(
+    store: Store, run: Run, match: Match, out: Path, camera: str | None
+) -> list[Path]:
+    films = write_broadcast_videos(run, match, out)
+    for clip in clips_of(run.record):
+        owner = camera or static_view(run, match, clip)
+        if owner is not None:
+            films.append(out.with_name(f"{out.stem}-{clip}-{owner}.mp4"))
+            with whole_file(films[-1]) as draft:
+                write_clip_video(store, run, match, clip, draft, owner=owner)
+    return films
+
+
+def _sections(store: Store, run: Run, match: Match, reference: str | None) -> list[Section]:
+    """All there is to see of a run, in the order of a reader's questions."""
+    clips = clips_of(run.record)
+    truth = None if reference is None else load_reference(reference)
+    cameras = static_cameras(run, match.folder.spec)
+    return [
+        Section(
+            "In space",
+            tuple(clip_scene(run, match, clip) for clip in clips),
+            "Drag to turn, Shift and drag to move, click and use the wheel to come closer; Space "
+            "plays.",
+        ),
+        Section(
+            "Sample images",
+            tuple(p for clip in clips for p in clip_pictures(run, match, clip, truth)),
+        ),
+        extent_section(run, match),
+        Section(
+            "Detections",
+            tuple(p for clip in clips for p in detection_pictures(store, run, match, clip)),
+            "What one camera's detector said, and what all cameras together make of it.",
+        ),
+        Section(
+            "Static cameras",
+            (
+                camera_table(camera_summaries(run, match.folder.spec)),
+                *camera_pictures(store, run, match, cameras),
+                *paint_pictures(run, match, cameras),
+            ),
+        ),
+        Section("Bundle adjustment", tuple(adjustment_tables(run))),
+        Section(
+            "Broadcast camera", (*broadcast_pictures(run, match), *broadcast_tables(run, match))
+        ),
+        Section(
+            "Bodies",
+            (
+                *body_tables(run, clips),
+                *(p for clip in clips for p in disagreement_pictures(store, run, match, clip)),
+            ),
+        ),
+        Section("Who reviewed what", tuple(review_table(match))),
+    ]
+
+
+def _seconds(store: Store, record: RunRecord) -> dict[str, float]:
+    """How long each unit took when it was computed [s]."""
+    seconds = {}
+    for name, key in record.results.items():
+        stage, _, unit = name.partition("/")
+        seconds[name] = store.manifest(record.match_id, stage, unit, key).seconds
+    return seconds
+
+
+def _own_reference(match: Match) -> str | None:
+    folder = match.folder.folder / "reference"
+    return str(folder) if (folder / "joints.npz").is_file() else None

@@ -1,0 +1,112 @@
+"""An inbox in object storage: what has arrived there whole is copied into the inbox folder.
+
+Nothing in the bucket is changed. From the folder on, a match is an arrival like any other.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import shutil
+from collections import defaultdict
+from pathlib import Path
+from typing import Final
+
+from flows.service.layout import PRIORITIES, StateFolder
+from worldpose.errors import InputError, UsageError
+from worldpose.formats import whole_file
+from worldpose.store.blobs import Entry
+from worldpose.store.objects import ObjectBlobs
+from worldpose.store.paths import checked_path
+
+SCHEME: Final = "s3://"
+
+LOG = logging.getLogger("worldpose.operations")
+
+
+class BucketInbox:
+    """Matches below one address, each in a folder of its own as in an inbox folder.
+
+    Attributes:
+        url: `s3://bucket/prefix`; credentials and endpoint are the environment's, as of a project.
+        inbox: the folder that they are copied to.
+    """
+
+    def __init__(self, url: str, inbox: Path, state: StateFolder) -> None:
+        self.url, self.inbox = url, inbox
+        if not url.startswith(SCHEME):
+            raise UsageError(
+                f"--bucket {url}",
+                expected="s3://bucket or s3://bucket/prefix",
+                found=repr(url),
+                todo="Name one, as in --bucket s3://arriving/matches.",
+            )
+        self._objects = ObjectBlobs.at(url)
+        self._file = state.folder / "bucket.json"
+        kept = json.loads(self._file.read_text()) if self._file.exists() else {}
+        self._copied: dict[str, str] = kept
+        self._since: dict[str, tuple[str, float]] = {}
+
+    def fetch(self, now: float, quiet: float) -> list[str]:
+        """Copy each match of which nothing has changed for a while; gives their names.
+
+        Args:
+            now: of a clock that only goes forward [s].
+            quiet: how long nothing may have changed [s].
+        """
+        fetched = []
+        for name, objects in self._listed().items():
+            fingerprint = _fingerprint(objects)
+            seen, since = self._since.get(name, ("", now))
+            if seen != fingerprint:
+                since = now
+            self._since[name] = (fingerprint, since)
+            if self._copied.get(name) == fingerprint or now - since < quiet:
+                continue
+            if self._copy(name, objects):
+                fetched.append(name)
+            self._copied[name] = fingerprint
+            with whole_file(self._file) as draft:
+                draft.write_text(json.dumps(self._copied, indent=2) + "\n")
+        return fetched
+
+    def _listed(self) -> dict[str, list[Entry]]:
+        """Objects by the name of their match, of all that have a match.yaml."""
+        found: dict[str, list[Entry]] = defaultdict(list)
+        for each in self._objects.all_entries():
+            parts = each.path.split("/")
+            depth = 2 if parts[0] in PRIORITIES and len(parts) > 2 else 1
+            if len(parts) > depth:
+                found["/".join(parts[:depth])].append(each)
+        return {
+            name: objects
+            for name, objects in sorted(found.items())
+            if any(each.path == f"{name}/match.yaml" for each in objects)
+        }
+
+    def _copy(self, name: str, objects: list[Entry]) -> bool:
+        """Have the match in the folder whole, in place of what was copied before."""
+        target = self.inbox / name
+        draft = target.with_name(f".{target.name}.arriving")
+        try:
+            for each in objects:
+                checked_path(each.path)
+        except InputError as error:
+            LOG.warning("%s/%s is not taken: %s", self.url, name, error)
+            return False
+        shutil.rmtree(draft, ignore_errors=True)
+        for each in objects:
+            self._objects.download(each.path, draft / each.path.removeprefix(f"{name}/"))
+        if target.exists() and name not in self._copied:
+            LOG.warning("%s/%s is not taken: %s is there already", self.url, name, target)
+            shutil.rmtree(draft)
+            return False
+        shutil.rmtree(target, ignore_errors=True)
+        draft.rename(target)
+        return True
+
+
+def _fingerprint(objects: list[Entry]) -> str:
+    lines = [f"{each.path}\n{each.size} {each.modified.isoformat()}" for each in objects]
+    return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()

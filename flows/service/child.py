@@ -1,0 +1,89 @@
+"""One process of `worldpose serve`: `python -m flows.service.child PART PLAN`.
+
+It ends with its standard input, and with it all that it started: killed in any way, the service
+leaves nothing behind.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import threading
+
+from flows.service.plan import ServePlan
+from worldpose.errors import WorldposeError
+
+
+def main() -> None:
+    """Do one part's work until standard input is closed."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    part, plan = sys.argv[1], ServePlan.model_validate_json(sys.argv[2])
+    logging.basicConfig(format="%(asctime)s  %(message)s", level=logging.WARNING)
+    for name in ("worldpose.operations", "worldpose.pages"):
+        logging.getLogger(name).setLevel(logging.INFO)
+    try:
+        PARTS[part](plan)
+    except WorldposeError as error:
+        sys.stderr.write(f"error: {error}\n")
+        sys.stderr.flush()
+        os._exit(1)  # the thread that reads standard input would not let the interpreter end
+
+
+def prefect(plan: ServePlan) -> None:
+    """Prefect's server: its API, its services and its pages."""
+    from urllib.parse import urlsplit
+
+    from flows.prefect_server import serve
+
+    address = urlsplit(plan.prefect)
+    serve(address.hostname or "127.0.0.1", address.port or 80, ())
+
+
+def worker(plan: ServePlan) -> None:
+    """Deployments, and what runs them."""
+    import anyio
+
+    from flows.service.deployments import install, work
+    from flows.service.recovery import begin_again
+
+    async def serve() -> None:
+        installed = await install(plan)
+        await begin_again(plan, at_start=True)
+        await work(plan, installed)
+
+    anyio.run(serve)
+
+
+def watch(plan: ServePlan) -> None:
+    """The inbox, alerts, lost runs, and figures for Prometheus."""
+    from flows.service.watching import watch as watch_all
+
+    watch_all(plan)
+
+
+def pages(plan: ServePlan) -> None:
+    """The review pages and the status page."""
+    from flows.service.pages import serve_pages
+
+    serve_pages(plan)
+
+
+PARTS = {"prefect": prefect, "worker": worker, "watch": watch, "pages": pages}
+"""In the order in which they start."""
+
+
+def _end_with_parent() -> None:
+    sys.stdin.buffer.read()
+    import psutil
+
+    for process in psutil.Process().children(recursive=True):
+        try:
+            process.kill()
+        except psutil.NoSuchProcess:
+            continue
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,197 @@
+"""The flows as deployments run them: with Dask workers, and with parameters that are plain JSON."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final, cast
+
+from prefect import flow
+from prefect.artifacts import create_markdown_artifact, create_table_artifact
+from prefect.client.schemas.objects import FlowRun
+from prefect.deployments import run_deployment
+from prefect.task_runners import TaskRunner
+from prefect_dask import DaskTaskRunner
+from pydantic import TypeAdapter, ValidationError
+
+from data_contracts.finetune import NetKind
+from data_contracts.operations import Arrival
+from data_contracts.records import Name
+from flows.match import process_match
+from flows.prefect_environment import served_cluster
+from flows.registering import open_match
+from flows.service.arrivals import take_in
+from flows.service.plan import ServePlan
+from flows.stage import Match
+from worldpose.errors import UsageError, WorldposeError
+from worldpose.store import Store, open_run
+
+NAME: Final = TypeAdapter(Name)
+LOG = logging.getLogger("worldpose.operations")
+
+RUNNER: Final = cast("TaskRunner[Any]", DaskTaskRunner(**served_cluster()))
+
+match = process_match.with_options(task_runner=RUNNER)
+"""Process one match; suspended while its results wait for people."""
+
+
+@flow(name="ingest", flow_run_name="inbox", validate_parameters=False)
+def ingest(plan: dict[str, Any]) -> list[str]:
+    """Take in every match that has arrived whole, and give each its run; returns their ids.
+
+    Args:
+        plan: a `ServePlan`.
+    """
+    LOG.setLevel(logging.INFO)
+    served = ServePlan.model_validate(plan)
+
+    def begin(opened: Match, arrival: Arrival) -> str:
+        return _begin(served, opened, arrival)
+
+    decided = take_in(
+        Store.create(served.project),
+        served.state_folder,
+        served.inbox,
+        served.settle_seconds,
+        begin,
+    )
+    for arrival in decided:
+        LOG.info("%s: %s %s", arrival.name, arrival.state, arrival.reason)
+    if decided:
+        create_table_artifact(
+            key="arrivals",
+            table=[
+                {
+                    "arrival": each.name,
+                    "state": each.state,
+                    "match": each.match_id or "",
+                    "why": each.reason,
+                }
+                for each in decided
+            ],
+            description=f"What arrived in {served.inbox}",
+        )
+    return [arrival.match_id for arrival in decided if arrival.match_id]
+
+
+def _begin(plan: ServePlan, opened: Match, arrival: Arrival) -> str:
+    begun = run_deployment(
+        plan.match_deployment,
+        parameters={"match_id": opened.match_id},
+        flow_run_name=opened.match_id,
+        timeout=0,
+        as_subflow=False,
+        tags=[arrival.priority],
+        # Called again after a kill, or for a folder that moved, it gives the run that is there.
+        idempotency_key=f"arrival-{opened.registration.identity}",
+        work_queue_name=arrival.priority,
+    )
+    return str(cast("FlowRun", begun).id)  # outside of an event loop it is awaited
+
+
+@flow(name="release", flow_run_name="release {name} of {match_id}", validate_parameters=False)
+def release(
+    project: str,
+    match_id: str,
+    name: str,
+    licence: str,
+    formats: Sequence[str] = ("worldpose",),
+    out: str | None = None,
+) -> str:
+    """Freeze the latest run of a match under a name, with a report; returns the folder.
+
+    Args:
+        project: folder or URL of the store.
+        match_id: a match whose latest run is complete.
+        name: of the release.
+        licence: text under which its data may be used.
+        formats: of its files.
+        out: folder to write into; `releases/<match>/<name>` of the project if None.
+
+    Raises:
+        WorldposeError: the latest run is not complete.
+    """
+    from flows.formats import Origin  # late, as all that only few runs need
+    from flows.releasing import release as write_release
+    from flows.reports.report import write_report
+
+    store = Store.open(project)
+    opened = open_match(store, match_id)
+    run = open_run(project, opened.match_id, complete=True)
+    if run.record.state != "complete":
+        raise WorldposeError(
+            f"run {run.record.run_id} of {match_id}: expected a complete one, found "
+            f"{run.record.state}. Run the match to the end, and approve what waits, first."
+        )
+    folder = release_folder(store, opened.match_id, name, out)
+    origin = Origin(run, opened.registration, None)
+    write_release(store, origin, list(formats), folder, name, licence)
+    report = folder.with_name(f"{folder.name}-report.html")
+    write_report(store, opened, report, run_id=run.record.run_id, videos=False)
+    create_markdown_artifact(
+        f"Run {run.record.run_id} of {match_id}\n\n- files: `{folder}`\n- report: `{report}`",
+        key="release",
+        description=f"Release {name} of {match_id}",
+    )
+    return str(folder)
+
+
+def release_folder(store: Store, match_id: str, name: str, out: str | None) -> Path:
+    """Where a release is written.
+
+    Raises:
+        UsageError: the name is none for a folder, or the project is in no folder of this machine.
+    """
+    if out is not None:
+        return Path(out)
+    try:
+        NAME.validate_python(name)
+    except ValidationError:
+        raise UsageError(
+            f"release {name!r}",
+            expected="a name of letters, digits, `.`, `_` and `-`",
+            found=repr(name),
+            todo="Choose such a name.",
+        ) from None
+    if "://" in store.url:
+        raise UsageError(
+            f"release {name} of {match_id}",
+            expected="`out`, a folder on this machine: the project is in object storage",
+            found="none",
+            todo="Name one.",
+        )
+    return Path(store.url) / "releases" / match_id / name
+
+
+@flow(name="finetune", validate_parameters=False)
+def finetune(
+    project: str,
+    annotations: str,
+    pictures: str | None = None,
+    nets: Sequence[NetKind] = ("people", "keypoints"),
+    settings: dict[str, Any] | None = None,
+    starts: dict[NetKind, str] | None = None,
+) -> list[str]:
+    """Train the embedded nets on reviewed labels; returns the files of their new versions.
+
+    Args:
+        project: folder of the store, which keeps the versions.
+        annotations: file of COCO keypoints.
+        pictures: the folder of their pictures; that of the annotations if None.
+        nets: which.
+        settings: of the training, where not their defaults.
+        starts: net to the weights to begin from, where not the shipped ones.
+    """
+    from flows.finetune import FOLDER, fine_tune_nets  # late: torch takes seconds to import
+    from worldpose.training import FineTuningSettings
+
+    versions = fine_tune_nets.fn(  # as this flow, not as one within it
+        Path(annotations),
+        None if pictures is None else Path(pictures),
+        Path(project) / FOLDER,
+        nets,
+        FineTuningSettings.model_validate(settings or {}),
+        {kind: Path(file) for kind, file in (starts or {}).items()},
+    )
+    return [version.file for version in versions]

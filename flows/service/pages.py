@@ -1,0 +1,23 @@
+"""The pages of a served project: those of review, and its status."""
+
+from __future__ import annotations
+
+import os
+
+from flows.service.plan import ServePlan
+from flows.web.access import access_for
+from flows.web.serving import serve
+
+
+def serve_pages(plan: ServePlan) -> None:
+    """Serve until this process ends."""
+    access = access_for(
+        plan.host,
+        token=os.environ.pop("WORLDPOSE_REVIEW_TOKEN"),  # runs that pages begin do not have it
+        names=plan.names,
+        secure=plan.certificate is not None,
+    )
+    tls = None
+    if plan.certificate is not None and plan.key is not None:
+        tls = (plan.certificate, plan.key)
+    serve(plan.project, access, host=plan.host, port=plan.pages_port, tls=tls)

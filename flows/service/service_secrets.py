@@ -1,0 +1,113 @@
+"""The secrets of a served project: which there are, where they are kept, which part has which."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from secrets import token_urlsafe
+from typing import Final
+
+from flows.prefect_environment import CLIENT_LOGIN, CLOUD_LOGIN, DATABASE, SERVER_LOGIN, new_login
+from flows.service.plan import ServePlan
+from flows.web.access import TOKEN_LENGTH
+from worldpose.errors import UsageError
+from worldpose.formats import whole_file
+
+ALERTS: Final = ("WORLDPOSE_ALERT_URL", "WORLDPOSE_ALERT_MAIL")
+PAGES_TOKEN: Final = "WORLDPOSE_REVIEW_TOKEN"
+METRICS_TOKEN: Final = "WORLDPOSE_METRICS_TOKEN"
+
+
+@dataclass(frozen=True)
+class Secrets:
+    """What a served project's parts keep from everybody else, as variables of the environment.
+
+    Attributes:
+        pages: what people log in to the pages with.
+        metrics: what Prometheus asks for figures with.
+        prefect: what clients log in to Prefect's server with; None = another's asks for none.
+    """
+
+    pages: str
+    metrics: str
+    prefect: str | None
+
+    def of(self, part: str, plan: ServePlan) -> dict[str, str]:
+        """The secrets that a part needs to do its work, and no others."""
+        environ = os.environ
+        names: list[str] = []
+        found: dict[str, str] = {}
+        if part == "prefect":
+            names += DATABASE
+            found[SERVER_LOGIN] = self.prefect or ""
+        else:
+            names.append(CLOUD_LOGIN)
+            if self.prefect is not None:
+                found[CLIENT_LOGIN] = self.prefect
+            urls = [plan.project, *([plan.bucket or ""] if part == "watch" else [])]
+            if any("://" in url for url in urls):
+                names += [name for name in environ if name.startswith("AWS_")]
+        if part == "watch":
+            names += ALERTS
+            found[METRICS_TOKEN] = self.metrics
+        if part == "pages":
+            found[PAGES_TOKEN] = self.pages
+        return {**{name: environ[name] for name in names if name in environ}, **found}
+
+
+def secrets_of(plan: ServePlan, pages: str) -> Secrets:
+    """The secrets of a project that is about to be served; those that are kept are made once.
+
+    Args:
+        plan: what is served.
+        pages: what people log in to the pages with.
+
+    Raises:
+        UsageError: the token for figures is short.
+    """
+    metrics = os.environ.get(METRICS_TOKEN)
+    if metrics is not None and len(metrics) < TOKEN_LENGTH:
+        raise UsageError(
+            METRICS_TOKEN,
+            expected=f"at least {TOKEN_LENGTH} characters",
+            found=f"{len(metrics)}",
+            todo="Make one with: openssl rand -hex 16.",
+        )
+    state = plan.state_folder
+    if metrics is None:
+        metrics = kept_secret(state.metrics_token, lambda: token_urlsafe(24))
+    login = os.environ.get(CLIENT_LOGIN)
+    if plan.owns_prefect:
+        given = os.environ.get(SERVER_LOGIN)
+        login = given or kept_secret(state.prefect_login, new_login)
+    return Secrets(pages, metrics, login)
+
+
+def kept_secret(file: Path, make: Callable[[], str]) -> str:
+    """A secret that is kept in a file for this user alone; made where there is none yet.
+
+    One that other users may read or may have written is replaced.
+
+    Args:
+        file: in a folder for this user alone.
+        make: gives a new secret, one line.
+    """
+    file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    file.parent.chmod(0o700)
+    try:
+        with os.fdopen(os.open(file, os.O_RDONLY | os.O_NOFOLLOW)) as opened:
+            known = os.fstat(opened.fileno())
+            secret = opened.read().strip()
+        if secret and known.st_uid == os.geteuid() and not stat.S_IMODE(known.st_mode) & 0o077:
+            return secret
+    except OSError:
+        pass  # not there, a link, or another user's
+    secret = make()
+    with whole_file(file) as draft:
+        draft.touch(mode=0o600)
+        draft.chmod(0o600)
+        draft.write_text(f"{secret}\n")
+    return secret

@@ -1,0 +1,312 @@
+"""Serving a project: processes that start in order, begin again when they end, and end together."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+from data_contracts.operations import Service, Serving
+from flows.prefect_database import begin_database, keep_database
+from flows.prefect_environment import one_authority, require_login, served_environment
+from flows.service.health import at_prefect
+from flows.service.layout import PRIORITIES
+from flows.service.plan import ServePlan
+from flows.service.service_secrets import Secrets
+from worldpose.errors import UsageError, WorldposeError
+from worldpose.store import Store
+
+LONGEST_PAUSE: Final = 60.0
+"""Between two beginnings of a process that keeps ending [s]."""
+STEADY_SECONDS: Final = 120.0
+"""A process that worked for so long begins again at once."""
+BEGIN_SECONDS: Final = 300.0
+"""What a process may take to begin: the first start makes a database, and machines are busy [s]."""
+END_SECONDS: Final = 15.0
+"""What a process may take to end before it is killed."""
+LOG_BYTES: Final = 10_000_000
+"""A longer log is set aside as `.1`, also while its process is at work."""
+
+Tell = Callable[[str], None]
+
+
+@dataclass
+class _Part:
+    """A process that is kept at work.
+
+    Attributes:
+        name: of the part.
+        address: at which it answers.
+        process: None until it is due again.
+        said: how long its log was before it began [byte].
+        began: on the clock that only goes forward [s].
+        pause: before it began the last time [s].
+        due: when it is begun again [s].
+    """
+
+    name: str
+    address: str | None
+    process: subprocess.Popen[bytes] | None = None
+    said: int = 0
+    began: float = 0.0
+    pause: float = 0.0
+    due: float = 0.0
+
+
+@dataclass
+class _Supervisor:
+    """Keeps the parts at work.
+
+    Attributes:
+        plan: what is served.
+        secrets: what its parts keep from everybody else.
+        tell: takes lines for whoever started this.
+    """
+
+    plan: ServePlan
+    secrets: Secrets
+    tell: Tell
+    parts: list[_Part] = field(default_factory=list)
+
+    def start(self, name: str, address: str | None = None) -> _Part:
+        part = _Part(name, address)
+        self.parts.append(part)
+        self._begin(part)
+        return part
+
+    def look(self) -> None:
+        """Begin again what has ended."""
+        now = time.monotonic()
+        for part in self.parts:
+            bound_log(self.plan.state_folder.logs / f"{part.name}.log")
+            if part.process is not None and part.process.poll() is not None:
+                code = part.process.returncode
+                is_steady = now - part.began > STEADY_SECONDS
+                part.pause = 0.0 if is_steady else min(2.0 * part.pause + 1.0, LONGEST_PAUSE)
+                part.due, part.process = now + part.pause, None
+                log = self.plan.state_folder.logs / f"{part.name}.log"
+                self.tell(
+                    f"{part.name} ended ({code}), see {log}; it begins again in {part.pause:.0f} s"
+                )
+            elif part.process is None and now >= part.due:
+                self._begin(part)
+                self.write()
+
+    def write(self) -> None:
+        """Say in the state folder what is served."""
+        plan = self.plan
+        services = {
+            part.name: Service(pid=part.process.pid, address=part.address)
+            for part in self.parts
+            if part.process is not None
+        }
+        services["serve"] = Service(pid=os.getpid())
+        plan.state_folder.write_serving(
+            Serving(
+                project=plan.project,
+                inbox=str(plan.inbox),
+                name=plan.name,
+                prefect=plan.prefect,
+                owns_prefect=plan.owns_prefect,
+                services=services,
+                started_at=datetime.now(UTC),
+            )
+        )
+
+    def end(self) -> None:
+        """End everything, last first: what runs ends before the server that it reports to."""
+        for part in reversed(self.parts):
+            process, part.process = part.process, None
+            if process is None:
+                continue
+            if process.stdin is not None:
+                process.stdin.close()
+            try:
+                process.wait(END_SECONDS)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def _begin(self, part: _Part) -> None:
+        log = self.plan.state_folder.logs / f"{part.name}.log"
+        log.parent.mkdir(parents=True, exist_ok=True)
+        bound_log(log)
+        with log.open("ab") as output:
+            part.said = output.tell()
+            part.process = subprocess.Popen(
+                [
+                    *(sys.executable, "-m", "flows.service.child"),
+                    *(part.name, self.plan.model_dump_json()),
+                ],
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=environment_of(self.plan) | self.secrets.of(part.name, self.plan),
+                start_new_session=True,  # Ctrl-C is for this process, which then ends its parts
+            )
+        part.began = time.monotonic()
+
+
+def serve(plan: ServePlan, secrets: Secrets, ready: Callable[[], None], tell: Tell) -> None:
+    """Serve a project until SIGINT or SIGTERM.
+
+    Args:
+        plan: what is served, and how.
+        secrets: what its parts keep from everybody else.
+        ready: called when everything answers.
+        tell: takes lines for whoever started this.
+
+    Raises:
+        UsageError: the project is served already, or a port is taken.
+        WorldposeError: a part does not answer in time.
+    """
+    Store.create(plan.project)
+    for priority in PRIORITIES:
+        (plan.inbox / ("" if priority == "normal" else priority)).mkdir(parents=True, exist_ok=True)
+    state = plan.state_folder
+    with state.only_one("serve", wait=False) as is_alone:
+        if not is_alone:
+            raise UsageError(
+                f"worldpose serve --project {plan.project}",
+                expected="nothing that serves this project yet",
+                found=f"another process; see {state.serving}",
+                todo="See how it is with --check, or end it first.",
+            )
+        with _until_told() as told:
+            supervisor = _Supervisor(plan, secrets, tell)
+            try:
+                _bring_up(supervisor, told)
+                if not told.is_set():
+                    ready()
+                while not told.wait(0.5):
+                    supervisor.look()
+            finally:
+                supervisor.end()
+                state.end_orderly()
+                state.serving.unlink(missing_ok=True)
+
+
+def bound_log(log: Path) -> None:
+    """Set a log that is too long aside, in place of the one before.
+
+    Its process goes on writing to the same file, which it appends to, from the beginning.
+    """
+    if not log.exists() or log.stat().st_size <= LOG_BYTES:
+        return
+    with suppress(OSError):  # on a full disk it is the log that makes room
+        shutil.copyfile(log, log.with_suffix(".log.1"))
+    os.truncate(log, 0)
+
+
+def answers(address: str) -> bool:
+    """Does a server of ours answer at `address` within seconds."""
+    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    try:
+        with opener.open(address, timeout=5) as answer:
+            return bool(answer.status == 200)
+    except (OSError, ValueError):
+        return False
+
+
+def health_addresses(plan: ServePlan) -> Mapping[str, str]:
+    """Part to the address at which it says that it is well."""
+    local = "127.0.0.1" if plan.host in ("0.0.0.0", "::") else plan.host
+    return {
+        "prefect": f"{plan.prefect}/health",
+        "pages": f"http://{local}:{plan.pages_port}/api/health",
+        "watch": f"http://{local}:{plan.metrics_port}/health",
+    }
+
+
+def _bring_up(supervisor: _Supervisor, told: threading.Event) -> None:
+    plan = supervisor.plan
+    addresses = health_addresses(plan)
+    if plan.owns_prefect:
+        is_first = begin_database(plan.state / "prefect")
+        part = supervisor.start("prefect", plan.prefect)
+        _wait_for(supervisor, part, lambda: answers(addresses["prefect"]), told)
+        if is_first and not told.is_set():
+            keep_database(plan.state / "prefect")
+    elif not answers(addresses["prefect"]):
+        raise UsageError(
+            f"PREFECT_API_URL={plan.prefect}",
+            expected="a running Prefect server",
+            found="no answer",
+            todo="Start it, or unset PREFECT_API_URL to have one started.",
+        )
+    else:
+        require_login(plan.prefect)
+    pages = supervisor.start("pages", plan.pages)
+    worker = supervisor.start("worker")
+    watch = supervisor.start("watch", f"http://{plan.host}:{plan.metrics_port}/metrics")
+    supervisor.write()
+    if plan.certificate is None:
+        _wait_for(supervisor, pages, lambda: answers(addresses["pages"]), told)
+    _wait_for(supervisor, watch, lambda: answers(addresses["watch"]), told)
+    serving = plan.state_folder.read_serving()
+    if serving is not None:
+        login = supervisor.secrets.prefect
+        _wait_for(supervisor, worker, lambda: _is_at_work(serving, login), told)
+
+
+def _is_at_work(serving: Serving, login: str | None) -> bool:
+    """Whether runs are taken; that one of them hangs is another matter."""
+    findings = at_prefect(serving, login)
+    return all(finding.is_well for finding in findings if finding.part != "runs")
+
+
+def _wait_for(
+    supervisor: _Supervisor, part: _Part, is_well: Callable[[], bool], told: threading.Event
+) -> None:
+    deadline = time.monotonic() + BEGIN_SECONDS
+    while not told.wait(0.2):
+        process = part.process
+        if process is None or process.poll() is not None or time.monotonic() > deadline:
+            log = supervisor.plan.state_folder.logs / f"{part.name}.log"
+            said = log.read_bytes()[part.said :].decode(errors="replace")
+            raise WorldposeError(f"{part.name} did not start. It said:\n{said[-2000:]}")
+        if is_well():
+            return
+
+
+def environment_of(plan: ServePlan) -> dict[str, str]:
+    """What every part of a served project has in its environment; secrets are not among it."""
+    home = plan.state / "prefect" if plan.owns_prefect else None
+    values = served_environment(plan.prefect, home)
+    workers = plan.workers or max(1, (os.cpu_count() or 1) // plan.max_concurrent)
+    values["WORLDPOSE_STATE"] = str(plan.state)
+    values["WORLDPOSE_WORKERS"] = str(workers)
+    if plan.dask is not None:
+        values["WORLDPOSE_DASK"] = plan.dask
+    elif home is not None:
+        home.mkdir(parents=True, exist_ok=True)
+        values |= one_authority(home)
+    return values
+
+
+@contextmanager
+def _until_told() -> Iterator[threading.Event]:
+    """An event that is set by SIGINT and SIGTERM inside the block."""
+    told = threading.Event()
+
+    def end(number: int, frame: FrameType | None) -> None:
+        told.set()
+
+    before = {each: signal.signal(each, end) for each in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield told
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,190 @@
+"""What is looked at all the time while a project is served."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import logging
+import os
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from typing import Any, Final
+
+from prefect.client.orchestration import get_client
+from prefect.client.schemas.filters import (
+    DeploymentFilter,
+    DeploymentFilterName,
+    FlowRunFilter,
+    FlowRunFilterEndTime,
+    FlowRunFilterState,
+    FlowRunFilterStateType,
+)
+from prefect.client.schemas.objects import State, StateType
+from prefect.deployments import arun_deployment
+
+from flows.service.alerts import AlertDispatcher, FailedRun, alerts_now
+from flows.service.arrivals import watch_once
+from flows.service.metrics import ProjectFigures, metrics_server
+from flows.service.overview import Overview
+from flows.service.plan import ServePlan
+from flows.service.recovery import begin_again, may_begin_again
+from flows.service.senders import Sender, senders_of
+from flows.service.service_secrets import METRICS_TOKEN
+from worldpose.store import Store
+
+INBOX_SECONDS: Final = 2.0
+"""Between two looks at the inbox; longer where one look takes long."""
+BUCKET_SECONDS: Final = 10.0
+"""Between two looks at an inbox in object storage."""
+ALERT_SECONDS: Final = 30.0
+"""Between two looks for alerts and lost runs."""
+DELIVERY_SECONDS: Final = 2.0
+"""Between two looks of a sender for alerts that it has not taken."""
+TROUBLE_SECONDS: Final = 3600.0
+"""Between two log lines about a failure that lasts."""
+TROUBLE_LENGTH: Final = 500
+"""Of such a line."""
+FAILED_DAYS: Final = 7
+"""A failed run is no alert any more after so long."""
+
+LOG = logging.getLogger("worldpose.operations")
+
+
+def watch(plan: ServePlan) -> None:
+    """Watch until this process ends."""
+    store = Store.create(plan.project)
+    figures = ProjectFigures(store, plan.state_folder)
+    server = metrics_server(plan, figures, os.environ[METRICS_TOKEN])
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    asyncio.run(_watch(plan, store))
+
+
+async def _watch(plan: ServePlan, store: Store) -> None:
+    teller = AlertDispatcher(plan.state_folder, senders_of(os.environ))
+    await asyncio.gather(  # each at its own pace: none waits for what another waits for
+        _watch_bucket(plan),
+        _watch_inbox(plan),
+        _begin_lost_runs_again(plan),
+        _watch_alerts(plan, store, teller),
+        *(_deliver(teller, sender) for sender in teller.senders),
+    )
+
+
+class Trouble:
+    """Something that is done again and again: a failure that lasts is said once, then hourly.
+
+    Attributes:
+        what: is done, in words.
+    """
+
+    def __init__(self, what: str) -> None:
+        self.what = what
+        self._said: str | None = None
+        self._at = 0.0
+
+    @contextmanager
+    def told(self) -> Iterator[None]:
+        """A block whose failure is logged, on one line, and goes no further."""
+        try:
+            yield
+        except Exception as error:
+            said = " ".join(f"{type(error).__name__}: {error}".split())[:TROUBLE_LENGTH]
+            now = time.monotonic()
+            if said != self._said or now - self._at >= TROUBLE_SECONDS:
+                LOG.warning("%s failed: %s; it is tried again", self.what, said)
+                LOG.debug("%s", self.what, exc_info=error)
+                self._said, self._at = said, now
+        else:
+            if self._said is not None:
+                LOG.warning("%s works again", self.what)
+                self._said = None
+
+
+async def _watch_bucket(plan: ServePlan) -> None:
+    if plan.bucket is None:
+        return
+    from flows.service.bucket import BucketInbox  # late: object storage is an extra
+
+    bucket = BucketInbox(plan.bucket, plan.inbox, plan.state_folder)
+    trouble = Trouble("looking at the bucket")
+    while True:
+        with trouble.told():
+            await asyncio.to_thread(bucket.fetch, time.monotonic(), plan.settle_seconds)
+        await asyncio.sleep(BUCKET_SECONDS)
+
+
+async def _watch_inbox(plan: ServePlan) -> None:
+    trouble = Trouble("looking at the inbox")
+    while True:
+        began = time.monotonic()
+        with trouble.told():
+            ready = await asyncio.to_thread(
+                watch_once, plan.state_folder, plan.inbox, plan.settle_seconds
+            )
+            if ready:
+                await _ingest(plan, ready)
+        took = time.monotonic() - began
+        await asyncio.sleep(max(INBOX_SECONDS, 10.0 * took))
+
+
+async def _ingest(plan: ServePlan, ready: list[str]) -> None:
+    """Have arrivals taken in now; asked twice for the same ones, there is one run."""
+    key = hashlib.sha256("\n".join(sorted(ready)).encode()).hexdigest()[:16]
+    await arun_deployment(
+        plan.ingest_deployment, timeout=0, as_subflow=False, idempotency_key=f"arrived-{key}"
+    )
+
+
+async def _begin_lost_runs_again(plan: ServePlan) -> None:
+    trouble = Trouble("looking for lost runs")
+    while True:
+        await asyncio.sleep(ALERT_SECONDS)
+        with trouble.told():
+            await begin_again(plan)
+
+
+async def _watch_alerts(plan: ServePlan, store: Store, teller: AlertDispatcher) -> None:
+    overview = Overview(store)
+    at_prefect = Trouble("asking Prefect for failed runs")
+    trouble = Trouble("looking for alerts")
+    failed: list[FailedRun] = []
+    while True:
+        await asyncio.sleep(ALERT_SECONDS)
+        with at_prefect.told():
+            failed = await failed_runs(plan)
+        with trouble.told():
+            matches = await asyncio.to_thread(overview.look)
+            arrivals = plan.state_folder.arrivals().values()
+            await asyncio.to_thread(teller.hold, alerts_now(plan, matches, arrivals, failed))
+
+
+async def _deliver(teller: AlertDispatcher, sender: Sender) -> None:
+    """Hand alerts to one sender, in a thread of its own: however long it takes, nobody waits."""
+    pool = ThreadPoolExecutor(1, thread_name_prefix=sender.name)
+    while True:
+        await asyncio.sleep(DELIVERY_SECONDS)
+        await asyncio.get_running_loop().run_in_executor(pool, teller.deliver, sender)
+
+
+async def failed_runs(plan: ServePlan) -> list[FailedRun]:
+    """Runs of this project's deployments that ended badly and do not begin again."""
+    bad = FlowRunFilterStateType(any_=[StateType.FAILED, StateType.CRASHED])
+    since = FlowRunFilterEndTime(after_=datetime.now(UTC) - timedelta(days=FAILED_DAYS))
+    async with get_client() as client:
+        runs = await client.read_flow_runs(
+            flow_run_filter=FlowRunFilter(state=FlowRunFilterState(type=bad), end_time=since),
+            deployment_filter=DeploymentFilter(name=DeploymentFilterName(any_=[plan.name])),
+        )
+    return [
+        FailedRun(str(run.id), run.name, str(run.state_name).lower(), _said(run.state))
+        for run in runs
+        if not may_begin_again(run)
+    ]
+
+
+def _said(state: State[Any] | None) -> str:
+    return "" if state is None else str(state.message or "")

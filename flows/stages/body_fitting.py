@@ -1,0 +1,45 @@
+"""Stage `body_fitting`: one unit a clip, from its triangulated joints (S1-S3)."""
+
+from __future__ import annotations
+
+from pydantic import JsonValue
+
+from flows.stage import Match, Stage
+from flows.stages import detection, tracking
+from worldpose.body import OPEN_BODY, digest_of_body
+from worldpose.body_fitting import BodyFittingSettings
+
+
+def inputs(match: Match, unit: str) -> tuple[str, ...]:
+    """Where everybody's joints are, and what each camera saw of whom."""
+    seen = detection.seen_by_cameras(match, unit)
+    return (*seen, "bundle_adjustment/cameras", f"tracking/{unit}", f"retriangulation/{unit}")
+
+
+def sources(match: Match, unit: str) -> dict[str, JsonValue]:
+    """The clip, the clock, the order of the cameras, and the pitch under the feet."""
+    pitch = match.folder.pitch
+    return {
+        **tracking.clip_sources(match, unit),
+        "pitch": None if pitch is None else pitch.model_dump(mode="json"),
+    }
+
+
+def outside(settings: BodyFittingSettings) -> dict[str, JsonValue]:
+    """The content of an installed body model; the open body is part of the code."""
+    if settings.body_model == OPEN_BODY:
+        return {"body_model_sha256": None}
+    return {"body_model_sha256": digest_of_body(settings.body_model)}
+
+
+STAGE = Stage(
+    name="body_fitting",
+    about="fit a body to every person",
+    settings=BodyFittingSettings,
+    units=tracking.units,
+    inputs=inputs,
+    sources=sources,
+    previous_pass_inputs=tracking.filtered,
+    late_inputs=tracking.found_again,
+    external_inputs=outside,
+)

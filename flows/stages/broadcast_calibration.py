@@ -1,0 +1,66 @@
+"""Stage `broadcast_calibration`: one unit a clip whose key frames were clicked (M1-M6)."""
+
+from __future__ import annotations
+
+from pydantic import JsonValue
+
+from flows.stage import Match, Stage, once_a_match
+from flows.stages import detection
+from worldpose.broadcast_calibration import BroadcastCalibrationSettings
+from worldpose.ingest import unit_frames
+from worldpose.ingest.annotations import key_frames_file
+
+
+@once_a_match
+def units(match: Match) -> tuple[str, ...]:
+    """Clips with a broadcast video in which somebody clicked key frames."""
+    folder = match.folder
+    clips = (clip.id for clip in folder.spec.clips if clip.broadcast is not None)
+    return tuple(clip for clip in clips if clip in folder.key_frames and clip in folder.videos)
+
+
+def inputs(match: Match, unit: str) -> tuple[str, ...]:
+    """The fitted people, and whom the broadcast camera saw."""
+    return (*detection.seen_in_broadcast(match, unit), f"body_fitting/{unit}")
+
+
+def sources(match: Match, unit: str) -> dict[str, JsonValue]:
+    """The video, how its frames lie on the match's clock, the key frames and the pitch.
+
+    Clicks are listed under the file's name, frame by frame and marking by marking, so that a
+    difference of two runs names the file, the frame and the point.
+    """
+    folder = match.folder
+    video = folder.videos[unit]
+    path = video.relative_to(folder.folder).as_posix()
+    frames = unit_frames(folder.spec, unit)
+    clicked: dict[str, JsonValue] = {
+        str(key.frame): {
+            "points": {point.name: list(point.xy) for point in key.markings.points},
+            "drawn": {
+                marking.name: [[x, y] for x, y in marking.xy] for marking in key.markings.drawn
+            },
+        }
+        for key in folder.key_frames[unit].key_frames
+    }
+    return {
+        "video": path,
+        "video_sha256": match.registration.digest_of(path),
+        "key_frames": {key_frames_file(unit): clicked},
+        "first_frame": frames.first,
+        "frame_count": frames.count,
+        "offset_frames": frames.offset,
+        "broadcast_offset_frames": folder.spec.clip(unit).broadcast_offset_frames,
+        "fps": folder.spec.fps,
+        "pitch": None if folder.pitch is None else folder.pitch.model_dump(mode="json"),
+    }
+
+
+STAGE = Stage(
+    name="broadcast_calibration",
+    about="follow the broadcast camera from its key frames",
+    settings=BroadcastCalibrationSettings,
+    units=units,
+    inputs=inputs,
+    sources=sources,
+)

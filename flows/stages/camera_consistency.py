@@ -1,0 +1,31 @@
+"""Stage `camera_consistency`: one unit a clip, from all static cameras and their detections."""
+
+from __future__ import annotations
+
+from pydantic import JsonValue
+
+from flows.stage import Match, Stage
+from flows.stages import tracking
+from worldpose.camera_consistency import ConsistencySettings
+
+
+def sources(match: Match, unit: str) -> dict[str, JsonValue]:
+    """The clip, whether it has a pitch, and the stated offsets of the cameras."""
+    spec = match.folder.spec
+    return {
+        **tracking.clip_sources(match, unit),
+        "ground": match.folder.pitch is not None,
+        "offset_frames": [camera.offset_frames for camera in spec.static_cameras],
+    }
+
+
+STAGE = Stage(
+    name="camera_consistency",
+    about="find cameras that contradict the others",
+    settings=ConsistencySettings,
+    units=tracking.units,
+    inputs=tracking.inputs,
+    sources=sources,
+    leaves_out=True,
+    min_cameras=tracking.MIN_CAMERAS,
+)

@@ -1,0 +1,108 @@
+"""Stage `detection`: people in videos; one unit a clip and camera that brought none (D1-D5)."""
+
+from __future__ import annotations
+
+from pydantic import JsonValue
+
+from data_contracts.detection import detection_unit
+from data_contracts.redetection import again_of
+from flows.stage import Match, Stage, once_a_match
+from flows.stages import ingest
+from worldpose.detection import DetectionSettings, weights_of
+
+
+def seen_by(match: Match, camera_id: str, clip_id: str) -> str:
+    """The result with the people whom a static camera sees in a clip, given or detected."""
+    if camera_id in match.folder.detections:
+        return f"ingest/{camera_id}"
+    return f"detection/{detection_unit(camera_id, clip_id)}"
+
+
+def seen_by_cameras(match: Match, clip_id: str) -> tuple[str, ...]:
+    """The same of every static camera, in order."""
+    cameras = match.folder.spec.static_cameras
+    return tuple(seen_by(match, camera.id, clip_id) for camera in cameras)
+
+
+def again(match: Match, camera_id: str, clip_id: str) -> tuple[str, ...]:
+    """The result with those whom a camera's video shows when they are looked for again, if any."""
+    name = again_of(seen_by(match, camera_id, clip_id))
+    return (name,) if name else ()
+
+
+def again_by_cameras(match: Match, clip_id: str) -> tuple[str, ...]:
+    """The same of every static camera, in order."""
+    cameras = match.folder.spec.static_cameras
+    return tuple(name for camera in cameras for name in again(match, camera.id, clip_id))
+
+
+def seen_in_broadcast(match: Match, clip_id: str) -> tuple[str, ...]:
+    """The result with the people whom a clip's broadcast camera sees, where there is one."""
+    if clip_id in match.folder.detections:
+        return (f"ingest/{clip_id}",)
+    return (f"detection/{clip_id}",) if clip_id in _units(match) else ()
+
+
+def units(match: Match) -> tuple[str, ...]:
+    """`camera.clip` of static cameras without given 2D poses, then broadcast clips without them."""
+    return tuple(_units(match))
+
+
+@once_a_match
+def _units(match: Match) -> dict[str, tuple[str, str]]:
+    """The unit of `ingest` and the clip of each unit."""
+    folder = match.folder
+    static = {camera.id for camera in folder.spec.static_cameras}
+    found = [unit for unit in ingest.units(match) if unit not in folder.detections]
+    return {
+        detection_unit(unit, clip.id) if unit in static else unit: (unit, clip.id)
+        for unit in found
+        for clip in folder.spec.clips
+        if unit in static or unit == clip.id
+    }
+
+
+def inputs(match: Match, unit: str) -> tuple[str, ...]:
+    """The index of the video, and the camera, which tells players from crowd."""
+    footage, _ = _units(match)[unit]
+    return tuple(f"{stage}/{footage}" for stage in _stages(match, footage))
+
+
+def _stages(match: Match, footage: str) -> tuple[str, ...]:
+    static = {camera.id for camera in match.folder.spec.static_cameras}
+    known = footage in static and match.folder.pitch is not None
+    return ("ingest", "static_calibration") if known else ("ingest",)
+
+
+def sources(match: Match, unit: str) -> dict[str, JsonValue]:
+    """The video, the clip, the pitch around which the crowd sits, and what people corrected."""
+    footage, clip_id = _units(match)[unit]
+    clip, pitch = match.folder.spec.clip(clip_id), match.folder.pitch
+    known = len(_stages(match, footage)) > 1
+    video = ingest.video_sources(match, footage)
+    return {
+        "camera": footage,
+        "video": video["video"],
+        "video_sha256": video["video_sha256"],
+        "first_frame": clip.first_frame,
+        "frame_count": clip.frame_count,
+        "pitch": pitch.model_dump(mode="json") if known and pitch is not None else None,
+        **ingest.edits_of(match, footage, clip.first_frame, clip.frame_count),
+    }
+
+
+def outside(settings: DetectionSettings) -> dict[str, JsonValue]:
+    """What the named weights hold, and the libraries that compute them."""
+    return {"weights": dict(weights_of(settings))}
+
+
+STAGE = Stage(
+    name="detection",
+    about="find people and their keypoints in videos",
+    settings=DetectionSettings,
+    units=units,
+    inputs=inputs,
+    sources=sources,
+    external_inputs=outside,
+    worker_tag="GPU",
+)

@@ -1,0 +1,76 @@
+"""Stage `redetection`: in the second iteration and later, one unit a video's clip (R2)."""
+
+from __future__ import annotations
+
+from collections.abc import Container
+
+from pydantic import JsonValue
+
+from data_contracts.detection import detection_unit
+from flows.stage import Match, Stage, once_a_match
+from flows.stages import detection, refitting
+from worldpose.redetection import RedetectionSettings
+
+
+@once_a_match
+def _units(match: Match) -> dict[str, tuple[str, str]]:
+    """The static camera and the clip of each unit: those with people found in a video."""
+    spec = match.folder.spec
+    return {
+        detection_unit(camera.id, clip.id): (camera.id, clip.id)
+        for camera in spec.static_cameras
+        for clip in spec.clips
+        if detection.again(match, camera.id, clip.id)
+    }
+
+
+def units(match: Match) -> tuple[str, ...]:
+    """`camera.clip` of static cameras without given 2D poses."""
+    return tuple(_units(match))
+
+
+def inputs(match: Match, unit: str) -> tuple[str, ...]:
+    """The index of the video, and who was detected."""
+    camera, clip = _units(match)[unit]
+    return (f"ingest/{camera}", detection.seen_by(match, camera, clip))
+
+
+def again(match: Match, unit: str) -> tuple[str, ...]:
+    """The adjusted cameras, the bodies as they were fitted last, and what these said."""
+    _, clip = _units(match)[unit]
+    bodies = "refitting" if clip in refitting.units(match) else "body_fitting"
+    stages = ("tracking", "triangulation", "retriangulation", bodies, "filtering")
+    return ("bundle_adjustment/cameras", *(f"{stage}/{clip}" for stage in stages))
+
+
+def sources(match: Match, unit: str) -> dict[str, JsonValue]:
+    """Which camera and clip; all else comes with `detection`."""
+    camera, clip = _units(match)[unit]
+    return {"camera": camera, "clip": clip}
+
+
+def seen_in(run: Container[str], match: Match, camera_id: str, clip_id: str) -> str:
+    """The result with all whom a run took a static camera to show in a clip.
+
+    Args:
+        run: names of its results, as `stage/unit`.
+        match: it is of.
+        camera_id: a static camera.
+        clip_id: a clip.
+    """
+    again = detection.again(match, camera_id, clip_id)
+    found = [name for name in again if name in run]
+    return found[0] if found else detection.seen_by(match, camera_id, clip_id)
+
+
+STAGE = Stage(
+    name="redetection",
+    about="look again for people where bodies say they must be",
+    settings=RedetectionSettings,
+    units=units,
+    inputs=inputs,
+    sources=sources,
+    previous_pass_inputs=again,
+    first_pass=2,
+    worker_tag="GPU",
+)

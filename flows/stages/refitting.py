@@ -1,0 +1,82 @@
+"""Stage `refitting`: one unit a clip that a broadcast camera or other clips tell of (S1, S4)."""
+
+from __future__ import annotations
+
+from pydantic import JsonValue
+
+from data_contracts.records import Record
+from flows.stage import Match, Stage, once_a_match
+from flows.stages import body_fitting, broadcast_calibration, broadcast_pooling, detection, tracking
+from worldpose.ingest import unit_frames
+
+
+class RefittingSettings(Record):
+    """None of its own: bodies are fitted again as `body_fitting` fitted them."""
+
+
+@once_a_match
+def units(match: Match) -> tuple[str, ...]:
+    """Clips whose calibrated broadcast camera saw people, and those with people of other clips."""
+    clips = (clip.id for clip in match.folder.spec.clips)
+    return tuple(clip for clip in clips if _is_broadcast(match, clip) or _namesakes(match, clip))
+
+
+def inputs(match: Match, unit: str) -> tuple[str, ...]:
+    """What the bodies were made from, these, the broadcast camera, and shapes of other clips."""
+    names = [*body_fitting.inputs(match, unit), f"body_fitting/{unit}"]
+    if _is_broadcast(match, unit):
+        names += [f"broadcast_calibration/{unit}", *detection.seen_in_broadcast(match, unit)]
+    if _is_broadcast(match, unit) and unit in broadcast_pooling.units(match):
+        names.append(f"broadcast_pooling/{unit}")
+    return (*names, *(f"body_fitting/{clip}" for clip in _namesakes(match, unit)))
+
+
+def sources(match: Match, unit: str) -> dict[str, JsonValue]:
+    """The clip, estimates from the broadcast video and its clock, and who is who."""
+    folder = match.folder
+    clip = folder.spec.clip(unit)
+    file = folder.estimates.get(unit) if _is_broadcast(match, unit) else None
+    path = None if file is None else file.relative_to(folder.folder).as_posix()
+    named = {unit: clip.people, **_namesakes(match, unit)}
+    return {
+        **body_fitting.sources(match, unit),
+        "seen_in_broadcast": next(iter(detection.seen_in_broadcast(match, unit)), None),
+        "estimates": path,
+        "estimates_sha256": None if path is None else match.registration.digest_of(path),
+        "offset_frames": unit_frames(folder.spec, unit).offset,
+        "broadcast_offset_frames": clip.broadcast_offset_frames,
+        "people": {
+            name: {str(person): player for person, player in sorted(people.items())}
+            for name, people in named.items()
+        },
+    }
+
+
+def _is_broadcast(match: Match, unit: str) -> bool:
+    """Whether a broadcast camera is calibrated, and people found in its pictures."""
+    seen = detection.seen_in_broadcast(match, unit)
+    return bool(seen) and unit in broadcast_calibration.units(match)
+
+
+def _namesakes(match: Match, unit: str) -> dict[str, dict[int, str]]:
+    """The people of a clip in other clips: clip to their person ids and names there."""
+    clips = match.folder.spec.clips
+    here = set(match.folder.spec.clip(unit).people.values())
+    there = {
+        clip.id: {person: name for person, name in clip.people.items() if name in here}
+        for clip in clips
+        if clip.id != unit
+    }
+    return {clip: people for clip, people in there.items() if people}
+
+
+STAGE = Stage(
+    name="refitting",
+    about="fit bodies again with the broadcast camera and other clips",
+    settings=RefittingSettings,
+    units=units,
+    inputs=inputs,
+    sources=sources,
+    previous_pass_inputs=tracking.filtered,
+    late_inputs=tracking.found_again,
+)

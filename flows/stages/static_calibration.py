@@ -1,0 +1,72 @@
+"""Stage `static_calibration`: one unit a static camera, given or calibrated from clicks (C1-C5)."""
+
+from __future__ import annotations
+
+from pydantic import JsonValue
+
+from flows.stage import Match, Stage
+from flows.stages.ingest import video_sources
+from worldpose.ingest import unit_frames
+from worldpose.ingest.annotations import clicked_file
+from worldpose.static_calibration import StaticCalibrationSettings
+
+
+def units(match: Match) -> tuple[str, ...]:
+    """The static cameras in order."""
+    return tuple(camera.id for camera in match.folder.spec.static_cameras)
+
+
+def inputs(match: Match, unit: str) -> tuple[str, ...]:
+    """Nothing: a camera comes from what people gave or clicked, never from detections."""
+    return ()
+
+
+def sources(match: Match, unit: str) -> dict[str, JsonValue]:
+    """The given calibration alone, or else the clicks, the pitch and a picture of this camera.
+
+    Clicks are listed under the file's name, marking by marking, so that a difference of two runs
+    names the file and the point.
+    """
+    folder = match.folder
+    camera = folder.spec.camera(unit)
+    given = folder.calibrations.get(unit)
+    if given is not None:
+        return {"calibration": given.model_dump(mode="json")}
+    clicked = folder.clicked[unit]  # registering a match makes sure of one of the two
+    still = folder.stills.get(unit)
+    path = None if still is None else still.relative_to(folder.folder).as_posix()
+    return {
+        "calibration": None,
+        "clicked": {
+            clicked_file(unit): {
+                "points": {point.name: list(point.xy) for point in clicked.points},
+                "drawn": {
+                    marking.name: [list(xy) for xy in marking.xy] for marking in clicked.drawn
+                },
+            }
+        },
+        "pitch": None if folder.pitch is None else folder.pitch.model_dump(mode="json"),
+        "image_size": [camera.width, camera.height],
+        "still": path,
+        "still_sha256": None if path is None else match.registration.digest_of(path),
+        "filmed": _filmed(match, unit) if still is None else None,
+    }
+
+
+def _filmed(match: Match, unit: str) -> dict[str, JsonValue] | None:
+    """The camera's video, out of which a still without people is made where none is given."""
+    if unit not in match.folder.videos:
+        return None
+    offset = unit_frames(match.folder.spec, unit).offset
+    return {**video_sources(match, unit), "offset_frames": offset}
+
+
+STAGE = Stage(
+    name="static_calibration",
+    about="find every static camera from clicked markings",
+    settings=StaticCalibrationSettings,
+    units=units,
+    inputs=inputs,
+    sources=sources,
+    leaves_out=True,
+)

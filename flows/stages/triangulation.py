@@ -1,0 +1,24 @@
+"""Stage `triangulation`: one unit a clip, from its tracks and all static cameras (T3, T4)."""
+
+from __future__ import annotations
+
+from flows.stage import Match, Stage
+from flows.stages import tracking
+from worldpose.triangulation import TriangulationSettings
+
+
+def inputs(match: Match, unit: str) -> tuple[str, ...]:
+    """Every static camera, what it brought in, and who is who."""
+    return (*tracking.inputs(match, unit), f"tracking/{unit}")
+
+
+STAGE = Stage(
+    name="triangulation",
+    about="place every joint from the cameras that agree",
+    settings=TriangulationSettings,
+    units=tracking.units,
+    inputs=inputs,
+    sources=tracking.clip_sources,
+    previous_pass_inputs=tracking.again,
+    late_inputs=tracking.found_again,
+)

@@ -1,0 +1,292 @@
+"""Clicking a picture: what is clicked, the picture, and the camera that the clicks make (C7)."""
+
+from __future__ import annotations
+
+import gc
+from collections import OrderedDict
+from pathlib import Path
+from threading import Lock
+from typing import Any, Final
+
+import numpy as np
+from fastapi import APIRouter, HTTPException
+from fastapi.responses import JSONResponse, Response
+from numpy.typing import NDArray
+from pydantic import Field
+
+from data_contracts.records import Name, Record
+from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking, Pixel
+from flows.review import reviews_of
+from flows.run_record import latest_run
+from flows.stage import Match
+from flows.web.app_context import Desk
+from worldpose.errors import InputError, WorldposeError
+from worldpose.ingest.stills import read_still
+from worldpose.pitch import PitchTemplate
+from worldpose.review.preview import PitchDrawing, Preview, preview
+from worldpose.static_calibration import StaticCalibrationSettings
+from worldpose.video import open_video
+
+KEPT: Final = 2
+"""Pictures that are kept decoded; a 4K one takes 25 MB."""
+_POINTS_ALONE: Final = StaticCalibrationSettings(lines=False)
+
+
+class Clicked(Record):
+    """Everything clicked in one picture, as the page has it."""
+
+    points: dict[Name, Pixel] = Field(default={}, max_length=200)
+    """Name to place [px]."""
+    drawn: dict[Name, tuple[Pixel, ...]] = Field(default={}, max_length=100)
+    """Name to places along it [px]."""
+    refine: bool = False
+    """Refine on the painted lines of the picture: seconds, not milliseconds."""
+
+
+class Pictures:
+    """The pictures that people click in, the last ones decoded."""
+
+    def __init__(self) -> None:
+        self._decoded: OrderedDict[tuple[str, str, int | None], NDArray[np.uint8]] = OrderedDict()
+        self._lock = Lock()
+
+    def png(self, match: Match, owner: str, frame: int | None) -> bytes:
+        """One picture as a browser shows it.
+
+        Raises:
+            HTTPException: 404, there is none.
+        """
+        still = match.folder.stills.get(owner)
+        if frame is None and still is not None:
+            return Path(still).read_bytes()
+        import cv2  # late: few pages open a picture
+
+        picture = cv2.cvtColor(self.decoded(match, owner, frame), cv2.COLOR_RGB2BGR)
+        return bytes(cv2.imencode(".png", picture)[1])
+
+    def decoded(self, match: Match, owner: str, frame: int | None) -> NDArray[np.uint8]:
+        """One picture (height, width, 3), RGB.
+
+        Raises:
+            HTTPException: 404, there is none.
+        """
+        name = (match.match_id, owner, frame)
+        with self._lock:
+            if name not in self._decoded:
+                self._decoded[name] = _read(match, owner, frame)
+            self._decoded.move_to_end(name)
+            while len(self._decoded) > KEPT:
+                self._decoded.popitem(last=False)
+            return self._decoded[name]
+
+
+def routes(desk: Desk) -> APIRouter:
+    """Routes of one picture: of a static camera, or of a frame of a clip's broadcast camera."""
+    router = APIRouter(prefix="/api/matches/{match_id}/pictures/{owner}")
+    pictures = Pictures()
+    drawings: dict[str, tuple[PitchDrawing, dict[str, tuple[int, int]]]] = {}
+
+    def prepared(match_id: str) -> tuple[PitchDrawing, dict[str, tuple[int, int]]]:
+        """A match's pitch and picture sizes; another pitch would be another match."""
+        if match_id not in drawings:
+            folder = desk.match(match_id).folder
+            pitch = folder.pitch
+            if pitch is None:
+                raise HTTPException(404, "the match has no pitch")
+            spec = folder.spec
+            owners = {camera.id: camera for camera in spec.static_cameras}
+            owners |= {
+                clip.id: spec.camera(clip.broadcast)
+                for clip in spec.clips
+                if clip.broadcast is not None
+            }
+            sizes = {name: (camera.width, camera.height) for name, camera in owners.items()}
+            drawings[match_id] = PitchDrawing(PitchTemplate.from_spec(pitch)), sizes
+        return drawings[match_id]
+
+    def size_of(match_id: str, owner: str) -> tuple[int, int]:
+        sizes = prepared(match_id)[1]
+        if owner not in sizes:
+            raise HTTPException(404, "no such camera")
+        return sizes[owner]
+
+    @router.get("")
+    def picture(match_id: str, owner: str, frame: int | None = None) -> dict[str, Any]:
+        match = desk.match(match_id)
+        size = size_of(match_id, owner)
+        clicked = _clicked(match, owner, frame)
+        latest = latest_run(desk.store, match_id)
+        stage = "static_calibration" if frame is None else "broadcast_calibration"
+        unit = f"{stage}/{owner}"
+        names = [camera.id for camera in match.folder.spec.static_cameras]
+        return {
+            "match": match_id,
+            "owner": owner,
+            "frame": frame,
+            "size": size,
+            "given": owner in match.folder.calibrations,
+            "has_picture": owner in match.folder.stills or owner in match.folder.videos,
+            "points": {point.name: point.xy for point in clicked.points},
+            "drawn": {marking.name: marking.xy for marking in clicked.drawn},
+            "pitch": _pitch(prepared(match_id)[0]),
+            "figures": {} if latest is None else latest.figures.get(unit, {}),
+            "reviews": [
+                {"id": each.request.id, "state": each.state, "reasons": each.request.reasons}
+                for each in reviews_of(match, latest)
+                if unit in each.request.keys and each.is_current
+            ],
+            "cameras": names,
+            "key_frames": _key_frames(match, owner),
+        }
+
+    @router.get("/image")
+    def image(match_id: str, owner: str, frame: int | None = None) -> Response:
+        size_of(match_id, owner)
+        content = pictures.png(desk.match(match_id), owner, frame)
+        return Response(content, media_type="image/png")
+
+    @router.post("/preview")
+    def estimate(
+        match_id: str, owner: str, clicked: Clicked, frame: int | None = None
+    ) -> JSONResponse:
+        size = size_of(match_id, owner)
+        markings = ClickedMarkings(
+            points=tuple(ClickedPoint(name=n, xy=xy) for n, xy in sorted(clicked.points.items())),
+            drawn=tuple(
+                DrawnMarking(name=n, xy=xy) for n, xy in sorted(clicked.drawn.items()) if xy
+            ),
+        )
+        seen = pictures.decoded(desk.match(match_id), owner, frame) if clicked.refine else None
+        try:
+            found = preview(
+                prepared(match_id)[0],
+                markings,
+                size,
+                picture=seen,
+                settings=StaticCalibrationSettings() if clicked.refine else _POINTS_ALONE,
+            )
+        except InputError as error:
+            advice = {"camera": None, "expected": error.expected, "todo": error.todo}
+            return JSONResponse(advice)
+        return JSONResponse(_answer(found))
+
+    return router
+
+
+def warm_up(desk: Desk) -> None:
+    """Estimate one clicked camera, which loads kernels, and open all matches with their journals.
+
+    So the first person to look waits for neither.
+    """
+    is_warm = False
+    for name in desk.store.matches():
+        try:
+            folder = desk.match(name).folder
+            if folder.pitch is None or not folder.clicked or is_warm:
+                continue
+            camera, clicked = next(iter(folder.clicked.items()))
+            spec = folder.spec.camera(camera)
+            drawing = PitchDrawing(PitchTemplate.from_spec(folder.pitch))
+            is_warm = True
+            preview(drawing, clicked, (spec.width, spec.height), settings=_POINTS_ALONE)
+        except (OSError, WorldposeError):
+            continue  # the queue says what is wrong with it
+    gc.collect()
+    gc.freeze()  # looking through long journals for garbage would hold up requests
+
+
+def _read(match: Match, owner: str, frame: int | None) -> NDArray[np.uint8]:
+    folder = match.folder
+    still = folder.stills.get(owner)
+    if frame is None and still is not None:
+        camera = folder.spec.camera(owner)
+        return read_still(still, (camera.width, camera.height))
+    if owner not in folder.videos:
+        raise HTTPException(404, "there is no picture")
+    with open_video(folder.videos[owner]) as video:
+        if not 0 <= (frame or 0) < len(video):
+            raise HTTPException(404, "the video has no such frame")
+        return video.frame(frame or 0)
+
+
+def _clicked(match: Match, owner: str, frame: int | None) -> ClickedMarkings:
+    if frame is None:
+        return match.folder.clicked.get(owner, ClickedMarkings())
+    picked = match.folder.key_frames.get(owner)
+    frames = {} if picked is None else {each.frame: each.markings for each in picked.key_frames}
+    return frames.get(frame, ClickedMarkings())
+
+
+def _key_frames(match: Match, owner: str) -> list[int]:
+    picked = match.folder.key_frames.get(owner)
+    return [] if picked is None else [each.frame for each in picked.key_frames]
+
+
+def _pitch(drawing: PitchDrawing) -> dict[str, Any]:
+    """The template as the small map shows it: names, places and shapes [m]."""
+    template = drawing.template
+    return {
+        "length": template.length,
+        "width": template.width,
+        "points": {name: _rounded(place, 3) for name, place in template.points.items()},
+        "markings": {name: _rounded(line, 2) for name, line in drawing.markings.items()},
+    }
+
+
+def _answer(found: Preview) -> dict[str, Any]:
+    report, camera = found.report, found.camera
+    ground = report.ground_error
+    return {
+        "camera": {
+            "center": _rounded(camera.center, 3),
+            "focal": round(float(camera.focal[0]), 1),
+        },
+        "markings": {
+            name: [_rounded(piece, 1) for piece in pieces]
+            for name, pieces in found.markings.items()
+        },
+        "points": {name: _rounded(place, 2) for name, place in found.points.items()},
+        "residuals": [
+            {
+                "name": each.name,
+                "residual": _rounded(each.residual, 3)
+                if np.isfinite(each.residual).all()
+                else None,
+                "surprise": _number(each.surprise),
+                "inlier": each.inlier,
+                "problem": each.problem,
+            }
+            for each in report.points
+        ],
+        "drawn": [
+            {
+                "name": each.name,
+                "rms": _number(each.rms),
+                "worst": _number(each.worst),
+                "inlier": each.inlier,
+            }
+            for each in report.drawn
+        ],
+        "wrong": report.wrong,
+        "weak": report.weak,
+        "reasons": report.reasons,
+        "decisions": report.decisions,
+        "add_next": report.add_next,
+        "stage": report.stage,
+        "median": _number(ground.median),
+        "p95": _number(ground.p95),
+        "ground": {
+            "x": _rounded(ground.x, 2),
+            "y": _rounded(ground.y, 2),
+            "expected": [[_number(value) for value in row] for row in ground.expected],
+        },
+    }
+
+
+def _rounded(values: NDArray[np.float64], digits: int) -> Any:  # noqa: ANN401 - nested lists
+    return np.round(values, digits).tolist()
+
+
+def _number(value: float) -> float | None:
+    """Four digits, or None for what could not be computed: JSON has no NaN."""
+    return float(f"{value:.4g}") if np.isfinite(value) else None

@@ -1,0 +1,147 @@
+"""Whom a camera saw in one frame: boxes and keypoints to be looked at and corrected (D4, D6)."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from fastapi import APIRouter, HTTPException
+from fastapi.responses import Response
+from numpy.typing import NDArray
+from pydantic import Field
+
+from data_contracts.conventions import COCO17, COCO17_BONES
+from data_contracts.records import Record
+from flows.acceptance import accept, left_to_look_at
+from flows.detections import detections_now
+from flows.reports.match_pictures import frame_picture
+from flows.stage import Match
+from flows.web.app_context import Desk, Person
+from worldpose.errors import InputError
+from worldpose.ingest import Observations
+from worldpose.store import Store
+
+LISTED: Final = 60
+"""People who are listed of those to look at."""
+ACCEPTED: Final = 500
+"""Most people who are accepted by name at once."""
+
+
+class Accepting(Record):
+    """Detections that a person found right."""
+
+    at_least: float | None = Field(default=None, ge=0, le=1)
+    """Everybody whose score is at least this [1]; None = nobody but those named."""
+    people: tuple[tuple[int, int], ...] = Field(default=(), max_length=ACCEPTED)
+    """Match frame, and place among the detections of the frame."""
+
+
+def routes(desk: Desk) -> APIRouter:
+    """Routes of the people in one frame of a static camera, or of a clip's broadcast camera."""
+    router = APIRouter(prefix="/api/matches/{match_id}/detections/{owner}")
+
+    @router.get("")
+    def detections(match_id: str, owner: str, frame: int | None = None) -> dict[str, Any]:
+        match = desk.match(match_id)
+        spec = match.folder.spec
+        frames = [
+            [clip.first_frame, clip.first_frame + clip.frame_count - 1]
+            for clip in spec.clips
+            if owner in (clip.id, *(camera.id for camera in spec.static_cameras))
+        ]
+        if not frames:
+            raise HTTPException(404, "no such camera")
+        frame = frames[0][0] if frame is None else frame
+        return {
+            "frame": frame,
+            "frames": frames,
+            "size": _size(match, owner),
+            "has_picture": owner in match.folder.videos,
+            "joints": COCO17,
+            "bones": COCO17_BONES,
+            **_seen(detections_now(desk.store, match, owner, frame)),
+            "cameras": [camera.id for camera in spec.static_cameras],
+        }
+
+    @router.get("/image")
+    def image(match_id: str, owner: str, frame: int) -> Response:
+        import cv2  # late: few pages open a picture
+
+        try:
+            picture = frame_picture(desk.store, desk.match(match_id), owner, frame)
+        except InputError as error:
+            raise HTTPException(404, error.found) from error
+        if picture is None:
+            raise HTTPException(404, "there is no picture of this frame")
+        content = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1]
+        return Response(bytes(content), media_type="image/jpeg")
+
+    @router.get("/queue")
+    def queue(match_id: str, owner: str) -> dict[str, Any]:
+        return _queue(desk.store, desk.match(match_id), owner)
+
+    @router.post("/acceptances")
+    def take(match_id: str, owner: str, given: Accepting, who: Person) -> dict[str, Any]:
+        match = desk.match(match_id)
+        people, at_least = given.people, given.at_least
+        accept(desk.store, match, owner, at_least=at_least, people=people, who=who)
+        return _queue(desk.store, desk.match(match_id), owner)
+
+    return router
+
+
+def _queue(store: Store, match: Match, owner: str) -> dict[str, Any]:
+    """How many of a camera's people nobody has looked at, and the least certain of them."""
+    left = left_to_look_at(store, match, owner)
+    rows = sorted(
+        (float(score), int(frame), int(detection))
+        for each in left
+        for frame, detection, score in zip(
+            each.frame[:LISTED], each.detection[:LISTED], each.score[:LISTED], strict=True
+        )
+    )
+    return {
+        "left": sum(len(each.frame) for each in left),
+        "people": sum(each.people for each in left),
+        "next": [
+            {"frame": frame, "detection": detection, "score": round(score, 3)}
+            for score, frame, detection in rows[:LISTED]
+        ],
+    }
+
+
+def _size(match: Match, owner: str) -> tuple[int, int]:
+    spec = match.folder.spec
+    broadcast = {clip.id: clip.broadcast for clip in spec.clips if clip.broadcast is not None}
+    camera = spec.camera(broadcast.get(owner, owner))
+    return camera.width, camera.height
+
+
+def _seen(found: Observations) -> dict[str, Any]:
+    """Everybody in the first row, and the place that an added person takes."""
+    there = np.isfinite(found.score[:1]).any(axis=0)
+    occupied = np.flatnonzero(there)
+    free = int(occupied[-1]) + 1 if len(occupied) else 0
+    return {"people": _people(found), "free": free}
+
+
+def _people(found: Observations) -> list[dict[str, Any]]:
+    """Everybody in the first row, the least certain first."""
+    if not len(found.frame):
+        return []
+    there = np.flatnonzero(np.isfinite(found.score[0]))
+    return [
+        {
+            "detection": int(k),
+            "score": round(float(found.score[0, k]), 3),
+            "box": _numbers(found.boxes[0, k]),
+            "keypoints": [_numbers(place) for place in found.keypoints[0, k]],
+            "confidence": [None if np.isnan(c) else round(float(c), 3) for c in confidence],
+        }
+        for k in there[np.argsort(found.score[0, there], kind="stable")]
+        for confidence in (found.confidence[0, k],)
+    ]
+
+
+def _numbers(values: NDArray[np.float32]) -> list[float] | None:
+    return None if np.isnan(values).any() else [round(float(value), 3) for value in values]

@@ -1,0 +1,202 @@
+"""What a person is shown beside a question: pictures and tables of the result."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Lock
+from typing import Any, Final
+
+import numpy as np
+from fastapi import APIRouter, HTTPException
+from fastapi.responses import FileResponse, Response
+from numpy.typing import NDArray
+
+from data_contracts.review import ReviewRequest
+from flows.release import placed_joints, static_cameras
+from flows.reports.broadcast import broadcast_pictures, broadcast_tables
+from flows.reports.cameras import camera_evidence
+from flows.reports.clip_video import clip_view, write_clip_video
+from flows.reports.clips import clip_pictures, detection_pictures
+from flows.reports.people import adjustment_tables, body_tables
+from flows.stage import Match
+from flows.web.app_context import Desk
+from worldpose.formats import JointTracks
+from worldpose.reports import Picture
+from worldpose.reports.clips import paths_picture
+from worldpose.reports.html_page import Table
+from worldpose.review import requests_by_id
+from worldpose.review.curves import Curve, clip_curves
+from worldpose.store import Run, Store, open_run
+
+KEPT: Final = 16
+"""Questions whose pictures are kept in memory; one takes a second or two to draw."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What belongs to one question."""
+
+    pictures: tuple[Picture, ...] = ()
+    tables: tuple[Table, ...] = ()
+    curves: tuple[Curve, ...] = ()
+    first_frame: int = 0
+    video: str | None = None
+    """Whose video shows it; None where none does."""
+
+
+def routes(desk: Desk) -> APIRouter:
+    """Routes of the evidence of one question."""
+    router = APIRouter(prefix="/api/matches/{match_id}/reviews/{request}")
+    drawn: dict[tuple[str, str], Evidence] = {}
+    lock, filming = Lock(), Lock()
+    videos = TemporaryDirectory(prefix="worldpose-pages-")
+
+    def evidence_of(match_id: str, request: str) -> Evidence:
+        match = desk.match(match_id)
+        asked = requests_by_id(match.journal.questions).get(request)
+        if asked is None:
+            raise HTTPException(404, "no such review")
+        with lock:  # one drawing at a time: they take all the memory of their pictures
+            if (match_id, request) not in drawn:
+                while len(drawn) >= KEPT:
+                    drawn.pop(next(iter(drawn)))
+                drawn[match_id, request] = draw_evidence(desk.store, match, asked)
+            return drawn[match_id, request]
+
+    @router.get("/evidence")
+    def evidence(match_id: str, request: str) -> dict[str, Any]:
+        found = evidence_of(match_id, request)
+        return {
+            "pictures": [picture.caption for picture in found.pictures],
+            "tables": [
+                {"title": table.heading, "columns": table.columns, "rows": table.rows}
+                for table in found.tables
+            ],
+            "curves": [
+                {"title": curve.title, "values": _numbers(curve.values)} for curve in found.curves
+            ],
+            "first_frame": found.first_frame,
+            "video": found.video,
+        }
+
+    @router.get("/pictures/{number}")
+    def picture(match_id: str, request: str, number: int) -> Response:
+        pictures = evidence_of(match_id, request).pictures
+        if not 0 <= number < len(pictures):
+            raise HTTPException(404, "no such picture")
+        return Response(pictures[number].png, media_type="image/png")
+
+    @router.get("/video")
+    def video(match_id: str, request: str) -> FileResponse:
+        if evidence_of(match_id, request).video is None:
+            raise HTTPException(404, "no camera of this clip has a video")
+        match = desk.match(match_id)
+        asked = requests_by_id(match.journal.questions)[request]
+        name = hashlib.sha256(f"{match_id} {request}".encode()).hexdigest()
+        file = Path(videos.name) / f"{name}.mp4"
+        with filming:
+            if not file.is_file():
+                run = open_run(desk.store.url, match_id, asked.run_id, complete=True)
+                (unit,) = asked.keys
+                draft = file.with_suffix(".draft.mp4")
+                write_clip_video(desk.store, run, match, unit.partition("/")[2], draft)
+                draft.replace(file)
+        return FileResponse(file, media_type="video/mp4")
+
+    return router
+
+
+def _numbers(values: NDArray[np.float64]) -> list[float | None]:
+    return [None if np.isnan(value) else round(float(value), 5) for value in values]
+
+
+def draw_evidence(store: Store, match: Match, request: ReviewRequest) -> Evidence:
+    """What a person should see before deciding on a question: of the run that asked it."""
+    run = open_run(store.url, match.match_id, request.run_id, complete=True)
+    (unit,) = request.keys
+    return _DRAWN.get(request.gate, _nothing)(store, run, match, unit.partition("/")[2])
+
+
+def _camera(store: Store, run: Run, match: Match, camera: str) -> Evidence:
+    if "point_inlier" not in run[f"static_calibration/{camera}"]:
+        return Evidence()  # it was given, or it is left out
+    cameras = static_cameras(run, match.folder.spec, "triangulation")
+    png = camera_evidence(store, run, match, camera, cameras[camera])
+    caption = (
+        "The pitch as this camera projects it; clicks as circles, those that it does not rest on "
+        "as crosses; below, the expected error on the ground."
+    )
+    return Evidence((Picture(caption, png),))
+
+
+def _identities(store: Store, run: Run, match: Match, clip: str) -> Evidence:
+    result = run[f"tracking/{clip}"]
+    tracks = JointTracks(
+        frames=result["frame"].values,
+        person_ids=result["person"].values.astype(np.int64),
+        joints=result["joints"].values.astype(np.float64),
+    )
+    cameras = static_cameras(run, match.folder.spec, "triangulation")
+    png = paths_picture(tracks, cameras=cameras, pitch=match.folder.pitch)
+    rows = tuple(
+        (
+            str(join["before"]),
+            str(join["after"]),
+            f"{join['last_frame']} to {join['first_frame']}",
+            "joined" if join["decided"] else "undecided",
+            f"{join['cost']:.1f}",
+        )
+        for join in result.attrs["joins"]
+    )
+    columns = (">track that stops", ">that begins", "frames", "", ">cost")
+    return Evidence((Picture("Everybody's way.", png),), (Table("Joins", columns, rows),))
+
+
+def _clip(store: Store, run: Run, match: Match, clip: str) -> Evidence:
+    pictures = (
+        *clip_pictures(run, match, clip),
+        *detection_pictures(store, run, match, clip),
+    )
+    return Evidence(pictures, tuple(body_tables(run, (clip,))))
+
+
+def _acceptance(store: Store, run: Run, match: Match, clip: str) -> Evidence:
+    """Of a clip that is to be released: its pictures and tables, figures over its frames, video."""
+    fits, joints = run[f"body_fitting/{clip}"], placed_joints(run, clip)
+    placed = joints["joints"].reindex(frame=fits["frame"].values, person=fits["person"].values)
+    curves = clip_curves(
+        fits["joints"].values.astype(np.float64),
+        fits["covariance"].values,
+        fits["filled"].values,
+        placed.values.astype(np.float64),
+    )
+    shown = _clip(store, run, match, clip)
+    first = int(fits["frame"].values[0]) if fits.sizes["frame"] else 0
+    video = clip_view(run, match, clip)
+    return replace(shown, curves=curves, first_frame=first, video=video)
+
+
+def _adjustment(store: Store, run: Run, match: Match, unit: str) -> Evidence:
+    return Evidence((), tuple(adjustment_tables(run)[:1]))  # the others are lists to choose from
+
+
+def _broadcast(store: Store, run: Run, match: Match, clip: str) -> Evidence:
+    return Evidence(tuple(broadcast_pictures(run, match)), tuple(broadcast_tables(run, match)))
+
+
+def _nothing(store: Store, run: Run, match: Match, unit: str) -> Evidence:
+    return Evidence()
+
+
+_DRAWN: Final[dict[str, Callable[[Store, Run, Match, str], Evidence]]] = {
+    "static_calibration": _camera,
+    "tracking": _identities,
+    "triangulation": _clip,
+    "bundle_adjustment": _adjustment,
+    "body_fitting": _acceptance,
+    "broadcast_calibration": _broadcast,
+}

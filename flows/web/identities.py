@@ -1,0 +1,141 @@
+"""Who is who in a clip: everybody's time in it, ways on the ground, and uncertain joins."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from fastapi import APIRouter, HTTPException
+from fastapi.responses import Response
+from numpy.typing import NDArray
+
+from flows.identities import identities_now
+from flows.release import static_cameras
+from flows.stage import Match
+from flows.web.app_context import Desk
+from worldpose.ingest import unit_frames
+from worldpose.review.identities import Identities, sighting_of
+from worldpose.store import Store, open_run
+from worldpose.video import open_video
+
+WAYS: Final = 300
+"""Places of a person's way that are sent."""
+HIPS: Final = (11, 12)
+"""Places of the hips in COCO-17."""
+AROUND: Final = 1.6
+"""Half the height of what is shown of a person's picture [m]."""
+
+
+def routes(desk: Desk) -> APIRouter:
+    """Routes of who is who in one clip."""
+    router = APIRouter(prefix="/api/matches/{match_id}/identities/{clip}")
+
+    def opened(match_id: str, clip: str) -> tuple[Match, Identities]:
+        match = desk.match(match_id)
+        if clip not in {each.id for each in match.folder.spec.clips}:
+            raise HTTPException(404, "no such clip")
+        return match, identities_now(desk.store, match, clip).identities
+
+    @router.get("")
+    def identities(match_id: str, clip: str) -> dict[str, Any]:
+        match, found = opened(match_id, clip)
+        spec = match.folder.spec
+        first = int(found.frame[0])
+        step = max(1, len(found.frame) // WAYS)
+        pitch = match.folder.pitch
+        return {
+            "clip": clip,
+            "fps": spec.fps,
+            "first_frame": first,
+            "frame_count": len(found.frame),
+            "step": step,
+            "pitch": None if pitch is None else {"length": pitch.length, "width": pitch.width},
+            "roster": [each.id for each in spec.roster],
+            "has_video": any(camera in match.folder.videos for camera in found.cameras),
+            "people": [_person(found, track.person, step) for track in found.tracks],
+            "joins": [
+                {
+                    **join.model_dump(mode="json"),
+                    "last_frame": join.last_frame + first,
+                    "first_frame": join.first_frame + first,
+                }
+                for join in found.joins
+            ],
+        }
+
+    @router.get("/crop")
+    def crop(match_id: str, clip: str, person: int, frame: int) -> Response:
+        match, found = opened(match_id, clip)
+        if person not in found.person or frame not in found.frame:
+            raise HTTPException(404, "nobody is there")
+        return Response(_crop(desk.store, match, found, person, frame), media_type="image/png")
+
+    return router
+
+
+def _person(found: Identities, person: int, step: int) -> dict[str, Any]:
+    k = found.person.tolist().index(person)
+    views = np.count_nonzero(found.detection_index[:, :, k] >= 0, axis=1)
+    bounds = np.flatnonzero(np.diff(np.concatenate([[0], views > 0, [0]])))
+    first = int(found.frame[0])
+    seen = sighting_of(found, person)
+    return {
+        "id": person,
+        "name": found.names.get(person),
+        "seen": None if seen is None else seen.model_dump(),
+        "segments": [
+            [first + int(begin), first + int(end) - 1]
+            for begin, end in zip(bounds[::2], bounds[1::2], strict=True)
+        ],
+        "views": round(float(views[views > 0].mean()), 1),
+        "way": [
+            None if np.isnan(place).any() else np.round(place, 2).tolist()
+            for place in _ways(found.joints[:, k])[::step]
+        ],
+    }
+
+
+def _ways(joints: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Where a person is on the ground (frames, 2) [m], NaN where that is not known."""
+    hips = joints[:, HIPS, :2].astype(np.float64)
+    known = np.asarray(np.isfinite(hips).all(axis=2))
+    total = np.where(known[..., None], hips, 0.0).sum(axis=1)
+    count = known.sum(axis=1)[:, None]
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _crop(store: Store, match: Match, found: Identities, person: int, frame: int) -> bytes:
+    """A PNG of one person in the view that shows them largest.
+
+    Raises:
+        HTTPException: 404, no camera with a video sees them.
+    """
+    import cv2  # late: few pages open a picture
+
+    k, f = found.person.tolist().index(person), int(np.searchsorted(found.frame, frame))
+    joints = found.joints[f, k].astype(np.float64)
+    known = joints[np.isfinite(joints).all(axis=1)]
+    if not len(known):
+        raise HTTPException(404, "nobody is there")
+    middle = known.mean(axis=0)
+    cameras = static_cameras(open_run(store.url, match.match_id), match.folder.spec)
+    best: tuple[float, str, NDArray[np.float64]] | None = None
+    for c, name in enumerate(found.cameras):
+        if found.detection_index[f, c, k] < 0 or name not in match.folder.videos:
+            continue
+        ends = cameras[name].project(middle + np.array([[0, 0, AROUND], [0, 0, -AROUND]]))
+        tall = float(np.linalg.norm(ends[0] - ends[1]))
+        if np.isfinite(tall) and (best is None or tall > best[0]):
+            best = (tall, name, cameras[name].project(middle[None])[0])
+    if best is None:
+        raise HTTPException(404, "no video shows this person")
+    tall, name, center = best
+    with open_video(match.folder.videos[name]) as video:
+        picture = video.frame(frame + unit_frames(match.folder.spec, name).offset)
+    half = max(16, round(0.5 * tall))
+    x, y = np.round(center).astype(int)
+    piece = picture[max(0, y - half) : y + half, max(0, x - half) : x + half]
+    if not piece.size:
+        raise HTTPException(404, "the person is out of the picture")
+    sized = cv2.resize(piece, None, fx=200 / (2 * half), fy=200 / (2 * half))
+    return bytes(cv2.imencode(".png", cv2.cvtColor(sized, cv2.COLOR_RGB2BGR))[1])

@@ -1,0 +1,104 @@
+"""Clicks and keypoints that an adjustment contradicts, each with the edit that removes it (B3)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any, Final
+
+import numpy as np
+from fastapi import APIRouter, HTTPException
+
+from data_contracts.conventions import COCO17
+from data_contracts.review import DeletedDetection, MovedKeypoint, MovedPoint
+from flows.release import ADJUSTED
+from flows.stage import Match
+from flows.stages.detection import seen_by
+from flows.web.app_context import Desk
+from worldpose.review import requests_by_id, value_now
+from worldpose.store import Run, open_run
+
+MOST: Final = 60
+"""Keypoints that are listed: the most surprising."""
+Outlier = tuple[float, str, MovedPoint | MovedKeypoint | DeletedDetection, bool]
+"""Surprise in standard deviations, who it is of, the edit that takes it out, is it out already."""
+
+
+def routes(desk: Desk) -> APIRouter:
+    """Route of what contradicts the adjustment that a question is about."""
+    router = APIRouter(prefix="/api/matches/{match_id}/reviews/{request}")
+
+    @router.get("/outliers")
+    def outliers(match_id: str, request: str) -> list[dict[str, Any]]:
+        match = desk.match(match_id)
+        asked = requests_by_id(match.journal.questions).get(request)
+        if asked is None:
+            raise HTTPException(404, "no such review")
+        run = open_run(desk.store.url, match_id, asked.run_id, complete=True)
+        if ADJUSTED not in asked.keys or ADJUSTED not in run:
+            return []
+        return [
+            {
+                "surprise": round(surprise, 1) if math.isfinite(surprise) else None,
+                "of": of,
+                "edit": edit.model_dump(mode="json"),
+                "out": out,
+            }
+            for surprise, of, edit, out in (*_clicks(run, match), *_keypoints(run, match))
+        ]
+
+    return router
+
+
+def _clicks(run: Run, match: Match) -> Iterator[Outlier]:
+    """Clicked points that are proposed for removal."""
+    result = run[ADJUSTED]
+    names = [str(name) for name in result["camera"].values]
+    for k in np.flatnonzero(result["click_wrong"].values):
+        camera, marking = (
+            names[int(result["click_camera"].values[k])],
+            str(result["click"].values[k]),
+        )
+        edit = MovedPoint(camera=camera, marking=marking, xy=None)
+        was = value_now(match.folder, edit)
+        surprise = float(result["click_surprise"].values[k])
+        yield surprise, "click", edit.model_copy(update={"was": was}), was is None
+
+
+def _keypoints(run: Run, match: Match) -> Iterator[Outlier]:
+    """Keypoints, and people in one picture, that the other cameras contradict."""
+    result = run[ADJUSTED]
+    names = [str(name) for name in result["camera"].values]
+    said = {_place(correction.edit) for correction in match.corrections}
+    for k in range(min(MOST, result.sizes["outlier"])):
+        frame, c, person, joint = (
+            int(result[f"outlier_{name}"].values[k])
+            for name in ("frame", "camera", "person", "joint")
+        )
+        clip = next(
+            clip.id
+            for clip in match.folder.spec.clips
+            if 0 <= frame - clip.first_frame < clip.frame_count
+        )
+        tracks = run[f"tracking/{clip}"].sel(frame=frame, person=person)
+        detection = int(tracks["detection_index"].values[c])
+        seen = run[seen_by(match, names[c], clip)]
+        # Whom an iteration found again the next one looks for anew: there is nothing to correct.
+        if not 0 <= detection < seen.sizes["detection"]:
+            continue
+        place = {"camera": names[c], "frame": frame, "detection": detection}
+        edit: MovedKeypoint | DeletedDetection
+        if joint < 0:
+            edit = DeletedDetection(**place)
+        else:
+            pixel = seen["keypoints"].sel(frame=frame).values[detection, joint]
+            x, y = (float(value) for value in pixel)
+            edit = MovedKeypoint(**place, joint=COCO17[joint], was=(x, y), xy=None)
+        surprise = float(result["outlier_surprise"].values[k])
+        yield surprise, f"person {person}", edit, _place(edit) in said
+
+
+def _place(edit: object) -> tuple[object, ...]:
+    """What an edit of a detection is about."""
+    names = ("kind", "camera", "frame", "detection", "joint")
+    return tuple(getattr(edit, name, None) for name in names)

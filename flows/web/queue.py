@@ -1,0 +1,185 @@
+"""What waits in all matches: since when, why, and how bad it is."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final
+
+from fastapi import APIRouter, Query
+
+from data_contracts.review import Correction, ReviewRequest
+from flows.cli.review_text import correction_json, in_words, review_json
+from flows.method import GATES
+from flows.review import Review, reviews_of, still_waiting
+from flows.run_record import latest_run
+from flows.stage import Match
+from flows.web.app_context import Desk
+from worldpose.errors import WorldposeError
+from worldpose.store import Store
+
+CORRECTIONS: Final = 200
+"""Most that one answer has: a match can have many thousand, and a page shows the last ones."""
+
+
+def routes(desk: Desk) -> APIRouter:
+    """Routes of the queue and of one match."""
+    router = APIRouter(prefix="/api/matches")
+
+    @router.get("")
+    def matches() -> dict[str, Any]:
+        return {"matches": [_at_a_glance(desk, name) for name in desk.store.matches()]}
+
+    @router.get("/{match_id}")
+    def match(match_id: str) -> dict[str, Any]:
+        opened = desk.match(match_id)
+        latest = latest_run(desk.store, match_id)
+        folder = opened.folder
+        return {
+            **_glance(desk, opened),
+            "reviews": [shown(each) for each in reviews_of(opened, latest)],
+            **_corrections(opened),
+            "cameras": [
+                {
+                    "id": camera.id,
+                    "given": camera.id in folder.calibrations,
+                    "clicks": _clicks(opened, camera.id),
+                    "has_picture": camera.id in folder.stills or camera.id in folder.videos,
+                    "figures": _figures(desk, opened, f"static_calibration/{camera.id}"),
+                }
+                for camera in folder.spec.static_cameras
+            ],
+            "clips": [_clip(desk, opened, clip.id) for clip in folder.spec.clips],
+            "failures": [] if latest is None else [each.model_dump() for each in latest.failed],
+            "left_out": {} if latest is None else latest.left_out,
+            "warnings": [] if latest is None else list(latest.warnings),
+        }
+
+    @router.get("/{match_id}/corrections")
+    def corrections(match_id: str, skip: Annotated[int, Query(ge=0)] = 0) -> dict[str, Any]:
+        return _corrections(desk.match(match_id), skip)
+
+    return router
+
+
+def _corrections(match: Match, skip: int = 0) -> dict[str, Any]:
+    """Return the last corrections that stand, those that no longer apply after all others.
+
+    Args:
+        match: with the corrections so far.
+        skip: how many of the last ones a page has already.
+    """
+    count = len(match.corrections) + len(match.stale)
+    end = max(0, count - skip)
+    first = max(0, end - CORRECTIONS)
+    applied: list[tuple[Correction, str | None]] = [
+        (each, None) for each in match.corrections[first:end]
+    ]
+    stale = match.stale[
+        max(0, first - len(match.corrections)) : max(0, end - len(match.corrections))
+    ]
+    return {
+        "corrections": [
+            {**correction_json(each), "words": in_words(each), "objection": why}
+            for each, why in [*applied, *stale]
+        ],
+        "corrections_before": first,
+    }
+
+
+def shown(review: Review) -> dict[str, Any]:
+    """One question as the pages show it."""
+    (unit,) = review.request.keys
+    return {**review_json(review), "unit": unit, "excess": _excess(review.request)}
+
+
+def _at_a_glance(desk: Desk, name: str) -> dict[str, Any]:
+    """One match in the queue; one that cannot be opened says why, and hides no other."""
+    try:
+        return _glance(desk, desk.match(name))
+    except (OSError, WorldposeError) as error:
+        return {"match": name, "problem": str(error), "waiting": [], "run": None}
+
+
+def _glance(desk: Desk, match: Match) -> dict[str, Any]:
+    store = desk.store
+    latest = latest_run(store, match.match_id)
+    known = {each.request.id: each for each in reviews_of(match, latest)}
+    waiting = []
+    for unit in still_waiting(match, latest):
+        review = known.get(unit.request)
+        waiting.append(
+            {
+                "id": unit.request,
+                "unit": unit.unit,
+                "reasons": unit.reasons,
+                "rejected": unit.rejected or (review is not None and review.state == "reject"),
+                "since": None if review is None else review.request.created_at,
+                "excess": 0.0 if review is None else _excess(review.request),
+            }
+        )
+    folder = match.folder
+    clicked = {**folder.calibrations, **folder.clicked}
+    return {
+        "match": match.match_id,
+        "problem": None,
+        "damage": match.journal.damage,
+        "run": None
+        if latest is None
+        else {
+            "id": latest.run_id,
+            "state": latest.state,
+            "finished_at": latest.finished_at,
+            "gates": latest.gates,
+            "failed": len(latest.failed),
+        },
+        "waiting": waiting,
+        "to_click": [each.id for each in folder.spec.static_cameras if each.id not in clicked],
+        "corrections": len(match.corrections),
+        "stale": len(match.stale),
+        "at_work": _at_work(store, desk, match.match_id),
+    }
+
+
+def _at_work(store: Store, desk: Desk, match_id: str) -> dict[str, Any] | None:
+    """The run that was begun on a page, or else one that was begun elsewhere and has not ended."""
+    state = desk.continuing.state(match_id)
+    if state is not None:
+        return state
+    open_runs = store.unfinished_runs(match_id)
+    if not open_runs:
+        return None
+    last = open_runs[-1]
+    return {"state": "elsewhere", "lines": [f"run {last.run_id} on {last.host} has not ended"]}
+
+
+def _clip(desk: Desk, match: Match, clip: str) -> dict[str, Any]:
+    """A clip, and the key frames of its broadcast camera: clicked, and those to click next."""
+    picked = match.folder.key_frames.get(clip)
+    latest = latest_run(desk.store, match.match_id)
+    key = None if latest is None else latest.results.get(f"broadcast_calibration/{clip}")
+    pick_next = []
+    if key is not None:
+        result = desk.store.open_result(match.match_id, "broadcast_calibration", clip, key)
+        pick_next = [int(frame) for frame in result.attrs["pick_next"]]
+    return {
+        "id": clip,
+        "has_video": clip in match.folder.videos,
+        "key_frames": [] if picked is None else [each.frame for each in picked.key_frames],
+        "pick_next": pick_next,
+        "has_tracks": latest is not None and f"tracking/{clip}" in latest.results,
+    }
+
+
+def _excess(request: ReviewRequest) -> float:
+    gates = {gate.stage: gate for gate in GATES}
+    gate = gates.get(request.gate)
+    return 0.0 if gate is None else gate.excess(request.figures)
+
+
+def _clicks(match: Match, camera: str) -> int:
+    clicked = match.folder.clicked.get(camera)
+    return 0 if clicked is None else len(clicked.points) + len(clicked.drawn)
+
+
+def _figures(desk: Desk, match: Match, unit: str) -> dict[str, float]:
+    latest = latest_run(desk.store, match.match_id)
+    return {} if latest is None else latest.figures.get(unit, {})
