@@ -1,12 +1,11 @@
-"""Prints how exactly static cameras are known before and after bundle adjustment, and how surely.
+"""Prints accuracy and coverage of static cameras before and after bundle adjustment.
 
     python benchmarks/adjustment_accuracy.py [--scenario match] [--seeds 601 602] [--duration 4]
 
-Cameras are calibrated from the scenario's clicks and one picture each, people are tracked and
-triangulated with them, and all cameras are adjusted together. Ground: the true pixel of a place
-where a player stands, back through the camera onto the pitch, median / 95 %. Regions: share of
-these places, seen by a camera, whose error in its picture lies within what the camera's covariance
-says.
+Cameras are calibrated from the scenario's clicks and one image each, people are tracked and
+triangulated with them, and all cameras are adjusted together. Ground: the true pixel of a player's
+place, back through the camera onto the pitch, median / 95 %. Regions: share of these places, seen
+by a camera, whose image error is within the camera's covariance.
 """
 
 from __future__ import annotations
@@ -31,11 +30,11 @@ from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
 Floats = NDArray[np.float64]
 MOMENTS = 6
-"""Frames of a clip whose players count."""
+"""Number of frames of a clip whose players count."""
 
 
 def calibrated(scene: Scene, scenario: Scenario, seed: int) -> dict[str, StaticCalibration]:
-    """Return every static camera from clicks and the lines of one picture."""
+    """Return every static camera from clicks and the lines of one image."""
     surveyed = PitchTemplate.from_spec(scene.surveyed)
     painted = PitchTemplate.from_spec(scenario.pitch)
     found = {}
@@ -48,7 +47,7 @@ def calibrated(scene: Scene, scenario: Scenario, seed: int) -> dict[str, StaticC
 
 
 def as_clip(scene: Scene, fps: float, known: dict[str, StaticCalibration]) -> Clip:
-    """Return the clip as bundle adjustment takes it."""
+    """Return the clip in bundle adjustment's format."""
     seen, settings = scene.static_views(list(known)), TriangulationSettings()
     cameras = Camera.stack([each.estimate.camera for each in known.values()])
     covariance = np.stack([each.estimate.covariance for each in known.values()])
@@ -88,7 +87,7 @@ def as_clip(scene: Scene, fps: float, known: dict[str, StaticCalibration]) -> Cl
 def errors(
     cameras: Camera, covariance: Floats, true: Camera, places: Floats, pitch: PitchTemplate
 ) -> tuple[Floats, Floats]:
-    """Return errors on the ground [m], and squared ones in the picture over their covariance."""
+    """Return errors on the ground [m], and squared ones in the image over their covariance."""
     ground, squared = [], []
     for c in range(len(covariance)):
         pixels = true[c].project(places)
@@ -102,7 +101,7 @@ def errors(
 
 
 def tell(label: str, found: list[tuple[Floats, Floats]]) -> None:
-    """Print a line of figures."""
+    """Print a line of metrics."""
     ground, squared = (np.concatenate(part) for part in zip(*found, strict=True))
     held = [100.0 * np.mean(squared < chi2.ppf(share, 2)) for share in SHARES]
     print(
@@ -116,7 +115,7 @@ def tell(label: str, found: list[tuple[Floats, Floats]]) -> None:
 
 
 def main() -> None:
-    """Print two lines a match, and two of all."""
+    """Print two lines per match, and two for all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenario", default="match")
     parser.add_argument("--seeds", type=int, nargs="+", default=[601, 602])

@@ -1,16 +1,16 @@
-"""Prints how exactly bodies of simulated people are fitted, and what thin stretches gain.
+"""Prints the accuracy of fitted bodies on simulated people, and gains in chunks with few cameras.
 
     python benchmarks/body_accuracy.py [--seeds 601 602 603] [--duration 4]
     python benchmarks/body_accuracy.py --thin [--seeds 411 412 413 414 415 416]
 
-Scenario `match`, cameras as surveyed. Standing: feet that truly move less than 0.1 m/s and are
-within 12 cm of the ground; height is that of their keypoints over the true ones'. Shape: of
-betas, height of the body and six limbs, median over people.
+Scenario `match`, cameras as surveyed. Standing: feet with a true speed below 0.1 m/s within 12 cm
+of the ground; height is that of their keypoints over the true ones'. Shape: of betas, height of the
+body and six limbs, median over people.
 
-With `--thin` 14 people for 3 s; each is left for 0.6 to 1.2 s to one or two of the cameras that
-see him. Refitted as `refitting` does: with the broadcast camera's keypoints (S4), with bodies that
-a method of one picture estimates, 80 mm off after alignment, and with both. Errors are of people
-in the broadcast picture, in those stretches.
+With `--thin` 14 people for 3 s; for 0.6 to 1.2 s, each keeps one or two of the cameras that see the
+person. Refitted as `refitting` does: with the broadcast camera's keypoints (S4), with bodies from a
+simulated monocular method, with errors of 80 mm after alignment, and with both. Errors are of
+people in the broadcast image, in those chunks.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ SETTINGS, TRIANGULATION = BodyFittingSettings(), TriangulationSettings()
 LIMBS = ((16, 18), (18, 20), (1, 4), (4, 7), (1, 2), (16, 17))
 """Upper arm, forearm, thigh, shin, hips and shoulders, as joints of the body."""
 STILL, LOW = 0.1, 0.12
-"""A standing foot's speed [m/s] and height [m] at most."""
+"""Maximum speed [m/s] and height [m] of a standing foot."""
 
 
 def sizes(betas: Floats) -> tuple[float, Floats]:
@@ -66,7 +66,7 @@ def jerk(joints: Floats, fps: float) -> float:
 
 
 def nearest(joints: Floats, truth: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """Return who of the truth everybody is, and the median distance of their bodies [m]."""
+    """Return the true person of each body, and the median distance between the two [m]."""
     apart = np.linalg.norm(
         np.nanmean(joints[:, :, None, 5:] - truth[:, None, :, 5:], axis=3), axis=-1
     )
@@ -75,7 +75,7 @@ def nearest(joints: Floats, truth: Floats) -> tuple[NDArray[np.int64], Floats]:
 
 
 def whole(seed: int, duration: float) -> dict[str, float]:
-    """Return the figures of one match."""
+    """Return the metrics of one match."""
     scenario = SCENARIOS["match"].model_copy(update={"duration": duration, "broadcast": None})
     scene = simulate_scene(scenario, seed)
     seen = scene.static_views()
@@ -119,7 +119,7 @@ def whole(seed: int, duration: float) -> dict[str, float]:
 
 
 def thinned(scene: Scene, index: NDArray[np.int16], left: int, seed: int) -> NDArray[np.bool_]:
-    """Take all but some cameras' detections away for a while; return (frames, persons) when."""
+    """Remove all but some cameras' detections for a while; return (frames, persons) when."""
     rng = np.random.default_rng(seed)
     frames, cameras, persons = index.shape
     dark = np.zeros((frames, persons), np.bool_)
@@ -135,7 +135,7 @@ def thinned(scene: Scene, index: NDArray[np.int16], left: int, seed: int) -> NDA
 
 
 def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
-    """Return how many bodies of a match there are in thin stretches, and their errors [mm]."""
+    """Return the number of bodies in chunks with few cameras, and their errors [mm]."""
     scenario = SCENARIOS["match"]
     crowd = scenario.crowd.model_copy(update={"people": 14})
     scene = simulate_scene(scenario.model_copy(update={"duration": 3.0, "crowd": crowd}), seed)
@@ -190,7 +190,7 @@ def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
 
 
 def main() -> None:
-    """Print the figures, means over seeds."""
+    """Print the metrics, means over seeds."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, nargs="+")
     parser.add_argument("--duration", type=float, default=4.0)

@@ -1,16 +1,16 @@
-"""Prints how long bodies take to fit, beside torch's LBFGS in the same run.
+"""Prints the time of body fitting, next to torch's LBFGS in the same run.
 
     python benchmarks/body_fitting.py [--persons 22] [--frames 500] [--compare 500] [--mesh 50]
 
-Poses are smooth, of drawn betas; joints are the body's keypoints with 20 mm of noise. The first
+Poses are smooth, with random betas; joints are the body's keypoints with 20 mm of noise. The first
 line is this project's whole objective: shape, shared offsets, motion, priors. The others have a
 simpler one, the same for all of them: squared distances and 1e-4 of squared angles, betas known,
-frame by frame. Gauss-Newton is on this project's keypoints and Jacobian, and begins where its fit
-does, at limbs along their joints. LBFGS, with a strong-Wolfe search of 60 iterations in single
+frame by frame. Gauss-Newton is on this project's keypoints and Jacobian, and starts as its fit
+does, with limbs along their joints. LBFGS, with a strong-Wolfe search of 60 iterations in single
 precision, is on the same keypoints in torch and, where smplx is installed, on the vertices of its
-mesh. Times are scaled to all poses from `--compare` and `--mesh` of them. Each line has the cost it
-reached, and the mean distance to the true joints. Torch has one thread; with OMP_NUM_THREADS=1 all
-sides have.
+mesh. Times are scaled to all poses from `--compare` and `--mesh` of them. Each line has the final
+cost and the mean distance to the true joints. Torch has one thread; with OMP_NUM_THREADS=1 all
+sides have one.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ Floats = NDArray[np.float64]
 
 NOISE = 0.02
 WEIGHT = 1e-4
-"""Of squared angles [m^2/rad^2]."""
+"""Weight of squared angles [m^2/rad^2]."""
 STEPS = 3
-"""Of Gauss-Newton; then the cost is below that of LBFGS."""
+"""Steps of Gauss-Newton; then the cost is below that of LBFGS."""
 
 
 def workload(persons: int, frames: int) -> BodyParameters:
@@ -104,7 +104,7 @@ def main() -> None:
 def gauss_newton(chained: ChainedKeypoints, betas: Floats, wanted: Floats) -> tuple[Floats, float]:
     """Return keypoints (poses, 17, 3) and cost of the simple objective's least squares.
 
-    Levenberg and Marquardt's damping, of each pose by itself.
+    Each pose has its own Levenberg-Marquardt damping.
     """
     count = len(wanted)
     weight = np.r_[np.zeros(3 + 3), np.full(69, WEIGHT)]
@@ -172,7 +172,7 @@ def _compare(
 
 
 def _mesh(model: BodyModel) -> Callable[..., torch.Tensor] | None:
-    """Keypoints picked from smplx's mesh of this body; None where smplx is not installed."""
+    """Return keypoints picked from smplx's mesh of this body; None if smplx is not installed."""
     try:
         import smplx
         from smplx.utils import Struct

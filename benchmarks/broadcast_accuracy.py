@@ -1,15 +1,15 @@
-"""Prints how exactly broadcast cameras of simulated clips are found, and how honest regions are.
+"""Prints accuracy and coverage of broadcast cameras on simulated clips.
 
     worldpose simulate --scenario broadcast-pan --duration 30 --cameras 1 --no-stills --out A
     python benchmarks/broadcast_accuracy.py A [MORE ...] [--key-frames 1] [--without-m6]
 
-People of the static cameras are emulated: the true joints, every joint of a person off by 1 cm for
-the whole clip and by 2 cm anew in every frame. The first line of a clip is of its key frames and
-followed points alone, the second of the same turned onto the painted lines, the third of all.
-Off: painted lines, and people by the mean over their keypoints, before and after the third step.
+People of the static cameras are emulated: the true joints, with an error per joint of a person of 1
+cm for the whole clip and of 2 cm per frame. The first line of a clip has key frames and followed
+points alone, the second the same turned onto the painted lines, the third all terms. Off: residuals
+of painted lines, and of people by the mean over their keypoints, before and after the third step.
 Rough: root mean square second differences of log focal length, k1 and k2. Regions: the share of
-centers, of frames' cameras with the center, and of players' places in the picture that lie within
-what is stated.
+centers, of frames' cameras with the center, and of players' places in the image that are inside
+their stated regions.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ SHARES = (0.5, 0.8, 0.95, 0.99)
 
 
 def true_camera(folder: Path, size: tuple[int, int], clip: str) -> MovingCamera:
-    """Return the camera that filmed a clip."""
+    """Return the true camera of a clip."""
     camera = read_camera(folder / "reference" / "cameras" / f"{clip}.npz", size)
     return MovingCamera.of(camera, camera.center[0], camera.principal_point[0])
 
 
 def people_of(match: MatchFolder, joints: Floats, clip: str) -> People:
-    """Return people as static cameras have them about, and as the clip's detector does."""
+    """Return people with the static cameras' errors, and the clip detector's keypoints."""
     rng = np.random.default_rng(9)
     seen, _ = read_unit(match, clip)
     given = joints + ANEW * rng.standard_normal(joints.shape)
@@ -60,7 +60,7 @@ def people_of(match: MatchFolder, joints: Floats, clip: str) -> People:
 
 
 def feet_in_picture(true: MovingCamera, joints: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return where players stand (frames, persons, 3) [m], and which of them the picture shows."""
+    """Return players' places (frames, persons, 3) [m], and a mask of those inside the image."""
     feet = joints[:, :, 15:17].mean(axis=2)
     seen = true.camera.project(feet)
     return feet, np.asarray(((seen > 0.0) & (seen < true.image_size - 1.0)).all(axis=-1))
@@ -87,7 +87,7 @@ def errors(found: MovingCamera, true: MovingCamera, joints: Floats) -> str:
 def distances(
     found: MovingCamera, known: Uncertainty, true: MovingCamera, joints: Floats
 ) -> dict[str, Floats]:
-    """Return squared errors in standard deviations, as shares of a chi-square law below them."""
+    """Return squared errors over the covariance, as quantiles of a chi-square distribution."""
     shared = np.append(true.center - found.center, true.principal_point - found.principal_point)
     turn = Rigid(true.rotation @ np.swapaxes(found.rotation, 1, 2), np.zeros(3)).rotvec
     step = np.concatenate(
@@ -100,7 +100,7 @@ def distances(
         axis=1,
     )
     center = shared[:3] @ np.linalg.solve(known.clip[:3, :3], shared[:3])
-    # k3, which nobody's lens has, is not judged.
+    # k3 is not judged: no simulated lens has it.
     judged = np.delete(np.arange(step.shape[1]), FRAME_SIZE - 1)
     whole = known.frame[:, judged[:, None], judged]
     frame = np.einsum(
@@ -124,7 +124,7 @@ def distances(
 
 
 def main() -> None:
-    """Print two lines a clip, and the regions of all together."""
+    """Print two lines per clip, and the regions of all together."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("matches", nargs="+", type=Path)
     parser.add_argument("--key-frames", type=int, default=0, help="of each clip's; 0 = all")

@@ -3,10 +3,10 @@
     python benchmarks/broadcast_calibration.py [--frames 1500] [--adam 2000]
 
 A pan and zoom of the simulated broadcast camera with 20 places on the pitch and 17 joints of 16
-people a frame, 2 px of noise and 8 % of outliers, from a start about 20 px off; the cost is the
-same for all: Geman-McClure losses, smoothness and priors. Adam, at the paper's rate of 1e-3, uses
-our compiled gradient, so that what differs is the method. SciPy's sparse trust region gets the
-pattern of the Jacobian and as long as Adam takes. One thread.
+people per frame, 2 px of noise and 8 % of outliers, from a start with errors of about 20 px; the
+cost is the same for all: Geman-McClure losses, smoothness and priors. Adam, at the paper's rate of
+1e-3, uses our compiled gradient, so that only the method differs. SciPy's sparse trust region gets
+the pattern of the Jacobian and as much time as Adam takes. One thread.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ NOISE, OUTLIERS, LOSS = 2.0, 0.08, 4.0
 
 
 def true_camera(frames: int, rng: np.random.Generator) -> tuple[MovingCamera, Floats]:
-    """Return the camera, and where the action is (frames, 2) [m]."""
+    """Return the camera, and the place of the action (frames, 2) [m]."""
     times = np.arange(frames) / 50.0
     at = np.arange(-2.0, times[-1] + 1.0, 0.1)
     action = np.stack([25.0 * np.sin(0.25 * at), 8.0 * np.sin(0.4 * at)], axis=1)
@@ -77,7 +77,7 @@ def evidence(camera: MovingCamera, where: Floats, rng: np.random.Generator) -> P
 
 
 def start_of(true: MovingCamera, rng: np.random.Generator) -> MovingCamera:
-    """Return a camera some 20 px off, each frame in its own way."""
+    """Return a camera with errors of some 20 px, independent per frame."""
     frames = len(true)
     step = np.zeros((frames, FRAME_SIZE))
     step[:, :3] = 0.0015 * rng.standard_normal((frames, 3))
@@ -101,7 +101,7 @@ def figures(camera: MovingCamera, true: MovingCamera, points: PointEvidence) -> 
 
 
 def by_scipy(start: MovingCamera, problem: Problem, seconds: float) -> tuple[MovingCamera, int]:
-    """Return SciPy's trust region after about so many seconds, and its evaluations."""
+    """Return SciPy's trust region result after about so many seconds, and its evaluations."""
     points, prior = problem.points, problem.prior
     frames, count = len(start), len(problem.points)
     frame = points.frame
@@ -172,7 +172,7 @@ def main() -> None:
     start = start_of(true, rng)
     prior = prior_of(BroadcastPrior(), start.focal, start.image_size)
     problem = Problem(points, FlowEvidence.none(), prior, SMOOTH)
-    # Compiling is not what is measured.
+    # Exclude compilation from the measurement.
     some = replace(problem, points=points[points.frame < 5])
     few = replace(some, prior=prior_of(BroadcastPrior(), start.focal[:5], start.image_size))
     solve(start.frames(slice(0, 5)), few, 2)

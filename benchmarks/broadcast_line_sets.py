@@ -1,9 +1,9 @@
-"""Prints what single key frames of real main cameras give: hand-drawn lines of WorldCup 2014.
+"""Prints cameras from single key frames of real main cameras: hand-drawn lines of WorldCup 2014.
 
     python benchmarks/broadcast_line_sets.py DATA
 
-DATA holds `wc14` (lines.json, calib_eval.py), as for pitch_lines.py. There are no pictures: every
-line set is the only key frame of a clip, and rests on what was drawn alone.
+DATA holds `wc14` (lines.json, calib_eval.py), as for pitch_lines.py. There are no images: every
+line set is the only key frame of a clip, and its camera depends on the drawn lines alone.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _, SIZE = pitch_lines.SETS["wc14"]
 
 
 def cameras(lines: dict[str, dict]) -> dict[str, Camera | None]:
-    """Return each line set's camera as that of a clip with this one key frame."""
+    """Return each line set's camera, that of a clip with this one key frame."""
     settings = BroadcastCalibrationSettings()
     found: dict[str, Camera | None] = {}
     for name, drawn in lines.items():
@@ -44,12 +44,12 @@ def cameras(lines: dict[str, dict]) -> dict[str, Camera | None]:
 
 
 def line_sets(folder: Path, count: int = 30) -> dict[str, dict]:
-    """Return line sets of the half that settings were not chosen on."""
+    """Return line sets of the half that settings were not tuned on."""
     return dict(list(pitch_lines.load_lines(folder, "wc14", 1, 1).items())[:count])
 
 
 def main() -> None:
-    """Print how many cameras there are, where they stand, and how well they hit what was drawn."""
+    """Print the number of cameras, their positions, and their residuals on the drawn lines."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
     options = parser.parse_args()

@@ -1,11 +1,11 @@
-"""Prints how often the regions of broadcast cameras hold the true ones, on many emulated clips.
+"""Prints the coverage of broadcast cameras' confidence regions, on many emulated clips.
 
     python benchmarks/broadcast_regions.py --seeds 106 107 108 109 110 [--seconds 30]
 
 Nothing is rendered: painted lines are emulated with 0.15 px of noise, the survey's errors and a
-shift of the whole picture; people are those of the simulated detector, and joints as in
-broadcast_accuracy.py. No points are followed. Scenarios broadcast-pan and broadcast-zoom of every
-seed.
+shift of the whole image; people are those of the simulated detector, and joints as in
+broadcast_accuracy.py. There are no followed points. Scenarios broadcast-pan and broadcast-zoom of
+every seed.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from worldpose.synthetic.scene import simulate_scene
 
 Floats = NDArray[np.float64]
 NOISE = 0.15
-"""Of a line's sample [px]."""
+"""Noise of a line's sample [px]."""
 
 
 def lines_of(
@@ -54,7 +54,7 @@ def lines_of(
     settings: BroadcastCalibrationSettings,
     rng: np.random.Generator,
 ) -> PointEvidence:
-    """Return painted lines as they are found in every frame."""
+    """Return emulated detections of painted lines in every frame."""
     painted = rng.standard_normal((int(samples.ends.max()) + 1, 3))
     shift = settings.line_shift * rng.standard_normal(2)
     parts = []
@@ -84,7 +84,7 @@ def lines_of(
 
 
 def judged(name: str, seed: int, seconds: float, fps: float) -> dict[str, Floats]:
-    """Return an emulated clip's squared errors as shares of the law of its regions."""
+    """Return an emulated clip's squared errors as quantiles of the regions' distribution."""
     settings = BroadcastCalibrationSettings()
     scenario = SCENARIOS[name]
     rig = scenario.rig.model_copy(update={"cameras": 1})
@@ -115,7 +115,7 @@ def judged(name: str, seed: int, seconds: float, fps: float) -> dict[str, Floats
 
 
 def main() -> None:
-    """Print a line a clip, and the regions of all together."""
+    """Print one line per clip, and the coverage over all clips."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", nargs="+", type=int, required=True)
     parser.add_argument("--seconds", type=float, default=30.0)

@@ -1,12 +1,12 @@
-"""Prints what each term of the broadcast camera's fit brings: markings, players, motion.
+"""Prints the contribution of each term to the broadcast camera's fit: markings, players, motion.
 
     python benchmarks/broadcast_terms.py broadcast-pan --seeds 61 62 63 --survey-error 0.03
 
 Rows: every frame turned and zoomed onto its painted lines; all frames by painted lines; those and
-players; those and even, followed motion; all; and the true camera. Columns: by how much painted
-lines and people are missed in the median [px], people by the mean over their keypoints; true feet
-in the picture, median and 95 % [px]. What the true camera misses is the survey's and the detector's
-error: who misses lines by less than it bends to them.
+players; those and even, followed motion; all; and the true camera. Columns: median residuals of
+painted lines and people [px], people by the mean over their keypoints; true feet in the image,
+median and 95 % [px]. The true camera's residuals are the errors of the survey and the detector:
+smaller line residuals are a fit to those errors.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ TERMS: dict[str, dict[str, float]] = {
 def rows_of(
     folder: Path, whole: BroadcastCalibrationSettings, picture: Path | None
 ) -> dict[str, Floats]:
-    """Return lines, people and feet, median and 95 % (4,) [px], of every way to fit a clip.
+    """Return lines, people and feet, median and 95 % (4,) [px], of every variant of a clip's fit.
 
-    The picture is of the person whom players move most, before and after.
+    The image shows the person with the largest change by the players' term, before and after.
     """
     match = read_match(folder)
     (clip,) = match.key_frames
@@ -75,7 +75,7 @@ def rows_of(
         **{name: fit.camera for name, fit in fits.items()},
         "true camera": true,
     }
-    # The same lines and people for all, looked for about the true camera.
+    # The same lines and people for all variants, searched around the true camera.
     lines = follow_lines(true, FieldSamples.of(pitch), pictures(), people.boxes, whole)
     players, _ = player_evidence(true, people, match_players(true, people), whole)
     evidence = together([lines.evidence, players])

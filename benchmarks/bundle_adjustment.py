@@ -1,17 +1,17 @@
-"""Prints how long cameras and points are adjusted together, as ratios to peers in the same run.
+"""Prints the time of bundle adjustment, as ratios to peers in the same run.
 
     python benchmarks/bundle_adjustment.py [--large] [--rounds 3] [--peers pycolmap scipy]
 
 10 cameras, 40 frames of 6 players and 60 surveyed points; with --large 18 cameras and 300 frames of
 22 players. Free are pose, focal length, principal point, k1 and k2 of every camera and all joints;
-the surveyed points hold the world. Everybody starts from the same cameras, 1 % of focal length, 3
-mrad and 0.2 m off, and stops where a step gains less than 1e-8 of the cost (scipy: 1e-6, which
-favours it; not with --large, where it does not end). All sides take turns, one thread each; the
-best round counts. What a side is prepared with, such as COLMAP's reconstruction, is not timed; no
-side computes a covariance.
+the surveyed points fix the world. All sides start from the same cameras, with errors of 1 % of
+focal length, 3 mrad and 0.2 m, and stop where a step gains less than 1e-8 of the cost (scipy: 1e-6,
+which favours it; not with --large, where it does not end). All sides take turns, one thread each;
+the best round counts. Preparation, such as COLMAP's reconstruction, is not timed; no side computes
+a covariance.
 
 pycolmap adjusts with Ceres and weighs all observations alike, so weights are one and no loss is
-robust here. The scipy side is what a user writes: residuals in numpy, the sparsity of the
+robust here. The scipy side is typical user code: residuals in numpy, the sparsity of the
 Jacobian, finite differences. Costs are computed for all sides by one function at the end.
 """
 
@@ -44,7 +44,7 @@ FREE = len(PARAMETERS) - 1
 
 
 def make_problem(cameras: int, frames: int, players: int) -> Problem:
-    """Return the problem that everybody starts from."""
+    """Return the common problem of all sides."""
     rng = np.random.default_rng(5)
     angles = 2.0 * np.pi * (np.arange(cameras) + 0.5) / cameras
     centers = np.stack([80.0 * np.cos(angles), 62.0 * np.sin(angles), np.full(cameras, 18.0)], 1)
@@ -69,7 +69,7 @@ def make_problem(cameras: int, frames: int, players: int) -> Problem:
     pixels = true.project(points)
     seen = ((pixels > 0.0) & (pixels < np.array(SIZE))).all(axis=-1).T
     seen &= rng.random(seen.shape) < 0.8
-    # One view tells no depth.
+    # A single view has no depth.
     kept = (seen.sum(axis=1) >= 2) | (np.arange(len(points)) < len(surveyed))
     points, seen, pixels = points[kept], seen[kept], pixels[:, kept]
     point_of, camera_of = np.nonzero(seen)
@@ -127,7 +127,7 @@ def cost(problem: Problem, solution: Solution) -> float:
 
 
 def ours(problem: Problem) -> Run:
-    """The solver of this package."""
+    """Return the solver of this package."""
 
     def run() -> Solution:
         solved = solve(problem, SolverSettings(cost_change=1e-8), covariance=False)
@@ -137,7 +137,7 @@ def ours(problem: Problem) -> Run:
 
 
 def pycolmap_side(problem: Problem) -> Run:
-    """COLMAP's bundle adjuster on a reconstruction of the same cameras and points."""
+    """Return COLMAP's bundle adjuster on a reconstruction of the same cameras and points."""
     import pycolmap
 
     pycolmap.logging.minloglevel = 2
@@ -191,7 +191,7 @@ def pycolmap_side(problem: Problem) -> Run:
 
 
 def _solution_of(problem: Problem, scene: Any, ids: dict[int, int]) -> Solution:
-    """What a COLMAP reconstruction has become."""
+    """Return cameras and points of a COLMAP reconstruction."""
     cameras, count = problem.cameras, len(problem.cameras.focal)
     points = problem.points.copy()
     for p, point_id in ids.items():
@@ -212,7 +212,7 @@ def _solution_of(problem: Problem, scene: Any, ids: dict[int, int]) -> Solution:
 
 
 def scipy_side(problem: Problem) -> Run:
-    """Scipy's trust region with a sparsity pattern and finite differences."""
+    """Return scipy's trust region with a sparsity pattern and finite differences."""
     free = np.flatnonzero(problem.point_information == 0.0)
     column = np.full(len(problem.points), -1)
     column[free] = np.arange(len(free))

@@ -1,12 +1,12 @@
-"""Plants faults in random camera rigs and counts how many are found and named.
+"""Plants faults in random camera rigs and counts faults that are found and named.
 
     python benchmarks/camera_faults.py [--rigs 60] [--seed 0] [--data FOLDER]
 
-Half of the rigs have one fault each, the kinds taken in turn; the other half have none. The rigs,
-people and detector are drawn here and share no code with `worldpose.synthetic`: 4 to 18 cameras at
-heights of 2 to 35 m, focal lengths from wide to long, people on recorded players' paths (FOLDER, or
-WORLDPOSE_TEST_DATA) or on random ones, as stick figures or motion capture, and a detector with
-a bias, heavy tails, misses, false positives and a confidence that says nothing.
+Half of the rigs have one fault each, of each kind in turn; the other half have none. Rigs, people
+and detector are drawn here and share no code with `worldpose.synthetic`: 4 to 18 cameras at heights
+of 2 to 35 m, focal lengths from wide to long, people on recorded players' paths (FOLDER, or
+WORLDPOSE_TEST_DATA) or on random ones, as stick models or motion capture, and a detector with a
+bias, heavy tails, misses, false positives and an uninformative confidence.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from worldpose.cameras import Camera, Rigid
 
 KINDS = ("flipped", "mirrored", "focal", "lens", "clock", "frame_rate", "swapped", "duplicate")
 FLIPPED_JOINTS = [0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15]
-"""COCO-17 with left and right exchanged."""
+"""COCO-17 with left and right swapped."""
 MOCAP_JOINTS = ("head", "lShldr", "lForeArm", "lHand", "lThigh", "lShin", "lFoot")
 
 
 @dataclass
 class RandomRig:
-    """Calibrated cameras and what a detector found in their videos.
+    """Calibrated cameras and detections in their videos.
 
     Attributes:
-        cameras: as the match folder states them.
-        true: as they are.
-        covariance: (cameras, 12, 12) of the stated cameras; None = given without.
+        cameras: stated in the match folder.
+        true: the true cameras.
+        covariance: (cameras, 12, 12) of the stated cameras; None = not given.
         keypoints: (frames, cameras, detections, 17, 2) [px].
         confidence: (frames, cameras, detections, 17).
         fps: frames per second [1/s].
         pitch_size: length and width [m].
         fault: kind of the planted fault; None = none.
-        faulty: cameras that count as named rightly.
-        about: what was planted, for the report.
+        faulty: cameras that count as correct when named.
+        about: planted fault, for the report.
         world: (frames at 100 Hz, persons, 17, 3) [m].
     """
 
@@ -91,7 +91,7 @@ def random_paths(rng: np.random.Generator) -> tuple[NDArray, float]:
 
 
 def stick_figure(path: NDArray, rate: float, rng: np.random.Generator) -> NDArray:
-    """Return joints (frames, 17, 3) [m] of somebody walking along a path (frames, 2)."""
+    """Return joints (frames, 17, 3) [m] of a person who walks along a path (frames, 2)."""
     velocity = np.gradient(path, axis=0) * rate
     kernel = np.ones(round(0.3 * rate)) / round(0.3 * rate)
     velocity = np.stack([np.convolve(v, kernel, "same") for v in velocity.T], axis=-1)
@@ -133,7 +133,7 @@ def stick_figure(path: NDArray, rate: float, rng: np.random.Generator) -> NDArra
 
 
 def captured_figure(path: NDArray, rate: float, data: Path, rng: np.random.Generator) -> NDArray:
-    """Return joints (frames, 17, 3) [m] of a motion capture clip carried along a path."""
+    """Return joints (frames, 17, 3) [m] of a motion capture clip moved along a path."""
     name = rng.choice(["cmu_10_01", "cmu_10_03"])
     with np.load(data / "mocap" / f"{name}.npz") as file:
         joints, names = file["joints"].astype(float), file["joint_names"].tolist()
@@ -217,7 +217,7 @@ def looking(
 
 
 def random_camera(middle: NDArray, rng: np.random.Generator) -> Camera:
-    """Return a camera beside the pitch that looks at the play around `middle` (2,) [m]."""
+    """Return a camera off the pitch that looks at the play around `middle` (2,) [m]."""
     size = [(1920, 1080), (1280, 720), (3840, 2160)][rng.choice(3, p=[0.7, 0.2, 0.1])]
     angle = rng.uniform(0, 2 * np.pi)
     away = rng.uniform(4.0, 30.0)
@@ -245,7 +245,7 @@ def random_camera(middle: NDArray, rng: np.random.Generator) -> Camera:
 
 
 def perturbed(camera: Camera, sigma: NDArray, rng: np.random.Generator) -> Camera:
-    """Return the camera as a calibration finds it, off by a random error of `sigma` (12,)."""
+    """Return the camera with a random calibration error of `sigma` (12,)."""
     step = rng.normal(0, sigma)
     pose = camera.cam_from_world
     turned = Rigid.from_rotvec(step[:3], np.zeros(3)) @ Rigid(pose.rotation, pose.translation)
@@ -261,7 +261,7 @@ def perturbed(camera: Camera, sigma: NDArray, rng: np.random.Generator) -> Camer
 
 @dataclass
 class Detector:
-    """A detector with errors of its own: bias and noise in units of the person's height."""
+    """A detector with random errors: bias and noise in units of the person's height."""
 
     bias: NDArray
     noise: float
@@ -272,7 +272,7 @@ class Detector:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Detector:
-        """Draw one."""
+        """Draw a detector."""
         return cls(
             bias=rng.normal(0, 0.012, (17, 2)),
             noise=float(rng.uniform(0.01, 0.03)),
@@ -286,14 +286,14 @@ class Detector:
 def detect(
     camera: Camera, world: NDArray, detector: Detector, rng: np.random.Generator
 ) -> tuple[list[list[NDArray]], NDArray]:
-    """Return found people of every frame, each (17, 2) [px], and how many people are in view."""
+    """Return the detections of every frame, each (17, 2) [px], and the number of people in view."""
     image = camera.project(world.reshape(-1, 3)).reshape(*world.shape[:3], 2)
     size = camera.image_size
     frames, persons = image.shape[:2]
     inside = np.isfinite(image).all(-1) & (image >= 0).all(-1) & (image < size).all(-1)
     visible = inside.mean(axis=-1) > 0.6
     height = np.nanmax(image[..., 1], -1) - np.nanmin(image[..., 1], -1)
-    # Hidden people: somebody nearer covers the same place in the image.
+    # Occluded people: a nearer person covers the same place in the image.
     depth = np.linalg.norm(world.mean(axis=2) - camera.center, axis=-1)
     middle = image.mean(axis=2)
     found: list[list[NDArray]] = []
@@ -345,7 +345,7 @@ def padded(found: list[list[list[NDArray]]]) -> NDArray:
 # --- faults ---------------------------------------------------------------------------------
 
 LENS_ORDERS = ([0, 1, 3, 4, 2], [0, 1, 4, 2, 3], [2, 3, 0, 1, 4])
-"""Places of the numbers that a reader with another order takes for k1 k2 p1 p2 k3."""
+"""Positions from which a reader with another order takes k1 k2 p1 p2 k3."""
 
 
 def with_pose(camera: Camera, rotation: NDArray, center: NDArray) -> Camera:
@@ -361,7 +361,7 @@ def plant(
     detector: Detector,
     rng: np.random.Generator,
 ) -> bool:
-    """Plant a fault into the rig; False where this rig cannot have it."""
+    """Plant a fault into the rig; return False if this rig cannot have it."""
     c = int(rng.choice(eligible))
     camera = rig.cameras[c]
     rotation, center = camera.cam_from_world.rotation, camera.center
@@ -421,7 +421,7 @@ def plant(
 
 
 def lens_shift(true: Camera, stated: Camera, world: NDArray) -> float:
-    """Return the mean shift of people in the image that a wrong lens brings, over their height."""
+    """Return the mean image shift of people by a wrong lens [px]."""
     points = world[::25].reshape(-1, 3)
     a, b = true.project(points), stated.project(points)
     inside = ((a >= 0) & (a < true.image_size)).all(-1)
@@ -477,7 +477,7 @@ def _attempt(rng: np.random.Generator, kind: str | None, data: Path | None) -> R
         fps,
         (105.0, 68.0) if rng.random() < 0.7 else None,
     )
-    # Whom does each pair of cameras see together, on average?
+    # Mean number of people that each pair of cameras sees in common.
     together = np.array([[(a & b).sum(1).mean() for b in seen] for a in seen])
     np.fill_diagonal(together, 0.0)
     eligible = [c for c in range(count) if np.sort(together[c])[-2] >= 2.0]

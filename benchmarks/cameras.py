@@ -1,12 +1,11 @@
-"""Prints how fast points are projected and unprojected, as ratios to OpenCV in the same run.
+"""Prints the speed of projection and unprojection, as ratios to OpenCV in the same run.
 
     python benchmarks/cameras.py [--points 1000000] [--rounds 5]
 
 Both sides take turns on the same points in one process with one thread; the best round of each
-counts, so that a busy machine slows both alike. From Python OpenCV's `projectPoints` computes
-its Jacobians whether they are wanted or not. Its `undistortPoints` stops after five iterations
-unless told otherwise; the lines "to 1e-12" ask it for more, and the last lines print what each
-accuracy is.
+counts, so that a busy machine slows both alike. From Python OpenCV's `projectPoints` always
+computes its Jacobians. Its `undistortPoints` stops after five iterations by default; the lines "to
+1e-12" ask it for more, and the last lines print each accuracy.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Clips of people who pass close to each other in a room, seen by few cameras, with known truth.
+"""Clips of people who pass close to each other in a room, seen by few cameras, with ground truth.
 
-Written for measuring identity switches of tracking. It shares no code with `worldpose.synthetic`:
-skeleton, motion, cameras and detector errors are its own. The detector makes the errors that
-exchange identities: it misses a person behind another, gives both one detection, takes joints of
-the person in front, and errs over many frames in the same direction.
+For measuring identity switches of tracking. It shares no code with `worldpose.synthetic`: skeleton,
+motion, cameras and detector errors are its own. The detector makes the errors that swap identities:
+it misses a person behind another, merges both into one detection, reports joints of the person in
+front, and errs over many frames in the same direction.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ BONES = [
     *((5, 6), (11, 12), (5, 11), (6, 12)),
     *((5, 7), (7, 9), (6, 8), (8, 10), (11, 13), (13, 15), (12, 14), (14, 16), (0, 5), (0, 6)),
 ]
-"""Pairs of COCO-17 joints between which a body hides what is behind it."""
+"""Pairs of COCO-17 joints between which a body occludes points behind it."""
 BODY_RADIUS = 0.13
 """[m]"""
 
@@ -180,7 +180,7 @@ def _rig(rng: np.random.Generator, count: int, half: NDArray[np.float64]) -> Cam
 def _detect(
     rng: np.random.Generator, rig: Camera, joints: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Return what a detector finds: keypoints, confidence, and owners."""
+    """Return a detector's results: keypoints, confidence, and owners."""
     frames, people = joints.shape[:2]
     cameras = len(rig.focal)
     room = people + 2
@@ -191,7 +191,7 @@ def _detect(
     slow = rng.normal(0, 0.02, (*shape, 2))  # errors that last, in metres at the person
     bias = rng.normal(0, 0.012, (JOINTS, 2))
     missed = np.zeros((cameras, people), dtype=bool)
-    coat = rng.uniform([100, 200], [900, 400], (cameras, 2))  # false person at a fixed place
+    coat = rng.uniform([100, 200], [900, 400], (cameras, 2))  # false positive at a fixed place
     has_coat = rng.random(cameras) < 0.3
     for frame in range(frames):
         slow = 0.9 * slow + np.sqrt(1 - 0.81) * rng.standard_t(5, slow.shape) * 0.02
@@ -242,7 +242,7 @@ def _detect(
 def _merged(
     rng: np.random.Generator, given: list[tuple[NDArray[np.float64], int]]
 ) -> list[tuple[NDArray[np.float64], int]]:
-    """Return detections after two that overlap much were taken for one person now and then."""
+    """Return detections after random merges of two with large overlap."""
     out = list(given)
     for a in range(len(given)):
         for b in range(a + 1, len(given)):
@@ -265,7 +265,7 @@ def _merged(
 def _occlusion(
     pixels: NDArray[np.float64], depth: NDArray[np.float64], scale: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Return which joints (people, 17) are seen, and who is in front of the others, -1 = nobody."""
+    """Return visible joints (people, 17), and the person in front of the others, -1 = none."""
     people = len(pixels)
     front = np.full((people, JOINTS), -1)
     middle = depth.mean(axis=-1)

@@ -1,6 +1,6 @@
 """Time and peak memory of writing, checking and counting a simulated data set of any size.
 
-Each step runs in a process of its own, so that its peak is its own:
+Each step runs in a separate process, to measure its own peak:
 
     python benchmarks/data_set_size.py /tmp/data 88 1694 17
 
@@ -79,7 +79,7 @@ def count(folder: Path):
 
 
 def main():
-    """Run one step, or all in processes of their own."""
+    """Run one step, or all in separate processes."""
     folder = Path(sys.argv[1])
     if sys.argv[2] in STEPS:
         started = time.perf_counter()

@@ -1,11 +1,11 @@
-"""Prints what finding people in pictures costs on this computer, stage by stage.
+"""Prints the cost of person detection on this computer, stage by stage.
 
     python benchmarks/detection.py [--people 25] [--frames 8]
 
-A crowd of `--people` in pictures of 1920 x 1080 is rendered, coded and decoded, searched with the
-embedded detector, and everybody's pose is found with the embedded estimator. One thread; times are
-processor time, which holds beside other work. The last lines reckon what the reconstruction's share
-of it, without rendering, comes to for 90 minutes at 50 frames a second before 16 cameras.
+A crowd of `--people` in images of 1920 x 1080 is rendered, encoded and decoded; the embedded
+detector finds people, and the embedded estimator finds the pose of each. One thread; times are
+processor time, so other work on the machine does not count. The last lines extrapolate the
+reconstruction's share, without rendering, to 90 minutes at 50 frames per second of 16 cameras.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ Result = TypeVar("Result")
 
 FPS = 50.0
 MATCH_FRAMES = 90 * 60 * 50 * 16
-"""Pictures of a match: 90 minutes, 50 frames a second, 16 cameras."""
+"""Images of a match: 90 minutes, 50 frames per second, 16 cameras."""
 SURE = 0.4
-"""Boxes from this score on get a pose here: what the stage takes for people at once."""
+"""Minimum score of boxes that get a pose here: the stage's high score threshold."""
 
 
 def main() -> None:
@@ -86,7 +86,7 @@ def main() -> None:
 
 
 def rendered(people: int, frames: int) -> tuple[float, list[Picture]]:
-    """Seconds for the pictures of a moving crowd from one camera, and the pictures."""
+    """Return the images of a moving crowd from one camera, after the seconds that they took."""
     scenario = SCENARIOS["match"]
     pitch = PitchTemplate.from_spec(scenario.pitch)
     crowd = gather(
@@ -114,7 +114,7 @@ def rendered(people: int, frames: int) -> tuple[float, list[Picture]]:
 
 
 def decoded(pictures: list[Picture]) -> float:
-    """Seconds to decode as many pictures from a video."""
+    """Return the seconds to decode as many images from a video."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "pictures.mp4"
         write_video(path, pictures, FPS)
@@ -124,7 +124,7 @@ def decoded(pictures: list[Picture]) -> float:
 
 
 def timed(work: Callable[[], Result]) -> tuple[float, Result]:
-    """Processor seconds of some work, and what it came to."""
+    """Return processor seconds of some work, and its result."""
     start = time.process_time()
     result = work()
     return time.process_time() - start, result

@@ -1,11 +1,11 @@
-"""Prints how many planted wrong keypoints bodies find, and how many honest ones they reject.
+"""Prints recall of planted gross errors in keypoints by bodies, and rejections of good keypoints.
 
     python benchmarks/filtering.py [--scenario match] [--seeds 401 402 403] [--duration 1.0]
 
-Given cameras as the scenario errs in them, tracking, triangulation, bodies, then the filter; no
-adjustment. The first line of a seed has nothing wrong but what is planted: joints put 4 to 10 of
-the detector's deviations off. The second has all that the scenario's detector does besides, such
-as sides exchanged and joints of the person before, which then count as honest.
+Cameras with the scenario's errors, tracking, triangulation, bodies, then the filter; no adjustment.
+The first line of a seed has planted errors only: joints 4 to 10 of the detector's deviations off.
+The second also has all errors of the scenario's detector, such as left-right swaps and joints of an
+occluding person, which then count as good.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, reconstruct_joints, unswap
 
 PLANTED = 0.06
-"""Share of joints put far off."""
+"""Share of joints with planted gross errors."""
 
 
 def main() -> None:
-    """Print two lines a seed."""
+    """Print two lines per seed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenario", default="match")
     parser.add_argument("--seeds", type=int, nargs="+", default=[401, 402, 403])
@@ -59,7 +59,7 @@ def main() -> None:
 
 
 def filtered(scenario: Scenario, seed: int) -> tuple[int, int, int, int]:
-    """Return planted keypoints found, others rejected, planted and others in all."""
+    """Return planted keypoints found, others rejected, and totals of planted and others."""
     scene = simulate_scene(scenario, seed)
     seen = scene.static_views()
     keypoints, confidence = seen.keypoints, seen.confidence

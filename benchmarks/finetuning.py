@@ -1,12 +1,12 @@
-"""Prints what `worldpose finetune` makes of labels of footage that the shipped nets do not know.
+"""Prints the gain by `worldpose finetune` on labelled footage that the shipped nets do not know.
 
     python benchmarks/finetuning.py FOLDER [--scenes 25] [--net people] [--set NAME=VALUE ...]
 
-Rendered into FOLDER, once: scenes of eight pictures with shirts that training never showed (sashes
-and chequers), fog throughout and people of 34 to 48 px; labels are the truth, as a careful reviewer
-would give them. Then both nets are fine-tuned by the command line, whose settings `--set` names.
-AP50 of boxes and PCK of keypoints are of the pictures that nothing was learned from or chosen by;
-last AP50 of the boxes that stage `detection` stores, which both nets have a say in.
+Rendered into FOLDER, once: scenes of eight images with shirts outside the training data (sashes and
+chequers), fog throughout and people of 34 to 48 px; labels are the truth, like those of a careful
+reviewer. Then the command line fine-tunes both nets, with settings from `--set`. AP50 of boxes and
+PCK of keypoints are of the images outside training and selection; last AP50 of the boxes that stage
+`detection` stores, which depend on both nets.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def main() -> None:
 
 
 def stored(labels: Path, files: dict[str, Path]) -> float:
-    """Return AP50 of the boxes that `detection` stores of the pictures held out, by these nets."""
+    """Return AP50 of the boxes that `detection` stores for held-out images with these nets."""
     held_out = split(read_labels(labels), FineTuningSettings())[2]
     detector, pose = embedded_detector(files.get("people")), embedded_pose(files.get("keypoints"))
     return score_people(found_people(detector, held_out, PictureCache(1 << 28), pose), held_out)[0]
@@ -62,7 +62,7 @@ def _row(net: str, figure: str, before: float, after: float) -> str:
 
 
 def rendered(folder: Path, scenes: int) -> Path:
-    """Return the labels of all scenes, rendered where they are not there."""
+    """Return the labels of all scenes; render missing ones."""
     sys.path.insert(0, str(RECIPE))
     from scenes import SHIFTED, SIZE, read_set, render_set
 
@@ -76,7 +76,7 @@ def rendered(folder: Path, scenes: int) -> Path:
 def fine_tuned(
     labels: Path, project: Path, net: str, settings: list[str]
 ) -> tuple[dict[str, Any], float]:
-    """Return the record of a net's new version, and the processor time it took [s]."""
+    """Return the record of a net's new version, and its processor time [s]."""
     words = ["finetune", str(labels), "--project", str(project), "--net", net, "--json"]
     words += [word for setting in settings for word in ("--set", setting)]
     start = os.times()

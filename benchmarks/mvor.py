@@ -5,10 +5,10 @@
 DATA holds `mvor` with camma_mvor_2018.json (cameras, 2D and 3D) and openpose_kps.json of the
 repository CAMMA-public/MVOR (CC BY-NC-SA 4.0). Every annotated moment is a clip of one frame, in
 metres and without a pitch; tracking and triangulation run in process with default settings. A
-person counts as seen by a camera when one of its detections lies within 0.25 m of the annotated
-upper-body joints on average, measured at their depth, each detection used once. Found is whoever
-has a person within 0.5 m, by the mean over shoulders, hips, elbows and wrists. Hips are annotated
-some 17 cm from where COCO's are. Published errors are of mv3dreg, whose choice of people differs.
+person counts as seen by a camera when one of its detections is within 0.25 m of the annotated
+upper-body joints on average, measured at their depth, each detection used once. A person is found
+if a result is within 0.5 m, by the mean over shoulders, hips, elbows and wrists. Annotated hips are
+some 17 cm from COCO's. Published errors are of mv3dreg, which selects people differently.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ def load_cameras(info: dict[str, Any]) -> Camera:
     room_from_first = np.array(given["firstCamToRoomRef"]).reshape(4, 4)
     cameras = []
     for lens, extrinsic in zip(given["intrinsics"], given["extrinsics"], strict=True):
-        # The extrinsics take points of each camera into the first one's frame.
+        # The extrinsics map points of each camera into the first one's frame.
         camera_from_room = np.linalg.inv(room_from_first @ np.array(extrinsic).reshape(4, 4))
         cameras.append(
             Camera(
                 focal=np.array(lens["focallength"]),
                 principal_point=np.array(lens["principalpoint"]),
-                # Key points were taken in images whose distortion the data set leaves in.
+                # Keypoints are in the original images, with lens distortion.
                 distortion=np.zeros(5),
                 cam_from_world=Rigid(camera_from_room[:3, :3], camera_from_room[:3, 3] / 1000.0),
                 image_size=np.array(lens["imagesize"]),
@@ -84,7 +84,7 @@ def load_moments(folder: Path) -> tuple[Camera, list[dict[str, Any]]]:
 def count_views(
     cameras: Camera, truth: NDArray[np.float64], image: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """Return by how many cameras each person (people, 8, 3) is seen."""
+    """Return the number of cameras that see each person (people, 8, 3)."""
     views = np.zeros(len(truth), dtype=np.int64)
     for c in range(image.shape[1]):
         camera = cameras[np.array([c])]
@@ -104,7 +104,7 @@ def count_views(
 def measure(
     cameras: Camera, moments: list[dict[str, Any]], settings: TrackingSettings
 ) -> dict[str, Any]:
-    """Return errors (people, 8) [cm] of the found by views, and counts of all and of false ones."""
+    """Return errors (people, 8) [cm] of found people by views, and counts of all and false ones."""
     errors: dict[int, list[NDArray[np.float64]]] = defaultdict(list)
     people: dict[int, int] = defaultdict(int)
     extra = 0

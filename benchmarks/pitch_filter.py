@@ -1,13 +1,13 @@
-"""Prints whom the pitch filter (D2) takes for crowd, in rendered pictures of a match.
+"""Prints errors of the pitch filter (D2), which removes crowd, in rendered images of a match.
 
     python benchmarks/pitch_filter.py [--scenario match] [--seeds 3] [--pictures FOLDER]
 
-One picture of every static camera, true cameras, embedded nets; doubtful boxes count, too. Stage
-`detection` looks for people twice: wherever they are, and on the pitch and close beside it.
-Players, referees and assistants are those of whom at least half is seen; a box is of whom it shares
-0.3 with. Bystanders stand 2.5 to 3.3 m behind the lines. Of whatever else was taken for somebody,
-that is in the stands whose middle shows no ground up to 8 m behind the lines; the rest is goals,
-shadows and parts of people.
+One image of every static camera, true cameras, embedded nets; boxes of low score count, too. Stage
+`detection` searches for people twice: everywhere, and on the pitch and close to it. A player,
+referee or assistant counts if at least half of the person is visible; a box belongs to the person
+that it overlaps by 0.3. Bystanders stand 2.5 to 3.3 m behind the lines. Of the other false
+positives, a box is in the stands if its middle shows no ground up to 8 m behind the lines; the rest
+is goals, shadows and parts of people.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from worldpose.synthetic.settings import Scenario
 Floats = NDArray[np.float64]
 
 SEEN = 0.5
-"""Least share of a person that counts as to be found."""
+"""Minimum visible share of a person that counts as to be found."""
 SHARED = 0.3
-"""Of a box with a person's outline."""
+"""Minimum overlap of a box with a person's outline."""
 STANDS = 8.0
-"""Behind the lines [m]; the middle of whoever stands before the boards shows nearer ground."""
+"""Distance behind the lines [m]; the middle of a person before the boards shows nearer ground."""
 KEPT, TAKEN = (0, 200, 0), (220, 0, 0)
 
 
 def main() -> None:
-    """Print a line a seed."""
+    """Print one line per seed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenario", default="match")
     parser.add_argument("--seeds", type=int, nargs="+", default=[3])
@@ -53,7 +53,7 @@ def main() -> None:
     asked = parser.parse_args()
     scenario = SCENARIOS[asked.scenario].model_copy(update={"duration": 0.2, "broadcast": None})
     pitch = PitchTemplate.from_spec(scenario.pitch)
-    settings = DetectionSettings(sure=DetectionSettings().doubtful)
+    settings = DetectionSettings(high_score_threshold=DetectionSettings().low_score_threshold)
     finder = PeopleFinder([embedded_detector()], embedded_pose(), settings)
     for seed in asked.seeds:
         counts = np.zeros((5, 2), int)
@@ -86,7 +86,7 @@ def main() -> None:
 def filmed(
     scenario: Scenario, pitch: PitchTemplate, seed: int
 ) -> Iterator[tuple[str, Camera, RenderedFrame, Floats]]:
-    """Yield every static camera, its first picture and the boxes of bystanders (n, 4) [px]."""
+    """Yield every static camera, its first image and the boxes of bystanders (n, 4) [px]."""
     scene = simulate_scene(scenario, seed)
     poses = scene.crowd.poses(np.zeros(1))
     roles = roles_of(scenario.crowd, len(scene.crowd.paths))
@@ -106,14 +106,14 @@ def filmed(
 
 
 def boxes_of(finder: PeopleFinder, picture: Picture, place: Place | None) -> Floats:
-    """Return the boxes (n, 4) [px] that stage `detection` would store of a picture."""
+    """Return the boxes (n, 4) [px] that stage `detection` would store for an image."""
     (stretch,) = finder.find([(0, picture)], place)
     boxes = stretch.boxes[0].astype(float)
     return np.asarray(boxes[np.isfinite(boxes).all(axis=1)])
 
 
 def in_stands(boxes: Floats, camera: Camera, pitch: PitchTemplate) -> NDArray[np.bool_]:
-    """Whether the middle of each box shows what is far behind the lines, or no ground (n,)."""
+    """Return whether each box's middle shows a place far behind the lines, or no ground (n,)."""
     rays = camera.unproject(0.5 * (boxes[:, :2] + boxes[:, 2:]))
     with np.errstate(divide="ignore", invalid="ignore"):
         along = -rays.origins[:, 2] / rays.directions[:, 2]
@@ -123,14 +123,14 @@ def in_stands(boxes: Floats, camera: Camera, pitch: PitchTemplate) -> NDArray[np
 
 
 def shared(boxes: Floats, others: Floats, share: float = SHARED) -> NDArray[np.bool_]:
-    """Whether each box overlaps any of the others by so much (n,)."""
+    """Return whether each box overlaps any of the others by a share (n,)."""
     if not len(others):
         return np.zeros(len(boxes), bool)
     return np.asarray(overlaps(boxes, others).max(axis=1) >= share)
 
 
 def draw(file: Path, picture: Picture, boxes: Floats, kept: NDArray[np.bool_]) -> None:
-    """Write the picture with who was kept in green and who was taken for crowd in red."""
+    """Write the image with kept people in green and removed ones in red."""
     drawn = picture.copy()
     for box, is_kept in zip(boxes.round().astype(int), kept, strict=True):
         cv2.rectangle(drawn, box[:2].tolist(), box[2:].tolist(), KEPT if is_kept else TAKEN, 2)

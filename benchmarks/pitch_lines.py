@@ -1,12 +1,12 @@
-"""Cameras of single broadcast pictures from hand-drawn lines: accuracy against annotations.
+"""Cameras of single broadcast images from hand-drawn lines: accuracy against annotations.
 
     python benchmarks/pitch_lines.py DATA [--every 1] [--half 0|1] [--sheets FOLDER]
 
 DATA holds `wc14` (lines.json, homographies.json, calib_eval.py) and `sn22_lines` (lines.json): the
-2014 World Cup pictures and a part of SoccerNet-Calibration 2022. No truth is used to fit; settings
-were chosen on the even half (`--half 0`), the odd half is for reporting. The lines that score are
-those that were fitted: an annotation's slips count against the camera. Leaving a marking out is the
-score that fitting cannot buy.
+2014 World Cup images and a part of SoccerNet-Calibration 2022. The fit uses no truth; settings were
+tuned on the even half (`--half 0`), the odd half is for reporting. The scored lines are the fitted
+ones: an annotation's slips count against the camera. The score with one marking left out cannot be
+gained by overfitting.
 """
 
 from __future__ import annotations
@@ -34,11 +34,12 @@ from worldpose.static_calibration import (
 )
 from worldpose.static_calibration.soccernet import soccernet_markings
 
-# The scorer's template is flat. Broadcast pictures are crops of a zoom lens whose middle wanders.
-# Main cameras of the even half that see seven markings or more: focal length 2.6 widths (factor
-# 1.34 either way), 15 m high (1.34), 66 m off (1.19), rolled by 0.006 rad, corners drawn inwards by
-# 0.035 of their distance (0.015) at every zoom. Spreads are set wider than those found; k2's, three
-# times smaller than usual, keeps markings beyond the drawn ones from being bent back into view.
+# The scorer's template is flat. Broadcast images are crops of a zoom lens with a varying principal
+# point. Main cameras of the even half with seven visible markings or more: focal length 2.6 widths
+# (factor 1.34 either way), 15 m high (1.34), at a distance of 66 m (1.19), rolled by 0.006 rad,
+# corners distorted inwards by 0.035 of their distance (0.015) at every zoom. Spreads here are wider
+# than those; k2's, three times smaller than usual, keeps markings beyond the drawn ones from
+# bending back into view.
 PITCH = PitchTemplate.from_spec(PitchSpec(crown=0.0))
 BROADCAST = StaticCalibrationSettings(
     prior=CameraPrior(
@@ -60,12 +61,12 @@ BROADCAST = StaticCalibrationSettings(
 SETS = {"wc14": ("wc14", (1280, 720)), "sn22": ("sn22_lines", (960, 540))}
 PIXELS = (5, 10, 20)
 FAR_OFF = BROADCAST.wrong_marking * BROADCAST.drawn_noise
-CLEARLY_SEEN = 40.0  # pixels of a marking in the picture that an annotator does not overlook
+CLEARLY_SEEN = 40.0  # pixels of a marking in the image that an annotator does not overlook
 
 
 @dataclass
 class Fitted:
-    """One picture's camera, or why there is none."""
+    """One image's camera, or the reason why there is none."""
 
     calibration: StaticCalibration | None
     error: str
@@ -73,14 +74,14 @@ class Fitted:
 
     @property
     def residual(self) -> float:
-        """The worst drawn pixel [px], infinite without a camera."""
+        """Return the largest residual of a drawn pixel [px], infinite without a camera."""
         if self.calibration is None:
             return np.inf
         return max(marking.worst for marking in self.calibration.report.drawn)
 
 
 def load_scorer(folder: Path) -> ModuleType:
-    """The scorer that lies beside the data."""
+    """Return the scorer of the data set."""
     spec = importlib.util.spec_from_file_location("calib_eval", folder / "wc14" / "calib_eval.py")
     scorer = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(scorer)
@@ -88,7 +89,7 @@ def load_scorer(folder: Path) -> ModuleType:
 
 
 def load_lines(folder: Path, name: str, half: int | None, every: int) -> dict[str, dict]:
-    """Annotations of one set by picture."""
+    """Return annotations of one set by image."""
     lines = json.loads((folder / SETS[name][0] / "lines.json").read_text())
     keys = sorted(lines)
     keys = keys if half is None else keys[half::2]
@@ -96,7 +97,7 @@ def load_lines(folder: Path, name: str, half: int | None, every: int) -> dict[st
 
 
 def fit(lines: dict, size: tuple[int, int], settings: StaticCalibrationSettings) -> Fitted:
-    """The camera of one picture."""
+    """Return the camera of one image."""
     start = time.perf_counter()
     try:
         found = calibrate(PITCH, soccernet_markings(lines, size), size, settings=settings)
@@ -106,7 +107,7 @@ def fit(lines: dict, size: tuple[int, int], settings: StaticCalibrationSettings)
 
 
 def as_json(camera: Camera) -> dict:
-    """A camera in the scorer's form."""
+    """Return a camera in the scorer's form."""
     (fx, fy), (cx, cy) = camera.focal, camera.principal_point
     return {
         "K": [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
@@ -117,7 +118,7 @@ def as_json(camera: Camera) -> dict:
 
 
 def jaccards(scorer: ModuleType, lines: dict, camera: Camera, size: tuple[int, int]) -> list[float]:
-    """JaC at every pixel threshold."""
+    """Return JaC at every pixel threshold."""
     shares = []
     for pixels in PIXELS:
         hit, extra, lost, _ = scorer.jaccard(lines, as_json(camera), np.array(size, float), pixels)
@@ -126,7 +127,7 @@ def jaccards(scorer: ModuleType, lines: dict, camera: Camera, size: tuple[int, i
 
 
 def scored(scorer: ModuleType, lines: dict, fits: dict[str, Fitted], size: tuple) -> dict:
-    """JaC of every picture that has a camera."""
+    """Return JaC of every image with a camera."""
     return {
         key: jaccards(scorer, lines[key], fitted.calibration.estimate.camera, size)
         for key, fitted in fits.items()
@@ -137,7 +138,7 @@ def scored(scorer: ModuleType, lines: dict, fits: dict[str, Fitted], size: tuple
 def left_out(
     scorer: ModuleType, lines: dict, size: tuple, settings: StaticCalibrationSettings
 ) -> np.ndarray:
-    """Shares of markings that the camera of all others predicts, at every pixel threshold."""
+    """Return shares of markings predicted by the camera of all others, per pixel threshold."""
     hits = []
     for drawn in lines.values():
         for name, points in drawn.items():
@@ -158,15 +159,15 @@ def left_out(
 def contradictions(
     scorer: ModuleType, lines: dict, fitted: Fitted, size: tuple, limit: float, seen: float
 ) -> list[str]:
-    """What camera and annotation disagree about, in words.
+    """Return disagreements between camera and annotation, in words.
 
     Args:
         scorer: projects the markings.
         lines: the annotation.
-        fitted: with a camera.
+        fitted: an image's fit with a camera.
         size: width, height [px].
-        limit: of a drawn pixel's distance [px].
-        seen: length in the picture from which a marking has to be drawn [px].
+        limit: maximum distance of a drawn pixel [px].
+        seen: length in the image from which a marking has to be drawn [px].
     """
     box = np.array(size, float)
     predicted = scorer.image_lines(as_json(fitted.calibration.estimate.camera), box)
@@ -186,7 +187,7 @@ def contradictions(
 
 
 def refusal(scorer: ModuleType, lines: dict, fits: dict[str, Fitted], size: tuple) -> dict:
-    """Share of markings that camera and annotation clearly disagree about, then the worst pixel."""
+    """Return the share of markings with clear disagreement to the annotation, then the residual."""
     ranks = {}
     for key, fitted in fits.items():
         share = np.inf
@@ -198,7 +199,7 @@ def refusal(scorer: ModuleType, lines: dict, fits: dict[str, Fitted], size: tupl
 
 
 def curve(scores: dict, refusal: dict) -> list[tuple[float, np.ndarray]]:
-    """Completeness [%] and JaC [%] as pictures are refused, those of the largest refusal first."""
+    """Return completeness [%] and JaC [%] while images are refused by descending refusal score."""
     order = sorted(scores, key=lambda key: refusal[key])
     points = []
     for share in (1.0, 0.995, 0.988, 0.97, 0.95, 0.9):
@@ -210,7 +211,7 @@ def curve(scores: dict, refusal: dict) -> list[tuple[float, np.ndarray]]:
 
 
 def overlap(scorer: ModuleType, folder: Path, lines: dict, size: tuple) -> tuple[float, float]:
-    """Mean and median IoU of the seen part [%] of distortion-free fits, against homographies."""
+    """Return mean and median IoU of the seen part [%] of distortion-free fits to homographies."""
     truth = json.loads((folder / "wc14" / "homographies.json").read_text())
     settings = BROADCAST.model_copy(update={"distortion": "none"})
     x, y = 105.0 / scorer.TEMPLATE_W, 68.0 / scorer.TEMPLATE_H
@@ -229,7 +230,7 @@ def overlap(scorer: ModuleType, folder: Path, lines: dict, size: tuple) -> tuple
 
 
 def sheet(scorer: ModuleType, lines: dict, fits: dict, keys: list[str], size: tuple) -> np.ndarray:
-    """Pictures two to a row: green what was drawn, red what nobody drew, yellow what is off."""
+    """Return images two to a row: green drawn, red only predicted, yellow large residuals."""
     box = np.array(size, float)
     tiles = []
     for key in keys:
@@ -254,7 +255,7 @@ def sheet(scorer: ModuleType, lines: dict, fits: dict, keys: list[str], size: tu
 
 
 def main() -> None:
-    """Prints every figure."""
+    """Print all metrics."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("--half", type=int, choices=(0, 1), default=1)

@@ -3,11 +3,11 @@
     python benchmarks/result_digests.py FILE [--data DATA] [--cases NAME ...] [--keep FOLDER]
     python benchmarks/result_digests.py FILE --compare OTHER
 
-A change of structure must not change a number. The matches are simulated and run by the command
-line, and their stores are read with zarr alone, so that this script needs no name of the code that
-changes. DATA holds `shelf_dev` as `shelf.py` says; without it that case is left out. For an array
-whose digest differs, the comparison prints how many values are missing, their mean and their
-standard deviation in both records.
+A change of structure must not change a number. The command line simulates and runs the matches, and
+this script reads their stores with zarr alone, so that it needs no name of the code that changes.
+DATA holds `shelf_dev`, see `shelf.py`; without it that case is omitted. For an array whose digest
+differs, the comparison prints the number of missing values, the mean and the standard deviation in
+both records.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SHELF = "shelf"
 
 
 def run_case(name: str, data: Path | None, folder: Path) -> dict[str, Any]:
-    """Make and run one match; return the arrays of its runs by `run/stage/unit/array`."""
+    """Simulate and run one match; return the arrays of its runs by `run/stage/unit/array`."""
     match, project = folder / name, folder / f"{name}-project"
     options: list[str] = []
     if name == SHELF:
@@ -57,7 +57,7 @@ def run_case(name: str, data: Path | None, folder: Path) -> dict[str, Any]:
 
 
 def worldpose(arguments: list[str], accepted: tuple[int, ...] = (0,)) -> None:
-    """Run the command line; stop with its output if it does not end as it should."""
+    """Run the command line; exit with its output if its exit code is not accepted."""
     ended = subprocess.run(
         [Path(sys.executable).parent / "worldpose", *arguments],
         capture_output=True,
@@ -95,7 +95,7 @@ def describe_array(values: np.ndarray) -> dict[str, Any]:
 
 
 def compare(ours: dict[str, Any], theirs: dict[str, Any]) -> int:
-    """Print the arrays that differ; return how many do."""
+    """Print the arrays that differ; return their number."""
     count = 0
     for case in sorted(ours.keys() & theirs.keys()):
         one, other = ours[case], theirs[case]

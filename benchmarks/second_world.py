@@ -1,18 +1,18 @@
-"""Measures every stage on matches of the second world, or on scenarios of the first.
+"""Scores every stage on matches of the second simulator, or on scenarios of the first.
 
     python benchmarks/second_world.py --matches 40 --duration 4 --seed 1 --resume DIR
     python benchmarks/second_world.py --scenarios match hard tiny --matches 2 --seed 1 --resume DIR
     python benchmarks/second_world.py --resume DIR --report
 
-Every match is simulated, run with default settings and scored in a process of its own, one after
-the other; stages are called as the flow plans them, without Prefect or Dask. Its row goes to
-DIR/rows.jsonl, and rows that are there are not computed again. With --recordings every second match
-replays recordings. --iterations N goes through the method N times.
+Every match is simulated, run with default settings and scored in a separate process, one after the
+other; stages are called in the flow's order, without Prefect or Dask. Its row goes to
+DIR/rows.jsonl, and existing rows are not recomputed. With --recordings every second match replays
+recordings. --iterations N runs N passes over the stages.
 
-Seen: people whom the detections of two cameras or more show in at least half of the frames. With a
-body: those of them who have one in at least half of these frames, within 1 m. Regions: share of
-joints, seen by two cameras, whose true place lies in the stated 95 % region, by joint group; in
-brackets for what the detector takes for joints, where the reference has that.
+Seen: people in the detections of two cameras or more in at least half of the frames. With a body:
+those of them with a body in at least half of these frames, within 1 m. Regions: share of joints,
+seen by two cameras, whose true place is in the stated 95 % region, by joint group; in brackets
+against the detector's joint definition, where the reference has it.
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ MIX = (
 """Scenarios of ten matches in a row."""
 STAGES = ("triangulation", "retriangulation", "body_fitting")
 GATE = 1.0
-"""Largest mean joint distance of a true person and a found one [m]."""
+"""Maximum mean joint distance between a true person and a result [m]."""
 SCORES = ("mpjpe_mm", "g_mpjpe_mm", "pa_mpjpe_mm", "coverage", "idf1", "switches")
 
 
 def run_in_process(project: Path, folder: Path, iteration: int) -> RunRecord:
-    """Run one pass over the method in this process; a unit that fails leaves others to go on."""
+    """Run one pass over the stages in this process; after a failed unit, others continue."""
     store = Store.open_or_new(str(project))
     match = find_match(store, str(folder))
     stages = selected_stages(None, None)
@@ -77,7 +77,7 @@ def run_in_process(project: Path, folder: Path, iteration: int) -> RunRecord:
                 continue
             try:
                 task_of(stage).fn(unit.work(store.url, match, log.run_id))
-            except Exception as failure:  # the run goes on, as on workers; the row names it
+            except Exception as failure:  # the run continues, as on workers
                 log.finished(unit, failure)
             else:
                 log.finished(unit, None)
@@ -86,7 +86,7 @@ def run_in_process(project: Path, folder: Path, iteration: int) -> RunRecord:
 
 
 def views_of_detections(folder: Path, truth: JointTracks) -> NDArray[np.int64]:
-    """Return how many static cameras' detections show each true person (frames, persons)."""
+    """Return the number of static cameras that detect each true person (frames, persons)."""
     count = np.zeros(truth.joints.shape[:2], np.int64)
     for camera in read_match(folder).spec.static_cameras:
         known = np.load(folder / "reference" / "identities" / f"{camera.id}.npz")
@@ -97,7 +97,7 @@ def views_of_detections(folder: Path, truth: JointTracks) -> NDArray[np.int64]:
 
 
 def score_stage(tracks: JointTracks, truth: JointTracks, fps: float) -> dict[str, Any]:
-    """Return the scores of one stage's joints, and how many lie in their regions by group."""
+    """Return the scores of one stage's joints, and the region coverage by group."""
     scores, _ = evaluate_joints(tracks, truth, fps=fps)
     found: dict[str, Any] = {name: getattr(scores, name) for name in SCORES}
     found["regions"] = {name: list(n) for name, n in region_counts(tracks, truth).items()}
@@ -107,7 +107,7 @@ def score_stage(tracks: JointTracks, truth: JointTracks, fps: float) -> dict[str
 def people_with_bodies(
     tracks: JointTracks | None, truth: JointTracks, shown: NDArray[np.int64]
 ) -> dict[str, int]:
-    """Return how many people two cameras see, and how many of them have bodies."""
+    """Return the number of people that two cameras see, and the number of those with bodies."""
     seen = shown >= 2
     people = np.flatnonzero(seen.mean(axis=0) >= 0.5)
     if tracks is None:
@@ -180,11 +180,11 @@ def measure_apart(plan: dict[str, Any], limit: float, keep: Path | None) -> dict
         answer = folder / "row.json"
 
         def work() -> None:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)  # it ends at once with its parent
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)  # the process ends with its parent
             with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
                 try:
                     row = measure(plan, folder)
-                except Exception:  # a bug of ours or of the harness: the row shows it
+                except Exception:  # a bug of ours or of the benchmark: the row shows it
                     row = plan | {"state": "traceback", "failures": [traceback.format_exc()]}
             answer.write_text(json.dumps(row))
 
@@ -201,7 +201,7 @@ def measure_apart(plan: dict[str, Any], limit: float, keep: Path | None) -> dict
 
 
 def line_of(row: dict[str, Any]) -> str:
-    """Return a match's row for people."""
+    """Return a match's row as readable text."""
     text = (
         f"{row['scenario']:15s} {row['seed']:5d} {row.get('cameras', 0):3d} cameras "
         f"{row.get('people', 0):3d} people {row['state']:9s}"
@@ -222,7 +222,7 @@ def line_of(row: dict[str, Any]) -> str:
 
 
 def print_report(rows: list[dict[str, Any]]) -> None:
-    """Print how matches ended, and errors and regions by scenario, stage and iteration."""
+    """Print outcomes of matches, and errors and regions by scenario, stage and iteration."""
     enough = [
         row
         for row in rows
@@ -271,7 +271,7 @@ def _stage_line(title: str, iteration: int, stage: str, scored: list[dict[str, A
 
 
 def plans(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Return what is to be measured."""
+    """Return the measurements to make."""
     if options.scenarios:
         numbers = [(s, options.seed + k) for s in options.scenarios for k in range(options.matches)]
     else:
@@ -290,7 +290,7 @@ def plans(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Measure what is missing, print a line a match, then the report."""
+    """Measure missing matches, print one line per match, then the report."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--matches", type=int, default=40, help="of the mix, or of each scenario")
     parser.add_argument("--scenarios", nargs="+", choices=[*SCENARIOS, *FOREIGN_SCENARIOS])
@@ -303,7 +303,7 @@ def main() -> None:
     parser.add_argument("--keep", action="store_true", help="keep match folders and projects")
     parser.add_argument("--report", action="store_true", help="only print what DIR holds")
     options = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit("stopped"))  # and so ends the match's process
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("stopped"))  # also ends the match's process
     options.resume.mkdir(parents=True, exist_ok=True)
     file = options.resume / "rows.jsonl"
     rows = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []

@@ -46,7 +46,7 @@ def command(*words: object) -> None:
 
 
 def without(given: Path, camera: str, folder: Path) -> Path:
-    """Return a copy of the import form that lacks a camera."""
+    """Return a copy of the import form without one camera."""
     out = folder / "import"
     shutil.copytree(given, out)
     (out / "detections" / f"{camera}.json").unlink()
@@ -82,7 +82,7 @@ def scores(data: Path, given: Path, folder: Path, *settings: str) -> list[float]
 
 
 def main() -> None:
-    """Print one line a run."""
+    """Print one line per run."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
     data = parser.parse_args().data / "shelf_dev"

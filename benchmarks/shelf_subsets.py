@@ -1,13 +1,14 @@
-"""Prints what each stage makes of the Shelf sequence with few cameras and in short windows.
+"""Prints each stage's score on the Shelf sequence with few cameras and in short windows.
 
     python benchmarks/shelf_subsets.py DATA [--windows 211 121 60 30] [--cameras 2 3 4 5]
         [--iterations 2] [--until body_fitting] [--keep FOLDER] [--set STAGE.SETTING=JSON ...]
 
-DATA holds `shelf_dev` as `shelf.py` says. Every subset of so many cameras is a match of its own,
-and so is every window of so many frames, side by side from the first frame on. The stages run in
-this process; with --keep, what the folder has already is not computed again. Scored are joints of
+DATA holds `shelf_dev`, see `shelf.py`. Every subset of so many cameras is a separate match, and so
+is every window of so many frames, in sequence from the first frame on. The stages run in this
+process; with --keep, results already in the folder are not recomputed. Scored are joints of
 `triangulation` (T), `retriangulation` (R), and bodies (B): PCP3D at alpha 0.5 and mean error [mm].
-The last lines say how often a stage is worse than its input by more than 0.3 points or 1 mm.
+The last lines count the cases in which a stage is worse than its input by more than 0.3 points or 1
+mm.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def write_case(given: Path, cameras: tuple[str, ...], frames: range, folder: Pat
 def run(
     store: Store, folder: Path, until: str, iterations: int, overrides: dict[str, Any]
 ) -> tuple[str, list[dict[str, str]]]:
-    """Return the match's id, and for every iteration `stage/unit` to key, computing what lacks."""
+    """Compute missing results; return the match's id, and per iteration `stage/unit` to key."""
     match, _ = register(store, folder)
     names = [stage.name for stage in METHOD]
     stages = dict(zip(names, METHOD, strict=True))
@@ -93,7 +94,7 @@ def score(
 
 
 def main() -> None:
-    """Print a line a case and a summary."""
+    """Print one line per case and a summary."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("--windows", type=int, nargs="+", default=[211, 121, 60, 30])
@@ -145,7 +146,7 @@ def tell_case(
     how: tuple[str, int, dict[str, Any]],
     worse: dict[str, list[str]],
 ) -> None:
-    """Print one case, and add what is worse in it than in its input."""
+    """Print one case, and record stages that are worse than their input."""
     _, cameras, frames, _ = case
     scorer, truth, store, stages = scoring
     label = f"{''.join(c.removeprefix('cam') for c in cameras):5s} {frames.start}-{frames.stop - 1}"

@@ -1,12 +1,12 @@
-"""Prints how exactly static cameras of simulated pictures are found, and how honest regions are.
+"""Prints the accuracy of static cameras on simulated images, and the coverage of their regions.
 
     python benchmarks/static_accuracy.py [SCENARIO ...] [--surveys 19] [--first 0]
 
-Clicks and mistakes are the scenario's own, the survey is off as the scenario says, one picture a
-camera with people in it. Ground: the true pixel of a place where a player stands, back through the
-estimated camera onto the pitch. Wrong clicks: which of them calibration from clicks names, and
-which of those it names are wrong. Regions: share of cameras that lie within what is stated. Each
-line is of clicks (stages 1 and 2), then with the picture's lines (stage 3).
+Clicks and mistakes are the scenario's own, the survey has the scenario's errors, one image per
+camera with people in it. Ground: the true pixel of a player's place, back through the estimated
+camera onto the pitch. Wrong clicks: recall and precision of calibration from clicks. Regions: share
+of cameras inside their stated region. Each line has results of clicks (stages 1 and 2), then with
+the image's lines (stage 3).
 """
 
 from __future__ import annotations
@@ -34,25 +34,26 @@ Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 SHARES = (0.5, 0.8, 0.95, 0.99)
 BORDER = 4.0
-"""What is nearer to the picture's border is not in it [px]."""
+"""Points nearer to the image border count as outside [px]."""
 SHORT = 60.0
-"""A marking of which less is in the picture is not seen [px]."""
+"""A marking with a shorter part in the image counts as invisible [px]."""
 MANY = 8
-"""Markings from which on a camera sees many."""
+"""Minimum number of markings of a camera that sees many."""
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """One camera.
+    """Results of one camera.
 
     Attributes:
         ground: errors at the players from clicks, and with lines [m].
-        region: share of the estimate's law that is nearer than the true camera, likewise.
-        markings: how many the camera sees.
+        region: probability mass of the estimate's distribution nearer than the true camera, for
+            both.
+        markings: number of markings that the camera sees.
         wrong: names of wrong clicks.
-        named: names that calibration took for wrong.
-        weak: does the report ask for a person's look, from clicks.
-        refined: did lines go into the camera.
+        named: names of clicks that calibration reported as wrong.
+        weak: whether the report asks for a user's check, from clicks.
+        refined: whether lines contributed to the camera.
     """
 
     ground: tuple[Floats, ...]
@@ -65,7 +66,7 @@ class Outcome:
 
 
 def ground_errors(found: Camera, true: Camera, places: Floats, pitch: PitchTemplate) -> Floats:
-    """Return the distance between places and where their true pixels are taken to be [m]."""
+    """Return the distance between places and the back-projections of their true pixels [m]."""
     pixels = true.project(places)
     seen = ((pixels > 0.0) & (pixels < true.image_size - 1.0)).all(axis=-1)
     met = surface_points(found.unproject(pixels[seen]), pitch)
@@ -74,7 +75,7 @@ def ground_errors(found: Camera, true: Camera, places: Floats, pitch: PitchTempl
 
 
 def markings_seen(camera: Camera, pitch: PitchTemplate) -> int:
-    """Return how many painted markings a camera's picture shows."""
+    """Return the number of painted markings in a camera's image."""
     count = 0
     for name in (*pitch.lines, *pitch.arcs):
         pixels = camera.project(pitch.marking_points(name, 0.25))
@@ -85,7 +86,7 @@ def markings_seen(camera: Camera, pitch: PitchTemplate) -> int:
 
 
 def region(estimate: CameraEstimate, true: Camera) -> float:
-    """Return the share of the estimate's law that is nearer to it than the true camera."""
+    """Return the estimate's probability mass that is nearer to it than the true camera."""
     camera = estimate.camera
     off = true.cam_from_world @ camera.cam_from_world.inverse()
     step = np.concatenate(
@@ -106,12 +107,12 @@ def region(estimate: CameraEstimate, true: Camera) -> float:
 def calibrated(
     surveyed: PitchTemplate, clicked: ClickedMarkings, size: tuple[int, int], still: Picture
 ) -> list[StaticCalibration]:
-    """Return the calibration from clicks, and that with the picture's lines."""
+    """Return the calibration from clicks, and that with the image's lines."""
     return [calibrate(surveyed, clicked, size, picture=each) for each in (None, still)]
 
 
 def outcomes(scenario: str, seeds: range) -> Iterator[Outcome | None]:
-    """Yield the cameras of some surveys, None for one that is refused."""
+    """Yield the cameras of some surveys, None for a camera that calibration refuses."""
     settings = SCENARIOS[scenario].model_copy(update={"duration": 0.2, "broadcast": None})
     painted = PitchTemplate.from_spec(settings.pitch)
     for seed in seeds:
@@ -143,13 +144,13 @@ def outcomes(scenario: str, seeds: range) -> Iterator[Outcome | None]:
 
 
 def ground(cameras: list[Outcome], stage: int) -> str:
-    """Return the errors at players of all cameras together."""
+    """Return the errors at players, over all cameras."""
     errors = 100.0 * np.concatenate([each.ground[stage] for each in cameras])
     return f"{np.median(errors):.2f} / {np.percentile(errors, 95.0):.2f} cm"
 
 
 def tell(scenario: str, every: list[Outcome | None]) -> None:
-    """Print a scenario's figures."""
+    """Print a scenario's metrics."""
     cameras = [each for each in every if each is not None]
     many = [each for each in cameras if each.markings >= MANY]
     print(
@@ -178,7 +179,7 @@ def tell(scenario: str, every: list[Outcome | None]) -> None:
 
 
 def main() -> None:
-    """Print one block a scenario."""
+    """Print one block per scenario."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
         "scenarios", nargs="*", default=["match", "penalty-box", "sparse-corner"], metavar="NAME"

@@ -2,13 +2,13 @@
 
     python benchmarks/static_calibration.py [--cameras 4] [--rounds 5]
 
-Clicks: ten named points with 1 px of noise. Lines: a rendered picture and a start 5 px off, 2000
-samples. The peers of the line refinement minimise the paper's distance map (Canny edges near the
-start's lines, `cv2.distanceTransform`), looked up between pixels, with SciPy's
+Clicks: ten named points with 1 px of noise. Lines: a rendered image and a start with an error of 5
+px, 2000 samples. The peers of the line refinement minimise the paper's distance map (Canny edges
+near the start's lines, `cv2.distanceTransform`), interpolated between pixels, with SciPy's
 Levenberg-Marquardt and with a damped Gauss-Newton, both with a robust loss. Errors are root mean
 squares over the visible markings against the true camera. All take turns in one process with one
-thread; the best round counts. The map is made before the clock starts and timed by itself; so are
-the iterations of ours, which the reading of the picture comes before.
+thread; the best round counts. The map is computed before the clock starts and timed separately; so
+are the iterations of ours, without the analysis of the image.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ from worldpose.synthetic.stadium import place_camera
 
 PITCH = PitchTemplate.standard()
 SPREAD = np.array([1e-3, 1e-3, 1e-3, 0.1, 0.1, 0.1, 2e-3, 4.0, 4.0, 0.01, 0.01, 0.0])
-"""Proportions of what a start is off, in the order of `PARAMETERS`."""
+"""Proportions of a start's errors, in the order of `PARAMETERS`."""
 FREE = SPREAD > 0.0
 START_ERROR = 5.0
 FARTHEST = 30.0
-"""Where the distance map ends [px]."""
+"""Upper limit of the distance map [px]."""
 ROBUST = 3.0
-"""Cauchy scale of the peers' residuals on the map [px]: boards and shadows have edges too."""
+"""Cauchy scale of the peers' residuals on the map [px]: boards and shadows have edges, too."""
 
 Floats = NDArray[np.float64]
 
 
 def line_points(camera: Camera, count: int) -> Floats:
-    """Return evenly chosen points of the markings in a camera's picture (count, 3)."""
+    """Return evenly chosen points of the markings in a camera's image (count, 3)."""
     points = PITCH.sample_lines(0.1).points_world
     pixels = camera.project(points)
     points = points[((pixels > 3.0) & (pixels < camera.image_size - 4.0)).all(axis=-1)]
@@ -59,14 +59,14 @@ def line_points(camera: Camera, count: int) -> Floats:
 
 
 def line_error(camera: Camera, true: Camera) -> float:
-    """Return the root mean square over the markings [px]."""
+    """Return the root mean square error over the markings [px]."""
     points = line_points(true, 2000)
     off = camera.project(points) - true.project(points)
     return float(np.sqrt((off**2).sum(axis=-1).mean()))
 
 
 def some_pixels_off(true: Camera, rng: np.random.Generator) -> tuple[Camera, Floats]:
-    """Return a camera whose markings are 5 px off, and the spread that it was drawn with.
+    """Return a camera with marking errors of 5 px, and the spread that it was drawn with.
 
     All methods have that spread as their prior.
     """
@@ -88,7 +88,7 @@ def distance_map(picture: NDArray[np.uint8], start: Camera) -> NDArray[np.float3
 
 
 def looked_up(away: NDArray[np.float32], pixels: Floats) -> Floats:
-    """Return the map between its pixels (n,)."""
+    """Return the map interpolated at pixels (n,)."""
     at = pixels.astype(np.float32)[None]
     return cv2.remap(away, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0].astype(
         np.float64
@@ -116,7 +116,7 @@ def by_scipy(away: NDArray[np.float32], start: Camera, points: Floats, spread: F
 def by_gauss_newton(
     away: NDArray[np.float32], start: Camera, points: Floats, spread: Floats
 ) -> Camera:
-    """Return a damped Gauss-Newton on the map, with its gradient and our Jacobian."""
+    """Return a damped Gauss-Newton result on the map, with its gradient and our Jacobian."""
     gx = cv2.Sobel(away, cv2.CV_32F, 1, 0, ksize=3) / 8.0
     gy = cv2.Sobel(away, cv2.CV_32F, 0, 1, ksize=3) / 8.0
     prior = 9.0 / spread[FREE] ** 2
@@ -159,7 +159,7 @@ def clicks_by_opencv(world: Floats, pixels: Floats, size: tuple[int, int]) -> Ca
 
 
 def clicks_by_scipy(world: Floats, pixels: Floats, size: tuple[int, int]) -> Camera:
-    """Return `cv2.solvePnP` at the usual focal length, then SciPy on all but the middle."""
+    """Return `cv2.solvePnP` at the usual focal length, then SciPy; the principal point is fixed."""
     width, height = size
     middle = np.array([(width - 1) / 2, (height - 1) / 2])
     matrix = np.array([[2200.0, 0.0, middle[0]], [0.0, 2200.0, middle[1]], [0.0, 0.0, 1.0]])
@@ -195,7 +195,7 @@ def _camera(
 
 @contextmanager
 def fitting(spent: list[float]) -> Iterator[None]:
-    """Append how long the refinement's own iterations take [s], the reading of bars apart."""
+    """Append the time of the refinement's own iterations [s], without the reading of bars."""
     settle = LineSearch._settle
 
     def timed(*args: object, **named: object) -> object:

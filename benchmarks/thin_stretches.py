@@ -1,15 +1,16 @@
-"""Prints what bodies from single pictures (S4) bring to thinly seen stretches, through whole runs.
+"""Prints the effect of monocular poses (S4) on chunks with few cameras, through whole runs.
 
     python benchmarks/thin_stretches.py [--seeds 825 826 827 828] [--duration 2] [--keep FOLDER]
 
-Scenario `tiny-broadcast` with 12 people and exact static cameras. Everybody is left for 0.6 to
-1.2 s to one of the static cameras that see him, every second person to two: the others' detections
-are taken out of the match folder. What `worldpose run --iterations 2` does is then done with the
-estimates of the folder, which err by 80 mm after alignment. Its second refitting is made again
-without them, from the same tracks, joints and cameras; and the whole run is. Broadcast keypoints
-are in all. Errors are of the second iteration's bodies against the truth, of people in the
-broadcast picture, in those stretches, wherever both have a body within half a metre. In whole runs
-who is who is decided anew, which differs in either direction by more than estimates bring.
+Scenario `tiny-broadcast` with 12 people and exact static cameras. For 0.6 to 1.2 s, each person
+keeps the detections of one of the static cameras that see the person, every second person those of
+two: the others' detections are removed from the match folder. Then the steps of `worldpose run
+--iterations 2` run with the estimates of the folder, with errors of 80 mm after alignment. The
+second refitting is repeated without them, from the same tracks, joints and cameras, and so is the
+whole run. Broadcast keypoints are in all. Errors are of the second iteration's bodies against the
+truth, of people in the broadcast image, in those chunks, wherever both have a body within half a
+metre. Whole runs recompute identities, which changes errors in either direction by more than
+estimates do.
 """
 
 from __future__ import annotations
@@ -36,15 +37,16 @@ from worldpose.synthetic.matches import simulate_match
 Floats = NDArray[np.float64]
 SCENARIO, PEOPLE = SCENARIOS["tiny-broadcast"], 12
 LENGTH = (0.6, 1.2)
-"""Of a stretch [s]."""
+"""Duration of a chunk [s]."""
 FIRST = 0.3
-"""Earliest beginning of a stretch, and least time after it [s]: tracks begin and end seen well."""
+"""Earliest beginning of a chunk, and minimum time after it [s]: tracks begin and end in full
+view."""
 FAR = 0.5
-"""Bodies farther from everybody are nobody's [m]."""
+"""Bodies farther from all persons belong to none [m]."""
 
 
 def run(store: Store, folder: Path, iterations: int) -> tuple[str, list[PlannedUnit]]:
-    """Compute what `worldpose run FOLDER --iterations N` does, in this process.
+    """Run the steps of `worldpose run FOLDER --iterations N` in this process.
 
     Returns:
         The match's id and all units of the last iteration.
@@ -61,11 +63,11 @@ def run(store: Store, folder: Path, iterations: int) -> tuple[str, list[PlannedU
 
 
 def thin(match: Path, seed: int, fps: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Take detections out of a match folder.
+    """Remove detections from a match folder.
 
     Returns:
-        (frames, persons) how many static cameras were left to whom; -1 where all that see him
-        were. And (frames, persons), who is found in the broadcast picture.
+        (frames, persons) number of remaining static cameras; -1 where no camera was removed. And
+        (frames, persons), whether the broadcast camera has a detection of the person.
     """
     rng = np.random.default_rng([seed, 7])
     identities = {
@@ -139,7 +141,7 @@ def errors(found: Floats, match: Path) -> Floats:
 
 
 def measure(folder: Path, seed: int, duration: float) -> dict[str, tuple[int, float, float]]:
-    """Return how many bodies there are, and their errors without and with estimates [mm]."""
+    """Return the number of bodies, and their errors without and with estimates [mm]."""
     match = folder / "match"
     crowd = SCENARIO.crowd.model_copy(update={"people": PEOPLE})
     scenario = SCENARIO.model_copy(update={"crowd": crowd})
@@ -169,7 +171,7 @@ def measure(folder: Path, seed: int, duration: float) -> dict[str, tuple[int, fl
 
 
 def main() -> None:
-    """Print a line a seed, and the means."""
+    """Print one line per seed, and the means."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, nargs="+", default=[825, 826, 827, 828])
     parser.add_argument("--duration", type=float, default=2.0)
@@ -188,7 +190,7 @@ def main() -> None:
 
 
 def _line(rows: list[dict[str, tuple[int, float, float]]]) -> str:
-    """Errors by cameras left, bodies counted alike."""
+    """Return errors by cameras left, with equal weight per body."""
     parts = []
     for label in rows[0]:
         counts = [row[label][0] for row in rows]

@@ -1,11 +1,11 @@
-"""Prints how fast and how well people are told apart, beside plain peers in the same run.
+"""Prints speed and accuracy of person association, next to simple peers in the same run.
 
     python benchmarks/tracking.py [--frames 100] [--people 22] [--rounds 5]
 
-Sixteen cameras about a pitch, detections in any order, 15 % missed, one false person a view, 1.5 px
-noise. Association takes the true poses of the frame before, so all methods solve the same problem;
-all sides take turns in one process with one thread and the best round of each counts. The loops are
-written as research code often is, joint by joint, and are timed on one frame.
+Sixteen cameras around a pitch, detections in any order, 15 % missed, one false positive per view,
+1.5 px noise. Association takes the true poses of the previous frame, so all methods solve the same
+problem; all sides take turns in one process with one thread and the best round of each counts. The
+loops are typical research code, joint by joint, and are timed on one frame.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def crowd(frames: int, people: int, rng: np.random.Generator) -> np.ndarray:
 def detections(
     cameras: Camera, joints: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return keypoints (frames, cameras, detections, 17, 2) and whose they are, -1 for nobody."""
+    """Return keypoints (frames, cameras, detections, 17, 2) and their persons, -1 for none."""
     frames, people = joints.shape[:2]
     keypoints = np.full((frames, CAMERAS, people + 1, 17, 2), np.nan)
     owner = np.full(keypoints.shape[:3], -1)
@@ -99,7 +99,7 @@ def numpy_affinity(joints: np.ndarray, centers: np.ndarray, rays: np.ndarray) ->
 
 
 def loop_affinity(joints: np.ndarray, centers: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Return the same, joint by joint."""
+    """Return the same mean distances, joint by joint."""
     affinity = np.full((len(rays), len(joints), rays.shape[1]), -np.inf)
     for c, person, detection in np.ndindex(affinity.shape):
         if np.isfinite(rays[c, detection, 0, 0]):
@@ -128,7 +128,7 @@ def numpy_greedy(affinity: np.ndarray) -> np.ndarray:
 
 
 def hungarian(affinity: np.ndarray) -> np.ndarray:
-    """Return each person's detection by scipy's method."""
+    """Return each person's detection by scipy's assignment."""
     index = np.full(affinity.shape[:2], -1)
     for c, gains in enumerate(affinity):
         row, column = linear_sum_assignment(np.where(gains < -GATE, 1e3, -gains))

@@ -1,10 +1,10 @@
-"""Prints how well people are kept apart in simulated clips, cameras as surveyed.
+"""Prints the tracking accuracy in simulated clips, cameras as surveyed.
 
     python benchmarks/tracking_accuracy.py [match:501:60 corner-kick:501 crossing:501 ...]
     python benchmarks/tracking_accuracy.py --trajectories DATA
 
 A clip is scenario:seed, or scenario:seed:seconds. With `--trajectories` people run along the
-recorded ways in that folder's files, at most twelve seconds of each. Coverage is over people's
+recorded paths in that folder's files, at most twelve seconds of each. Coverage is over people's
 frames with two cameras or more; speed is processor time of tracking alone.
 """
 
@@ -27,7 +27,7 @@ LONGEST, MOST = 12.0, 25
 
 
 def tell(name: str, scene: Scene, fps: float) -> None:
-    """Print a clip's figures."""
+    """Print a clip's metrics."""
     seen = scene.static_views()
     cameras = Camera.stack(list(scene.given.values()))
     begin = time.process_time()
@@ -45,7 +45,7 @@ def tell(name: str, scene: Scene, fps: float) -> None:
 
 
 def driven(file: Path) -> tuple[Scenario, Scene]:
-    """Return `match` with people who run as recorded."""
+    """Return `match` with people on recorded paths."""
     paths, length = read_trajectories(file, LONGEST, most=MOST)
     base = SCENARIOS["match"]
     crowd = base.crowd.model_copy(update={"people": len(paths), "officials": 0})
@@ -55,7 +55,7 @@ def driven(file: Path) -> tuple[Scenario, Scene]:
 
 
 def main() -> None:
-    """Print one line a clip."""
+    """Print one line per clip."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("clips", nargs="*", default=CLIPS)
     parser.add_argument("--trajectories", type=Path, help="folder of recorded ways, *.npz")

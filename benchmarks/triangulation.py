@@ -1,13 +1,13 @@
-"""Prints how fast and how well joints are triangulated, beside peers in the same run.
+"""Prints speed and accuracy of joint triangulation, next to peers in the same run.
 
     python benchmarks/triangulation.py [--frames 500] [--rounds 3]
 
 22 people of 17 joints before 16 cameras; noise of 1.5 px with a heavy spread, 20 % of keypoints
-missing, 5 % displaced by 15 to 150 px. All sides start from pixels and use one thread; they take
+missing, 5 % outliers of 15 to 150 px. All sides start from pixels and use one thread; they take
 turns and the best round counts, in processor time, so that other work on the machine matters
 little. "aniposelib-style" is that library's published algorithm written here (undistort with
-OpenCV, one SVD a point, a loop over points): the library is not needed. It and "EasyMocap-style"
-(one SVD call a person) run on a part, their time is scaled.
+OpenCV, one SVD per point, a loop over points): the library is not needed. It and "EasyMocap-style"
+(one SVD call per person) run on a part of the points, and their times are scaled.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
 CAMERAS, PEOPLE, JOINTS = 16, 22, 17
 PART = 17 * 60
-# The points are no bodies, which have a left and a right.
+# The points are not bodies, so left-right swaps do not apply.
 STATED = TriangulationSettings(learn_noise=False, offsets="none", undo_swaps=False)
 
 
 def rig(rng: np.random.Generator) -> Camera:
-    """Cameras in the stands, each framing a part of the pitch."""
+    """Return cameras in the stands, each of which sees a part of the pitch."""
     cameras = []
     for n in range(CAMERAS):
         angle = 2 * np.pi * (n + rng.uniform(-0.2, 0.2)) / CAMERAS
@@ -52,7 +52,7 @@ def rig(rng: np.random.Generator) -> Camera:
 
 
 def workload(frames: int) -> tuple[Camera, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Cameras, joints (n, 3), pixels (cameras, n, 2), confidence (cameras, n), displaced."""
+    """Return cameras, joints (n, 3), pixels (cameras, n, 2), confidence (cameras, n), outliers."""
     rng = np.random.default_rng(0)
     cameras = rig(rng)
     seconds = np.arange(frames)[:, None] / 50.0
@@ -76,7 +76,7 @@ def workload(frames: int) -> tuple[Camera, np.ndarray, np.ndarray, np.ndarray, n
 
 
 def main() -> None:
-    """Print one line a method."""
+    """Print one line per method."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=500)
     parser.add_argument("--rounds", type=int, default=3)
@@ -175,7 +175,7 @@ def main() -> None:
             out[n] = vector[:3] / vector[3]
         return out
 
-    # All sides have pixels and confidence in the order that they work in.
+    # All sides have pixels and confidence in their own memory order.
     given, inliers = by_frame(sure), by_frame(np.where(displaced, 0.0, sure))
     sides: dict[str, Callable[[], np.ndarray]] = {
         "ours, robust": lambda: ours(given, STATED),

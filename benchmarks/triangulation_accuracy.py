@@ -1,11 +1,11 @@
-"""Prints what errors of calibration do to poses, with and without offsets of the cameras (T3, T4).
+"""Prints pose errors from calibration errors, with and without offsets of the cameras (T3, T4).
 
     python benchmarks/triangulation_accuracy.py [--scenario penalty-box] [--seeds 501 502 503 504]
 
-Tracked and triangulated with exact cameras, then with cameras that are turned, shifted and zoomed
-at random until they misplace people by 5 cm (root mean square over cameras and joints of the
-distance of the joint to the ray of its true pixel). "none" takes cameras as exact, "midhip" is the
-paper's second stage, "body" ours.
+Tracked and triangulated with exact cameras, then with cameras with random rotation, shift and zoom
+errors that misplace people by 5 cm (root mean square over cameras and joints of the distance of the
+joint to the ray of its true pixel). "none" takes cameras as exact, "midhip" is the paper's second
+stage, "body" ours.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from worldpose.triangulation import TriangulationSettings, triangulate_joints
 SMALL = CalibrationErrors(rotation=3e-4, center=0.1, focal=1e-3)
 WAYS = ("none", "midhip", "body")
 WANTED = 0.05
-"""How far cameras misplace people [m]."""
+"""Misplacement of people by the cameras [m]."""
 
 
 def misplaced(given: Camera, true: Camera, joints: NDArray[np.float64]) -> float:
-    """Return the root mean square over cameras of how far people are put beside themselves [m]."""
+    """Return the root mean square over cameras of people's distances to their rays [m]."""
     points = joints[::10].reshape(-1, 3)
     pixels = true.project(points)
     seen = ((pixels > 0.0) & (pixels < true.image_size[:, None] - 1.0)).all(axis=-1)
@@ -72,7 +72,7 @@ def scored(scene: Scene, cameras: Camera, fps: float) -> NDArray[np.float64]:
 
 
 def main() -> None:
-    """Print one block for exact cameras and one for those that are off."""
+    """Print one block for exact cameras and one for inexact ones."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenario", default="penalty-box")
     parser.add_argument("--seeds", type=int, nargs="+", default=[501, 502, 503, 504])

@@ -1,1 +1,1 @@
-"""Order, fan-out and reruns: the paper's method as Prefect flows, and the command line."""
+"""Orchestration: the paper's method as Prefect flows, and the command line."""

@@ -41,8 +41,8 @@ CLICKS: Final = {
     ),
     "many clicks": ClickSettings(),
 }
-"""Five or six in a third of the picture, 1.5 px off; and eight to twelve all over it, 1 px off,
-some of them wrong."""
+"""Five or six clicks in a third of the image with 1.5 px noise; eight to twelve all over it with
+1 px noise, some of them wrong."""
 
 PAPER: Final = {
     "base": (83.5, 70.8),
@@ -59,19 +59,19 @@ TRIANGULATIONS: Final = {
     ", stated noise": _OURS.model_copy(update=_STATED),
     ", plain least squares": _OURS.model_copy(update=_STATED | {"max_deviation": 1e6}),
 }
-"""Ours; views that agree, at their stated weight, calibration's errors not taken off; and every
-view so, however far off."""
+"""Our settings; then robust triangulation with the stated noise and no camera errors; then plain
+least squares without outlier rejection."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """One row of one trial.
+    """Metrics of one row of one trial.
 
     Attributes:
-        g_mpjpe_mm: mean joint distance after the alignment of everybody [mm].
+        g_mpjpe_mm: mean joint distance after one alignment of all people [mm].
         pa_mpjpe_mm: mean joint distance after alignment of each pose [mm].
-        ground_error_m: median over the cameras' pitch [m].
-        marking_error_px: of the clicks that calibration rests on, mean over cameras [px].
+        ground_error_m: median over the part of the pitch that the cameras see [m].
+        marking_error_px: residual of the clicks used for calibration, mean over cameras [px].
         changed: share of cameras that the adjustment changed [1].
     """
 
@@ -83,16 +83,16 @@ class Score:
 
 
 def trial(seed: int, clicks: ClickSettings) -> dict[str, Score]:
-    """The rows of one simulated trial by name.
+    """Return the rows of one simulated trial by name.
 
-    Base is calibration from clicks alone, without painted lines, as the paper's was. `S only`
-    frees the whole lens and forgets what is known of cameras, as people do it; its rows without
-    guard are what the guard is for. Every row is triangulated from the same tracks; the last one
+    Base is calibration from clicks alone, without painted lines, as in the paper. `S only` frees
+    the whole lens and drops the camera priors, as is common practice; the rows `unguarded` show its
+    result without held-out validation. Every row is triangulated from the same tracks; the last one
     fits bodies to our triangulation after adjustment.
 
     Args:
-        seed: of the trial.
-        clicks: how people click.
+        seed: random seed of the trial.
+        clicks: simulated click noise.
 
     Note:
         Paper, table of the Vicon trial.
@@ -130,7 +130,7 @@ def ablation(
     progress: Callable[[str, int], None] = lambda clicks, seed: None,
     clicks: Mapping[str, ClickSettings] = CLICKS,
 ) -> dict[str, list[dict[str, Score]]]:
-    """The trials of all seeds, by how people click."""
+    """Return the trials of all seeds, by click settings."""
     trials: dict[str, list[dict[str, Score]]] = {}
     numbers = tuple(seeds)
     for name, settings in clicks.items():
@@ -142,7 +142,7 @@ def ablation(
 
 
 def _calibrated(scene: Scene, pitch: PitchTemplate) -> dict[str, StaticCalibration]:
-    """The cameras whose clicks determine them: of the others a person would be asked for more."""
+    """Calibrate the cameras whose clicks determine them; skip the others."""
     found = {}
     for name, camera in scene.cameras.items():
         size = (int(camera.image_size[0]), int(camera.image_size[1]))
@@ -159,7 +159,7 @@ def _calibrated(scene: Scene, pitch: PitchTemplate) -> dict[str, StaticCalibrati
 def _clip(
     scene: Scene, calibrations: Mapping[str, StaticCalibration], pitch: PitchTemplate
 ) -> Clip:
-    """The trial as bundle adjustment takes it: tracked and triangulated with the base cameras."""
+    """Track and triangulate the trial with the base cameras; return bundle adjustment's input."""
     seen = scene.static_views(list(calibrations))
     keypoints, confidence = seen.keypoints, seen.confidence
     cameras = Camera.stack([known.estimate.camera for known in calibrations.values()])
@@ -207,7 +207,7 @@ def _score(
     covariance: np.ndarray | None = None,
     bodies: bool = False,
 ) -> Score:
-    """The score of cameras and of the joints that they give, or of bodies fitted to these."""
+    """Score cameras and the joints triangulated with them, or bodies fitted to these joints."""
     index = clip.detection_index.astype(np.int16)
     seen = (cameras, clip.keypoints, clip.confidence, index)
     placed = triangulate_joints(*seen, settings, covariance)

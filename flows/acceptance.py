@@ -1,4 +1,4 @@
-"""What of a camera's people is left to look at, and what a person found right at once."""
+"""Acceptance of a camera's detections: those still open, and those that a person accepted."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from worldpose.store import Store
 
 
 def left_to_look_at(store: Store, match: Match, camera: str) -> list[OpenDetections]:
-    """Whom nobody has accepted or corrected, by result of the camera.
+    """Return the detections that no person has accepted or corrected, by result of the camera.
 
     Args:
         store: the store.
-        match: with its journal.
+        match: the match with its journal.
         camera: a static camera, or the clip of a broadcast camera.
 
     Raises:
-        InputError: the latest run has nobody seen by this camera.
+        InputError: the latest run has no detections of this camera.
     """
     said = [each for each in match.journal.records if isinstance(each, Acceptance)]
     edits = [
@@ -51,18 +51,19 @@ def accept(
     people: Sequence[tuple[int, int]],
     who: str,
 ) -> Acceptance:
-    """Keep that a person found detections right.
+    """Record in the journal that a person accepted detections.
 
     Args:
-        store: where the journal lies.
+        store: the store that holds the journal.
         match: the match.
         camera: a static camera, or the clip of a broadcast camera.
-        at_least: everybody whose score is at least this [1]; None = nobody but those named.
-        people: match frame, and place among the detections of the frame.
-        who: the person.
+        at_least: accept every detection with at least this score [1]; None = only those in
+            `people`.
+        people: match frame, and index among the detections of the frame.
+        who: name of the reviewer.
 
     Raises:
-        InputError: the latest run has nobody seen by this camera.
+        InputError: the latest run has no detections of this camera.
     """
     names = results_of(store, match, camera)
     acceptance = Acceptance(

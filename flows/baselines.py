@@ -1,4 +1,4 @@
-"""Scores of other methods' results, by the paper's protocol (E1-E5)."""
+"""Scores of baseline methods' results under the paper's protocol (E1-E5)."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ def score_methods(
     seen_fps: Mapping[str, float] | None = None,
     settings: EvaluationSettings | None = None,
 ) -> tuple[MethodScore, ...]:
-    """The scores of methods' results, each with the settings under which it came about.
+    """Score results of baseline methods; return each score with its settings.
 
     Args:
-        named: NAME=PATH of each.
-        reference: the truth, as for `worldpose evaluate`.
-        match_in: the reference's camera in whose picture tracks are matched (E3).
-        body: body that poses are put on; None = the open body.
-        first_frame: match frame of the methods' first picture; None = the reference's first.
-        fps: frames in a second; None = the match's, where there is one.
-        seen_fps: name of a method to the frames in a second of the video that it saw, where that is
-            not the clip's; its result is put on the clip's frames.
+        named: NAME=PATH of each result.
+        reference: ground truth, as for `worldpose evaluate`.
+        match_in: reference camera in whose image tracks are matched (E3).
+        body: body model that poses are applied to; None = the open body.
+        first_frame: match frame of the methods' first image; None = the reference's first.
+        fps: frames per second; None = the match's, if there is one.
+        seen_fps: name of a method to the frames per second of its input video, if not the clip's;
+            the result is resampled to the clip's frames.
         settings: the defaults if None.
 
     Raises:
-        UsageError: an unknown method, no such camera, or a method that needs one to be matched.
-        InputError: a file is not what the method writes.
+        UsageError: an unknown method, an unknown camera, or a method that needs `match_in`.
+        InputError: a file is not in the method's format.
     """
     settings = settings or EvaluationSettings()
     truth = reference_side(reference)
@@ -115,7 +115,7 @@ def score_methods(
 
 
 def _require_scored(named: Sequence[str], seen_fps: Mapping[str, float]) -> None:
-    """Refuse a frame rate of a method that is not scored."""
+    """Refuse a frame rate for a method that is not scored."""
     names = [item.partition("=")[0] for item in named]
     for name in seen_fps:
         if name not in names:
@@ -139,7 +139,7 @@ def _clip_fps(fps: float | None, name: str) -> float:
 
 
 def _picture(camera: Camera | None) -> tuple[int, int]:
-    """Width and height of the video [px]."""
+    """Return width and height of the video [px]."""
     if camera is None:
         return RELEASE_SIZE
     width, height = (int(side) for side in camera.image_size.reshape(-1, 2)[0])
@@ -147,7 +147,7 @@ def _picture(camera: Camera | None) -> tuple[int, int]:
 
 
 def _boxes(result: MethodResult, camera: Camera | None) -> NDArray[np.float64] | None:
-    """The method's boxes in the picture of the camera [px]."""
+    """Return the method's boxes in the camera's image [px]."""
     if result.boxes is None or camera is None or result.picture is None:
         return result.boxes
     width, height = np.array(_picture(camera)) / np.array(result.picture)

@@ -1,4 +1,4 @@
-"""What a run goes on from: the stages before its own, and the iteration before."""
+"""Results that a run starts from: earlier stages, and the previous iteration."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from worldpose.store import Store
 
 @dataclass(frozen=True)
 class Basis:
-    """What is there before a run's first stage.
+    """Results that exist before a run's first stage.
 
     Attributes:
-        results: `stage/unit` to key of the stages before.
-        iteration: which pass over the method the run is of, from 1.
-        before: `stage/unit` to key of the pass before; None in the first.
+        results: `stage/unit` to result key, for the stages before.
+        iteration: iteration number of the run, from 1.
+        before: `stage/unit` to result key of the previous iteration; None in the first.
     """
 
     results: Mapping[str, str]
@@ -37,19 +37,19 @@ def basis_of(
     latest: RunRecord | None,
     iteration: int,
 ) -> Basis:
-    """What a run of `stages` goes on from.
+    """Return the results that a run of `stages` starts from.
 
-    A run of the method from its first stage has the pass before it, with its own settings. Any
-    other goes on with the latest run: the results of the stages before stand, stale or not, of
-    whichever pass they are, and so does what that pass was made of.
+    A run from the method's first stage uses the previous iteration with its own settings. Any other
+    run continues the latest run: it takes that run's results of earlier stages, stale or not, and
+    the previous iteration that they were computed from.
 
     Args:
         store: the store.
         match: the match.
-        stages: those of the run.
-        overrides: its settings that differ from their defaults.
+        stages: stages of the run.
+        overrides: settings that differ from their defaults.
         latest: the match's latest run.
-        iteration: which pass it is, if it goes on with no other.
+        iteration: iteration number, if the run does not continue the latest run.
     """
     if stages[0] is METHOD[0]:
         return Basis({}, iteration, results_before(store, match, overrides, iteration))
@@ -64,7 +64,7 @@ def basis_of(
 
 
 def _made_of(store: Store, match: Match, latest: RunRecord) -> dict[str, str]:
-    """What the latest run took from the pass before it, as its results' recipes say."""
+    """Return the latest run's inputs from the previous iteration, read from its recipes."""
     before: dict[str, str] = {}
     for stage in METHOD:
         for unit in stage.units(match):
@@ -74,7 +74,7 @@ def _made_of(store: Store, match: Match, latest: RunRecord) -> dict[str, str]:
                 continue
             try:
                 manifest = store.manifest(match.match_id, stage.name, unit, latest.results[name])
-            except StoreError:  # withdrawn: the others tell, or what it was made of is missed
+            except StoreError:  # withdrawn: other recipes name them, else missing
                 continue
             inputs = manifest.recipe.inputs
             before |= {each: inputs[each] for each in taken if each in inputs}

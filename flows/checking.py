@@ -1,4 +1,4 @@
-"""Checking an exported data set, clip by clip."""
+"""Validation of an exported data set, clip by clip."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from worldpose.dataset.reading import clips_in, read_clip
 from worldpose.dataset.settings import CheckSettings
 
 USUAL_FPS = 50.0
-"""Frames in a second where neither an export nor a person says it: the released clips'."""
+"""Frames per second if neither an export nor a person states it: that of the released clips."""
 
 
 def stated_rates(folder: Path, fps: float | None = None) -> dict[str, float | None]:
-    """Frames in a second of a data set's clips; None where neither it nor a person says it.
+    """Return the frames per second of each clip of a data set; None where it is not stated.
 
     Raises:
         InputError: a file cannot be read.
@@ -35,14 +35,14 @@ def check(
     pitch: bool = True,
     settings: CheckSettings | None = None,
 ) -> CheckReport:
-    """What is wrong with a data set, and what was measured; one clip is in memory at a time.
+    """Check a data set and return faults and measurements; one clip is in memory at a time.
 
     Args:
-        folder: what `worldpose export` wrote, or another of the same layout.
-        fps: frames in a second; None = what the data set says, or 50.
+        folder: written by `worldpose export`, or another folder of the same layout.
+        fps: frames per second; None = as the data set states, or 50.
         body: body model of pose files that name none; None = the open body.
-        pitch: whether the ground is z = 0; a manifest may say that it is not.
-        settings: what counts as wrong.
+        pitch: whether the ground is z = 0; a manifest can state otherwise.
+        settings: thresholds of the checks.
 
     Raises:
         InputError: a file cannot be read.

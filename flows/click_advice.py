@@ -1,4 +1,4 @@
-"""Whether the clicks of a run are as far off as the settings state."""
+"""Advice on the click noise setting, from the residuals of a run's clicks."""
 
 from __future__ import annotations
 
@@ -7,20 +7,21 @@ from math import sqrt
 from typing import Final
 
 FREEDOM: Final = 10.0
-"""Degrees of freedom of all cameras from which on people are told [1]."""
+"""Minimum degrees of freedom of all cameras for advice [1]."""
 WORTH: Final = 1.25
-"""Factor on the stated noise from which on people are told [1]."""
+"""Minimum ratio of estimated to stated noise for advice [1]."""
 SURE: Final = 4.0
-"""How many standard errors it must be above the stated one."""
+"""Minimum difference from the stated noise in standard errors."""
 
 
 def click_advice(figures: Mapping[str, Mapping[str, float]], stated: float) -> list[str]:
-    """What people are told where clicks are clearly farther off than stated.
+    """Return advice if the click noise is significantly larger than stated.
 
-    The clicks of all cameras are pooled: a camera with few of them hardly tells its own noise.
+    The clicks of all cameras are pooled: a single camera with few clicks cannot determine its
+    noise.
 
     Args:
-        figures: of a run, by unit and name.
+        figures: metrics of a run, by unit and name.
         stated: `static_calibration.click_noise` of that run [px].
     """
     told = [

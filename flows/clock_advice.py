@@ -1,4 +1,4 @@
-"""Which static cameras a run shows to be out of step, and what match.yaml should say of them."""
+"""Advice on clock offsets of static cameras in match.yaml, from a run's metrics."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from typing import Final
 from data_contracts.match import MatchSpec
 
 STAGES: Final = ("filtering", "retriangulation", "triangulation")
-"""Whose figures tell, the best first: adjusted cameras take in much of what their clocks are late,
-and filtering alone tells one from the other."""
+"""Stages that estimate clock offsets, most accurate first: adjusted cameras absorb much of a
+clock offset, and only filtering separates the two."""
 LATE: Final = "clock_late_frames."
 ERROR: Final = "clock_error_frames."
 WORTH: Final = 0.5
-"""Difference from which on another whole offset is nearer [frame]."""
+"""Minimum difference for advice: from here another integer offset is nearer [frame]."""
 SURE: Final = 4.0
-"""Difference in standard errors from which on people are told."""
+"""Minimum difference for advice in standard errors."""
 
 
 def clock_advice(figures: Mapping[str, Mapping[str, float]], spec: MatchSpec) -> list[str]:
-    """What people are told of cameras that are out of step, one line a camera.
+    """Return one line of advice per camera with a significant clock offset.
 
     Args:
-        figures: of a run, by unit and name.
-        spec: match.yaml as that run had it.
+        figures: metrics of a run, by unit and name.
+        spec: match.yaml as of that run.
     """
     said = []
     for camera in spec.static_cameras:
@@ -46,10 +46,10 @@ def clock_advice(figures: Mapping[str, Mapping[str, float]], spec: MatchSpec) ->
 def _difference(
     figures: Mapping[str, Mapping[str, float]], clip: str, camera: str
 ) -> tuple[float, float] | None:
-    """By how much a camera is later than most others, and its standard error [frame].
+    """Return a camera's clock offset relative to the median camera, and its standard error [frame].
 
-    Figures are against the mean, which a camera far off has moved: the median stays. Of two cameras
-    the earlier one counts as right, so that not both are moved.
+    Metrics are relative to the mean, which an outlier camera shifts; the median is robust. Of two
+    cameras the earlier one counts as correct, so that only one is corrected.
     """
     stages = [figures.get(f"{stage}/{clip}", {}) for stage in STAGES]
     for stage in stages:

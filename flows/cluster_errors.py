@@ -1,4 +1,4 @@
-"""When what fails is the machines of a run, and not what it computes."""
+"""Detection of failures of a run's machines, as opposed to failures of its computation."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from pathlib import Path
 from worldpose.errors import StoreError, WorldposeError
 
 LITTLE_BYTES = 1 << 20
-"""With less than this free [byte], Prefect's database cannot take a transaction."""
+"""Free disk space below which Prefect's database cannot complete a transaction [byte]."""
 
 
 class LostWorkersError(WorldposeError):
-    """The Prefect server or the Dask scheduler of a run was lost; all that was finished is kept."""
+    """The Prefect server or the Dask scheduler of a run was lost; finished results are kept."""
 
 
 def require_room(failure: BaseException, project: str) -> None:
-    """Go on only if a failure of Prefect, or of what starts it, is not that of a full disk.
+    """Raise StoreError if a failure of Prefect was caused by a full disk; else return.
 
     Args:
-        failure: what was raised; Prefect says no more of its database than `500`.
-        project: folder or URL of the store; Prefect's database lies there, or in a passing folder.
+        failure: the exception; Prefect reports database failures only as `500`.
+        project: folder or URL of the store; Prefect's database is there, or in a temporary folder.
 
     Raises:
         StoreError: the disk of one of them is full.
@@ -41,12 +41,12 @@ def require_room(failure: BaseException, project: str) -> None:
 
 
 def require_workers(failure: BaseException) -> None:
-    """Go on only if a unit's failure is its own.
+    """Raise LostWorkersError if a unit failed because its machines are gone; else return.
 
     Raises:
-        LostWorkersError: the machines that the run uses are gone; its other units would fail too.
+        LostWorkersError: the run's machines are gone; its other units would fail too.
     """
-    # Late: only runs that compute need them.
+    # Imported here: only runs that compute need them.
     import httpx
     from distributed.client import FutureCancelledError
     from distributed.comm.core import CommClosedError

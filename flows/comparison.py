@@ -1,9 +1,9 @@
-"""Two runs of a match in figures: which cameras, clips and players are better, worse, unchanged.
+"""Comparison of two runs of a match by metrics: cameras, clips and players better or worse.
 
-Only figures of which less is better are compared, and none that needs the truth. A figure is better
-or worse where it changed by more than 1 % of what it was, and by more than what matters of it. A
-camera, clip or player is better where some of its figures are better and none is worse, worse the
-other way round, mixed where both are, else unchanged.
+Only metrics where lower is better are compared, and none that needs ground truth. A metric is
+better or worse if it changed by more than 1 % and by more than its minimum relevant change. A
+camera, clip or player is better if some of its metrics are better and none is worse, worse in the
+opposite case, mixed if both occur, else unchanged.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Mark = Literal["better", "worse", "mixed", "unchanged", "only in A", "only in B"
 
 KINDS: Final[tuple[Kind, ...]] = ("match", "clip", "camera", "player")
 PART: Final = 0.01
-"""Of a figure, by which it must change [1]."""
+"""Minimum relative change of a metric [1]."""
 MATTERS: Final[Mapping[str, Mapping[str, float]]] = {
     "static_calibration": {"expected_ground_error_median_m": 1e-3, "clicks_wrong": 0.0},
     "tracking": {"mean_ray_distance_m": 1e-3, "unmatched_share": 1e-3, "undecided": 0.0},
@@ -39,9 +39,9 @@ MATTERS: Final[Mapping[str, Mapping[str, float]]] = {
     "broadcast_calibration": {"expected_error_median_px": 0.01},
     "filtering": {"held_out_error": 1e-4, "rejected_share": 1e-3},
 }
-"""Stage, figure, and the least change of it that matters, in its unit; `bodies` are those that were
-fitted last. A tenth of a millimetre and a hundredth of a pixel are below what a joint's standard
-deviation of 30 mm can tell; shares are of thousands of keypoints."""
+"""Stage, metric, and its minimum relevant change, in its unit; `bodies` are those of the last
+fit. A tenth of a millimetre and a hundredth of a pixel are below the resolution of a joint's
+standard deviation of 30 mm; shares are of thousands of keypoints."""
 
 Figures = dict[str, float]
 Subject = tuple[Kind, str]
@@ -49,7 +49,7 @@ Subject = tuple[Kind, str]
 
 @dataclass(frozen=True)
 class Change:
-    """One figure, as `stage/unit figure`, in two runs."""
+    """One metric, as `stage/unit figure`, in two runs."""
 
     figure: str
     before: float
@@ -59,13 +59,13 @@ class Change:
 
 @dataclass(frozen=True)
 class SubjectChange:
-    """A camera, clip, player or the match in two runs.
+    """Metrics of a camera, clip, player or the match in two runs.
 
     Attributes:
-        kind: what it is.
-        name: its id; of a player as `clip: person 3`.
-        mark: over its figures.
-        figures: those that both runs have.
+        kind: kind of the subject.
+        name: its id; for a player `clip: person 3`.
+        mark: summary over its metrics.
+        figures: metrics that both runs have.
     """
 
     kind: Kind
@@ -75,10 +75,9 @@ class SubjectChange:
 
 
 def compare_runs(store: Store, a: RunRecord, b: RunRecord) -> list[SubjectChange]:
-    """How the match, its clips, cameras and players fare in B against A.
+    """Compare the match, its clips, cameras and players in B with A.
 
-    Players are paired by where they are, whatever their ids; one who is in one run alone is so
-    marked.
+    Players are paired by position, whatever their ids; a player in only one run is marked so.
     """
     before = _subjects(a, {})
     after = _subjects(b, paired_people(store, a, b))
@@ -89,7 +88,7 @@ def compare_runs(store: Store, a: RunRecord, b: RunRecord) -> list[SubjectChange
 
 
 def count_marks(changes: list[SubjectChange], kind: Kind) -> dict[Mark, int]:
-    """How many subjects of a kind have each mark."""
+    """Return the number of subjects of a kind by mark."""
     return dict(Counter(change.mark for change in changes if change.kind == kind))
 
 
@@ -114,7 +113,7 @@ def _mark(figure: str, before: float, after: float) -> Mark:
 
 
 def _subjects(record: RunRecord, names: Mapping[tuple[str, str], str]) -> dict[Subject, Figures]:
-    """Every subject of a run with its figures; `names` are those of players in the other run."""
+    """Return the metrics of every subject of a run; `names` are players' names in the other run."""
     found: dict[Subject, Figures] = {}
     for unit, figures in _last_of_all(record):
         stage, _, place = unit.partition("/")
@@ -127,7 +126,7 @@ def _subjects(record: RunRecord, names: Mapping[tuple[str, str], str]) -> dict[S
 
 
 def _last_of_all(record: RunRecord) -> Iterator[tuple[str, Mapping[str, float]]]:
-    """Units with figures; bodies only as they were fitted last."""
+    """Yield units with metrics; bodies only from the last fit."""
     for unit, figures in record.figures.items():
         stage, _, clip = unit.partition("/")
         if stage not in BODY_STAGES:
@@ -149,7 +148,7 @@ def _subject(stage: str, unit: str, part: str, names: Mapping[tuple[str, str], s
 
 
 def _order(subject: Subject) -> tuple[int, list[str | int]]:
-    """Kinds in order, names as people count."""
+    """Return a sort key: kinds in order, names in natural order."""
     kind, name = subject
     parts = re.split(r"(\d+)", name)
     return KINDS.index(kind), [int(part) if part.isdigit() else part for part in parts]

@@ -1,4 +1,4 @@
-"""Corrections of a match: taken in, taken back, and laid over what its folder holds."""
+"""Corrections of a match: recording, withdrawing, and applying them to its folder's content."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from worldpose.store import Store
 
 
 def corrected_match(store: Store, folder: MatchFolder, registration: Registration) -> Match:
-    """The match as people have corrected it; no file of its folder changes."""
+    """Return the match with its corrections applied; no file of its folder changes."""
     journal = read_journal(store, registration.spec.match_id)
     replay = _replayed(store, folder, tuple(journal.standing.values()))
     return Match(replay.folder, registration, journal, replay.applied, replay.stale)
@@ -39,11 +39,11 @@ def corrected_match(store: Store, folder: MatchFolder, registration: Registratio
 _REPLAYED: WeakKeyDictionary[
     Store, dict[str, tuple[MatchFolder, tuple[Correction, ...], Replay]]
 ] = WeakKeyDictionary()
-"""Match to its folder as it was read, the corrections that stood, and what they made of it."""
+"""Match to its folder as it was read, the corrections in force, and the replay result."""
 
 
 def _replayed(store: Store, folder: MatchFolder, standing: tuple[Correction, ...]) -> Replay:
-    """All corrections replayed; what was replayed before over the same folder is not again."""
+    """Replay all corrections; corrections already replayed on the same folder are not repeated."""
     known = _REPLAYED.setdefault(store, {})
     before, done, replay = known.get(folder.spec.match_id, (folder, (), Replay(folder)))
     if before != folder or standing[: len(done)] != done:
@@ -66,21 +66,21 @@ def new_corrections(
     results: Mapping[str, str],
     ids: Sequence[str] = (),
 ) -> list[Correction]:
-    """Edits as corrections to be said, each based on those before it.
+    """Turn edits into corrections, each based on those before it.
 
     Args:
-        match: as it was opened; its folder has the corrections that were standing then.
+        match: as it was opened; its folder has the corrections that were in force then.
         journal: as it is now.
-        edits: in the order they are to be applied.
-        who: the person.
-        note: in the person's words.
-        results: `stage/unit` to key of what the person looked at.
-        ids: of the corrections, one an edit; none = new ones.
+        edits: in the order of application.
+        who: name of the reviewer.
+        note: the reviewer's comment.
+        results: `stage/unit` to key of the results that the reviewer saw.
+        ids: one per edit for the corrections; empty = new ids.
 
     Raises:
-        StaleEditError: what an edit changes is no longer what it says that it was.
-        InputError: an edit that does not apply, because of what it names or of what somebody else
-            did in between; nothing is kept of any.
+        StaleEditError: the edited value differs from the edit's `was`.
+        InputError: an edit does not apply, because of its target or because of another person's
+            edit in between; no edit is kept.
     """
     standing = tuple(journal.standing.values())
     if standing != tuple(match.journal.standing.values()):
@@ -120,19 +120,19 @@ def new_corrections(
 def keep_edits(
     store: Store, open_match: Callable[[], Match], given: Mapping[str, Edit], *, who: str, note: str
 ) -> list[Correction]:
-    """Edits as corrections in the journal, all or none; durable when this returns.
+    """Record edits as corrections in the journal, all or none; durable on return.
 
-    What was kept already under an id is the same edit sent again, and is kept once.
+    An edit with an id that is already recorded counts as resent, and is kept once.
 
     Args:
-        store: where the journal lies.
-        open_match: gives the match with its journal as it is.
-        given: id to edit, in the order they are to be applied.
-        who: the person.
-        note: in the person's words.
+        store: the store that holds the journal.
+        open_match: returns the match with its current journal.
+        given: id to edit, in the order of application.
+        who: name of the reviewer.
+        note: the reviewer's comment.
 
     Raises:
-        StaleEditError: what an edit changes is no longer what it says that it was.
+        StaleEditError: the edited value differs from the edit's `was`.
         InputError: an edit does not apply.
     """
     while True:
@@ -157,7 +157,7 @@ def keep_edits(
 
 
 def _require_unchanged(folder: MatchFolder, standing: Sequence[Correction], edit: Edit) -> None:
-    """Refuse an edit of what is not as it says that it was, and tell who changed it."""
+    """Refuse an edit whose `was` differs from the current value; name the author of the change."""
     if not isinstance(edit, MovedPoint | RedrawnMarking) or value_now(folder, edit) == edit.was:
         return
     place = (edit.camera, edit.frame, edit.marking)
@@ -187,10 +187,10 @@ def _require_unchanged(folder: MatchFolder, standing: Sequence[Correction], edit
 
 
 def withdrawal(journal: Journal, correction: str, *, who: str, why: str) -> Withdrawal:
-    """A correction taken back, to be said.
+    """Return the withdrawal of a correction, to be recorded.
 
     Raises:
-        InputError: no such correction stands.
+        InputError: no such correction is in force.
     """
     if correction not in journal.standing:
         last = [*journal.standing][-10:]
@@ -210,6 +210,6 @@ def withdrawal(journal: Journal, correction: str, *, who: str, why: str) -> With
 
 
 def _looked_at(edit: Edit, results: Mapping[str, str]) -> dict[str, str]:
-    """The results that an edit is about."""
+    """Return the results that an edit refers to."""
     unit = getattr(edit, "camera", None) or getattr(edit, "clip", None)
     return {name: key for name, key in results.items() if name.partition("/")[2] == unit}

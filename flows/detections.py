@@ -1,4 +1,4 @@
-"""Whom a camera saw by now: what was given or detected, with all that people said since."""
+"""Current detections of a camera: given or detected, with all corrections since."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from worldpose.review.detections import (
 )
 from worldpose.store import Store, key_of
 
-if TYPE_CHECKING:  # it imports dask, which deciding what to run must not
+if TYPE_CHECKING:  # imports dask, which planning a run must not load
     import xarray as xr
 
 
 def detections_now(store: Store, match: Match, camera: str, frame: int) -> Observations:
-    """Whom a camera saw in one match frame, as corrected; a frame that it lacks has no row.
+    """Return a camera's corrected detections in one match frame; no row if the camera has no frame.
 
     Args:
         store: the store.
-        match: with the corrections so far.
+        match: the match with all corrections.
         camera: a static camera, or the clip of a broadcast camera.
         frame: match frame.
 
     Raises:
-        InputError: the latest run has nobody seen by this camera in this frame, or only with a
+        InputError: the latest run has no detections of this camera in this frame, or only with a
             correction that was withdrawn since.
     """
     stored, taken_in = _stored(store, match, camera, frame)
@@ -55,10 +55,10 @@ def detections_now(store: Store, match: Match, camera: str, frame: int) -> Obser
 
 
 def require_seen(store: Store, match: Match, edits: Sequence[Edit]) -> None:
-    """Refuse corrections of detections that do not fit what the cameras saw, as corrected by now.
+    """Refuse corrections that do not fit the cameras' current, corrected detections.
 
     Raises:
-        StaleEditError: somebody changed it, or the edit never fitted.
+        StaleEditError: another person changed the detection, or the edit never fitted.
     """
     found: dict[tuple[str, int], Observations] = {}
     for edit in edits:
@@ -87,13 +87,13 @@ def _stale(edit: DetectionEdit, objection: str) -> StaleEditError:
 def results_of(
     store: Store, match: Match, camera: str, frame: int | None = None
 ) -> tuple[str, ...]:
-    """The results of the latest run with whom a camera saw, as `stage/unit`.
+    """Return the latest run's results with a camera's detections, as `stage/unit`.
 
     Args:
         store: the store.
         match: the match.
         camera: a static camera, or the clip of a broadcast camera.
-        frame: of the clips that have this match frame; None = of all.
+        frame: only clips with this match frame; None = all clips.
 
     Raises:
         InputError: there are none.
@@ -123,7 +123,7 @@ def results_of(
 
 
 def stored_people(store: Store, match: Match, name: str) -> tuple[xr.Dataset, str]:
-    """Whom a camera saw, by `stage/unit`, and the key of that without corrections."""
+    """Return a camera's detections by `stage/unit`, and their key without corrections."""
     stored = _result(store, match, name)
     return stored.result, stored.plain
 
@@ -131,7 +131,7 @@ def stored_people(store: Store, match: Match, name: str) -> tuple[xr.Dataset, st
 def _stored(
     store: Store, match: Match, camera: str, frame: int
 ) -> tuple[xr.Dataset, list[JsonValue]]:
-    """The result that has a frame of a camera, and the edits of that frame it holds."""
+    """Return the result with a frame of a camera, and the edits of that frame that it contains."""
     stored = _result(store, match, results_of(store, match, camera, frame)[0])
     here = [each for each in stored.edits if isinstance(each, dict) and each["frame"] == frame]
     return stored.result, list(here)
@@ -139,12 +139,12 @@ def _stored(
 
 @dataclass(frozen=True, eq=False)
 class _Result:
-    """Whom a camera saw, as it is stored.
+    """Stored detections of a camera.
 
     Attributes:
-        result: without corrections where it is there so.
-        plain: its key without corrections.
-        edits: the corrections that it holds.
+        result: without corrections if that version is stored.
+        plain: key of the result without corrections.
+        edits: the corrections that it contains.
     """
 
     result: xr.Dataset
@@ -153,7 +153,7 @@ class _Result:
 
 
 def _result(store: Store, match: Match, name: str) -> _Result:
-    """A result of the latest run, by `stage/unit`."""
+    """Return a result of the latest run, by `stage/unit`."""
     stage, _, unit = name.partition("/")
     key = store.run(match.match_id).results[name]
     place = (match.match_id, stage, unit)

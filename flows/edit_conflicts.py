@@ -1,4 +1,4 @@
-"""Edits that somebody else was quicker than, and results and work that edits overtook."""
+"""Edits that conflict with newer edits, and results that edits made stale."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ E = TypeVar("E", bound=Record)
 
 
 class StaleEditError(InputError):
-    """Somebody changed what an edit changes, after the person who edits looked at it.
+    """The edited value changed after the reviewer looked at it.
 
     Attributes:
-        difference: what it was to the editor, what it is now, and who made it that.
+        difference: value that the editor saw, current value, and who changed it.
     """
 
     difference: Mapping[str, Any] = {}
 
 
 class EditedMeanwhileError(InputError):
-    """The match is no longer as it was when the iteration before was computed."""
+    """The match changed since the previous iteration was computed."""
 
 
 def edits_since(
     said: Sequence[E], taken_in: Sequence[JsonValue], place: str, match_id: str
 ) -> Sequence[E]:
-    """The edits that stand and that a result does not hold yet.
+    """Return the edits in force that a result does not contain yet.
 
     Args:
-        said: all that stand, in order.
-        taken_in: those that the result holds, as its recipe names them.
-        place: what it is the result of, for people.
+        said: all edits in force, in order.
+        taken_in: edits that the result contains, as its recipe lists them.
+        place: name of the result, for messages.
         match_id: the match.
 
     Raises:
-        InputError: the result holds one that was withdrawn since, so that it does not tell how
-            things are without.
+        InputError: the result contains an edit that was withdrawn since, so that the state without
+            it is unknown.
     """
     first, later = said[: len(taken_in)], said[len(taken_in) :]
     if [edit.model_dump(mode="json") for edit in first] != list(taken_in):

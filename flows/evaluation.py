@@ -1,4 +1,4 @@
-"""Predictions and references by whatever a person names them with, and their scores."""
+"""Loading of predictions and references by name, and their scores."""
 
 from __future__ import annotations
 
@@ -35,24 +35,24 @@ from worldpose.store import Store, open_run
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Figures against truth: all together, by true person, by camera."""
+    """Metrics against ground truth: total, by true person, by camera."""
 
     evaluation: Evaluation
     people: tuple[PersonScore, ...]
     cameras: tuple[CameraScore, ...]
     laid: ReferenceAlignment | None = None
-    """How markers were laid over the prediction, where they are the truth."""
+    """Alignment of markers to the prediction, if markers are the ground truth."""
 
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """What a prediction or a reference brings."""
+    """Data of a prediction or a reference."""
 
     joints: JointTracks | None
     cameras: Mapping[str, Camera]
-    """By camera, or by clip for the broadcast camera."""
+    """By static camera, or by clip for the broadcast camera."""
     match: MatchFolder | None = None
-    """The match it belongs to, where that is known."""
+    """The match it belongs to, if known."""
 
 
 def score(
@@ -66,23 +66,22 @@ def score(
     match_in: str | None = None,
     marker_map: Path | None = None,
 ) -> Scores:
-    """Every score of a prediction against a reference that both sides have the data for.
+    """Compute every score for which both prediction and reference have data.
 
     Args:
         prediction: a joints file, a folder with `joints.npz` and `cameras/`, or a match.
         reference: a joints file, a folder with `joints.npz`, `cameras/` or both, or a C3D or TRC
-            file of markers, which is laid over the prediction in time and space.
-        project: where runs of matches are kept.
-        run_id: number of the run, of a match.
-        stage: whose joints are scored, of a match; None = the latest there are.
-        fps: frames in a second; None = the match's, where there is one.
-        match_in: the reference's camera in whose picture tracks are matched (E3).
-        marker_map: YAML file that says which markers make which joints; None = they are called
-            after them.
+            file of markers, which is aligned with the prediction in time and space.
+        project: project with the runs of matches.
+        run_id: number of the run, for a match.
+        stage: stage whose joints are scored, for a match; None = the last one with joints.
+        fps: frames per second; None = the match's, if there is one.
+        match_in: reference camera in whose image tracks are matched (E3).
+        marker_map: YAML file that maps markers to joints; None = markers have the joints' names.
 
     Raises:
-        UsageError: a name that does not exist, or nothing that both sides have.
-        InputError: a file is not what it must be.
+        UsageError: an unknown name, or no data that both sides have.
+        InputError: a file has the wrong format.
     """
     measured = Path(reference).suffix.lower() in SUFFIXES
     truth = Side(None, {}) if measured else reference_side(reference)
@@ -125,7 +124,7 @@ def score(
 def _laid_over(
     path: Path, prediction: JointTracks | None, fps: float | None, marker_map: Path | None
 ) -> tuple[JointTracks, ReferenceAlignment]:
-    """Joints of a marker file in the prediction's frames and world."""
+    """Align a marker file with the prediction's frames and world; return its joints."""
     if prediction is None or fps is None:
         raise UsageError(
             f"--reference {path}",
@@ -139,20 +138,20 @@ def _laid_over(
 
 
 def load_reference(name: str) -> JointTracks:
-    """True joints: a joints file, or a folder that holds `joints.npz`.
+    """Load true joints from a joints file, or from a folder with `joints.npz`.
 
     Raises:
-        InputError: there is no such file, or it is no joints file.
+        InputError: there is no such file, or it is not a joints file.
     """
     path = Path(name)
     return read_joints(path / "joints.npz" if path.is_dir() else path)
 
 
 def reference_side(name: str) -> Side:
-    """What a file or folder of truth brings, and the match beside it.
+    """Load the data of a ground truth file or folder, and the match next to it.
 
     Raises:
-        InputError: there is no such file, or it is not what it must be.
+        InputError: there is no such file, or it has the wrong format.
     """
     path = Path(name)
     above = [folder for folder in path.resolve().parents[:2] if (folder / "match.yaml").is_file()]
@@ -187,7 +186,7 @@ def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str
 
 
 def cameras_of(reference: str, truth: Side, spec: MatchSpec | None) -> dict[str, Camera]:
-    """The true cameras with the pictures of the match: the files do not tell their size."""
+    """Return the true cameras with the image sizes of the match: the files lack them."""
     if spec is None:
         return dict(truth.cameras)
     clips = {clip.id: clip.broadcast or clip.id for clip in spec.clips}
@@ -208,7 +207,7 @@ def cameras_of(reference: str, truth: Side, spec: MatchSpec | None) -> dict[str,
 
 
 def _pitch(match: MatchFolder | None) -> PitchTemplate | None:
-    """The match's pitch; the standard one where no match is known."""
+    """Return the match's pitch, or the standard one if no match is known."""
     if match is None:
         return PitchTemplate.standard()
     return None if match.pitch is None else PitchTemplate.from_spec(match.pitch)

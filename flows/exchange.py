@@ -1,4 +1,4 @@
-"""People in pictures out to the annotator that a team has, and what it changed back in."""
+"""Export of detections to external annotation tools, and import of their changes."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ from worldpose.review.detections import DETECTION_EDITS
 from worldpose.store import Store
 
 EXPORTED: Final = "exported.json"
-"""What was exported, beside the annotator's file: what comes back is compared with it."""
+"""Record of the export, next to the annotation file; the import compares against it."""
 PICTURES: Final = "pictures"
-"""Folder of the pictures."""
+"""Folder of the images."""
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What an export holds.
+    """Content of an export.
 
     Attributes:
-        annotations: the annotator's file.
-        pictures: how many.
-        people: in them.
-        unseen: pictures that have no file, since their camera has no video of the frame.
+        annotations: file for the annotation tool.
+        pictures: number of images.
+        people: number of people in them.
+        unseen: images without a file, since the camera has no video of the frame.
     """
 
     annotations: Path
@@ -62,18 +62,18 @@ def export_people(
     folder: Path,
     form: Format,
 ) -> Exported:
-    """Write whom cameras saw, with the pictures, for an annotator.
+    """Write a camera's detections and images for an annotation tool.
 
     Args:
         store: the project's store.
-        match: with the corrections so far.
-        places: camera (or clip of a broadcast camera) and match frame of each picture.
-        folder: absent or empty; then has labels.json or labels.xml, pictures/ and exported.json.
-        form: of the annotator.
+        match: the match with all corrections.
+        places: camera (or clip of a broadcast camera) and match frame of each image.
+        folder: absent or empty; receives labels.json or labels.xml, pictures/ and exported.json.
+        form: format of the annotation tool.
 
     Raises:
-        UsageError: the folder holds something.
-        InputError: nobody was seen there in the latest run, or a picture is damaged.
+        UsageError: the folder is not empty.
+        InputError: the latest run has no detections there, or an image is damaged.
     """
     if folder.exists() and any(folder.iterdir()):
         raise UsageError(
@@ -105,19 +105,19 @@ def import_people(
     *,
     who: str,
 ) -> tuple[Changes, list[Correction]]:
-    """Take what an annotator changed in as corrections, all or none; the same file again is none.
+    """Import an annotation tool's changes as corrections, all or none; a repeated import adds none.
 
     Args:
-        store: where the journal lies.
-        open_match: gives the match with its journal as it is.
-        file: the annotator's.
-        exported: what was exported.
-        form: of the annotator; None = as the file's content says.
-        who: the person who annotated.
+        store: the store that holds the journal.
+        open_match: returns the match with its current journal.
+        file: file of the annotation tool.
+        exported: record of the export.
+        form: format of the file; None = detect from its content.
+        who: name of the annotator.
 
     Raises:
-        StaleEditError: somebody corrected the same in between.
-        InputError: a file is not what it must be, or a change does not apply; nothing is kept.
+        StaleEditError: another person corrected the same detection in between.
+        InputError: a file has the wrong format, or a change does not apply; no change is kept.
     """
     changes = changes_of(
         read_annotations(exported, "coco"), read_annotations(file, form), str(file)
@@ -159,8 +159,8 @@ def _annotated(match: Match, camera: str, found: Observations, name: str) -> Ann
 
 
 def _write_picture(store: Store, match: Match, camera: str, frame: int, file: Path) -> bool:
-    """Write a camera's picture of a frame; False where there is none."""
-    import cv2  # late: few commands write a picture
+    """Write a camera's image of a frame; return False if there is none."""
+    import cv2  # imported here: few commands write an image
 
     picture = frame_picture(store, match, camera, frame)
     return picture is not None and cv2.imwrite(str(file), picture[..., ::-1])

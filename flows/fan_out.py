@@ -1,4 +1,4 @@
-"""A stage's units as Prefect tasks on Dask's workers."""
+"""Execution of a stage's units as Prefect tasks on Dask workers."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from flows.planning import PlannedUnit
 from flows.stage import Stage
 
 MOST_TASKS: Final = 200
-"""Of one stage: more units than these share tasks. Prefect takes 0.1 s of processor for a task."""
+"""Tasks per stage; more units share tasks. Prefect needs 0.1 s of CPU time per task."""
 TASKS_EACH: Final = 20
-"""For a worker, where units share tasks: then none waits long for the last one [1]."""
+"""Tasks per worker if units share tasks, so that no worker waits long for the last task [1]."""
 
 
 def compute(
     stage: Stage, units: list[PlannedUnit], work: list[Work]
 ) -> Iterator[tuple[PlannedUnit, BaseException | None]]:
-    """Each unit as its task ends, with what it failed of.
+    """Yield each unit when its task ends, with its exception if it failed.
 
     Raises:
         LostWorkersError: the Prefect server or Dask scheduler is gone.
@@ -41,7 +41,7 @@ def compute(
 
 
 def task_count(workers: int) -> int:
-    """How many tasks the units of a stage share where they are more than MOST_TASKS."""
+    """Return the number of tasks for a stage with more than MOST_TASKS units."""
     return min(max(1, workers) * TASKS_EACH, MOST_TASKS)
 
 
@@ -53,7 +53,7 @@ def _each_alone(
     for future in as_completed(list(submitted)):
         try:
             future.result()
-        except Exception as failure:  # recorded with the run: siblings go on
+        except Exception as failure:  # recorded with the run; other units continue
             require_workers(failure)
             yield submitted[future], failure
         else:
@@ -63,7 +63,7 @@ def _each_alone(
 def _in_batches(
     units: list[PlannedUnit], work: list[Work], count: int
 ) -> Iterator[tuple[PlannedUnit, BaseException | None]]:
-    from tasks.batch import batch  # late, as all tasks are
+    from tasks.batch import batch  # imported here, as all tasks are
 
     size = math.ceil(len(units) / count)
     submitted = {}
@@ -86,7 +86,7 @@ def _in_batches(
 
 
 def task_of(stage: Stage) -> Task[..., Any]:
-    """The task that computes one unit of a stage: the function of its name in `tasks`."""
+    """Return the task that computes one unit of a stage: the function of its name in `tasks`."""
     task: Task[..., Any] = getattr(importlib.import_module(f"tasks.{stage.name}"), stage.name)
     return task
 
@@ -97,18 +97,18 @@ def _placed(stage: Stage) -> AbstractContextManager[Any]:
 
 
 def _client() -> Client | None:
-    """The flow's client of its Dask scheduler; None where its tasks go to no scheduler."""
+    """Return the flow's client of its Dask scheduler; None if its tasks use no scheduler."""
     context = FlowRunContext.get()
     return getattr(context and context.task_runner, "client", None)
 
 
 def _workers(client: Client | None) -> dict[str, Any]:
-    """Workers that are there now, by address."""
+    """Return the current workers, by address."""
     return {} if client is None else dict(client.scheduler_info(n_workers=-1)["workers"])
 
 
 def on_workers_with(tag: str | None, client: Client) -> AbstractContextManager[Any]:
-    """A block whose tasks go to workers with a tag, where any has it now: `--resources TAG=1`."""
+    """Return a context that sends tasks to workers with a tag, if any: `--resources TAG=1`."""
     if tag and any(worker["resources"].get(tag) for worker in _workers(client).values()):
         block: AbstractContextManager[Any] = dask.annotate(resources={tag: 1})
         return block

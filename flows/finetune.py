@@ -1,8 +1,8 @@
-"""The flow of fine-tuning: reviewed labels in, new versions of the embedded nets out (D3-D5).
+"""Fine-tuning flow: reviewed labels in, new versions of the embedded nets out (D3-D5).
 
 Labels come from people: detections of chosen frames, corrected in review and exported as COCO
-keypoints. A version is adopted only where it is better on frames it has not seen; adopted or not,
-it is kept with its figures, and later runs use whichever their settings name.
+keypoints. A version is adopted only if it is better on held-out frames; adopted or not, it is kept
+with its metrics, and later runs use the version that their settings name.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tasks.finetune import finetune
 from worldpose.training import FineTuningSettings
 
 FOLDER = "detectors"
-"""Of a project: versions of nets, `<net>-<fingerprint>.safetensors` and their records."""
+"""Project folder with versions of nets, `<net>-<fingerprint>.safetensors`, and their records."""
 
 
 @flow(name="finetune", validate_parameters=False)
@@ -33,11 +33,11 @@ def fine_tune_nets(
 
     Args:
         annotations: COCO keypoints.
-        pictures: the folder of their pictures; that of the annotations if None.
-        folder: where versions are kept.
-        nets: which.
-        settings: steps, rate, shares of pictures, seed.
-        starts: weights to begin from, where not the shipped ones.
+        pictures: the folder of their images; that of the annotations if None.
+        folder: folder of the versions.
+        nets: nets to train.
+        settings: steps, learning rate, sampling shares of images, seed.
+        starts: initial weights, if not the shipped ones.
     """
     return [
         finetune(kind, annotations, pictures, folder, settings, starts.get(kind)) for kind in nets

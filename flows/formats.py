@@ -1,4 +1,4 @@
-"""The forms that a run's results can be written in."""
+"""Export formats of a run's results."""
 
 from __future__ import annotations
 
@@ -46,31 +46,31 @@ from worldpose.pitch import PitchTemplate
 from worldpose.store import Run
 
 PITCH_SPACING = 0.5
-"""Between points of pitch_points.txt [m]."""
+"""Spacing of the points in pitch_points.txt [m]."""
 
 
 @dataclass(frozen=True)
 class Origin:
-    """What an export is made from."""
+    """Source of an export."""
 
     run: Run
     registration: Registration
     stage: str | None = None
-    """Whose joints are meant; None = the best there are."""
+    """Stage whose joints are exported; None = the best available."""
 
     @property
     def spec(self) -> MatchSpec:
-        """The match."""
+        """Return the match."""
         return self.registration.spec
 
     @property
     def clips(self) -> tuple[str, ...]:
-        """The clips that have joints."""
+        """Return the clips that have joints."""
         return clips_of(self.run.record)
 
 
 def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArray[np.int32]]:
-    """The body model of a clip's fits, the poses (persons, frames) and the person ids.
+    """Return body model, poses (persons, frames) and person ids of a clip's fits.
 
     Raises:
         WorldposeError: the run has no fitted bodies.
@@ -84,10 +84,10 @@ def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArr
 
 
 def broadcast_camera(run: Run, clip: str) -> Camera:
-    """The moving camera of a clip in the frames of its fitted bodies, (frames,).
+    """Return the moving camera of a clip in the frames of its fitted bodies, (frames,).
 
     Raises:
-        WorldposeError: the run has none.
+        WorldposeError: the run has no such camera.
     """
     todo = (
         "This format is about the broadcast camera's picture: calibrate that camera first, or "
@@ -114,7 +114,7 @@ def _needed(run: Run, unit: str, todo: str) -> str:
 
 
 def export_joints(origin: Origin, out: Path) -> list[Path]:
-    """Writes `joints.npz`, or `<clip>.joints.npz` for each clip where there are several."""
+    """Write `joints.npz`, or `<clip>.joints.npz` per clip if there are several."""
     written = []
     for clip in origin.clips:
         path = out / ("joints.npz" if len(origin.clips) == 1 else f"{clip}.joints.npz")
@@ -124,7 +124,7 @@ def export_joints(origin: Origin, out: Path) -> list[Path]:
 
 
 def export_coco(origin: Origin, out: Path) -> list[Path]:
-    """Writes `<camera>.json` for each static camera, in `<clip>/` where there are several."""
+    """Write `<camera>.json` for each static camera, in `<clip>/` if there are several."""
     written = []
     for clip in origin.clips:
         tracks = joint_tracks(origin.run, clip, origin.stage)
@@ -145,7 +145,7 @@ def export_coco(origin: Origin, out: Path) -> list[Path]:
 
 
 def export_worldpose(origin: Origin, out: Path) -> list[Path]:
-    """Writes `poses/<clip>.npz` and `cameras/<clip or static camera>.npz` (X3)."""
+    """Write `poses/<clip>.npz` and `cameras/<clip or static camera>.npz` (X3)."""
     written = []
     for clip in origin.clips:
         model, poses, _ = fitted_bodies(origin.run, clip)
@@ -161,7 +161,7 @@ def export_worldpose(origin: Origin, out: Path) -> list[Path]:
 
 
 def export_markers(origin: Origin, out: Path) -> list[Path]:
-    """Writes `markers/<clip>/person_<id>.trc` for everybody who has a joint."""
+    """Write `markers/<clip>/person_<id>.trc` for every person with a joint."""
     written = []
     for clip in origin.clips:
         tracks = joint_tracks(origin.run, clip, origin.stage)
@@ -173,7 +173,7 @@ def export_markers(origin: Origin, out: Path) -> list[Path]:
 
 
 def export_motion(origin: Origin, out: Path) -> list[Path]:
-    """Writes `motion/<clip>/person_<id>_frame_<first>.bvh` for every uninterrupted stretch."""
+    """Write `motion/<clip>/person_<id>_frame_<first>.bvh` for every uninterrupted interval."""
     written = []
     for clip in origin.clips:
         model, poses, persons = fitted_bodies(origin.run, clip)
@@ -187,7 +187,7 @@ def export_motion(origin: Origin, out: Path) -> list[Path]:
 
 
 def export_challenge(origin: Origin, out: Path, edition: Edition = 2026) -> list[Path]:
-    """Writes cameras, boxes, skeletons, the pitch's points and what to submit."""
+    """Write cameras, boxes, skeletons, pitch points and the submission."""
     pitch = read_match(Path(origin.registration.folder)).pitch
     for clip in origin.clips:
         fitted_bodies(origin.run, clip)
@@ -218,12 +218,12 @@ def export_challenge(origin: Origin, out: Path, edition: Edition = 2026) -> list
 
 
 def export_challenge_2025(origin: Origin, out: Path) -> list[Path]:
-    """Writes what `export_challenge` writes, in the layout of the edition of 2025."""
+    """Write the files of `export_challenge` in the 2025 layout."""
     return export_challenge(origin, out, 2025)
 
 
 def export_tracks(origin: Origin, out: Path) -> list[Path]:
-    """Writes `tracks/<clip>.txt`, our boxes in the broadcast picture, and the paper's settings."""
+    """Write `tracks/<clip>.txt`, our boxes in the broadcast image, and the paper's settings."""
     written = [out / "baseline_settings.json"]
     write_baseline_settings(written[0], BaselineSettings())
     for clip in origin.clips:
@@ -235,7 +235,7 @@ def export_tracks(origin: Origin, out: Path) -> list[Path]:
 
 
 def export_slahmr_cameras(origin: Origin, out: Path) -> list[Path]:
-    """Writes `slahmr/cameras/<clip>/shot-0/cameras.npz`, and the paper's settings."""
+    """Write `slahmr/cameras/<clip>/shot-0/cameras.npz`, and the paper's settings."""
     written = [out / "baseline_settings.json"]
     write_baseline_settings(written[0], BaselineSettings())
     for clip in origin.clips:
@@ -245,8 +245,8 @@ def export_slahmr_cameras(origin: Origin, out: Path) -> list[Path]:
 
 
 def export_recording(origin: Origin, out: Path) -> list[Path]:
-    """Writes `rerun/<clip>.rrd` for the rerun viewer."""
-    # Late: it draws with matplotlib's colours, which cost half a second to load.
+    """Write `rerun/<clip>.rrd` for the rerun viewer."""
+    # Imported here: it loads matplotlib's colours, which takes half a second.
     from worldpose.reports.rerun_recording import write_recording
 
     written = []
@@ -278,4 +278,4 @@ EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
     "slahmr-cameras": export_slahmr_cameras,
     "rerun": export_recording,
 }
-"""Formats by name; each takes what it is made from and a folder, and returns the files."""
+"""Format name to function, which takes the source and a folder, and returns the files."""

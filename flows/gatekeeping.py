@@ -1,4 +1,4 @@
-"""Which results of a run wait for a person, by what the journal says and the figures show."""
+"""Results of a run that need review, from journal verdicts, metrics and policy."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ ALWAYS = "every result is asked about"
 
 @dataclass(frozen=True)
 class Gatekeeper:
-    """Lets results pass or holds them.
+    """Decides which results pass and which need review.
 
     Attributes:
-        store: where results lie.
-        match: the match, with its journal as it was when the run began.
-        policy: when a person is asked.
+        store: the store of the results.
+        match: the match, with its journal as of the start of the run.
+        policy: when a review is requested.
     """
 
     store: Store
@@ -32,10 +32,10 @@ class Gatekeeper:
     policy: GatePolicy
 
     def held(self, stage: str, results: Mapping[str, str]) -> tuple[WaitingUnit, ...]:
-        """The units of `stage` in `results` that may not be built upon yet.
+        """Return the units of `stage` in `results` that later stages must not use yet.
 
-        A verdict holds for a result's bytes, and goes before figures and policy: what somebody
-        rejected waits for a correction, however good it looks.
+        A verdict applies to a result's bytes, and overrides metrics and policy: a rejected result
+        waits for a correction, however good its metrics are.
         """
         gate = {each.stage: each for each in GATES}.get(stage)
         if gate is None or (self.policy == "never" and not self._has_refusals()):
@@ -59,7 +59,7 @@ class Gatekeeper:
         return tuple(waiting)
 
     def ask(self, run_id: str, waiting: Sequence[WaitingUnit], results: Mapping[str, str]) -> None:
-        """Put what waits into the journal, once for each result."""
+        """Add review requests to the journal, one per result."""
         requests = [
             self._request(unit, results[unit.unit], run_id) for unit in waiting if not unit.rejected
         ]
@@ -72,7 +72,7 @@ class Gatekeeper:
             say(self.store, self.match.match_id, unasked)
 
     def _reasons(self, gate: Gate, manifest: ResultManifest) -> tuple[str, ...]:
-        """Why a person is asked about a result that nobody has decided on."""
+        """Return why a result without a verdict needs review."""
         if self.policy == "never":
             return ()
         asked = (ALWAYS,) if self.policy == "always" else ()
@@ -108,17 +108,17 @@ class Gatekeeper:
 
 
 def request_id(unit: str, key: str) -> str:
-    """The id of the question about one result: `static_calibration.cam03.1f2e3d4c5b6a`."""
+    """Return the review request id of a result: `static_calibration.cam03.1f2e3d4c5b6a`."""
     stage, _, name = unit.partition("/")
     return f"{stage[:24]}.{name[:24]}.{key[:12]}"
 
 
 def passed(results: Mapping[str, str], waiting: Iterable[WaitingUnit]) -> dict[str, str]:
-    """The results that may be built upon."""
+    """Return the results that later stages can use."""
     held = {unit.unit for unit in waiting}
     return {name: key for name, key in results.items() if name not in held}
 
 
 def undecided(waiting: Iterable[WaitingUnit]) -> list[WaitingUnit]:
-    """What nobody has said anything about yet; the rest waits for corrections."""
+    """Return the units without a verdict; the others wait for corrections."""
     return [unit for unit in waiting if not unit.rejected]

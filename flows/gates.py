@@ -1,7 +1,7 @@
-"""Gates: where a person is asked before a run goes on, and which figures ask for it.
+"""Review gates: where a run waits for a person, and the metric limits that trigger a review.
 
-A gate stands behind a stage and looks at each of its results on its own; `GATES`, beside
-`METHOD`, names them all.
+A gate follows a stage and checks each of its results separately; `GATES`, next to `METHOD`, lists
+all gates.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ def _as_they_are(figures: Figures) -> Figures:
 
 @dataclass(frozen=True)
 class Gate:
-    """Where a person is asked.
+    """Gate that requests a review.
 
     Attributes:
-        stage: the stage behind which it stands, which also names it.
-        question: what a person is to decide.
-        limits: a record of the largest figures with which `auto` lets a result pass.
-        judged: the figures that are held against the limits, from a result's.
-        warned: figures of which a run warns that asks no person: beyond their limit, the result is
-            probably wrong. Beyond others it is less accurate than it could be.
+        stage: the stage that the gate follows, also the gate's name.
+        question: the decision that is asked of the reviewer.
+        limits: record of the largest metrics that `auto` lets pass.
+        judged: maps a result's metrics to those that are compared with the limits.
+        warned: metrics that a run without review warns of: beyond their limit, the result is
+            probably wrong. Beyond other limits it is less accurate than it could be.
     """
 
     stage: str
@@ -40,7 +40,7 @@ class Gate:
     warned: tuple[str, ...] = ()
 
     def warnings(self, figures: Figures) -> tuple[str, ...]:
-        """Return a line for each figure that says that the result is probably wrong."""
+        """Return a line for each metric that indicates a probably wrong result."""
         judged = self.judged(figures) if figures else {}
         return tuple(
             _beyond(name, judged[name], limit)
@@ -49,10 +49,10 @@ class Gate:
         )
 
     def objections(self, figures: Figures) -> tuple[str, ...]:
-        """A line for each figure beyond its limit; none where `auto` lets the result pass.
+        """Return a line for each metric beyond its limit; none if `auto` lets the result pass.
 
-        A result without any figure, such as a camera that was given, was somebody's to judge
-        before. A figure that could not be computed is beyond every limit.
+        A result without any metric, such as a given camera, passes: it was judged before the run. A
+        metric that could not be computed is beyond every limit.
         """
         if not figures:
             return ()
@@ -66,9 +66,9 @@ class Gate:
         return tuple(lines)
 
     def excess(self, figures: Figures) -> float:
-        """How far the worst figure is beyond its limit [1]: 0 within, 1 at twice the limit.
+        """Return the relative excess of the worst metric [1]: 0 within, 1 at twice the limit.
 
-        Of a limit of zero it is the figure itself.
+        For a limit of zero it is the metric itself.
         """
         judged = self.judged(figures)
         beyond = [
@@ -84,106 +84,106 @@ def _beyond(name: str, figure: float, limit: float) -> str:
 
 
 class CameraLimits(Record):
-    """What a calibrated static camera may show."""
+    """Metric limits of a calibrated static camera."""
 
     expected_ground_error_median_m: float = Field(default=0.03, ge=0)
-    """Expected error on the pitch, median over what the camera sees [m]. Joints of five views have
-    a standard deviation of 0.03 themselves; clicks with a still's lines reach 0.01 to 0.02, clicks
-    alone 0.05 to 0.2 on simulated cameras."""
+    """Expected error on the pitch, median over the visible pitch [m]. Joints of five views have
+    a standard deviation of 0.03 themselves; clicks with a still's lines reach 0.01 to 0.02,
+    clicks alone 0.05 to 0.2 on simulated cameras."""
     expected_ground_error_p95_m: float = Field(default=0.10, ge=0)
     """The same at its 95th percentile [m]: the far side, where a pixel is 5 to 20 cm."""
     clicks_wrong: float = Field(default=0, ge=0)
-    """Clicks that the others contradict [1]. One click at the wrong marking looks like this, and
-    whoever made it knows in a glance which of the two is right."""
+    """Clicks that are outliers to the others [1]. A click at the wrong marking is one, and the
+    annotator sees at once which click is wrong."""
     weak: float = Field(default=0, ge=0)
-    """1 where the clicks leave a direction of the camera open [1]."""
+    """1 if the clicks leave a direction of the camera undetermined [1]."""
 
 
 class PeopleLimits(Record):
-    """What the people found in a camera's clip may show (D6)."""
+    """Metric limits of the people found in a camera's clip (D6)."""
 
     unreadable_share: float = Field(default=0.02, ge=0)
-    """Frames whose picture is missing or damaged [1]: half a second of a minute is a recorder's
-    hiccup; more is a video to be looked at."""
+    """Share of frames with a missing or damaged image [1]: half a second per minute is a
+    recorder glitch; more needs a check of the video."""
     empty_share: float = Field(default=0.5, ge=0)
-    """Pictures in which nobody was found [1]. A camera looks away from play at times; one that sees
-    nobody for half a clip is turned, dark or beyond what the detector knows."""
+    """Share of images without detections [1]. A camera can look away from play at times; one
+    without people for half a clip is turned, dark or outside the detector's training data."""
     bridged_share: float = Field(default=0.25, ge=0)
-    """Boxes that were filled in between two looks [1]; a quarter says that the detector misses."""
+    """Share of boxes interpolated between two processed frames [1]; at a quarter, the detector
+    misses too many."""
     flicker_share: float = Field(default=0.10, ge=0)
-    """Boxes of tracks seen too seldom to be kept, per box that was [1]: turf, boards and crowd that
-    now and then look like somebody."""
+    """Boxes of discarded short tracks per kept box [1]: false positives on turf, boards and
+    crowd."""
 
 
 class ConsistencyLimits(Record):
-    """What static cameras may show of each other; a camera that is left out is asked about too."""
+    """Limits of the cross-checks between static cameras; a left-out camera always needs review."""
 
     contradictions: float = Field(default=0, ge=0)
-    """Cameras that contradict another where nothing tells which is wrong [1]."""
+    """Cameras that contradict another with no evidence which is wrong [1]."""
 
 
 class IdentityLimits(Record):
-    """What the tracks of a clip may show."""
+    """Metric limits of the tracks of a clip."""
 
     undecided: float = Field(default=0, ge=0)
-    """Joins of two tracks for and against which the evidence is too even [1]: a person sees at once
-    what a wrong guess would spoil for good."""
+    """Joins of two tracks with ambiguous evidence [1]: a person decides these at once, and a
+    wrong guess corrupts all that follows."""
     unmatched_share: float = Field(default=0.15, ge=0)
-    """Detections that belong to nobody [1]: staff and crowd are some, a camera out of step or place
-    makes many."""
+    """Share of detections without a track [1]: staff and crowd cause some, a camera with a wrong
+    clock or pose causes many."""
     mean_ray_distance_m: float = Field(default=0.15, ge=0)
-    """How far the rays of matched detections pass each other [m]: beyond a shoulder's width of
-    0.4 m people are mixed up, and a third of it says that cameras disagree."""
+    """Distance between the rays of matched detections [m]: beyond a shoulder's width of 0.4 m
+    people are mixed up; a third of it means that cameras disagree."""
     corrections_refused: float = Field(default=0, ge=0)
-    """Corrections of who is who that do not fit these tracks [1]: what a person said is not in
-    them."""
+    """Identity corrections that do not fit these tracks [1]; the tracks lack these corrections."""
 
 
 class JointLimits(Record):
-    """What the triangulated joints of a clip may show."""
+    """Metric limits of the triangulated joints of a clip."""
 
     standard_deviation_m: float = Field(default=0.10, ge=0)
     """Of a joint along an axis, median over joints [m]; 0.03 with five views."""
     filled_share: float = Field(default=0.05, ge=0)
-    """Joints that are there by motion alone [1]."""
+    """Share of joints filled by the motion model alone [1]."""
 
 
 class AdjustmentLimits(Record):
-    """What adjusted cameras may show.
+    """Metric limits of adjusted cameras.
 
-    How many changes left-out people refused is no limit: cameras that were good already need none.
+    The number of changes that held-out validation refused has no limit: accurate cameras need none.
     """
 
     held_out_error_after_px: float = Field(default=5.0, ge=0)
-    """Median distance of left-out people's keypoints to where the adjusted cameras put them [px];
-    1.5 to 2.4 on simulated matches."""
+    """Median reprojection error of held-out people in the adjusted cameras [px]; 1.5 to 2.4 on
+    simulated matches."""
     held_out_growth: float = Field(default=1.0, ge=0)
-    """The same over what it was before adjustment [1]: above 1 it did harm."""
+    """The same relative to before the adjustment [1]: above 1 the adjustment did harm."""
 
 
 class ClipLimits(Record):
-    """What the bodies of a clip may show before it is released."""
+    """Metric limits of the bodies of a clip before release."""
 
     offset_rms_m: float = Field(default=0.03, ge=0)
-    """What the detector takes for a joint against the body's, along an axis [m]; 0.005 to 0.015
-    where the body fits."""
+    """Offset of the detector's joints from the body's joints, along an axis [m]; 0.005 to 0.015
+    if the body fits."""
     filled_share: float = Field(default=0.05, ge=0)
-    """Bodies in frames without any joint of the person [1]."""
+    """Share of bodies in frames without any joint of the person [1]."""
 
 
 class BroadcastLimits(Record):
-    """What the calibrated broadcast camera of a clip may show."""
+    """Metric limits of the calibrated broadcast camera of a clip."""
 
     expected_error_median_px: float = Field(default=3.0, ge=0)
-    """Expected error of the pitch in a frame's picture, median over frames [px]. A painted line
-    of 0.12 m is 4 px wide at 60 m through a focal length of 2000 px: beyond 3 px the drawn pitch
-    leaves the picture's for the eye."""
+    """Expected error of the pitch in the image, median over frames [px]. A painted line of 0.12
+    m is 4 px wide at 60 m with a focal length of 2000 px: beyond 3 px the drawn pitch is visibly
+    off."""
     weak: float = Field(default=0, ge=0)
-    """1 where something of the clip has to be looked at, as its report says [1]."""
+    """1 if the clip's report asks for a check [1]."""
 
 
 def _of_people(figures: Figures) -> Figures:
-    """With a stride, boxes between two looks are filled in on purpose and tell nothing."""
+    """Zero `bridged_share` with a stride: then boxes are interpolated on purpose."""
     return {**figures, "bridged_share": 0.0} if figures.get("stride", 1) > 1 else figures
 
 

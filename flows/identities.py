@@ -1,4 +1,4 @@
-"""Who is who in a clip by now: the tracker's output with all that people said since."""
+"""Current identities of a clip: the tracker's output with all corrections since."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from worldpose.store import Store, key_of
 
 
 def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
-    """The tracks of a clip with people's corrections, whether or not a run has taken them in.
+    """Return the tracks of a clip with all corrections, including those no run contains yet.
 
     Raises:
-        InputError: the match's latest run has no tracks of this clip, or only some with a
-            correction that was withdrawn since.
+        InputError: the latest run has no tracks of this clip, or only with a correction that was
+            withdrawn since.
     """
     said = [
         correction.edit
@@ -39,10 +39,10 @@ def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
 
 
 def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> None:
-    """Refuse corrections of who is who that do not fit the tracks as they are by now.
+    """Refuse identity corrections that do not fit the current tracks.
 
     Raises:
-        StaleEditError: somebody changed who is who, or the edit never fitted.
+        StaleEditError: another person changed the identities, or the edit never fitted.
     """
     found: dict[str, Identities] = {}
     for edit in edits:
@@ -64,7 +64,7 @@ def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> None:
 
 
 def _found(store: Store, match: Match, clip: str) -> tuple[Identities, list[JsonValue]]:
-    """What the tracker found in the latest run, and the corrections it holds already."""
+    """Return the tracker's output of the latest run, and the corrections that it contains."""
     runs = store.runs(match.match_id)
     key = store.run(match.match_id).results.get(f"tracking/{clip}") if runs else None
     if key is None:

@@ -1,7 +1,8 @@
-"""The method again and again, each time with what the bodies of the time before contradicted (R1).
+"""Iterations of the method, each without the outliers that the previous bodies rejected (R1).
 
-Calibrate, track, adjust, fit, film, filter; then again from tracking, with cameras that agree with
-people (C6) and without the keypoints and boxes that no body fits (R2). Every iteration is a run.
+Calibrate, track, adjust, fit, calibrate the broadcast camera, filter; then repeat from tracking,
+with cameras adjusted to people (C6) and without the keypoints and boxes that no body fits (R2).
+Every iteration is a run.
 """
 
 from __future__ import annotations
@@ -26,22 +27,22 @@ from worldpose.errors import UsageError
 from worldpose.store import Store
 
 GAIN: Final = 0.01
-"""An iteration is better where it lowers the error in cameras that were left out by more than this
-part: less is what rejecting the honest ends of a detector's errors brings by itself."""
+"""Minimum relative decrease of the held-out error for a better iteration: rejecting the tails of
+a detector's noise alone causes smaller decreases."""
 MOST: Final = 6
-"""Iterations that nobody asked for by number."""
+"""Maximum number of iterations if the caller gives none."""
 
 
 @dataclass(frozen=True)
 class Iteration:
-    """One pass over the method.
+    """One iteration of the method.
 
     Attributes:
-        number: from 1.
-        record: of its run.
-        held_out_error: mean distance of keypoints in cameras that were left out to where the
-            others put people, all clips [box height]; None where left-out cameras cannot judge: two
-            cameras alone, or nobody detected.
+        number: iteration number, from 1.
+        record: record of its run.
+        held_out_error: mean distance of keypoints in held-out cameras to the reprojection from the
+            others, all clips [box height]; None if it is undefined: only two cameras, or no
+            detections.
     """
 
     number: int
@@ -49,21 +50,22 @@ class Iteration:
     held_out_error: float | None
 
     def is_better_than(self, other: Iteration) -> bool:
-        """Whether it lowers the held-out error by more than `GAIN`."""
+        """Return whether it lowers the held-out error by more than `GAIN`."""
         ours, theirs = self.held_out_error, other.held_out_error
         return ours is not None and (theirs is None or ours < (1.0 - GAIN) * theirs)
 
 
 @dataclass(frozen=True)
 class Iterations:
-    """All passes that were made.
+    """All iterations of a call.
 
     Attributes:
-        passes: in order.
-        kept: the one whose results stand: each is kept only if it is better than the kept one.
-        record: the latest run, that names those results; of the last pass where it did not end
-            well.
-        ended: why there was no further one.
+        passes: iterations in order.
+        kept: the accepted iteration: each is accepted only if it is better than the last accepted
+            one.
+        record: the latest run, which names the results of `kept`; the last iteration's run if that
+            did not complete.
+        ended: why there is no further iteration.
     """
 
     passes: tuple[Iteration, ...]
@@ -73,20 +75,20 @@ class Iterations:
 
 
 def iterate_match(store: Store, match: Match, request: RunRequest, most: int | None) -> Iterations:
-    """Runs the method `most` times over and lets the best iteration stand.
+    """Run up to `most` iterations of the method and keep the best.
 
-    What a run of an iteration holds already is not computed again; killed anywhere, the next call
-    goes on from what is finished. Where the match is edited between two passes, they begin again
-    with the edit, so that none is made from another state of the match than the next.
+    Existing results are not computed again; after a kill, the next call resumes from the finished
+    results. If the match is edited between two iterations, all restart with the edit, so that all
+    iterations use the same state of the match.
 
     Args:
         store: the store.
         match: the match.
         request: settings and machines, for every iteration.
-        most: how many; None = until one is no better than the best before it.
+        most: number of iterations; None = until one is no better than the best before it.
 
     Raises:
-        UsageError: only a part of the method was asked for.
+        UsageError: only a part of the method was requested.
     """
     if request.from_stage is not None or request.until_stage is not None:
         raise UsageError(
@@ -132,7 +134,7 @@ def _pass(
     request: RunRequest,
     machines_for: Callable[[Iterable[PlannedUnit]], RunRequest],
 ) -> Iteration:
-    """One pass over the method: the run that has it already, or a new one."""
+    """Return the run that has all results of an iteration, or a new run."""
     outlook = _outlook(store, match, request)
     record = _recorded(store, match, outlook)
     if record is None:
@@ -152,7 +154,7 @@ def _outlook(store: Store, match: Match, request: RunRequest) -> Outlook:
 
 
 def _recorded(store: Store, match: Match, outlook: Outlook) -> RunRecord | None:
-    """The run, if any, that has all results of an iteration already, whichever came after it."""
+    """Return the newest run that has all results of an iteration, if any."""
     runs = (store.run(match.match_id, run_id) for run_id in reversed(store.runs(match.match_id)))
     found = next((run for run in runs if outlook.is_recorded_by(run)), None)
     if found is None:
@@ -169,7 +171,7 @@ def _best(passes: list[Iteration]) -> Iteration:
 
 
 def held_out_error(record: RunRecord) -> float | None:
-    """The error in left-out cameras over all clips of a run [box height]."""
+    """Return the held-out error over all clips of a run [box height]."""
     clips = [
         (figures["held_out_error"], figures["held_out_keypoints"])
         for name, figures in record.figures.items()

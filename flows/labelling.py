@@ -1,4 +1,4 @@
-"""Frames of videos with proposed labels, for people to correct before a fine-tuning."""
+"""Frames of videos with proposed labels, for correction before fine-tuning."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from worldpose.video import open_video
 
 
 def propose(videos: Sequence[Path], every: int, folder: Path, settings: DetectionSettings) -> int:
-    """Write every so many frames of videos with proposed labels; returns how many frames.
+    """Write every n-th frame of videos with proposed labels; return the number of frames.
 
     Args:
-        videos: files or folders of images, of pictures of one size.
-        every: frames from one to the next.
+        videos: video files or folders of images, all of one image size.
+        every: step between frames.
         folder: absent or empty.
-        settings: which detectors propose.
+        settings: detectors that propose the labels.
 
     Raises:
-        UsageError: the folder holds something.
-        InputError: two videos of one name or of different sizes, or a damaged one.
+        UsageError: the folder is not empty.
+        InputError: two videos have the same name or different sizes, or one is damaged.
     """
     if folder.exists() and any(folder.iterdir()):
         raise UsageError(

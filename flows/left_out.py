@@ -1,8 +1,8 @@
-"""Static cameras that a run does without, and the warnings of a run.
+"""Static cameras that a run leaves out, and the warnings of a run.
 
-One bad camera must not end a match. A stage that finds that a camera cannot be used says so with
-its result, and every later stage is planned as if the match did not have this camera: it is in no
-list of cameras, no recipe and no array of theirs. A stage does this in three steps:
+One bad camera must not end a match. A stage that finds a camera unusable reports this with its
+result, and every later stage is planned as if the match did not have this camera: it is in none of
+their camera lists, recipes and arrays. A stage does this in three steps:
 
 1. Its `Stage` record has `leaves_out=True`, and the stage stands before `tracking` in `METHOD`.
 2. Its task fills the result's `left_out` before it leaves `Store.publishing`::
@@ -12,15 +12,16 @@ list of cameras, no recipe and no array of theirs. A stage does this in three st
            result.left_out["cam03"] = "its people stand 40 m from those of cam01, cam02 and cam05"
            result.warnings.append("camera cam04 shows 2.7 frames earlier than the others")
 
-   The same must be in what `write` stores, because two computations of one key are compared by it.
+   The same information must be in the arrays that `write` stores, because two computations of one
+   key are compared by them.
 3. Nothing else. `worldpose run` prints `warning: camera cam03 is left out: ...` at its end, and
    `run --json`, `status`, the report and the pages list it. With gates, a person is asked before
-   the run goes on without the camera.
+   the run continues without the camera.
 
-`warnings` are for all stages: sentences that the user must read although the run went on.
+`warnings` are for all stages: sentences that the user must read although the run continued.
 
-The exit code stays 0 while two cameras are left. With fewer, `tracking` and all after it have no
-results, and the run is partial (exit code 4).
+The exit code stays 0 while two cameras are left. With fewer, `tracking` and all later stages have
+no results, and the run is partial (exit code 4).
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ from worldpose.store import Store
 def left_out_cameras(
     store: Store, match: Match, stages: tuple[Stage, ...], results: Mapping[str, str]
 ) -> dict[str, str]:
-    """Static cameras that published results leave out, by id, with the reason, in match order.
+    """Return the static cameras that published results leave out, with reasons, in match order.
 
     Args:
         store: where the results are.
         match: the whole match.
-        stages: those whose results count.
+        stages: stages whose results count.
         results: `stage/unit` to key; a result that is not published yet leaves out no camera.
     """
     judging = {stage.name for stage in stages if stage.leaves_out}
@@ -52,13 +53,13 @@ def left_out_cameras(
             place = (match.match_id, stage, unit, key)
             try:
                 said = {**match.once(place, partial(store.manifest, *place)).left_out, **said}
-            except StoreError:  # not computed yet, or damaged: then its reader says so
+            except StoreError:  # not computed yet, or damaged: then its reader reports it
                 continue
     return {each.id: said[each.id] for each in match.folder.spec.static_cameras if each.id in said}
 
 
 def left_out_warnings(match: Match, left_out: Mapping[str, str], needed: int) -> list[str]:
-    """One sentence for each camera, and one where fewer than `needed` cameras are left."""
+    """Return one sentence per camera, and one if fewer than `needed` cameras are left."""
     said = [f"camera {camera} is left out: {reason}" for camera, reason in left_out.items()]
     left = [each.id for each in match.without(left_out).folder.spec.static_cameras]
     if left_out and len(left) < needed:

@@ -1,4 +1,4 @@
-"""Why results are what they are: comparing runs, explaining staleness."""
+"""Provenance of results: differences between runs, and reasons for staleness."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from worldpose.store import Store, explain_difference, list_pins
 
 @dataclass(frozen=True)
 class UnitChange:
-    """One unit in two runs.
+    """Change of one unit between two runs.
 
     Attributes:
         unit: as `stage/unit`.
         state: same, changed, only in A, only in B.
-        reasons: what of the recipe differs.
-        figures: name, value in A, value in B of the figures that differ.
+        reasons: differences between the recipes.
+        figures: name, value in A, value in B of the metrics that differ.
     """
 
     unit: str
@@ -34,7 +34,7 @@ class UnitChange:
 
 @dataclass(frozen=True)
 class Explanation:
-    """Where a unit stands (`unit_state`), the key it would have now, and why."""
+    """State of a unit (`unit_state`), its current key, and the reasons."""
 
     unit: str
     state: str
@@ -43,7 +43,7 @@ class Explanation:
 
 
 def find_run(store: Store, name: str) -> RunRecord:
-    """The run that a person means by `match/number` or `match/name`, or `match` for its latest.
+    """Return the run named by `match/number` or `match/name`, or `match` for its latest.
 
     Raises:
         InputError: no such run.
@@ -63,7 +63,7 @@ def find_run(store: Store, name: str) -> RunRecord:
 
 
 def run_difference(store: Store, a: RunRecord, b: RunRecord) -> list[UnitChange]:
-    """How each unit differs between two runs, in the order of the method."""
+    """Compare each unit between two runs, in the order of the method."""
     changes = []
     for unit in sorted(a.results.keys() | b.results.keys(), key=_method_order):
         if unit not in b.results:
@@ -85,10 +85,10 @@ def run_difference(store: Store, a: RunRecord, b: RunRecord) -> list[UnitChange]
 
 
 def unit_state(unit: PlannedUnit, latest: RunRecord | None) -> str:
-    """Where a unit stands.
+    """Return the state of a unit.
 
-    current: the latest run has the result that a run would give now. ready: the store has it, the
-    latest run has not. stale: the latest run has another. missing: there is none.
+    current: the latest run has the result of the current recipe. ready: the store has it, the
+        latest run has not. stale: the latest run has another. missing: there is none.
     """
     theirs = None if latest is None else latest.results.get(unit.name)
     if unit.published:
@@ -97,12 +97,12 @@ def unit_state(unit: PlannedUnit, latest: RunRecord | None) -> str:
 
 
 def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
-    """Where a unit stands, and what made it so.
+    """Return the state of a unit, and the reasons.
 
     Args:
         store: the store.
         name: as `match/stage/unit`.
-        overrides: settings to ask for; empty = those of the latest run.
+        overrides: requested settings; empty = those of the latest run.
 
     Raises:
         InputError: no such unit.
@@ -125,7 +125,7 @@ def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
 
 
 def unit_reasons(store: Store, unit: PlannedUnit, latest: RunRecord | None) -> tuple[str, ...]:
-    """Why a unit stands where `unit_state` says."""
+    """Return the reasons for the state in `unit_state`."""
     if latest is None or unit.name not in latest.results:
         return ("no run has computed it",)
     if latest.results[unit.name] == unit.key:
@@ -136,7 +136,7 @@ def unit_reasons(store: Store, unit: PlannedUnit, latest: RunRecord | None) -> t
 
 
 def _why_differs(store: Store, run: RunRecord, unit: str, recipe: Recipe | None) -> tuple[str, ...]:
-    """What is another in a recipe than in that of a run's result."""
+    """Return the differences between a recipe and that of a run's result."""
     before = _recipe(store, run, unit)
     if before is None or recipe is None:
         return ("its result was withdrawn or removed, and with it what it was made from",)
@@ -144,7 +144,7 @@ def _why_differs(store: Store, run: RunRecord, unit: str, recipe: Recipe | None)
 
 
 def _recipe(store: Store, run: RunRecord, unit: str) -> Recipe | None:
-    """How a run's result was made; None where that was withdrawn or removed."""
+    """Return the recipe of a run's result; None if the result was withdrawn or removed."""
     stage, _, name = unit.partition("/")
     place = (run.match_id, stage, name, run.results[unit])
     return store.manifest(*place).recipe if store.has(*place) else None

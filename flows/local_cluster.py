@@ -1,4 +1,4 @@
-"""Worker processes of a run's own, on its machine."""
+"""Local worker processes of a run."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from flows.private_cluster import PrivateCluster
 
 KEEP_SECONDS = 5.0
-"""How often workers that are gone are begun anew."""
+"""Interval at which lost workers are restarted."""
 
 
 def starting_cluster(asked: int | None, missing: list[PlannedUnit]) -> PrivateCluster:
-    """Workers on this machine that begin to start, and import at once what they will need.
+    """Start workers on this machine, which at once import the modules that they will need.
 
     Args:
-        asked: how many; None = as many as have something to do at once.
-        missing: what is to be computed first.
+        asked: number of workers; None = as many as can work in parallel.
+        missing: units to compute first.
     """
     import dask
 
@@ -34,9 +34,9 @@ def starting_cluster(asked: int | None, missing: list[PlannedUnit]) -> PrivateCl
     named = [given] if isinstance(given, str) else given
     stages = sorted({unit.recipe.stage for unit in missing})
     preload = ["tasks.preload", *named, "prefect_dask", *(f"tasks.{stage}" for stage in stages)]
-    preload.append("flows.match")  # with each task Prefect sends the flow that it is of
-    # Dask closes what begins a lost worker anew if that takes longer: 15 s, as long as a start on a
-    # slow machine.
+    preload.append("flows.match")  # Prefect sends the flow along with each of its tasks
+    # Dask closes a restarted worker that takes longer than this: 15 s, as long as a start on a slow
+    # machine.
     dask.config.set({"distributed.deploy.lost-worker-timeout": START_SECONDS})
     workers = workers_for(asked, missing)
     cluster = PrivateCluster(
@@ -47,17 +47,17 @@ def starting_cluster(asked: int | None, missing: list[PlannedUnit]) -> PrivateCl
 
 
 def workers_for(asked: int | None, missing: list[PlannedUnit]) -> int:
-    """How many workers were asked for, or else have something to do at once."""
+    """Return the requested number of workers, or else the number that can work in parallel."""
     stages = Counter(unit.recipe.stage for unit in missing)
     return asked or min(os.cpu_count() or 1, max(stages.values()))
 
 
 @contextmanager
 def kept_complete(cluster: PrivateCluster) -> Iterator[Callable[[int], None]]:
-    """Begin workers anew that are gone for good, as are those that end while they start.
+    """Restart workers that are permanently gone, such as those that end while they start.
 
-    Dask notices that they are gone, but begins others only when it is asked for workers. Gives a
-    function that asks for so many, if there are fewer.
+    Dask notices that they are gone, but starts others only on request. Yields a function that
+    requests a number of workers, if there are fewer.
     """
     most = len(cluster.worker_spec)
     is_over, asking = threading.Event(), threading.Lock()

@@ -1,7 +1,7 @@
-"""The flow of one match: every stage of the method, fanned out over Dask.
+"""Flow of one match: every stage of the method, fanned out over Dask.
 
-The flow decides what must run, hands each missing unit to its task, and records the run. It holds
-no state that matters: killed anywhere, the next run finds in the store what was finished.
+The flow plans the units, submits each missing one as a task, and records the run. It holds no
+essential state: after a kill, the next run finds the finished results in the store.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from worldpose.store import Store
 
 
 class IncompleteRunError(WorldposeError):
-    """A run is recorded, but some of its units have no result, or wait for a person."""
+    """A run is recorded, but some of its units have no result, or need review."""
 
     def __init__(self, record: RunRecord) -> None:
         self.run_id = record.run_id
@@ -50,24 +50,24 @@ def process_match(
     iteration: int = 1,
     time_limits: dict[str, float] | None = None,
 ) -> str:
-    """Runs the method on one match, records the run and returns its number.
+    """Run the method on one match, record the run and return its number.
 
-    A run of a deployment that has to wait for people is suspended until they have decided, and then
-    goes on; any other ends, and the next one goes on.
+    A deployment's run that needs review is suspended until people have decided, and then resumes;
+    any other run ends, and the next one continues.
 
     Args:
         project: folder or URL of the store.
         match_id: a registered match.
-        settings: stage to the settings that differ from their defaults.
-        from_stage: first stage to run; earlier ones are taken from the latest run as they stand.
+        settings: stage to its settings that differ from their defaults.
+        from_stage: first stage to run; earlier results are taken from the latest run.
         until_stage: last stage to run.
-        gates: when results wait for a person; None is `auto` for a deployment, else `never`.
-        iteration: which pass over the method; the ones before it have their results.
-        time_limits: stage to the minutes that a unit may be at work, where not as long as all.
+        gates: when results need review; None is `auto` for a deployment, else `never`.
+        iteration: iteration number; the previous iterations have their results.
+        time_limits: stage to the time limit of a unit [min], if not the default.
 
     Raises:
-        IncompleteRunError: some units failed or wait; the others have their results.
-        LostWorkersError: the Prefect server or Dask scheduler is gone; run again goes on.
+        IncompleteRunError: some units failed or need review; the others have their results.
+        LostWorkersError: the Prefect server or Dask scheduler is gone; another run resumes.
     """
     logging.getLogger("worldpose").setLevel(logging.INFO)
     store = Store.open(project)
@@ -99,7 +99,7 @@ def process_match(
 
 
 def _shown(store: Store, match_id: str) -> AbstractContextManager[None]:
-    from flows.service.artifacts import shown_at_prefect  # late: only deployments show them
+    from flows.service.artifacts import shown_at_prefect  # only deployments use it
 
     return shown_at_prefect(store, match_id)
 

@@ -1,7 +1,7 @@
-"""The method: its stages in the paper's order, and where people are asked.
+"""The method: its stages in the paper's order, and its review gates.
 
-Read it beside docs/architecture.md. A stage that is not in the tuple does not exist; the comments
-hold the places of those to come, with their units and checklist ids.
+See docs/architecture.md. Only the stages of this tuple exist; the comments mark the places of
+planned ones, with their units and checklist ids.
 """
 
 from __future__ import annotations
@@ -54,5 +54,4 @@ GATES: tuple[Gate, ...] = (
     gates.ACCEPTANCE,
     gates.BROADCAST,
 )
-"""Where people are asked, with `--gates auto` or `always`; each stands behind the stage it names.
-"""
+"""Review gates, with `--gates auto` or `always`; each follows the stage that it names."""

@@ -1,4 +1,4 @@
-"""What a run would do and where it would wait, decided before anything starts."""
+"""Plan of a run: its units, and the gates where it would wait, before anything starts."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from worldpose.errors import UsageError
 
 @dataclass(frozen=True)
 class Outlook:
-    """A run as it would be if every unit succeeded and every missing result passed its gate.
+    """Run under the assumption that every unit succeeds and every missing result passes its gate.
 
     Attributes:
         units: all units of its stages that are not behind a closed gate.
         standing: the results of the stages before.
-        waiting: results that are there and wait for a person.
+        waiting: existing results that need review.
     """
 
     units: tuple[PlannedUnit, ...]
@@ -36,11 +36,11 @@ class Outlook:
 
     @property
     def results(self) -> dict[str, str]:
-        """`stage/unit` to key of all it would name."""
+        """`stage/unit` to key of all results of the run."""
         return {**self.standing, **{unit.name: unit.key for unit in self.units}}
 
     def is_recorded_by(self, latest: RunRecord | None) -> bool:
-        """Whether the latest run's record is that of a run made now."""
+        """Return whether the latest run's record equals that of a run made now."""
         if latest is None or latest.failed or latest.state == "failed" or self.missing:
             return False
         is_asked = {unit.request for unit in self.waiting} == {u.request for u in latest.waiting}
@@ -53,16 +53,16 @@ def look_ahead(
     stages: tuple[Stage, ...],
     basis: Basis,
 ) -> Outlook:
-    """What a run of `stages` would do.
+    """Plan a run of `stages`.
 
     Args:
         gatekeeper: with the store and the match.
         overrides: settings that differ from their defaults.
         stages: the stages to run.
-        basis: what it goes on from.
+        basis: existing results that it starts from.
 
     Raises:
-        UsageError: that lacks what the stages are made from.
+        UsageError: `basis` lacks inputs of the stages.
     """
     store, match = gatekeeper.store, gatekeeper.match
     results = dict(basis.results)

@@ -1,4 +1,4 @@
-"""Who of one run is who in another: ids are each run's own, places are not."""
+"""Matching of people between two runs by position: each run has its own ids."""
 
 from __future__ import annotations
 
@@ -14,18 +14,17 @@ from flows.release import bodies_unit
 from worldpose.store import Run, Store
 
 FRAMES: Final = 50
-"""Frames in which places are compared, all over a clip: people who are apart in one are two."""
+"""Frames whose positions are compared, spread over a clip, so that briefly close people differ."""
 NEAR: Final = 1.0
-"""Mean distance of joints up to which two are one person [m]: no two people stand closer for
-long."""
+"""Maximum mean joint distance of one person [m]: no two people stay closer for long."""
 
 Floats = NDArray[np.float64]
 
 
 def paired_people(store: Store, a: RunRecord, b: RunRecord) -> dict[tuple[str, str], str]:
-    """Clip and `person<id>` of B to the name in A, for whoever has another in A.
+    """Map clip and `person<id>` of B to the name in A, for people whose name in A differs.
 
-    Who of B is nobody in A is named `person<id> of B`.
+    A person of B without a match in A is named `person<id> of B`.
     """
     names = {}
     for bodies in bodies_of_both(Run(store, a), Run(store, b)):
@@ -42,7 +41,7 @@ def paired_people(store: Store, a: RunRecord, b: RunRecord) -> dict[tuple[str, s
 
 @dataclass(frozen=True, eq=False)
 class BodiesOfBoth:
-    """The bodies of one clip in two runs, in the frames that both have.
+    """Bodies of one clip in two runs, in their common frames.
 
     Attributes:
         clip: its id.
@@ -61,13 +60,13 @@ class BodiesOfBoth:
     after: Floats
 
     def pairs(self) -> dict[int, int]:
-        """Places of B's people among A's, where both are one person."""
+        """Map person indices of B to those of A, for matched people."""
         step = max(len(self.frame) // FRAMES, 1)
         return pair_people(self.before[::step], self.after[::step])
 
 
 def bodies_of_both(a: Run, b: Run) -> Iterator[BodiesOfBoth]:
-    """The clips whose bodies are others in two runs."""
+    """Yield the clips whose bodies differ between two runs."""
     clips = {unit.partition("/")[2] for unit in a if unit.startswith("body_fitting/")}
     for clip in sorted(clips):
         one, other = bodies_unit(a, clip), bodies_unit(b, clip)
@@ -86,7 +85,7 @@ def bodies_of_both(a: Run, b: Run) -> Iterator[BodiesOfBoth]:
 
 
 def pair_people(before: Floats, after: Floats) -> dict[int, int]:
-    """Places of the second among the first, for those who are each other's nearest.
+    """Map indices of `after` to those of `before`, for mutual nearest neighbours.
 
     Args:
         before: (frames, persons, joints, 3) [m].

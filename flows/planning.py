@@ -1,7 +1,7 @@
-"""What a run must do: keys of all units, decided before any work starts.
+"""Planning of a run: keys of all units, computed before any work starts.
 
-A unit's key is the digest of its recipe: inputs' keys, sources, settings, code, libraries. Whatever
-key the store already holds is reused; nothing else is ever skipped.
+A unit's key is the digest of its recipe: inputs' keys, sources, settings, code, libraries. A result
+is reused if and only if the store holds its key.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class PlannedUnit:
 
     @property
     def name(self) -> str:
-        """As `stage/unit`."""
+        """Name as `stage/unit`."""
         return self.recipe.name
 
     def work(self, project: str, match: Match, run_id: str, seconds: float | None = None) -> Work:
-        """This unit as a task takes it, which may be at work for so long."""
+        """Return the work order for this unit's task, with a time limit [s]."""
         return Work(
             project=project,
             folder=match.registration.folder,
@@ -44,12 +44,12 @@ class PlannedUnit:
 
 @dataclass(frozen=True)
 class StagePlan:
-    """A stage's units.
+    """Planned units of a stage.
 
     Attributes:
-        units: those whose inputs are known.
-        blocked: names, as `stage/unit`, of those that are made from a unit without a result, that
-            wait for a decision which cameras are left out, or that need more than are left.
+        units: units with known inputs.
+        blocked: names, as `stage/unit`, of units with an input without a result, that wait for the
+            decision which cameras are left out, or that need more cameras than are left.
         lacks_cameras: whether they are blocked because too many cameras are left out.
     """
 
@@ -66,17 +66,17 @@ def plan_stage(
     results: Mapping[str, str],
     before: Mapping[str, str] | None = None,
 ) -> StagePlan:
-    """What a stage has to do.
+    """Plan the units of a stage.
 
-    It is planned for the cameras that no earlier result leaves out (`flows.left_out`).
+    The plan uses the cameras that no earlier result leaves out (`flows.left_out`).
 
     Args:
-        store: where results are looked for.
+        store: store with existing results.
         match: the match, with all its cameras.
         stage: the stage to plan.
         overrides: settings that differ from their defaults.
-        results: `stage/unit` to key of what earlier stages have, or will have, computed.
-        before: the same of the iteration before; None in the first.
+        results: `stage/unit` to key of results that earlier stages have, or will have.
+        before: the same for the previous iteration; None in the first.
     """
     if before is None and stage.first_pass > 1:
         return StagePlan((), ())
@@ -100,8 +100,8 @@ def plan_stage(
         if known.keys() != inputs.keys():
             blocked.append(f"{stage.name}/{unit}")
             continue
-        # Not validated here: all values are ours, `key_of` refuses what is not plain JSON, and
-        # checking thousands of corrections value by value takes longer than all the rest.
+        # Not validated here: all values are ours, `key_of` refuses values that are not plain JSON,
+        # and validating thousands of corrections one by one takes longer than all other steps.
         recipe = Recipe.model_construct(
             match_id=match.match_id,
             stage=stage.name,
@@ -121,7 +121,7 @@ def plan_stage(
 def _cameras_are_decided(
     match: Match, stages: tuple[Stage, ...], results: Mapping[str, str]
 ) -> bool:
-    """Whether every result is there that may leave cameras out: none has failed or waits."""
+    """Return whether every result that can leave cameras out exists, and none waits."""
     judging = (stage for stage in stages if stage.leaves_out)
     return all(
         f"{stage.name}/{unit}" in results for stage in judging for unit in stage.units(match)
@@ -135,14 +135,14 @@ def plan_run(
     stages: tuple[Stage, ...] = METHOD,
     iteration: int = 1,
 ) -> list[PlannedUnit]:
-    """All units of the method's first `stages`, as they would be if every one succeeded.
+    """Plan all units of the method's first `stages`, as if every unit succeeded.
 
     Args:
-        store: where results are looked for.
+        store: store with existing results.
         match: the match.
         overrides: settings that differ from their defaults.
         stages: the stages to plan, from the first.
-        iteration: which, from 1.
+        iteration: iteration number, from 1.
     """
     planned: list[PlannedUnit] = []
     results: dict[str, str] = {}
@@ -157,7 +157,7 @@ def plan_run(
 def results_before(
     store: Store, match: Match, overrides: Overrides, iteration: int
 ) -> dict[str, str] | None:
-    """The results that the iteration before has, as `stage/unit` to key; None before the first."""
+    """Return the previous iteration's results, `stage/unit` to key; None in the first iteration."""
     if iteration == 1:
         return None
     planned = plan_run(store, match, overrides, iteration=iteration - 1)

@@ -1,4 +1,4 @@
-"""The pictures in which two runs differ most: where to look first."""
+"""Images with the largest pose differences between two runs."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from worldpose.cameras import Camera
 from worldpose.store import Run, Store
 
 JOINTS: Final = 9
-"""Joints of a person in the picture, of 17, from which on the person is taken to be in it."""
+"""Minimum number of a person's joints, of 17, inside the image."""
 
 
 @dataclass(frozen=True)
 class PoseChange:
-    """A picture of one camera, and who moved most in it.
+    """Largest pose change in one camera's image.
 
     Attributes:
         clip: its id.
         camera: its id.
         frame: match frame.
         person: id in the first run.
-        moved_px: mean distance of the person's joints in the one run from the other's [px].
+        moved_px: mean distance between the person's joints in the two runs [px].
     """
 
     clip: str
@@ -41,15 +41,15 @@ class PoseChange:
 def largest_pose_changes(
     store: Store, a: RunRecord, b: RunRecord, most: int = 5
 ) -> list[PoseChange]:
-    """The pictures in which bodies moved most, one a camera and clip, the worst first.
+    """Return the images with the largest pose changes, one per camera and clip, largest first.
 
-    Each run's bodies are projected by its own cameras.
+    Each run's bodies are projected with its own cameras.
 
     Args:
         store: with both runs.
-        a: the one run.
-        b: the other, of the same match.
-        most: how many pictures.
+        a: the first run.
+        b: the second run, of the same match.
+        most: maximum number of images.
     """
     spec = find_registration(store, a.match_id).spec
     ours, theirs = Run(store, a), Run(store, b)
@@ -64,7 +64,7 @@ def largest_pose_changes(
 def _worst(
     bodies: BodiesOfBoth, name: str, before: Mapping[str, Camera], after: Mapping[str, Camera]
 ) -> list[PoseChange]:
-    """The worst picture of a camera; none where nobody of both runs is in it."""
+    """Return a camera's image with the largest change; empty if no person of both runs is in it."""
     pairs = bodies.pairs()
     if not pairs or not len(bodies.frame):
         return []

@@ -1,8 +1,8 @@
-"""Prefect's empty database, made once for each of its versions.
+"""Empty Prefect database, created once per Prefect version.
 
-Prefect makes one by a hundred migrations, which takes as long as starting does. All are the same
-while they are empty: the first is kept in the user's cache folder (XDG_CACHE_HOME, or ~/.cache),
-and new projects begin with a copy.
+Prefect creates it with a hundred migrations, which takes as long as the rest of its start. All
+empty databases are equal: the first is kept in the user's cache folder (XDG_CACHE_HOME, or
+~/.cache), and new projects start with a copy.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ DATABASE = "prefect.db"
 
 
 def begin_database(home: Path) -> bool:
-    """Put an empty database into `home`, PREFECT_HOME of a server that is about to start.
+    """Copy an empty database to `home`, PREFECT_HOME of a server that will be started.
 
     Returns:
-        Whether the server is to make the first of its version there, which is then to be kept.
+        Whether the server must create the first one of its version there, to be kept then.
 
     Raises:
-        StoreError: `home` cannot be written to.
+        StoreError: `home` is not writable.
     """
     kept = kept_database()
     if (home / DATABASE).exists():
@@ -38,16 +38,16 @@ def begin_database(home: Path) -> bool:
     with storage_errors(str(home / DATABASE)), whole_file(home / DATABASE) as draft:
         try:
             shutil.copyfile(kept, draft)
-        except OSError as error:  # a copy names its source first, whichever of them failed
+        except OSError as error:  # a copy error names the source file first, whichever failed
             raise OSError(error.errno, error.strerror) from error
     return False
 
 
 def keep_database(home: Path) -> None:
-    """Keep a copy of what a server has made in `home`, and nobody has used yet."""
+    """Keep a copy of the unused database that a server has created in `home`."""
     if not (home / DATABASE).exists():
         return  # the environment names another database
-    # Where there is no place for it, every project waits for its own.
+    # If the cache is not writable, every project creates its own.
     with (
         suppress(OSError, sqlite3.Error),
         whole_file(kept_database()) as draft,
@@ -58,7 +58,7 @@ def keep_database(home: Path) -> None:
 
 
 def kept_database() -> Path:
-    """Where the empty database of this Prefect is kept."""
+    """Return the path of the kept empty database of this Prefect version."""
     given = os.environ.get("XDG_CACHE_HOME", "")
     cache = Path(given) if Path(given).is_absolute() else Path("~/.cache").expanduser()
     return cache / "worldpose" / f"prefect-{version('prefect')}.db"

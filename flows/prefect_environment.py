@@ -1,8 +1,8 @@
-"""Prefect as this project wants it: silent towards the network, its database with the project.
+"""Prefect's environment for this project: no telemetry, its database with the project.
 
-With PREFECT_API_URL set, runs go to that server and appear in its dashboard. Otherwise a run brings
-a server of its own on loopback, for as long as the run lasts. This is the one module that reads and
-sets the environment; it must be called before Prefect is imported.
+With PREFECT_API_URL set, runs use that server and appear in its dashboard. Otherwise a run starts
+its own server on loopback for its duration. Only this module reads and sets the environment; it
+must be called before Prefect is imported.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from worldpose.errors import InputError, WorldposeError
 from worldpose.store.blobs import storage_errors
 
 START_SECONDS = 120.0
-"""The first start of all creates Prefect's database, which took 15 s on two busy cores."""
+"""The very first start creates Prefect's database, which took 15 s on two busy cores."""
 
 ALWAYS = {
     "DO_NOT_TRACK": "1",
@@ -40,20 +40,20 @@ ALWAYS = {
 }
 AUTHORITIES = "PREFECT_API_SSL_CERT_FILE"
 LOOPBACK = "127.0.0.1,localhost"
-"""Never asked for through a proxy."""
+"""Addresses that bypass proxies."""
 SERVER_LOGIN = "PREFECT_SERVER_API_AUTH_STRING"
-"""What a Prefect server asks its clients for, as USER:PASSWORD."""
+"""Login that a Prefect server requires of its clients, as USER:PASSWORD."""
 CLIENT_LOGIN = "PREFECT_API_AUTH_STRING"
-"""What clients of a Prefect server log in with."""
+"""Login of clients at a Prefect server."""
 CLOUD_LOGIN = "PREFECT_API_KEY"
-"""What clients of Prefect Cloud log in with."""
+"""Login of clients at Prefect Cloud."""
 DATABASE = (
     "PREFECT_API_DATABASE_CONNECTION_URL",
     "PREFECT_API_DATABASE_PASSWORD",
     "PREFECT_SERVER_DATABASE_CONNECTION_URL",
     "PREFECT_SERVER_DATABASE_PASSWORD",
 )
-"""What a Prefect server logs in to its database with."""
+"""Logins of a Prefect server at its database."""
 _SECRET = re.compile(
     r"TOKENS?(?![A-Z])|SECRET|PASSW|PASSPHRASE|CREDENTIAL|AUTH_STRING|(API|ACCESS|PRIVATE)_?KEY|"
     r"(CONNECTION|DATABASE|WEBHOOK)_URL|^WORLDPOSE_ALERT|^AWS_(PROFILE|ROLE|WEB)",
@@ -61,46 +61,45 @@ _SECRET = re.compile(
 )
 """Names of variables that hold a secret, or lead to one."""
 UNLESS_GIVEN = {
-    # The server gets every line; the terminal has progress and failures of our own.
+    # The server gets every line; the terminal has our own progress and failures.
     "PREFECT_LOGGING_EXTRA_LOGGERS": "worldpose",
     "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "CRITICAL",
 }
 SERVED = {
-    "PREFECT_FLOWS_HEARTBEAT_FREQUENCY": "30",  # a sign of life; none that is shorter is taken
+    "PREFECT_FLOWS_HEARTBEAT_FREQUENCY": "30",  # heartbeat; the minimum value
     "PREFECT_WORKER_QUERY_SECONDS": "2",
     "PREFECT_SERVER_METRICS_ENABLED": "true",
-    "PREFECT_SERVER_DATABASE_TIMEOUT": "60",  # SQLite takes one writer at a time
+    "PREFECT_SERVER_DATABASE_TIMEOUT": "60",  # SQLite accepts one writer at a time
     "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",
-    "PREFECT_LOGGING_TO_API_WHEN_MISSING_FLOW": "ignore",  # what serves is no run
-    # Dask closes what begins a lost worker anew if that takes longer: 15 s, a slow machine's start.
+    "PREFECT_LOGGING_TO_API_WHEN_MISSING_FLOW": "ignore",  # serving processes are not runs
+    # Dask closes a restarted worker that takes longer than this: 15 s, a slow machine's start.
     "DASK_DISTRIBUTED__DEPLOY__LOST_WORKER_TIMEOUT": str(START_SECONDS),
 }
-"""Of processes that serve, unless given."""
+"""Defaults of serving processes."""
 EMBEDDED = {
-    # For automations and blocks, of which a run's own server has none.
+    # Used by automations and blocks, which a run's own server does not have.
     "PREFECT_API_BLOCKS_REGISTER_ON_START": "false",
     "PREFECT_SERVER_SERVICES_TRIGGERS_ENABLED": "false",
 }
-"""Of a server that lasts as long as its run, unless given."""
+"""Defaults of a server that lasts as long as its run."""
 
 
 def new_login() -> str:
-    """A random login for a Prefect server, as its variables have it."""
+    """Return a random login for a Prefect server, in the format of its variables."""
     return f"worldpose:{secrets.token_urlsafe(24)}"
 
 
 def authorization(login: str) -> str:
-    """The Authorization header with which an HTTP client logs in to a Prefect server."""
+    """Return the Authorization header of an HTTP client's login at a Prefect server."""
     return f"Basic {base64.b64encode(login.encode()).decode()}"
 
 
 def without_secrets(environment: Mapping[str, str], keep: Iterable[str] = ()) -> dict[str, str]:
-    """An environment without the variables that hold secrets, judged by their names.
+    """Return an environment without the variables that hold secrets, selected by name.
 
     Args:
         environment: of a process.
-        keep: variables that its child needs; a name that ends with `*` stands for all that begin
-            with the rest.
+        keep: variables that its child needs; a name that ends with `*` is a prefix.
     """
     kept = tuple(keep)
     exact = {name for name in kept if not name.endswith("*")}
@@ -113,11 +112,11 @@ def without_secrets(environment: Mapping[str, str], keep: Iterable[str] = ()) ->
 
 
 def served_environment(api: str, home: Path | None) -> dict[str, str]:
-    """The environment of the processes of `worldpose serve`, without any secret.
+    """Return the environment of the processes of `worldpose serve`, without secrets.
 
     Args:
         api: address of Prefect's API.
-        home: where a Prefect server of our own keeps its database; None = the server is another's.
+        home: database folder of our own Prefect server; None = an external server.
     """
     port = urlsplit(api).port or 80
     own = {} if home is None else {"PREFECT_HOME": str(home), "PREFECT_SERVER_API_PORT": str(port)}
@@ -126,20 +125,20 @@ def served_environment(api: str, home: Path | None) -> dict[str, str]:
     }
     proxies = {name: os.environ.get(name) for name in ("NO_PROXY", "no_proxy")}
     no_proxy = {name: ",".join(filter(None, [had, LOOPBACK])) for name, had in proxies.items()}
-    # The dashboard asks the server that it came from, under whatever name and port that was.
+    # The dashboard uses the API of the server that it came from, whatever its name and port.
     origins = {"PREFECT_SERVER_CORS_ALLOWED_ORIGINS": api.removesuffix("/api")}
     pages = {"PREFECT_API_URL": api, "PREFECT_UI_API_URL": "/api", **origins}
     return {**without_secrets(os.environ), **ALWAYS, **given, **no_proxy, **own, **pages}
 
 
 def one_authority(folder: Path) -> dict[str, str]:
-    """The environment of those who talk to Prefect over plain HTTP alone: they check nobody.
+    """Return the environment of processes that use Prefect over plain HTTP only: no CA checks.
 
-    Prefect reads every certificate authority twice for each task, which takes 34 ms of processor;
-    of a file with one of them it reads one.
+    Prefect reads every certificate authority twice for each task, which takes 34 ms of CPU time;
+    from a file with one of them it reads one.
 
     Args:
-        folder: where the file is put; workers must see it too.
+        folder: folder of the file; workers must see it too.
     """
     end = b"-----END CERTIFICATE-----\n"
     first = Path(certifi.where()).read_bytes().partition(end)
@@ -149,10 +148,10 @@ def one_authority(folder: Path) -> dict[str, str]:
 
 
 def served_cluster() -> dict[str, Any]:
-    """What a deployment's `DaskTaskRunner` is made with: `worldpose serve` sets it for its worker.
+    """Return a deployment's `DaskTaskRunner` options, which `worldpose serve` sets for its worker.
 
-    WORLDPOSE_DASK is the address of a running scheduler; without it a run makes WORLDPOSE_WORKERS
-    worker processes on its machine, one a core by default.
+    WORLDPOSE_DASK is the address of a running scheduler; without it a run starts WORLDPOSE_WORKERS
+    worker processes on its machine, one per core by default.
     """
     address = os.environ.get("WORLDPOSE_DASK")
     if address:
@@ -164,35 +163,35 @@ def served_cluster() -> dict[str, Any]:
 
 
 def local_cluster_options(workers: int) -> dict[str, Any]:
-    """How Dask makes so many worker processes on this machine; 0 = one a core."""
+    """Return Dask's options for worker processes on this machine; 0 = one per core."""
     return {
         "n_workers": workers or os.cpu_count() or 1,
         "threads_per_worker": 1,
         "memory_limit": 0,  # a limit of one worker's share would kill a long clip's only task
         "dashboard_address": "127.0.0.1:0",
         "silence_logs": "CRITICAL",
-        # A unit that ends its worker gives itself up; those that waited beside it are not to blame.
+        # A unit that ends its worker is given up by itself; units queued with it are not at fault.
         "scheduler_kwargs": {"allowed_failures": 100, "dashboard": False},
-        # A worker would look at its own stack a hundred times a second.
+        # A worker would sample its own stack a hundred times per second.
         "config": {"distributed.worker.profile.enabled": False},
     }
 
 
 def has_server() -> bool:
-    """Is a Prefect server named: only such a one outlives its runs."""
+    """Return whether an external Prefect server is configured, which outlives its runs."""
     return bool(os.environ.get("PREFECT_API_URL"))
 
 
 @contextmanager
 def prefect_server(project: str, *, is_local: bool = False) -> Iterator[Callable[[], None]]:
-    """Environment and server for Prefect; gives a function that returns when its API answers.
+    """Set up environment and server for Prefect; yield a function that waits for its API.
 
-    So Prefect can be imported, which takes seconds, while its server starts. Waiting raises
-    WorldposeError where our own does not answer.
+    Prefect, which takes seconds to import, can then be imported while its server starts. The
+    function raises WorldposeError if our own server does not answer.
 
     Args:
-        project: folder or URL of the store; a local one also keeps Prefect's database.
-        is_local: whether all who will talk to it see this machine's files.
+        project: folder or URL of the store; a local one also holds Prefect's database.
+        is_local: whether all its clients see this machine's files.
 
     Raises:
         InputError: a given server does not answer.
@@ -222,10 +221,10 @@ def prefect_server(project: str, *, is_local: bool = False) -> Iterator[Callable
 
 @contextmanager
 def _home(project: str, scratch: Path) -> Iterator[Path]:
-    """Where Prefect's database lies: with a local project, which saves making it anew.
+    """Return the folder of Prefect's database: a local project's, which saves its creation.
 
-    While another run of the project uses that one, or on object storage, it is a passing one: two
-    servers that make one database at once destroy it.
+    While another run of the project uses that folder, or on object storage, it is a temporary one:
+    two servers that create one database at once destroy it.
     """
     if "://" in project:
         yield scratch
@@ -261,8 +260,8 @@ def _embedded_server(home: Path, log: Path) -> Iterator[tuple[str, Callable[[], 
     is_first = begin_database(home)
     with socket.create_server(("127.0.0.1", 0)) as listening, log.open("wb") as output:
         address = f"http://127.0.0.1:{listening.getsockname()[1]}/api"
-        # The server ends when its standard input does, so a killed run leaves none behind. It is
-        # given the socket rather than a port, which another process could have taken meanwhile.
+        # The server ends when its standard input closes, so a killed run leaves none behind. It
+        # inherits a socket rather than a port, which another process could take in between.
         server = subprocess.Popen(
             [sys.executable, "-m", "flows.prefect_server", "--socket", str(listening.fileno())],
             stdin=subprocess.PIPE,
@@ -291,7 +290,7 @@ def _embedded_server(home: Path, log: Path) -> Iterator[tuple[str, Callable[[], 
 
 
 def _wait_until_healthy(server: subprocess.Popen[bytes], address: str, log: Path) -> None:
-    """Returns when the embedded server answers.
+    """Return when the embedded server answers.
 
     Raises:
         WorldposeError: it ended, or does not answer in time.
@@ -317,10 +316,10 @@ def _require_answer(address: str) -> None:
 
 
 def require_login(address: str) -> None:
-    """Check that a Prefect server takes this process's login.
+    """Check that a Prefect server accepts this process's login.
 
     Raises:
-        InputError: it asks for another one.
+        InputError: it requires another login.
     """
     login, key = os.environ.get(CLIENT_LOGIN), os.environ.get(CLOUD_LOGIN)
     headers = {"authorization": f"Bearer {key}"} if key else {}
@@ -338,7 +337,7 @@ def require_login(address: str) -> None:
                 todo=f"Set it to what that server has in {SERVER_LOGIN}.",
             ) from None
     except (OSError, ValueError):
-        return  # whoever asks next says why it does not answer
+        return  # the next request reports why it does not answer
 
 
 def _answers(address: str) -> bool:

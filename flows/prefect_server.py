@@ -1,7 +1,7 @@
 """Prefect's server behind a guard: `python -m flows.prefect_server --host HOST --port PORT`.
 
-Prefect's own program checks no Host and no Origin, and asks for a login only where
-PREFECT_SERVER_API_AUTH_STRING is set. This one refuses to start without.
+Prefect's own program checks neither Host nor Origin, and requires a login only if
+PREFECT_SERVER_API_AUTH_STRING is set. This one does not start without it.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp
 
 MAX_CONNECTIONS: Final = 1000
-"""Open at a time: every run and every one of its workers has several."""
+"""Maximum open connections: every run and every one of its workers has several."""
 
 
 def guarded_app(names: Iterable[str], *, is_embedded: bool = False) -> ASGIApp:
-    """Prefect's API, and its dashboard unless embedded, for requests that name this server.
+    """Create Prefect's API, and its dashboard unless embedded, for requests that name this server.
 
     Args:
-        names: under which it is known, besides those of loopback.
+        names: names of the server, in addition to those of loopback.
         is_embedded: whether it lasts as long as one run.
 
     Raises:
@@ -45,7 +45,7 @@ def guarded_app(names: Iterable[str], *, is_embedded: bool = False) -> ASGIApp:
             found="none: every user who reaches it could start runs",
             todo=f"Set it: export {SERVER_LOGIN}=worldpose:$(openssl rand -hex 16).",
         )
-    # Collecting garbage takes a fifth of the seconds in which modules are imported that all stay.
+    # Garbage collection takes a fifth of the import time, although all modules stay.
     gc.disable()
     from prefect.server.api.server import create_app
 
@@ -60,11 +60,11 @@ def serve(host: str, port: int, names: Iterable[str]) -> None:
 
     Args:
         host: address to listen at.
-        port: of it.
-        names: of this machine in clients elsewhere.
+        port: port to listen at.
+        names: names of this machine for remote clients.
     """
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # each client has some connections
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # each client has several connections
     serve_http(
         guarded_app({*names, host} - {"0.0.0.0", "::"}),
         host=host,
@@ -77,10 +77,10 @@ def serve(host: str, port: int, names: Iterable[str]) -> None:
 
 
 def main() -> None:
-    """Serve as the arguments say.
+    """Serve as the arguments state.
 
-    `--socket` is for `worldpose run`: the inherited socket is served until standard input closes.
-    Prefect's own temporary server outlives a parent that is killed; this one does not.
+    `--socket` is for `worldpose run`: serve the inherited socket until standard input closes.
+    Prefect's own temporary server outlives a killed parent; this one does not.
     """
     parser = argparse.ArgumentParser(prog="python -m flows.prefect_server")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at")

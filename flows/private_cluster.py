@@ -1,8 +1,8 @@
-"""Workers on this machine, and a scheduler that only they and their run can use.
+"""Local workers and a scheduler that only they and their run can use.
 
-Dask runs whatever code a client sends, and a scheduler listens to every user of its machine. This
-one takes no connection without a certificate that exists in the memory of one run's processes.
-For a cluster over several machines, `python -m flows.private_cluster FOLDER` writes such a one.
+Dask runs any code that a client sends, and a scheduler is reachable for every user of its machine.
+This one requires a certificate that exists only in the memory of one run's processes. For a cluster
+over several machines, `python -m flows.private_cluster FOLDER` writes a certificate.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from distributed import LocalCluster, Security
 
 
 class PrivateCluster(LocalCluster):
-    """A local cluster over TLS, for those that have its certificate; nothing of it speaks HTTP."""
+    """Local cluster over TLS, for processes with its certificate; it has no HTTP servers."""
 
     def __init__(self, preload: list[str] | None = None, **options: Any) -> None:  # noqa: ANN401
-        # The servers for HTTP are closed as soon as they are started, and had nothing to tell.
+        # The HTTP servers are closed right after their start, before they served anything.
         silent: dict[str, list[str]] = {
             f"distributed.{node}.http.routes": [] for node in ("scheduler", "worker")
         }
@@ -41,7 +41,7 @@ class PrivateCluster(LocalCluster):
 def write_certificate(folder: Path) -> None:
     """Write `certificate.pem` and `key.pem`, valid for a year, for this user alone.
 
-    Schedulers, workers and clients that have both trust each other and nobody else.
+    Schedulers, workers and clients with both files trust only each other.
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     made = Security.temporary()

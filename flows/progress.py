@@ -1,4 +1,4 @@
-"""Progress of a run, told to whoever started it."""
+"""Progress reports of a run."""
 
 from __future__ import annotations
 
@@ -12,53 +12,53 @@ from typing import Final
 logger = logging.getLogger("worldpose.run")
 
 MOST_TOLD: Final = 200
-"""Units of a stage that are told of; of more, every so-manieth: nobody reads thousands of lines."""
+"""Units of a stage that are reported one by one; of more, only every n-th."""
 
 
 class Reporter:
-    """Tells progress as log lines, which a Prefect server shows with the run.
+    """Reports progress as log lines, which a Prefect server shows with the run.
 
-    The command line puts a livelier one in its place, which tells this one too.
+    The command line installs its own reporter, which calls this one too.
 
     Attributes:
-        left: units of the stage at work that are still to end.
-        every: of how many that are done one is told of.
+        left: units of the current stage that have not ended.
+        every: report every n-th finished unit.
     """
 
     left: int = 0
     every: int = 1
 
     def say(self, text: str) -> None:
-        """Anything else that takes a while."""
+        """Report any other slow operation."""
         logger.info(text)
 
     def stage_started(self, stage: str, about: str, *, units: int, missing: int) -> None:
-        """A stage begins: how many units it has and how many must be computed."""
+        """Report the start of a stage, its number of units and how many must be computed."""
         self.left, self.every = missing, max(1, math.ceil(missing / MOST_TOLD))
         logger.info("%s: %s (%d units, %d to compute)", stage, about, units, missing)
 
     def unit_done(self, unit: str, seconds: float, figures: Mapping[str, float]) -> None:
-        """A unit has been computed and published."""
+        """Report that a unit has been computed and published."""
         self.left -= 1
         if self.left % self.every == 0:
             self.tell_of(unit, seconds, figures)
 
     def tell_of(self, unit: str, seconds: float, figures: Mapping[str, float]) -> None:
-        """Say that a unit is done; where there are very many, not of each."""
+        """Report that a unit is done; with very many units, only every n-th."""
         logger.info("%s: done in %.2f s (%s)", unit, seconds, in_short(figures))
 
     def unit_waits(self, unit: str, reasons: Sequence[str]) -> None:
-        """A unit's result waits for a person."""
+        """Report that a unit's result needs review."""
         logger.warning("%s: waits for review: %s", unit, "; ".join(reasons))
 
     def unit_failed(self, unit: str, message: str) -> None:
-        """A unit has no result."""
+        """Report that a unit has no result."""
         self.left -= 1
         logger.error("%s: failed: %s", unit, message)
 
 
 def in_short(figures: Mapping[str, float]) -> str:
-    """A unit's figures on one line, without those of single cameras."""
+    """Format a unit's metrics on one line, without those of single cameras."""
     return ", ".join(f"{name} {value:.4g}" for name, value in figures.items() if "." not in name)
 
 
@@ -66,13 +66,13 @@ _reporter: ContextVar[Reporter | None] = ContextVar("reporter", default=None)
 
 
 def reporter() -> Reporter:
-    """The reporter of the run under way."""
+    """Return the reporter of the current run."""
     return _reporter.get() or Reporter()
 
 
 @contextmanager
 def reporting_to(target: Reporter) -> Iterator[None]:
-    """Let runs started in this context tell `target` of their progress."""
+    """Send progress of runs started in this context to `target`."""
     token = _reporter.set(target)
     try:
         yield

@@ -1,4 +1,4 @@
-"""Matches known to a project: registering folders, opening what is registered."""
+"""Registration of match folders in a project, and access to registered matches."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from worldpose.store import Store
 
 
 def register(store: Store, folder: Path, *, unfinished: bool = False) -> tuple[Match, bool]:
-    """Validate a match folder and make it known; tells whether it was new or changed.
+    """Validate and register a match folder; return whether it was new or changed.
 
-    The same content under another name is the same match. A known match whose videos, detections
-    or pitch changed is another match and needs another id.
+    The same content under another name is the same match. A known match with changed videos,
+    detections or pitch is another match and needs another id.
 
     Args:
         store: the project.
         folder: the match folder.
-        unfinished: take it without knowing all of its cameras; people click them on the pages.
+        unfinished: accept it without all cameras known; people click them on the pages.
 
     Raises:
-        InputError: the folder is not a valid match, or its id or content is taken.
+        InputError: the folder is not a valid match, or its id or content is already registered.
     """
     match_folder = read_match(folder)
     match_id = match_folder.spec.match_id
@@ -59,28 +59,28 @@ def register(store: Store, folder: Path, *, unfinished: bool = False) -> tuple[M
 
 
 def open_match(store: Store, match_id: str) -> Match:
-    """A registered match, with its folder read anew: annotations may have changed since.
+    """Open a registered match and read its folder again: annotations may have changed since.
 
     Raises:
-        InputError: no such match, or its folder is not as it must be.
+        InputError: there is no such match, or its folder is invalid.
     """
     return register(store, Path(find_registration(store, match_id).folder))[0]
 
 
 def open_for_review(store: Store, match_id: str) -> Match:
-    """A registered match as `open_match` gives it, whether or not all its cameras are known."""
+    """Open a registered match like `open_match`, even if cameras are missing."""
     folder = Path(find_registration(store, match_id).folder)
     return register(store, folder, unfinished=True)[0]
 
 
 def find_registration(store: Store, name: str) -> Registration:
-    """What the project knows of the match that a person means by a folder or an id.
+    """Return the registration of a match given by folder or id.
 
-    Nothing is read from the match folder but its id, and nothing is written: results stay
-    readable when the folder has moved or has been edited.
+    Only the id is read from the match folder, and nothing is written: results stay readable when
+    the folder has moved or has been edited.
 
     Raises:
-        InputError: no such match.
+        InputError: there is no such match.
     """
     folder = Path(name)
     match_id = read_match(folder).spec.match_id if (folder / "match.yaml").is_file() else name
@@ -97,7 +97,7 @@ def find_registration(store: Store, name: str) -> Registration:
 
 
 def find_match(store: Store, name: str) -> Match:
-    """The match that a person means by a folder or an id; a folder is registered first."""
+    """Open a match given by folder or id; a folder is registered first."""
     folder = Path(name)
     if (folder / "match.yaml").is_file() or (folder.is_dir() and name not in store.matches()):
         return register(store, folder)[0]
@@ -105,12 +105,12 @@ def find_match(store: Store, name: str) -> Match:
 
 
 def _refuse_duplicate(store: Store, registration: Registration) -> None:
-    """Refuse a second folder of known content; a folder that moved is no second one."""
+    """Refuse a second folder of known content; a moved folder does not count as a second one."""
     for match_id in store.matches():
         try:
             known = store.registration(match_id)
         except CorruptionError:
-            continue  # `status` and `verify` tell; another match can be registered all the same
+            continue  # `status` and `verify` report it; other matches can be registered
         if known is None or known.identity != registration.identity:
             continue
         renamed = known.spec.match_id != registration.spec.match_id
@@ -125,7 +125,7 @@ def _refuse_duplicate(store: Store, registration: Registration) -> None:
 
 
 def _is_there(folder: Path) -> bool:
-    """Does the folder exist; one that does not answer may."""
+    """Return whether the folder exists; one that does not answer counts as existing."""
     try:
         folder.stat()
     except (FileNotFoundError, NotADirectoryError):
@@ -140,7 +140,7 @@ def _read_new_files(
 ) -> None:
     """Refuse broken 2D poses, videos and stills now, not in the middle of a run.
 
-    All are read again where match.yaml says something else of them: they may not bear it out.
+    All files are read again if match.yaml changed: they may not agree with it.
     """
     known: set[str] = set()
     if previous is not None and _of_footage(previous.spec) == _of_footage(match.spec):
@@ -164,7 +164,7 @@ def _read_new_files(
 
 
 def _of_footage(spec: MatchSpec) -> MatchSpec:
-    """What match.yaml says of cameras and clips: who is who has no say in what files must be."""
+    """Return match.yaml's camera and clip entries: identities do not affect file checks."""
     clips = tuple(clip.model_copy(update={"people": {}}) for clip in spec.clips)
     return spec.model_copy(update={"clips": clips, "roster": ()})
 

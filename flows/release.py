@@ -1,4 +1,4 @@
-"""What of a run is given out: clips, the best joints, the best static cameras."""
+"""Results of a run for release: clips, the best joints, the best static cameras."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     import xarray as xr
 
 BODY_STAGES = ("body_fitting", "refitting")
-"""Stages that give bodies, the best last."""
+"""Stages that produce bodies, the best last."""
 JOINT_STAGES = ("triangulation", "retriangulation", *BODY_STAGES)
-"""Stages that give 3D joints, the best last."""
+"""Stages that produce 3D joints, the best last."""
 ADJUSTED = "bundle_adjustment/cameras"
-"""Where all static cameras are once people have adjusted them."""
+"""Result with all static cameras after adjustment."""
 
 
 def clips_of(record: RunRecord) -> tuple[str, ...]:
-    """The clips for which a run has joints.
+    """Return the clips for which a run has joints.
 
     Raises:
         WorldposeError: there are none.
@@ -44,12 +44,12 @@ def clips_of(record: RunRecord) -> tuple[str, ...]:
 
 
 def clip_title(clip: str) -> str:
-    """What a reader is told of which clip something is."""
+    """Return the heading of a clip."""
     return "The clip" if clip == "clip" else f"Clip {clip}"
 
 
 def joint_tracks(run: Run, clip: str, stage: str | None = None) -> JointTracks:
-    """The joints of one clip, of the best stage that has them or of the stage asked for.
+    """Return the joints of one clip, from the best available or the given stage.
 
     Raises:
         UsageError: the run has no such result.
@@ -76,13 +76,13 @@ def joint_tracks(run: Run, clip: str, stage: str | None = None) -> JointTracks:
 
 
 def bodies_unit(run: Run, clip: str) -> str:
-    """The best fitted bodies of a clip, as `stage/unit`, whether or not the run has any."""
+    """Return the best bodies of a clip, as `stage/unit`, whether or not they exist."""
     first, again = (f"{stage}/{clip}" for stage in BODY_STAGES)
     return again if again in run else first
 
 
 def body_tracks(run: Run, clip: str) -> BodyTracks | None:
-    """The best fitted bodies of a clip; None where the run has none."""
+    """Return the best fitted bodies of a clip; None if the run has none."""
     if bodies_unit(run, clip) not in run:
         return None
     fits = run[bodies_unit(run, clip)]
@@ -97,7 +97,7 @@ def body_tracks(run: Run, clip: str) -> BodyTracks | None:
 
 
 def placed_joints(run: Run, clip: str) -> xr.Dataset:
-    """The best triangulated joints of one clip, with the views that carry them.
+    """Return the best triangulated joints of one clip, with their contributing views.
 
     Raises:
         UsageError: the run has none.
@@ -114,12 +114,12 @@ def placed_joints(run: Run, clip: str) -> xr.Dataset:
 
 
 def static_cameras(run: Run, spec: MatchSpec, stage: str | None = None) -> dict[str, Camera]:
-    """The static cameras that a run has, by id; where it has joints, all that it did not leave out.
+    """Return the static cameras of a run by id; if it has joints, all that it did not leave out.
 
     Args:
         run: the run.
         spec: the match.
-        stage: as the joints of this stage were placed with them; None = the best there are.
+        stage: the cameras with which this stage computed joints; None = the best available.
     """
     if ADJUSTED in run and stage != "triangulation":
         adjusted = run[ADJUSTED]
@@ -138,7 +138,7 @@ def static_cameras(run: Run, spec: MatchSpec, stage: str | None = None) -> dict[
 
 
 def broadcast_cameras(run: Run) -> dict[str, Camera]:
-    """The broadcast camera of every calibrated clip, a batch (frames,), by clip."""
+    """Return the broadcast camera of every calibrated clip, a batch (frames,), by clip."""
     return {
         clip: camera_from_arrays(run[broadcast_unit(run, clip)].data_vars)
         for stage, _, clip in (name.partition("/") for name in run)
@@ -147,6 +147,6 @@ def broadcast_cameras(run: Run) -> dict[str, Camera]:
 
 
 def broadcast_unit(run: Run, clip: str) -> str:
-    """The best broadcast camera of a clip, as `stage/unit`."""
+    """Return the best broadcast camera of a clip, as `stage/unit`."""
     pooled = f"broadcast_pooling/{clip}"
     return pooled if pooled in run else f"broadcast_calibration/{clip}"

@@ -1,4 +1,4 @@
-"""A release: the files of a run under a name, frozen, with a manifest that proves them."""
+"""Release: the frozen files of a named run, with a checksum manifest."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.store import Store, pin_run
 
 CLASHING = {"worldpose", "challenge", "challenge-2025"}
-"""Formats that want the same file names; a folder holds one of them."""
+"""Formats with the same file names; a folder can hold one of them."""
 COUNTED = {"joints", *CLASHING}
-"""Formats that `check` and `statistics` read, and that do not say the frame rate."""
+"""Formats that `check` and `statistics` read, and that lack the frame rate."""
 
 
 def export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
-    """Writes a run in several formats into one folder; returns the files.
+    """Write a run in several formats into one folder; return the files.
 
-    With what `check` and `statistics` read goes frame_rates.json.
+    Formats that `check` and `statistics` read also get frame_rates.json.
 
     Raises:
-        UsageError: an unknown format, or two that want the same files.
+        UsageError: an unknown format, or two with the same file names.
     """
     written = _export(origin, forms, out)
     if not COUNTED & set(forms):
@@ -45,7 +45,7 @@ def export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
 
 
 def _export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
-    """As `export`, for a release too, whose manifest says the frame rate."""
+    """Write formats like `export`, also for a release, whose manifest has the frame rate."""
     for form in forms:
         if form not in EXPORTS:
             raise UsageError(
@@ -65,7 +65,7 @@ def _export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
 
 
 def _keep(store: Store, origin: Origin, name: str) -> None:
-    """Pins the run of a release, so that nothing that the release names is ever collected."""
+    """Pin the run of a release, so that its results are never garbage collected."""
     record = origin.run.record
     pin = Pin(
         match_id=record.match_id,
@@ -81,9 +81,9 @@ def _keep(store: Store, origin: Origin, name: str) -> None:
 def release(
     store: Store, origin: Origin, forms: list[str], out: Path, name: str, licence: str
 ) -> list[Path]:
-    """Writes a release: the formats, origins/<clip>.npz and manifest.json; returns the files.
+    """Write a release: the formats, origins/<clip>.npz and manifest.json; return the files.
 
-    A release is frozen: its folder takes the same release again, and no other. Its run is pinned.
+    A release is frozen: its folder accepts only the same release again. Its run is pinned.
 
     Raises:
         UsageError: the folder holds another release.

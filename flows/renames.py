@@ -1,8 +1,15 @@
-"""Former names of commands, options and settings: each is refused with its present name."""
+"""Former names of commands, options and settings: each is refused with its present name.
+
+Settings in the records of earlier runs are read under their present names.
+"""
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from pydantic import JsonValue
 
 COMMANDS: Final = {"times": "timings"}
 OPTIONS: Final = {
@@ -13,7 +20,7 @@ OPTIONS: Final = {
     },
 }
 """By command."""
-SETTINGS: Final = {
+SETTINGS: Final[Mapping[str, Mapping[str, str]]] = {
     "detection": {
         "mirrored": "flip_test",
         "overlap": "nms_iou",
@@ -45,3 +52,13 @@ SETTINGS: Final = {
     },
 }
 """By stage."""
+
+
+def rename_settings(
+    overrides: Mapping[str, Mapping[str, JsonValue]],
+) -> dict[str, dict[str, JsonValue]]:
+    """Return settings by stage under their present names."""
+    return {
+        stage: {SETTINGS.get(stage, {}).get(name, name): value for name, value in values.items()}
+        for stage, values in overrides.items()
+    }

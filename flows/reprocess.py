@@ -1,4 +1,4 @@
-"""The flow that a schedule or an event starts: whatever an edit has touched is made current."""
+"""Scheduled flow that recomputes all results that edits made stale."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from worldpose.store import Store
 
 
 class UnprocessedError(WorldposeError):
-    """Some matches could not be made current; the others are."""
+    """Some matches could not be recomputed; the others are current."""
 
 
 @flow(name="reprocess", validate_parameters=False)
@@ -25,19 +25,19 @@ def reprocess(
     workers: int | None = None,
     time_limits: dict[str, float] | None = None,
 ) -> dict[str, str]:
-    """Runs every match of a project that an edit has touched; gives each match's state.
+    """Run every match of a project with stale results; return each match's state.
 
-    Nothing is started where nothing was touched. A match that waits for people is no failure; its
-    run goes on when this flow comes again after their verdict.
+    Nothing is started if nothing is stale. A match that waits for review is no failure; its run
+    continues when this flow is called again after the verdict.
 
     Args:
         project: folder or URL of the store.
         matches: ids of registered matches; none = all.
-        settings: stage to settings to ask for beside those of each match's latest run.
-        retry: try again what failed, though nothing was edited.
+        settings: stage to settings that override those of each match's latest run.
+        retry: retry failed units, even without an edit.
         dask: address of a running Dask scheduler; None starts workers on this machine.
-        workers: number of worker processes on this machine; None = one a core.
-        time_limits: stage to the minutes that a unit may be at work, where not as long as all.
+        workers: number of worker processes on this machine; None = one per core.
+        time_limits: stage to the time limit of a unit [min], if not the default.
 
     Raises:
         UnprocessedError: some matches failed or are partial; the others are done.

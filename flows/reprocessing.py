@@ -1,4 +1,4 @@
-"""Making current again whatever an edit has touched, match by match."""
+"""Recomputation of all results that edits made stale, match by match."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ State = Literal["never run", "untouched", "touched", "complete", "waiting", "par
 
 @dataclass(frozen=True)
 class Reprocessed:
-    """What became of one match.
+    """Outcome for one match.
 
     Attributes:
         match_id: the match.
-        state: never run and untouched: nothing to do; touched: there is, and nothing was done;
-            otherwise the new run's, or failed where there is none.
-        touched: what was to be done; None where that could not be found out.
-        record: of the run that stands.
-        problem: why nothing was found out or no run was recorded.
+        state: never run and untouched: nothing to do; touched: stale, but not run; otherwise the
+            new run's state, or failed if there is none.
+        touched: stale results of the match; None if they could not be determined.
+        record: record of the current run.
+        problem: why the check failed or no run was recorded.
     """
 
     match_id: str
@@ -46,17 +46,17 @@ def reprocess_matches(
     retry: bool = False,
     is_rehearsal: bool = False,
 ) -> list[Reprocessed]:
-    """Runs every match that an edit has touched, to where its latest run went.
+    """Run every match with stale results, up to the last stage of its latest run.
 
-    A match is run with the settings, gates and iterations of its latest run. What cannot be done
-    for one match is said of that, and stops no other.
+    A match is run with the settings, gates and iterations of its latest run. A failure is reported
+    for its match, and does not stop the others.
 
     Args:
         store: the project.
-        match_ids: registered matches; none = all.
+        match_ids: registered matches; empty = all.
         request: further settings for each, and the machines.
-        retry: try again what failed, though nothing of it was edited.
-        is_rehearsal: only find out what would be done.
+        retry: retry failed units, even without an edit.
+        is_rehearsal: only determine what would be done.
     """
     with shared_machines(store, request) as machines_for:
         return [
@@ -84,7 +84,7 @@ def _reprocess(
             return Reprocessed(match_id, "touched", touched, touched.latest)
         reporter().say(f"{match_id}: {len(touched.to_compute)} units to compute")
         record = _run(store, touched, machines_for(touched.to_compute))
-    except Exception as failure:  # whatever it is, the other matches go on
+    except Exception as failure:  # any error, so that the other matches continue
         text = str(failure)
         if not isinstance(failure, WorldposeError | OSError):
             text = str(InternalError.wrapping(match_id, failure))

@@ -1,4 +1,4 @@
-"""What waits for people, what they say of it, and how a run goes on after that."""
+"""Review of results: pending requests, verdicts, and the continuation of a run."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ State = Literal["waits", "approve", "reject", "superseded"]
 
 @dataclass(frozen=True)
 class Review:
-    """A question, and what was said.
+    """A review request and its verdict.
 
     Attributes:
-        request: what a person was asked to look at.
-        decision: the last verdict on the very same bytes.
-        is_current: is it about what the latest run has.
+        request: the review request.
+        decision: the last verdict on exactly these bytes.
+        is_current: whether it refers to the latest run's result.
     """
 
     request: ReviewRequest
@@ -38,20 +38,20 @@ class Review:
 
     @property
     def state(self) -> State:
-        """The verdict; without one, whether somebody is waited for."""
+        """The verdict; without one, whether it is pending or superseded."""
         if self.decision is not None:
             return self.decision.verdict
         return "waits" if self.is_current else "superseded"
 
     @property
     def question(self) -> str:
-        """What a person is to decide."""
+        """The decision that is asked of the reviewer."""
         gates = {gate.stage: gate.question for gate in GATES}
         return gates.get(self.request.gate, "Is it good enough to be built upon?")
 
 
 def reviews_of(match: Match, latest: RunRecord | None) -> list[Review]:
-    """All questions about a match, first to last.
+    """Return all review requests of a match, first to last.
 
     Args:
         match: with its journal.
@@ -71,7 +71,7 @@ def _reviews(journal: Journal, latest: RunRecord | None) -> list[Review]:
 
 
 def warnings_of(match: Match) -> list[str]:
-    """What people said that cannot be heeded: damaged entries, corrections that do not apply."""
+    """Return warnings about unusable entries: damaged ones, and corrections that do not apply."""
     return [
         *match.journal.damage,
         *(
@@ -82,7 +82,7 @@ def warnings_of(match: Match) -> list[str]:
 
 
 def still_waiting(match: Match, latest: RunRecord | None) -> list[WaitingUnit]:
-    """What the latest run waits for, without what was approved since."""
+    """Return the units for which the latest run waits, without those approved since."""
     said = match.journal.questions
     decisions = [each for each in said if isinstance(each, ReviewDecision)]
     verdicts = {decision.request: decision.verdict for decision in decisions}
@@ -101,21 +101,21 @@ def decide(
     edits: Sequence[Edit] = (),
     seen: Mapping[str, str] | None = None,
 ) -> tuple[list[str], list[Correction]]:
-    """Keep a verdict and its corrections, all at once; gives the ids decided and the corrections.
+    """Record a verdict and its corrections at once; return decided ids and corrections.
 
     Args:
-        store: where the journal lies.
+        store: the store that holds the journal.
         match: as it was opened.
-        requests: ids of the questions; none = all that wait.
+        requests: ids of the review requests; empty = all pending ones.
         verdict: the verdict on each.
-        who: the person.
-        why: in the person's words.
-        edits: what is wrong in what was looked at.
-        seen: id of each question to the state that the person saw; None = whatever it is.
+        who: name of the reviewer.
+        why: the reviewer's comment.
+        edits: corrections of the reviewed results.
+        seen: review id to the state that the reviewer saw; None = any state.
 
     Raises:
-        StaleEditError: somebody else decided since the person looked.
-        InputError: no such question, nothing waits, or an edit does not apply; nothing is kept.
+        StaleEditError: another person decided since the reviewer looked.
+        InputError: an unknown request, no pending one, or an edit does not apply; nothing is kept.
     """
     latest = latest_run(store, match.match_id)
     ids: list[str] = []
@@ -177,7 +177,7 @@ def _decided_meanwhile(name: str, review: Review, seen: str | None) -> StaleEdit
 def correct(
     store: Store, match: Match, edits: Sequence[Edit], *, who: str, why: str
 ) -> list[Correction]:
-    """Take corrections in without a verdict.
+    """Record corrections without a verdict.
 
     Raises:
         InputError: an edit does not apply; none is kept.
@@ -195,10 +195,10 @@ def correct(
 
 
 def withdraw(store: Store, match: Match, correction: str, *, who: str, why: str) -> None:
-    """Take a correction back.
+    """Withdraw a correction.
 
     Raises:
-        InputError: no such correction stands.
+        InputError: no such correction is in force.
     """
     say(
         store,
@@ -208,7 +208,7 @@ def withdraw(store: Store, match: Match, correction: str, *, who: str, why: str)
 
 
 def origins_of(store: Store, match: Match, record: RunRecord) -> dict[str, Origin]:
-    """Where each result of a run comes from: automatic, corrected or rejected, by `stage/unit`."""
+    """Return each result's origin by `stage/unit`: automatic, corrected or rejected."""
     made_from: dict[str, tuple[str, ...]] = {}
     rejected = set()
     for name, key in record.results.items():
@@ -222,10 +222,10 @@ def origins_of(store: Store, match: Match, record: RunRecord) -> dict[str, Origi
 
 
 def resume(store: Store, match: Match) -> list[str]:
-    """Let suspended runs of a match go on; gives their names at the server.
+    """Resume suspended runs of a match; return their names at the server.
 
     Raises:
-        InputError: no Prefect server is named, or somebody still has to decide.
+        InputError: no Prefect server is named, or a review is pending.
     """
     match_id = match.match_id
     if not has_server():
@@ -243,6 +243,6 @@ def resume(store: Store, match: Match) -> list[str]:
             found=f"none on {', '.join(review.request.id for review in waiting)}",
             todo="Decide first: worldpose review approve, or reject.",
         )
-    from flows.suspension import resume_suspended  # late: Prefect takes seconds to import
+    from flows.suspension import resume_suspended  # imported here: Prefect takes seconds to import
 
     return resume_suspended(store.url, match_id)

@@ -1,4 +1,4 @@
-"""The record of a run while it is being made."""
+"""Record of a run in progress."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from flows.left_out import left_out_cameras, left_out_warnings
 from flows.method import GATES, METHOD
 from flows.planning import PlannedUnit, StagePlan, plan_stage
 from flows.progress import reporter
+from flows.renames import rename_settings
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
 from flows.stages import body_fitting, tracking, triangulation
@@ -23,15 +24,21 @@ from worldpose.store import Store, libraries
 
 
 def latest_run(store: Store, match_id: str) -> RunRecord | None:
-    """The match's latest finished run, None before the first."""
-    return store.run(match_id) if store.runs(match_id) else None
+    """Return the match's latest finished run, None before the first.
+
+    Its settings have their present names, whichever version of worldpose wrote the record.
+    """
+    if not store.runs(match_id):
+        return None
+    record = store.run(match_id)
+    return record.model_copy(update={"overrides": rename_settings(record.overrides)})
 
 
 @dataclass
 class RunLog:
-    """What a run has reused, computed and failed at so far.
+    """Results that a run has reused, computed and failed to compute so far.
 
-    `close` turns it into the stored record; until then the run is visible only as unfinished.
+    `close` turns it into the stored record; until then the run counts as unfinished.
     """
 
     store: Store
@@ -65,10 +72,10 @@ class RunLog:
         gates: GatePolicy = "never",
         iteration: int = 1,
     ) -> Self:
-        """A new run with its number reserved; earlier stages stand as the latest run has them.
+        """Reserve a new run; results of earlier stages are taken from the latest run.
 
         Raises:
-            EditedMeanwhileError: the iteration before has not the results that this one is made of.
+            EditedMeanwhileError: the previous iteration lacks the inputs of this one.
         """
         latest = latest_run(store, match.match_id)
         basis = basis_of(store, match, stages, overrides, latest, iteration)
@@ -89,18 +96,18 @@ class RunLog:
 
     @property
     def passed(self) -> dict[str, str]:
-        """The results that later stages may be made from."""
+        """The results that later stages can use."""
         return passed(self.results, self.waiting)
 
     def plan(self, stage: Stage) -> StagePlan:
-        """What a stage has to do, now that those before it have run."""
+        """Plan a stage, now that those before it have run."""
         given = (self.store, self.match, stage, self.overrides)
         plan = plan_stage(*given, self.passed, self.before)
         self.lacks_cameras = self.lacks_cameras or plan.lacks_cameras
         return plan
 
     def hold(self, stage: Stage) -> None:
-        """Keep back what waits for a person behind a stage that has run."""
+        """Hold back results of a finished stage that need review."""
         held = self.gatekeeper.held(stage.name, self.results)
         self.waiting += held
         for unit in held:
@@ -113,7 +120,7 @@ class RunLog:
             self.reused.append(unit.name)
 
     def finished(self, unit: PlannedUnit, failure: BaseException | None) -> None:
-        """Note that a unit's task has ended."""
+        """Record that a unit's task has ended."""
         if failure is None:
             self.results[unit.name] = unit.key
             self.executed.append(unit.name)
@@ -132,7 +139,7 @@ class RunLog:
             reporter().unit_failed(unit.name, message)
 
     def close(self) -> RunRecord:
-        """Store the record: from here on the run counts, and people are asked what it waits for."""
+        """Store the record: the run is then finished, and its review requests are created."""
         self._carry_over()
         for name in self.results.keys() - self.figures.keys():
             stage, _, unit = name.partition("/")
@@ -173,7 +180,7 @@ class RunLog:
         return record
 
     def _doubts(self) -> Iterator[str]:
-        """Yield warnings of results that are probably wrong where no gate asks a person."""
+        """Yield warnings of results that are probably wrong, at stages without an active gate."""
         if self.gatekeeper.policy != "never":
             return
         gates = {gate.stage: gate for gate in GATES}
@@ -187,12 +194,12 @@ class RunLog:
                 )
 
     def _in_order(self) -> list[str]:
-        """The units with results, in the order of the method."""
+        """Return the units with results, in the order of the method."""
         stages = [stage.name for stage in METHOD]
         return sorted(self.results, key=lambda name: (stages.index(name.partition("/")[0]), name))
 
     def _carry_over(self) -> None:
-        """Keep results of later stages that are current all the same, and wait for nobody."""
+        """Keep results of later stages that are still current and need no review."""
         for stage in METHOD[METHOD.index(self.stages[-1]) + 1 :]:
             plan = self.plan(stage)
             current = {unit.name: unit for unit in plan.units if unit.published}
@@ -201,7 +208,7 @@ class RunLog:
             self.reuse(current[name] for name in let_pass)
 
     def _settings(self) -> tuple[dict[str, dict[str, Any]], dict[str, dict[str, Any]]]:
-        """All settings and the asked-for ones, by stage; a standing stage keeps its own."""
+        """Return all settings and the overrides, by stage; stages that did not run keep theirs."""
         first = METHOD.index(self.stages[0])
         settings = {
             stage.name: settings_of(stage, self.overrides).model_dump(mode="json")
@@ -210,7 +217,7 @@ class RunLog:
         overrides = {name: dict(values) for name, values in self.overrides.items()}
         if self.latest is not None:
             for stage in METHOD[:first]:
-                if stage.name in self.latest.settings:  # else the run is of before it
+                if stage.name in self.latest.settings:  # else that run is older than the stage
                     settings[stage.name] = self.latest.settings[stage.name]
                 if stage.name in self.latest.overrides:
                     overrides[stage.name] = self.latest.overrides[stage.name]
@@ -240,7 +247,7 @@ class RunLog:
 def _require_there(
     store: Store, match: Match, stages: tuple[Stage, ...], before: Mapping[str, str]
 ) -> None:
-    """Refuse an iteration if the one before has other results than it would be made of."""
+    """Refuse an iteration if the previous one has other results than its inputs."""
     used = {
         name
         for each in stages

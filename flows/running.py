@@ -1,4 +1,4 @@
-"""Running a match: decide first, then start only what the decision needs."""
+"""Running a match: plan first, then start only the machines that the plan needs."""
 
 from __future__ import annotations
 
@@ -35,27 +35,25 @@ if TYPE_CHECKING:
     from flows.private_cluster import PrivateCluster
 
 DASK_SECONDS = 10.0
-"""How long a Dask scheduler may take to answer."""
+"""Timeout of a Dask scheduler's answer."""
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What a person asked for.
+    """Options of a run.
 
     Attributes:
         settings: stage to the settings that differ from their defaults.
-        from_stage: first stage; earlier ones are taken from the latest run as they stand.
+        from_stage: first stage; earlier results are taken from the latest run.
         until_stage: last stage.
         dask: address of a running Dask scheduler; None starts workers on this machine.
-        workers: number of worker processes on this machine; None = one a core, as far as there
-            is work for them.
-        gates: when results wait for a person; None = as in the latest run while that waits, else
-            never.
-        iteration: which pass over the method, unless `from_stage` goes on with the latest run's;
-            the passes before it have their results.
-        time_limits: stage to the minutes that a unit may be at work, where not as long as all.
-        security: the certificate that the scheduler at `dask` asks for; None = as Dask's
-            configuration says.
+        workers: number of worker processes on this machine; None = one per core, as far as there is
+            work for them.
+        gates: when results need review; None = as in the latest run while that waits, else never.
+        iteration: iteration number, unless `from_stage` continues the latest run's; the previous
+            iterations have their results.
+        time_limits: stage to the time limit of a unit [min], if not the default.
+        security: TLS certificate for the scheduler at `dask`; None = Dask's configuration.
     """
 
     settings: Overrides
@@ -70,15 +68,15 @@ class RunRequest:
 
 
 def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
-    """The record of a run that makes the match's results current.
+    """Run a match until its results are current; return the run's record.
 
-    When nothing is stale this is the latest run's own record, and neither Prefect nor Dask starts;
-    the same where all that could run waits for people.
+    If nothing is stale, this is the latest run's record, and neither Prefect nor Dask starts; the
+    same holds if all runnable units wait for review.
 
     Raises:
-        UsageError: no such stage, or no results to start `from_stage` from.
-        InputError: the Dask scheduler or Prefect server that was named does not answer.
-        LostWorkersError: it did, and does no more.
+        UsageError: an unknown stage, or no results to start `from_stage` from.
+        InputError: the given Dask scheduler or Prefect server does not answer.
+        LostWorkersError: it stopped answering during the run.
     """
     stages = selected_stages(request.from_stage, request.until_stage)
     latest = latest_run(store, match.match_id)
@@ -106,7 +104,7 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
 def _without_work(
     gatekeeper: Gatekeeper, stages: tuple[Stage, ...], request: RunRequest
 ) -> RunRecord:
-    """A new record of results that are all there: an earlier setting, or a verdict since."""
+    """Record a run whose results all exist: from an earlier setting, or after a verdict."""
     store, match, policy = gatekeeper.store, gatekeeper.match, gatekeeper.policy
     log = RunLog.begin(store, match, stages, request.settings, policy, request.iteration)
     for stage in stages:
@@ -147,7 +145,7 @@ def _with_prefect(
             require_workers(failure)
             raise
         finally:
-            APILogHandler().flush()  # while the server is there to take the last lines
+            APILogHandler().flush()  # while the server can still accept the last lines
     return store.run(match.match_id, run_id)
 
 
@@ -155,15 +153,15 @@ def _with_prefect(
 def shared_machines(
     store: Store, request: RunRequest
 ) -> Iterator[Callable[[Iterable[PlannedUnit]], RunRequest]]:
-    """A function that gives the request a server and workers, which all runs inside then use.
+    """Yield a function that adds a shared server and workers to the request of each run inside.
 
-    Starting them takes seconds, and Prefect keeps to the first server that it was shown. They start
-    when the function is first given units to compute, as many as those need; more join them where
-    later ones need more.
+    Starting them takes seconds, and Prefect keeps its first server address. They start when the
+    function first gets units to compute, as many workers as those need; more are added if later
+    units need more.
 
     Args:
         store: the store.
-        request: what is asked of every run.
+        request: options of every run.
     """
     with ExitStack() as stack:
         started: list[tuple[RunRequest, Callable[[int], None]]] = []
@@ -184,7 +182,7 @@ def shared_machines(
 def _machines(
     store: Store, request: RunRequest, missing: list[PlannedUnit]
 ) -> Iterator[tuple[RunRequest, Callable[[int], None]]]:
-    """The request with a server and workers, and a function that asks for so many of those."""
+    """Yield the request with server and workers, and a function that asks for more workers."""
     is_watched = has_server()
     if request.dask is None or not is_watched:
         reporter().say("starting Prefect and Dask")
@@ -198,7 +196,7 @@ def _machines(
             request = replace(request, dask=cluster.scheduler_address, security=cluster.security)
         else:
             _require_scheduler(request.dask)
-        # Late: it takes seconds to import, which pass while server and workers start.
+        # Imported here: it takes seconds, while server and workers start.
         import flows.match  # noqa: F401
 
         if not is_watched:
@@ -214,18 +212,18 @@ def _machines(
 
 
 def _no_more(workers: int) -> None:
-    """A cluster of somebody else's has the workers that it has."""
+    """Do nothing: an external cluster has a fixed number of workers."""
 
 
 @contextmanager
 def _ending_at_once() -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM end the run without ceremony.
+    """Let Ctrl-C and SIGTERM end the run at once.
 
-    A killed run loses nothing that was finished, and its workers and server end with it. An orderly
-    end would wait for the tasks at work, which can take minutes.
+    A killed run keeps its finished results, and its workers and server end with it. An orderly
+    shutdown would wait for running tasks, which can take minutes.
     """
     if threading.current_thread() is not threading.main_thread():
-        yield  # signals go to the main thread, whose owner decides
+        yield  # signals go to the main thread, whose owner handles them
         return
 
     def end(number: int, frame: FrameType | None) -> None:
@@ -242,7 +240,7 @@ def _ending_at_once() -> Iterator[None]:
 
 
 def _without_heartbeats() -> AbstractContextManager[Any]:
-    """A block whose runs give no sign of life, for which each would wait a second at its end."""
+    """Disable heartbeats, for which each run would wait one second at its end."""
     from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
 
     return temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None})

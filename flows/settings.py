@@ -1,4 +1,4 @@
-"""What a person chooses for a run: stages and settings, checked before anything starts."""
+"""Run options: stages and settings, validated before anything starts."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ Overrides = Mapping[str, Mapping[str, JsonValue]]
 
 
 def selected_stages(from_stage: str | None, until_stage: str | None) -> tuple[Stage, ...]:
-    """The stages from one to another, both included.
+    """Return the stages between two stages, both included.
 
     Raises:
-        UsageError: no such stage, or the first comes after the last.
+        UsageError: an unknown stage, or the first comes after the last.
     """
     names = [stage.name for stage in METHOD]
     first = 0 if from_stage is None else _place("--from", from_stage, names)
@@ -38,14 +38,14 @@ def selected_stages(from_stage: str | None, until_stage: str | None) -> tuple[St
 
 
 def parse_overrides(assignments: list[str], stages: tuple[Stage, ...] = METHOD) -> Overrides:
-    """Settings given as `stage.name=value`; values are JSON, or else text.
+    """Parse settings given as `stage.name=value`; values are JSON, or else text.
 
     Args:
         assignments: one for each setting.
-        stages: those that will run; a setting of another would have no effect.
+        stages: stages that will run; a setting of another would have no effect.
 
     Raises:
-        UsageError: no such stage or setting, or a value that does not fit it.
+        UsageError: an unknown stage or setting, or an invalid value.
     """
     overrides: dict[str, dict[str, JsonValue]] = {}
     by_name = {stage.name: stage for stage in stages}
@@ -64,7 +64,7 @@ def parse_overrides(assignments: list[str], stages: tuple[Stage, ...] = METHOD) 
         _place(f"--set {assignment}", field, list(by_name[stage_name].settings.model_fields))
         try:
             value = json.loads(text)
-        except (ValueError, RecursionError):  # no JSON, or brackets without end
+        except (ValueError, RecursionError):  # not JSON, or unclosed brackets
             value = text
         overrides.setdefault(stage_name, {})[field] = value
     for stage_name in overrides:
@@ -73,10 +73,10 @@ def parse_overrides(assignments: list[str], stages: tuple[Stage, ...] = METHOD) 
 
 
 def settings_of(stage: Stage, overrides: Overrides) -> Record:
-    """The stage's settings with `overrides` applied.
+    """Return the stage's settings with `overrides` applied.
 
     Raises:
-        UsageError: a value does not fit.
+        UsageError: a value is invalid.
     """
     try:
         return stage.settings.model_validate(dict(overrides.get(stage.name, {})))

@@ -1,4 +1,4 @@
-"""What a stage is to the factory: its units, what each is made from, its settings."""
+"""Interface of a stage: its units, their inputs and sources, its settings."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Match:
     """A registered match: its folder as validated and corrected, and the digests of its files.
 
     Attributes:
-        folder: what it holds, with people's corrections.
-        registration: what the project knows of it.
-        journal: what people said of it.
-        corrections: those that are in `folder`.
-        stale: those that no longer apply, each with the reason.
+        folder: its content, with corrections applied.
+        registration: the project's entry for the match.
+        journal: verdicts and corrections.
+        corrections: the corrections applied in `folder`.
+        stale: corrections that no longer apply, each with the reason.
     """
 
     folder: MatchFolder
@@ -36,7 +36,7 @@ class Match:
     corrections: tuple[Correction, ...] = ()
     stale: tuple[tuple[Correction, str], ...] = ()
     _kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
-    """What `once_a_match` has found out of it."""
+    """Cache of `once_a_match`."""
 
     @property
     def match_id(self) -> str:
@@ -44,7 +44,7 @@ class Match:
         return self.registration.spec.match_id
 
     def without(self, cameras: Container[str]) -> Match:
-        """The match as if it did not have these static cameras; see `flows.left_out`."""
+        """Return the match without these static cameras; see `flows.left_out`."""
         spec = self.folder.spec
         names = tuple(each.id for each in spec.static_cameras if each.id in cameras)
         if not names:
@@ -55,17 +55,17 @@ class Match:
         return self.once(name, lambda: replace(self, folder=replace(self.folder, spec=fewer)))
 
     def once(self, name: Hashable, find: Callable[[], T]) -> T:
-        """What `find` gives, which is called the first time that `name` is asked for."""
+        """Return the cached result of `find`, which is called on the first request for `name`."""
         if name not in self._kept:
             self._kept[name] = find()
         return cast("T", self._kept[name])
 
 
 def once_a_match(table: Callable[[Match], T]) -> Callable[[Match], T]:
-    """Work out a table of a match once, though planning asks for it at every unit.
+    """Cache a table per match: planning needs it for every unit.
 
-    Hundreds of clips of many cameras are thousands of units: what looks through all of them for
-    each one grows with their cube.
+    Hundreds of clips of many cameras make thousands of units: scanning all of them for each unit
+    has cubic cost.
     """
 
     @wraps(table)
@@ -85,22 +85,22 @@ def _no_results(match: Match, unit: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Stage:
-    """One step of the method; its task is the function of the same name in `tasks`.
+    """One stage of the method; its task is the function of the same name in `tasks`.
 
     Attributes:
-        name: the one word for this stage in flows/, tasks/, worldpose/ and data_contracts/.
-        about: what a person reads in progress lines.
+        name: the one name of this stage in flows/, tasks/, worldpose/ and data_contracts/.
+        about: text of progress lines.
         settings: the record of its settings.
-        units: names of the pieces that are computed, retried and stored on their own.
-        inputs: for a unit, the `stage/unit` names of the results it is made from.
-        sources: for a unit, everything the match folder contributes to its result.
-        previous_pass_inputs: for a unit, the inputs from the iteration before.
-        late_inputs: for a unit, further inputs from its own iteration, from the second one on.
-        first_pass: the first iteration in which the stage runs.
-        external_inputs: digests of the files outside the match that its settings name.
-        worker_tag: tag of the workers that compute it, if the cluster has such.
-        leaves_out: its results may leave static cameras out of all later stages.
-        min_cameras: static cameras that it needs once some are left out.
+        units: names of the pieces that are computed, retried and stored separately.
+        inputs: for a unit, the `stage/unit` names of its input results.
+        sources: for a unit, all data of the match folder that its result depends on.
+        previous_pass_inputs: for a unit, its further inputs from the previous iteration.
+        late_inputs: for a unit, its further inputs from its own iteration, from the second on.
+        first_pass: the first iteration that includes the stage.
+        external_inputs: for its settings, digests of the external files that they name.
+        worker_tag: tag of the workers that compute it, if the cluster has any.
+        leaves_out: whether its results can leave static cameras out of all later stages.
+        min_cameras: static cameras that it needs after some are left out.
     """
 
     name: str

@@ -17,13 +17,13 @@ from worldpose.errors import UsageError
 
 
 def count(folders: Sequence[Path], *, fps: float | None = None) -> DataSetStatistics:
-    """How much there is in one data set, which may lie in several folders.
+    """Count the content of one data set, which can span several folders.
 
     One clip is in memory at a time.
 
     Args:
-        folders: what `worldpose export` wrote, or others of the same layouts.
-        fps: frames in a second; None = what the data sets say, or 50.
+        folders: written by `worldpose export`, or others of the same layouts.
+        fps: frames per second; None = as the data sets state, or 50.
 
     Raises:
         InputError: a file cannot be read.

@@ -1,7 +1,7 @@
-"""How a deployment's run waits for people: Prefect suspends it, its process ends.
+"""Suspension of a deployment's run until review: Prefect suspends it, its process ends.
 
-The store's journal is the truth; Prefect only keeps the run until somebody resumes it, from the
-command line or in Prefect's own form. A resumed run begins anew and finds all its results.
+The store's journal is authoritative; Prefect only keeps the run until it is resumed from the
+command line or in Prefect's own form. A resumed run restarts and finds all its results.
 """
 
 from __future__ import annotations
@@ -31,37 +31,37 @@ from worldpose.store.canonical import canonical_json, digest
 from worldpose.store.store import open_blobs
 
 PATIENCE: Final = timedelta(days=90)
-"""Prefect cannot resume a run that has been suspended for longer; a new run goes on as well."""
+"""Prefect cannot resume a run after a longer suspension; a new run continues equally well."""
 
 
 class Verdict(RunInput):
-    """What resumes a run. The verdict has no default, so that an empty answer is refused."""
+    """Input that resumes a run. The verdict has no default, so that an empty form is refused."""
 
     verdict: Literal["approve", "reject", "recorded"]
-    """On all that waits; `recorded`: it has been decided one by one, as `worldpose review` does."""
+    """On all pending reviews; `recorded`: decided one by one, as with `worldpose review`."""
     who: str = Field(min_length=1)
-    """Name of the person."""
+    """Name of the reviewer."""
     why: str = ""
-    """In the person's words."""
+    """The reviewer's comment."""
 
 
 def is_deployed() -> bool:
-    """Is this flow run one of a deployment: nothing else can be suspended."""
+    """Return whether this flow run belongs to a deployment: only such a run can be suspended."""
     context = FlowRunContext.get()
     run = None if context is None else context.flow_run
     return run is not None and run.deployment_id is not None
 
 
 def take_verdict(store: Store, match_id: str, waiting: Sequence[WaitingUnit]) -> None:
-    """Suspend this flow run, or take in the verdict that it was resumed with.
+    """Suspend this flow run, or record the verdict that it was resumed with.
 
-    Prefect knows the question by a key that the waiting results decide: asked again after a
-    resume it gives the answer, and other results are another question.
+    Prefect identifies the question by a key derived from the waiting results: after a resume the
+    same key returns the answer, and other results form another question.
 
     Args:
-        store: where the verdict is kept.
+        store: the store for the verdict.
         match_id: the match.
-        waiting: what nobody has decided on, and is in the journal already.
+        waiting: undecided units, already in the journal.
 
     Raises:
         WorldposeError: resumed with `recorded` though nothing was decided.
@@ -83,7 +83,7 @@ def take_verdict(store: Store, match_id: str, waiting: Sequence[WaitingUnit]) ->
     verdict: Literal["approve", "reject"] = answer.verdict
 
     def decisions(journal: Journal) -> list[ReviewDecision]:
-        # Somebody may have decided with the command line between the resume and now.
+        # The command line can have recorded a verdict between the resume and now.
         decided = {
             record.request for record in journal.questions if isinstance(record, ReviewDecision)
         }
@@ -104,7 +104,7 @@ def take_verdict(store: Store, match_id: str, waiting: Sequence[WaitingUnit]) ->
 
 
 def resume_suspended(project: str, match_id: str) -> list[str]:
-    """Resume the suspended runs of a match, whose reviews are decided; gives their names.
+    """Resume the suspended runs of a match after its reviews are decided; return their names.
 
     Args:
         project: folder or URL of the store.
@@ -126,6 +126,6 @@ def resume_suspended(project: str, match_id: str) -> list[str]:
 
 
 def question_key(waiting: Sequence[WaitingUnit]) -> str:
-    """The fixed key of a question: the same for the same waiting results."""
+    """Return the key of a question: the same for the same waiting results."""
     asked = sorted(unit.request for unit in waiting)
     return f"review-{digest(canonical_json(asked))[:16]}"

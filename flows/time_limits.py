@@ -1,4 +1,4 @@
-"""How long a unit may be at work before it is taken for hung."""
+"""Time limits after which a unit counts as hung."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from flows.method import METHOD
 from worldpose.errors import UsageError
 
 LONGEST: Final = 360.0
-"""Of a stage for which nothing else was said [min]; the longest unit yet took a tenth of it."""
+"""Default limit of a stage [min]; the longest unit so far took a tenth of it."""
 
 TimeLimits = Mapping[str, float]
-"""Stage to the minutes that each of its units may be at work."""
+"""Stage to the time limit of each of its units [min]."""
 
 
 def seconds_of(stage: str, limits: TimeLimits) -> float:
-    """How long a unit of the stage may be at work [s]."""
+    """Return the time limit of the stage's units [s]."""
     return 60.0 * limits.get(stage, LONGEST)
 
 
 def parse_time_limits(given: Sequence[str]) -> TimeLimits:
-    """Limits given as minutes for every stage, or as `stage=minutes`; later ones win.
+    """Parse limits given as minutes for every stage, or as `stage=minutes`; later ones win.
 
     Raises:
-        UsageError: no such stage, or not a number of minutes.
+        UsageError: an unknown stage, or not a number of minutes.
     """
     limits: dict[str, float] = {}
     names = [stage.name for stage in METHOD]

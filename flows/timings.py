@@ -1,4 +1,4 @@
-"""Where the time of a run went: stage by stage, and between its units."""
+"""Timing of a run: by stage, and between its units."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from worldpose.store import Store
 
 @dataclass(frozen=True)
 class StageTime:
-    """What a stage of a run took.
+    """Timing of one stage of a run.
 
     Attributes:
         stage: its name.
-        units: how many the run computed.
-        work: of all its units together, on whatever worker [s].
+        units: number of units that the run computed.
+        work: sum over its units, on all workers [s].
         longest: of one unit [s].
-        elapsed: while any of its units was at work [s].
+        elapsed: time with at least one running unit [s].
     """
 
     stage: str
@@ -30,14 +30,14 @@ class StageTime:
 
 @dataclass(frozen=True)
 class RunTime:
-    """What a run took.
+    """Timing of a run.
 
     Attributes:
         run_id: its number.
-        seconds: from its begin to its record [s].
-        stages: in the method's order, those of which it computed something.
-        start: until its first unit was at work: planning, and the start of workers [s].
-        between: from then on, while none was: planning, handing out, recording [s].
+        seconds: from its start to its record [s].
+        stages: stages with computed units, in the method's order.
+        start: until its first unit ran: planning, and the start of workers [s].
+        between: after that, time without a running unit: planning, submitting, recording [s].
     """
 
     run_id: str
@@ -48,10 +48,10 @@ class RunTime:
 
 
 def run_time(store: Store, match_id: str, run_id: str) -> RunTime:
-    """Where a run's time went, as the manifests of what it computed tell.
+    """Return the timing of a run from the manifests of its computed results.
 
-    A unit's time begins when its task opens its inputs. The start of Prefect comes before a run's
-    begin.
+    A unit's time starts when its task opens its inputs. The start of Prefect precedes a run's
+    start.
 
     Args:
         store: the project.
@@ -84,7 +84,7 @@ def run_time(store: Store, match_id: str, run_id: str) -> RunTime:
 
 
 def _covered(spans: Iterable[tuple[float, float]]) -> float:
-    """Length of the union of spans."""
+    """Return the length of the union of intervals."""
     total, reached = 0.0, float("-inf")
     for begin, end in sorted(spans):
         total += max(0.0, end - max(begin, reached))

@@ -1,7 +1,7 @@
-"""What an edit has touched: what a match's latest run would compute anew, and why.
+"""Stale results of a match: units that its latest run would recompute, and why.
 
 An edit is a correction or a verdict, a changed file of the match folder, a setting, a detector's
-weights, the code. All of them are in the units' recipes, so that nobody has to tell of an edit.
+weights, the code. All of them are in the units' recipes, so edits need no notification.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from flows.method import METHOD
 from flows.outlook import Outlook, look_ahead
 from flows.planning import PlannedUnit
 from flows.registering import open_match
+from flows.renames import rename_settings
 from flows.run_record import latest_run
 from flows.settings import Overrides, selected_stages
 from flows.stage import Match
@@ -28,18 +29,18 @@ from worldpose.errors import InputError, StoreError
 from worldpose.store import Store
 
 _INPUT: Final = "input "
-"""How a line about an input begins (`explain_difference`)."""
+"""Prefix of a line about an input (`explain_difference`)."""
 
 
 @dataclass(frozen=True)
 class TouchedUnit:
-    """One unit that the latest run does not have as a run would give it now.
+    """A unit whose current result is not in the latest run.
 
     Attributes:
-        planned: with its recipe as it is now.
-        iteration: of which pass over the method.
+        planned: with its current recipe.
+        iteration: its iteration number.
         state: stale or missing, to be computed; ready: the store has it (`unit_state`).
-        reasons: what of its recipe is another.
+        reasons: differences of its recipe.
     """
 
     planned: PlannedUnit
@@ -49,32 +50,32 @@ class TouchedUnit:
 
     @property
     def unit(self) -> str:
-        """As `stage/unit`."""
+        """Name as `stage/unit`."""
         return self.planned.name
 
     @property
     def own_reasons(self) -> tuple[str, ...]:
-        """What is another in this unit itself; none where only what it is made from is."""
+        """Differences in this unit itself; empty if only its inputs changed."""
         return tuple(line for line in self.reasons if not line.startswith(("since run", _INPUT)))
 
     @property
     def changed_inputs(self) -> tuple[str, ...]:
-        """What it is made from and is another, as `stage/unit`."""
+        """Changed inputs, as `stage/unit`."""
         inputs = (line for line in self.reasons if line.startswith(_INPUT))
         return tuple(line.removeprefix(_INPUT).partition(":")[0] for line in inputs)
 
 
 @dataclass(frozen=True)
 class Touched:
-    """One match as a new run would find it.
+    """Stale results of one match.
 
     Attributes:
-        match: with everything that people said of it until now.
-        latest: the run that stands.
-        settings: those of that run, and what was asked for beyond.
-        until_stage: where that run ended; None = with the method.
-        units: those that are no longer as the run has them, in order.
-        is_touched: whether there is anything to do, were it only a verdict to be heeded.
+        match: with all current corrections and verdicts.
+        latest: the current run.
+        settings: settings of that run, and further requested ones.
+        until_stage: last stage of that run; None = the method's last.
+        units: units that differ from the run, in order.
+        is_touched: whether there is anything to do, even only to apply a verdict.
     """
 
     match: Match
@@ -94,19 +95,19 @@ class Touched:
 def find_touched(
     store: Store, match_id: str, settings: Overrides | None = None, *, retry: bool = False
 ) -> Touched | None:
-    """What a match's latest run would do anew; None where the match never had one.
+    """Find what a match's latest run would recompute; None if the match never had a run.
 
-    A unit that failed is left at that while its recipe is the same, and with it what would be made
-    from it, except where a disk or a network failed.
+    A failed unit with an unchanged recipe is skipped, and so are the units that depend on it,
+    unless a disk or a network failed.
 
     Args:
         store: the project.
         match_id: a registered match.
-        settings: what to ask for beyond the settings of the latest run.
-        retry: try again whatever failed.
+        settings: requested settings beyond those of the latest run.
+        retry: retry all failed units.
 
     Raises:
-        InputError: the match folder is not as it must be.
+        InputError: the match folder is invalid.
     """
     latest = latest_run(store, match_id)
     if latest is None:
@@ -124,7 +125,7 @@ def find_touched(
         is_last = number == latest.iteration
         standing = latest if is_last else _pass(store, latest, number)
         found = _units(store, outlook, standing, hopeless, number)
-        # Of the passes before, only their results count: their records may be of other settings.
+        # Only the results of earlier iterations count: their records can have other settings.
         units += [unit for unit in found if is_last or unit.state != "ready"]
     settled = latest.state in ("complete", "waiting")
     return Touched(
@@ -138,7 +139,7 @@ def find_touched(
 
 
 def merged(before: Overrides, further: Overrides) -> dict[str, dict[str, JsonValue]]:
-    """Settings with further ones over them."""
+    """Return settings overridden by further ones."""
     names = before.keys() | further.keys()
     return {name: {**before.get(name, {}), **further.get(name, {})} for name in sorted(names)}
 
@@ -150,7 +151,7 @@ def _units(
     hopeless: Mapping[str, str | None],
     iteration: int,
 ) -> Iterator[TouchedUnit]:
-    """The units that are not as a run has them, but for those that would fail again."""
+    """Yield the units that differ from a run, except those that would fail again."""
     failing: set[str] = set()
     for unit in outlook.units:
         if (unit.name, unit.key) in hopeless.items() or failing & unit.recipe.inputs.keys():
@@ -163,7 +164,7 @@ def _units(
 
 
 def _until(match: Match, latest: RunRecord) -> str | None:
-    """The stage that the run was to end with; None = the last there was."""
+    """Return the last stage of the run; None = the method's last."""
     planned = {*latest.results, *latest.blocked, *(failure.unit for failure in latest.failed)}
     known = [stage for stage in METHOD if stage.name in latest.settings and stage.units(match)]
     reached = [stage for stage in known if any(_is_of(name, stage.name) for name in planned)]
@@ -182,15 +183,15 @@ def _is_of(unit: str, stage: str) -> bool:
 
 
 def _pass(store: Store, latest: RunRecord, number: int) -> RunRecord | None:
-    """The newest run of an earlier pass over the method, of the latest run's settings if any is."""
+    """Return the newest run of an earlier iteration, preferably with the latest run's settings."""
     records = [store.run(latest.match_id, run_id) for run_id in store.runs(latest.match_id)]
     passes = [record for record in reversed(records) if record.iteration == number]
-    same = (record for record in passes if record.overrides == latest.overrides)
+    same = (record for record in passes if rename_settings(record.overrides) == latest.overrides)
     return next(same, passes[0] if passes else None)
 
 
 def _may_pass(failure: UnitFailure) -> bool:
-    """Whether a recorded failure was a disk's or a network's, and may be gone next time."""
+    """Return whether a recorded failure was a disk's or a network's, and can be temporary."""
     kind = getattr(builtins, failure.error, None)
     is_system = isinstance(kind, type) and issubclass(kind, OSError)
     return is_system or failure.error == StoreError.__name__

@@ -1,1 +1,1 @@
-"""One retriable unit of work each: open the inputs, call worldpose, publish the result."""
+"""Prefect tasks, one retriable unit each: read the inputs, call worldpose, publish the result."""

@@ -1,4 +1,4 @@
-"""Task of many small units of a stage, one after another: Prefect costs each of them less then."""
+"""Task that computes many small units of a stage in sequence, with less Prefect overhead each."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from worldpose.store import Store
 
 @task(task_run_name="{name}", persist_result=False)
 def batch(name: str, work: list[str]) -> list[Exception | None]:
-    """Has each unit computed and published as its own task would; gives what each failed of.
+    """Compute and publish each unit like its own task; return the exception of each, or None.
 
-    Begun again after its worker was killed, it goes on with the first unit that has no result.
+    After its worker was killed, a retry resumes with the first unit without a result.
 
     Args:
-        name: as the dashboard shows it.
-        work: units of one stage, as JSON: Prefect looks through whatever else it is given.
+        name: name in the dashboard.
+        work: units of one stage, as JSON: Prefect inspects parameters of any other type.
     """
     units = [Work.model_validate_json(each) for each in work]
     stage = units[0].recipe.stage

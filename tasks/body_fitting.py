@@ -38,7 +38,7 @@ Floats = NDArray[np.float64]
 
 @unit_task
 def body_fitting(work: Work) -> str:
-    """Publishes bodies and their keypoints; returns the key."""
+    """Publish bodies and their keypoints; return the key."""
     store = Store.open(work.project)
     with store.publishing(work) as result:
         people = open_people(store, work)
@@ -48,17 +48,17 @@ def body_fitting(work: Work) -> str:
 
 @dataclass(frozen=True, eq=False)
 class ClipPeople:
-    """What the static cameras say of the people of one clip.
+    """Observations of the people of one clip by the static cameras.
 
     Attributes:
         clip: cameras, frames and clock.
-        keypoints: (frames, cameras, detections, 17, 2) [px], as triangulated: where sides were
-            exchanged, put right.
-        index: (frames, cameras, persons), place among the detections; -1 = not seen.
+        keypoints: (frames, cameras, detections, 17, 2) [px], as triangulated: left-right swaps are
+            corrected.
+        index: (frames, cameras, persons), index among the detections; -1 = not seen.
         person: (persons,) ids.
         joints: (frames, persons, 17, 3) [m], world, triangulated.
         covariance: (frames, persons, 17, 3, 3) [m^2].
-        common_bias: (17,) per axis, of what all views err in common [m]; in `covariance`.
+        common_bias: (17,) per axis, systematic error shared by all views [m]; in `covariance`.
     """
 
     clip: ClipInputs
@@ -71,7 +71,7 @@ class ClipPeople:
 
 
 def open_people(store: Store, work: Work) -> ClipPeople:
-    """The tracked and triangulated people of the clip of `work`."""
+    """Read the tracked and triangulated people of the clip of `work`."""
     clip = open_clip(store, work)
     placed = open_input(store, work, f"retriangulation/{work.recipe.unit}")
     index = open_input(store, work, f"tracking/{work.recipe.unit}")["detection_index"].values
@@ -94,14 +94,14 @@ def fit_people(
     glimpses: MonocularPoses | None = None,
     known: Mapping[int, Shape] | None = None,
 ) -> tuple[BodyModel, BodyFit]:
-    """The bodies of a clip.
+    """Fit the bodies of a clip.
 
     Args:
-        people: of the clip.
+        people: people of the clip.
         recipe: of this stage: its settings, body model and pitch.
-        views: lines of sight of further cameras.
-        glimpses: bodies of single pictures (S4).
-        known: shapes of some, by their place among the persons, as other clips have them.
+        views: ray constraints of further cameras.
+        glimpses: monocular poses (S4).
+        known: shapes from other clips, by person index.
     """
     sources: dict[str, Any] = recipe.sources
     pitch = sources["pitch"]
@@ -134,7 +134,7 @@ def publish_fit(
     fit: BodyFit,
     further: Mapping[str, NDArray[Any]] | None = None,
 ) -> None:
-    """Writes bodies, and what a layout has `further`, with their figures."""
+    """Write bodies, the arrays in `further`, and their metrics."""
     result.write(
         layout,
         arrays={
@@ -170,7 +170,7 @@ def publish_fit(
 
 
 def _body(name: str, sha256: str | None) -> BodyModel:
-    """The body model that was planned with."""
+    """Return the body model of the run plan."""
     if sha256 is not None and digest_of_body(name) != sha256:
         raise InputError(
             f"body model {name}",

@@ -29,7 +29,7 @@ from worldpose.video import open_video
 
 @unit_task
 def broadcast_calibration(work: Work) -> str:
-    """Publishes a camera a frame, and how well it is known; returns the key."""
+    """Publish a camera per frame, and its uncertainty; return the key."""
     store = Store.open(work.project)
     sources: dict[str, Any] = work.recipe.sources
     first, count = sources["first_frame"], sources["frame_count"]
@@ -68,7 +68,7 @@ def broadcast_calibration(work: Work) -> str:
 
 
 def _people(store: Store, work: Work) -> People | None:
-    """Fitted people when each picture was taken, and who was seen in it, where that is known."""
+    """Return fitted people at the time of each image, and their detections, where known."""
     sources: dict[str, Any] = work.recipe.sources
     unit = work.recipe.unit
     seen_names = [f"{stage}/{unit}" for stage in ("ingest", "detection")]
@@ -84,7 +84,7 @@ def _people(store: Store, work: Work) -> People | None:
 
 
 def _figures(report: BroadcastReport) -> dict[str, float]:
-    """Figures of a calibrated clip; what could not be computed is left out."""
+    """Return metrics of a calibrated clip; those that could not be computed are left out."""
     named = {
         "expected_error_median_px": report.reprojection_error,
         "marking_rms_median_px": report.marking_rms,

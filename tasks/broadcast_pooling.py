@@ -1,4 +1,4 @@
-"""Task of stage `broadcast_pooling`: one clip's camera at the place that all its clips agree on."""
+"""Task of stage `broadcast_pooling`: one clip's camera at the pooled position of its clips."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from worldpose.store import Store
 
 @unit_task
 def broadcast_pooling(work: Work) -> str:
-    """Publishes the clip's camera, as it was where the clips contradict; returns the key."""
+    """Publish the clip's camera, unchanged if the clips disagree; return the key."""
     store, unit = Store.open(work.project), work.recipe.unit
     sources: dict[str, Any] = work.recipe.sources
     clips: list[str] = sources["clips"]

@@ -1,4 +1,4 @@
-"""Task of stage `bundle_adjustment`: all static cameras of a match adjusted together."""
+"""Task of stage `bundle_adjustment`: joint adjustment of all static cameras of a match."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from worldpose.store import Store
 
 @unit_task
 def bundle_adjustment(work: Work) -> str:
-    """Publishes the cameras and what disagrees with them; returns the key."""
+    """Publish the adjusted cameras and their outliers; return the key."""
     store = Store.open(work.project)
     settings = BundleAdjustmentSettings.model_validate(work.recipe.settings)
     with store.publishing(work) as result:
@@ -45,14 +45,14 @@ def bundle_adjustment(work: Work) -> str:
 
 @dataclass(frozen=True)
 class _People:
-    """Everybody in some frames of all clips.
+    """Tracked people in selected frames of all clips.
 
     Attributes:
         frame: (frames,) match frames, clip by clip.
-        clip_frames: the same by clip.
-        fps: of them a second.
-        person: (persons,) ids; one id in two clips need not be one person, and nothing here takes
-            them for one.
+        clip_frames: match frames by clip.
+        fps: frames per second.
+        person: (persons,) ids; the same id in two clips can be two people, and no code here
+            identifies them.
         detection_index: (frames, cameras, persons).
         joints: (frames, persons, 17, 3) [m], world.
         views: (frames, persons, 17).
@@ -68,7 +68,7 @@ class _People:
 
 
 def _open_people(store: Store, work: Work, settings: BundleAdjustmentSettings) -> _People:
-    """Tracked and placed people in evenly spread frames, and in those a person chose."""
+    """Read tracks and joints in evenly spaced frames, and in frames chosen by a person."""
     sources: dict[str, Any] = work.recipe.sources
     whole = {
         clip: np.arange(first, first + count) for clip, (first, count) in sources["clips"].items()
@@ -111,7 +111,7 @@ def _open_people(store: Store, work: Work, settings: BundleAdjustmentSettings) -
 
 
 def _open_clip(store: Store, work: Work, people: _People) -> Clip:
-    """The cameras as calibrated, what was clicked in them, and what they saw of `people`."""
+    """Return the calibrated cameras, their clicks, and their detections of `people`."""
     sources: dict[str, Any] = work.recipe.sources
     opened = open_frames(store, work, people.clip_frames)
     pitch = sources["pitch"]
@@ -138,14 +138,14 @@ def _open_clip(store: Store, work: Work, people: _People) -> Clip:
 
 
 def _covariance(known: xr.Dataset) -> NDArray[np.float64]:
-    """The covariance of a calibrated camera; zero of a given one."""
+    """Return the covariance of a calibrated camera; zero for a given one."""
     if "covariance" not in known:
         return np.zeros((len(PARAMETERS), len(PARAMETERS)))
     return np.asarray(known["covariance"].values)
 
 
 def _clicks(known: xr.Dataset, pitch: PitchTemplate | None) -> Clicks:
-    """The clicked points of a camera; none of a given one."""
+    """Return the clicked points of a camera; none for a given one."""
     if pitch is None or "point_pixel" not in known:
         return Clicks.none()
     names = tuple(str(name) for name in known["point"].values)
@@ -154,7 +154,7 @@ def _clicks(known: xr.Dataset, pitch: PitchTemplate | None) -> Clicks:
 
 
 def _figures(adjusted: BundleAdjustment, camera_ids: list[str]) -> dict[str, float]:
-    """Figures of the adjustment."""
+    """Return metrics of the adjustment."""
     figures = {
         "cameras_changed": float(adjusted.accepted.sum()),
         "cameras_refused": float((~adjusted.accepted).sum()),

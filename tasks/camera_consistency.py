@@ -1,4 +1,4 @@
-"""Task of stage `camera_consistency`: which static cameras contradict the others in a clip."""
+"""Task of stage `camera_consistency`: static cameras that are outliers to the others in a clip."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from worldpose.store import Store
 
 @unit_task
 def camera_consistency(work: Work) -> str:
-    """Publishes which cameras agree, and leaves out those with a fault; returns the key."""
+    """Publish the consistency of the cameras, leaving out faulty ones; return the key."""
     store = Store.open(work.project)
     sources: dict[str, Any] = work.recipe.sources
     settings = ConsistencySettings.model_validate(work.recipe.settings)
@@ -68,7 +68,7 @@ def camera_consistency(work: Work) -> str:
 
 
 def _covariance(store: Store, work: Work, cameras: Sequence[str]) -> NDArray[np.float64]:
-    """Return the covariance (cameras, 12, 12) of a step of each camera; NaN where it was given."""
+    """Return each camera's parameter covariance (cameras, 12, 12); NaN for given cameras."""
     unknown = np.full((12, 12), np.nan)
     each = [open_input(store, work, f"static_calibration/{camera}") for camera in cameras]
     return np.stack([c["covariance"].values if "covariance" in c else unknown for c in each])

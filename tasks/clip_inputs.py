@@ -1,4 +1,4 @@
-"""Frames of a match as all static cameras see them, on one clock."""
+"""Synchronized frames of a match with the detections of all static cameras."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from worldpose.store import Store
 from worldpose.tracking.clip_arrays import ClipArray
 
 PAGE = 256
-"""Frames read at a time."""
+"""Frames per read."""
 PAGES = 4
-"""Pages kept: a stretch with its margins lies in four."""
+"""Cached pages: a chunk with its margins fits into four."""
 
 
 class StoredClip:
-    """One array of every camera's detections, padded to the same number, read when it is used.
+    """One array of all cameras' detections, padded to the same number, read on access.
 
-    Rejected keypoints are as if they had not been found. What was said of a place among the
-    detections is not said of whom was found again there since.
+    Rejected keypoints count as not detected. Filtering results of a detection index do not apply to
+    people redetected at that index since.
 
     Attributes:
         shape: (frames, cameras, detections, ...).
@@ -44,14 +44,14 @@ class StoredClip:
         *,
         found_again: bool = True,
     ) -> None:
-        """Open it.
+        """Open the arrays.
 
         Args:
-            clips: whom each camera saw.
-            name: of the array.
-            rejected: (frames, cameras, detections, 17), to be left out.
-            shift: (frames, cameras, detections, 17, 2) [px], to be taken off.
-            found_again: with those who were looked for again.
+            clips: detections of each camera.
+            name: name of the array.
+            rejected: (frames, cameras, detections, 17), keypoints to leave out.
+            shift: (frames, cameras, detections, 17, 2) [px], systematic error to subtract.
+            found_again: include redetected people.
         """
         arrays = [clip[name] for clip in clips]
         detections = max(1, *(array.sizes["detection"] for array in arrays))
@@ -65,7 +65,7 @@ class StoredClip:
         self._page = lru_cache(PAGES)(self._read)
 
     def __getitem__(self, frames: slice) -> NDArray[np.float64]:
-        """A stretch of frames as float64; NaN where a camera has fewer detections."""
+        """Return a slice of frames as float64; NaN beyond a camera's number of detections."""
         first, last, _ = frames.indices(self.shape[0])
         out = np.empty((max(0, last - first), *self.shape[1:]))
         for number in range(first // PAGE, -(-last // PAGE)):
@@ -95,13 +95,13 @@ class StoredClip:
 def said_of(
     clips: Sequence[xr.Dataset], said: xr.DataArray, shape: tuple[int, ...], rows: slice
 ) -> NDArray[Any]:
-    """What the iteration before said of detections, in their places now; nothing of those since.
+    """Return filtering results of the previous iteration for current detections; zero for new ones.
 
     Args:
-        clips: whom each camera saw.
-        said: (frames, cameras, detections of then, ...).
-        shape: (rows, cameras, detections, ...) of the answer.
-        rows: of the frames.
+        clips: detections of each camera.
+        said: (frames, cameras, previous detections, ...).
+        shape: (rows, cameras, detections, ...) of the result.
+        rows: slice of the frames.
     """
     before = said[rows].values
     out = np.zeros(shape, dtype=before.dtype)
@@ -114,7 +114,7 @@ def said_of(
 def _found_again(
     clips: Sequence[xr.Dataset], shape: tuple[int, ...], rows: slice
 ) -> NDArray[np.bool_]:
-    """Which places (rows, cameras, detections) hold somebody who was looked for again."""
+    """Return a mask (rows, cameras, detections) of redetected people."""
     found = np.zeros(shape, dtype=np.bool_)
     for camera, clip in enumerate(clips):
         if "found_again" in clip:
@@ -124,16 +124,16 @@ def _found_again(
 
 @dataclass(frozen=True)
 class ClipInputs:
-    """Observations of some frames.
+    """Observations in some frames.
 
     Attributes:
         camera_ids: in the order of every camera dimension.
         cameras: (cameras,) batch.
-        camera_covariance: (cameras, 12, 12) of a step of each; None where not all are known.
+        camera_covariance: (cameras, 12, 12) of the parameters; None unless known for all.
         frame: (frames,) match frames.
-        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
-        confidence: (frames, cameras, detections, 17); NaN where not found.
-        fps: frames a second of match time.
+        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN if not detected.
+        confidence: (frames, cameras, detections, 17); NaN if not detected.
+        fps: frames per second of match time.
     """
 
     camera_ids: tuple[str, ...]
@@ -146,9 +146,9 @@ class ClipInputs:
 
 
 NOTHING = {"keypoints": np.nan, "confidence": np.nan, "found_again": -1, "shift": 0.0}
-"""What is said of places without anybody."""
+"""Fill values of padded detections."""
 ADJUSTED = "bundle_adjustment/cameras"
-"""All static cameras, where they are adjusted to people."""
+"""All static cameras after adjustment to people."""
 
 
 def open_clip(
@@ -159,14 +159,14 @@ def open_clip(
     shifted: bool = True,
     found_again: bool = True,
 ) -> ClipInputs:
-    """The clip of `work`; its detections are read when they are used.
+    """Open the clip of `work`; its detections are read on access.
 
     Args:
         store: the store.
-        work: the work under way.
-        filtered: without what the bodies of the iteration before contradicted.
-        shifted: without what keypoints were beside those bodies by for lasting reasons.
-        found_again: with those who were looked for again.
+        work: the current work order.
+        filtered: leave out keypoints that the previous iteration rejected.
+        shifted: subtract the systematic errors of keypoints.
+        found_again: include redetected people.
     """
     sources: dict[str, Any] = work.recipe.sources
     first, count = sources["first_frame"], sources["frame_count"]
@@ -179,7 +179,7 @@ def open_clip(
 
 
 def dropped_before(store: Store, work: Work) -> NDArray[np.bool_] | None:
-    """Boxes that the iteration before dropped (frames, cameras, detections); None in the first."""
+    """Return boxes dropped by the previous iteration (frames, cameras, detections), if any."""
     before = f"filtering/{work.recipe.unit}"
     if before not in work.recipe.inputs:
         return None
@@ -190,7 +190,7 @@ def dropped_before(store: Store, work: Work) -> NDArray[np.bool_] | None:
 
 
 def open_frames(store: Store, work: Work, frames: Mapping[str, NDArray[np.int64]]) -> ClipInputs:
-    """Match frames of each clip, clip by clip, with every camera's detections in memory."""
+    """Open selected match frames of each clip, with every camera's detections in memory."""
     sources: dict[str, Any] = work.recipe.sources
     names = sources["seen"]
     seen = [
@@ -205,19 +205,19 @@ def open_frames(store: Store, work: Work, frames: Mapping[str, NDArray[np.int64]
 
 
 def _seen(store: Store, work: Work, where: slice) -> list[xr.Dataset]:
-    """Whom each camera saw in the clip of `work`."""
+    """Return each camera's detections in the clip of `work`."""
     sources: dict[str, Any] = work.recipe.sources
     return [_people(store, work, name).sel(frame=where) for name in sources["seen"]]
 
 
 def _people(store: Store, work: Work, name: str) -> xr.Dataset:
-    """Whom a camera saw, with those found again where `work` is made from them."""
+    """Return a camera's detections, with redetected people if `work` has them as input."""
     again = again_of(name)
     return open_input(store, work, again if again in work.recipe.inputs else name)
 
 
 def _together(clips: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Whom one camera saw, clip by clip, padded to the same number."""
+    """Concatenate one camera's detections over clips, padded to the same number."""
     most = max(clip.sizes["detection"] for clip in clips)
     padded = []
     for clip in clips:
@@ -230,7 +230,7 @@ def _together(clips: Sequence[xr.Dataset]) -> xr.Dataset:
 def _said_before(
     store: Store, work: Work, frames: Mapping[str, NDArray[np.int64] | slice]
 ) -> dict[str, xr.DataArray | None]:
-    """What the iteration before said of keypoints, frame by frame; None in the first."""
+    """Return the previous filtering results of keypoints by frame; None in the first iteration."""
     clips = [
         open_input(store, work, name)[["rejected", "shift"]].sel(frame=where)
         for clip, where in frames.items()
@@ -260,9 +260,9 @@ def _open(
     *,
     found_again: bool = True,
 ) -> ClipInputs:
-    """Match frames, with whom each camera saw in them.
+    """Open match frames with each camera's detections.
 
-    The cameras are the adjusted ones where `work` is made from them.
+    The cameras are the adjusted ones if `work` has them as input.
     """
     sources: dict[str, Any] = work.recipe.sources
     camera_ids = tuple(sources["cameras"])
@@ -281,14 +281,14 @@ def _open(
 def _cameras(
     store: Store, work: Work, camera_ids: tuple[str, ...]
 ) -> tuple[Camera, NDArray[np.float64] | None]:
-    """The cameras in order, and how well they are known, where all of them tell."""
+    """Return the cameras in order, and their covariances if known for all."""
     if ADJUSTED in work.recipe.inputs:
         adjusted = open_input(store, work, ADJUSTED)
         stated = adjusted["camera_covariance"].values
-        known = stated.any(axis=(1, 2)).all()  # a given camera that was not changed tells none
+        known = stated.any(axis=(1, 2)).all()  # an unchanged given camera has none
         return camera_from_arrays(adjusted.data_vars), stated if known else None
     each = [open_input(store, work, f"static_calibration/{camera}") for camera in camera_ids]
     cameras = Camera.stack([camera_from_arrays(camera.data_vars) for camera in each])
     if all("covariance" in camera for camera in each):
         return cameras, np.stack([camera["covariance"].values for camera in each])
-    return cameras, None  # a given camera tells none
+    return cameras, None  # a given camera has no covariance

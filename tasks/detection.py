@@ -38,7 +38,7 @@ from worldpose.video import FrameIndex, open_video
 
 @unit_task
 def detection(work: Work) -> str:
-    """Publishes boxes and keypoints; returns the key."""
+    """Publish boxes and keypoints; return the key."""
     store = Store.open(work.project)
     edits = TypeAdapter(list[DetectionEdit]).validate_python(work.recipe.sources.get("edits") or [])
     with store.publishing(work) as result, spooling(store) as spool:
@@ -64,12 +64,12 @@ def detection(work: Work) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """What the nets found.
+    """Output of the detection nets.
 
     Attributes:
-        observations: the people.
-        unreadable: [first, last] of each stretch of frames without a picture.
-        figures: of the work.
+        observations: detected people.
+        unreadable: [first, last] of each interval of frames without an image.
+        figures: metrics.
     """
 
     observations: Observations
@@ -78,9 +78,9 @@ class _Found:
 
 
 def _published(store: Store, work: Work) -> _Found | None:
-    """What the nets found, as it is published without corrections; None where it is not.
+    """Return the published detections without corrections; None if there are none.
 
-    Found anew it is the same bytes.
+    New detections would be the same bytes.
     """
     recipe = work.recipe
     sources = {name: each for name, each in recipe.sources.items() if name != "edits"}
@@ -103,7 +103,7 @@ def _published(store: Store, work: Work) -> _Found | None:
 
 
 def _detected(store: Store, work: Work, spool: Spool) -> _Found:
-    """What the nets find now."""
+    """Run the detection nets."""
     sources: dict[str, Any] = work.recipe.sources
     settings = DetectionSettings.model_validate(work.recipe.settings)
     finder = PeopleFinder(load_detectors(settings), load_pose(settings), settings)
@@ -139,7 +139,7 @@ def _detected(store: Store, work: Work, spool: Spool) -> _Found:
 
 
 def _pictures(store: Store, work: Work) -> Iterator[tuple[int, Picture | None]]:
-    """Every match frame of the clip with its picture, decoded once and in order."""
+    """Yield every match frame of the clip with its image, decoded once and in order."""
     sources: dict[str, Any] = work.recipe.sources
     first, count = sources["first_frame"], sources["frame_count"]
     footage = open_input(store, work, f"ingest/{sources['camera']}")
@@ -150,7 +150,7 @@ def _pictures(store: Store, work: Work) -> Iterator[tuple[int, Picture | None]]:
         shown = video.readable(int(there[0]), int(there[-1]) + 1) if len(there) else iter(())
         for number in numbers:
             picture = None
-            while number >= 0:  # pictures that no frame shows are passed over
+            while number >= 0:  # skip images that no match frame uses
                 at, picture = next(shown)
                 if at == number:
                     break
@@ -159,7 +159,7 @@ def _pictures(store: Store, work: Work) -> Iterator[tuple[int, Picture | None]]:
 
 
 def footage_index(footage: xr.Dataset) -> FrameIndex:
-    """Which pictures a video has, as `ingest` found them."""
+    """Return the frame index of a video, as `ingest` stored it."""
     video = footage.attrs["video"]
     width, height = video["size"]
     base = video["time_base"]
@@ -172,7 +172,7 @@ def footage_index(footage: xr.Dataset) -> FrameIndex:
 
 
 def _place(store: Store, work: Work) -> Place | None:
-    """Where the camera stands, where that is known and there is a pitch."""
+    """Return the camera on the pitch, if it is known and there is a pitch."""
     sources: dict[str, Any] = work.recipe.sources
     if sources["pitch"] is None:
         return None
@@ -182,7 +182,7 @@ def _place(store: Store, work: Work) -> Place | None:
 
 
 def require_weights(settings: DetectionSettings, planned: dict[str, str | None]) -> None:
-    """Refuse other weights or libraries than the run was planned with.
+    """Refuse weights or libraries that differ from the run plan.
 
     Raises:
         InputError: they differ.

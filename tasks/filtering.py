@@ -1,4 +1,4 @@
-"""Task of stage `filtering`: the detections of one clip beside its bodies."""
+"""Task of stage `filtering`: comparison of one clip's detections with its bodies."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from worldpose.store import Store
 from worldpose.triangulation import TriangulationSettings
 
 PART = 128
-"""Frames judged at a time: 200 MB with 25 people before 16 cameras."""
+"""Frames per chunk: 200 MB with 25 people and 16 cameras."""
 
 
 @unit_task
 def filtering(work: Work) -> str:
-    """Publishes which keypoints and boxes the bodies contradict; returns the key."""
+    """Publish the keypoints and boxes that the bodies reject; return the key."""
     store = Store.open(work.project)
     settings = FilteringSettings.model_validate(work.recipe.settings)
     with store.publishing(work) as result, spooling(store) as spool:
@@ -101,19 +101,19 @@ def filtering(work: Work) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Case:
-    """A clip with the bodies fitted to it, read a stretch at a time.
+    """A clip with its fitted bodies, read in chunks.
 
     Attributes:
-        clip: with all that was detected, whatever was rejected before.
+        clip: all detections, without earlier rejections.
         person: (persons,) ids.
         index: (frames, cameras, persons).
-        joints: (frames, persons, 17, 3) [m], world, where the detector sees the bodies' joints.
-        step: (frames, persons, 17, 3) [m], their way in a frame; NaN where not known.
+        joints: (frames, persons, 17, 3) [m], world, body joints by the detector's definition.
+        step: (frames, persons, 17, 3) [m], motion per frame; NaN if unknown.
         covariance: (frames, persons, 17, 3, 3) [m^2].
-        placed: the result of `retriangulation`.
-        dropped: (frames, cameras, detections), boxes that the iteration before dropped; None in
+        placed: result of `retriangulation`.
+        dropped: (frames, cameras, detections), boxes that the previous iteration dropped; None in
             the first.
-        triangulation: how joints were placed.
+        triangulation: settings of the triangulation.
     """
 
     clip: ClipInputs
@@ -128,11 +128,11 @@ class _Case:
 
     @property
     def first(self) -> bool:
-        """Whether no pass came before, of which keypoints were shifted."""
+        """Whether this is the first iteration, without shifted keypoints."""
         return self.dropped is None
 
     def at(self, frames: NDArray[np.int64]) -> tuple[BodyViews, BodyMotion, Suspects]:
-        """The bodies in all pictures, how they move there, and what was detected."""
+        """Project the bodies into all images; return views, motion, and the detections to test."""
         motion = watch_motion(self.clip.cameras, self.joints[frames], self.step[frames])
         views = view_bodies(self.clip.cameras, self.joints[frames], self.covariance[frames])
         keypoints, confidence = _taken(self.clip, frames)
@@ -175,7 +175,7 @@ def _open(store: Store, work: Work) -> _Case:
 
 
 def _counts(judged: Judgement, suspects: Suspects) -> list[float]:
-    """Keypoints judged and rejected; boxes dropped, of other bodies, and of nobody till now."""
+    """Count keypoints tested and rejected; boxes dropped, reassigned, and newly assigned."""
     frame, camera, person = np.nonzero(suspects.index >= 0)
     taken = np.full(judged.fits.shape, -1)
     taken[frame, camera, suspects.index[frame, camera, person]] = person
@@ -190,10 +190,10 @@ def _counts(judged: Judgement, suspects: Suspects) -> list[float]:
 
 
 def _held_out(store: Store, work: Work, case: _Case, frames: NDArray[np.int64]) -> dict[str, float]:
-    """How well left-out cameras are foreseen from the keypoints that this iteration rests on.
+    """Measure the held-out error of cameras from the keypoints that this iteration uses.
 
-    How far cameras misplace people is learned in every iteration, and nobody who was looked for
-    again is to be foreseen, so that all compare.
+    The systematic errors of cameras are estimated in every iteration, and redetected people are not
+    evaluated, so that iterations are comparable.
     """
     clip = open_clip(store, work)
     whole = open_clip(store, work, filtered=False, found_again=False)
@@ -210,14 +210,14 @@ def _held_out(store: Store, work: Work, case: _Case, frames: NDArray[np.int64]) 
 
 
 def _evenly(frames: int, most: int) -> NDArray[np.int64]:
-    """Frames all over a clip."""
+    """Return evenly spaced frames of a clip."""
     return np.unique(np.linspace(0, frames - 1, min(frames, most)).astype(np.int64))
 
 
 def _taken(
     clip: ClipInputs, frames: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Keypoints and confidence of some frames."""
+    """Return keypoints and confidence of some frames."""
     first, last = int(frames[0]), int(frames[-1]) + 1
     if last - first == len(frames):
         return clip.keypoints[first:last], clip.confidence[first:last]

@@ -1,4 +1,4 @@
-"""Task of fine-tuning: one net trained on reviewed labels, and the record of its new version."""
+"""Fine-tuning task: train one net on reviewed labels, and record its new version."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ def finetune(
     settings: FineTuningSettings,
     start: Path | None,
 ) -> NetVersion:
-    """Trains a net, writes `<kind>-<fingerprint>.safetensors` and `.json`; returns the record.
+    """Train a net, write `<kind>-<fingerprint>.safetensors` and `.json`; return the record.
 
-    A retry, or the same call after a kill, goes on from the last checkpoint.
+    A retry, or the same call after a kill, resumes from the last checkpoint.
 
     Args:
-        kind: which net.
+        kind: net to train.
         annotations: COCO keypoints.
-        pictures: the folder of their pictures; that of the annotations if None.
-        folder: of the versions.
-        settings: steps, rate, shares of pictures, seed.
-        start: weights to begin from; the shipped ones if None.
+        pictures: the folder of their images; that of the annotations if None.
+        folder: folder of the versions.
+        settings: steps, learning rate, sampling shares of images, seed.
+        start: initial weights; the shipped ones if None.
     """
     from worldpose.training.fine_tuning import FIGURES, fine_tune
 
     labels = _digest(annotations)
     parent = start or EMBEDDED[0 if kind == "people" else 1]
     folder.mkdir(parents=True, exist_ok=True)
-    # Its name keeps another training from going on from its checkpoint.
+    # The name prevents other trainings from resuming its checkpoint.
     about = f"{labels}{_digest(parent)}{settings.model_dump_json()}".encode()
     draft = folder / f"{kind}-draft-{hashlib.sha256(about).hexdigest()[:12]}.safetensors"
     result = fine_tune(

@@ -1,4 +1,4 @@
-"""Task of stage `ingest`: one camera's 2D poses, or the index of its video, into the store."""
+"""Task of stage `ingest`: store one camera's 2D poses, or the index of its video."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from worldpose.store.writer import ResultWriter
 
 @unit_task
 def ingest(work: Work) -> str:
-    """Publishes the observations or the index; returns the key."""
+    """Publish the observations or the index; return the key."""
     with Store.open(work.project).publishing(work) as result:
         if "detections" in work.recipe.sources:
             _write_observations(result, work)
@@ -73,10 +73,10 @@ def _write_footage(result: ResultWriter, work: Work) -> None:
 
 
 def _observations(work: Work) -> Observations:
-    """The unit's people on match frames, from the very file that its key stands for.
+    """Read the unit's 2D poses on match frames, and verify that the file matches the key.
 
     Raises:
-        InputError: the file is not, or no longer, the one that was registered.
+        InputError: the file differs from the registered one.
     """
     sources: dict[str, Any] = work.recipe.sources
     path = Path(work.folder) / sources["detections"]
@@ -87,7 +87,7 @@ def _observations(work: Work) -> Observations:
 
 
 def _footage(work: Work) -> Footage:
-    """The unit's video on match frames, from the very file that its key stands for; raises so."""
+    """Index the unit's video on match frames; raises like `_observations`."""
     sources: dict[str, Any] = work.recipe.sources
     path = Path(work.folder) / sources["video"]
     width, height = sources["image_size"]

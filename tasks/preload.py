@@ -1,7 +1,7 @@
-"""What a Dask worker does around its work: `dask worker --preload tasks.preload`.
+"""Setup and teardown of a Dask worker: `dask worker --preload tasks.preload`.
 
-Runs that start workers of their own do so. They name it first of what workers import when they
-start: until they have, no garbage is collected, which takes a fifth of those seconds.
+Runs with their own workers use it. It is the first preloaded module: garbage collection, a fifth of
+the import time, is off until all modules are imported.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ import os
 from distributed import Scheduler, Worker
 
 gc.disable()
-# Before Prefect is imported with the first task: it would report its use.
+# Before Prefect is imported with the first task: it would send telemetry.
 os.environ.setdefault("DO_NOT_TRACK", "1")
 
 
 def dask_setup(node: Worker | Scheduler) -> None:
-    """Collect garbage again, but for the modules that are imported by now.
+    """Enable garbage collection again, except for the modules imported so far.
 
-    The server for HTTP is closed: it would tell every user of the machine what is computed.
+    The HTTP server is closed: it would show the computation to every user of the machine.
     """
     node.http_server.stop()
     gc.freeze()
@@ -27,5 +27,5 @@ def dask_setup(node: Worker | Scheduler) -> None:
 
 
 def dask_teardown(node: Worker | Scheduler) -> None:
-    """Leave all there is to the end of the process: freeing it piece by piece takes a second."""
+    """Leave all memory to the end of the process: freeing it piece by piece takes a second."""
     gc.freeze()

@@ -1,4 +1,4 @@
-"""Task of stage `redetection`: who is looked for again in one clip of one camera's video."""
+"""Task of stage `redetection`: second search for missed people in one clip of one video."""
 
 from __future__ import annotations
 
@@ -52,12 +52,13 @@ from worldpose.video import open_video
 from worldpose.video.some import some_pictures
 
 FEW: Final = 500
-"""Keypoints below which a camera's own spread is not learned, and the stated one counts [1]."""
+"""Minimum number of keypoints to estimate a camera's spread; below it the stated one is used
+[1]."""
 
 
 @unit_task
 def redetection(work: Work) -> str:
-    """Publishes whom the camera shows, those found again included; returns the key."""
+    """Publish the camera's people, including redetected ones; return the key."""
     store = Store.open(work.project)
     settings = RedetectionSettings.model_validate(work.recipe.settings)
     with store.publishing(work) as result:
@@ -87,19 +88,18 @@ def redetection(work: Work) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Case:
-    """A clip before one camera, and the bodies of the iteration before.
+    """A clip in one camera, and the bodies of the previous iteration.
 
     Attributes:
-        camera: as adjusted to people.
-        detection: the recipe by which people were detected.
+        camera: after adjustment to people.
+        detection: recipe of the detection.
         detected: the result of `detection`.
         person: (persons,) ids.
-        expected: the bodies in the camera's pictures.
-        shift: (frames, persons, 17, 2) [px], by how much keypoints are beside joints for lasting
-            reasons.
-        seen: (frames, persons), who was detected; everybody in frames that people corrected.
-        spread: of the camera's keypoints about the bodies.
-        noise: what keypoints are stated to err by, [px] and [m].
+        expected: the bodies in the camera's images.
+        shift: (frames, persons, 17, 2) [px], systematic error of keypoints relative to joints.
+        seen: (frames, persons), detected people; all people in corrected frames.
+        spread: spread of the camera's keypoints around the bodies.
+        noise: stated keypoint noise, [px] and [m].
     """
 
     camera: Camera
@@ -113,7 +113,7 @@ class _Case:
     noise: tuple[float, float]
 
     def sought(self, settings: RedetectionSettings) -> Sought:
-        """Who should be seen well and is not; nobody where that is not wanted."""
+        """Return visible people without a detection; none if disabled."""
         pitch = self.detection.sources["pitch"]
         place = None
         if pitch is not None:
@@ -157,7 +157,7 @@ def _open(store: Store, work: Work) -> _Case:
     offsets = placed["offsets"].values.astype(np.float64)
     beside = shift[:, 0] + offsets[:, 0, :, None]
 
-    count = detected.sizes["detection"]  # after these, the iteration before had found some again
+    count = detected.sizes["detection"]  # indices from here on: earlier redetections
     index = tracks["detection_index"].values[:, place]
     fits, dropped = (said[name].values[:, place, :count] for name in ("fits", "dropped"))
     seen = who_is_seen(index, fits, dropped)
@@ -188,14 +188,14 @@ def _open(store: Store, work: Work) -> _Case:
 
 
 def _spread(views: BodyViews, suspects: Suspects) -> Spread:
-    """How keypoints lie about bodies before this camera; as stated where too few tell."""
+    """Estimate the keypoint spread around bodies; the stated one if there are too few keypoints."""
     if np.count_nonzero(suspects.index >= 0) * len(COCO17) < FEW:
         return Spread(np.ones(len(COCO17)), np.empty(0), np.ones(1))
     return learn_from(views, suspects)
 
 
 def _answers(store: Store, work: Work, case: _Case, sought: Sought) -> Answers:
-    """What the pose net of `detection` sees where people are sought."""
+    """Run the pose net of `detection` where people are expected."""
     settings = DetectionSettings.model_validate(case.detection.settings)
     sources: dict[str, Any] = case.detection.sources
     if not len(sought.frame):
@@ -203,7 +203,9 @@ def _answers(store: Store, work: Work, case: _Case, sought: Sought) -> Answers:
     require_weights(settings, sources["weights"])
     shown = _pictures(store, work, case, np.unique(sought.frame))
     boxes = case.detected["boxes"].values
-    answers = look_again(shown, sought, load_pose(settings), settings.least_keypoint, boxes)
+    answers = look_again(
+        shown, sought, load_pose(settings), settings.min_keypoint_confidence, boxes
+    )
     require_registered(Path(work.folder) / sources["video"], sources["video_sha256"])
     return answers
 
@@ -211,9 +213,9 @@ def _answers(store: Store, work: Work, case: _Case, sought: Sought) -> Answers:
 def _pictures(
     store: Store, work: Work, case: _Case, places: NDArray[np.int64]
 ) -> Iterator[tuple[int, Picture | None]]:
-    """The pictures at some places among the frames, in order; those that the video lacks are not.
+    """Yield the images of some frame indices in order, without those that the video lacks.
 
-    Decoding jumps over what nobody is sought in.
+    Decoding skips images without a search.
     """
     sources: dict[str, Any] = case.detection.sources
     footage = open_input(store, work, f"ingest/{work.recipe.sources['camera']}")
@@ -228,7 +230,7 @@ def _pictures(
 def _arrays(
     case: _Case, sought: Sought, answers: Answers, verdicts: Verdicts
 ) -> dict[str, NDArray[Any]]:
-    """All that were detected in their places, and behind them those found again."""
+    """Return all detections at their indices, followed by the redetected people."""
     before = {
         name: case.detected[name].values for name in ("keypoints", "confidence", "boxes", "score")
     }

@@ -1,4 +1,4 @@
-"""Task of stage `refitting`: bodies again, with what the broadcast camera and other clips say."""
+"""Task of stage `refitting`: bodies refitted with the broadcast camera and other clips' shapes."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ from worldpose.store import Store
 Floats = NDArray[np.float64]
 
 KNOWN: Final = 2.0
-"""Frames whose broadcast camera is expected to put players farther off than this are left out
-[px]: keypoints are about as far off, but not all of a person the same way."""
+"""Frames with a larger expected reprojection error of players are left out [px]: keypoint errors
+are as large, but vary within a person."""
 
 
 @unit_task
 def refitting(work: Work) -> str:
-    """Publishes bodies and their keypoints; returns the key."""
+    """Publish bodies and their keypoints; return the key."""
     store = Store.open(work.project)
     unit = work.recipe.unit
     before = store.manifest(
@@ -72,12 +72,12 @@ def refitting(work: Work) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Pictures:
-    """The pictures of a clip's broadcast camera, one a frame of the clip.
+    """Images of a clip's broadcast camera, one per frame of the clip.
 
     Attributes:
-        number: (frames,) of each picture in its video.
-        camera: batch (frames,); NaN where it is not known well enough.
-        late: how much later than the frame the picture was taken [frame].
+        number: (frames,) index of each image in its video.
+        camera: batch (frames,); NaN if too uncertain.
+        late: clock offset of the images relative to the frames [frame].
     """
 
     number: NDArray[np.int64]
@@ -109,7 +109,7 @@ def _pictures(store: Store, work: Work, frame: NDArray[np.int64]) -> _Pictures:
 
 
 def _view(store: Store, work: Work, pictures: _Pictures, joints: Floats) -> Sightings:
-    """What the 2D poses in the pictures say of where joints are."""
+    """Return the ray constraints of the broadcast camera's 2D poses."""
     sources: dict[str, Any] = work.recipe.sources
     first, count = sources["first_frame"], sources["frame_count"]
     seen = open_input(store, work, sources["seen_in_broadcast"]).sel(
@@ -125,7 +125,7 @@ def _view(store: Store, work: Work, pictures: _Pictures, joints: Floats) -> Sigh
 
 
 def _glimpses(work: Work, pictures: _Pictures, joints: Floats) -> MonocularPoses | None:
-    """The bodies that were estimated from the pictures, where any were."""
+    """Return the monocular poses of the images, if there are any."""
     sources: dict[str, Any] = work.recipe.sources
     if sources["estimates"] is None:
         return None
@@ -141,13 +141,13 @@ def _glimpses(work: Work, pictures: _Pictures, joints: Floats) -> MonocularPoses
 def _known(
     store: Store, work: Work, persons: NDArray[np.integer], weight: float
 ) -> dict[int, Shape]:
-    """The shapes that other clips found, by the place of their people among the persons.
+    """Return the body shapes from other clips, by person index.
 
     Args:
         store: the store.
-        work: the work under way.
+        work: the current work order.
         persons: ids of this clip's people.
-        weight: of betas' normal distribution, with which bodies of all clips were fitted [1].
+        weight: weight of the betas' normal prior, common to the bodies of all clips [1].
     """
     sources: dict[str, Any] = work.recipe.sources
     named: dict[str, dict[str, str]] = dict(sources["people"])

@@ -1,4 +1,4 @@
-"""Task of stage `retriangulation`: where every joint of one clip is, seen by adjusted cameras."""
+"""Task of stage `retriangulation`: joints of one clip, triangulated by adjusted cameras."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from worldpose.store import Store
 
 @unit_task
 def retriangulation(work: Work) -> str:
-    """Publishes joints with covariance; returns the key."""
+    """Publish joints with covariance; return the key."""
     store = Store.open(work.project)
     with store.publishing(work) as result:
         settings = settings_before(store, work, work.recipe.unit)

@@ -1,4 +1,4 @@
-"""Arrays too long for memory, laid down on disk a stretch of frames at a time."""
+"""Arrays too long for memory, written to disk in chunks of frames."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from worldpose.store import Store
 
 
 class Spool:
-    """Arrays by name in a scratch folder, each longer by every stretch that is added."""
+    """Arrays by name in a scratch folder, extended by every added chunk."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._form: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
 
     def add(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Append a stretch; frames are the first dimension."""
+        """Append a chunk; frames are the first dimension."""
         for name, values in arrays.items():
             frames = self._form[name][1][0] if name in self._form else 0
             with (self._folder / name).open("ab") as file:
@@ -30,7 +30,7 @@ class Spool:
             self._form[name] = (values.dtype, (frames + len(values), *values.shape[1:]))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """All that was added, read from disk when it is used."""
+        """Return all added data, read from disk on access."""
         return {
             name: np.memmap(self._folder / name, dtype, "r", shape=shape)
             if np.prod(shape)
@@ -41,7 +41,7 @@ class Spool:
 
 @contextmanager
 def spooling(store: Store) -> Iterator[Spool]:
-    """A spool beside the results under way, where there is room for them; gone afterwards."""
+    """Yield a temporary spool next to the results in progress, where disk space is sufficient."""
     folder = store.blobs.staging()
     try:
         yield Spool(folder)

@@ -1,4 +1,4 @@
-"""Task of stage `static_calibration`: one camera as it was given, or from its clicked markings."""
+"""Task of stage `static_calibration`: one given camera, or one calibrated from clicks."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ from worldpose.store import Store
 from worldpose.video import index_video, open_video
 
 STILL_FRAMES: Final = 25
-"""Pictures of a video of which a still is the median."""
+"""Number of video frames for a median still."""
 
 
 @unit_task
 def static_calibration(work: Work) -> str:
-    """Publishes the camera, and how well it is known where it was calibrated; returns the key.
+    """Publish the camera, and its uncertainty if calibrated; return the key.
 
     A camera that its clicks do not determine is published as left out, with the reason.
     """
@@ -72,7 +72,7 @@ def static_calibration(work: Work) -> str:
                 settings=settings,
                 where=file,
             )
-        except InputError as error:  # one camera that cannot be calibrated must not end the match
+        except InputError as error:  # a failed calibration of one camera must not end the match
             reason = str(error)
             attributes = left_out_attributes(work.recipe.unit, reason)
             result.write(STATIC_CALIBRATION, arrays={}, attributes=attributes)
@@ -89,7 +89,7 @@ def static_calibration(work: Work) -> str:
 
 
 def clicked_markings(listed: Mapping[str, Any]) -> ClickedMarkings:
-    """The clicks of a recipe, by name: their order in the file decides nothing."""
+    """Return the clicks of a recipe, by name: their order in the file has no effect."""
     points, drawn = listed["points"], listed["drawn"]
     return ClickedMarkings(
         points=tuple(ClickedPoint(name=name, xy=points[name]) for name in sorted(points)),
@@ -98,10 +98,10 @@ def clicked_markings(listed: Mapping[str, Any]) -> ClickedMarkings:
 
 
 def _still(work: Work) -> NDArray[np.uint8] | None:
-    """The unit's still, or one without people from its video, from the files of its key.
+    """Return the unit's still, or one without people from its video, from the files of its key.
 
     Raises:
-        InputError: the file is not, or no longer, the one that was registered, or no picture.
+        InputError: the file differs from the registered one, or is not an image.
     """
     sources: dict[str, Any] = work.recipe.sources
     if sources["still"] is None:
@@ -114,10 +114,10 @@ def _still(work: Work) -> NDArray[np.uint8] | None:
 
 
 def _filmed_still(work: Work, filmed: Mapping[str, Any]) -> NDArray[np.uint8]:
-    """The median of pictures spread evenly over the clips; who stands still stays in it (C4).
+    """Return the median of images evenly spaced over the clips; motionless people stay in it (C4).
 
     Raises:
-        InputError: the video is not, or no longer, the one that was registered, or none.
+        InputError: the file differs from the registered one, or is not a video.
     """
     path = Path(work.folder) / filmed["video"]
     every = np.concatenate(
@@ -142,7 +142,7 @@ def _filmed_still(work: Work, filmed: Mapping[str, Any]) -> NDArray[np.uint8]:
 
 
 def _figures(report: CalibrationReport) -> dict[str, float]:
-    """Figures of a calibrated camera; what could not be computed is left out."""
+    """Return metrics of a calibrated camera; those that could not be computed are left out."""
     used = [point.residual for point in report.points if point.inlier]
     figures = {
         "expected_ground_error_median_m": report.ground_error.median,

@@ -1,4 +1,4 @@
-"""Task of stage `tracking`: who is who in one clip."""
+"""Task of stage `tracking`: identities of the detections in one clip."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from worldpose.tracking import (
 
 @unit_task
 def tracking(work: Work) -> str:
-    """Publishes which detection is which person, as corrected by people; returns the key."""
+    """Publish the person of each detection, with people's corrections; return the key."""
     store = Store.open(work.project)
     with store.publishing(work) as result:
         said = work.recipe.sources.get("identities") or []
@@ -60,11 +60,11 @@ def tracking(work: Work) -> str:
 
 
 Tracked = tuple[Identities, dict[str, float], tuple[str, ...]]
-"""What the tracker found, its figures, and its warnings."""
+"""The tracker's output, its metrics, and its warnings."""
 
 
 def _automatic(store: Store, work: Work) -> Tracked:
-    """Return what the tracker found: as it is published, else tracked again.
+    """Return the published tracks without corrections; if there are none, track.
 
     Both are the same bytes.
     """

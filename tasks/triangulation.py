@@ -1,4 +1,4 @@
-"""Task of stage `triangulation`: where every joint of one clip is."""
+"""Task of stage `triangulation`: 3D joints of one clip."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from worldpose.triangulation import (
 
 @unit_task
 def triangulation(work: Work) -> str:
-    """Publishes joints with covariance; returns the key."""
+    """Publish joints with covariance; return the key."""
     store = Store.open(work.project)
     with store.publishing(work) as result:
         settings = TriangulationSettings.model_validate(work.recipe.settings)
@@ -38,7 +38,7 @@ def triangulation(work: Work) -> str:
 
 
 def settings_before(store: Store, work: Work, clip: str) -> TriangulationSettings:
-    """The settings with which the joints of a clip were placed the first time."""
+    """Return the settings of the first triangulation of a clip."""
     match_id, key = work.recipe.match_id, work.recipe.inputs[f"triangulation/{clip}"]
     recipe = store.manifest(match_id, "triangulation", clip, key).recipe
     return TriangulationSettings.model_validate(recipe.settings)
@@ -51,7 +51,7 @@ def place_joints(
     result: ResultWriter,
     layout: GroupLayout,
 ) -> None:
-    """Writes the joints of the clip of `work` into its result, a stretch of frames at a time."""
+    """Triangulate the clip of `work` in chunks of frames, and write the joints."""
     clip = open_clip(store, work)
     tracks = open_input(store, work, f"tracking/{work.recipe.unit}")
     index = tracks["detection_index"].values
@@ -94,18 +94,18 @@ def place_joints(
 
 
 def camera_errors(work: Work, clip: ClipInputs) -> NDArray[np.float64] | None:
-    """How well each camera is known, (cameras, 12, 12); None from the second iteration on.
+    """Return each camera's covariance, (cameras, 12, 12); None from the second iteration on.
 
-    Cameras that were adjusted to people know where they are towards each other much better than
-    each knows its own place, which all have in common: taken for errors of single cameras, that
-    moves people. How far these misplace people is then learned from how they disagree.
+    Adjusted cameras have accurate relative poses, and a larger position error that all share.
+    Treated as independent errors of the cameras, their covariances would displace people.
+    Systematic errors of each camera are then estimated from the residuals between cameras.
     """
     is_again = f"filtering/{work.recipe.unit}" in work.recipe.inputs
     return None if is_again else clip.camera_covariance
 
 
 def part_arrays(joints: Triangulation, smooth: Smoothing) -> dict[str, NDArray[Any]]:
-    """The stored arrays that have frames."""
+    """Return the stored arrays with a frame dimension."""
     return {
         "joints": joints.joints,
         "covariance": joints.covariance,
@@ -122,5 +122,5 @@ def part_arrays(joints: Triangulation, smooth: Smoothing) -> dict[str, NDArray[A
 
 
 def clock_arrays(clocks: CameraClocks) -> dict[str, NDArray[Any]]:
-    """The stored arrays of the cameras' clocks."""
+    """Return the stored arrays of the cameras' clock offsets."""
     return {"clock_late": clocks.late, "clock_error": clocks.standard_error}

@@ -1,4 +1,4 @@
-"""What every unit's task has in common: its name in the dashboard, retries, verified inputs."""
+"""Common behaviour of all units' tasks: dashboard name, retries, verified inputs."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from worldpose.store import Store, code_version, libraries
 
 RETRIES: Final = 2
 RETRY_SECONDS: Final = 1.0
-"""Of what may be gone next time."""
+"""Before a retry of a temporary failure."""
 
 
 def unit_task(compute: Callable[[Work], str]) -> Task[[Work], str]:
-    """Make a task of a function of one `Work` that publishes its result under `work.key`."""
+    """Turn a function of one `Work` that publishes its result under `work.key` into a task."""
 
     @functools.wraps(compute)
     def checked(work: Work) -> str:
-        # A log line that Prefect's server does not take (a full disk) is no output of a worker.
+        # A log line that Prefect's server rejects (a full disk) is not output of a worker.
         logging.raiseExceptions = False
         require_same_code(work)
         with kill_on_timeout(work):
@@ -50,7 +50,7 @@ def unit_task(compute: Callable[[Work], str]) -> Task[[Work], str]:
                 require_memory(error, work.recipe.name)
                 if isinstance(error, OSError):
                     raise
-                # A bug must not read as a fault of the match.
+                # A bug must not look like a fault of the match.
                 raise InternalError.wrapping(work.recipe.name, error) from error
 
     return task(
@@ -63,10 +63,10 @@ def unit_task(compute: Callable[[Work], str]) -> Task[[Work], str]:
 
 
 def require_same_code(work: Work) -> None:
-    """Refuse to compute with other code than the key stands for.
+    """Refuse to compute with other code than that of the key.
 
     Raises:
-        InputError: this process has other sources or libraries than the one that planned.
+        InputError: this process has other sources or libraries than the planning process.
     """
     recipe = work.recipe
     ours = {**code_version(f"tasks.{recipe.stage}"), **libraries()}
@@ -82,11 +82,11 @@ def require_same_code(work: Work) -> None:
 
 
 def open_input(store: Store, work: Work, name: str) -> xr.Dataset:
-    """A published input of this work; every byte is checked against its manifest when read.
+    """Open a published input of this work; every byte is verified against its manifest on read.
 
     Args:
         store: the store.
-        work: the work under way.
+        work: the current work order.
         name: the input as `stage/unit`.
 
     Raises:
@@ -97,12 +97,12 @@ def open_input(store: Store, work: Work, name: str) -> xr.Dataset:
 
 
 def require_registered(path: Path, sha256: str) -> None:
-    """Refuse what was read of a file or folder of the match if it is not what the key stands for.
+    """Refuse the content of a match file or folder that differs from the registered one.
 
-    Call it after reading: what is changed meanwhile is then seen.
+    Call it after reading, so that it detects changes in between.
 
     Raises:
-        InputError: the file is not, or no longer, the one that was registered.
+        InputError: the file differs from the registered one.
     """
     if digest_of_files(path) != sha256:
         raise InputError(
@@ -114,7 +114,7 @@ def require_registered(path: Path, sha256: str) -> None:
 
 
 def figures_of(report: Record, camera_ids: Sequence[str]) -> dict[str, float]:
-    """A stage's report as figures of its result; a value a camera is named `figure.camera`."""
+    """Return a stage's report as metrics of its result; a value per camera is `figure.camera`."""
     figures: dict[str, float] = {}
     for name, value in report:
         per_camera = isinstance(value, tuple)
@@ -126,7 +126,7 @@ def figures_of(report: Record, camera_ids: Sequence[str]) -> dict[str, float]:
 
 
 def may_pass(failure: BaseException) -> bool:
-    """Whether a failure may be gone next time: a disk's or network's, not an input's or a bug's."""
+    """Return whether a failure can be temporary: of a disk or network, not an input or a bug."""
     lasting = isinstance(failure, CorruptionError | NondeterminismError)
     return isinstance(failure, StoreError | OSError) and not lasting
 

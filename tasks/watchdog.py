@@ -1,7 +1,7 @@
-"""How often a unit may be begun: one that hangs or ends its worker's process is given up in time.
+"""Limit on restarts of a unit: a unit that hangs or ends its worker's process is given up.
 
-What hangs or crashes in a library cannot be caught, only survived: its process ends, Dask begins a
-new one and gives it the unit again. A mark beside Dask's own scratch files tells how that went.
+A hang or crash in a library cannot be caught: its process ends, Dask starts a new one and gives it
+the unit again. A mark file next to Dask's scratch files records the attempts.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ from data_contracts.work import Work
 from worldpose.errors import WorldposeError
 
 MOST_STOPPED: Final = 2
-"""A unit that was stopped so often, as it took too long, is given up."""
+"""After so many timeouts, a unit is given up."""
 MOST_DEATHS: Final = 3
-"""So is one whose process ended so often: fewer than Dask takes from units beside it."""
+"""Likewise after so many process deaths: fewer than Dask tolerates for units on the same worker."""
 FRAMES_SHOWN: Final = 3
-"""Of the stack of what hung."""
+"""Stack frames of a hung unit in its message."""
 BEGUN: Final = "begun"
 
 
 class TaskTimeoutError(WorldposeError):
-    """A unit was at work for longer than it may be, each time that it was begun."""
+    """A unit exceeded its time limit at each attempt."""
 
 
 class WorkerCrashError(WorldposeError):
-    """A unit ended its process, each time that it was begun."""
+    """A unit ended its process at each attempt."""
 
 
 @contextmanager
 def kill_on_timeout(work: Work) -> Iterator[None]:
-    """End this worker if the block takes longer than the work may.
+    """End this worker if the block exceeds the time limit of the work.
 
-    Outside of Dask's workers nothing is watched: there the process is somebody's own.
+    Outside Dask workers there is no limit: the process belongs to the caller.
 
     Raises:
-        TaskTimeoutError: it was stopped often enough.
-        WorkerCrashError: it ended its process often enough.
+        TaskTimeoutError: it reached the maximum number of timeouts.
+        WorkerCrashError: it reached the maximum number of process deaths.
     """
     mark = _mark_of(work)
     if mark is None:
@@ -53,7 +53,7 @@ def kill_on_timeout(work: Work) -> Iterator[None]:
         return
     before = mark.read_text().splitlines() if mark.exists() else []
     stopped = [line for line in before if line != BEGUN]
-    deaths = len(before) - 2 * len(stopped)  # a line as it began, and one as it was stopped
+    deaths = len(before) - 2 * len(stopped)  # one line per start, and one per timeout
     if len(stopped) >= MOST_STOPPED or deaths >= MOST_DEATHS:
         mark.unlink(missing_ok=True)
         _give_up(work, stopped, deaths)
@@ -89,7 +89,7 @@ def _watch(is_done: threading.Event, work: Work, mark: Path, thread: int) -> Non
     frames = traceback.extract_stack(sys._current_frames().get(thread))[-FRAMES_SHOWN:]
     try:
         _append(mark, ", ".join(f"{each.name} ({each.filename}:{each.lineno})" for each in frames))
-    finally:  # a full disk leaves it hanging no longer either
+    finally:  # a full disk must not keep the process hanging
         os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -99,12 +99,12 @@ def _append(mark: Path, line: str) -> None:
 
 
 def _mark_of(work: Work) -> Path | None:
-    """Where a run's workers on this machine note that this was begun; None outside of Dask's.
+    """Return the mark file of a work order on this machine; None outside Dask workers.
 
-    All runs of a machine share the folder, and killed ones leave their marks. Another project, or
-    the same one made anew, has runs of the same number and results of the same key.
+    All runs of a machine share the folder, and killed ones leave their marks. Another project, or a
+    recreated one, can have the same run numbers and result keys.
     """
-    # Late: what computes without Dask never imports it.
+    # Imported here: computation without Dask never imports it.
     from distributed import get_worker
 
     try:

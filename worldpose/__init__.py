@@ -14,7 +14,7 @@ __all__ = ["open_run"]
 
 
 def __getattr__(name: str) -> object:
-    # Late: most of the library needs neither the store nor xarray.
+    # Lazy import: most of the library needs neither the store nor xarray.
     if name == "open_run":
         from worldpose.store.opened_run import open_run
 

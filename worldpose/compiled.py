@@ -1,4 +1,4 @@
-"""The decorator of the compiled kernels."""
+"""Decorator that compiles numerical kernels to machine code (Numba)."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ Function = TypeVar("Function", bound=Callable[..., object])
 
 
 def compiled(function: Function) -> Function:
-    """Return `function` compiled to machine code on first call, and kept on disk.
+    """Return `function`, compiled to machine code on its first call and cached on disk.
 
     No fast-math and no parallel loops: the same input gives the same bits on any number of
     threads. The interpreter lock is released, and division by zero gives infinity as in numpy.
     """
     given = config.CACHE_DIR  # type: ignore[attr-defined]
-    # Numba looks there while it decorates.
+    # Numba reads this setting while it decorates.
     config.CACHE_DIR = given or str(_cache_folder())  # type: ignore[attr-defined]
     try:
         return cast(Function, njit(cache=True, nogil=True, error_model="numpy")(function))
@@ -32,10 +32,10 @@ def compiled(function: Function) -> Function:
 
 @functools.cache
 def _cache_folder() -> Path:
-    """One folder for each state of the kernels' sources.
+    """Return a cache folder that is unique to the state of the kernels' sources.
 
-    Numba renews a kernel when its own file changes, but not when a kernel or constant that it
-    takes from another file does: old machine code would then be taken for the new source's.
+    Numba recompiles a kernel when its own file changes, but not when a kernel or constant from
+    another file changes: it would then run machine code of the old source.
     """
     package = Path(__file__).parent
     digest = hashlib.sha256()

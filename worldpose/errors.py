@@ -1,4 +1,4 @@
-"""The error tree. A message says where, what was expected, what came, and what to do."""
+"""Exception classes. A message says where, what was expected, what was found, and what to do."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Final
 
 
 class WorldposeError(Exception):
-    """Base of every error that a user can cause or mend."""
+    """Base class of errors that a user can cause or fix."""
 
 
 class InputError(WorldposeError):
-    """Something given to worldpose is not what it must be.
+    """Invalid input.
 
     Args:
-        where: file, and key or place in it: `match.yaml: cameras[2].kind`.
+        where: file, and key or position in it: `match.yaml: cameras[2].kind`.
         expected: what is needed there.
         found: what is there instead; the middle of a long text is left out.
         todo: what the user can do about it.
@@ -27,18 +27,18 @@ class InputError(WorldposeError):
         super().__init__(f"{self.where}: expected {expected}, found {self.found}. {todo}")
 
     def __reduce__(self) -> tuple[object, ...]:
-        # Keyword-only arguments: without this the error cannot travel back from a worker.
+        # Keyword-only arguments: without this the error cannot be unpickled from a worker.
         return _input_error, (type(self), self.where, self.expected, self.found, self.todo)
 
 
 _LONGEST: Final = 600
-"""Characters that a message repeats of what was given: a name may have a million."""
+"""Most characters of the input that a message repeats: a name may have a million."""
 
 
 def _shortened(text: str) -> str:
     if len(text) <= _LONGEST:
         return text
-    half = _LONGEST // 2 - 20  # with what stands between, it is not shortened again
+    half = _LONGEST // 2 - 20  # leaves room for the text between, so the result is short enough
     return f"{text[:half]}...[{len(text) - 2 * half} characters]...{text[-half:]}"
 
 
@@ -53,15 +53,15 @@ class UsageError(InputError):
 
 
 class DegenerateError(WorldposeError):
-    """The geometry does not determine the answer."""
+    """Geometry that does not determine the result."""
 
 
 class InternalError(WorldposeError):
-    """Worldpose itself is wrong; nothing that was given to it is.
+    """A bug in worldpose, not in its input.
 
     Args:
-        where: what was at work: `triangulation/clip`, or `tracking: array joints[3, 1]`.
-        problem: what went wrong, as a programmer would say it.
+        where: the running code: `triangulation/clip`, or `tracking: array joints[3, 1]`.
+        problem: what went wrong, in a programmer's words.
     """
 
     def __init__(self, where: str, problem: str) -> None:
@@ -73,7 +73,7 @@ class InternalError(WorldposeError):
 
     @classmethod
     def wrapping(cls, where: str, error: BaseException) -> InternalError:
-        """The error for an exception that no code foresaw; names the line that raised it."""
+        """Return the error for an unforeseen exception; it names the line that raised it."""
         steps = traceback.extract_tb(error.__traceback__)
         place = ""
         if steps:
@@ -87,18 +87,18 @@ class InternalError(WorldposeError):
 
 
 class MemoryLimitError(WorldposeError):
-    """The system gave no memory, or no thread."""
+    """The system refused memory or a thread."""
 
 
 def require_memory(failure: BaseException, where: str = "") -> None:
-    """Go on only if a failure is not that of too little memory.
+    """Raise an error if a failure means too little memory; otherwise return.
 
     Args:
-        failure: what was raised.
-        where: what was at work, for the message.
+        failure: the exception.
+        where: the running code, for the message.
 
     Raises:
-        MemoryLimitError: it is.
+        MemoryLimitError: the failure means too little memory.
     """
     is_thread = isinstance(failure, RuntimeError) and "start new thread" in str(failure)
     is_refused = isinstance(failure, OSError) and failure.errno == errno.ENOMEM
@@ -112,7 +112,7 @@ def require_memory(failure: BaseException, where: str = "") -> None:
 
 
 class StoreError(WorldposeError):
-    """The store cannot give or take a result."""
+    """The store cannot read or write a result."""
 
 
 class CorruptionError(StoreError):

@@ -14,13 +14,13 @@ import traceback
 
 
 def main() -> None:
-    """Run the command line; user errors become one message and an exit code."""
-    # Late: every process that a run starts imports this module once more, and no command.
+    """Run the command line; a user error becomes one message and an exit code."""
+    # Imported here: every process of a run imports this module again, but needs no command.
     from flows.cli.app import app
     from flows.cli.console import errors, line
     from worldpose.errors import InternalError, UsageError, WorldposeError, require_memory
 
-    # A log line that Prefect's server does not take (a full disk) is no output of the command.
+    # A log line that Prefect's server rejects (a full disk) is not output of the command.
     logging.raiseExceptions = False
     try:
         try:
@@ -43,11 +43,11 @@ def main() -> None:
         line(f"error: {message}", to=errors)
         sys.exit(1)
     finally:
-        gc.freeze()  # the process ends: freeing all its modules piece by piece takes half a second
+        gc.freeze()  # the process ends: freeing all its modules one by one takes half a second
 
 
 def _kept_trace() -> str:
-    """Path of a file with the traceback of the exception that is being handled."""
+    """Write the traceback of the current exception to a file; return its path."""
     with tempfile.NamedTemporaryFile(
         "w", prefix="worldpose-error-", suffix=".txt", delete=False, encoding="utf-8"
     ) as file:

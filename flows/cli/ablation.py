@@ -1,4 +1,4 @@
-"""`worldpose evaluate --ablation`: the paper's table, ours beside it."""
+"""`worldpose evaluate --ablation`: our results next to the paper's table."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
 
 def print_ablation(seeds: int, *, as_json: bool) -> None:
-    """Simulates trials and prints every row's mean and spread over them.
+    """Simulate trials and print every row's mean and standard deviation over them.
 
     Args:
-        seeds: how many, from 0.
-        as_json: every trial's figures instead of a table.
+        seeds: number of trials, with seeds from 0.
+        as_json: print every trial's metrics instead of a table.
     """
     from flows.ablation import PAPER, TRIANGULATIONS, Score, ablation
 
@@ -50,7 +50,7 @@ def print_ablation(seeds: int, *, as_json: bool) -> None:
 
 
 def _is_of(row: str, how: str) -> bool:
-    """Whether a row is triangulated this way; the first way has no name."""
+    """Return whether a row is triangulated this way; the first way has no name."""
     from flows.ablation import TRIANGULATIONS
 
     return max((end for end in TRIANGULATIONS if row.endswith(end)), key=len) == how

@@ -1,4 +1,4 @@
-"""The commands of `worldpose`; each is imported when it is called."""
+"""Command table of `worldpose`; each command is imported when it is called."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class RenamingCommand(TyperCommand):
 class Commands(TyperGroup):
     """All commands, in the order of the table.
 
-    Estimators and stores take seconds to import, so that only the command that is called is.
+    Importing estimators and stores takes seconds, so only the called command is imported.
     """
 
     def get_command(self, ctx: Context, cmd_name: str) -> Command | None:
@@ -89,7 +89,7 @@ class Commands(TyperGroup):
     def resolve_command(
         self, ctx: Context, args: list[str]
     ) -> tuple[str | None, Command | None, list[str]]:
-        """Return the command that was called, or say which one may be meant."""
+        """Return the called command, or raise an error that suggests one."""
         name = args[0]
         if name in renames.COMMANDS:
             ctx.fail(f"worldpose {name} is now worldpose {renames.COMMANDS[name]}.")
@@ -105,7 +105,7 @@ class Commands(TyperGroup):
             formatter.write_dl([(name, summary(name)) for name in COMMANDS])
 
     def shell_complete(self, ctx: Context, incomplete: str) -> list[CompletionItem]:
-        """Return the commands and options that begin with what was typed."""
+        """Return the commands and options that begin with the typed text."""
         from typer._click.shell_completion import CompletionItem
 
         options = super(TyperGroup, self).shell_complete(ctx, incomplete)

@@ -1,4 +1,4 @@
-"""The command that checks an exported data set."""
+"""Command check: validate an exported data set."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import typer
 from flows.cli.console import JsonOption, errors, line, print_json, print_table
 
 FAULTY = 1
-"""Exit code where something is wrong with the data set."""
+"""Exit code if the data set has faults."""
 
 
 def check(
@@ -64,7 +64,7 @@ def check(
 
 
 def tell_unstated_rate(folder: Path, fps: float | None) -> None:
-    """Says which frame rate is assumed, since seconds and speeds hang on it."""
+    """Print the assumed frame rate, since seconds and speeds depend on it."""
     from flows.checking import USUAL_FPS, stated_rates
 
     if None in stated_rates(folder, fps).values():

@@ -1,4 +1,4 @@
-"""Options of the commands that compute: with which machines, and for how long."""
+"""Options of the commands that compute: machines and time limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all commands share: the project and JSON options, output, progress."""
+"""Shared parts of all commands: the project and JSON options, output, progress."""
 
 from __future__ import annotations
 
@@ -38,24 +38,24 @@ StageOption = Annotated[
 
 DEFAULT_PROJECT = "worldpose-data"
 NO_WIDTH = 100_000
-"""Characters of a line where no terminal bounds it."""
+"""Line width without a terminal [characters]."""
 
 
 def print_json(value: Mapping[str, Any]) -> None:
-    """One JSON object on standard output."""
+    """Print one JSON object on standard output."""
     print(json.dumps(value, indent=2, default=str))  # noqa: T201
 
 
 def line(text: str, *, to: Console = output) -> None:
-    """Plain text as it is: names and messages may hold brackets."""
+    """Print plain text without markup: names and messages can contain brackets."""
     to.print(text, markup=False, highlight=False)
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """A plain table; columns that start with ">" are right-aligned.
+    """Print a plain table; columns that start with ">" are right-aligned.
 
-    Nothing is ever cut off: a cell too wide for the terminal goes on in its next line, and a file
-    or pipe, in which people search, gets whole lines.
+    Nothing is truncated: a cell too wide for the terminal wraps, and a file or pipe, which people
+    search, gets whole lines.
     """
     table = Table(title=title, title_justify="left", box=None, pad_edge=False, title_style="bold")
     for column in columns:
@@ -68,51 +68,51 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]
 
 
 class ConsoleReporter(Reporter):
-    """Progress as lines on standard error, with a spinner while a terminal watches."""
+    """Progress as lines on standard error, with a spinner on a terminal."""
 
     def __init__(self) -> None:
         self._started = time.monotonic()
         self._tenths = 0
 
     def say(self, text: str) -> None:
-        """One line, stamped with the seconds since the start."""
+        """Print one line, with the seconds since the start."""
         seconds = time.monotonic() - self._started
         errors.print(f"[dim]{seconds:7.1f} s[/]  {text}", highlight=False)
 
     def bytes_read(self, done: int, total: int) -> None:
-        """Tells of every tenth of a long reading."""
+        """Report every tenth of a long read."""
         tenth = 10 * done // max(total, 1)
         if tenth > self._tenths:
             self._tenths = tenth
             self.say(f"{done / 1e6:.1f} of {total / 1e6:.1f} MB checked")
 
     def stage_started(self, stage: str, about: str, *, units: int, missing: int) -> None:
-        """Names the stage and how much of it is already there."""
+        """Print the stage and how many of its units are already published."""
         super().stage_started(stage, about, units=units, missing=missing)
         reused = f", {units - missing} already there" if missing < units else ""
         self.say(f"[bold]{stage}[/]: {about} ({missing} of {units} to compute{reused})")
 
     def tell_of(self, unit: str, seconds: float, figures: Mapping[str, float]) -> None:
-        """Names the unit, its time and its figures."""
+        """Print the unit, its time and its metrics."""
         super().tell_of(unit, seconds, figures)
         self.say(
             f"  {escape(unit)}  {seconds:.2f} s  [dim]{in_short(figures)}[/]  ({self.left} left)"
         )
 
     def unit_waits(self, unit: str, reasons: Sequence[str]) -> None:
-        """Names the unit and why a person is asked."""
+        """Print the unit and why it needs review."""
         super().unit_waits(unit, reasons)
         self.say(f"  [bold]{escape(unit)} waits for review[/]: {escape('; '.join(reasons))}")
 
     def unit_failed(self, unit: str, message: str) -> None:
-        """Names the unit and why it failed."""
+        """Print the unit and why it failed."""
         super().unit_failed(unit, message)
         self.say(f"  [bold red]{escape(unit)} failed[/]: {escape(message)}  ({self.left} left)")
 
 
 @contextmanager
 def progress() -> Iterator[ConsoleReporter]:
-    """Progress of whatever runs inside, as lines on standard error."""
+    """Report progress of all runs inside the context as lines on standard error."""
     reporter = ConsoleReporter()
     with reporting_to(reporter):
         if errors.is_terminal:

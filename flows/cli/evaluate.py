@@ -1,4 +1,4 @@
-"""The command that scores joints, cameras and other methods' results against a reference."""
+"""Command evaluate: score joints, cameras and baseline results against a reference."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ _CAMERA_COLUMNS = {
 
 
 def _print_rows(kind: str, columns: Mapping[str, str], rows: Mapping[str, object]) -> None:
-    """One row for each person or camera, where there are any."""
+    """Print one row per person or camera, if there are any."""
     if not rows:
         return
     shown = []

@@ -1,4 +1,4 @@
-"""Commands label and finetune: make the embedded nets better at what people correct."""
+"""Commands label and finetune: train the embedded nets on corrected labels."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from worldpose.training import FineTuningSettings
 
 SETTING = {"people": "detection.detector", "keypoints": "detection.pose"}
-"""What names each net in a run's settings."""
+"""Setting that selects each net in a run."""
 
 
 class _Lines(logging.Handler):
-    """Shows the lines of training."""
+    """Log handler that prints training progress."""
 
     def emit(self, record: logging.LogRecord) -> None:
         line(record.getMessage(), to=errors)
@@ -115,7 +115,7 @@ def finetune(
                     annotations, pictures, Path(project) / FOLDER, kinds, settings, begin
                 )
             finally:
-                APILogHandler().flush()  # while the server is there to take the last lines
+                APILogHandler().flush()  # while the server can still accept the last lines
     finally:
         logger.removeHandler(shown)
     folder = Path(project) / FOLDER
@@ -164,10 +164,10 @@ def _parted(assignment: str) -> tuple[str, str]:
 
 
 def _settings(assignments: list[str]) -> FineTuningSettings:
-    """Settings by name, those of the training with `training.` before them.
+    """Parse settings by name; those of the training have the prefix `training.`.
 
     Raises:
-        UsageError: no such setting, or a value that does not fit.
+        UsageError: an unknown setting, or an invalid value.
     """
     from worldpose.training import FineTuningSettings
 

@@ -1,4 +1,4 @@
-"""What `worldpose run --iterations` reads and prints."""
+"""Parsing and output of `worldpose run --iterations`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ UNTIL_BEST = "auto"
 
 
 def parse_iterations(text: str) -> int | None:
-    """How many; None until one is no better.
+    """Return the number of iterations; None = until one is no better.
 
     Raises:
         UsageError: neither a number from 1 nor `auto`.
@@ -37,7 +37,7 @@ def parse_iterations(text: str) -> int | None:
 
 
 def figures_of(iteration: Iteration) -> dict[str, float | None]:
-    """The figures by which iterations are compared, over all clips."""
+    """Return the metrics by which iterations are compared, over all clips."""
     record = iteration.record
     judged = _total(record, "filtering", "judged")
     rejected = _total(record, "filtering", "keypoints_rejected")
@@ -57,7 +57,7 @@ def figures_of(iteration: Iteration) -> dict[str, float | None]:
 
 
 def marks_of(store: Store, found: Iterations) -> list[dict[str, str]]:
-    """How cameras, clips and players of each iteration fare against the one before it."""
+    """Compare cameras, clips and players of each iteration with the iteration before."""
     marks: list[dict[str, str]] = [{}]
     for before, after in pairwise(found.passes):
         changes = compare_runs(store, before.record, after.record)
@@ -71,7 +71,7 @@ def _in_short(marks: Mapping[Mark, int]) -> str:
 
 
 def as_json(store: Store, found: Iterations) -> dict[str, JsonValue]:
-    """All iterations with their figures, and which one stands."""
+    """Return all iterations with their metrics, and the kept one."""
     return {
         "iterations": [
             {
@@ -88,7 +88,7 @@ def as_json(store: Store, found: Iterations) -> dict[str, JsonValue]:
 
 
 def print_iterations(store: Store, found: Iterations) -> None:
-    """One column an iteration, and which one stands."""
+    """Print one column per iteration, and the kept one."""
     columns = [figures_of(each) for each in found.passes]
     rows = [
         (name, *("" if column[name] is None else f"{column[name]:.4g}" for column in columns))
@@ -114,7 +114,7 @@ def _total(record: RunRecord, stage: str, name: str) -> float:
 
 
 def _last_bodies(record: RunRecord) -> dict[str, float]:
-    """Figures of the bodies of all clips, `unit.figure`, refitted where they were."""
+    """Return the metrics of the bodies of all clips, `unit.figure`, refitted ones if available."""
     found: dict[str, float] = {}
     for stage in ("body_fitting", "refitting"):
         for unit, figures in record.figures.items():

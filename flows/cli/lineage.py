@@ -73,7 +73,7 @@ def diff(
 
 
 def _print_compared(compared: list[SubjectChange]) -> None:
-    """Cameras, clips and players with the figures that made them better or worse."""
+    """Print cameras, clips and players with the metrics that changed significantly."""
     rows = [
         (
             change.kind,

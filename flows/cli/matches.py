@@ -1,4 +1,4 @@
-"""Commands that make and register matches: simulate, import, ingest."""
+"""Commands that create and register matches: simulate, import, ingest."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def _refuse_options(what: str, options: dict[str, bool]) -> None:
 
 
 def _report_match(match_id: str, out: Path, as_json: bool) -> None:
-    """Print which match was made."""
+    """Print the id of the created match."""
     if as_json:
         print_json({"match": match_id, "folder": str(out)})
     else:
@@ -161,7 +161,7 @@ def _report_match(match_id: str, out: Path, as_json: bool) -> None:
 
 @contextmanager
 def _filming() -> Iterator[Callable[[str, int, int], None]]:
-    """Progress of filming: a bar for each camera, or a line when one is done."""
+    """Report rendering progress: a bar for each camera, or a line when one is done."""
     with Progress(console=errors, transient=True, disable=not errors.is_terminal) as bars:
         tasks: dict[str, TaskID] = {}
 
@@ -236,7 +236,7 @@ def import_command(
 
 
 def import_pitch(survey: Path, out: Path, *, left_handed: bool, as_json: bool) -> None:
-    """Lay a survey onto the world frame, write pitch.json and say how it fits."""
+    """Align a survey with the world frame, write pitch.json and print the residuals."""
     from worldpose.formats import whole_file
     from worldpose.ingest.pitch_file import refuse_unread_pitch
     from worldpose.pitch.survey import fit_survey
@@ -318,7 +318,7 @@ def ingest(
 
 
 def _tell_unclicked(match: Match) -> None:
-    """What has to be done before the match can be run."""
+    """Print what has to be clicked before the match can run."""
     known = {**match.folder.calibrations, **match.folder.clicked}
     missing = [each.id for each in match.folder.spec.static_cameras if each.id not in known]
     if missing and match.folder.pitch is None:

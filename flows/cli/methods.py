@@ -1,4 +1,4 @@
-"""The table of other methods, printed."""
+"""Printed table of baseline methods."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ FORMS = ("text", "csv", "latex")
 
 
 def named_rates(given: Sequence[str]) -> dict[str, float]:
-    """NAME=FPS as numbers by name.
+    """Parse NAME=FPS arguments into numbers by name.
 
     Raises:
-        UsageError: it is not that.
+        UsageError: an argument has another form.
     """
     rates = {}
     for item in given:
@@ -37,10 +37,10 @@ def named_rates(given: Sequence[str]) -> dict[str, float]:
 
 
 def print_methods(scores: Sequence[MethodScore], form: str, *, as_json: bool) -> None:
-    """Prints scores of methods as text, CSV or LaTeX, or all that is known of them as JSON.
+    """Print scores of methods as text, CSV or LaTeX, or in full as JSON.
 
     Raises:
-        UsageError: another form.
+        UsageError: an unknown format.
     """
     if form not in FORMS:
         raise UsageError(
@@ -50,7 +50,7 @@ def print_methods(scores: Sequence[MethodScore], form: str, *, as_json: bool) ->
         rows = [score.model_dump(mode="json", exclude_none=True) for score in scores]
         print_json({"methods": rows, "table": [list(row) for row in table_rows(scores)]})
     elif form == "text":
-        # Brackets would be taken for markup.
+        # Brackets would be parsed as markup.
         titles = (f">{title.replace('[', '').replace(']', '')}" for title in COLUMNS.values())
         print_table("", ("method", *titles), table_rows(scores))
     else:

@@ -1,4 +1,4 @@
-"""Options of the commands that serve the pages: where they listen, and who may."""
+"""Options of the commands that serve the pages: address and access."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ TokenOption = Annotated[
 
 
 def certificate_and_key(certificate: Path | None, key: Path | None) -> tuple[Path, Path] | None:
-    """Both files, or None where none is given.
+    """Return both files, or None if neither is given.
 
     Raises:
         UsageError: only one of them is given.

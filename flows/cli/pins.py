@@ -1,4 +1,4 @@
-"""Commands that name runs and keep them: pin, unpin."""
+"""Commands pin and unpin: named runs that garbage collection keeps."""
 
 from __future__ import annotations
 

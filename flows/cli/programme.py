@@ -1,4 +1,4 @@
-"""Command `clips`: proposes clips of a whole programme, and cuts out what a person confirms."""
+"""Command clips: propose clips of a whole programme, and cut out the confirmed ones."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from flows.cli.console import JsonOption, errors, line, print_json, print_table
 from worldpose.errors import UsageError
 
 WIDTH = 320
-"""Of the pictures that are looked at [px]."""
+"""Of the analysed images [px]."""
 
 
 def clips(
@@ -97,7 +97,7 @@ def clips(
 
 
 def _pictures(programme: Path) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
-    """All pictures, small, with progress on a terminal."""
+    """Yield all images, downscaled, with progress on a terminal."""
     from worldpose.video import VideoReader
 
     with (
@@ -111,7 +111,7 @@ def _pictures(programme: Path) -> Iterator[tuple[int, NDArray[np.uint8] | None]]
 
 
 def _take(programme: Path, take: str, out: Path, *, as_json: bool) -> None:
-    """Cut pictures out, and say what match.yaml is to say of them."""
+    """Cut a range of images out, and print the entry for match.yaml."""
     from worldpose.formats import whole_file
     from worldpose.video.cutting import cut_video
 

@@ -105,10 +105,10 @@ STATES = ("current", "ready", "stale", "missing")
 
 
 def _match_status(store: Store, match_id: str) -> dict[str, Any]:
-    """One match at a glance; what cannot be read of it is said, and hides no other match."""
+    """Return one match's status; unreadable parts are reported, and do not affect other matches."""
     try:
         return _readable_status(store, match_id)
-    except (OSError, WorldposeError) as failure:  # a damaged record, a disk that does not answer
+    except (OSError, WorldposeError) as failure:  # a damaged record, an unresponsive disk
         return {
             "match": match_id,
             "run": None,
@@ -134,7 +134,7 @@ def _readable_status(store: Store, match_id: str) -> dict[str, Any]:
     try:
         match = open_match(store, match_id)
         planned = plan_run(store, match, asked, iteration=iteration)
-    except (OSError, WorldposeError) as failure:  # a setting, too, may name what is gone
+    except (OSError, WorldposeError) as failure:  # a setting can name a missing file, too
         problem = str(failure)
     else:
         waiting = still_waiting(match, latest)

@@ -1,4 +1,4 @@
-"""Command reprocess: make current again whatever an edit has touched."""
+"""Command reprocess: recompute everything that edits made stale."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from flows.touched import Touched
 from worldpose.store import Store
 
 SHOWN = 3
-"""Reasons of a unit that are printed; --json has them all."""
+"""Printed reasons per unit; --json has them all."""
 
 
 def reprocess(
@@ -78,7 +78,7 @@ def reprocess(
 
 
 def exit_code(found: Sequence[Reprocessed]) -> int:
-    """What the command ends with."""
+    """Return the exit code of the command."""
     states = {each.state for each in found}
     if states & {"failed", "partial"}:
         return 1 if states == {"failed"} else 4

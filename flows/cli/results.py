@@ -1,4 +1,4 @@
-"""Commands that bring results out: export, report."""
+"""Commands export and report: output of results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands review export, import and convert: the annotator that a team has."""
+"""Commands review export, import and convert: external annotation tools."""
 
 from __future__ import annotations
 
@@ -137,10 +137,10 @@ def _format(name: str) -> Format:
 def _places(
     match: Match, cameras: list[str] | None, frames: list[int] | None, every: int
 ) -> list[tuple[str, int]]:
-    """Camera and frame of each picture: of a clip's own camera, in that clip alone.
+    """Return camera and frame of each image: of a clip's own camera, in that clip alone.
 
     Raises:
-        UsageError: there is no such camera, or no such frame.
+        UsageError: an unknown camera or frame.
     """
     spec = match.folder.spec
     static = [camera.id for camera in spec.static_cameras]

@@ -1,4 +1,4 @@
-"""Command review serve: the pages for people in the loop."""
+"""Command review serve: the review pages."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def serve(
 
     Example: worldpose review serve --port 8571
     """
-    # Late: the server takes half a second to import, which no other command needs.
+    # Imported here: the server takes half a second to import, and no other command needs it.
     from flows.web.access import access_for
     from flows.web.serving import address
     from flows.web.serving import serve as serve_pages
@@ -40,7 +40,7 @@ def serve(
     access = access_for(host, token=token, names=names or (), secure=tls is not None)
     logging.basicConfig(format="%(asctime)s  %(message)s", level=logging.WARNING)
     logging.getLogger("worldpose.pages").setLevel(logging.INFO)
-    # A token that the operator chose is not printed: this may go to a log.
+    # A token chosen by the operator is not printed: the output can go to a log.
     where = address(access, host, port)
     shown = where if token is None else where.partition("#")[0]
     line(f"review pages of {Store.open(project).url}: {shown}")

@@ -1,4 +1,4 @@
-"""How reviews and corrections are shown, to people and as JSON."""
+"""Output of reviews and corrections, as text and JSON."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from flows.review import Review
 
 
 def print_list(shown: list[Review]) -> None:
-    """Questions, each with its state and reasons."""
+    """Print review requests, each with its state and reasons."""
     if not shown:
         line("nothing waits for review")
     for each in shown:
@@ -30,7 +30,7 @@ def print_list(shown: list[Review]) -> None:
 
 
 def print_review(shown: Review, as_json: bool) -> None:
-    """One question, what was said, and all figures."""
+    """Print one review request, its verdict, and all metrics."""
     if as_json:
         print_json(review_json(shown))
         return
@@ -52,7 +52,7 @@ def _figures(shown: Review) -> list[tuple[str, str]]:
 
 
 def review_json(shown: Review) -> dict[str, Any]:
-    """One question for machines."""
+    """Return one review request as JSON."""
     decision = shown.decision
     return {
         **shown.request.model_dump(mode="json"),
@@ -63,12 +63,12 @@ def review_json(shown: Review) -> dict[str, Any]:
 
 
 def correction_json(correction: Correction) -> dict[str, Any]:
-    """One correction for machines."""
+    """Return one correction as JSON."""
     return correction.model_dump(mode="json")
 
 
 def in_words(correction: Correction) -> str:
-    """What a correction changes, on one line."""
+    """Describe the change of a correction on one line."""
     edit = correction.edit
     if isinstance(edit, MovedPoint | RedrawnMarking):
         place = edit.camera if edit.frame is None else f"{edit.camera} frame {edit.frame}"
@@ -89,5 +89,5 @@ def in_words(correction: Correction) -> str:
 
 
 def when(moment: datetime) -> str:
-    """A moment as people read it."""
+    """Format a date and time for people."""
     return f"{moment:%Y-%m-%d %H:%M} UTC"

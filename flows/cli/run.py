@@ -37,7 +37,7 @@ from worldpose.store import Store
 
 EXIT_CODES = {"complete": 0, "failed": 1, "waiting": 3, "partial": 4}
 SHOWN = 5
-"""Waiting units that are named one by one."""
+"""Number of waiting units listed by name."""
 
 
 def run(
@@ -191,7 +191,7 @@ def _print(record: RunRecord, project: str, seconds: float) -> None:
 
 
 def _print_waiting(record: RunRecord) -> None:
-    """What waits, and what to do about it."""
+    """Print the units that need review, and how to review them."""
     if not record.waiting:
         return
     undecided = sum(not unit.rejected for unit in record.waiting)

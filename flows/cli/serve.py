@@ -1,4 +1,4 @@
-"""Command serve: a project served day and night."""
+"""Command serve: continuous processing of a project."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def serve(
 
     Example: worldpose serve --inbox /data/arriving
     """
-    # Late: no other command needs them.
+    # Imported here: no other command needs them.
     from flows.service.layout import state_folder
     from flows.service.plan import ServePlan
     from worldpose.store.store import open_blobs
@@ -102,7 +102,7 @@ def serve(
     from flows.service.serving import serve as serve_all
     from flows.web.access import access_for
 
-    senders_of(os.environ)  # refused now, not where nobody looks
+    senders_of(os.environ)  # refuse wrong addresses at once, not in an unread log
     tls = certificate_and_key(certificate, key)
     if inbox is None and "://" in url:
         raise UsageError(
@@ -146,12 +146,12 @@ def serve(
     def ready() -> None:
         line(f"serving {plan.project}")
         line(f"inbox          {plan.inbox}")
-        # Where a secret is kept, not what it is: this may go to a log.
+        # Print the path of a secret, not its value: the output can go to a log.
         if secrets.prefect is None:
             line(f"dashboard      {plan.dashboard}  which asks for no login: others may use it")
         else:
             line(f"dashboard      {plan.dashboard}  log in with: {login_at}")
-        # A token that somebody chose is not said: this may go to a log.
+        # A token chosen by the operator is not printed: the output can go to a log.
         login = "/login" if token else f"/login#token={access.token}"
         line(f"review pages   {plan.pages}{login}")
         line(f"status page    {plan.pages}/status")

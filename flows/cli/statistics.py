@@ -1,4 +1,4 @@
-"""The command that counts a data set."""
+"""Command statistics: size of a data set."""
 
 from __future__ import annotations
 

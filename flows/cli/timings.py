@@ -1,4 +1,4 @@
-"""Command timings: where the time of a run went."""
+"""Command timings: time that each part of a run took."""
 
 from __future__ import annotations
 

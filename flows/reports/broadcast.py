@@ -1,4 +1,4 @@
-"""What the page about a run says of the broadcast camera."""
+"""Report section about the broadcast camera."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ from worldpose.store import Run
 from worldpose.video import open_video, write_video
 
 WORST: Final = 2
-"""Frames that are shown of those whose cameras are known least [1]."""
+"""Number of frames shown with the largest camera uncertainty [1]."""
 FRAME_RATE: Final = 25.0
-"""Of overlay videos, at most about [1/s]."""
+"""Maximum frame rate of overlay videos, approximate [1/s]."""
 LENGTH: Final = 30.0
-"""Of overlay videos, at most [s]."""
+"""Maximum duration of overlay videos [s]."""
 
 
 def broadcast_pictures(run: Run, match: Match) -> list[Picture]:
-    """The course of each clip's broadcast camera, and its pictures where it is known least."""
+    """Plot each clip's broadcast camera over time, and its frames of largest uncertainty."""
     pictures = []
     for clip, camera in broadcast_cameras(run).items():
         result = run[f"broadcast_calibration/{clip}"]
@@ -92,7 +92,7 @@ def broadcast_pictures(run: Run, match: Match) -> list[Picture]:
 
 
 def _before_and_after(run: Run, match: Match, clip: str, tracks: JointTracks) -> list[Picture]:
-    """Zooms of the person whom the refinement by players moved most; none without players."""
+    """Crop the person that player refinement moved most, before and after; else empty."""
     result = run[f"broadcast_calibration/{clip}"]
     if result.attrs["players_off"][1] is None:
         return []
@@ -134,15 +134,15 @@ def _before_and_after(run: Run, match: Match, clip: str, tracks: JointTracks) ->
 def write_broadcast_videos(
     run: Run, match: Match, page: Path, *, clips: Collection[str] | None = None
 ) -> list[Path]:
-    """Writes each clip's broadcast video with markings and people over it; returns the files.
+    """Write each clip's broadcast video with markings and people overlaid; return the files.
 
-    At half the size and at most 25 frames a second; of a longer clip, the 30 s about the frame
-    whose camera is known least.
+    Half size, at most 25 frames per second. A longer clip is cut to the 30 s around the frame with
+    the largest camera uncertainty.
 
     Args:
         run: the run.
         match: the match.
-        page: beside this file, and named after it.
+        page: the videos are written next to this file, with names derived from its name.
         clips: which clips; None = all.
     """
     files = []
@@ -180,7 +180,7 @@ def write_broadcast_videos(
 
 
 def broadcast_tables(run: Run, match: Match) -> list[Table]:
-    """What the frames of each clip rest on, and what a person should look at."""
+    """Tabulate the evidence of each clip's frames, and the warnings for a reviewer."""
     tables = []
     for clip in broadcast_cameras(run):
         result = run[f"broadcast_calibration/{clip}"]
@@ -213,7 +213,7 @@ def broadcast_tables(run: Run, match: Match) -> list[Table]:
 
 
 def _motion(run: Run, clip: str, fps: float) -> list[tuple[str, str]]:
-    """How long the clip is, and how far it pans."""
+    """Return the clip's duration and pan range as table rows."""
     camera = broadcast_cameras(run)[clip]
     pan, _, _ = angles_of(camera)
     return [
@@ -223,7 +223,7 @@ def _motion(run: Run, clip: str, fps: float) -> list[tuple[str, str]]:
 
 
 def _pooled(run: Run, clip: str) -> list[tuple[str, str]]:
-    """What the camera's other clips say of its place, where there are any."""
+    """Return the agreement of the camera position with its other clips, if there are any."""
     unit = broadcast_unit(run, clip)
     if "distance" not in run[unit].attrs:
         return []

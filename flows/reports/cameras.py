@@ -1,4 +1,4 @@
-"""What the page about a run says of its static cameras."""
+"""Report section about the static cameras."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from worldpose.reports.static_cameras import (
 from worldpose.store import Run, Store
 
 SHOWN = 2
-"""Cameras that are shown with their clicks: the weakest."""
+"""Number of cameras shown with their clicks, weakest first."""
 
 _ORIGINS = {
     "given": "given",
@@ -34,7 +34,7 @@ _ORIGINS = {
 
 
 def camera_summaries(run: Run, spec: MatchSpec) -> list[CameraSummary]:
-    """One summary for each static camera, in the order of the match."""
+    """Summarize each static camera, in the order of the match."""
     summaries = []
     for camera in spec.static_cameras:
         unit = f"static_calibration/{camera.id}"
@@ -56,7 +56,7 @@ def camera_summaries(run: Run, spec: MatchSpec) -> list[CameraSummary]:
 
 
 def _reasons(run: Run, camera_id: str) -> tuple[str, ...]:
-    """Why a person should look at a camera: what it was left out for, or why it is weak."""
+    """Return why a person should check a camera: the reason it was left out, or why it is weak."""
     left_out = run.record.left_out.get(camera_id)
     weak = run[f"static_calibration/{camera_id}"].attrs.get("reasons") or ()
     return tuple(weak) if left_out is None else (f"left out: {left_out}",)
@@ -65,7 +65,7 @@ def _reasons(run: Run, camera_id: str) -> tuple[str, ...]:
 def camera_pictures(
     store: Store, run: Run, match: Match, cameras: Mapping[str, Camera]
 ) -> list[Picture]:
-    """The weakest calibrated cameras: their clicks, and the expected error over the pitch."""
+    """Draw the weakest calibrated cameras: their clicks, and the expected error over the pitch."""
     errors = {
         name: run.record.figures.get(f"static_calibration/{name}", {}).get(
             "expected_ground_error_median_m", 0.0
@@ -86,7 +86,7 @@ def camera_pictures(
 
 
 def paint_pictures(run: Run, match: Match, cameras: Mapping[str, Camera]) -> list[Picture]:
-    """Painted lines in the still of the camera that saw most of them, and the map of distances."""
+    """Draw painted lines in the still of the camera with most of them, and the distance map."""
     if match.folder.pitch is None:
         return []
     counts = {
@@ -112,7 +112,7 @@ def paint_pictures(run: Run, match: Match, cameras: Mapping[str, Camera]) -> lis
 
 
 def camera_evidence(store: Store, run: Run, match: Match, name: str, camera: Camera) -> bytes:
-    """A PNG of one calibrated camera: its clicks on its still, and the expected ground error."""
+    """Return a PNG of one calibrated camera: clicks on its still, and the expected ground error."""
     assert match.folder.pitch is not None, "nothing is clicked without a pitch"
     result = run[f"static_calibration/{name}"]
     inlier = dict(zip(_names(run, name), result["point_inlier"].values.tolist(), strict=True))
@@ -132,7 +132,7 @@ def camera_evidence(store: Store, run: Run, match: Match, name: str, camera: Cam
 
 
 def still_of(match: Match, camera_id: str) -> NDArray[np.uint8] | None:
-    """The camera's picture, where the match folder has one."""
+    """Return the camera's still, if the match folder has one."""
     still = match.folder.stills.get(camera_id)
     if still is None:
         return None
@@ -141,7 +141,7 @@ def still_of(match: Match, camera_id: str) -> NDArray[np.uint8] | None:
 
 
 def _names(run: Run, camera_id: str) -> list[str]:
-    """Clicked points in the order of the result's arrays."""
+    """Return the clicked points in the order of the result's arrays."""
     return [str(name) for name in run[f"static_calibration/{camera_id}"]["point"].values]
 
 
@@ -154,7 +154,7 @@ def _wrong_clicks(run: Run, unit: str) -> tuple[str, ...]:
 
 
 def _clicked_places(store: Store, run: Run, camera_id: str) -> dict[str, NDArray[np.float64]]:
-    """Where the run's own clicks were made: those of the folder may have been edited since."""
+    """Return the clicks that the run used: those of the folder may have changed since."""
     record = run.record
     key = record.results[f"static_calibration/{camera_id}"]
     recipe = store.manifest(record.match_id, "static_calibration", camera_id, key).recipe

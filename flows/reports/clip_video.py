@@ -1,4 +1,4 @@
-"""The video of a clip with what was found drawn over it, for the person who accepts it."""
+"""Video of a clip with an overlay of the results, for the reviewer."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from worldpose.store import Run, Store
 from worldpose.video import write_video
 
 LENGTH: Final = 30.0
-"""Longest stretch that is drawn [s]: its middle is that of the clip."""
+"""Maximum duration [s]; a longer clip is cut to the middle part."""
 RATE: Final = 25.0
-"""Most frames a second that are drawn."""
+"""Maximum frames per second."""
 
 
 def clip_view(run: Run, match: Match, clip: str) -> str | None:
-    """Whose video shows a clip: the clip's own camera, else the static one that sees most people.
+    """Return the source of a clip's video: its own camera, else the static camera with most people.
 
-    None where no camera has a video.
+    None if no camera has a video.
     """
     if clip in broadcast_cameras(run) and clip in match.folder.videos:
         return clip
@@ -41,7 +41,7 @@ def clip_view(run: Run, match: Match, clip: str) -> str | None:
 
 
 def static_view(run: Run, match: Match, clip: str) -> str | None:
-    """The static camera with a video that sees most people in a clip; None where none has any."""
+    """Return the static camera with a video and most people in a clip; None if none has a video."""
     seen = placed_joints(run, clip)["inliers"].any("joint").sum(("frame", "person")).values
     order = [list(static_cameras(run, match.folder.spec))[c] for c in np.argsort(-seen)]
     return next((camera for camera in order if camera in match.folder.videos), None)
@@ -50,21 +50,21 @@ def static_view(run: Run, match: Match, clip: str) -> str | None:
 def write_clip_video(
     store: Store, run: Run, match: Match, clip: str, file: Path, *, owner: str | None = None
 ) -> None:
-    """Write the video of a clip with markings and people over it.
+    """Write the video of a clip with markings and people overlaid.
 
     Args:
         store: the project's store.
         run: the run.
-        match: the match; `clip_view` has a camera for the clip.
-        clip: which clip.
-        file: an mp4, named after what it shows.
-        owner: whose video, as `static_view` gives it; None = that of `clip_view`.
+        match: the match; `clip_view` returns a camera for the clip.
+        clip: id of the clip.
+        file: an mp4 file.
+        owner: the camera as `static_view` returns it; None = that of `clip_view`.
 
     Raises:
-        InputError: a picture is damaged.
+        InputError: an image is damaged.
     """
     owner = owner or clip_view(run, match, clip)
-    assert owner is not None  # asked for only where there is one
+    assert owner is not None  # the caller checks that there is one
     if owner == clip:
         (made,) = write_broadcast_videos(run, match, file, clips=(clip,))
         made.replace(file)
@@ -80,7 +80,7 @@ def write_clip_video(
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
         for picture in frame_pictures(store, match, owner, frames.tolist()):
-            dark = np.zeros((height, width, 3), dtype=np.uint8)  # where the camera has no picture
+            dark = np.zeros((height, width, 3), dtype=np.uint8)  # where the camera has no frame
             yield dark if picture is None else picture
 
     bodies = body_tracks(run, clip)

@@ -1,4 +1,4 @@
-"""What the page about a run shows of a clip: people in cameras, from above, and in space."""
+"""Report section about a clip: people in camera images, from above, and in a 3D view."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from worldpose.store import Run, Store
 def clip_pictures(
     run: Run, match: Match, clip: str, truth: JointTracks | None = None
 ) -> list[Picture]:
-    """The stadium from a camera and from above, bodies, and everybody's way."""
+    """Draw the stadium from a camera and from above, the bodies, and all trajectories."""
     cameras = static_cameras(run, match.folder.spec)
     tracks = joint_tracks(run, clip)
     pitch = match.folder.pitch
@@ -63,7 +63,7 @@ def clip_pictures(
 
 
 def _bodies(bodies: BodyTracks, match: Match, clip: str, camera_id: str, camera: Camera) -> Picture:
-    """The bodies of a clip's first frame over a camera's still."""
+    """Draw the bodies of a clip's first frame on a camera's still."""
     frame, still = int(bodies.frames[0]), still_of(match, camera_id)
     png = bodies_picture(
         camera,
@@ -82,7 +82,7 @@ def _bodies(bodies: BodyTracks, match: Match, clip: str, camera_id: str, camera:
 
 
 def detection_pictures(store: Store, run: Run, match: Match, clip: str) -> list[Picture]:
-    """The view with most people: what its detector said, and what became of it."""
+    """Draw the view with most people: its detections, and their track assignments."""
     placed = placed_joints(run, clip)
     seen = placed["inliers"].any("joint").sum("person").values
     if not seen.any():
@@ -119,7 +119,7 @@ def detection_pictures(store: Store, run: Run, match: Match, clip: str) -> list[
 
 
 def clip_scene(run: Run, match: Match, clip: str) -> Scene:
-    """A clip in space, with the broadcast camera where all its frames have one."""
+    """Return the 3D scene of a clip, with the broadcast camera if it is known in all frames."""
     tracks = joint_tracks(run, clip)
     broadcast = broadcast_cameras(run).get(clip)
     if broadcast is not None:

@@ -1,4 +1,4 @@
-"""What the page about a run shows of the views in which people and detections differ most."""
+"""Report section about the views with the largest residuals between detections and joints."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from worldpose.reports.detections import detections_picture
 from worldpose.store import Run, Store
 
 SHOWN: Final = 2
-"""Views that are shown: the worst, each of another person."""
+"""Number of views shown: the worst, each of another person."""
 FRAMES: Final = 300
-"""Frames of a clip that are looked at, evenly spread."""
+"""Frames of a clip that are evaluated, evenly spaced."""
 KNOWN: Final = 8
-"""Joints of a person that a view needs."""
+"""Minimum number of joints of a person in a view."""
 _AROUND: Final = 2.5
-"""Side of the part that is shown [height of the person]."""
+"""Side length of the crop [height of the person]."""
 
 
 def worst_views(run: Run, match: Match, clip: str, tracks: JointTracks) -> list[tuple[int, ...]]:
-    """Views with the largest median distance between keypoints and found joints, worst first.
+    """Return views with the largest median distance of keypoints to projected joints, worst first.
 
-    Distances are in heights of the person in the picture, over the keypoints that are tracked as
-    the person's; each person comes once.
+    Distances are in heights of the person in the image, over the keypoints assigned to the person's
+    track; each person appears once.
 
     Returns:
-        Row among the frames, camera and person of each, and their median distance in percent.
+        Frame index, camera and person of each, and the median distance in percent.
     """
     rows = np.unique(np.linspace(0, len(tracks.frames) - 1, FRAMES).round().astype(np.int64))
     numbers = tracks.frames[rows]
@@ -60,7 +60,7 @@ def worst_views(run: Run, match: Match, clip: str, tracks: JointTracks) -> list[
 
 
 def disagreement_pictures(store: Store, run: Run, match: Match, clip: str) -> list[Picture]:
-    """Zooms on the people whose detections and found joints differ most, before and after."""
+    """Crop the people whose detections and projected joints differ most, before and after."""
     tracks = joint_tracks(run, clip)
     cameras = static_cameras(run, match.folder.spec)
     pictures = []

@@ -1,4 +1,4 @@
-"""How much there is in a run, as the paper counts a data set, and its figures at a glance."""
+"""Report section about the size of a run, as in the paper's data set table, and key metrics."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from worldpose.store import Run
 
 
 def extent_of(run: Run, match: Match) -> DataSetStatistics:
-    """Clips, frames, poses and distances of a run: the middle of the hips is where people are."""
+    """Count clips, frames, poses and distances of a run; a person's position is the mid-hip."""
     from worldpose.reports.drawing import HIPS
 
     broadcast = broadcast_cameras(run)
@@ -33,12 +33,12 @@ def extent_of(run: Run, match: Match) -> DataSetStatistics:
 
 
 def extent_section(run: Run, match: Match) -> Section:
-    """The row of the paper's table of data sets, its histograms, and each clip's share."""
+    """Return the data set table row, its histograms, and each clip's share."""
     return counted_section(extent_of(run, match))
 
 
 def tiles_of(run: Run, match: Match, scores: Evaluation | None) -> list[tuple[str, str]]:
-    """The few figures that a reader wants first."""
+    """Return the key metrics for the top of the report."""
     found = extent_of(run, match)
     people = sum(clip.persons for clip in found.clips.values())
     tiles = [

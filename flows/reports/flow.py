@@ -1,4 +1,4 @@
-"""What the page about a run shows of the background's motion in a broadcast clip (M6)."""
+"""Report section about the background motion in a broadcast clip (M6)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from worldpose.video import open_video
 
 
 def flow_pictures(run: Run, match: Match, clip: str, camera: Camera) -> list[Picture]:
-    """Points followed between the two frames between which the camera turns most.
+    """Draw points tracked between the two frames with the largest camera rotation.
 
     Args:
         run: the run.
@@ -30,7 +30,7 @@ def flow_pictures(run: Run, match: Match, clip: str, camera: Camera) -> list[Pic
     """
     frames = run[f"broadcast_calibration/{clip}"]["frame"].values
     rotation = camera.cam_from_world.rotation
-    # The angle of R1^T R2 grows as the trace falls.
+    # The angle of R1^T R2 increases as the trace decreases.
     traces = np.einsum("fab,fab->f", rotation[1:], rotation[:-1])
     known = np.isfinite(traces) & (np.diff(frames) == 1)
     if not known.any():

@@ -1,4 +1,4 @@
-"""Pictures of a match by camera and match frame."""
+"""Images of a match by camera and match frame."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from worldpose.video import open_video
 
 
 def frame_picture(store: Store, match: Match, owner: str, frame: int) -> NDArray[np.uint8] | None:
-    """What a camera saw (height, width, 3) RGB in a match frame; None where it has no picture.
+    """Return a camera's image (height, width, 3) RGB in a match frame; None if there is none.
 
     Args:
-        store: its latest run knows which picture of a video a frame is.
-        match: names the videos.
+        store: its latest run maps match frames to video frames.
+        match: the match, which names the videos.
         owner: a static camera, or the clip of a broadcast camera.
         frame: match frame.
 
     Raises:
-        InputError: the picture is damaged.
+        InputError: the image is damaged.
     """
     return next(frame_pictures(store, match, owner, [frame]))
 
@@ -31,16 +31,16 @@ def frame_picture(store: Store, match: Match, owner: str, frame: int) -> NDArray
 def frame_pictures(
     store: Store, match: Match, owner: str, frames: Sequence[int]
 ) -> Iterator[NDArray[np.uint8] | None]:
-    """Yield the same of several match frames, decoded once and in order.
+    """Yield the images of several match frames, decoded once and in order.
 
     Args:
         store: as above.
         match: as above.
         owner: as above.
-        frames: rising match frames.
+        frames: ascending match frames.
 
     Raises:
-        InputError: a picture is damaged.
+        InputError: an image is damaged.
     """
     if owner not in match.folder.videos:
         yield from (None for _ in frames)
@@ -60,7 +60,7 @@ def frame_pictures(
 def _numbers(
     store: Store, match: Match, owner: str, frames: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """The pictures of the video that match frames are; -1 where there is none."""
+    """Return the video frames of match frames; -1 if there is none."""
     results = store.run(match.match_id).results if store.runs(match.match_id) else {}
     key = results.get(f"ingest/{owner}")
     if key is not None:

@@ -1,4 +1,4 @@
-"""What the page about a run says of adjusted cameras and of fitted bodies."""
+"""Report section about adjusted cameras and fitted bodies."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from worldpose.reports.score_names import shown_number
 from worldpose.store import Run
 
 MOST = 20
-"""Rows of the lists of what disagrees: the worst."""
+"""Maximum number of rows of the outlier lists, worst first."""
 
 _BODIES = {
     "residual_m": ("body from joints mm", 1000.0, 1),
@@ -21,11 +21,11 @@ _BODIES = {
     "skating_m": ("standing feet slide mm a frame", 1000.0, 3),
     "jerk_m_s3": ("jerk m/s³", 1.0, 0),
 }
-"""Title of each figure of a body, what it is multiplied with to be shown, and decimals."""
+"""Title of each body metric, its display factor, and decimals."""
 
 
 def adjustment_tables(run: Run) -> list[Table]:
-    """Markings and people side by side, camera by camera, and what disagrees after adjustment."""
+    """Tabulate clicks and people by camera, and the outliers after adjustment."""
     if ADJUSTED not in run:
         return []
     result = run[ADJUSTED]
@@ -99,7 +99,7 @@ def _people(result: xr.Dataset, names: list[str]) -> Table | None:
 
 
 def body_tables(run: Run, clips: tuple[str, ...]) -> list[Table]:
-    """Figures of every fitted person, clip by clip."""
+    """Tabulate the metrics of every fitted person, by clip."""
     tables = []
     for clip in clips:
         unit = bodies_unit(run, clip)

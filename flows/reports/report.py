@@ -1,4 +1,4 @@
-"""The page about a run."""
+"""HTML report of a run."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ def write_report(
     videos: bool = True,
     camera: str | None = None,
 ) -> list[Path]:
-    """Writes the HTML page of one run, and returns the videos written beside it.
+    """Write the HTML report of one run, and return the videos written next to it.
 
     Args:
         store: the project's store.
         match: the match.
         out: the file to write.
         run_id: number of the run.
-        reference: truth; None = `reference/` of the match folder, where there is one.
-        videos: write each clip's broadcast video, and that of a static camera, with what was found
-            drawn over them.
-        camera: which static camera's; None = the one that sees most people.
+        reference: ground truth; None = `reference/` of the match folder, if it exists.
+        videos: write each clip's broadcast video, and that of a static camera, with the results
+            overlaid.
+        camera: static camera of the video; None = the one with most people.
 
     Raises:
-        UsageError: no static camera of that name has a video.
+        UsageError: there is no such static camera with a video.
     """
     if camera is not None:
         _check_film(match, camera)
@@ -98,7 +98,7 @@ def _write_videos(
 
 
 def _sections(store: Store, run: Run, match: Match, reference: str | None) -> list[Section]:
-    """All there is to see of a run, in the order of a reader's questions."""
+    """Return all sections of the report, in the order of a reader's questions."""
     clips = clips_of(run.record)
     truth = None if reference is None else load_reference(reference)
     cameras = static_cameras(run, match.folder.spec)
@@ -143,7 +143,7 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
 
 
 def _seconds(store: Store, record: RunRecord) -> dict[str, float]:
-    """How long each unit took when it was computed [s]."""
+    """Return the computation time of each unit [s]."""
     seconds = {}
     for name, key in record.results.items():
         stage, _, unit = name.partition("/")

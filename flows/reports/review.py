@@ -1,4 +1,4 @@
-"""What the page about a run says of the people who reviewed it."""
+"""Report section about reviews of the run."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from flows.stage import Match
 from worldpose.reports import Table
 
 MOST = 200
-"""Rows: the last ones."""
+"""Maximum number of rows, the last ones."""
 
 
 def review_table(match: Match) -> list[Table]:
-    """Verdicts, corrections and withdrawals, first to last; none where nobody said anything."""
+    """Tabulate verdicts, corrections and withdrawals, first to last; empty without any."""
     units: dict[str, str] = {}
     corrections: dict[str, str] = {}
     rows: list[tuple[str, str, str, str, str]] = []

@@ -1,5 +1,5 @@
-"""Operations: a project served day and night.
+"""Operations: continuous processing of a project.
 
 Input: a project and an inbox folder. Output: a Prefect server with deployments, a worker, the
-pages, figures for Prometheus and alerts; `flows.service.serving` starts them.
+pages, metrics for Prometheus and alerts; `flows.service.serving` starts them.
 """

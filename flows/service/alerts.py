@@ -1,4 +1,4 @@
-"""What somebody has to be told of, and telling it once, by webhook and mail."""
+"""Alerts for operators, each sent once, by webhook and mail."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from worldpose.formats import whole_file
 AlertKind = Literal["run_failed", "gate_waiting", "quality", "disk_low", "arrival_refused"]
 
 FIRST_PAUSE: Final = 30.0
-"""After a first failure of a sender; each further one doubles it [s]."""
+"""After a sender's first failure; each further one doubles it [s]."""
 LONGEST_PAUSE: Final = 3600.0
-"""Between two tries of a sender that fails [s]."""
+"""Between two attempts of a failing sender [s]."""
 
 LOG = logging.getLogger("worldpose.operations")
 
 
 @dataclass(frozen=True)
 class Alert:
-    """Something that somebody has to be told of.
+    """An alert for an operator.
 
     Attributes:
-        key: the same as long as it is the same matter, which is told once.
-        alert: what kind of matter it is.
-        text: the matter, for people.
-        link: where to look; empty where there is no such page.
-        match_id: the match that it is about; empty where it is about none.
+        key: identifies the cause; each cause is sent once.
+        alert: kind of the alert.
+        text: message.
+        link: page with details; empty if there is none.
+        match_id: the match that it concerns; empty if none.
     """
 
     key: str
@@ -49,7 +49,7 @@ class Alert:
 
 @dataclass(frozen=True)
 class FailedRun:
-    """A run at the Prefect server that ended badly: its id, name, state and what it said."""
+    """A failed run at the Prefect server: its id, name, state and message."""
 
     id: str
     name: str
@@ -63,7 +63,7 @@ def alerts_now(
     arrivals: Iterable[Arrival],
     failed: Iterable[FailedRun],
 ) -> list[Alert]:
-    """All that holds now, told before or not."""
+    """Return all current alerts, sent before or not."""
     found = [
         Alert(
             f"run_failed/{run.id}",
@@ -108,15 +108,15 @@ def _of_match(plan: ServePlan, match: MatchStatus) -> Iterator[Alert]:
 
 
 class AlertDispatcher:
-    """Tells of each alert once, as long as it holds; what could not be told is told later.
+    """Sends each alert once while its cause lasts, and retries failed deliveries.
 
-    Each sender has its own pace: `hold` says what there is to be told, and never waits; `deliver`
-    hands it to one sender, stops at the first failure, and tries again after a pause that doubles.
+    Each sender has its own pace: `hold` sets the alerts to send and never blocks; `deliver` passes
+    them to one sender, stops at the first failure, and retries after a pause that doubles.
 
     Attributes:
-        state: where it is kept what was told, so that a restart repeats nothing.
-        senders: the ways to tell it; none tells the log alone.
-        pause: after a first failure of a sender [s].
+        state: keeps which alerts were sent, so that a restart repeats none.
+        senders: the channels; without any, alerts go to the log alone.
+        pause: after a sender's first failure [s].
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class AlertDispatcher:
         self._due: dict[str, float] = {}
 
     def tell(self, alerts: Iterable[Alert]) -> list[Alert]:
-        """Hold and deliver to all senders in turn; gives what is new, where all ways took it."""
+        """Hold and deliver to all senders in turn; return the new alerts that all accepted."""
         alerts = list({each.key: each for each in alerts}.values())
         before = {key: kept.get("told_by") for key, kept in self._told.items()}
         self.hold(alerts)
@@ -144,7 +144,7 @@ class AlertDispatcher:
         ]
 
     def hold(self, alerts: Iterable[Alert]) -> None:
-        """From now on these alerts are to be told, and no others."""
+        """Replace the alerts to send."""
         with self._lock:
             before, told = self._told, {}
             for alert in alerts:
@@ -157,7 +157,7 @@ class AlertDispatcher:
                 self._keep()
 
     def deliver(self, sender: Sender) -> None:
-        """Hand what a sender has not taken yet to it, until it fails; not while it is paused."""
+        """Send a sender's outstanding alerts until it fails; does nothing during its pause."""
         name = sender.name
         while time.monotonic() >= self._due.get(name, float("-inf")):
             with self._lock:
@@ -170,7 +170,7 @@ class AlertDispatcher:
             except Exception as error:
                 pause = min(2.0 * self._pauses.get(name, 0.5 * self.pause), LONGEST_PAUSE)
                 self._pauses[name], self._due[name] = pause, time.monotonic() + pause
-                # What the error says may hold the address, and that a secret.
+                # The error message can contain the address, and that a secret.
                 kind = type(error).__name__
                 LOG.warning(
                     "%s did not take an alert: %s; again in %.0f s, with %s more",
@@ -181,7 +181,7 @@ class AlertDispatcher:
                 LOG.warning("%s takes alerts again", name)
             with self._lock:
                 kept = self._told.get(pending[0])
-                if kept is not None:  # it may be over meanwhile
+                if kept is not None:  # its cause can have ended in between
                     took = {*kept["told_by"], name}
                     kept["told_by"] = [each.name for each in self.senders if each.name in took]
                     self._keep()
@@ -190,12 +190,12 @@ class AlertDispatcher:
         try:
             with whole_file(self.state.alerts) as draft:
                 draft.write_text(json.dumps(self._told, indent=2) + "\n")
-        except OSError as error:  # the disk may be what is to be told of
+        except OSError as error:  # the full disk can be the cause of the alert
             LOG.warning("%s cannot be written: %s", self.state.alerts, error.strerror)
 
 
 def _kept_alerts(state: StateFolder) -> dict[str, dict[str, Any]]:
-    """What was told; nothing where the file is damaged, so that it is told once more."""
+    """Return the sent alerts; empty if the file is damaged, so that they are sent again."""
     try:
         kept = json.loads(state.alerts.read_text())
         return {
@@ -209,7 +209,7 @@ def _kept_alerts(state: StateFolder) -> dict[str, dict[str, Any]]:
 
 
 def _content(alert: Alert) -> Mapping[str, str]:
-    """`text` is what chat services show of a webhook's JSON."""
+    """Return the JSON content; chat services show `text`."""
     return {
         "alert": alert.alert,
         "match": alert.match_id,

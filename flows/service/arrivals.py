@@ -1,4 +1,4 @@
-"""Taking in what has arrived: each complete match is registered once, and given one run."""
+"""Intake of arrivals: each complete match is registered once, and gets one run."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from worldpose.errors import InternalError, StoreError, WorldposeError
 from worldpose.store import Store
 
 MAX_DEATHS: Final = 2
-"""Of processes that took an arrival in, after which it is refused."""
+"""Processes that end during the intake of an arrival before it is refused."""
 
 Begin = Callable[[Match, Arrival], str]
-"""Gives a match its run, once however often it is called; the run's id at Prefect."""
+"""Starts a run for a match, only once however often it is called; returns the run's Prefect id."""
 
 
 def watch_once(state: StateFolder, inbox: Path, quiet: float) -> list[str]:
-    """Look at the inbox, keep what is seen, and name the arrivals that can be taken in.
+    """Scan the inbox, save its state, and return the names of complete arrivals.
 
     Args:
-        state: where what is known of the inbox lies.
+        state: holds the known state of the inbox.
         inbox: the folder.
-        quiet: how long nothing of an arrival may have changed [s].
+        quiet: time without changes after which an arrival is complete [s].
     """
     with state.only_one("arrivals", wait=False) as is_held:
         ready = _looked(state, inbox, quiet) if is_held else []
@@ -38,18 +38,18 @@ def watch_once(state: StateFolder, inbox: Path, quiet: float) -> list[str]:
 def take_in(
     store: Store, state: StateFolder, inbox: Path, quiet: float, begin: Begin
 ) -> list[Arrival]:
-    """Take in every arrival that is complete; gives all that were decided on.
+    """Register every complete arrival; return all arrivals with a decision.
 
-    Killed anywhere and called again, it registers nothing twice and begins no second run. An
-    arrival whose taking in ended the process (out of memory, a crash) comes after all others the
-    next time, and is refused after `MAX_DEATHS`.
+    A call after a kill registers nothing twice and starts no second run. An arrival whose intake
+    ended the process (out of memory, a crash) is processed last at the next attempt, and is refused
+    after `MAX_DEATHS`.
 
     Args:
         store: the project.
-        state: where what is known of the inbox lies.
+        state: holds the known state of the inbox.
         inbox: the folder.
-        quiet: how long nothing of an arrival may have changed [s].
-        begin: gives a match its run.
+        quiet: time without changes after which an arrival is complete [s].
+        begin: starts a run for a match.
     """
     decided = []
     with state.only_one("arrivals", wait=True):
@@ -64,7 +64,7 @@ def take_in(
 def _take(
     store: Store, state: StateFolder, entry: Entry, arrival: Arrival, begin: Begin
 ) -> Arrival:
-    """Decide on one arrival; what is noted before tells the next process that this one died."""
+    """Register one arrival; a note written first tells the next process if this one dies."""
     if arrival.deaths >= MAX_DEATHS:
         return changed(
             arrival,
@@ -79,7 +79,7 @@ def _take(
     try:
         return _decide(store, entry, arrival, begin)
     except BaseException:
-        state.write_arrival(arrival)  # ended by an error or a signal, which is no death
+        state.write_arrival(arrival)  # an exception or a signal does not count as a death
         raise
 
 
@@ -97,19 +97,19 @@ def _looked(state: StateFolder, inbox: Path, quiet: float) -> list[tuple[Entry, 
 
 
 def _decide(store: Store, entry: Entry, arrival: Arrival, begin: Begin) -> Arrival:
-    """Take one arrival in, or say why not; the next is taken in all the same."""
+    """Register one arrival, or return the reason against it; errors do not affect others."""
     try:
         missing = missing_of(entry.path)
         if missing:
             return changed(arrival, "incomplete", missing)
         match, _ = register(store, entry.path.resolve(), unfinished=True)
     except StoreError:
-        raise  # the project's trouble is not the arrival's
+        raise  # the project is at fault, not the arrival
     except (RefusalError, WorldposeError) as refusal:
         return changed(arrival, "refused", str(refusal))
     except OSError as error:
         return changed(arrival, "incomplete", f"{error.filename}: {error.strerror}")
-    except Exception as error:  # what no reader foresaw: nothing of it was taken in
+    except Exception as error:  # an unforeseen error; nothing was registered
         return changed(arrival, "refused", str(InternalError.wrapping(arrival.name, error)))
     known = {**match.folder.calibrations, **match.folder.clicked}
     unclicked = [each.id for each in match.folder.spec.static_cameras if each.id not in known]

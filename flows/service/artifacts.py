@@ -1,4 +1,4 @@
-"""What a deployment's run shows in Prefect's dashboard: progress, a table of its units, links."""
+"""Artifacts of a deployment's run in Prefect's dashboard: progress, unit table, links."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ LOG = logging.getLogger("worldpose.operations")
 
 
 class ArtifactReporter(Reporter):
-    """Progress as an artifact, besides the log's lines.
+    """Progress as an artifact, in addition to the log lines.
 
     Attributes:
-        artifact: the progress artifact; None where there is none.
+        artifact: the progress artifact; None if there is none.
     """
 
     def __init__(self, artifact: UUID | None) -> None:
@@ -39,19 +39,19 @@ class ArtifactReporter(Reporter):
         self._missing = 0
 
     def stage_started(self, stage: str, about: str, *, units: int, missing: int) -> None:
-        """All stages before are done."""
+        """Report that all stages before are done."""
         super().stage_started(stage, about, units=units, missing=missing)
         self._at = [each.name for each in METHOD].index(stage)
         self._missing = missing
         self._tell(f"{stage}: {about}")
 
     def tell_of(self, unit: str, seconds: float, figures: Mapping[str, float]) -> None:
-        """More of the stage is done."""
+        """Report progress of the stage."""
         super().tell_of(unit, seconds, figures)
         self._tell(unit)
 
     def unit_failed(self, unit: str, message: str) -> None:
-        """It is not waited for any more."""
+        """Count the failed unit as finished."""
         super().unit_failed(unit, message)
         self._tell(f"{unit} failed")
 
@@ -65,9 +65,9 @@ class ArtifactReporter(Reporter):
 
 @contextmanager
 def shown_at_prefect(store: Store, match_id: str) -> Iterator[None]:
-    """Show how the run inside goes, and afterwards what came of it.
+    """Show progress of the enclosed run, and its outcome afterwards.
 
-    What cannot be shown is said in the log and stops nothing.
+    Failures to show it are logged and stop nothing.
 
     Args:
         store: the project.
@@ -91,7 +91,7 @@ def shown_at_prefect(store: Store, match_id: str) -> Iterator[None]:
 
 
 def table_of(store: Store, match_id: str) -> list[dict[str, Any]]:
-    """A row for each unit of the match's latest run."""
+    """Return a row for each unit of the match's latest run."""
     (match,) = [each for each in Overview(store).look() if each.match_id == match_id]
     return [
         {

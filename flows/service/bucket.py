@@ -1,6 +1,6 @@
-"""An inbox in object storage: what has arrived there whole is copied into the inbox folder.
+"""Inbox in object storage: complete arrivals are copied to the inbox folder.
 
-Nothing in the bucket is changed. From the folder on, a match is an arrival like any other.
+The bucket is never changed. In the folder, a match is an arrival like any other.
 """
 
 from __future__ import annotations
@@ -26,11 +26,12 @@ LOG = logging.getLogger("worldpose.operations")
 
 
 class BucketInbox:
-    """Matches below one address, each in a folder of its own as in an inbox folder.
+    """Matches below one address, each in its own folder as in an inbox folder.
 
     Attributes:
-        url: `s3://bucket/prefix`; credentials and endpoint are the environment's, as of a project.
-        inbox: the folder that they are copied to.
+        url: `s3://bucket/prefix`; credentials and endpoint come from the environment, as for a
+            project.
+        inbox: destination folder.
     """
 
     def __init__(self, url: str, inbox: Path, state: StateFolder) -> None:
@@ -49,11 +50,11 @@ class BucketInbox:
         self._since: dict[str, tuple[str, float]] = {}
 
     def fetch(self, now: float, quiet: float) -> list[str]:
-        """Copy each match of which nothing has changed for a while; gives their names.
+        """Copy each match without recent changes; return their names.
 
         Args:
-            now: of a clock that only goes forward [s].
-            quiet: how long nothing may have changed [s].
+            now: time on the monotonic clock [s].
+            quiet: required time without changes [s].
         """
         fetched = []
         for name, objects in self._listed().items():
@@ -72,7 +73,7 @@ class BucketInbox:
         return fetched
 
     def _listed(self) -> dict[str, list[Entry]]:
-        """Objects by the name of their match, of all that have a match.yaml."""
+        """Return objects by match name, for all matches with a match.yaml."""
         found: dict[str, list[Entry]] = defaultdict(list)
         for each in self._objects.all_entries():
             parts = each.path.split("/")
@@ -86,7 +87,7 @@ class BucketInbox:
         }
 
     def _copy(self, name: str, objects: list[Entry]) -> bool:
-        """Have the match in the folder whole, in place of what was copied before."""
+        """Copy the whole match to the folder, replacing an earlier copy."""
         target = self.inbox / name
         draft = target.with_name(f".{target.name}.arriving")
         try:

@@ -1,7 +1,7 @@
 """One process of `worldpose serve`: `python -m flows.service.child PART PLAN`.
 
-It ends with its standard input, and with it all that it started: killed in any way, the service
-leaves nothing behind.
+It ends when its standard input closes, and so do all processes that it started: however the service
+is killed, no process is left.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from worldpose.errors import WorldposeError
 
 
 def main() -> None:
-    """Do one part's work until standard input is closed."""
+    """Run one part until standard input closes."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     part, plan = sys.argv[1], ServePlan.model_validate_json(sys.argv[2])
     logging.basicConfig(format="%(asctime)s  %(message)s", level=logging.WARNING)
@@ -27,11 +27,11 @@ def main() -> None:
     except WorldposeError as error:
         sys.stderr.write(f"error: {error}\n")
         sys.stderr.flush()
-        os._exit(1)  # the thread that reads standard input would not let the interpreter end
+        os._exit(1)  # the thread that reads standard input would keep the interpreter alive
 
 
 def prefect(plan: ServePlan) -> None:
-    """Prefect's server: its API, its services and its pages."""
+    """Run Prefect's server: API, services and dashboard."""
     from urllib.parse import urlsplit
 
     from flows.prefect_server import serve
@@ -41,7 +41,7 @@ def prefect(plan: ServePlan) -> None:
 
 
 def worker(plan: ServePlan) -> None:
-    """Deployments, and what runs them."""
+    """Create the deployments, and run their flows."""
     import anyio
 
     from flows.service.deployments import install, work
@@ -56,21 +56,21 @@ def worker(plan: ServePlan) -> None:
 
 
 def watch(plan: ServePlan) -> None:
-    """The inbox, alerts, lost runs, and figures for Prometheus."""
+    """Watch inbox, alerts and lost runs, and serve metrics for Prometheus."""
     from flows.service.watching import watch as watch_all
 
     watch_all(plan)
 
 
 def pages(plan: ServePlan) -> None:
-    """The review pages and the status page."""
+    """Serve the review pages and the status page."""
     from flows.service.pages import serve_pages
 
     serve_pages(plan)
 
 
 PARTS = {"prefect": prefect, "worker": worker, "watch": watch, "pages": pages}
-"""In the order in which they start."""
+"""In start order."""
 
 
 def _end_with_parent() -> None:

@@ -1,4 +1,4 @@
-"""The flows as deployments run them: with Dask workers, and with parameters that are plain JSON."""
+"""Flows as deployed: with Dask workers, and with plain JSON parameters."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ LOG = logging.getLogger("worldpose.operations")
 RUNNER: Final = cast("TaskRunner[Any]", DaskTaskRunner(**served_cluster()))
 
 match = process_match.with_options(task_runner=RUNNER)
-"""Process one match; suspended while its results wait for people."""
+"""Flow that processes one match; suspended while its results need review."""
 
 
 @flow(name="ingest", flow_run_name="inbox", validate_parameters=False)
 def ingest(plan: dict[str, Any]) -> list[str]:
-    """Take in every match that has arrived whole, and give each its run; returns their ids.
+    """Register every complete arrival, and start a run for each; return their ids.
 
     Args:
-        plan: a `ServePlan`.
+        plan: a `ServePlan` as JSON.
     """
     LOG.setLevel(logging.INFO)
     served = ServePlan.model_validate(plan)
@@ -83,11 +83,11 @@ def _begin(plan: ServePlan, opened: Match, arrival: Arrival) -> str:
         timeout=0,
         as_subflow=False,
         tags=[arrival.priority],
-        # Called again after a kill, or for a folder that moved, it gives the run that is there.
+        # After a kill, or for a moved folder, a second call returns the existing run.
         idempotency_key=f"arrival-{opened.registration.identity}",
         work_queue_name=arrival.priority,
     )
-    return str(cast("FlowRun", begun).id)  # outside of an event loop it is awaited
+    return str(cast("FlowRun", begun).id)  # already awaited, outside an event loop
 
 
 @flow(name="release", flow_run_name="release {name} of {match_id}", validate_parameters=False)
@@ -99,20 +99,20 @@ def release(
     formats: Sequence[str] = ("worldpose",),
     out: str | None = None,
 ) -> str:
-    """Freeze the latest run of a match under a name, with a report; returns the folder.
+    """Release the latest run of a match under a name, with a report; return the folder.
 
     Args:
         project: folder or URL of the store.
         match_id: a match whose latest run is complete.
-        name: of the release.
-        licence: text under which its data may be used.
-        formats: of its files.
-        out: folder to write into; `releases/<match>/<name>` of the project if None.
+        name: name of the release.
+        licence: text of the data licence.
+        formats: export formats.
+        out: output folder; `releases/<match>/<name>` of the project if None.
 
     Raises:
         WorldposeError: the latest run is not complete.
     """
-    from flows.formats import Origin  # late, as all that only few runs need
+    from flows.formats import Origin  # imported here, as everything that few runs need
     from flows.releasing import release as write_release
     from flows.reports.report import write_report
 
@@ -138,10 +138,10 @@ def release(
 
 
 def release_folder(store: Store, match_id: str, name: str, out: str | None) -> Path:
-    """Where a release is written.
+    """Return the output folder of a release.
 
     Raises:
-        UsageError: the name is none for a folder, or the project is in no folder of this machine.
+        UsageError: the name is not valid for a folder, or the project is not in a local folder.
     """
     if out is not None:
         return Path(out)
@@ -173,20 +173,20 @@ def finetune(
     settings: dict[str, Any] | None = None,
     starts: dict[NetKind, str] | None = None,
 ) -> list[str]:
-    """Train the embedded nets on reviewed labels; returns the files of their new versions.
+    """Train the embedded nets on reviewed labels; return the files of their new versions.
 
     Args:
-        project: folder of the store, which keeps the versions.
-        annotations: file of COCO keypoints.
-        pictures: the folder of their pictures; that of the annotations if None.
-        nets: which.
-        settings: of the training, where not their defaults.
-        starts: net to the weights to begin from, where not the shipped ones.
+        project: folder of the store, which holds the versions.
+        annotations: file with COCO keypoints.
+        pictures: the folder of their images; that of the annotations if None.
+        nets: nets to train.
+        settings: training settings that differ from their defaults.
+        starts: net to its initial weights, if not the shipped ones.
     """
-    from flows.finetune import FOLDER, fine_tune_nets  # late: torch takes seconds to import
+    from flows.finetune import FOLDER, fine_tune_nets  # torch takes seconds to import
     from worldpose.training import FineTuningSettings
 
-    versions = fine_tune_nets.fn(  # as this flow, not as one within it
+    versions = fine_tune_nets.fn(  # in this flow, not as a subflow
         Path(annotations),
         None if pictures is None else Path(pictures),
         Path(project) / FOLDER,

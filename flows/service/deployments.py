@@ -1,4 +1,4 @@
-"""What the Prefect server is told: deployments, their queues and limits."""
+"""Deployments at the Prefect server, with their queues and limits."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ def _of_project(plan: ServePlan) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Deployed:
-    """One flow that the server offers.
+    """One deployed flow.
 
     Attributes:
-        flow: its name at the server, and in `flows.service.deployed` unless it lies elsewhere.
-        about: shown with it.
-        queue: where its runs wait by default; None = in the pool of arrivals.
-        parameters: those that the plan decides.
-        schedule: when it runs by itself.
-        module: where the flow lies.
-        fixed: parameters of the plan that a run may not change: what it works on, and whose code
-            its workers run.
+        flow: its name at the server and in `module`.
+        about: description.
+        queue: default queue of its runs; None = in the pool of arrivals.
+        parameters: parameters from the plan.
+        schedule: schedule of its runs.
+        module: module of the flow.
+        fixed: parameters of the plan that a run must not change: the project that it processes, and
+            the code that its workers run.
     """
 
     flow: str
@@ -51,7 +51,7 @@ class Deployed:
 
     @property
     def entrypoint(self) -> str:
-        """Module and name: found wherever worldpose is installed."""
+        """Module and name: importable wherever worldpose is installed."""
         return f"{self.module}.{self.flow}"
 
 
@@ -90,19 +90,19 @@ DEPLOYED: Final = (
     Deployed("release", "Freeze a match's complete run under a name, with a report.", None),
     Deployed("finetune", "Train the embedded nets on reviewed labels.", "background"),
 )
-"""Their names are also `flows.service.plan.FLOWS`."""
+"""Their names are also in `flows.service.plan.FLOWS`."""
 
 
 def pools(plan: ServePlan) -> tuple[str, str]:
-    """Names of the pool of matches and of that of arrivals."""
+    """Return the names of the pool of matches and of the pool of arrivals."""
     return plan.name, f"{plan.name}-arrivals"
 
 
 async def install(plan: ServePlan) -> dict[UUID, Installed]:
-    """Tell the server of all there is; done again it changes only what is different.
+    """Create or update all deployments, pools and queues at the server.
 
     Returns:
-        What a worker may run, by the ids of its deployments.
+        Flows that a worker can run, by deployment id.
 
     Raises:
         InputError: another project has deployments of this name at the server.
@@ -118,11 +118,11 @@ async def install(plan: ServePlan) -> dict[UUID, Installed]:
 
 
 async def work(plan: ServePlan, installed: Mapping[UUID, Installed]) -> None:
-    """Run what is due, until this process ends.
+    """Run due flow runs until this process ends.
 
     Args:
-        plan: what is served.
-        installed: what is run; a run of anything else fails.
+        plan: the served project.
+        installed: flows that can run; a run of any other flow fails.
     """
     import anyio
 
@@ -144,11 +144,11 @@ async def _deploy(plan: ServePlan, deployed: Deployed) -> tuple[UUID, Installed]
         schedule=None if deployed.schedule is None else deployed.schedule(plan),
         work_pool_name=arrivals if deployed.queue is None else matches,
         work_queue_name=deployed.queue,
-        enforce_parameter_schema=False,  # the worker checks, with what it runs
+        enforce_parameter_schema=False,  # the worker checks, with the flow that it runs
     )
     deployment.entrypoint = deployed.entrypoint
     number = await deployment.aapply()
-    async with get_client() as client:  # applied again, it would leave these as they are there
+    async with get_client() as client:  # applying the deployment again would not update these
         again = DeploymentUpdate(
             entrypoint=deployed.entrypoint, pull_steps=[], job_variables={}, path=None
         )
@@ -191,7 +191,7 @@ async def _pool(client: PrefectClient, name: str, limit: int, about: str) -> Non
             )
         )
     else:
-        # Also what was changed there, or made by an earlier version, is as it should be again.
+        # Reset values that were changed there, or set by an earlier version.
         again = WorkPoolUpdate(concurrency_limit=limit, base_job_template=JOB_TEMPLATE)
         await client.update_work_pool(name, again)
 

@@ -1,4 +1,4 @@
-"""Whether what is served is well, and how to mend what is not."""
+"""Health checks of a served project, and how to fix each fault."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from flows.service.layout import StateFolder, is_alive
 from flows.service.plan import FLOWS
 
 WORKER_SECONDS: Final = 90.0
-"""A worker that the Prefect server has not heard of for so long is gone; it reports every 30."""
+"""Without a heartbeat for so long, a worker counts as lost; it sends one every 30 s."""
 LOW_DISK_GB: Final = 1.0
-"""With less free space nothing can be computed for long [GB]."""
+"""With less free space, computation will soon fail [GB]."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One part of what is served.
+    """Check result of one part of the service.
 
     Attributes:
         part: its name.
-        is_well: whether it does what it should.
-        state: how it is, in words.
-        mend: what to do where it is not well.
+        is_well: whether it works as expected.
+        state: its state, as text.
+        mend: how to fix it if it does not work.
     """
 
     part: str
@@ -43,7 +43,7 @@ class Finding:
 
 
 def check(state: StateFolder) -> list[Finding]:
-    """How everything is that `worldpose serve` keeps up, first what the rest needs."""
+    """Check everything that `worldpose serve` runs, dependencies first."""
     serving = state.read_serving()
     with state.only_one("serve", wait=False) as is_free:
         pass
@@ -93,15 +93,15 @@ def _login(state: StateFolder, serving: Serving) -> str | None:
     try:
         return os.environ.get(SERVER_LOGIN) or state.prefect_login.read_text().strip()
     except OSError:
-        return None  # the finding then says that the server refuses
+        return None  # the check then reports that the server refuses
 
 
 def at_prefect(serving: Serving, login: str | None = None) -> Iterator[Finding]:
-    """Whether deployments are there, and somebody takes their runs.
+    """Check that deployments exist, and that a worker takes their runs.
 
     Args:
-        serving: what is served.
-        login: what clients log in to its server with; None = it asks for none.
+        serving: the served project.
+        login: login of clients at its server; None = it needs none.
     """
     again = "End worldpose serve and begin it again: it installs what is missing."
     ask = _ask if login is None else partial(_ask, login=login)
@@ -178,7 +178,7 @@ def _disk(folder: Path) -> Finding:
 def _ask(
     address: str, body: Mapping[str, Any] | None = None, login: str | None = None
 ) -> tuple[Any, str]:
-    """What a server answers, and what is wrong where it does not."""
+    """Request an address; return the response, and an error message if it failed."""
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     data = None if body is None else json.dumps(body).encode()
     headers = {"content-type": "application/json"}

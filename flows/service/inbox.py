@@ -1,7 +1,7 @@
-"""What lies in the inbox: which arrivals are complete, and which can never be a match.
+"""Inbox scan: which arrivals are complete, and which are invalid.
 
-Nothing in the inbox is ever moved, changed or deleted: a match stays where it arrived, and what is
-known of it lies in the project.
+The inbox is never modified: a match stays at its place of arrival, and its known state is kept in
+the project.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from worldpose.errors import InputError
 from worldpose.ingest.places import require_local
 
 SUMS: Final = "SHA256SUMS"
-"""An optional list, as `sha256sum` writes it, of all that has to have arrived."""
+"""An optional checksum list in the format of `sha256sum`, of all files to expect."""
 MOST_FILES: Final = 2_000_000
-"""Eighteen cameras' pictures of an hour in folders of images; more is refused."""
+"""Images of eighteen cameras for an hour in image folders; more is refused."""
 LONGEST_SUMS: Final = 1 << 28
-"""Bytes of a list of `MOST_FILES` names."""
+"""Size of a list of `MOST_FILES` names [byte]."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class Entry:
     """One entry of the inbox.
 
     Attributes:
-        path: where it lies.
-        name: path below the inbox as it is shown and kept.
-        priority: by the folder that it lies in.
+        path: its path.
+        name: path below the inbox for display and storage.
+        priority: from the folder that contains it.
     """
 
     path: Path
@@ -44,11 +44,11 @@ class Entry:
 
 
 class RefusalError(Exception):
-    """An arrival can never be a match as it is."""
+    """An arrival cannot be a match in its present form."""
 
 
 def entries(inbox: Path) -> Iterator[Entry]:
-    """All arrivals in the inbox; names that begin with a dot are of those who still write."""
+    """Yield all arrivals in the inbox; a dot before a name marks an upload in progress."""
     for priority in PRIORITIES:
         if priority != "normal":
             folder = inbox / priority
@@ -63,18 +63,18 @@ def entries(inbox: Path) -> Iterator[Entry]:
 def look(
     inbox: Path, known: Mapping[str, Arrival], *, now: float, quiet: float
 ) -> list[tuple[Entry, Arrival, bool]]:
-    """Each arrival that is not taken yet, what is known of it now, and whether to take it in.
+    """Return each arrival that is not taken yet, its state now, and whether to take it in.
 
-    Called by the one that holds the lock of the arrivals.
+    The caller must hold the lock of the arrivals.
 
-    It is complete when match.yaml is there and nothing of it has changed for `quiet` seconds.
-    What was refused or incomplete is looked at again when it has changed.
+    It is complete when match.yaml is there and nothing changed for `quiet` seconds. A refused or
+    incomplete arrival is checked again after a change.
 
     Args:
         inbox: the folder.
-        known: what was known, by name.
-        now: of the machine's clock that only goes forward [s].
-        quiet: how long nothing may have changed [s].
+        known: previous states, by name.
+        now: time on the machine's monotonic clock [s].
+        quiet: required time without changes [s].
     """
     found = []
     for entry in entries(inbox):
@@ -86,14 +86,14 @@ def look(
         except RefusalError as refusal:
             found.append((entry, _changed(entry, before, "refused", str(refusal)), False))
             continue
-        except OSError as error:  # it changes as we look, or may not be read
+        except OSError as error:  # it changes during the scan, or is not readable
             reason = f"cannot be read: {error.strerror}"
             found.append((entry, _changed(entry, before, "incomplete", reason), False))
             continue
         is_same = before is not None and before.fingerprint == fingerprint
-        # The lock is ours: what is begun was begun by a process that lives no more.
+        # We hold the lock, so a process that began an intake is dead.
         deaths = before.deaths + before.is_begun if before is not None and is_same else 0
-        # After a reboot that clock begins anew: then it is waited for once more.
+        # The clock restarts at a reboot: then the quiet time starts again.
         since = before.unchanged_since if before is not None and is_same else now
         since = min(since, now)
         if is_same and before is not None and before.state in ("refused", "incomplete"):
@@ -113,11 +113,11 @@ def look(
 
 
 def fingerprint_of(path: Path) -> str:
-    """Digest of the names, sizes and times of all files of an arrival.
+    """Return a digest of the names, sizes and times of all files of an arrival.
 
     Raises:
-        RefusalError: it is no folder, or has a link, a special file, or a name that is not plain.
-        OSError: it cannot be read, or changed meanwhile.
+        RefusalError: it is not a folder, or has a link, a special file, or an unsafe name.
+        OSError: it is not readable, or changed in between.
     """
     _require_plain(path.name)
     mode = path.lstat().st_mode
@@ -149,10 +149,10 @@ def fingerprint_of(path: Path) -> str:
 
 
 def missing_of(path: Path) -> str:
-    """What a quiet arrival lacks, in words; empty where it lacks nothing.
+    """Describe the missing parts of a quiet arrival; empty if it is complete.
 
     Raises:
-        RefusalError: its list of sums is none.
+        RefusalError: its checksum list is malformed.
     """
     if not _is_match(path):
         return "match.yaml is not there"
@@ -172,7 +172,7 @@ def missing_of(path: Path) -> str:
 def changed(
     arrival: Arrival, state: ArrivalState, reason: str, **more: str | bool | None
 ) -> Arrival:
-    """The arrival in another state."""
+    """Return the arrival in another state."""
     update = {"state": state, "reason": reason, "changed_at": datetime.now(UTC), **more}
     return arrival.model_copy(update=update)
 
@@ -213,7 +213,7 @@ def _shown(name: str) -> str:
 
 
 def _require_plain(name: str) -> None:
-    if not name.isprintable() or "\\" in name:  # lone surrogates stand for what is no UTF-8
+    if not name.isprintable() or "\\" in name:  # lone surrogates stand for bytes that are not UTF-8
         raise RefusalError(f"the name {name!a} has characters that names here may not have")
 
 

@@ -1,4 +1,4 @@
-"""Where a served project keeps its state, and what its parts are called."""
+"""State folder of a served project, and the names of its parts."""
 
 from __future__ import annotations
 
@@ -19,71 +19,71 @@ from worldpose.formats import whole_file
 from worldpose.store.blobs import storage_errors
 
 PRIORITIES: Final[tuple[Priority, ...]] = ("urgent", "normal", "background")
-"""First to last; `INBOX/urgent` and `INBOX/background` take matches of those."""
+"""First to last; `INBOX/urgent` and `INBOX/background` set the priority of their matches."""
 
 
 @dataclass(frozen=True)
 class StateFolder:
-    """The folder of a served project's state: no result is in it, and no secret but `secrets/`.
+    """State folder of a served project: it holds no results, and secrets only in `secrets/`.
 
     Attributes:
-        folder: `<project>/operations`, or as it was given.
+        folder: `<project>/operations`, or as given.
     """
 
     folder: Path
 
     @property
     def serving(self) -> Path:
-        """What is being served."""
+        """File with the plan being served."""
         return self.folder / "serve.json"
 
     @property
     def logs(self) -> Path:
-        """What each process said."""
+        """Folder with the log of each process."""
         return self.folder / "logs"
 
     @property
     def alerts(self) -> Path:
-        """Which alerts were sent and still hold."""
+        """File with the sent alerts that still hold."""
         return self.folder / "alerts.json"
 
     def read_serving(self) -> Serving | None:
-        """What is served, or was last."""
+        """Return the plan being served, or the last one."""
         try:
             return Serving.model_validate_json(self.serving.read_bytes())
         except FileNotFoundError:
             return None
 
     def write_serving(self, serving: Serving) -> None:
-        """Say what is served."""
+        """Write the plan being served."""
         with whole_file(self.serving) as draft:
             draft.write_text(serving.model_dump_json(indent=2) + "\n")
 
     def arrivals(self) -> dict[str, Arrival]:
-        """What is known of the inbox, by name."""
+        """Return the known state of the inbox, by name."""
         found = {}
         for file in sorted((self.folder / "arrivals").glob("*.json")):
             try:
                 arrival = Arrival.model_validate_json(file.read_bytes())
             except (FileNotFoundError, ValidationError):
-                continue  # forgotten meanwhile, or damaged: then it is looked at as a new one
+                continue  # removed meanwhile, or damaged: then it counts as a new one
             found[arrival.name] = arrival
         return found
 
     def write_arrival(self, arrival: Arrival) -> None:
-        """Keep what is known of one entry; its name never becomes a path."""
+        """Write the state of one entry; its name never becomes a path."""
         file = self._arrival_file(arrival.name)
         with storage_errors(str(file)), whole_file(file) as draft:
             draft.write_text(arrival.model_dump_json(indent=2) + "\n")
 
     def end_orderly(self) -> None:
-        """All processes of the service were ended on purpose: that is no death of what they did."""
+        """Note that all processes ended on purpose: such an end does not count as a crash."""
         for arrival in self.arrivals().values():
             if arrival.is_begun:
                 self.write_arrival(arrival.model_copy(update={"is_begun": False}))
 
     def forget_arrival(self, name: str) -> None:
-        """Its entry is gone from the inbox."""
+        """Remove the state of an entry that is gone from the inbox."""
         self._arrival_file(name).unlink(missing_ok=True)
 
     def _arrival_file(self, name: str) -> Path:
@@ -91,19 +91,19 @@ class StateFolder:
 
     @property
     def prefect_login(self) -> Path:
-        """What clients log in to our own Prefect server with; for this user alone."""
+        """Login of clients at our own Prefect server; readable by this user only."""
         return self.folder / "secrets" / "prefect"
 
     @property
     def metrics_token(self) -> Path:
-        """What Prometheus asks for figures with; for this user alone."""
+        """Token for Prometheus; readable by this user only."""
         return self.folder / "secrets" / "metrics"
 
     @contextmanager
     def only_one(self, what: str, *, wait: bool) -> Iterator[bool]:
-        """Hold the lock `what`; gives whether it is held, which without `wait` it may not be.
+        """Hold the lock `what`; yield whether it was acquired, which can fail without `wait`.
 
-        The lock ends with the process, however that ends.
+        The operating system releases the lock when the process ends.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         with (self.folder / f"{what}.lock").open("w") as lock:
@@ -116,10 +116,10 @@ class StateFolder:
 
 
 def state_folder(project: str, given: Path | None) -> StateFolder:
-    """Where the state of a served project lies.
+    """Return the state folder of a served project.
 
     Raises:
-        UsageError: a project on object storage, and no folder is named.
+        UsageError: a project on object storage, and no folder is given.
     """
     if given is not None:
         return StateFolder(given.resolve())
@@ -134,15 +134,15 @@ def state_folder(project: str, given: Path | None) -> StateFolder:
 
 
 def served_state(url: str) -> StateFolder:
-    """Where the state of a project lies for a process of `worldpose serve`, or for any other."""
+    """Return the state folder of a project for a process of `worldpose serve`, or any other."""
     given = os.environ.get("WORLDPOSE_STATE")
     if given is None and "://" in url:
-        return StateFolder(Path("/nonexistent"))  # nothing is served from this machine
+        return StateFolder(Path("/nonexistent"))  # this machine serves no project
     return state_folder(url, None if given is None else Path(given))
 
 
 def is_alive(pid: int) -> bool:
-    """Is there such a process on this machine."""
+    """Return whether there is such a process on this machine."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

@@ -1,4 +1,4 @@
-"""Figures of a project for Prometheus, computed anew for each scrape from what the store says."""
+"""Metrics of a project for Prometheus, computed from the store at each scrape."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ from flows.web.http_server import Connections
 from worldpose.store import Store
 
 MAX_SCRAPES: Final = 50
-"""Open connections of those who ask for figures."""
+"""Open connections of scrapers."""
 SIZE_SECONDS: Final = 300.0
-"""How old the store's size may be: it is a sum over all its files."""
+"""Maximum age of the cached store size: it is a sum over all files."""
 STATES: Final = ("complete", "waiting", "partial", "failed", "at work", "not run", "unreadable")
 UNIT_STATES: Final = ("done", "waiting", "failed", "blocked")
 ARRIVAL_STATES: Final = ("arriving", "incomplete", "refused", "taken")
 
 
 class ProjectFigures(Collector):
-    """What Prometheus is told of a project.
+    """Prometheus collector for a project.
 
     Attributes:
         store: the project.
-        state: what is known of its arrivals and alerts.
+        state: state of its arrivals and alerts.
     """
 
     def __init__(self, store: Store, state: StateFolder) -> None:
@@ -51,11 +51,11 @@ class ProjectFigures(Collector):
         self._lock = Lock()
 
     def describe(self) -> list[Metric]:
-        """Nothing beforehand: names are those of what is collected."""
+        """Return nothing: the metric names come from `collect`."""
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """All figures as they are now."""
+        """Yield all current metrics."""
         with self._lock:
             matches = self._overview.look()
             ended = self._overview.poses()
@@ -92,19 +92,19 @@ class ProjectFigures(Collector):
 
 
 def exposition(figures: ProjectFigures) -> bytes:
-    """The figures as Prometheus reads them."""
+    """Return the metrics in Prometheus text format."""
     registry = CollectorRegistry(auto_describe=False)
     registry.register(figures)
     return generate_latest(registry)
 
 
 def metrics_server(plan: ServePlan, figures: ProjectFigures, token: str) -> ThreadingHTTPServer:
-    """A server of `/metrics` and `/health`, for requests that name it.
+    """Create a server of `/metrics` and `/health`, for requests that name it.
 
     Args:
-        plan: where it listens, and its names.
-        figures: what `/metrics` answers.
-        token: what `/metrics` asks for, as `Authorization: Bearer TOKEN`.
+        plan: its address and names.
+        figures: collector behind `/metrics`.
+        token: required by `/metrics`, as `Authorization: Bearer TOKEN`.
     """
     names = LOOPBACK | {plan.host.lower(), *(name.lower() for name in plan.names)}
     expected = f"Bearer {token}".encode()
@@ -137,13 +137,13 @@ def metrics_server(plan: ServePlan, figures: ProjectFigures, token: str) -> Thre
             self.wfile.write(body)
 
         def log_message(self, format: str, *args: object) -> None:
-            """Scrapes are no news."""
+            """Do not log scrapes."""
 
     return _MetricsServer((plan.host, plan.metrics_port), Handler)
 
 
 class _MetricsServer(ThreadingHTTPServer):
-    """One thread a connection, of which there are few: slow ones are closed."""
+    """One thread per connection; there are few, and slow ones are closed."""
 
     request_queue_size = 128
 
@@ -202,7 +202,7 @@ def _unit_figures(matches: list[MatchStatus]) -> Iterator[Metric]:
 
 
 def _quality(matches: list[MatchStatus]) -> Iterator[Metric]:
-    """The figures that gates judge: the worst of a match's units, and the limit."""
+    """Yield the metrics that gates judge: the worst of a match's units, and the limit."""
     worst = GaugeMetricFamily(
         "worldpose_quality",
         "Figure that a gate judges, worst unit of the match",

@@ -1,4 +1,4 @@
-"""A project at a glance: matches by stages, with times, figures, and what waits or failed."""
+"""Status of a project: matches by stage, with times, metrics, pending reviews and failures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from worldpose.store import Store
 UnitState = Literal["done", "waiting", "failed", "blocked"]
 
 BODIES = "body_fitting"
-"""The stage whose bodies are the poses that a project makes."""
+"""The stage whose bodies count as the poses of a project."""
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,12 @@ class UnitGlance:
 
     Attributes:
         unit: its name within the stage: a camera, a clip.
-        state: done; waiting for a person; failed; blocked by one that is not done.
-        seconds: how long it took to compute [s]; None where there is no result.
-        figures: its quality figures.
-        objections: figures beyond the gate's limits that nobody has approved.
-        waiting_since: when a person was asked; None where nobody is waited for.
-        why: what it failed of or waits for.
+        state: done; waiting for review; failed; blocked by a unit that is not done.
+        seconds: computation time [s]; None if there is no result.
+        figures: its quality metrics.
+        objections: metrics beyond the gate's limits without an approval.
+        waiting_since: time of the review request; None if there is none.
+        why: reason for the failure or the review.
     """
 
     unit: str
@@ -46,14 +46,14 @@ class UnitGlance:
 
 @dataclass(frozen=True)
 class MatchStatus:
-    """One match.
+    """Status of one match.
 
     Attributes:
         match_id: its id.
         latest: its latest finished run.
-        at_work_since: when the run that has begun and not ended did begin.
+        at_work_since: start of a run that has not ended.
         stages: stage to its units, in the order of the method.
-        problem: why nothing can be said of it.
+        problem: why its status is not readable.
     """
 
     match_id: str
@@ -64,7 +64,7 @@ class MatchStatus:
 
     @property
     def state(self) -> str:
-        """The latest run's state, or what comes before it."""
+        """The latest run's state, or the state before the first run."""
         if self.problem:
             return "unreadable"
         if self.at_work_since is not None:
@@ -73,12 +73,12 @@ class MatchStatus:
 
     @property
     def units(self) -> Iterable[tuple[str, UnitGlance]]:
-        """All units with their stage."""
+        """Yield all units with their stage."""
         return ((stage, unit) for stage, units in self.stages.items() for unit in units)
 
 
 class Overview:
-    """Looks at a project again and again; what never changes is read once."""
+    """Repeated reads of a project's status; immutable data is read once."""
 
     def __init__(self, store: Store) -> None:
         self.store = store
@@ -86,7 +86,7 @@ class Overview:
         self._poses: dict[tuple[str, str], tuple[datetime, float]] = {}
 
     def look(self) -> list[MatchStatus]:
-        """Every match as it is now; one that cannot be read hides no other."""
+        """Return the status of every match; an unreadable match does not affect others."""
         glances = []
         for match_id in self.store.matches():
             try:
@@ -96,14 +96,14 @@ class Overview:
         return glances
 
     def poses(self) -> list[tuple[datetime, float]]:
-        """When each run of any match ended, and how many bodies it fitted."""
+        """Return for each run of any match its end and the number of fitted bodies."""
         found = {}
         for match_id in self.store.matches():
             for run_id in self.store.runs(match_id):
                 key = (match_id, run_id)
                 try:
                     found[key] = self._poses.get(key) or _poses_of(self.store.run(match_id, run_id))
-                except (OSError, WorldposeError):  # `look` says so of its match
+                except (OSError, WorldposeError):  # `look` reports it
                     continue
         self._poses = found
         return list(found.values())
@@ -162,7 +162,7 @@ class Overview:
 
 
 def age(since: datetime | None) -> float:
-    """How long ago that was [s]; never negative, whatever the clock did since."""
+    """Return the elapsed time [s]; never negative, even if the clock was changed."""
     return 0.0 if since is None else max(0.0, (datetime.now(UTC) - since).total_seconds())
 
 

@@ -1,4 +1,4 @@
-"""The pages of a served project: those of review, and its status."""
+"""Pages of a served project: review pages and status page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def serve_pages(plan: ServePlan) -> None:
     """Serve until this process ends."""
     access = access_for(
         plan.host,
-        token=os.environ.pop("WORLDPOSE_REVIEW_TOKEN"),  # runs that pages begin do not have it
+        token=os.environ.pop("WORLDPOSE_REVIEW_TOKEN"),  # hide it from runs that pages start
         names=plan.names,
         secure=plan.certificate is not None,
     )

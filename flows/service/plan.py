@@ -1,4 +1,4 @@
-"""What `worldpose serve` was asked for, as all its processes know it."""
+"""Options of `worldpose serve`, shared by all its processes."""
 
 from __future__ import annotations
 
@@ -11,63 +11,64 @@ from flows.service.layout import StateFolder
 
 METRICS_PORT = 8573
 FLOWS = ("match", "ingest", "reprocess", "release", "finetune")
-"""What the Prefect server offers, known without importing Prefect."""
+"""Flows that the Prefect server offers, known without importing Prefect."""
 
 
 class ServePlan(Record):
-    """What is served, and how; it holds no secret."""
+    """Options of a served project; contains no secret."""
 
     project: str
     """Folder or URL of the store."""
     inbox: Path
-    """Folder in which matches arrive."""
+    """Folder for arriving matches."""
     bucket: str | None = None
-    """Where matches arrive in object storage, to be copied into the inbox."""
+    """Address of an inbox in object storage, copied to the inbox folder."""
     state: Path
-    """Folder of logs, alerts and what is known of arrivals."""
+    """Folder of logs, alerts and the state of arrivals."""
     name: Name = "worldpose"
-    """Of the deployments and work pools: projects that share a Prefect server need their own."""
+    """Name of the deployments and work pools; projects that share a Prefect server need their
+    own."""
     prefect: str
     """Address of Prefect's API."""
     owns_prefect: bool = True
-    """Whether the Prefect server is started and ended with this."""
+    """Whether this service starts and ends the Prefect server."""
     max_concurrent: int = Field(default=1, ge=1)
-    """Matches that run at the same time; what waits for people does not count."""
+    """Matches that run at the same time; runs that wait for review do not count."""
     dask: str | None = None
     """Address of a running Dask scheduler; None: workers on this machine for each run."""
     workers: int | None = Field(default=None, ge=1)
-    """Worker processes of a run on this machine; None: the cores, shared by the matches at once."""
+    """Worker processes of a run on this machine; None: the cores, divided by `at_once`."""
     time_limits: dict[str, float] = Field(default_factory=dict)
-    """Stage to the minutes that a unit may be at work, where not as long as all."""
+    """Stage to the time limit of a unit [min], if not the default."""
     host: str = "127.0.0.1"
-    """Address that pages and figures listen at."""
+    """Address of the pages and metrics servers."""
     names: tuple[str, ...] = ()
     """Further names of this machine in browsers and scrapers."""
     pages_port: int = 8571
     """Of the review and status pages."""
     metrics_port: int = METRICS_PORT
-    """Of the figures for Prometheus."""
+    """Of the metrics for Prometheus."""
     certificate: Path | None = None
     """PEM file of the pages' certificate."""
     key: Path | None = None
     """PEM file of its private key."""
     settle_seconds: float = Field(default=30.0, ge=0)
-    """A match has arrived when nothing of it has changed for so long [s]."""
+    """A match is complete when nothing changed for so long [s]."""
     poll_minutes: float = Field(default=15.0, gt=0)
-    """How often the inbox is gone through on schedule, besides on arrival [min]."""
+    """Interval of scheduled inbox scans, in addition to those on arrival [min]."""
     gate_hours: float = Field(default=24.0, gt=0)
-    """A result that waits longer for a person raises an alert [h]."""
+    """A result that waits longer for review raises an alert [h]."""
     disk_gb: float = Field(default=10.0, ge=0)
     """Less free space than this raises an alert [GB]."""
 
     @property
     def state_folder(self) -> StateFolder:
-        """The folder of logs, alerts and what is known of arrivals."""
+        """The folder of logs, alerts and the state of arrivals."""
         return StateFolder(self.state)
 
     @property
     def dashboard(self) -> str:
-        """Address of Prefect's own pages."""
+        """Address of Prefect's dashboard."""
         return self.prefect.removesuffix("/api")
 
     @property
@@ -85,5 +86,5 @@ class ServePlan(Record):
 
     @property
     def ingest_deployment(self) -> str:
-        """Prefect's name of the deployment that takes in arrivals."""
+        """Prefect's name of the deployment that registers arrivals."""
         return f"ingest/{self.name}"

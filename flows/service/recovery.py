@@ -1,7 +1,7 @@
-"""Runs whose process was killed begin again: the store holds what they had finished.
+"""Restart of runs whose process was killed: the store holds their finished results.
 
-Prefect alone shows them as running for ever. An automation on its heartbeats would not do: it knows
-events, not states, and takes a run that waits for people for one that was killed.
+Prefect alone shows them as running forever. An automation on its heartbeats would not work: it uses
+events, not states, and cannot tell a suspended run from a killed one.
 """
 
 from __future__ import annotations
@@ -32,11 +32,12 @@ from flows.service.layout import is_alive
 from flows.service.plan import ServePlan
 
 SILENT: Final = timedelta(seconds=90)
-"""A run that gave no sign of life for so long is looked after; they come every 30 s."""
+"""Without a heartbeat for so long, a run is checked; heartbeats come every 30 s."""
 STARTING: Final = timedelta(minutes=5)
-"""What the process of a run may take until the run is at work, on a machine with too much to do."""
+"""Maximum time from the start of a run's process until the run is active, on an overloaded
+machine."""
 MOST_BEGINNINGS: Final = 3
-"""A run that was killed so often is left crashed, for a person to look at."""
+"""After so many starts, a killed run stays crashed and needs an operator."""
 AT_WORK: Final = (StateType.RUNNING, StateType.PENDING, StateType.CANCELLING)
 KILLED: Final = "its process was killed"
 
@@ -44,12 +45,12 @@ LOG = logging.getLogger("worldpose.operations")
 
 
 async def begin_again(plan: ServePlan, *, at_start: bool = False) -> list[str]:
-    """Schedule runs that were killed or lost their machines once more; gives their names.
+    """Reschedule runs that were killed or lost their machines; return their names.
 
     Args:
-        plan: what is served.
-        at_start: nothing runs yet, so that with a Prefect server of our own even what seems to be
-            at work was killed with the service before.
+        plan: the served project.
+        at_start: no run is active yet, so with a Prefect server of our own even an apparently
+            active run was killed with the previous service.
     """
     again = []
     async with get_client() as client:
@@ -73,7 +74,7 @@ async def begin_again(plan: ServePlan, *, at_start: bool = False) -> list[str]:
 
 
 def may_begin_again(run: FlowRun) -> bool:
-    """Whether a run ended by no fault of its own: it was killed, or its machines were lost."""
+    """Return whether a run ended by no fault of its own: killed, or its machines were lost."""
     if run.state is None or run.run_count >= MOST_BEGINNINGS:
         return False
     was_lost = LostWorkersError.__name__ in (run.state.message or "")
@@ -81,10 +82,10 @@ def may_begin_again(run: FlowRun) -> bool:
 
 
 async def _is_dead(client: PrefectClient, plan: ServePlan, run: FlowRun) -> bool:
-    """Whether a run that seems to run or start has no process and gave no sign of life lately.
+    """Return whether an active or starting run has no process and no recent heartbeat.
 
-    A run is left starting if its process was killed while the server could not be told, on a full
-    disk for instance. It would keep its place in the pool from all others.
+    A run stays in a starting state if its process was killed while the server was not reachable or
+    its disk was full. It would occupy a slot of the pool forever.
     """
     is_starting = run.state_type == StateType.PENDING
     since = datetime.now(UTC) - (STARTING if is_starting else SILENT)

@@ -1,4 +1,4 @@
-"""Ways to tell somebody of an alert: a webhook and e-mail, each named by an address."""
+"""Channels for alerts: a webhook and e-mail, each given by an address."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from urllib.parse import parse_qs, unquote, urlsplit
 from worldpose.errors import UsageError
 
 ANSWER_SECONDS: Final = 10.0
-"""How long a server may take to answer."""
+"""Timeout for a server's response."""
 
 
 class Sender(Protocol):
-    """One way; its address may hold a secret, which is never said."""
+    """One channel; its address can contain a secret, and is never printed."""
 
     @property
     def name(self) -> str:
-        """As logs and the state call it."""
+        """Name in logs and in the state folder."""
 
     def send(self, content: Mapping[str, str]) -> None:
-        """Have it delivered.
+        """Deliver the message.
 
         Raises:
-            Exception: it was not taken.
+            Exception: it was not accepted.
         """
 
 
 class _NoRedirects(urllib.request.HTTPRedirectHandler):
-    """An answer of 3xx is an error."""
+    """Treats a 3xx response as an error."""
 
     def redirect_request(self, *_: object) -> None:
         return None
@@ -42,17 +42,17 @@ class _NoRedirects(urllib.request.HTTPRedirectHandler):
 
 @dataclass(frozen=True)
 class Webhook:
-    """A POST of JSON; chat services show its `text`."""
+    """POST request with JSON; chat services show its `text`."""
 
     address: str
     name: str = "webhook"
 
     @classmethod
     def at(cls, address: str) -> Webhook:
-        """The webhook of an http: or https: address.
+        """Parse the http: or https: address of a webhook.
 
         Raises:
-            UsageError: it is none.
+            UsageError: the address is malformed.
         """
         try:
             parts = urlsplit(address)
@@ -82,16 +82,16 @@ class Webhook:
 
 @dataclass(frozen=True)
 class Mail:
-    """A message by SMTP.
+    """Message by SMTP.
 
     Attributes:
-        host: of the mail server.
-        port: of it.
-        is_secure: TLS from the start; else it is asked for where the server offers it.
-        user: to log in as, which is done under TLS alone; empty = no log-in.
-        password: of the user.
-        sender: who it is from.
-        receivers: whom it is for.
+        host: mail server.
+        port: its port.
+        is_secure: TLS from the start; else STARTTLS if the server offers it.
+        user: login name, only used under TLS; empty = no login.
+        password: password of the user.
+        sender: sender address.
+        receivers: recipient addresses.
     """
 
     host: str
@@ -105,10 +105,10 @@ class Mail:
 
     @classmethod
     def at(cls, address: str) -> Mail:
-        """As `smtps://USER:PASSWORD@HOST/?to=A@B&to=C@D&from=E@F` says; `smtp:` without TLS first.
+        """Parse `smtps://USER:PASSWORD@HOST/?to=A@B&to=C@D&from=E@F`; `smtp:` starts without TLS.
 
         Raises:
-            UsageError: it does not say so.
+            UsageError: the address is malformed.
         """
         try:
             parts = urlsplit(address)
@@ -132,7 +132,7 @@ class Mail:
     def send(self, content: Mapping[str, str]) -> None:
         """See `Sender`."""
         message = EmailMessage()
-        # A header is one line, whatever a message of an error holds.
+        # A header is one line, even if an error message has several.
         message["Subject"] = " ".join(f"worldpose: {content['text']}".split())[:150]
         message["From"], message["To"] = self.sender, ", ".join(self.receivers)
         message.set_content(f"{content['text']}\n\n{content['link']}\n")
@@ -157,10 +157,10 @@ class Mail:
 
 
 def senders_of(environment: Mapping[str, str]) -> tuple[Sender, ...]:
-    """The ways that WORLDPOSE_ALERT_URL and WORLDPOSE_ALERT_MAIL name.
+    """Return the channels in WORLDPOSE_ALERT_URL and WORLDPOSE_ALERT_MAIL.
 
     Raises:
-        UsageError: one of them is no address of its kind.
+        UsageError: one of them is malformed.
     """
     webhook, mail = environment.get("WORLDPOSE_ALERT_URL"), environment.get("WORLDPOSE_ALERT_MAIL")
     found: list[Sender] = [Webhook.at(webhook)] if webhook else []

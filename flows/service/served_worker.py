@@ -1,8 +1,8 @@
-"""The worker of a served project: it runs the flows that were installed, and nothing else.
+"""Worker of a served project: it runs the installed flows, and nothing else.
 
-Whoever may use Prefect's API can make deployments that fetch code, and give runs a command, an
-environment or a folder. This worker takes from a run its id and its parameters: command, code and
-environment are its own.
+A client of Prefect's API can create deployments that fetch code, and give runs a command, an
+environment or a folder. This worker takes only a run's id and parameters from the server: command,
+code and environment are its own.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ JOB_TEMPLATE: Final[dict[str, Any]] = {
         "additionalProperties": False,
     },
 }
-"""What a run of our pools may choose: neither command, environment nor folder."""
+"""A run of our pools can choose neither command, environment nor folder."""
 
 
 @dataclass(frozen=True)
 class Installed:
-    """A flow that the worker runs.
+    """A flow that the worker can run.
 
     Attributes:
         entrypoint: module and name.
-        flow: it.
-        fixed: parameters that a run may not change.
+        flow: the flow.
+        fixed: parameters that a run must not change.
     """
 
     entrypoint: str
@@ -66,19 +66,19 @@ class Installed:
 
 
 class RefusedRunError(Exception):
-    """A run asks for what the worker does not do."""
+    """A run requests something that the worker does not allow."""
 
 
 def require_installed(run: FlowRun, installed: Mapping[UUID, Installed]) -> Installed:
-    """The installed flow that a run is of.
+    """Return the installed flow of a run.
 
     Args:
-        run: as the server has it.
-        installed: flows by the ids of their deployments.
+        run: run from the server.
+        installed: flows by deployment id.
 
     Raises:
-        RefusedRunError: it is of another deployment, sets variables of its job, or has parameters
-            that are not the flow's or not its to choose.
+        RefusedRunError: it belongs to another deployment, sets variables of its job, or has unknown
+            or fixed parameters.
     """
     if run.deployment_id is None or run.deployment_id not in installed:
         raise RefusedRunError("it is of no deployment that was installed with this service")
@@ -97,7 +97,7 @@ def require_installed(run: FlowRun, installed: Mapping[UUID, Installed]) -> Inst
 
 
 class _OwnJob(ProcessJobConfiguration):
-    """A job of which nothing comes from the server, whose templates can read its blocks."""
+    """Job that takes nothing from the server: its templates could read the server's blocks."""
 
     @classmethod
     async def from_template_and_values(
@@ -110,7 +110,7 @@ class _OwnJob(ProcessJobConfiguration):
 
 
 class _NoHooks:
-    """Our flows have none; to look for them, Prefect would load what the deployment names."""
+    """Our flows have no hooks; to look for them, Prefect would load the deployment's code."""
 
     async def run_cancellation_hooks(self, flow_run: FlowRun, state: State[Any]) -> None:
         """Do nothing."""
@@ -120,10 +120,10 @@ class _NoHooks:
 
 
 class ServedWorker(ProcessWorker):
-    """Runs installed flows in processes with this process's environment.
+    """Worker that runs installed flows in processes with this process's environment.
 
     Attributes:
-        installed: flows by the ids of their deployments.
+        installed: flows by deployment id.
     """
 
     type = "process"
@@ -135,7 +135,7 @@ class ServedWorker(ProcessWorker):
 
     @classmethod
     def __dispatch_key__(cls) -> str:
-        return "worldpose"  # "process" stays Prefect's own worker for who asks for one by type
+        return "worldpose"  # "process" stays Prefect's own worker if requested by type
 
     async def run(
         self,
@@ -143,7 +143,7 @@ class ServedWorker(ProcessWorker):
         configuration: ProcessJobConfiguration,
         task_status: anyio.abc.TaskStatus[int] | None = None,
     ) -> ProcessWorkerResult:
-        """Run an installed flow to its end; a run that is refused is failed, with the reason."""
+        """Run an installed flow to its end; a refused run is set to failed, with the reason."""
         status = task_status or anyio.TASK_STATUS_IGNORED
         try:
             found = require_installed(flow_run, self.installed)

@@ -1,4 +1,4 @@
-"""The secrets of a served project: which there are, where they are kept, which part has which."""
+"""Secrets of a served project: their files, and the parts that receive them."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ METRICS_TOKEN: Final = "WORLDPOSE_METRICS_TOKEN"
 
 @dataclass(frozen=True)
 class Secrets:
-    """What a served project's parts keep from everybody else, as variables of the environment.
+    """Secrets of a served project's parts, passed as environment variables.
 
     Attributes:
-        pages: what people log in to the pages with.
-        metrics: what Prometheus asks for figures with.
-        prefect: what clients log in to Prefect's server with; None = another's asks for none.
+        pages: login token of the review pages.
+        metrics: token for Prometheus.
+        prefect: login of Prefect's server; None = an external server without login.
     """
 
     pages: str
@@ -36,7 +36,7 @@ class Secrets:
     prefect: str | None
 
     def of(self, part: str, plan: ServePlan) -> dict[str, str]:
-        """The secrets that a part needs to do its work, and no others."""
+        """Return only the secrets that a part needs."""
         environ = os.environ
         names: list[str] = []
         found: dict[str, str] = {}
@@ -59,14 +59,14 @@ class Secrets:
 
 
 def secrets_of(plan: ServePlan, pages: str) -> Secrets:
-    """The secrets of a project that is about to be served; those that are kept are made once.
+    """Return the secrets of a project before it is served; stored secrets are created once.
 
     Args:
-        plan: what is served.
-        pages: what people log in to the pages with.
+        plan: the served project.
+        pages: login token of the review pages.
 
     Raises:
-        UsageError: the token for figures is short.
+        UsageError: the token for metrics is short.
     """
     metrics = os.environ.get(METRICS_TOKEN)
     if metrics is not None and len(metrics) < TOKEN_LENGTH:
@@ -87,13 +87,13 @@ def secrets_of(plan: ServePlan, pages: str) -> Secrets:
 
 
 def kept_secret(file: Path, make: Callable[[], str]) -> str:
-    """A secret that is kept in a file for this user alone; made where there is none yet.
+    """Return a secret from a file that only this user can read; create it if missing.
 
-    One that other users may read or may have written is replaced.
+    A secret that other users can read or write is replaced.
 
     Args:
-        file: in a folder for this user alone.
-        make: gives a new secret, one line.
+        file: in a folder that only this user can read.
+        make: returns a new secret, one line.
     """
     file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     file.parent.chmod(0o700)
@@ -104,7 +104,7 @@ def kept_secret(file: Path, make: Callable[[], str]) -> str:
         if secret and known.st_uid == os.geteuid() and not stat.S_IMODE(known.st_mode) & 0o077:
             return secret
     except OSError:
-        pass  # not there, a link, or another user's
+        pass  # missing, a link, or another user's
     secret = make()
     with whole_file(file) as draft:
         draft.touch(mode=0o600)

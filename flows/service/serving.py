@@ -1,4 +1,4 @@
-"""Serving a project: processes that start in order, begin again when they end, and end together."""
+"""Process supervisor of a served project: ordered start, restarts, and shutdown."""
 
 from __future__ import annotations
 
@@ -29,31 +29,31 @@ from worldpose.errors import UsageError, WorldposeError
 from worldpose.store import Store
 
 LONGEST_PAUSE: Final = 60.0
-"""Between two beginnings of a process that keeps ending [s]."""
+"""Between two starts of a process that keeps ending [s]."""
 STEADY_SECONDS: Final = 120.0
-"""A process that worked for so long begins again at once."""
+"""A process that ran for so long is restarted at once."""
 BEGIN_SECONDS: Final = 300.0
-"""What a process may take to begin: the first start makes a database, and machines are busy [s]."""
+"""Start timeout: the first start creates a database, and machines are busy [s]."""
 END_SECONDS: Final = 15.0
-"""What a process may take to end before it is killed."""
+"""Time to end before a process is killed."""
 LOG_BYTES: Final = 10_000_000
-"""A longer log is set aside as `.1`, also while its process is at work."""
+"""A longer log is moved to `.1`, also while its process runs."""
 
 Tell = Callable[[str], None]
 
 
 @dataclass
 class _Part:
-    """A process that is kept at work.
+    """A supervised process.
 
     Attributes:
-        name: of the part.
-        address: at which it answers.
-        process: None until it is due again.
-        said: how long its log was before it began [byte].
-        began: on the clock that only goes forward [s].
-        pause: before it began the last time [s].
-        due: when it is begun again [s].
+        name: name of the part.
+        address: address for health checks.
+        process: None until its restart.
+        said: size of its log before the start [byte].
+        began: start time on the monotonic clock [s].
+        pause: pause before the last start [s].
+        due: time of the next start [s].
     """
 
     name: str
@@ -67,12 +67,12 @@ class _Part:
 
 @dataclass
 class _Supervisor:
-    """Keeps the parts at work.
+    """Keeps the parts running.
 
     Attributes:
-        plan: what is served.
-        secrets: what its parts keep from everybody else.
-        tell: takes lines for whoever started this.
+        plan: the served project.
+        secrets: secrets of its parts.
+        tell: receives lines for the operator.
     """
 
     plan: ServePlan
@@ -87,7 +87,7 @@ class _Supervisor:
         return part
 
     def look(self) -> None:
-        """Begin again what has ended."""
+        """Restart parts that have ended."""
         now = time.monotonic()
         for part in self.parts:
             bound_log(self.plan.state_folder.logs / f"{part.name}.log")
@@ -105,7 +105,7 @@ class _Supervisor:
                 self.write()
 
     def write(self) -> None:
-        """Say in the state folder what is served."""
+        """Write the plan and processes to the state folder."""
         plan = self.plan
         services = {
             part.name: Service(pid=part.process.pid, address=part.address)
@@ -126,7 +126,7 @@ class _Supervisor:
         )
 
     def end(self) -> None:
-        """End everything, last first: what runs ends before the server that it reports to."""
+        """End all parts in reverse order: runs end before the server that they report to."""
         for part in reversed(self.parts):
             process, part.process = part.process, None
             if process is None:
@@ -163,13 +163,13 @@ def serve(plan: ServePlan, secrets: Secrets, ready: Callable[[], None], tell: Te
     """Serve a project until SIGINT or SIGTERM.
 
     Args:
-        plan: what is served, and how.
-        secrets: what its parts keep from everybody else.
-        ready: called when everything answers.
-        tell: takes lines for whoever started this.
+        plan: the served project and its options.
+        secrets: secrets of its parts.
+        ready: called when all parts answer.
+        tell: receives lines for the operator.
 
     Raises:
-        UsageError: the project is served already, or a port is taken.
+        UsageError: the project is already served, or a port is taken.
         WorldposeError: a part does not answer in time.
     """
     Store.create(plan.project)
@@ -199,19 +199,19 @@ def serve(plan: ServePlan, secrets: Secrets, ready: Callable[[], None], tell: Te
 
 
 def bound_log(log: Path) -> None:
-    """Set a log that is too long aside, in place of the one before.
+    """Move a log that is too long aside, replacing the previous one.
 
-    Its process goes on writing to the same file, which it appends to, from the beginning.
+    Its process keeps the file open in append mode, and continues at its start.
     """
     if not log.exists() or log.stat().st_size <= LOG_BYTES:
         return
-    with suppress(OSError):  # on a full disk it is the log that makes room
+    with suppress(OSError):  # on a full disk the log frees space
         shutil.copyfile(log, log.with_suffix(".log.1"))
     os.truncate(log, 0)
 
 
 def answers(address: str) -> bool:
-    """Does a server of ours answer at `address` within seconds."""
+    """Return whether one of our servers answers at `address` within seconds."""
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     try:
         with opener.open(address, timeout=5) as answer:
@@ -221,7 +221,7 @@ def answers(address: str) -> bool:
 
 
 def health_addresses(plan: ServePlan) -> Mapping[str, str]:
-    """Part to the address at which it says that it is well."""
+    """Return the health check address of each part."""
     local = "127.0.0.1" if plan.host in ("0.0.0.0", "::") else plan.host
     return {
         "prefect": f"{plan.prefect}/health",
@@ -262,7 +262,7 @@ def _bring_up(supervisor: _Supervisor, told: threading.Event) -> None:
 
 
 def _is_at_work(serving: Serving, login: str | None) -> bool:
-    """Whether runs are taken; that one of them hangs is another matter."""
+    """Return whether a worker takes runs; a hanging run is handled elsewhere."""
     findings = at_prefect(serving, login)
     return all(finding.is_well for finding in findings if finding.part != "runs")
 
@@ -282,7 +282,7 @@ def _wait_for(
 
 
 def environment_of(plan: ServePlan) -> dict[str, str]:
-    """What every part of a served project has in its environment; secrets are not among it."""
+    """Return the environment of all parts of a served project; it contains no secrets."""
     home = plan.state / "prefect" if plan.owns_prefect else None
     values = served_environment(plan.prefect, home)
     workers = plan.workers or max(1, (os.cpu_count() or 1) // plan.max_concurrent)
@@ -298,7 +298,7 @@ def environment_of(plan: ServePlan) -> dict[str, str]:
 
 @contextmanager
 def _until_told() -> Iterator[threading.Event]:
-    """An event that is set by SIGINT and SIGTERM inside the block."""
+    """Yield an event that SIGINT and SIGTERM set inside the block."""
     told = threading.Event()
 
     def end(number: int, frame: FrameType | None) -> None:

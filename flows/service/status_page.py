@@ -1,4 +1,4 @@
-"""The status page: matches by stages at a glance, by camera and clip, with times and figures."""
+"""Status page: matches by stage, camera and clip, with times and metrics."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ summary { cursor: pointer; }
   a { color: #7cc4f5; }
 }
 """
-"""Colours that the colour-blind tell apart; each state is also said in words."""
+"""Colours that are distinct for colour-blind readers; each state is also given as text."""
 
 
 def routes(desk: Desk) -> APIRouter:
-    """Routes of the status page, and of what it shows as JSON."""
+    """Create the routes of the status page, and of its JSON."""
     router = APIRouter()
     overview = Overview(desk.store)
 
@@ -77,12 +77,12 @@ def routes(desk: Desk) -> APIRouter:
 
 
 def status_html(matches: Sequence[MatchStatus], arrivals: Iterable[Arrival], dashboard: str) -> str:
-    """The page; every name and message is escaped.
+    """Render the page; every name and message is escaped.
 
     Args:
         matches: all matches.
-        arrivals: what is known of the inbox.
-        dashboard: address of Prefect's pages; empty where none is known.
+        arrivals: state of the inbox.
+        dashboard: address of Prefect's dashboard; empty if unknown.
     """
     arrived = {each.match_id: each for each in arrivals if each.match_id}
     seen = {stage for match in matches for stage in match.stages}
@@ -131,7 +131,7 @@ def _row(
 
 
 def _cell(units: Sequence[UnitGlance]) -> str:
-    """One stage of a match: the worst state of its units, how many are done, how long it took."""
+    """Render one stage of a match: the worst unit state, units done, computation time."""
     if not units:
         return "<td></td>"
     counts = Counter(unit.state for unit in units)
@@ -146,7 +146,7 @@ def _cell(units: Sequence[UnitGlance]) -> str:
 
 
 def _details(match: MatchStatus) -> str:
-    """Every camera and clip of a match, stage by stage."""
+    """Render every camera and clip of a match, stage by stage."""
     rows = "".join(
         f"<tr><td>{escape(stage.replace('_', ' '))}</td><td>{escape(unit.unit)}</td>"
         f'<td class="{unit.state}">{unit.state}</td>'

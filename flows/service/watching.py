@@ -1,4 +1,4 @@
-"""What is looked at all the time while a project is served."""
+"""Periodic checks while a project is served."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ from flows.service.service_secrets import METRICS_TOKEN
 from worldpose.store import Store
 
 INBOX_SECONDS: Final = 2.0
-"""Between two looks at the inbox; longer where one look takes long."""
+"""Between two scans of the inbox; longer if a scan takes long."""
 BUCKET_SECONDS: Final = 10.0
-"""Between two looks at an inbox in object storage."""
+"""Between two scans of an inbox in object storage."""
 ALERT_SECONDS: Final = 30.0
-"""Between two looks for alerts and lost runs."""
+"""Between two checks for alerts and lost runs."""
 DELIVERY_SECONDS: Final = 2.0
-"""Between two looks of a sender for alerts that it has not taken."""
+"""Between two checks of a sender for outstanding alerts."""
 TROUBLE_SECONDS: Final = 3600.0
-"""Between two log lines about a failure that lasts."""
+"""Between two log lines about a lasting failure."""
 TROUBLE_LENGTH: Final = 500
-"""Of such a line."""
+"""Maximum length of such a line."""
 FAILED_DAYS: Final = 7
-"""A failed run is no alert any more after so long."""
+"""After so long, a failed run raises no alert."""
 
 LOG = logging.getLogger("worldpose.operations")
 
@@ -65,7 +65,7 @@ def watch(plan: ServePlan) -> None:
 
 async def _watch(plan: ServePlan, store: Store) -> None:
     teller = AlertDispatcher(plan.state_folder, senders_of(os.environ))
-    await asyncio.gather(  # each at its own pace: none waits for what another waits for
+    await asyncio.gather(  # each at its own interval: none blocks another
         _watch_bucket(plan),
         _watch_inbox(plan),
         _begin_lost_runs_again(plan),
@@ -75,10 +75,10 @@ async def _watch(plan: ServePlan, store: Store) -> None:
 
 
 class Trouble:
-    """Something that is done again and again: a failure that lasts is said once, then hourly.
+    """Failure log of a repeated operation: a lasting failure is logged once, then hourly.
 
     Attributes:
-        what: is done, in words.
+        what: name of the operation.
     """
 
     def __init__(self, what: str) -> None:
@@ -88,7 +88,7 @@ class Trouble:
 
     @contextmanager
     def told(self) -> Iterator[None]:
-        """A block whose failure is logged, on one line, and goes no further."""
+        """Log a failure of the block on one line, and suppress it."""
         try:
             yield
         except Exception as error:
@@ -107,7 +107,7 @@ class Trouble:
 async def _watch_bucket(plan: ServePlan) -> None:
     if plan.bucket is None:
         return
-    from flows.service.bucket import BucketInbox  # late: object storage is an extra
+    from flows.service.bucket import BucketInbox  # imported here: object storage is an extra
 
     bucket = BucketInbox(plan.bucket, plan.inbox, plan.state_folder)
     trouble = Trouble("looking at the bucket")
@@ -132,7 +132,7 @@ async def _watch_inbox(plan: ServePlan) -> None:
 
 
 async def _ingest(plan: ServePlan, ready: list[str]) -> None:
-    """Have arrivals taken in now; asked twice for the same ones, there is one run."""
+    """Start the intake of arrivals now; a second call for the same ones starts no second run."""
     key = hashlib.sha256("\n".join(sorted(ready)).encode()).hexdigest()[:16]
     await arun_deployment(
         plan.ingest_deployment, timeout=0, as_subflow=False, idempotency_key=f"arrived-{key}"
@@ -163,7 +163,7 @@ async def _watch_alerts(plan: ServePlan, store: Store, teller: AlertDispatcher) 
 
 
 async def _deliver(teller: AlertDispatcher, sender: Sender) -> None:
-    """Hand alerts to one sender, in a thread of its own: however long it takes, nobody waits."""
+    """Deliver alerts to one sender in its own thread, so that a slow sender delays no other."""
     pool = ThreadPoolExecutor(1, thread_name_prefix=sender.name)
     while True:
         await asyncio.sleep(DELIVERY_SECONDS)
@@ -171,7 +171,7 @@ async def _deliver(teller: AlertDispatcher, sender: Sender) -> None:
 
 
 async def failed_runs(plan: ServePlan) -> list[FailedRun]:
-    """Runs of this project's deployments that ended badly and do not begin again."""
+    """Return failed runs of this project's deployments that are not restarted."""
     bad = FlowRunFilterStateType(any_=[StateType.FAILED, StateType.CRASHED])
     since = FlowRunFilterEndTime(after_=datetime.now(UTC) - timedelta(days=FAILED_DAYS))
     async with get_client() as client:

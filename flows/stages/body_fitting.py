@@ -1,4 +1,4 @@
-"""Stage `body_fitting`: one unit a clip, from its triangulated joints (S1-S3)."""
+"""Stage `body_fitting`: one unit per clip, from its triangulated joints (S1-S3)."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from worldpose.body_fitting import BodyFittingSettings
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Where everybody's joints are, and what each camera saw of whom."""
+    """Return the results with triangulated joints, and with every camera's tracked detections."""
     seen = detection.seen_by_cameras(match, unit)
     return (*seen, "bundle_adjustment/cameras", f"tracking/{unit}", f"retriangulation/{unit}")
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The clip, the clock, the order of the cameras, and the pitch under the feet."""
+    """Return the clip, the clock, the camera order, and the pitch that bounds the feet."""
     pitch = match.folder.pitch
     return {
         **tracking.clip_sources(match, unit),
@@ -26,7 +26,7 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
 
 
 def outside(settings: BodyFittingSettings) -> dict[str, JsonValue]:
-    """The content of an installed body model; the open body is part of the code."""
+    """Return the digest of an installed body model; the open body is part of the code."""
     if settings.body_model == OPEN_BODY:
         return {"body_model_sha256": None}
     return {"body_model_sha256": digest_of_body(settings.body_model)}

@@ -1,4 +1,4 @@
-"""Stage `broadcast_calibration`: one unit a clip whose key frames were clicked (M1-M6)."""
+"""Stage `broadcast_calibration`: one unit per clip with clicked key frames (M1-M6)."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from worldpose.ingest.annotations import key_frames_file
 
 @once_a_match
 def units(match: Match) -> tuple[str, ...]:
-    """Clips with a broadcast video in which somebody clicked key frames."""
+    """Return the clips with a broadcast video and clicked key frames."""
     folder = match.folder
     clips = (clip.id for clip in folder.spec.clips if clip.broadcast is not None)
     return tuple(clip for clip in clips if clip in folder.key_frames and clip in folder.videos)
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """The fitted people, and whom the broadcast camera saw."""
+    """Return the results with fitted people, and with the broadcast camera's detections."""
     return (*detection.seen_in_broadcast(match, unit), f"body_fitting/{unit}")
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The video, how its frames lie on the match's clock, the key frames and the pitch.
+    """Return the video, its frame mapping to match time, the key frames and the pitch.
 
-    Clicks are listed under the file's name, frame by frame and marking by marking, so that a
-    difference of two runs names the file, the frame and the point.
+    Clicks are listed under the file's name, by frame and marking, so that a difference between two
+    runs names the file, the frame and the point.
     """
     folder = match.folder
     video = folder.videos[unit]

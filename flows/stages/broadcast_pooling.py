@@ -1,4 +1,4 @@
-"""Stage `broadcast_pooling`: one unit a clip whose broadcast camera filmed others too (M1)."""
+"""Stage `broadcast_pooling`: one unit per clip whose broadcast camera filmed other clips (M1)."""
 
 from __future__ import annotations
 
@@ -10,34 +10,34 @@ from flows.stages import broadcast_calibration
 
 
 class BroadcastPoolingSettings(Record):
-    """None: whether the clips agree is a test of their own covariances."""
+    """No settings: the covariances of the clips decide whether their positions agree."""
 
 
 @once_a_match
 def units(match: Match) -> tuple[str, ...]:
-    """Clips whose camera is calibrated in another clip too."""
+    """Return the clips whose camera is also calibrated in another clip."""
     clips = broadcast_calibration.units(match)
     return tuple(clip for clip in clips if len(_same_camera(match, clip)) > 1)
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """The camera in all its clips."""
+    """Return the camera's results in all its clips."""
     return tuple(f"broadcast_calibration/{clip}" for clip in _same_camera(match, unit))
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The clips' order."""
+    """Return the order of the clips."""
     return {"clips": list(_same_camera(match, unit))}
 
 
 def _same_camera(match: Match, unit: str) -> tuple[str, ...]:
-    """Calibrated clips of a clip's broadcast camera, itself among them."""
+    """Return the calibrated clips of a clip's broadcast camera, including the clip."""
     return _clips_of_cameras(match)[match.folder.spec.clip(unit).broadcast]
 
 
 @once_a_match
 def _clips_of_cameras(match: Match) -> dict[str | None, tuple[str, ...]]:
-    """The calibrated clips of every broadcast camera."""
+    """Return the calibrated clips of every broadcast camera."""
     found: dict[str | None, tuple[str, ...]] = {}
     for clip in broadcast_calibration.units(match):
         camera = match.folder.spec.clip(clip).broadcast

@@ -1,4 +1,4 @@
-"""Stage `bundle_adjustment`: one unit a match, all its static cameras and clips (B1-B3)."""
+"""Stage `bundle_adjustment`: one unit per match, all its static cameras and clips (B1-B3)."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from worldpose.bundle_adjustment import BundleAdjustmentSettings
 
 
 def units(match: Match) -> tuple[str, ...]:
-    """The cameras together: they stand still, so that every clip tells of the same ones."""
+    """Return one unit for all cameras: they do not move, so every clip constrains the same ones."""
     return ("cameras",)
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Every static camera, whom it saw, and who is where in every clip."""
+    """Return every static camera, its detections, and the tracks of every clip."""
     clips = tracking.units(match)
     people = [f"{stage}/{clip}" for stage in ("tracking", "triangulation") for clip in clips]
     seen = {name: None for clip in clips for name in tracking.camera_inputs(match, clip)}
@@ -23,19 +23,19 @@ def inputs(match: Match, unit: str) -> tuple[str, ...]:
 
 
 def again(match: Match, unit: str) -> tuple[str, ...]:
-    """What the bodies contradicted of every clip's detections."""
+    """Return the filtering results of every clip: keypoints that the bodies rejected."""
     return tuple(name for clip in tracking.units(match) for name in tracking.filtered(match, clip))
 
 
 def later(match: Match, unit: str) -> tuple[str, ...]:
-    """Whom all cameras show besides those who were detected, in every clip."""
+    """Return the redetection results of all cameras in every clip."""
     return tuple(
         name for clip in tracking.units(match) for name in tracking.found_again(match, clip)
     )
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The clips, the clock, the order of the cameras, and the pitch that clicked points are of."""
+    """Return the clips, the clock, the camera order, and the pitch that clicked points refer to."""
     spec, pitch = match.folder.spec, match.folder.pitch
     return {
         "cameras": [camera.id for camera in spec.static_cameras],

@@ -1,4 +1,4 @@
-"""Stage `camera_consistency`: one unit a clip, from all static cameras and their detections."""
+"""Stage `camera_consistency`: one unit per clip, from all static cameras and their detections."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from worldpose.camera_consistency import ConsistencySettings
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The clip, whether it has a pitch, and the stated offsets of the cameras."""
+    """Return the clip, whether it has a pitch, and the stated clock offsets of the cameras."""
     spec = match.folder.spec
     return {
         **tracking.clip_sources(match, unit),

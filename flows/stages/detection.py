@@ -1,4 +1,4 @@
-"""Stage `detection`: people in videos; one unit a clip and camera that brought none (D1-D5)."""
+"""Stage `detection`: people in videos; one unit per clip and camera without 2D poses (D1-D5)."""
 
 from __future__ import annotations
 
@@ -12,45 +12,45 @@ from worldpose.detection import DetectionSettings, weights_of
 
 
 def seen_by(match: Match, camera_id: str, clip_id: str) -> str:
-    """The result with the people whom a static camera sees in a clip, given or detected."""
+    """Return the result with a static camera's detections in a clip, given or detected."""
     if camera_id in match.folder.detections:
         return f"ingest/{camera_id}"
     return f"detection/{detection_unit(camera_id, clip_id)}"
 
 
 def seen_by_cameras(match: Match, clip_id: str) -> tuple[str, ...]:
-    """The same of every static camera, in order."""
+    """Return `seen_by` of every static camera, in order."""
     cameras = match.folder.spec.static_cameras
     return tuple(seen_by(match, camera.id, clip_id) for camera in cameras)
 
 
 def again(match: Match, camera_id: str, clip_id: str) -> tuple[str, ...]:
-    """The result with those whom a camera's video shows when they are looked for again, if any."""
+    """Return the result with a camera's redetected people, if its video is searched again."""
     name = again_of(seen_by(match, camera_id, clip_id))
     return (name,) if name else ()
 
 
 def again_by_cameras(match: Match, clip_id: str) -> tuple[str, ...]:
-    """The same of every static camera, in order."""
+    """Return `again` of every static camera, in order."""
     cameras = match.folder.spec.static_cameras
     return tuple(name for camera in cameras for name in again(match, camera.id, clip_id))
 
 
 def seen_in_broadcast(match: Match, clip_id: str) -> tuple[str, ...]:
-    """The result with the people whom a clip's broadcast camera sees, where there is one."""
+    """Return the result with the detections of a clip's broadcast camera, if there is one."""
     if clip_id in match.folder.detections:
         return (f"ingest/{clip_id}",)
     return (f"detection/{clip_id}",) if clip_id in _units(match) else ()
 
 
 def units(match: Match) -> tuple[str, ...]:
-    """`camera.clip` of static cameras without given 2D poses, then broadcast clips without them."""
+    """Return `camera.clip` of static cameras without 2D poses, then such broadcast clips."""
     return tuple(_units(match))
 
 
 @once_a_match
 def _units(match: Match) -> dict[str, tuple[str, str]]:
-    """The unit of `ingest` and the clip of each unit."""
+    """Return the unit of `ingest` and the clip of each unit."""
     folder = match.folder
     static = {camera.id for camera in folder.spec.static_cameras}
     found = [unit for unit in ingest.units(match) if unit not in folder.detections]
@@ -63,7 +63,7 @@ def _units(match: Match) -> dict[str, tuple[str, str]]:
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """The index of the video, and the camera, which tells players from crowd."""
+    """Return the index of the video, and the camera, which separates players from the crowd."""
     footage, _ = _units(match)[unit]
     return tuple(f"{stage}/{footage}" for stage in _stages(match, footage))
 
@@ -75,7 +75,7 @@ def _stages(match: Match, footage: str) -> tuple[str, ...]:
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The video, the clip, the pitch around which the crowd sits, and what people corrected."""
+    """Return the video, the clip, the pitch that separates the crowd, and people's corrections."""
     footage, clip_id = _units(match)[unit]
     clip, pitch = match.folder.spec.clip(clip_id), match.folder.pitch
     known = len(_stages(match, footage)) > 1
@@ -92,7 +92,7 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
 
 
 def outside(settings: DetectionSettings) -> dict[str, JsonValue]:
-    """What the named weights hold, and the libraries that compute them."""
+    """Return digests of the named weights, and versions of the libraries that run them."""
     return {"weights": dict(weights_of(settings))}
 
 

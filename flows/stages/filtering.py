@@ -1,4 +1,4 @@
-"""Stage `filtering`: one unit a clip, its detections beside its bodies (R2)."""
+"""Stage `filtering`: one unit per clip, comparing its detections with its bodies (R2)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from worldpose.filtering import FilteringSettings
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """The bodies as they were fitted last, the cameras, whom they saw, and who was who."""
+    """Return the last fitted bodies, the cameras, their detections, and the tracks."""
     bodies = "refitting" if unit in refitting.units(match) else "body_fitting"
     seen = detection.seen_by_cameras(match, unit)
     people = (f"tracking/{unit}", f"retriangulation/{unit}", f"{bodies}/{unit}")

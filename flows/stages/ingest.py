@@ -1,6 +1,6 @@
-"""Stage `ingest`: one unit a static camera, and one a broadcast clip whose people are to be seen.
+"""Stage `ingest`: one unit per static camera, and one per broadcast clip that needs detections.
 
-A unit brings in given 2D poses, or else the index of its video, in which `detection` finds people.
+A unit reads given 2D poses, or else indexes its video, in which `detection` finds people.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ _EDITS = TypeAdapter(list[DetectionEdit])
 
 
 class IngestSettings(Record):
-    """`ingest` takes what it is given; it has no settings."""
+    """No settings: `ingest` reads its inputs as given."""
 
 
 @once_a_match
 def units(match: Match) -> tuple[str, ...]:
-    """Static cameras in order, then broadcast clips with 2D poses, or with a video and clicks.
+    """Return static cameras in order, then broadcast clips with 2D poses, or with video and clicks.
 
-    A clip without key frames has no use for the people that its broadcast camera sees.
+    A clip without key frames does not use the detections of its broadcast camera.
     """
     folder = match.folder
     return (
@@ -39,14 +39,14 @@ def units(match: Match) -> tuple[str, ...]:
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Nothing: `ingest` is the first stage."""
+    """Return nothing: `ingest` is the first stage."""
     return ()
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The unit's detections or else its video, and how its frames lie on the match's clock.
+    """Return the unit's detections or else its video, and its frame mapping to match time.
 
-    With what people corrected of given detections; the key of others knows nothing of that.
+    Corrections of given detections are included; without them the key is unchanged.
     """
     folder = match.folder
     frames = unit_frames(folder.spec, unit)
@@ -68,7 +68,7 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
 
 
 def edits_of(match: Match, camera: str, first: int = 0, count: int = 2**62) -> dict[str, JsonValue]:
-    """What people corrected of whom a camera saw in some frames; nothing where they did not."""
+    """Return a camera's detection corrections in a frame range; empty if there are none."""
     edits = edits_by_camera(match).get(camera, ())
     said = [edit for edit in edits if first <= edit.frame < first + count]
     return {"edits": _EDITS.dump_python(said, mode="json")} if said else {}
@@ -76,7 +76,7 @@ def edits_of(match: Match, camera: str, first: int = 0, count: int = 2**62) -> d
 
 @once_a_match
 def edits_by_camera(match: Match) -> dict[str, list[DetectionEdit]]:
-    """Return the corrections of detections of each camera, in the order they were made."""
+    """Return each camera's detection corrections, in the order of their creation."""
     found: dict[str, list[DetectionEdit]] = {}
     for correction in match.corrections:
         edit = correction.edit
@@ -86,7 +86,7 @@ def edits_by_camera(match: Match) -> dict[str, list[DetectionEdit]]:
 
 
 def video_sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The unit's video, what is taken from it, and what it must be."""
+    """Return the unit's video, its selected frames, and its required properties."""
     folder = match.folder
     path = folder.videos[unit].relative_to(folder.folder).as_posix()
     return {

@@ -1,4 +1,4 @@
-"""Stage `redetection`: in the second iteration and later, one unit a video's clip (R2)."""
+"""Stage `redetection`: from the second iteration on, one unit per video and clip (R2)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from worldpose.redetection import RedetectionSettings
 
 @once_a_match
 def _units(match: Match) -> dict[str, tuple[str, str]]:
-    """The static camera and the clip of each unit: those with people found in a video."""
+    """Return the static camera and the clip of each unit: those with detections from a video."""
     spec = match.folder.spec
     return {
         detection_unit(camera.id, clip.id): (camera.id, clip.id)
@@ -25,18 +25,18 @@ def _units(match: Match) -> dict[str, tuple[str, str]]:
 
 
 def units(match: Match) -> tuple[str, ...]:
-    """`camera.clip` of static cameras without given 2D poses."""
+    """Return `camera.clip` of static cameras without given 2D poses."""
     return tuple(_units(match))
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """The index of the video, and who was detected."""
+    """Return the index of the video, and the detections."""
     camera, clip = _units(match)[unit]
     return (f"ingest/{camera}", detection.seen_by(match, camera, clip))
 
 
 def again(match: Match, unit: str) -> tuple[str, ...]:
-    """The adjusted cameras, the bodies as they were fitted last, and what these said."""
+    """Return the adjusted cameras, the last fitted bodies, and the filtering results."""
     _, clip = _units(match)[unit]
     bodies = "refitting" if clip in refitting.units(match) else "body_fitting"
     stages = ("tracking", "triangulation", "retriangulation", bodies, "filtering")
@@ -44,17 +44,17 @@ def again(match: Match, unit: str) -> tuple[str, ...]:
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """Which camera and clip; all else comes with `detection`."""
+    """Return camera and clip; `detection` has all other sources."""
     camera, clip = _units(match)[unit]
     return {"camera": camera, "clip": clip}
 
 
 def seen_in(run: Container[str], match: Match, camera_id: str, clip_id: str) -> str:
-    """The result with all whom a run took a static camera to show in a clip.
+    """Return the result with all of a static camera's people in a clip that a run used.
 
     Args:
-        run: names of its results, as `stage/unit`.
-        match: it is of.
+        run: names of the run's results, as `stage/unit`.
+        match: the match.
         camera_id: a static camera.
         clip_id: a clip.
     """

@@ -1,4 +1,4 @@
-"""Stage `refitting`: one unit a clip that a broadcast camera or other clips tell of (S1, S4)."""
+"""Stage `refitting`: one unit per clip with broadcast detections or shared players (S1, S4)."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from worldpose.ingest import unit_frames
 
 
 class RefittingSettings(Record):
-    """None of its own: bodies are fitted again as `body_fitting` fitted them."""
+    """No settings of its own: bodies are refitted with the settings of `body_fitting`."""
 
 
 @once_a_match
 def units(match: Match) -> tuple[str, ...]:
-    """Clips whose calibrated broadcast camera saw people, and those with people of other clips."""
+    """Return clips with broadcast camera and detections, and those with players of other clips."""
     clips = (clip.id for clip in match.folder.spec.clips)
     return tuple(clip for clip in clips if _is_broadcast(match, clip) or _namesakes(match, clip))
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """What the bodies were made from, these, the broadcast camera, and shapes of other clips."""
+    """Return `body_fitting`, its inputs, the broadcast camera, and other clips' shapes."""
     names = [*body_fitting.inputs(match, unit), f"body_fitting/{unit}"]
     if _is_broadcast(match, unit):
         names += [f"broadcast_calibration/{unit}", *detection.seen_in_broadcast(match, unit)]
@@ -32,7 +32,7 @@ def inputs(match: Match, unit: str) -> tuple[str, ...]:
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The clip, estimates from the broadcast video and its clock, and who is who."""
+    """Return the clip, monocular poses of the broadcast video, its clock, and the identities."""
     folder = match.folder
     clip = folder.spec.clip(unit)
     file = folder.estimates.get(unit) if _is_broadcast(match, unit) else None
@@ -53,13 +53,13 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
 
 
 def _is_broadcast(match: Match, unit: str) -> bool:
-    """Whether a broadcast camera is calibrated, and people found in its pictures."""
+    """Return whether a broadcast camera is calibrated, and has detections."""
     seen = detection.seen_in_broadcast(match, unit)
     return bool(seen) and unit in broadcast_calibration.units(match)
 
 
 def _namesakes(match: Match, unit: str) -> dict[str, dict[int, str]]:
-    """The people of a clip in other clips: clip to their person ids and names there."""
+    """Return a clip's players in other clips: clip to their person ids and names there."""
     clips = match.folder.spec.clips
     here = set(match.folder.spec.clip(unit).people.values())
     there = {

@@ -1,4 +1,4 @@
-"""Stage `retriangulation`: one unit a clip, its joints placed again by adjusted cameras (B2)."""
+"""Stage `retriangulation`: one unit per clip, its joints triangulated by adjusted cameras (B2)."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from flows.stages import detection, tracking
 
 
 class RetriangulationSettings(Record):
-    """None of its own: joints are placed again as `triangulation` placed them."""
+    """No settings of its own: joints are triangulated with the settings of `triangulation`."""
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """The cameras, whom they saw, who is who, and how it was triangulated before."""
+    """Return the cameras, their detections, the tracks, and the first triangulation."""
     seen = detection.seen_by_cameras(match, unit)
     return (*seen, "bundle_adjustment/cameras", f"tracking/{unit}", f"triangulation/{unit}")
 

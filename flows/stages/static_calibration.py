@@ -1,4 +1,4 @@
-"""Stage `static_calibration`: one unit a static camera, given or calibrated from clicks (C1-C5)."""
+"""Stage `static_calibration`: one unit per static camera, given or from clicks (C1-C5)."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from worldpose.static_calibration import StaticCalibrationSettings
 
 
 def units(match: Match) -> tuple[str, ...]:
-    """The static cameras in order."""
+    """Return the static cameras in order."""
     return tuple(camera.id for camera in match.folder.spec.static_cameras)
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Nothing: a camera comes from what people gave or clicked, never from detections."""
+    """Return nothing: a camera comes from given files or clicks, never from detections."""
     return ()
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The given calibration alone, or else the clicks, the pitch and a picture of this camera.
+    """Return the given calibration alone, or else the clicks, the pitch and an image of the camera.
 
-    Clicks are listed under the file's name, marking by marking, so that a difference of two runs
-    names the file and the point.
+    Clicks are listed under the file's name, by marking, so that a difference between two runs names
+    the file and the point.
     """
     folder = match.folder
     camera = folder.spec.camera(unit)
     given = folder.calibrations.get(unit)
     if given is not None:
         return {"calibration": given.model_dump(mode="json")}
-    clicked = folder.clicked[unit]  # registering a match makes sure of one of the two
+    clicked = folder.clicked[unit]  # registration ensures one of the two
     still = folder.stills.get(unit)
     path = None if still is None else still.relative_to(folder.folder).as_posix()
     return {
@@ -54,7 +54,7 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
 
 
 def _filmed(match: Match, unit: str) -> dict[str, JsonValue] | None:
-    """The camera's video, out of which a still without people is made where none is given."""
+    """Return the camera's video, for a still without people if none is given."""
     if unit not in match.folder.videos:
         return None
     offset = unit_frames(match.folder.spec, unit).offset

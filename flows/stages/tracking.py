@@ -1,4 +1,4 @@
-"""Stage `tracking`: one unit a clip, from all static cameras (T1, T2)."""
+"""Stage `tracking`: one unit per clip, from all static cameras (T1, T2)."""
 
 from __future__ import annotations
 
@@ -12,43 +12,43 @@ from worldpose.review.identities import IDENTITY_EDITS
 from worldpose.tracking import TrackingSettings, people_allowed
 
 MIN_CAMERAS: Final = 2
-"""Static cameras from which people can be placed [1]."""
+"""Minimum number of static cameras for triangulation [1]."""
 
 
 def units(match: Match) -> tuple[str, ...]:
-    """The clips."""
+    """Return the clips."""
     return tuple(clip.id for clip in match.folder.spec.clips)
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Every static camera, and whom it saw in the clip."""
+    """Return every static camera, and its detections in the clip."""
     return camera_inputs(match, unit)
 
 
 def again(match: Match, unit: str) -> tuple[str, ...]:
-    """Cameras that agree with people (C6), and what the bodies contradicted (R2)."""
+    """Return cameras adjusted to people (C6), and the filtering results (R2)."""
     return ("bundle_adjustment/cameras", *filtered(match, unit))
 
 
 def filtered(match: Match, unit: str) -> tuple[str, ...]:
-    """What the bodies contradicted of the clip's detections."""
+    """Return the filtering results of the clip's detections."""
     return (f"filtering/{unit}",)
 
 
 def found_again(match: Match, unit: str) -> tuple[str, ...]:
-    """Whom the clip's cameras show besides those who were detected."""
+    """Return the redetection results of the clip's cameras."""
     return detection.again_by_cameras(match, unit)
 
 
 def camera_inputs(match: Match, clip_id: str) -> tuple[str, ...]:
-    """Every static camera, and whom it saw in a clip."""
+    """Return every static camera, and its detections in a clip."""
     cameras = [camera.id for camera in match.folder.spec.static_cameras]
     known = (f"static_calibration/{camera}" for camera in cameras)
     return (*detection.seen_by_cameras(match, clip_id), *known)
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The clip, its pitch, how many people the roster allows, and what people said of who is who.
+    """Return the clip, its pitch, the roster size, and identity corrections.
 
     Without such corrections the key is the tracker's alone.
     """
@@ -67,7 +67,7 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
 
 
 def clip_sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """The clip's place in the match, the clock, the cameras in order, and whom each saw."""
+    """Return the clip's frames, the clock, the cameras in order, and their detections."""
     spec = match.folder.spec
     clip = spec.clip(unit)
     return {

@@ -1,4 +1,4 @@
-"""Stage `triangulation`: one unit a clip, from its tracks and all static cameras (T3, T4)."""
+"""Stage `triangulation`: one unit per clip, from its tracks and all static cameras (T3, T4)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from worldpose.triangulation import TriangulationSettings
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Every static camera, what it brought in, and who is who."""
+    """Return every static camera, its detections, and the tracks."""
     return (*tracking.inputs(match, unit), f"tracking/{unit}")
 
 

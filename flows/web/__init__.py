@@ -1,6 +1,6 @@
-"""Pages for people in the loop, served to browsers.
+"""Review pages, served to browsers.
 
-Input: a project, whose journals keep all that is said. Output: a server; `flows.web.app` makes
-it, and its other modules are one concern each. The pages themselves are built in
+Input: a project, whose journals record all decisions. Output: a server; `flows.web.app` creates
+it, and its other modules have one concern each. The pages themselves are built in
 `infra/review_pages`.
 """

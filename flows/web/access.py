@@ -1,4 +1,4 @@
-"""Who may use the pages: a token to log in with, signed sessions, and a secret for each session."""
+"""Access to the pages: a login token, signed sessions, and a form secret per session."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from worldpose.errors import UsageError
 SESSION_SECONDS: Final = 12 * 3600
 """A working day; after it, people log in again."""
 TOKEN_LENGTH: Final = 16
-"""Fewest characters of a token that somebody chose."""
+"""Minimum length of a chosen token [characters]."""
 NAME_LENGTH: Final = 80
-"""Most characters of a person's name."""
+"""Maximum length of a person's name [characters]."""
 WRONG_TOKENS: Final = 5
-"""Wrong tokens from one address within `WRONG_SECONDS`; after them none is looked at."""
+"""Wrong tokens from one address within `WRONG_SECONDS`; further ones are refused unchecked."""
 WRONG_SECONDS: Final = 10.0
 MOST_REMEMBERED: Final = 10_000
 """Wrong tokens and ended sessions that are remembered, the latest."""
@@ -31,17 +31,17 @@ MOST_REMEMBERED: Final = 10_000
 
 @dataclass(frozen=True)
 class Access:
-    """What lets people in.
+    """Login token and sessions of the pages.
 
-    Sessions are signed with a key made from the token: they outlive the server's process where the
-    token does, and end for all when it changes. One that its person ended is refused until the
-    process ends.
+    Sessions are signed with a key derived from the token: they survive a restart of the server with
+    the same token, and all end when it changes. A session after logout is refused until the process
+    ends.
 
     Attributes:
-        token: what people log in with.
-        hosts: names under which browsers may ask for the server; any other is somebody else's
-            name that leads here.
-        secure: are pages served with TLS.
+        token: login token.
+        hosts: names under which browsers reach the server; any other name is a foreign one that
+            points here.
+        secure: whether pages are served with TLS.
     """
 
     token: str
@@ -53,18 +53,18 @@ class Access:
 
     @property
     def cookie(self) -> str:
-        """The session cookie's name: servers on one machine do not end each other's sessions."""
+        """Name of the session cookie: servers on one machine do not end each other's sessions."""
         return f"worldpose_review_{self._sign('cookie')[:8]}"
 
     def session(self, who: str, now: float | None = None) -> str:
-        """A new session of a person, as the cookie's value."""
+        """Return a new session of a person, as the cookie's value."""
         until = (time.time() if now is None else now) + SESSION_SECONDS
         content = json.dumps({"who": who, "until": until, "nonce": secrets.token_hex(8)})
         packed = base64.urlsafe_b64encode(content.encode()).decode().rstrip("=")
         return f"{packed}.{self._sign('session', packed)}"
 
     def person(self, session: str | None, now: float | None = None) -> str | None:
-        """Whose session a cookie's value is; None where it is forged, over or not there."""
+        """Return the person of a session cookie; None if it is forged, expired or missing."""
         packed, _, signature = (session or "").partition(".")
         if not self._same(signature, self._sign("session", packed)):
             return None
@@ -81,7 +81,7 @@ class Access:
                 self._ended.pop(next(iter(self._ended)))
 
     def may_try(self, address: str, now: float | None = None) -> bool:
-        """Whether a token from this address is looked at: it has not just sent many wrong ones."""
+        """Return whether to check a token from this address: not after many recent wrong ones."""
         since = (time.monotonic() if now is None else now) - WRONG_SECONDS
         with self._lock:
             self._wrong[:] = [each for each in self._wrong if each[0] > since][-MOST_REMEMBERED:]
@@ -93,15 +93,15 @@ class Access:
             self._wrong.append((time.monotonic() if now is None else now, address))
 
     def form_secret(self, session: str) -> str:
-        """What a page of this session sends along with everything that changes something."""
+        """Return the secret that a page of this session sends with every change."""
         return self._sign("form", session)
 
     def has_form_secret(self, session: str, given: str) -> bool:
-        """Is this the session's form secret; it takes as long to say no as yes."""
+        """Return whether this is the session's form secret, in constant time."""
         return self._same(given, self.form_secret(session))
 
     def has_token(self, given: str) -> bool:
-        """Is this the token; it takes as long to say no as yes."""
+        """Return whether this is the token, in constant time."""
         return self._same(given, self.token)
 
     def _sign(self, *parts: str) -> str:
@@ -109,22 +109,22 @@ class Access:
         return hmac.new(self.token.encode(), text, hashlib.sha256).hexdigest()
 
     def _same(self, given: str, right: str) -> bool:
-        # JSON can hold halves of characters, which have no bytes of their own.
+        # JSON strings can contain lone surrogates, which have no UTF-8 bytes.
         return hmac.compare_digest(given.encode("utf-8", "surrogatepass"), right.encode())
 
 
 def access_for(host: str, *, token: str | None, names: Iterable[str], secure: bool) -> Access:
-    """What lets people in where a server listens at `host`.
+    """Create the access control of a server that listens at `host`.
 
     Args:
         host: address to listen at.
-        token: chosen by somebody; None = a new one, which is said when the server starts.
+        token: chosen token; None = a random one, printed when the server starts.
         names: further names of the machine that browsers use.
-        secure: with TLS.
+        secure: whether TLS is used.
 
     Raises:
-        UsageError: the token is short, or the server would listen to other machines without one
-            that was chosen or without a name.
+        UsageError: the token is short, or the server would listen to other machines without a
+            chosen token or without a name.
     """
     if token is not None and len(token) < TOKEN_LENGTH:
         raise UsageError(

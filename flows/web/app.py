@@ -1,4 +1,4 @@
-"""The server of the review pages."""
+"""Server of the review pages."""
 
 from __future__ import annotations
 
@@ -39,10 +39,11 @@ TYPES: Final = {
 
 
 class Login(Record):
-    """What a person logs in with."""
+    """Login form."""
 
     who: str = Field(min_length=1, max_length=NAME_LENGTH)
-    """Kept with all that the person decides and corrects; printable, so that no log line breaks."""
+    """Recorded with all decisions and corrections of the person; printable, so that no log line
+    breaks."""
     token: str
     """As the server printed it, or as the operator chose it."""
 
@@ -55,14 +56,14 @@ class Login(Record):
 
 
 def create_app(project: str, access: Access) -> FastAPI:
-    """The server of a project's pages.
+    """Create the server of a project's pages.
 
     Args:
         project: folder or URL of the store.
-        access: who may use them.
+        access: access control.
 
     Raises:
-        InputError: no such project.
+        InputError: there is no such project.
     """
     desk = Desk(Store.open(project), access)
 
@@ -146,7 +147,7 @@ def _sessions(desk: Desk) -> APIRouter:
 
 
 def _files() -> APIRouter:
-    """The built pages, read once: what is asked for is looked up, never made into a path."""
+    """Serve the built pages, read once: requests are looked up, and never become paths."""
     router = APIRouter()
     folder = files("flows.web")
     served = {

@@ -1,4 +1,4 @@
-"""What all pages work on: the project, and who may."""
+"""Shared context of all pages: the project and access control."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from worldpose.store import Store
 
 @dataclass(frozen=True)
 class Desk:
-    """What all pages work on.
+    """Shared context of all pages.
 
     Attributes:
         store: the project.
-        access: who may.
-        continuing: the runs that people let go on from a page.
+        access: access control.
+        continuing: runs started or resumed from a page.
     """
 
     store: Store
@@ -32,7 +32,7 @@ class Desk:
         object.__setattr__(self, "continuing", Continuing(self.store))
 
     def match(self, name: str) -> Match:
-        """A registered match, as people have corrected it by now.
+        """Return a registered match with its current corrections.
 
         Raises:
             HTTPException: 404; a name from outside never becomes a path.
@@ -47,4 +47,4 @@ def _person(request: Request) -> str:
 
 
 Person = Annotated[str, Depends(_person)]
-"""Who asks: the guard let nobody else through."""
+"""Logged-in person: the guard refuses requests without one."""

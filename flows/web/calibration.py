@@ -1,4 +1,4 @@
-"""Clicking a picture: what is clicked, the picture, and the camera that the clicks make (C7)."""
+"""Clicking markings in an image: clicks, image, and the camera estimated from them (C7)."""
 
 from __future__ import annotations
 
@@ -28,30 +28,30 @@ from worldpose.static_calibration import StaticCalibrationSettings
 from worldpose.video import open_video
 
 KEPT: Final = 2
-"""Pictures that are kept decoded; a 4K one takes 25 MB."""
+"""Images that are kept decoded; a 4K one takes 25 MB."""
 _POINTS_ALONE: Final = StaticCalibrationSettings(lines=False)
 
 
 class Clicked(Record):
-    """Everything clicked in one picture, as the page has it."""
+    """All clicks in one image, as sent by the page."""
 
     points: dict[Name, Pixel] = Field(default={}, max_length=200)
-    """Name to place [px]."""
+    """Point name to position [px]."""
     drawn: dict[Name, tuple[Pixel, ...]] = Field(default={}, max_length=100)
-    """Name to places along it [px]."""
+    """Line name to positions along it [px]."""
     refine: bool = False
-    """Refine on the painted lines of the picture: seconds, not milliseconds."""
+    """Refine on the painted lines of the image: seconds, not milliseconds."""
 
 
 class Pictures:
-    """The pictures that people click in, the last ones decoded."""
+    """Cache of the last decoded images for clicking."""
 
     def __init__(self) -> None:
         self._decoded: OrderedDict[tuple[str, str, int | None], NDArray[np.uint8]] = OrderedDict()
         self._lock = Lock()
 
     def png(self, match: Match, owner: str, frame: int | None) -> bytes:
-        """One picture as a browser shows it.
+        """Return one image as PNG.
 
         Raises:
             HTTPException: 404, there is none.
@@ -59,13 +59,13 @@ class Pictures:
         still = match.folder.stills.get(owner)
         if frame is None and still is not None:
             return Path(still).read_bytes()
-        import cv2  # late: few pages open a picture
+        import cv2  # imported here: few pages decode an image
 
         picture = cv2.cvtColor(self.decoded(match, owner, frame), cv2.COLOR_RGB2BGR)
         return bytes(cv2.imencode(".png", picture)[1])
 
     def decoded(self, match: Match, owner: str, frame: int | None) -> NDArray[np.uint8]:
-        """One picture (height, width, 3), RGB.
+        """Return one image (height, width, 3), RGB.
 
         Raises:
             HTTPException: 404, there is none.
@@ -81,13 +81,13 @@ class Pictures:
 
 
 def routes(desk: Desk) -> APIRouter:
-    """Routes of one picture: of a static camera, or of a frame of a clip's broadcast camera."""
+    """Create the routes of one image: of a static camera, or of a frame of a broadcast camera."""
     router = APIRouter(prefix="/api/matches/{match_id}/pictures/{owner}")
     pictures = Pictures()
     drawings: dict[str, tuple[PitchDrawing, dict[str, tuple[int, int]]]] = {}
 
     def prepared(match_id: str) -> tuple[PitchDrawing, dict[str, tuple[int, int]]]:
-        """A match's pitch and picture sizes; another pitch would be another match."""
+        """Return a match's pitch and image sizes; both are fixed per match."""
         if match_id not in drawings:
             folder = desk.match(match_id).folder
             pitch = folder.pitch
@@ -174,9 +174,9 @@ def routes(desk: Desk) -> APIRouter:
 
 
 def warm_up(desk: Desk) -> None:
-    """Estimate one clicked camera, which loads kernels, and open all matches with their journals.
+    """Calibrate one clicked camera, which loads kernels, and open all matches with their journals.
 
-    So the first person to look waits for neither.
+    The first request then waits for neither.
     """
     is_warm = False
     for name in desk.store.matches():
@@ -190,9 +190,9 @@ def warm_up(desk: Desk) -> None:
             is_warm = True
             preview(drawing, clicked, (spec.width, spec.height), settings=_POINTS_ALONE)
         except (OSError, WorldposeError):
-            continue  # the queue says what is wrong with it
+            continue  # the queue shows its error
     gc.collect()
-    gc.freeze()  # looking through long journals for garbage would hold up requests
+    gc.freeze()  # collecting long journals as garbage would delay requests
 
 
 def _read(match: Match, owner: str, frame: int | None) -> NDArray[np.uint8]:
@@ -223,7 +223,7 @@ def _key_frames(match: Match, owner: str) -> list[int]:
 
 
 def _pitch(drawing: PitchDrawing) -> dict[str, Any]:
-    """The template as the small map shows it: names, places and shapes [m]."""
+    """Return the template for the small map: names, positions and shapes [m]."""
     template = drawing.template
     return {
         "length": template.length,
@@ -288,5 +288,5 @@ def _rounded(values: NDArray[np.float64], digits: int) -> Any:  # noqa: ANN401 -
 
 
 def _number(value: float) -> float | None:
-    """Four digits, or None for what could not be computed: JSON has no NaN."""
+    """Round to four digits; None for NaN and infinity, which JSON lacks."""
     return float(f"{value:.4g}") if np.isfinite(value) else None

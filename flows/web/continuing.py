@@ -1,4 +1,4 @@
-"""Runs that go on because somebody decided on a page."""
+"""Runs started or resumed from a page."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class _Run:
 
 @dataclass
 class Continuing:
-    """Runs that people let go on from a page: at most one a match, each in its own process.
+    """Runs started from a page: at most one per match, each in its own process.
 
-    A run outlives the pages' server; killed, it is found as any killed run is.
+    A run survives the end of the pages' server; a killed run is handled like any killed run.
 
     Attributes:
         store: the project.
@@ -42,18 +42,18 @@ class Continuing:
     _lock: Lock = field(default_factory=Lock)
 
     def go_on(self, match_id: str, gates: str | None = None) -> dict[str, Any]:
-        """Resume the match's suspended runs, or do what `worldpose run` does; tells which.
+        """Resume the match's suspended runs, or start `worldpose run`; return which of the two.
 
         Args:
             match_id: a registered match.
-            gates: policy of a match's first run; None = as the command line would take it.
+            gates: gate policy of a match's first run; None = the command line's default.
 
         Raises:
-            InputError: a suspended run whose questions are not all decided.
+            InputError: a suspended run has undecided reviews.
         """
         with self._lock:
             if self._at_work(match_id):
-                # It may have asked its questions already, and not take in what was answered.
+                # It can have created its review requests already, and miss new verdicts.
                 self._once_more.add(match_id)
                 return {"state": "running", "how": "once more when the run at work has ended"}
             if has_server():
@@ -64,7 +64,7 @@ class Continuing:
             return {"state": "running", "how": "worldpose run"}
 
     def state(self, match_id: str) -> dict[str, Any] | None:
-        """How the last run that was begun here goes, None where there was none."""
+        """Return the state of the last run that was started here; None if there was none."""
         run = self._runs.get(match_id)
         if run is None:
             return None
@@ -90,7 +90,7 @@ class Continuing:
         Thread(target=self._watch, args=[match_id, process], daemon=True).start()
 
     def _watch(self, match_id: str, process: subprocess.Popen[bytes]) -> None:
-        """Begin the run once more where that was asked for while it was at work."""
+        """Start the run again if that was requested while it was running."""
         process.wait()
         with self._lock:
             if match_id in self._once_more:

@@ -1,4 +1,4 @@
-"""What people say on a page: verdicts, corrections, and that the run is to go on."""
+"""Decisions on a page: verdicts, corrections, and the continuation of a run."""
 
 from __future__ import annotations
 
@@ -17,30 +17,29 @@ from flows.run_record import latest_run
 from flows.web.app_context import Desk, Person
 
 EDITS: int = 200
-"""Most edits that are kept at once."""
+"""Maximum number of edits per request."""
 
 
 class Verdict(Record):
-    """A verdict on what waits."""
+    """A verdict on pending reviews."""
 
     reviews: tuple[Name, ...] = Field(min_length=1)
-    """Ids of the questions."""
+    """Ids of the review requests."""
     verdict: Literal["approve", "reject"]
-    """It has no default."""
+    """Required: there is no default."""
     why: str = Field(default="", max_length=2000)
-    """In the person's words."""
+    """The person's comment."""
     seen: dict[str, str]
-    """Id of each question to its state when the person decided: somebody else may have been
-    quicker."""
+    """Review id to the state that the person saw: another person can have decided in between."""
     go_on: bool = True
-    """Let the run go on when nothing waits any more."""
+    """Continue the run when no review is pending."""
 
 
 class GivenEdit(Record):
     """One edit of a page."""
 
     id: Name
-    """Made by the page: sent again, it is the same edit."""
+    """Created by the page: sent again, it is the same edit."""
     edit: Edit
     """With `was` as the page showed it."""
 
@@ -49,29 +48,29 @@ class Edits(Record):
     """Edits that are kept all or none."""
 
     edits: tuple[GivenEdit, ...] = Field(min_length=1, max_length=EDITS)
-    """In the order they are to be applied."""
+    """In the order of application."""
     note: str = Field(default="", max_length=2000)
-    """In the person's words."""
+    """The person's comment."""
 
 
 class Withdrawing(Record):
-    """A correction to be taken back."""
+    """A correction to withdraw."""
 
     correction: Name
     """Its id."""
     why: str = Field(default="", max_length=2000)
-    """In the person's words."""
+    """The person's comment."""
 
 
 class GoingOn(Record):
-    """How a run is to go on."""
+    """Options for continuing a run."""
 
     gates: GatePolicy | None = None
-    """When results wait for a person; None = as `worldpose run` takes it."""
+    """When results need review; None = the default of `worldpose run`."""
 
 
 def routes(desk: Desk) -> APIRouter:
-    """Routes of all that changes the journal or starts a run."""
+    """Create the routes of all requests that change the journal or start a run."""
     router = APIRouter(prefix="/api/matches/{match_id}")
 
     @router.post("/decisions")

@@ -1,4 +1,4 @@
-"""Whom a camera saw in one frame: boxes and keypoints to be looked at and corrected (D4, D6)."""
+"""Detections of a camera in one frame: boxes and keypoints for review and correction (D4, D6)."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from worldpose.ingest import Observations
 from worldpose.store import Store
 
 LISTED: Final = 60
-"""People who are listed of those to look at."""
+"""Maximum number of listed detections to review."""
 ACCEPTED: Final = 500
-"""Most people who are accepted by name at once."""
+"""Maximum number of detections accepted by name at once."""
 
 
 class Accepting(Record):
-    """Detections that a person found right."""
+    """Detections that a person accepts."""
 
     at_least: float | None = Field(default=None, ge=0, le=1)
-    """Everybody whose score is at least this [1]; None = nobody but those named."""
+    """Accept every detection with at least this score [1]; None = only those in `people`."""
     people: tuple[tuple[int, int], ...] = Field(default=(), max_length=ACCEPTED)
-    """Match frame, and place among the detections of the frame."""
+    """Match frame, and index among the detections of the frame."""
 
 
 def routes(desk: Desk) -> APIRouter:
-    """Routes of the people in one frame of a static camera, or of a clip's broadcast camera."""
+    """Create the routes of the detections in one frame of a static or broadcast camera."""
     router = APIRouter(prefix="/api/matches/{match_id}/detections/{owner}")
 
     @router.get("")
@@ -65,7 +65,7 @@ def routes(desk: Desk) -> APIRouter:
 
     @router.get("/image")
     def image(match_id: str, owner: str, frame: int) -> Response:
-        import cv2  # late: few pages open a picture
+        import cv2  # imported here: few pages decode an image
 
         try:
             picture = frame_picture(desk.store, desk.match(match_id), owner, frame)
@@ -91,7 +91,7 @@ def routes(desk: Desk) -> APIRouter:
 
 
 def _queue(store: Store, match: Match, owner: str) -> dict[str, Any]:
-    """How many of a camera's people nobody has looked at, and the least certain of them."""
+    """Count a camera's unreviewed detections, and list the least certain of them."""
     left = left_to_look_at(store, match, owner)
     rows = sorted(
         (float(score), int(frame), int(detection))
@@ -118,7 +118,7 @@ def _size(match: Match, owner: str) -> tuple[int, int]:
 
 
 def _seen(found: Observations) -> dict[str, Any]:
-    """Everybody in the first row, and the place that an added person takes."""
+    """Return all detections of the first row, and the index for an added person."""
     there = np.isfinite(found.score[:1]).any(axis=0)
     occupied = np.flatnonzero(there)
     free = int(occupied[-1]) + 1 if len(occupied) else 0
@@ -126,7 +126,7 @@ def _seen(found: Observations) -> dict[str, Any]:
 
 
 def _people(found: Observations) -> list[dict[str, Any]]:
-    """Everybody in the first row, the least certain first."""
+    """Return all detections of the first row, the least certain first."""
     if not len(found.frame):
         return []
     there = np.flatnonzero(np.isfinite(found.score[0]))

@@ -1,4 +1,4 @@
-"""What goes wrong, as answers that a page can show."""
+"""Errors as responses that a page can show."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def add_answers(app: FastAPI) -> None:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         said = f"{place}: {first['msg']}"
-        # A key of the body can hold halves of characters, which no answer can.
+        # A key of the body can contain lone surrogates, which a response cannot.
         return JSONResponse({"error": said.encode("utf-8", "replace").decode()}, status_code=422)
 
     @app.exception_handler(OSError)
@@ -52,6 +52,6 @@ def add_answers(app: FastAPI) -> None:
 
     @app.exception_handler(Exception)
     def unforeseen(request: Request, error: Exception) -> JSONResponse:
-        """The server's log has the traceback; the page says that nobody did anything wrong."""
+        """Report an internal error: traceback in the log, no blame of the user on the page."""
         where = f"{request.method} {request.url.path}"
         return JSONResponse({"error": str(InternalError.wrapping(where, error))}, status_code=500)

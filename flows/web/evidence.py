@@ -1,4 +1,4 @@
-"""What a person is shown beside a question: pictures and tables of the result."""
+"""Evidence for a review request: images and tables of the result."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ from worldpose.review.curves import Curve, clip_curves
 from worldpose.store import Run, Store, open_run
 
 KEPT: Final = 16
-"""Questions whose pictures are kept in memory; one takes a second or two to draw."""
+"""Review requests whose images are kept in memory; drawing takes one or two seconds each."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What belongs to one question."""
+    """Evidence for one review request."""
 
     pictures: tuple[Picture, ...] = ()
     tables: tuple[Table, ...] = ()
     curves: tuple[Curve, ...] = ()
     first_frame: int = 0
     video: str | None = None
-    """Whose video shows it; None where none does."""
+    """Camera or clip whose video shows it; None if there is none."""
 
 
 def routes(desk: Desk) -> APIRouter:
-    """Routes of the evidence of one question."""
+    """Create the routes of the evidence for one review request."""
     router = APIRouter(prefix="/api/matches/{match_id}/reviews/{request}")
     drawn: dict[tuple[str, str], Evidence] = {}
     lock, filming = Lock(), Lock()
@@ -60,7 +60,7 @@ def routes(desk: Desk) -> APIRouter:
         asked = requests_by_id(match.journal.questions).get(request)
         if asked is None:
             raise HTTPException(404, "no such review")
-        with lock:  # one drawing at a time: they take all the memory of their pictures
+        with lock:  # one at a time: drawing needs memory for all images
             if (match_id, request) not in drawn:
                 while len(drawn) >= KEPT:
                     drawn.pop(next(iter(drawn)))
@@ -115,7 +115,7 @@ def _numbers(values: NDArray[np.float64]) -> list[float | None]:
 
 
 def draw_evidence(store: Store, match: Match, request: ReviewRequest) -> Evidence:
-    """What a person should see before deciding on a question: of the run that asked it."""
+    """Draw the evidence for a review request, from the run that created it."""
     run = open_run(store.url, match.match_id, request.run_id, complete=True)
     (unit,) = request.keys
     return _DRAWN.get(request.gate, _nothing)(store, run, match, unit.partition("/")[2])
@@ -123,7 +123,7 @@ def draw_evidence(store: Store, match: Match, request: ReviewRequest) -> Evidenc
 
 def _camera(store: Store, run: Run, match: Match, camera: str) -> Evidence:
     if "point_inlier" not in run[f"static_calibration/{camera}"]:
-        return Evidence()  # it was given, or it is left out
+        return Evidence()  # a given camera, or one that is left out
     cameras = static_cameras(run, match.folder.spec, "triangulation")
     png = camera_evidence(store, run, match, camera, cameras[camera])
     caption = (
@@ -165,7 +165,7 @@ def _clip(store: Store, run: Run, match: Match, clip: str) -> Evidence:
 
 
 def _acceptance(store: Store, run: Run, match: Match, clip: str) -> Evidence:
-    """Of a clip that is to be released: its pictures and tables, figures over its frames, video."""
+    """Draw a clip for release: images and tables, metrics over its frames, video."""
     fits, joints = run[f"body_fitting/{clip}"], placed_joints(run, clip)
     placed = joints["joints"].reindex(frame=fits["frame"].values, person=fits["person"].values)
     curves = clip_curves(
@@ -181,7 +181,7 @@ def _acceptance(store: Store, run: Run, match: Match, clip: str) -> Evidence:
 
 
 def _adjustment(store: Store, run: Run, match: Match, unit: str) -> Evidence:
-    return Evidence((), tuple(adjustment_tables(run)[:1]))  # the others are lists to choose from
+    return Evidence((), tuple(adjustment_tables(run)[:1]))  # the others are lists of edits
 
 
 def _broadcast(store: Store, run: Run, match: Match, clip: str) -> Evidence:

@@ -1,4 +1,4 @@
-"""What every request passes before anything else looks at it."""
+"""Checks that every request must pass first."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ OPEN: Final = frozenset(
 )
 """Paths that answer without a session."""
 BODY_BYTES: Final = 1 << 20
-"""Most that a request may bring."""
+"""Maximum size of a request body [byte]."""
 SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 ASKING: Final = "/preview"
-"""End of a path that is posted to with every move of a mouse, and changes nothing."""
+"""Suffix of paths that are posted to with every mouse move, and change nothing."""
 POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
     "media-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'self'; "
     "frame-ancestors 'none'"
 )
-"""What a page may load: scripts, styles, pictures, videos of this server; nothing is inline."""
+"""Content that a page can load: scripts, styles, images, videos of this server; nothing inline."""
 
 logger = logging.getLogger("worldpose.pages")
 
 
 class Guard:
-    """Refuses what does not come from a page of this server in the hands of somebody logged in.
+    """Refuses requests that do not come from a page of this server with a valid session.
 
-    Host: a name that leads here by somebody else's rebinding is refused. Session: all but `OPEN`
-    needs one. Changes: need the session's form secret, and come from this origin where the browser
-    says from which. Size: no more than `BODY_BYTES`. Every login and every change that was asked
-    for is logged with who, what and the answer.
+    Host: a foreign name that points here (DNS rebinding) is refused. Session: all but `OPEN` needs
+        one. Changes: need the session's form secret, and this origin if the browser states one.
+        Size: at most `BODY_BYTES`. Every login and every requested change is logged with person,
+        request and response.
     """
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self.app, self.access = app, access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a refusal, or hand the request on with `state.who` and `state.session`."""
+        """Send the refusal, or pass the request on with `state.who` and `state.session`."""
         if scope["type"] == "lifespan":
             await self.app(scope, receive, send)
             return
@@ -69,10 +69,10 @@ class Guard:
             if message["type"] == "http.response.start":
                 _seal(MutableHeaders(scope=message), scope["path"])
                 asked = scope["path"].endswith(ASKING) and message["status"] < 400
-                # A client that left in the middle of its request has asked for nothing.
+                # A client that disconnected in the middle of its request requested nothing.
                 if scope["method"] not in SAFE and not asked and not is_gone:
                     place = f"{scope['method']} {scope['path']}"
-                    # Who logs in is somebody from then on.
+                    # After a login, log the new person.
                     logger.info("%s: %r: %s", state["who"] or "nobody", place, message["status"])
             await send(message)
 
@@ -104,7 +104,7 @@ class Guard:
         ):
             return refusal(403, "the page is of another session: load it again")
         length = headers.get("content-length", "")
-        if not (length.isascii() and length.isdigit()):  # of unknown length it could be any
+        if not (length.isascii() and length.isdigit()):  # without a length, the size is unbounded
             return refusal(411, "say how long it is")
         if len(length) > 12 or int(length) > BODY_BYTES:
             return refusal(413, f"at most {BODY_BYTES} bytes are taken in")

@@ -1,7 +1,7 @@
-"""Which requests a server of this project looks at: those that name it, and none of other sites.
+"""Host and origin checks: a server accepts requests that name it, and none of other sites.
 
-A web page that somebody visits can send requests to any port of his machine, and can have a name of
-its own lead there (DNS rebinding). Both show in headers that a page cannot choose.
+A web page in a user's browser can send requests to any port of the user's machine, and can point a
+name of its own there (DNS rebinding). Both show in headers that a page cannot choose.
 """
 
 from __future__ import annotations
@@ -15,31 +15,31 @@ from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
-"""Names of this machine for itself."""
+"""Names of this machine on loopback."""
 SAFE_METHODS: Final = frozenset({"GET", "HEAD"})
 _HOST: Final = re.compile(r"(?:(?P<name>[A-Za-z0-9.-]+)|\[(?P<ipv6>[0-9A-Fa-f:.]+)\])(?::\d{1,5})?")
 
 
 def host_name(host: str) -> str:
-    """The name in a Host header, without its port; empty if the header is malformed.
+    """Return the name in a Host header, without its port; empty if the header is malformed.
 
-    The port is not compared: a tunnel may have another.
+    The port is not compared: a tunnel can use another.
     """
     found = _HOST.fullmatch(host)
     return "" if found is None else (found["name"] or found["ipv6"]).lower()
 
 
 def refuse_foreign(scope: Scope, headers: Headers, names: Iterable[str]) -> Response | None:
-    """The refusal of a request that names another server or comes from another site's page.
+    """Refuse a request that names another server or comes from another site's page.
 
     Args:
-        scope: of an HTTP request or a WebSocket.
+        scope: ASGI scope of an HTTP request or a WebSocket.
         headers: its headers.
         names: lower-case names under which this server is known.
 
     Returns:
         421 for another name in Host, 403 for a foreign Origin or Sec-Fetch-Site; None if the
-        request may be looked at. A link to one of our pages from another site is no attack.
+        request is allowed. A link to one of our pages from another site is no attack.
     """
     hosts = headers.getlist("host")
     if len(hosts) != 1 or host_name(hosts[0]) not in names:
@@ -60,7 +60,7 @@ def refuse_foreign(scope: Scope, headers: Headers, names: Iterable[str]) -> Resp
 
 
 def refusal(status: int, why: str) -> JSONResponse:
-    """An answer that says why a request is refused."""
+    """Return a response that says why a request is refused."""
     return JSONResponse({"error": why}, status_code=status)
 
 
@@ -72,7 +72,7 @@ class HostGuard:
         self.names = LOOPBACK | {name.lower() for name in names}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a refusal, or hand the request on."""
+        """Send the refusal, or pass the request to the application."""
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return
@@ -82,5 +82,5 @@ class HostGuard:
         elif scope["type"] == "http":
             await refused(scope, receive, send)
         else:
-            await receive()  # the request to connect; closed before it is accepted, it gets a 403
+            await receive()  # the connect request; closing before accepting sends a 403
             await send({"type": "websocket.close", "code": 1008})

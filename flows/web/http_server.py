@@ -1,4 +1,4 @@
-"""An HTTP server that slow clients cannot fill: deadlines, and a bound on open connections."""
+"""HTTP server with deadlines for slow clients and a limit on open connections."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from worldpose.errors import UsageError
 
 REQUEST_SECONDS: Final = 10.0
-"""In which a client has to send the headers of a request, and again its body."""
+"""Deadline for the headers of a request, and again for its body."""
 ANSWER_SECONDS: Final = 60.0
-"""In which a client has to take some of an answer."""
+"""Deadline for a client to read some of a response."""
 MAX_CONNECTIONS: Final = 200
-"""Open at a time; for one more the oldest is closed that has not sent its request."""
+"""Open connections; beyond it the oldest one without a complete request is closed."""
 ACCEPTED_SHARE: Final = 8
-"""This part of the limit is accepted at a time, before others are read from."""
+"""At most this fraction of the limit is accepted per loop iteration, before other reads."""
 QUEUE: Final = 2048
-"""Connections that the system keeps until they are accepted."""
+"""Connections that the operating system queues until they are accepted."""
 LOG_SECONDS: Final = 60.0
-"""Between two log lines about connections that were closed."""
+"""Interval between two log lines about closed connections."""
 
 LOG = logging.getLogger("worldpose.pages")
 
 
 @dataclass
 class _Connection:
-    """One that is open.
+    """An open connection.
 
     Attributes:
-        socket: of it.
-        deadline: when it is closed unless its client has done its part by then, on the clock that
-            only goes forward [s]; None while the server is at work on an answer.
+        socket: its socket.
+        deadline: time on the monotonic clock at which it is closed unless the client acts [s]; None
+            while the server computes a response.
     """
 
     socket: socket.socket
@@ -51,10 +51,10 @@ class _Connection:
 
 @dataclass
 class Connections:
-    """The open connections of a server, of which those that wait too long for clients are closed.
+    """Open connections of a server; connections whose clients are too slow are closed.
 
     Attributes:
-        limit: how many may be open.
+        limit: maximum number of open connections.
     """
 
     limit: int = MAX_CONNECTIONS
@@ -69,7 +69,7 @@ class Connections:
             self.limit = max(1, min(self.limit, files // 4))
 
     def admit(self, connection: socket.socket, address: object) -> None:
-        """Take in a new connection; where there are too many, close the oldest that waits."""
+        """Register a connection; beyond the limit, close the oldest that waits for its client."""
         with self._lock:
             self._open[address] = _Connection(connection, time.monotonic() + REQUEST_SECONDS)
             if len(self._open) <= self.limit:
@@ -80,19 +80,19 @@ class Connections:
                 self._close(next(waiting, address))
 
     def wait(self, address: object, seconds: float = REQUEST_SECONDS) -> None:
-        """From now on the client has to do its part within so long [s]."""
+        """Start a deadline for the client of a connection [s]."""
         with self._lock:
             if address in self._open:
                 self._open[address].deadline = time.monotonic() + seconds
 
     def work(self, address: object) -> None:
-        """From now on the server is at work on an answer."""
+        """Remove the deadline while the server computes a response."""
         with self._lock:
             if address in self._open:
                 self._open[address].deadline = None
 
     def sweep(self) -> None:
-        """Close the connections whose clients let their deadline pass; called every second."""
+        """Close the connections whose deadline has passed; called every second."""
         with self._lock:
             self._forget_closed()
             now = time.monotonic()
@@ -108,9 +108,9 @@ class Connections:
                 self._closed, self._told = 0, now
 
     def _close(self, address: object) -> None:
-        """End a connection in both directions; whoever reads from it then closes its file."""
+        """Shut a connection down in both directions; its reader then closes the file."""
         self._closed += 1
-        with suppress(OSError):  # its client was quicker
+        with suppress(OSError):  # the client has closed it already
             self._open.pop(address).socket.shutdown(socket.SHUT_RDWR)
 
     def _forget_closed(self) -> None:
@@ -119,7 +119,7 @@ class Connections:
 
 
 class _Listener(socket.socket):
-    """A listening socket whose connections are counted as they are accepted."""
+    """Listening socket that registers each accepted connection."""
 
     connections: Connections
 
@@ -130,7 +130,7 @@ class _Listener(socket.socket):
 
 
 class _Protocol(H11Protocol):
-    """HTTP/1.1, which tells for whom each connection waits."""
+    """HTTP/1.1 protocol that reports whether a connection waits for its client or the server."""
 
     connections_open: Connections
     _address: object = None
@@ -147,7 +147,7 @@ class _Protocol(H11Protocol):
         self._note()
 
     def handle_websocket_upgrade(self, event: h11.Request) -> None:
-        """Hand the connection on; a WebSocket may be silent for as long as it wants."""
+        """Pass the connection on without a deadline: a WebSocket can be silent for any time."""
         super().handle_websocket_upgrade(event)
         self._is_upgraded = True
         self.connections_open.work(self._address)
@@ -166,7 +166,7 @@ class _Protocol(H11Protocol):
         self._note()
 
     def _note(self) -> None:
-        """Begin a deadline where a phase begins; further bytes of the same do not prolong it."""
+        """Start a deadline when a phase begins; further bytes of the phase do not extend it."""
         if self._is_upgraded:
             return
         cycle = self.cycle
@@ -182,7 +182,7 @@ class _Protocol(H11Protocol):
 
 
 class _Server(uvicorn.Server):
-    """uvicorn with a short accept loop, a long queue, and a sweep every second."""
+    """uvicorn with a short accept loop, a long queue, and a check of deadlines every second."""
 
     def __init__(self, config: uvicorn.Config, connections: Connections) -> None:
         super().__init__(config)
@@ -191,12 +191,12 @@ class _Server(uvicorn.Server):
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
         for each in sockets or []:
-            # asyncio accepts as many in one turn as it was told to queue: more than there are
-            # files, where that is the length of the queue.
+            # asyncio accepts as many connections per loop iteration as its backlog: more than there
+            # are file descriptors if that is the length of the queue.
             each.listen(QUEUE)
 
     async def on_tick(self, counter: int) -> bool:
-        if counter % 10 == 0:  # of a tenth of a second each
+        if counter % 10 == 0:  # every tenth tick of 0.1 s
             self.connections.sweep()
         return await super().on_tick(counter)
 
@@ -214,13 +214,13 @@ def serve_http(
     Args:
         app: the application.
         host: name or address to listen at.
-        port: 0 = one that is free.
-        max_connections: open at a time, and no more than a quarter of the files that this process
-            may open.
-        options: further ones of `uvicorn.Config`.
+        port: port; 0 = any free one.
+        max_connections: open connections, limited to a quarter of the files that this process can
+            open.
+        options: further options of `uvicorn.Config`.
 
     Raises:
-        UsageError: the port is taken, or the host is none of this machine.
+        UsageError: the port is taken, or the host is not an address of this machine.
     """
     connections = Connections(max_connections)
     protocol = type("Protocol", (_Protocol,), {"connections_open": connections})
@@ -230,7 +230,7 @@ def serve_http(
         loop="asyncio",
         backlog=max(1, connections.limit // ACCEPTED_SHARE),
         access_log=False,
-        log_level="error",  # a line for each request that is none would fill the disk
+        log_level="error",  # a line per malformed request would fill the disk
         **{"ws": "none", **options},
     )
     listeners = _listeners(host, port, connections)
@@ -241,7 +241,7 @@ def serve_http(
 
 
 def _listeners(host: str, port: int, connections: Connections) -> list[socket.socket]:
-    """Sockets at all addresses of a name."""
+    """Open listening sockets at all addresses of a name."""
     listeners: list[socket.socket] = []
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)

@@ -1,4 +1,4 @@
-"""Who is who in a clip: everybody's time in it, ways on the ground, and uncertain joins."""
+"""Identities of a clip: presence over time, ground trajectories, and uncertain joins."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from worldpose.store import Store, open_run
 from worldpose.video import open_video
 
 WAYS: Final = 300
-"""Places of a person's way that are sent."""
+"""Points of a person's trajectory that are sent."""
 HIPS: Final = (11, 12)
-"""Places of the hips in COCO-17."""
+"""Indices of the hips in COCO-17."""
 AROUND: Final = 1.6
-"""Half the height of what is shown of a person's picture [m]."""
+"""Half the height of a person's crop [m]."""
 
 
 def routes(desk: Desk) -> APIRouter:
-    """Routes of who is who in one clip."""
+    """Create the routes of the identities in one clip."""
     router = APIRouter(prefix="/api/matches/{match_id}/identities/{clip}")
 
     def opened(match_id: str, clip: str) -> tuple[Match, Identities]:
@@ -96,7 +96,7 @@ def _person(found: Identities, person: int, step: int) -> dict[str, Any]:
 
 
 def _ways(joints: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Where a person is on the ground (frames, 2) [m], NaN where that is not known."""
+    """Return a person's ground position (frames, 2) [m], NaN if unknown."""
     hips = joints[:, HIPS, :2].astype(np.float64)
     known = np.asarray(np.isfinite(hips).all(axis=2))
     total = np.where(known[..., None], hips, 0.0).sum(axis=1)
@@ -105,12 +105,12 @@ def _ways(joints: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _crop(store: Store, match: Match, found: Identities, person: int, frame: int) -> bytes:
-    """A PNG of one person in the view that shows them largest.
+    """Return a PNG of one person from the view with the largest image of the person.
 
     Raises:
-        HTTPException: 404, no camera with a video sees them.
+        HTTPException: 404, no camera with a video shows the person.
     """
-    import cv2  # late: few pages open a picture
+    import cv2  # imported here: few pages decode an image
 
     k, f = found.person.tolist().index(person), int(np.searchsorted(found.frame, frame))
     joints = found.joints[f, k].astype(np.float64)

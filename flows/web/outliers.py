@@ -1,4 +1,4 @@
-"""Clicks and keypoints that an adjustment contradicts, each with the edit that removes it (B3)."""
+"""Click and keypoint outliers of an adjustment, each with the edit that removes it (B3)."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ from worldpose.review import requests_by_id, value_now
 from worldpose.store import Run, open_run
 
 MOST: Final = 60
-"""Keypoints that are listed: the most surprising."""
+"""Maximum number of listed keypoints, by largest Mahalanobis distance."""
 Outlier = tuple[float, str, MovedPoint | MovedKeypoint | DeletedDetection, bool]
-"""Surprise in standard deviations, who it is of, the edit that takes it out, is it out already."""
+"""Mahalanobis distance [standard deviations], subject, edit that removes it, and whether it is
+already removed."""
 
 
 def routes(desk: Desk) -> APIRouter:
-    """Route of what contradicts the adjustment that a question is about."""
+    """Create the route of the outliers of the adjustment that a review request refers to."""
     router = APIRouter(prefix="/api/matches/{match_id}/reviews/{request}")
 
     @router.get("/outliers")
@@ -51,7 +52,7 @@ def routes(desk: Desk) -> APIRouter:
 
 
 def _clicks(run: Run, match: Match) -> Iterator[Outlier]:
-    """Clicked points that are proposed for removal."""
+    """Yield clicked points proposed for removal."""
     result = run[ADJUSTED]
     names = [str(name) for name in result["camera"].values]
     for k in np.flatnonzero(result["click_wrong"].values):
@@ -66,7 +67,7 @@ def _clicks(run: Run, match: Match) -> Iterator[Outlier]:
 
 
 def _keypoints(run: Run, match: Match) -> Iterator[Outlier]:
-    """Keypoints, and people in one picture, that the other cameras contradict."""
+    """Yield keypoints, and people in one image, that are outliers to the other cameras."""
     result = run[ADJUSTED]
     names = [str(name) for name in result["camera"].values]
     said = {_place(correction.edit) for correction in match.corrections}
@@ -83,7 +84,7 @@ def _keypoints(run: Run, match: Match) -> Iterator[Outlier]:
         tracks = run[f"tracking/{clip}"].sel(frame=frame, person=person)
         detection = int(tracks["detection_index"].values[c])
         seen = run[seen_by(match, names[c], clip)]
-        # Whom an iteration found again the next one looks for anew: there is nothing to correct.
+        # The next iteration repeats redetection: these people need no correction.
         if not 0 <= detection < seen.sizes["detection"]:
             continue
         place = {"camera": names[c], "frame": frame, "detection": detection}
@@ -99,6 +100,6 @@ def _keypoints(run: Run, match: Match) -> Iterator[Outlier]:
 
 
 def _place(edit: object) -> tuple[object, ...]:
-    """What an edit of a detection is about."""
+    """Return the target of a detection edit."""
     names = ("kind", "camera", "frame", "detection", "joint")
     return tuple(getattr(edit, name, None) for name in names)

@@ -1,4 +1,4 @@
-"""What waits in all matches: since when, why, and how bad it is."""
+"""Pending reviews of all matches: age, reason and severity."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from worldpose.errors import WorldposeError
 from worldpose.store import Store
 
 CORRECTIONS: Final = 200
-"""Most that one answer has: a match can have many thousand, and a page shows the last ones."""
+"""Maximum per response: a match can have many thousand, and a page shows the last ones."""
 
 
 def routes(desk: Desk) -> APIRouter:
-    """Routes of the queue and of one match."""
+    """Create the routes of the queue and of one match."""
     router = APIRouter(prefix="/api/matches")
 
     @router.get("")
@@ -61,11 +61,11 @@ def routes(desk: Desk) -> APIRouter:
 
 
 def _corrections(match: Match, skip: int = 0) -> dict[str, Any]:
-    """Return the last corrections that stand, those that no longer apply after all others.
+    """Return the last corrections in force; those that no longer apply come after all others.
 
     Args:
-        match: with the corrections so far.
-        skip: how many of the last ones a page has already.
+        match: the match with all corrections.
+        skip: number of last corrections that the page has already.
     """
     count = len(match.corrections) + len(match.stale)
     end = max(0, count - skip)
@@ -86,13 +86,13 @@ def _corrections(match: Match, skip: int = 0) -> dict[str, Any]:
 
 
 def shown(review: Review) -> dict[str, Any]:
-    """One question as the pages show it."""
+    """Return one review request as JSON for the pages."""
     (unit,) = review.request.keys
     return {**review_json(review), "unit": unit, "excess": _excess(review.request)}
 
 
 def _at_a_glance(desk: Desk, name: str) -> dict[str, Any]:
-    """One match in the queue; one that cannot be opened says why, and hides no other."""
+    """Return one match of the queue; a match that cannot be opened has its error instead."""
     try:
         return _glance(desk, desk.match(name))
     except (OSError, WorldposeError) as error:
@@ -140,7 +140,7 @@ def _glance(desk: Desk, match: Match) -> dict[str, Any]:
 
 
 def _at_work(store: Store, desk: Desk, match_id: str) -> dict[str, Any] | None:
-    """The run that was begun on a page, or else one that was begun elsewhere and has not ended."""
+    """Return the run started on a page, or else one started elsewhere that has not ended."""
     state = desk.continuing.state(match_id)
     if state is not None:
         return state
@@ -152,7 +152,7 @@ def _at_work(store: Store, desk: Desk, match_id: str) -> dict[str, Any] | None:
 
 
 def _clip(desk: Desk, match: Match, clip: str) -> dict[str, Any]:
-    """A clip, and the key frames of its broadcast camera: clicked, and those to click next."""
+    """Return a clip, and its broadcast key frames: clicked, and those to click next."""
     picked = match.folder.key_frames.get(clip)
     latest = latest_run(desk.store, match.match_id)
     key = None if latest is None else latest.results.get(f"broadcast_calibration/{clip}")

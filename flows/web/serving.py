@@ -1,4 +1,4 @@
-"""Serving the pages until somebody ends it."""
+"""Serving the pages until interrupted."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from flows.web.http_server import serve_http
 def serve(
     project: str, access: Access, *, host: str, port: int, tls: tuple[Path, Path] | None
 ) -> None:
-    """Serve a project's pages; returns when it is interrupted.
+    """Serve a project's pages; return when interrupted.
 
     Args:
         project: folder or URL of the store.
-        access: who may use them.
+        access: access control.
         host: address to listen at.
-        port: 0 = one that is free.
-        tls: files of certificate and key.
+        port: 0 = any free one.
+        tls: certificate and key files.
 
     Raises:
-        InputError: no such project.
+        InputError: there is no such project.
         UsageError: the port is taken.
     """
     certificate, key = (None, None) if tls is None else map(str, tls)
@@ -38,7 +38,7 @@ def serve(
 
 
 def address(access: Access, host: str, port: int) -> str:
-    """Where a person opens the pages; the token stands where browsers keep it to themselves."""
+    """Return the pages' URL; the token is in the fragment, which browsers do not send."""
     name = host
     if host not in LOOPBACK:
         name = sorted(access.hosts - LOOPBACK)[0]

@@ -1,4 +1,4 @@
-"""What the other cameras say of a person in one camera's picture (D4, D6)."""
+"""Other cameras' views of a person in one camera's image (D4, D6)."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from worldpose.review.other_views import check_views, epipolar_curves
 from worldpose.store import open_run
 
 KEPT: Final = 8
-"""People whose views are kept in memory while somebody drags a keypoint."""
+"""People whose views are kept in memory while a keypoint is dragged."""
 
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """One person in one frame, as all static cameras see them.
+    """One person in one frame, as all static cameras see the person.
 
     Attributes:
-        person: the tracker's id; None where it has none.
+        person: the tracker's id; None if there is none.
         names: ids of the cameras.
-        cameras: theirs.
-        detections: place in each camera's frame; -1 = not seen.
+        cameras: the cameras.
+        detections: index in each camera's frame; -1 = not detected.
         keypoints: (cameras, 17, 2) [px].
     """
 
@@ -45,7 +45,7 @@ class Group:
 
 
 def routes(desk: Desk) -> APIRouter:
-    """Route of what the other cameras say."""
+    """Create the route of the other cameras' views."""
     router = APIRouter(prefix="/api/matches/{match_id}/detections/{owner}")
     known: dict[tuple[Any, ...], Group] = {}
     lock = Lock()
@@ -80,10 +80,10 @@ def routes(desk: Desk) -> APIRouter:
 
 
 def _group(desk: Desk, match: Match, owner: str, frame: int, detection: int) -> Group:
-    """Whom a detection is, as the tracker and people say, and where every camera sees them.
+    """Return a detection's person by tracks and corrections, with its detections in all cameras.
 
     Raises:
-        InputError: nobody was seen there in the latest run.
+        InputError: there is no such detection in the latest run.
     """
     clip = next(
         (
@@ -100,7 +100,7 @@ def _group(desk: Desk, match: Match, owner: str, frame: int, detection: int) -> 
     try:
         found = None if clip is None else identities_now(desk.store, match, clip.id).identities
     except InputError:
-        found = None  # nobody is tracked yet
+        found = None  # no tracks yet
     if found is not None and owner in found.cameras and frame in found.frame:
         here = found.detection_index[int(np.searchsorted(found.frame, frame))]
         (who,) = np.nonzero(here[found.cameras.index(owner)] == detection)

@@ -23,25 +23,25 @@ from worldpose.synthetic.venues import RenderingSettings
 from worldpose.training import LabelledPicture, read_labels, write_labels
 
 HIDDEN = 0.3
-"""People of whom less can be seen are ignored [1]."""
+"""People with a smaller visible share are ignored [1]."""
 SIZE = (1920, 1080)
 
 
 @dataclass(frozen=True)
 class SceneKind:
-    """What a set of scenes is drawn from.
+    """Distribution of a set of scenes.
 
     Attributes:
         first_seed: of its stadiums, kits and people; sets do not share any.
         patterns: of shirts.
         heights: of people [m].
-        person_height: of people in the middle of the pictures [px].
+        person_height: of people in the middle of the images [px].
         hazy: share of scenes with fog [1].
-        fog: thickest [1/m].
-        exposure: logarithm of the pictures' brightness [1].
+        fog: maximum extinction [1/m].
+        exposure: logarithm of the images' brightness [1].
         blur: of the lens [px].
         noise: of the sensor [levels of 255].
-        movements: chances of a match, a corner, people who wander, and people whose ways cross [1].
+        movements: probabilities of a match, a corner, wandering people, and crossing paths [1].
     """
 
     first_seed: int
@@ -60,12 +60,12 @@ TRAINING = SceneKind(
     10_000, tuple(p for p in PATTERNS if p not in ("chequers", "sash")), (1.66, 1.97)
 )
 VARIETY = replace(TRAINING, first_seed=50_000)
-"""More stadiums, kits and people, in fewer pictures each."""
+"""More stadiums, kits and people, in fewer images each."""
 CROWDS = replace(TRAINING, first_seed=60_000, movements=(0.1, 0.7, 0.1, 0.1))
-"""Mostly corners: people who hide one another."""
+"""Mostly corners: people who occlude one another."""
 CHECKING = SceneKind(20_000, TRAINING.patterns, TRAINING.heights)
 HELD_OUT = SceneKind(30_000, PATTERNS, (1.60, 2.02))
-"""Kits with patterns that training has not seen, and shorter and taller people."""
+"""Kits with patterns outside the training data, and shorter and taller people."""
 SHIFTED = SceneKind(
     40_000, ("chequers", "sash"), (1.60, 2.02), person_height=(34.0, 48.0), hazy=1.0, fog=0.02
 )
@@ -73,15 +73,15 @@ SHIFTED = SceneKind(
 DUSK = replace(
     SHIFTED, first_seed=45_000, hazy=0.0, exposure=(-1.5, -1.1), blur=(1.0, 1.8), noise=(5.0, 10.0)
 )
-"""Another, by which the settings of fine-tuning are chosen: dark, soft and noisy."""
+"""Another, for tuning the settings of fine-tuning: dark, soft and noisy."""
 
 
 def render_set(
     folder: Path, kind: SceneKind, scenes: int, *, views: int = 4, frames: int = 2
 ) -> Iterator[str]:
-    """Write scenes, each a folder of pictures with labels.json; yields a line for each.
+    """Write scenes, each a folder of images with labels.json; yield a line for each.
 
-    Scenes whose labels are there are left alone.
+    Existing labels are kept.
     """
     for seed in range(kind.first_seed, kind.first_seed + scenes):
         labels = folder / str(seed) / "labels.json"
@@ -92,7 +92,7 @@ def render_set(
 
 
 def read_set(folder: Path) -> list[LabelledPicture]:
-    """Return the pictures of all scenes of a folder."""
+    """Return the images of all scenes of a folder."""
     scenes = sorted(folder.glob("*/labels.json"))
     return [picture for labels in scenes for picture in read_labels(labels)]
 
@@ -127,7 +127,7 @@ def _scene(
 def label(
     path: Path, rendered: RenderedFrame, camera: Camera, joints: NDArray[np.float64]
 ) -> LabelledPicture:
-    """Return who is where in a rendered frame; joints (persons, 17, 3) [m], world."""
+    """Return the labels of a rendered frame; joints (persons, 17, 3) [m], world."""
     height, width = rendered.picture.shape[:2]
     limits = np.array([width, height, width, height]) - 0.5
     boxes = np.clip(rendered.boxes, -0.5, limits)
@@ -146,10 +146,10 @@ def label(
 
 
 def _shown(person_ids: NDArray[np.int16], pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether a person fills a pixel about each of his joints (persons, 17)."""
+    """Return whether a person fills a pixel near each of the person's joints (persons, 17)."""
     height, width = person_ids.shape
     shown = np.zeros(pixels.shape[:2], dtype=bool)
-    # Distorted points far outside may lie beyond what a whole number can hold.
+    # Distorted points far outside may overflow an integer.
     at = np.clip(np.nan_to_num(np.round(pixels), nan=-9.0), -9.0, 2.0 * width + 2.0 * height)
     for down in (-1, 0, 1):
         for across in (-1, 0, 1):
@@ -203,7 +203,7 @@ def _camera(
     joints: NDArray[np.float64],
     rng: np.random.Generator,
 ) -> Camera:
-    """A camera off the pitch that looks at somebody, or past him."""
+    """Return a camera off the pitch that looks at or past a person."""
     target = joints[int(rng.integers(len(joints))), 11] + [*rng.uniform(-3.0, 3.0, 2), 0.0]
     target = np.clip(target, [-50.0, -32.0, 0.0], [50.0, 32.0, 0.0])
     rig = RigSettings(

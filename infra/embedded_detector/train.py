@@ -1,10 +1,10 @@
-"""Makes the weights that ship with the project: renders scenes, trains both nets, scores them.
+"""Trains the weights that ship with the project: renders scenes, trains both nets, scores them.
 
     python infra/embedded_detector/train.py FOLDER [--share 1.0] [scenes people keypoints figures]
 
-A training has phases, each of which begins with the weights of the one before. Every phase goes on
-where it was interrupted, and ends with the weights of an undisturbed one. Weights and figures.json
-end in FOLDER; with another seed or torch they differ in their bytes, not in their figures' size.
+A training has phases, each of which begins with the weights of the previous one. Every phase
+resumes after an interruption, and ends with the same weights as without it. Weights and
+figures.json end in FOLDER; with another seed or torch their bytes differ, but metrics are similar.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ class Phase:
 
     Attributes:
         steps: batches.
-        planned: batches over which the rate would have fallen to its end.
+        planned: batches over which the learning rate would have decayed fully.
         rate: highest learning rate [1].
         seed: of its batches.
-        learned: sets of scenes that it learns from.
+        learned: sets of scenes to learn from.
     """
 
     steps: int
@@ -59,7 +59,7 @@ class Phase:
     learned: tuple[str, ...]
 
     def settings(self, share: float) -> TrainingSettings:
-        """How a share of the phase is trained."""
+        """Return the training settings for a share of the phase."""
         steps, planned = (max(round(share * each), 2) for each in (self.steps, self.planned))
         return TrainingSettings(
             steps=steps,
@@ -85,16 +85,16 @@ PHASES: Final = {
         Phase(3750, 5000, 1e-3, 11, ALL),
     ),
 }
-"""How the shipped weights came about, but for what the model card says."""
+"""Phases of the shipped weights, with exceptions in the model card."""
 
 
 def main(folder: Path, parts: Sequence[str], share: float) -> None:
-    """Render, train and score what is named: `scenes`, `people`, `keypoints`, `figures`.
+    """Run the named parts: `scenes`, `people`, `keypoints`, `figures`.
 
     Args:
-        folder: of everything that is made.
-        parts: what to do.
-        share: of scenes and steps [1]; less than 1 shows that it works, and no more.
+        folder: of all outputs.
+        parts: parts to run.
+        share: of scenes and steps [1]; less than 1 is a smoke test only.
     """
     torch.set_num_threads(1)
     if "scenes" in parts:
@@ -121,7 +121,7 @@ def train(
     cache: PictureCache,
     share: float,
 ) -> None:
-    """Train a net through its phases; the weights of each are those of its best check."""
+    """Train a net through its phases; each phase's weights are those of its best check."""
     checked = read_set(folder / "checking")[::2]
     for number, phase in enumerate(PHASES[name]):
         done = folder / f"{name}-{number}.safetensors"
@@ -143,12 +143,12 @@ def train(
 def score(
     folder: Path, pictures: Sequence[LabelledPicture], cache: PictureCache
 ) -> dict[str, object]:
-    """Return the figures on scenes that nothing was learned from or chosen by."""
+    """Return metrics on scenes outside training and selection."""
     detector = EmbeddedDetector(load_weights(folder / "embedded_people.safetensors", PeopleNet()))
     pose = EmbeddedPose(load_weights(folder / "embedded_keypoints.safetensors", KeypointNet()))
     classes = ["all", *(f"{low:g} to {high:g} px" for low, high in HEIGHTS)]
     found, kept = (found_people(detector, pictures, cache, each) for each in (None, pose))
-    beside = found_people(detector, pictures, cache, pose, DetectionSettings(beside=True))
+    beside = found_people(detector, pictures, cache, pose, DetectionSettings(find_occluded=True))
     alone, stored, free, more = (
         dict(zip(classes, score_people(people, labels), strict=True))
         for people, labels in (

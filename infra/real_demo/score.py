@@ -1,6 +1,6 @@
-"""How well a run of the real demo explains its own pictures: there is no truth to compare with.
+"""Consistency of a real demo run with its own images, as there is no ground truth.
 
-Prints who is tracked how long, how far joints fall from keypoints, how steady bones are, and
+Prints durations of tracks, reprojection residuals of joints, and variation of bone lengths, and
 writes a video of one view with joints drawn over it.
 Example: python score.py real-demo/match real-demo/project real-demo/overlay.mp4
 """
@@ -30,7 +30,7 @@ COLOURS = ((255, 200, 0), (0, 200, 255), (255, 80, 200), (120, 255, 120))
 
 
 def steadiness(joints: NDArray[np.float64]) -> str:
-    """Say how long limbs are, and how much that changes; joints (frames, 17, 3) [m]."""
+    """Return limb lengths and their variation in words; joints (frames, 17, 3) [m]."""
     parts = []
     for limb, sides in LIMBS.items():
         lengths = [np.linalg.norm(joints[:, a] - joints[:, b], axis=-1) for a, b in sides]
@@ -42,7 +42,7 @@ def steadiness(joints: NDArray[np.float64]) -> str:
 
 
 def score(folder: Path, project: str, video: Path) -> None:
-    """Print the figures of the latest run and write the overlay video."""
+    """Print the metrics of the latest run and write the overlay video."""
     match = read_match(folder)
     run = worldpose.open_run(project, match.spec.match_id)
     clip = match.spec.clips[0].id

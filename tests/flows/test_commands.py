@@ -69,8 +69,10 @@ def test_a_former_name_is_refused_with_the_present_one(arguments, present):
 
 
 def test_a_former_setting_is_refused_with_the_present_one():
-    with pytest.raises(UsageError, match="repair_limb_lengths=VALUE"):
-        parse_overrides(["triangulation.mend_limbs=false"])
+    for stage, names in renames.SETTINGS.items():
+        for former, present in names.items():
+            with pytest.raises(UsageError, match=f"{stage}.{present}=VALUE"):
+                parse_overrides([f"{stage}.{former}=1"])
 
 
 def test_every_present_name_exists():
@@ -86,3 +88,10 @@ def test_every_present_name_exists():
         for former, present in options.items():
             assert present in known
             assert former not in known
+
+
+def test_settings_in_the_record_of_an_earlier_version_get_their_present_names():
+    former, present = next(iter(renames.SETTINGS["triangulation"].items()))
+    recorded = {"triangulation": {former: False, "min_views": 3}, "ingest": {}}
+    renamed = {"triangulation": {present: False, "min_views": 3}, "ingest": {}}
+    assert renames.rename_settings(recorded) == renamed

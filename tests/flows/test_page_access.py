@@ -246,7 +246,7 @@ def test_every_answer_forbids_what_pages_do_not_need(ada, stranger):
 
 
 def test_no_page_asks_anything_of_another_server():
-    files = list(Path(corrections.__file__).parent.glob("pages/*/**/*.*"))
+    files = list(Path(corrections.__file__).parent.glob("web/*/**/*.*"))
     shown = [file for file in files if file.suffix in (".html", ".css")]
     assert {file.parent.name for file in shown} >= {"login", "static"}
     for file in shown:

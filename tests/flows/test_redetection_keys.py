@@ -46,8 +46,8 @@ def test_detections_stay_and_all_later_stages_are_made_from_those_found_again(fi
 def test_a_setting_reaches_its_dependency_set(filmed, stage):
     store, folder = filmed
     value = {
-        "detection": {"sure": 0.3},
-        "redetection": {"least_confidence": 0.6},
+        "detection": {"high_score_threshold": 0.3},
+        "redetection": {"min_confidence": 0.6},
         "body_fitting": {"tail": 3.0},
     }[stage]
     before = keys(store, folder, 3)

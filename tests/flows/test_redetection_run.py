@@ -19,7 +19,7 @@ def test_who_was_missed_is_found_again_where_the_bodies_are(server, tmp_path):
     succeed("simulate", *scenario, "--render", "--no-stills", "--calibrated", "--out", folder)
     # Of five people, each camera leaves out the one of whom it is the least sure.
     asked = ("run", folder, "--project", project, "--iterations", 2)
-    asked += ("--set", "detection.stride=2", "--set", f"detection.most_people={PEOPLE - 1}")
+    asked += ("--set", "detection.stride=2", "--set", f"detection.max_people={PEOPLE - 1}")
     answer = succeed(*asked, "--json").json
     first, second = (each["run"] for each in answer["iterations"])
     store = Store.open(str(project))

@@ -1,7 +1,7 @@
-"""Methods: what the results of other people's methods say about a clip.
+"""Baseline methods: readers for the results of other methods on a clip.
 
-Inputs: the files that a method's own code wrote, and the body that its poses are put on.
-Outputs: `MethodResult`: joints, the world they are in, boxes in the picture.
+Inputs: the files that a method's own code wrote, and the body model for its poses. Outputs:
+    `MethodResult`: joints, their world frame, boxes in the image.
 """
 
 from worldpose.baselines.known import METHODS, Method, find_method

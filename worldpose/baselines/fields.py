@@ -1,4 +1,4 @@
-"""Parts of what a method wrote, checked as they are taken."""
+"""Checked access to parts of a method's file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 
 def wrong(where: object, expected: str, found: str) -> InputError:
-    """The error about one place of a method's file."""
+    """Return the error about one place of a method's file."""
     return InputError(
         str(where),
         expected=expected,
@@ -27,10 +27,10 @@ def wrong(where: object, expected: str, found: str) -> InputError:
 
 
 def part(where: str, content: object, *keys: object) -> Any:  # noqa: ANN401
-    """Return what lies under keys of nested dictionaries.
+    """Return the value at a path of keys in nested dictionaries.
 
     Raises:
-        InputError: naming the first key that is not there.
+        InputError: names the first missing key.
     """
     for key in keys:
         if not isinstance(content, Mapping) or key not in content:
@@ -42,10 +42,10 @@ def part(where: str, content: object, *keys: object) -> Any:  # noqa: ANN401
 
 
 def as_floats(where: str, value: object) -> Floats:
-    """Return numbers as an array of whatever shape they have.
+    """Return numbers as an array of any shape.
 
     Raises:
-        InputError: they are no numbers.
+        InputError: they are not numbers.
     """
     try:
         return np.asarray(value, dtype=np.float64)
@@ -54,14 +54,14 @@ def as_floats(where: str, value: object) -> Floats:
 
 
 def floats(where: str, value: object, shape: tuple[int | None, ...]) -> Floats:
-    """Return numbers of a shape, None for any length; ones as dimensions more do not count.
+    """Return numbers of a shape, None for any length; extra dimensions of length one are dropped.
 
     Raises:
-        InputError: no numbers, or another shape.
+        InputError: not numbers, or another shape.
     """
     array = as_floats(where, value)
     while array.ndim > len(shape) and 1 in array.shape:
-        # The first one of those that the shape does not want.
+        # The first extra dimension that the shape lacks.
         lone = next(
             (
                 i
@@ -78,10 +78,10 @@ def floats(where: str, value: object, shape: tuple[int | None, ...]) -> Floats:
 
 
 def whole(where: str, value: object, count: int | None = None) -> NDArray[np.int64]:
-    """Return whole numbers (count,), such as frames.
+    """Return integers (count,), such as frames.
 
     Raises:
-        InputError: no whole numbers, or another number of them.
+        InputError: not integers, or another number of them.
     """
     array = floats(where, value, (count,))
     if not np.array_equal(array, np.round(array)):
@@ -90,10 +90,10 @@ def whole(where: str, value: object, count: int | None = None) -> NDArray[np.int
 
 
 def number(where: str, value: object) -> int:
-    """Return one whole number, also where it is written as text.
+    """Return one integer, also if written as text.
 
     Raises:
-        InputError: it is none.
+        InputError: it is not an integer.
     """
     found = floats(where, value, ())
     if not np.isfinite(found) or found != np.round(found) or abs(found) > 2**53:
@@ -102,10 +102,10 @@ def number(where: str, value: object) -> int:
 
 
 def rising(where: str, frames: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return frames that rise.
+    """Return frames after checking that they ascend.
 
     Raises:
-        InputError: they do not, or count from below 0.
+        InputError: they do not ascend, or are negative.
     """
     if np.any(np.diff(frames) <= 0) or np.any(frames < 0):
         raise wrong(where, "frames that rise from 0", f"{frames[:8]}")
@@ -113,10 +113,10 @@ def rising(where: str, frames: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    """Return some arrays of an npz file; others in it are not looked at, pickled ones refused.
+    """Return some arrays of an npz file; others are ignored, pickled ones refused.
 
     Raises:
-        InputError: it is no npz file, is too large, or lacks one.
+        InputError: it is not an npz file, is too large, or lacks an array.
     """
     try:
         with zipfile.ZipFile(path) as file:

@@ -19,14 +19,14 @@ from worldpose.body import BodyModel
 
 
 def read_glamr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
-    """Return the people of GLAMR's result, in the frames in which it has them.
+    """Return the people of GLAMR's result, in the frames that contain them.
 
     Args:
         path: the pickle.
-        model: the body that is posed.
+        model: body model to pose.
 
     Raises:
-        InputError: it is no such file.
+        InputError: the file has another format.
     """
     people, boxes, used = [], [], ""
     for name, person in part(str(path), read_pickled(path), "person_data").items():
@@ -48,7 +48,7 @@ def read_glamr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult
         )
         joints, used = posed(track, model, "smpl", "pelvis")
         points = numbers("kp_2d", count, None, 2)[exists]
-        # Joints that HybrIK lacks, and people in frames without a picture of them, are zeros.
+        # Joints that HybrIK lacks, and people in frames without an image of them, are zeros.
         points = np.where((points == 0.0).all(-1, keepdims=True), np.nan, points)
         people.append((number(where, name), track.frames, joints))
         boxes.append(around_points(points))

@@ -3,8 +3,8 @@
 Layout as written by zju3dv/GVHMR at commit 44fbc19, tools/demo/demo.py and
 hmr4d/model/gvhmr/gvhmr_pl_demo.py: `smpl_params_global` and `smpl_params_incam`, SMPL-X with
 `global_orient` (T, 3), `body_pose` (T, 63), `transl` (T, 3) and `betas` (T, 10), and `K_fullimg`
-(T, 3, 3) px. The method follows one person through the whole video, in a world that begins where
-he does.
+(T, 3, 3) px. The method follows one person through the whole video, in a world that begins at that
+person.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ def read_gvhmr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult
     """Return the people of GVHMR's results, one for each file in order of their names.
 
     Args:
-        path: a file, or a folder with one file a person at any depth.
-        model: the body that is posed.
+        path: a file, or a folder with one file per person at any depth.
+        model: body model to pose.
 
     Raises:
         InputError: it is neither.
     """
     files = [path] if path.is_file() else sorted(path.rglob("*.pt"))
-    # Beside its results the method keeps other torch files in preprocess/.
+    # The method keeps other torch files in preprocess/.
     files = [file for file in files if file.parent.name != "preprocess"]
     if not files:
         raise wrong(path, "hmr4d_results.pt, or a folder of such files", "none")

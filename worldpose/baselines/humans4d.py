@@ -2,9 +2,9 @@
 
 Layout as written by brjathu/PHALP at commit 96f7e6c, phalp/trackers/PHALP.py (`track`), which
 shubham-goel/4D-Humans at commit 6ec7965, track.py, runs with HMR2: joblib's file of a dictionary by
-picture, with lists over people: `tid`, `tracked_time` (0 where it was seen in this picture), `bbox`
-x y width height px, `camera` (3,) m, `smpl` with `global_orient` (1, 3, 3), `body_pose`
-(23, 3, 3) and `betas` (10,); `time` counts the pictures from 0.
+image, with lists over people: `tid`, `tracked_time` (0 if detected in this image), `bbox` x y width
+height px, `camera` (3,) m, `smpl` with `global_orient` (1, 3, 3), `body_pose` (23, 3, 3) and
+`betas` (10,); `time` counts the images from 0.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ _Row = tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def read_humans4d(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
-    """Return the people of 4DHumans' result in the pictures in which they were seen.
+    """Return the people of 4DHumans' result in the images with a detection.
 
     Args:
         path: joblib's file.
-        model: the body that is posed.
+        model: body model to pose.
 
     Raises:
-        InputError: it is no such file.
+        InputError: the file has another format.
     """
     content = read_pickled(path)
     if not isinstance(content, dict):
@@ -54,7 +54,7 @@ def read_humans4d(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodRes
 
 
 def _people(where: str, picture: Any) -> list[tuple[int, _Row]]:  # noqa: ANN401
-    """Id and row of everybody who was seen in one picture."""
+    """Return id and row of every person detected in one image."""
     frame = number(where, part(where, picture, "time"))
     ages = part(where, picture, "tracked_time")
     found = []

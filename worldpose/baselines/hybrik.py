@@ -34,7 +34,7 @@ def read_hybrik(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResul
 
     Args:
         path: `pose.pkl` or `res.pk`.
-        model: the body that is posed.
+        model: body model to pose.
 
     Raises:
         InputError: it is neither.

@@ -1,4 +1,4 @@
-"""The methods whose results can be read, and what the paper calls them."""
+"""Supported baseline methods, with their names in the paper."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from worldpose.errors import UsageError
 
 @dataclass(frozen=True)
 class Method:
-    """One method."""
+    """A supported baseline method."""
 
     name: str
-    """As the command line names it."""
+    """Name on the command line."""
     title: str
-    """As a table names it."""
+    """Name in tables."""
     read: Callable[[Path, BodyModel, tuple[int, int]], MethodResult]
     """Takes path, body and the video's width and height [px]."""
 

@@ -1,4 +1,4 @@
-"""Files that methods write with pickle, joblib, numpy or torch, read without running them."""
+"""Files written with pickle, joblib, numpy or torch, read without executing them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from worldpose.pickles import (
 )
 
 FILE_BYTES: Final = 8 << 30
-"""Most that a file may hold, unpacked [byte]: whole results without surfaces are a hundredth."""
+"""Maximum unpacked size of a file [byte]: whole results without surfaces are a hundredth."""
 
 _NUMPY: Final = b"\x93NUMPY"
 
@@ -57,7 +57,7 @@ def read_pickled(path: Path) -> Any:  # noqa: ANN401
     are recognised by their bytes.
 
     Raises:
-        InputError: the file cannot be read, or names what no result needs.
+        InputError: the file is not readable, or names classes that no result needs.
     """
     try:
         if zipfile.is_zipfile(path):
@@ -73,7 +73,7 @@ def read_pickled(path: Path) -> Any:  # noqa: ANN401
         raise _refused(path, f"what cannot be read ({error})") from None
     except MemoryError:
         raise
-    # A damaged or hostile pickle can fail in any way: pickle's documentation names no closed list.
+    # A damaged or hostile pickle can fail in any way: pickle documents no complete list.
     except Exception as error:
         reason = str(error) or type(error).__name__
         raise _refused(path, f"what cannot be read as such ({reason})") from error
@@ -89,7 +89,7 @@ def _refused(path: Path, found: str) -> InputError:
 
 
 def _unpacked(path: Path) -> io.BytesIO:
-    """The bytes of a file, decompressed where it is."""
+    """Return the bytes of a file, decompressed if necessary."""
     if path.stat().st_size > FILE_BYTES:
         raise ValueError(f"{path.stat().st_size} bytes")
     content = path.read_bytes()
@@ -115,13 +115,13 @@ def _content(stream: io.BytesIO) -> object:
 
 
 def _item(value: object) -> object:
-    """What an array of objects without dimensions holds."""
+    """Return the element of a zero-dimensional object array."""
     found = plain(value, _DECODERS)
     return found["item"] if isinstance(found, dict) and set(found) == {"item"} else found
 
 
 class _Unpickler(Unpickler):
-    """With joblib's arrays, whose bytes follow where their note ends."""
+    """Unpickler for joblib's arrays, whose bytes follow their note."""
 
     def __init__(
         self, stream: io.BytesIO, storage: Callable[[object], object] = no_storage
@@ -139,7 +139,7 @@ class _Unpickler(Unpickler):
 
 
 def _read_wrapped(note: Wrapped, source: io.BytesIO) -> None:
-    """Read the array whose bytes follow at this place of joblib's file."""
+    """Read the array whose bytes follow at this position of joblib's file."""
     state = note.state
     if isinstance(state["dtype"], Dtype) and state["dtype"].args[0] == "O8":
         note.array = _Unpickler(source).load()

@@ -3,7 +3,7 @@
 Layout as written by yufu-wang/PromptHMR at commit ea85d0a, pipeline/pipeline.py and
 pipeline/world.py: `people[id]` with `frames` (n,), `bboxes` (n, 4) x0 y0 x1 y1 px and
 `smplx_world`, SMPL-X with `pose` (n, 165), `shape` and `trans` (n, 3); `camera.img_center` px is
-the middle of the pictures, which the method shrinks.
+the principal point of the images, which the method downscales.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ def read_prompthmr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodRe
 
     Args:
         path: joblib's file, or the folder it lies in.
-        model: the body that is posed.
+        model: body model to pose.
 
     Raises:
-        InputError: it is no such file.
+        InputError: the file has another format.
     """
     file = path / "results.pkl" if path.is_dir() else path
     content = read_pickled(file)

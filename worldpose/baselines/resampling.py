@@ -1,4 +1,4 @@
-"""Results of a method that saw the clip at another frame rate, at the clip's own."""
+"""Resampling of a method's result from the frame rate of its input to the clip's."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ Floats = NDArray[np.float64]
 
 
 def resampled(result: MethodResult, seen_fps: float, fps: float) -> MethodResult:
-    """Return a result at the frames of a clip, joints and boxes in between on straight lines.
+    """Return a result at the frames of a clip, with linear interpolation of joints and boxes.
 
-    The first pictures of both are the same moment. Where one of the two pictures around a frame has
-    no person, the frame has none either.
+    The first images of both are simultaneous. If a person is missing in one of the two images
+    around a frame, the person is missing in the frame, too.
 
     Args:
-        result: its frames count the pictures that the method saw.
-        seen_fps: of those pictures [1/s].
-        fps: of the clip [1/s].
+        result: its frames count the images of the method's input.
+        seen_fps: frame rate of those images [1/s].
+        fps: frame rate of the clip [1/s].
     """
     if seen_fps == fps or not len(result.joints.frames):
         return result
     own = result.joints.frames
-    # What is left of a frame by rounding is no reason to lose the last one.
+    # A rounding error must not drop the last frame.
     first = int(np.ceil(own[0] * fps / seen_fps - 1e-6))
     last = int(np.floor(own[-1] * fps / seen_fps + 1e-6))
     frames = np.arange(first, last + 1)
@@ -44,7 +44,7 @@ def resampled(result: MethodResult, seen_fps: float, fps: float) -> MethodResult
 
 
 def _between(values: Floats, own: NDArray[np.int64], places: Floats) -> Floats:
-    """Values (pictures, ...) at places [pictures]; NaN where a neighbour is not there."""
+    """Interpolate values (images, ...) at positions [images]; NaN if a neighbour is missing."""
     before = np.floor(places + 1e-6).astype(np.int64)
     share = np.clip(places - before, 0.0, 1.0)
     share[share < 1e-6] = 0.0

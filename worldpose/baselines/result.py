@@ -1,4 +1,4 @@
-"""What a method has found in a clip, in one form whatever the method wrote."""
+"""Result of a baseline method for a clip, independent of its file format."""
 
 from __future__ import annotations
 
@@ -17,61 +17,61 @@ from worldpose.formats import JointTracks
 
 Floats = NDArray[np.float64]
 World = Literal["shared", "own", "camera"]
-"""In which frame people stand: one for all, one for each person, the camera's of each frame."""
+"""Reference frame of people: one for all, one per person, or the camera's in each frame."""
 Shape = Literal["smpl", "open", "other"]
-"""Whose betas a file has: SMPL's, the open body's, or those of SMPL+H, SMPL-X or another body,
-which mean nothing here."""
+"""Body model of a file's betas: SMPL, the open body, or another (SMPL+H, SMPL-X, ...), whose
+betas are not used here."""
 Place = Literal["transl", "pelvis", "mid_hip"]
-"""What a place is of: `transl` is added to SMPL's joints; the others are where that point is."""
+"""Reference point of a position: `transl` is added to SMPL's joints; the others are points."""
 
 BODY_ANGLES: Final = 69
 _CHUNK: Final = 4096
-"""Bodies posed at a time: 50 MB."""
+"""Bodies posed per chunk: 50 MB."""
 
 
 @dataclass(frozen=True, eq=False)
 class MethodResult:
-    """People of a clip as a method found them."""
+    """People of a clip as estimated by a method."""
 
     joints: JointTracks
-    """Frames count the pictures from 0; COCO-17 [m]."""
+    """Frames count the images from 0; COCO-17 [m]."""
     world: World
     boxes: Floats | None = None
-    """(frames, persons, 4) x0 y0 x1 y1 [px] in the picture; None where the file tells nothing."""
+    """(frames, persons, 4) x0 y0 x1 y1 [px] in the image; None if the file has none."""
     picture: tuple[float, float] | None = None
-    """Width and height of the picture that the boxes are in [px]; None = that of the video."""
+    """Width and height of the image that the boxes refer to [px]; None = that of the video."""
     notes: Mapping[str, str] = field(default_factory=dict)
-    """What was done beyond reading, for the settings that are recorded with a score."""
+    """Processing beyond reading, for the settings that are recorded with a score."""
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """The bodies of one person, one for each of some frames."""
+    """Bodies of one person in some frames."""
 
     frames: NDArray[np.int64]
-    """(frames,) pictures from 0, rising."""
+    """(frames,) images from 0, ascending."""
     global_orient: Floats
     """(frames, 3) [rad]."""
     body_pose: Floats
-    """(frames, 63 or 69) [rad]; hands that are lacking are flat."""
+    """(frames, 63 or 69) [rad]; missing hands are flat."""
     place: Floats
     """(frames, 3) [m]."""
     betas: Floats | None = None
     """(frames, 10 or more), or (10 or more,)."""
     scale: Floats | None = None
-    """(frames,) by which the body is enlarged about its pelvis; None = 1."""
+    """(frames,) scale factor of the body about its pelvis; None = 1."""
 
 
 def posed(
     track: Track, model: BodyModel, shape: Shape, place: Place = "transl"
 ) -> tuple[Floats, str]:
-    """Return the joints (frames, 17, 3) [m] of one person, and whose shape the body has.
+    """Return the joints (frames, 17, 3) [m] of one person, and the source of its shape.
 
     Args:
-        track: the bodies.
-        model: the body that is posed.
-        shape: whose betas these are; they are used where the model is that body.
-        place: what the track's place is of.
+        track: bodies of the person.
+        model: body model to pose.
+        shape: body model of the betas; they are used if `model` is that body.
+        place: reference point of the track's position.
 
     Raises:
         InputError: arrays of other shapes.
@@ -108,14 +108,14 @@ def gathered(
     people: Sequence[tuple[int, NDArray[np.int64], Floats]],
     boxes: Sequence[Floats | None] | None = None,
 ) -> tuple[JointTracks, Floats | None]:
-    """Return people with frames of their own as one set, NaN where a person is missing.
+    """Merge people with their own frames into one set, NaN where a person is missing.
 
     Args:
         people: id, frames (frames,) and joints (frames, 17, 3) [m] of each.
         boxes: (frames, 4) [px] of each, in the same frames.
 
     Raises:
-        InputError: nobody at all.
+        InputError: there are no people.
     """
     if not people:
         raise InputError(
@@ -138,10 +138,10 @@ def gathered(
 
 
 def seen_boxes(joints: Floats, focal: Floats, center: Floats) -> Floats:
-    """Return boxes (frames, 4) x0 y0 x1 y1 [px] around one person's joints in a picture.
+    """Return boxes (frames, 4) x0 y0 x1 y1 [px] around one person's joints in an image.
 
     Args:
-        joints: (frames, 17, 3) [m], camera axes; those behind the camera do not count.
+        joints: (frames, 17, 3) [m], camera axes; those behind the camera are ignored.
         focal: (2,) or (frames, 2) [px].
         center: (2,) or (frames, 2) principal point [px].
     """
@@ -162,6 +162,6 @@ def around_points(pixels: Floats) -> Floats:
 
 
 def rotation_vectors(matrices: Any) -> Floats:  # noqa: ANN401
-    """Return rotation vectors (..., 3) [rad] of matrices (..., 3, 3), as a file holds them."""
+    """Convert a file's rotation matrices (..., 3, 3) to rotation vectors (..., 3) [rad]."""
     array = np.asarray(matrices, dtype=np.float64)
     return Rigid(array, np.zeros(array.shape[:-1])).rotvec

@@ -8,8 +8,8 @@ each phase `<phase>/<clip>_<iteration>_world_results.npz` with SMPL+H `root_orie
 x_cam = R x_world + t; `<clip>_cameras_<iteration>.json` has `intrinsics` (T, 4) fx fy cx cy px.
 
 The method moves every piece's world so that its first camera is near the origin, and scales its
-camera path. Pieces are put together at their cameras: the orientation of one SLAM run is common to
-all, and the centre of a piece's first camera is put where that of the piece before was last.
+camera path. Pieces are joined at their cameras: the orientation of one SLAM run is common to all,
+and the centre of a piece's first camera is moved to the last one of the previous piece.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from worldpose.baselines.result import MethodResult, Track, gathered, posed, see
 from worldpose.body import BodyModel
 
 WITH_MOTION_PRIOR: Final = "motion_chunks"
-"""Phase whose results are the method's."""
+"""Phase with the final results."""
 WITHOUT_MOTION_PRIOR: Final = "smooth_fit"
-"""Phase before HuMoR, the motion prior, has a say (E5)."""
+"""Phase before HuMoR, the motion prior, is used (E5)."""
 
 _ARRAYS: Final = ("root_orient", "pose_body", "trans", "cam_R", "cam_t")
 _Piece = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
 
 
 def slahmr_reader(phase: str) -> Callable[[Path, BodyModel, tuple[int, int]], MethodResult]:
-    """Return what reads the results of one phase."""
+    """Return a reader for the results of one phase."""
 
     def read(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
         return read_slahmr(path, model, phase)
@@ -48,12 +48,12 @@ def read_slahmr(path: Path, model: BodyModel, phase: str) -> MethodResult:
     """Return the people of SLAHMR's runs.
 
     Args:
-        path: a run's folder, or one that holds those of all pieces at any depth.
-        model: the body that is posed.
-        phase: whose results are taken; the last iteration counts.
+        path: a run's folder, or one that holds the folders of all pieces at any depth.
+        model: body model to pose.
+        phase: phase to read; its last iteration is used.
 
     Raises:
-        InputError: it is no such folder.
+        InputError: the folder has another layout.
     """
     runs = sorted(
         (_read_run(info, model, phase) for info in sorted(path.rglob("track_info.json"))),
@@ -71,7 +71,7 @@ def read_slahmr(path: Path, model: BodyModel, phase: str) -> MethodResult:
     found, around = [], []
     for person, some in sorted(pieces.items()):
         frames, joints, boxes = (np.concatenate(arrays) for arrays in zip(*some, strict=True))
-        # Where pieces overlap the first one counts.
+        # Where pieces overlap, the first one is used.
         frames, first = np.unique(frames, return_index=True)
         found.append((person, frames, joints[first]))
         around.append(boxes[first])
@@ -83,7 +83,7 @@ def read_slahmr(path: Path, model: BodyModel, phase: str) -> MethodResult:
 def _read_run(
     info: Path, model: BodyModel, phase: str
 ) -> tuple[int, dict[int, _Piece], NDArray[np.float64], str]:
-    """First picture, people by id, camera centres, and whose shape the bodies have."""
+    """Return first image, people by id, camera centres, and the body model of the shapes."""
     where = str(info)
     try:
         content: Any = json.loads(info.read_bytes())
@@ -116,7 +116,7 @@ def _read_run(
             continue
         if row >= count:
             raise wrong(where, f"tracks below {count}, as the results have", f"{row}")
-        # A track lasts from the first to the last picture with a person, hidden or not.
+        # A track lasts from the first to the last image with a person, visible or not.
         seen = np.flatnonzero(mask) - start
         rows = np.arange(seen[0], min(seen[-1] + 1, length))
         joints, used = posed(
@@ -130,7 +130,7 @@ def _read_run(
 
 
 def _intrinsics(results: Path, length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Focal lengths and principal points (pictures, 2) [px] beside a results file."""
+    """Return focal lengths and principal points (images, 2) [px] for a results file."""
     iteration = results.name.split("_")[-3]
     files = sorted(results.parent.glob(f"*_cameras_{iteration}.json"))
     if not files:

@@ -1,4 +1,4 @@
-"""Any method whose people were put into the release's own layout: `poses/<clip>.npz`."""
+"""Reader for any method's people in the release's own layout: `poses/<clip>.npz`."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ def read_smpl(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
 
     Args:
         path: npz file, persons first, NaN where a person is missing (docs/formats.md).
-        model: the body that is posed; betas of another body than the file's are not used.
+        model: body model to pose; betas of another body model are not used.
 
     Raises:
-        InputError: it is no such file.
+        InputError: the file has another format.
     """
     poses, named = read_poses(path)
     people, used = [], ""

@@ -1,7 +1,7 @@
-"""Tensors as torch writes them, in its zip files, its older files and plain pickles, without torch.
+"""Torch tensors from zip files, older files and plain pickles, read without torch.
 
-A tensor is a view into a storage: a first element, lengths and steps, all of which are checked
-against the bytes that are there.
+A tensor is a view of a storage: an offset, lengths and strides, all of which are checked against
+the size of the storage.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from worldpose.pickles import LARGEST, Note
 
 Storages = Callable[[object], object]
-"""Gives the storage of what a file calls its persistent id."""
+"""Returns the storage for a persistent id of a file."""
 Load = Callable[[io.BytesIO, Storages], Any]
 """Reads one pickle from a stream."""
 
@@ -40,7 +40,7 @@ _MAGIC: Final = 0x1950A86A20F9469CFC6C
 
 
 class Tensor(Note):
-    """`_rebuild_tensor_v2`: storage, first element, lengths, steps."""
+    """`_rebuild_tensor_v2`: storage, offset, lengths, strides."""
 
 
 class Parameter(Note):
@@ -48,7 +48,7 @@ class Parameter(Note):
 
 
 class Saved(Note):
-    """`_load_from_bytes`: an older file within a pickle, which holds one storage."""
+    """`_load_from_bytes`: an older file within a pickle, with one storage."""
 
 
 def _storage_type(code: str) -> type[Note]:
@@ -64,18 +64,18 @@ ALLOWED: Final[Mapping[tuple[str, str], type[Note]]] = {
     ("torch._utils", "_rebuild_parameter"): Parameter,
     ("torch.storage", "_load_from_bytes"): Saved,
 }
-"""Names of torch that a file may use."""
+"""Names of torch that a file can use."""
 
 
 def open_archive(file: zipfile.ZipFile, limit: int) -> tuple[io.BytesIO, Storages]:
-    """Return the pickle of a torch zip file, and what gives its storages.
+    """Return the pickle of a torch zip file, and a function that returns its storages.
 
     Args:
         file: the zip file.
-        limit: most that its members may hold, unpacked [byte].
+        limit: maximum unpacked size of its members [byte].
 
     Raises:
-        ValueError: it is no such file, too large, or of another byte order.
+        ValueError: it is not such a file, too large, or of another byte order.
     """
     names = [name for name in file.namelist() if name.endswith("/data.pkl")]
     if len(names) != 1:
@@ -94,7 +94,7 @@ def open_archive(file: zipfile.ZipFile, limit: int) -> tuple[io.BytesIO, Storage
 
 
 def decoders(load: Load) -> Mapping[type[Note], Callable[[Any], object]]:
-    """Return what torch's notes mean.
+    """Return the decoders of torch's notes.
 
     Args:
         load: reads a pickle.
@@ -121,7 +121,7 @@ def decoders(load: Load) -> Mapping[type[Note], Callable[[Any], object]]:
 
 
 def _identity(identity: object) -> tuple[str, str, int]:
-    """Type, key and length of a storage from its persistent id."""
+    """Return type, key and length of a storage from its persistent id."""
     if not isinstance(identity, tuple) or len(identity) < 5 or identity[0] != "storage":
         raise pickle.UnpicklingError("an object kept outside the file")
     kind, key, _, count = identity[1:5]
@@ -136,7 +136,7 @@ def _flat(code: str, raw: bytes) -> NDArray[Any]:
 
 
 def _view(flat: NDArray[Any], first: int, lengths: list[int], steps: list[int]) -> NDArray[Any]:
-    """A copy of the elements of a storage that a tensor shows."""
+    """Return a copy of the elements of a storage that a tensor views."""
     if len(lengths) != len(steps) or first < 0 or any(n < 0 for n in (*lengths, *steps)):
         raise ValueError(f"a tensor of lengths {lengths} and steps {steps}")
     if 0 in lengths:
@@ -150,7 +150,7 @@ def _view(flat: NDArray[Any], first: int, lengths: list[int], steps: list[int]) 
 
 
 def _older(stream: io.BytesIO, load: Load) -> NDArray[Any]:
-    """The one storage of a file in torch's older form: five pickles, then the bytes."""
+    """Read the one storage of a file in torch's older format: five pickles, then the bytes."""
     types: dict[str, tuple[str, int]] = {}
 
     def named(identity: object) -> object:

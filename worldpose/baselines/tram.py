@@ -33,10 +33,10 @@ def read_tram(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
 
     Args:
         path: the folder of the video.
-        model: the body that is posed.
+        model: body model to pose.
 
     Raises:
-        InputError: it is no such folder.
+        InputError: the folder has another layout.
     """
     files = {
         int(found[1]): file
@@ -54,7 +54,7 @@ def read_tram(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
     people, boxes, used = [], [], ""
     for person, name in sorted(files.items()):
         where, content = str(name), read_pickled(name)
-        # A track is in pieces, one after another in time.
+        # A track consists of pieces, in temporal order.
         frames = rising(where, whole(where, part(where, content, "frame")))
         if frames[-1] >= len(turns):
             raise wrong(where, f"frames below {len(turns)}, as the camera has", f"{frames[-1]}")

@@ -1,10 +1,10 @@
-"""WHAM: `wham_output.pkl`, joblib's file by person, each in a world of his own.
+"""WHAM: `wham_output.pkl`, joblib's file by person, each in its own world.
 
 Layout as written by yohanshin/WHAM at commit 2b54f77, demo.py: `pose_world` and `pose` (n, 72),
-`trans_world` and `trans` (n, 3), `betas` (n, 10), `frame_ids` (n,). `trans_world` is where the
-middle of the hips is (lib/models/smpl.py, `get_output`), `trans` is SMPL's own in camera axes; the
-focal length is the picture's diagonal (lib/vis/run_vis.py). Every trajectory begins at its own
-origin, so that only scores of single people mean anything.
+`trans_world` and `trans` (n, 3), `betas` (n, 10), `frame_ids` (n,). `trans_world` is the mid-hip
+(lib/models/smpl.py, `get_output`), `trans` is SMPL's own in camera axes; the focal length is the
+image diagonal (lib/vis/run_vis.py). Every trajectory begins at its own origin, so only scores of
+single people are meaningful.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ def read_wham(path: Path, model: BodyModel, picture: tuple[int, int]) -> MethodR
 
     Args:
         path: joblib's file.
-        model: the body that is posed.
-        picture: width and height of the video [px], which give the focal length.
+        model: body model to pose.
+        picture: width and height of the video [px], which determine the focal length.
 
     Raises:
-        InputError: it is no such file.
+        InputError: the file has another format.
     """
     content = read_pickled(path)
     if not isinstance(content, dict):

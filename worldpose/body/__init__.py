@@ -1,8 +1,8 @@
-"""The body model: from shape, joint angles and place to joints, keypoints and surface in metres.
+"""Body model: joints, keypoints and surface [m] from shape, joint angles and position.
 
-Input: `BodyParameters`, and the open body or one that the user brought. Output: world points.
-`worldpose.body.jacobian` has derivatives for least squares, `worldpose.body.differentiable` is the
-same for gradients; only that file needs torch.
+Input: `BodyParameters`, and the open body or an installed one. Output: world points.
+`worldpose.body.jacobian` has derivatives for least squares, `worldpose.body.differentiable` has
+gradients; only the latter needs torch.
 """
 
 from worldpose.body.body_file import OPEN_BODY, load_body, load_open_body, save_body

@@ -1,4 +1,4 @@
-"""Forward kinematics: from the rotation of each joint to where the joints go."""
+"""Forward kinematics: joint positions from joint rotations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class Articulation:
-    """Where the frames of the joints go, before the body's translation.
+    """Posed frames of the joints, before the body's translation.
 
     A point `x` fixed to joint j of the unposed body goes to `rotations[j] x + offsets[j]`.
     """

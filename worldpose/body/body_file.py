@@ -27,10 +27,10 @@ KEYS: Final = (
     "kintree_table",
     "f",
 )
-"""What SMPL's files call the arrays of a model."""
+"""Names of a model's arrays in SMPL's files."""
 
 _SHAPES: Final = 10
-"""Betas that are read; the released poses have as many (X3)."""
+"""Number of betas that are read, as in the released poses (X3)."""
 
 
 def load_open_body() -> BodyModel:
@@ -42,14 +42,14 @@ def load_body(path: Path) -> BodyModel:
     """Return the body model of a file that `save_body` wrote.
 
     Raises:
-        InputError: the file is missing, damaged or something else.
+        InputError: the file is missing, damaged or no body model.
     """
     arrays = read_arrays(path, (*KEYS, "name"))
     return model_of(arrays, str(arrays["name"]), path)
 
 
 def save_body(path: Path, model: BodyModel) -> None:
-    """Write a model in single precision, 0.1 um at most; the file appears whole or not at all."""
+    """Write a model in single precision, to 0.1 um; the file appears complete or not at all."""
     root = np.where(model.parents < 0, np.iinfo(np.uint32).max, model.parents)
     arrays = {
         "v_template": model.template.astype(np.float32),
@@ -88,7 +88,7 @@ def read_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[np.gener
 
 
 def unreadable(path: Path, found: str) -> InputError:
-    """The error of a file that is not a body model."""
+    """Return the error of a file that is not a body model."""
     return InputError(
         str(path),
         expected=f"a body model with the arrays {', '.join(KEYS)}",

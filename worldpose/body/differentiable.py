@@ -1,6 +1,6 @@
-"""The body model in torch: the same joints, keypoints and surface, with gradients.
+"""Body model in torch: the same joints, keypoints and surface, with gradients.
 
-Needs the extra `body`. Nothing else of worldpose imports this file before it is asked to.
+Needs the extra `body`. Other modules of worldpose import this file only on demand.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class DifferentiableBody:
         return self._tensor(self.model.weights)
 
     def _feature(self, betas: Tensor, local: Tensor, corrected: bool) -> Tensor:
-        """What the unposed surface is linear in (..., 1 + shapes + pose features)."""
+        """Return the linear features of the unposed surface (..., 1 + shapes + pose features)."""
         batch = local.shape[:-3]
         parts = [betas.new_ones((*batch, 1)), betas.expand(*batch, -1)]
         if corrected:
@@ -98,7 +98,7 @@ class DifferentiableBody:
     def _articulate(
         self, betas: Tensor, global_orient: Tensor, body_pose: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Local and world rotations, joints and offsets, as in `articulation.Articulation`."""
+        """Return local and world rotations, joints and offsets, as in `Articulation`."""
         shaped = self._joint_template + torch.einsum(
             "jcs,...s->...jc", self._joint_directions, betas
         )
@@ -117,7 +117,7 @@ class DifferentiableBody:
         return local, turned, placed, placed - (turned @ rest[..., None])[..., 0]
 
     def _rotations(self, rotvec: Tensor) -> Tensor:
-        """Rodrigues' formula (..., 3, 3); sinc keeps value and gradient exact at zero."""
+        """Return Rodrigues' rotations (..., 3, 3); sinc keeps value and gradient exact at zero."""
         angle = torch.linalg.vector_norm(rotvec, dim=-1)[..., None, None]
         x, y, z = rotvec.unbind(-1)
         zero = torch.zeros_like(x)
@@ -129,5 +129,5 @@ class DifferentiableBody:
 
 
 def _split(tensor: Tensor, *sizes: int) -> Tensor:
-    """The tensor with its last dimension in parts."""
+    """Return the tensor with its last dimension split."""
     return tensor.reshape(*tensor.shape[:-1], *sizes)

@@ -1,4 +1,4 @@
-"""Bringing a body model of one's own, such as SMPL, whose licence forbids to ship it."""
+"""Installation of a user's body model, such as SMPL, whose licence forbids shipping it."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from worldpose.body.pickled_arrays import read_pickled_arrays
 from worldpose.errors import InputError, UsageError
 
 BODY_FOLDER: Final = Path("~/.local/share/worldpose/bodies")
-"""Where installed bodies are kept unless another folder is given."""
+"""Default folder of installed bodies."""
 
 _NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]*")
 
 
 def install_body(file: Path, folder: Path = BODY_FOLDER, name: str | None = None) -> BodyModel:
-    """Return a model read from SMPL's own file, after keeping it as a safe npz file.
+    """Return a model read from SMPL's own file, after saving it as a safe npz file.
 
     Args:
-        file: SMPL's .pkl or .npz, as downloaded. Its first 10 shape directions are taken. The
+        file: SMPL's .pkl or .npz, as downloaded. Only its first 10 shape directions are used. The
             pickle's content is read, never run (`pickled_arrays`).
         folder: where `<name>.npz` is written; one of the same name is replaced.
-        name: what results call the model; from the file's name by default, so that
+        name: name of the model in results; from the file's name by default, so that
             SMPL_NEUTRAL.pkl becomes smpl-neutral.
 
     Raises:
         InputError: the file is not a body model in SMPL's layout, or names code to run.
-        UsageError: the name cannot be one.
+        UsageError: the name is invalid.
     """
     model_name = name or file.stem.lower().replace("_", "-")
     if not _NAME.fullmatch(model_name):
@@ -66,7 +66,7 @@ def install_body(file: Path, folder: Path = BODY_FOLDER, name: str | None = None
 
 
 def body_path(name: str, folder: Path = BODY_FOLDER) -> Path:
-    """Return where the installed model of that name is kept."""
+    """Return the path of the installed model of that name."""
     return folder.expanduser() / f"{name}.npz"
 
 

@@ -1,8 +1,8 @@
 """Keypoints of a posed body together with their derivatives, for least squares.
 
 Unfolding the kinematic chain writes a keypoint as `transl + pelvis + sum_q R_q a_q`: R_q is the
-turn of joint q in the world, and a_q is linear in the betas and the pose feature, with constants
-that depend on body and keypoint only. So betas move a keypoint by turned constants, and a turn of a
+world rotation of joint q, and a_q is linear in the betas and the pose feature, with constants that
+depend on body and keypoint only. So betas move a keypoint by rotated constants, and a rotation of a
 joint moves it by the axis times the lever: the sum of the terms of that joint and all below it.
 """
 
@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class KeypointJacobian:
-    """Keypoints and how they change with the parameters; `transl` changes them all alike."""
+    """Keypoints and their derivatives by the parameters; that by `transl` is the identity."""
 
     keypoints: Floats
     """(..., keypoints, 3) [m], world."""
@@ -46,7 +46,7 @@ class KeypointJacobian:
 
 @dataclass(frozen=True, eq=False)
 class ChainedKeypoints:
-    """Keypoints as sums of turned vectors, ready for many poses."""
+    """Keypoints as sums of rotated vectors, precomputed for many poses."""
 
     model: BodyModel
     pelvis: Floats
@@ -68,7 +68,7 @@ class ChainedKeypoints:
         np.add.at(vectors, pairs, keypoints.basis)
         fixed = keypoints.mass[:, None, None] * rest[keypoints.joint]
         np.subtract.at(vectors[..., :linear], pairs, fixed)
-        # A joint hangs on the bones of all joints above it, and a bone turns with its parent.
+        # A joint depends on the bones of all joints above it, and a bone rotates with its parent.
         for joint in range(JOINTS - 1, 0, -1):
             parent = model.parents[joint]
             bone = rest[joint] - rest[parent]
@@ -114,9 +114,9 @@ class ChainedKeypoints:
 
     @cached_property
     def _terms(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats, NDArray[np.bool_]]:
-        """Keypoint, joint (terms,) and constants (terms, 3, features) of every term that is not 0.
+        """Keypoint, joint (terms,) and constants (terms, 3, features) of every nonzero term.
 
-        And which joints move which keypoint (keypoints, 24).
+        The last array tells whether a joint moves a keypoint (keypoints, 24).
         """
         there: NDArray[np.bool_] = (self.vectors != 0.0).any(axis=(2, 3))
         keypoint, joint = np.nonzero(there)
@@ -139,8 +139,8 @@ class ChainedKeypoints:
 
 
 def _own_change(local: Floats, turns: Floats, axes: Floats, parents: NDArray[np.int64]) -> Floats:
-    """Change of the pose feature's parts by their own joint's angles (n, 23, 9, 3) [1/rad]."""
-    # Axes relative to the parent, in which the local rotation is.
+    """Return the pose feature's derivative by each joint's own angles (n, 23, 9, 3) [1/rad]."""
+    # Axes relative to the parent, the frame of the local rotation.
     inward = turns[:, parents[1:]].swapaxes(-1, -2) @ axes[:, 1:]
     changed = np.cross(inward[..., None, :], local[:, 1:, :, :, None], axis=-3)
     return changed.reshape(*inward.shape[:2], 9, 3)
@@ -148,14 +148,14 @@ def _own_change(local: Floats, turns: Floats, axes: Floats, parents: NDArray[np.
 
 @compiled
 def _turned(angles: Floats, parents: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
-    """Turns of joints relative to their parents and in the world, and axes of their angles.
+    """Return rotations of joints relative to parent and world, and axes of their angles.
 
     Args:
         angles: (n, joints, 3) [rad], axis-angle vectors relative to the parent.
         parents: (joints,).
 
     Returns:
-        Local and world turns (n, joints, 3, 3), and axes (n, joints, 3, 3): column c is the
+        Local and world rotations (n, joints, 3, 3), and axes (n, joints, 3, 3): column c is the
         angular velocity in the world while angle c grows.
     """
     count, joints = angles.shape[:2]
@@ -172,7 +172,7 @@ def _turned(angles: Floats, parents: NDArray[np.int64]) -> tuple[Floats, Floats,
                 first = np.sin(angle) / angle
                 third = (1.0 - first) / square
             else:
-                # Series beyond which double precision sees nothing.
+                # Series exact to double precision.
                 first = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
                 third = (1.0 - square / 20.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0))) / 6.0
             half = np.sin(0.5 * angle)
@@ -217,14 +217,14 @@ def _levered(
     moves: NDArray[np.bool_],
     parents: NDArray[np.int64],
 ) -> tuple[Floats, Floats]:
-    """Sums of turned terms (n, keypoints, 3) [m] and their change (n, keypoints, 3, 72) [m/rad].
+    """Return sums of rotated terms (n, keypoints, 3) [m] and Jacobian (n, keypoints, 3, 72).
 
     Args:
-        turns: (n, 24, 3, 3), world.
+        turns: (n, 24, 3, 3), world rotations.
         axes: (n, 24, 3, 3), of the angles.
         terms: (n, terms, 3) [m], unturned, by ascending keypoint.
         keypoint: (terms,).
-        joint: (terms,), which turns the term.
+        joint: (terms,), the joint that rotates the term.
         moves: (keypoints, 24), whether a joint has any part in a keypoint.
         parents: (24,).
     """

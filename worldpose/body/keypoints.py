@@ -22,7 +22,7 @@ from worldpose.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class FoldedKeypoints:
-    """Keypoints of one body model, ready for many poses."""
+    """Keypoints of one body model, precomputed for many poses."""
 
     model: BodyModel
     joint_shares: NDArray[np.float64]
@@ -69,7 +69,7 @@ def fold_keypoints(model: BodyModel, points: tuple[str, ...]) -> FoldedKeypoints
     """Return named points of a model, for instance those of `skeletons.COCO17`.
 
     Raises:
-        InputError: a point has no name here, or the model has another number of vertices than
+        InputError: the name of a point is unknown, or the model has another number of vertices than
             SMPL, where no vertex has a meaning.
     """
     joint_shares = np.zeros((len(points), JOINTS))
@@ -102,7 +102,7 @@ def fold_regressor(
             the sum 1 for every keypoint.
 
     Raises:
-        InputError: the shapes differ from these, or a sum from 1.
+        InputError: the shapes differ from these, or a sum differs from 1.
     """
     shapes = (len(joint_shares), JOINTS), (len(joint_shares), len(model.template))
     fitting = (joint_shares.shape, vertex_shares.shape) == shapes

@@ -1,7 +1,7 @@
-"""The body model: a surface and 24 joints, shaped by betas and posed by joint angles.
+"""Body model: a surface and 24 joints, shaped by betas and posed by joint angles.
 
 Loper et al., "SMPL: A Skinned Multi-Person Linear Model" (2015), describes the function; any model
-in that layout can be its content.
+in that layout can be loaded.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class BodyModel:
     def __post_init__(self) -> None:
         floats = ("template", "shape_directions", "pose_directions", "joint_regressor", "weights")
         for name in floats:
-            # Files keep either order of memory; sums over one are other bits than over the other.
+            # Files have either memory order, and the last bits of sums depend on it.
             array = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
             object.__setattr__(self, name, array)
         for name in ("parents", "faces"):
@@ -108,14 +108,14 @@ class BodyModel:
 
     @cached_property
     def joint_directions(self) -> NDArray[np.float64]:
-        """How the joints move with the betas (24, 3, shapes) [m]."""
+        """Motion of the joints per unit of the betas (24, 3, shapes) [m]."""
         moved: NDArray[np.float64] = np.einsum(
             "jv,vcs->jcs", self.joint_regressor, self.shape_directions, optimize=True
         )
         return moved
 
     def articulate(self, parameters: BodyParameters) -> Articulation:
-        """Return where every joint's frame goes, before `transl`.
+        """Return the posed frame of every joint, before `transl`.
 
         Raises:
             InputError: the number of betas is not this model's.
@@ -149,7 +149,7 @@ class BodyModel:
         return surfaces.reshape(*parameters.batch_shape, count, 3)
 
     def _surface(self, parameters: BodyParameters) -> NDArray[np.float64]:
-        """The surfaces (n, vertices, 3) of a flat batch."""
+        """Return the surfaces (n, vertices, 3) of a flat batch."""
         posed = self.articulate(parameters)
         unposed = self.template + np.einsum(
             "vcs,ns->nvc", self.shape_directions, parameters.betas, optimize=True

@@ -1,4 +1,4 @@
-"""What poses a body: shape, orientation, joint angles and place, named as in the release (X3)."""
+"""Body parameters: shape, orientation, joint angles and position, named as in the release (X3)."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ BODY_POSE = 69
 class BodyParameters:
     """One body or a batch of them; batch dimensions broadcast against each other.
 
-    Rotations are axis-angle vectors relative to the parent joint. `global_orient` turns the body
+    Rotations are axis-angle vectors relative to the parent joint. `global_orient` rotates the body
     about its pelvis joint, and `transl` is added after that: the pelvis of a body stands at
-    `transl` plus the pelvis of its unposed shape. The model itself stands upright along +y, so in
-    a world with z up a standing body has a `global_orient` near (pi / 2, 0, 0).
+    `transl` plus the pelvis of its unposed shape. The model itself stands upright along +y, so in a
+    world with z up a standing body has a `global_orient` near (pi / 2, 0, 0).
 
     Raises:
         InputError: an array has the wrong trailing shape or the batches do not broadcast.

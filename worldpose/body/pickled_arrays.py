@@ -1,4 +1,4 @@
-"""Arrays of the pickles in which SMPL and its kin are distributed, of numpy, scipy and chumpy.
+"""Reader of numpy, scipy and chumpy arrays in the pickles of SMPL and related models.
 
 Nothing that the pickle names is imported or run (`worldpose.pickles`): neither chumpy nor scipy's
 own unpickling is involved.
@@ -24,7 +24,7 @@ _MALFORMED: Final = (
     *(MemoryError, RecursionError),
 )
 _LARGEST: Final = 1 << 28
-"""Most elements of a dense array: three times the pose directions with 300 shapes."""
+"""Maximum elements of a dense array: three times the pose directions with 300 shapes."""
 
 
 class _Sparse(Note):
@@ -57,7 +57,7 @@ class _Unpickler(Unpickler):
 
 
 def read_pickled_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[np.generic]]:
-    """Return arrays of a pickled dictionary, dense also where the pickle holds sparse ones.
+    """Return arrays of a pickled dictionary, dense even if the pickle holds sparse ones.
 
     Raises:
         InputError: the file cannot be read, names anything but arrays, or lacks a key.
@@ -80,7 +80,7 @@ def read_pickled_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[
     for key in keys:
         try:
             arrays[key] = _array(content[key])
-        # The notes hold whatever the file says, of any type.
+        # The notes may hold content of any type.
         except _MALFORMED as bad:
             raise unreadable(path, f"{key} that is not an array ({_reason(bad)})") from None
     return arrays
@@ -111,7 +111,7 @@ def _sparse_array(note: _Sparse) -> NDArray[np.generic]:
 
 
 def _chumpy_array(note: _Chumpy) -> NDArray[np.generic]:
-    """An array that chumpy wraps (`x`), or one picked out of another (`a`, `idxs`)."""
+    """Return an array that chumpy wraps (`x`), or one indexed out of another (`a`, `idxs`)."""
     if "x" in note.state:
         return _array(note.state["x"])
     picked: NDArray[np.generic] = _array(note.state["a"]).ravel()[_array(note.state["idxs"])]

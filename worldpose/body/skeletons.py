@@ -1,9 +1,9 @@
-"""Named points of the body, and the sets of them that others use.
+"""Named points of the body, and common keypoint sets.
 
 Joints of the limbs are the model's own joints. Points of the face and feet are vertices, at the
-numbers at which SMPL's users look for them (those of smplx); the open body has the same points at
-the same numbers. So a hip is the centre of the joint, a little below and inside of where people
-annotate hips in pictures.
+vertex numbers that SMPL's users know (those of smplx); the open body has the same points at the
+same numbers. So a hip is the centre of the joint, a little below and inside of annotated hips in
+images.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ SKELETONS: Final = MappingProxyType(
 
 
 def places_of(points: tuple[str, ...], skeleton: tuple[str, ...]) -> NDArray[np.int64]:
-    """Return where each of `points` stands in `skeleton` (points,).
+    """Return the index of each of `points` in `skeleton` (points,).
 
     Raises:
         InputError: the skeleton lacks a point.

@@ -1,7 +1,7 @@
-"""Body fitting: shape, place, orientation and angles of every person's body (S1-S3).
+"""Body fitting: shape, position, orientation and joint angles of every person's body (S1-S3).
 
-Input: triangulated joints with covariance, a body model, and the ground where it is known. Output:
-body parameters, the bodies' keypoints with covariance, and what the detector always gets wrong.
+Input: triangulated joints with covariance, a body model, and the ground where known. Output: body
+parameters, the bodies' keypoints with covariance, and the detector's systematic offsets.
 """
 
 from worldpose.body_fitting.bones import (

@@ -1,7 +1,8 @@
-"""Least squares over time: a symmetric matrix of blocks that couple a frame with the next two.
+"""Block-banded Cholesky solver: blocks couple each frame with the next two.
 
 A second difference ties three frames, so the normal equations of a whole track have five diagonals
-of blocks. Their Cholesky factor has the same lower blocks and costs time in proportion to frames.
+of blocks. Their Cholesky factor has the same lower blocks and takes time proportional to the number
+of frames.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ class BandedFactor:
     lower: Floats
     """(3, frames, n, n): blocks of frame t in rows t, t + 1 and t + 2; those past the end are 0."""
     determined: bool
-    """Whether the matrix was positive definite; the factor means nothing otherwise."""
+    """Whether the matrix was positive definite; the factor is invalid otherwise."""
 
     @classmethod
     def of(cls, blocks: Floats) -> BandedFactor:
@@ -45,7 +46,7 @@ class BandedFactor:
     def inverse_blocks(self) -> Floats:
         """Return the diagonal blocks (frames, n, n) of the inverse: each frame's covariance.
 
-        By Takahashi's recursion from the last frame, which needs only the band of the inverse.
+        Takahashi's recursion from the last frame needs only the band of the inverse.
         """
         frames, size = self.lower.shape[1:3]
         inverse = np.zeros((3, frames + 2, size, size))
@@ -128,7 +129,7 @@ def _divide(target: Floats, block: Floats) -> None:
 
 @compiled
 def _substitute(lower: Floats, right: Floats) -> None:
-    """Forward and backward substitution in place."""
+    """Substitute forward and backward in place."""
     frames, size = lower.shape[1], lower.shape[2]
     columns = right.shape[2]
     for t in range(frames):

@@ -1,9 +1,9 @@
 """Shape from bone lengths (S1).
 
 The paper adds lengths of shape directions; lengths do not add, so here a bone's length is that of
-the blended bone. A joint with error makes bones longer, by about its variance over the length; the
-mean square of a noisy bone is its squared length plus the trace of the error's covariance, exactly,
-so squares are averaged and the trace is taken off.
+the blended bone. Joint noise makes bones longer, by about its variance over the length; the mean
+square of a noisy bone is exactly its squared length plus the trace of the error covariance, so
+squares are averaged and the trace is subtracted.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ BONES: Final = (
 LIMBS: Final = ((5, 7, 9), (6, 8, 10), (11, 13, 15), (12, 14, 16))
 """Arms and legs of COCO-17, outward."""
 MOST_NOISE: Final = 0.15
-"""By which part of their length bones are shortened at most [1]: beyond it noise is not small."""
+"""Maximum relative shortening of bones [1]: beyond it noise is not small."""
 DEFINITION: Final = 0.02
-"""How far a detector's idea of a joint is from the body model's [m]: no number of frames makes a
-bone's length surer than this times sqrt(2)."""
+"""Distance between a detector's definition of a joint and the body model's [m]: no number of frames
+makes a bone's length more accurate than this times sqrt(2)."""
 
 
 @dataclass(frozen=True, eq=False)
 class BoneLengths:
-    """A person's bones, of `BONES`."""
+    """Lengths of a person's `BONES`."""
 
     length: Floats
     """(bones,) [m]; NaN for bones that were never seen."""
@@ -46,7 +46,7 @@ class BoneLengths:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Betas and how sure they are."""
+    """Betas with covariance."""
 
     betas: Floats
     """(shapes,)"""
@@ -55,12 +55,12 @@ class Shape:
 
 
 def measure_bones(joints: Floats, covariance: Floats, witnesses: float) -> BoneLengths:
-    """Return lengths without what noise adds, robust over frames.
+    """Return bone lengths without the contribution of noise, robust over frames.
 
     Args:
         joints: (frames, 17, 3) [m].
         covariance: (frames, 17, 3, 3) [m^2], true to the joints' errors.
-        witnesses: frames that err alike, so that they count as one.
+        witnesses: frames with correlated errors, which count as one.
     """
     lengths, variances = np.full(len(BONES), np.nan), np.full(len(BONES), np.inf)
     for index, (a, b) in enumerate(BONES):
@@ -74,7 +74,7 @@ def measure_bones(joints: Floats, covariance: Floats, witnesses: float) -> BoneL
         # A normal vector's square varies by 4 d'Cd + 2 tr(C C).
         spread = 4.0 * np.einsum("fa,fab,fb->f", bone, error, bone)
         spread = spread + 2.0 * np.einsum("fab,fba->f", error, error) + 1e-12
-        # Three standard deviations of the middle half: gross errors, but no honest tail, go.
+        # Four robust standard deviations reject gross errors, but no correct tail.
         middle = np.median(square)
         scale = max(1.4826 * float(np.median(np.abs(square - middle))), 1e-9)
         kept = np.abs(square - middle) <= 4.0 * scale
@@ -86,10 +86,10 @@ def measure_bones(joints: Floats, covariance: Floats, witnesses: float) -> BoneL
 
 
 def shorten_limbs(joints: Floats, covariance: Floats) -> Floats:
-    """Return joints (frames, 17, 3) [m] whose limbs are on average as long as the true ones.
+    """Return joints (frames, 17, 3) [m] with limbs of the true mean length.
 
-    Bodies turned after noisy joints point along the noisy bones, which are longer than the true
-    ones by half the variance across over the length.
+    Bodies oriented by noisy joints point along the noisy bones, which are longer than the true ones
+    by half the variance across over the length.
 
     Args:
         joints: (frames, 17, 3) [m].
@@ -115,8 +115,7 @@ def shorten_limbs(joints: Floats, covariance: Floats) -> Floats:
 def fit_shape(model: BodyModel, bones: BoneLengths) -> Shape:
     """Return the most probable betas for bones, with exact lengths of the blended bones (S1).
 
-    Betas of people have a normal distribution of variance 1; without bones they are 0 with
-    covariance 1.
+    The prior of betas is normal with variance 1; without bones they are 0 with covariance 1.
     """
     ends = np.array([[JOINT_OF_POINT[COCO17[joint]] for joint in bone] for bone in BONES])
     template = model.joint_template[ends[:, 1]] - model.joint_template[ends[:, 0]]
@@ -125,7 +124,7 @@ def fit_shape(model: BodyModel, bones: BoneLengths) -> Shape:
     weight = np.zeros(len(BONES))
     weight[seen] = 1.0 / (bones.variance[seen] + 2.0 * DEFINITION**2)
     betas, precision = np.zeros(model.shapes), np.eye(model.shapes)
-    # Lengths are all but linear in the betas: the third step changes nothing any more.
+    # Lengths are almost linear in the betas: from the third step on nothing changes.
     for _ in range(5):
         blended = template + directions @ betas
         length = np.linalg.norm(blended, axis=-1)
@@ -137,15 +136,14 @@ def fit_shape(model: BodyModel, bones: BoneLengths) -> Shape:
 
 
 def pool_shapes(shapes: Sequence[Shape], weight: float) -> Shape:
-    """Return one person's shape from several clips: means weighted by what each of them says (S1).
+    """Return one person's shape from several clips: information-weighted means (S1).
 
-    Every covariance holds that betas of people are normal; that counts once. What the clips say is
-    taken as independent, which the detector's offsets are not: they are the same in all of them.
+    Every covariance includes the normal prior of betas, which counts once. Clips count as
+    independent, although the detector's offsets are the same in all of them.
 
     Args:
         shapes: of one person and body model, at least one.
-        weight: of that normal distribution in every one of them [1], `shape_weight` of the
-            settings.
+        weight: of that prior in every one of them [1], `shape_weight` of the settings.
     """
     anybody = weight * np.eye(len(shapes[0].betas))
     precisions = [np.linalg.inv(shape.covariance) for shape in shapes]

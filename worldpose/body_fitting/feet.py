@@ -1,4 +1,4 @@
-"""Feet on the ground: which ankles stand, and how feet lie that no keypoint shows."""
+"""Feet on the ground: standing ankles, and the orientation of feet without keypoints."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ ANKLES: Final = (15, 16)
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Which feet of one person stand, and how high a standing ankle is."""
+    """Standing feet of one person, and the height of a standing ankle."""
 
     standing: Floats
     """(frames, 2) 1 where an ankle stands, else 0."""
     slipping: Floats
     """(frames - 1, 2) 1 where it stands in this and the next frame."""
     height: Floats
-    """(frames, 2) [m], world: a flat foot's ankle there; nothing is lower."""
+    """(frames, 2) [m], world: a flat foot's ankle there, the minimum of any ankle."""
 
     def of(self, seen: NDArray[np.bool_]) -> Contacts:
-        """Return the contacts of ankles that were seen (frames, 17): others may stand or not."""
+        """Return the contacts of seen ankles (frames, 17); unseen ankles may stand or not."""
         ankles = seen[:, ANKLES]
         both = ankles[1:] & ankles[:-1]
         return Contacts(self.standing * ankles, self.slipping * both, self.height)
@@ -41,14 +41,14 @@ class Contacts:
 def find_contacts(
     joints: Floats, ankle_height: float, ground: Ground, fps: float, settings: BodyFittingSettings
 ) -> Contacts:
-    """Return where ankles are low and slow for at least two frames.
+    """Return contacts of ankles that are low and slow for at least two frames.
 
     Args:
         joints: (frames, 17, 3) [m], world, of a fit.
         ankle_height: of this person's ankle above the sole [m].
         ground: the surface.
         fps: [1/s].
-        settings: what is low and slow.
+        settings: limits of low and slow.
     """
     ankles = joints[:, ANKLES]
     height = ground(ankles[..., 0], ankles[..., 1]) + ankle_height
@@ -64,7 +64,7 @@ def find_contacts(
 
 
 def ankle_height(model: BodyModel, betas: Floats) -> float:
-    """Return how high the ankles of an upright body are above its soles [m]."""
+    """Return the height of the ankles of an upright body above its soles [m]."""
     lowest = int(model.template[:, 1].argmin())
     sole = model.template[lowest, 1] + model.shape_directions[lowest, 1] @ betas
     joints = model.joint_template + model.joint_directions @ betas
@@ -72,12 +72,12 @@ def ankle_height(model: BodyModel, betas: Floats) -> float:
 
 
 def level_feet(rotations: Floats, clear: Floats) -> Floats:
-    """Return turns of feet relative to their shanks (frames, 3, 3): flat where they stand.
+    """Return rotations of feet relative to their shanks (frames, 3, 3): flat where they stand.
 
     Args:
         rotations: (frames, 3, 3) of the shank, world.
-        clear: (frames,) [m], how much higher the ankle is than that of a flat foot; a foot 0.15 m
-            up or in a shank that lies hangs as it does in the unposed body.
+        clear: (frames,) [m], height of the ankle above that of a flat foot; a foot 0.15 m up or on
+            a horizontal shank hangs as in the unposed body.
     """
     forward = rotations[..., 2].copy()
     forward[..., 2] = 0.0

@@ -1,4 +1,4 @@
-"""How a fit looks without the truth."""
+"""Quality metrics of a fit without ground truth."""
 
 from __future__ import annotations
 
@@ -18,51 +18,51 @@ Floats = NDArray[np.float64]
 
 
 class BodyFittingReport(Record):
-    """Figures of a clip, and of each person in the order of the persons; None without any."""
+    """Metrics of one clip, and of each person in the order of the persons; None without data."""
 
     bodies: int
-    """Bodies fitted, one a frame and person [1]."""
+    """Fitted bodies, one per frame and person [1]."""
     filled: int
     """Of these, in frames without any joint of the person [1]."""
     guided: int
-    """Of these, with a monocular pose that had a say [1]."""
+    """Of these, fitted with a monocular pose [1]."""
     offset_rms_m: float
-    """How far, along an axis, what the detector takes for a joint is from it [m]."""
+    """Root mean square offset per axis from a body's joint to the detector's [m]."""
     residual_m: tuple[float | None, ...]
-    """Median distance of triangulated joints, less those offsets, from the body's [m]."""
+    """Median distance of triangulated joints, minus those offsets, from the body's [m]."""
     reprojection_px: tuple[float | None, ...]
-    """Median distance in pictures of seen keypoints from the body's, less those offsets [px]; None
-    where no cameras were given."""
+    """Median image distance of seen keypoints, minus those offsets, from the body's [px]; None
+    without cameras."""
     bone_spread_m: tuple[float | None, ...]
     """Standard deviation of triangulated limbs' lengths, median over limbs [m]; bodies have 0."""
     skating_m: tuple[float | None, ...]
-    """Median way of an ankle in a frame while it is slower than 0.5 m/s [m]."""
+    """Median motion of an ankle per frame while it is slower than 0.5 m/s [m]."""
     jerk_m_s3: tuple[float | None, ...]
     """Root mean square third derivative of the body's keypoints [m/s^3]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """What static cameras saw of tracked people."""
+    """Detections of tracked people in static cameras."""
 
     cameras: Camera
     """Batch (cameras,)."""
     keypoints: NDArray[np.floating]
-    """(frames, cameras, detections, 17, 2) [px], sides put right; NaN where not found."""
+    """(frames, cameras, detections, 17, 2) [px], left-right swaps undone; NaN where not found."""
     detection_index: NDArray[np.integer]
-    """(frames, cameras, persons), place among the detections; -1 = not seen."""
+    """(frames, cameras, persons), index of the detection; -1 = not seen."""
 
 
 def report_fit(
     fit: BodyFit, joints: Floats, fps: float, pictures: Pictures | None = None
 ) -> BodyFittingReport:
-    """Return the figures of a fit.
+    """Return the metrics of a fit.
 
     Args:
-        fit: bodies of a clip.
-        joints: (frames, persons, 17, 3) [m], world, that it was made from.
+        fit: bodies of one clip.
+        joints: (frames, persons, 17, 3) [m], world, input of the fit.
         fps: [1/s].
-        pictures: what the joints were made from.
+        pictures: detections behind the joints.
     """
     perceived = fit.joints + np.einsum("fpab,jb->fpja", body_axes(fit.joints), fit.offsets)
     away = np.linalg.norm(joints - perceived, axis=-1)
@@ -91,7 +91,7 @@ def report_fit(
 
 
 def _reprojection(perceived: Floats, pictures: Pictures, person: int) -> Floats:
-    """Distances of one person's keypoints (frames, cameras, 17) [px]; NaN where not seen."""
+    """Return distances of one person's keypoints (frames, cameras, 17) [px]; NaN where not seen."""
     place = pictures.detection_index[:, :, person]
     frame, camera = np.nonzero(place >= 0)
     seen = np.full((*place.shape, 17, 2), np.nan)

@@ -1,4 +1,4 @@
-"""Bodies for every person of a clip: shape, then place, orientation and angles in every frame."""
+"""Bodies of every person of a clip: shape, then position, orientation and angles per frame."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ from worldpose.errors import InputError
 Floats = NDArray[np.float64]
 
 SURE: Final = 0.035
-"""Joints are well known where their median standard deviation per axis is below this [m]: 16
+"""Joints are well determined if their median standard deviation per axis is below this [m]: 16
 cameras leave 0.02 to 0.03, two 0.04 to 0.1."""
 KEPT_BIAS: Final = 0.01
-"""Of the common bias of joints, what stays in their covariance per axis [m]: the rest is what the
-shared offsets are for."""
+"""Part of the joints' common bias that stays in their covariance per axis [m]; the shared offsets
+model the rest."""
 GLIMPSE_TIME: Final = 0.5
-"""Time in which an error of a monocular pose stays what it is [s]: pictures hardly change."""
+"""Correlation time of monocular pose errors [s]: images hardly change."""
 
 
 @dataclass(frozen=True, eq=False)
 class BodyFit:
-    """Bodies of a clip.
+    """Bodies of one clip.
 
     Attributes:
         betas: (persons, shapes); NaN for a person without any joint.
@@ -56,11 +56,11 @@ class BodyFit:
         betas_covariance: (persons, shapes, shapes).
         joints: (frames, persons, 17, 3) [m], world: COCO-17 keypoints of the bodies.
         covariance: (frames, persons, 17, 3, 3) [m^2], of `joints`: poses by the objective, the
-            detector's offsets, each person's own, and what the detector and the body model take
-            for different points: offsets and shape together follow the detector.
+            detector's offsets, each person's own, and different joint definitions of detector and
+            body model: offsets and shape together follow the detector.
         filled: (frames, persons), bodies in frames without any joint of theirs.
-        guided: (frames, persons), bodies that a picture of one camera had a say in.
-        offsets: (17, 3) [m] forward, left and up: from joints to what the detector takes for them.
+        guided: (frames, persons), bodies fitted with a monocular pose.
+        offsets: (17, 3) [m] forward, left and up: from a body's joints to the detector's.
     """
 
     betas: Floats
@@ -85,29 +85,30 @@ def fit_bodies(
     glimpses: MonocularPoses | None = None,
     common_bias: Floats | None = None,
 ) -> BodyFit:
-    """Return the bodies that explain everybody's triangulated joints (S1-S3).
+    """Return the bodies that fit the triangulated joints of all persons (S1-S3).
 
     Shape starts from bone lengths, poses from hips and torso; then betas, coarse poses and the
-    detector's shared offsets are estimated together, and last the poses of all frames with betas
-    and offsets held.
+    detector's shared offsets are estimated together, and last the poses of all frames with fixed
+    betas and offsets.
 
     Args:
         model: the body.
         joints: (frames, persons, 17, 3) [m], world, COCO-17; NaN where missing.
         covariance: (frames, persons, 17, 3, 3) [m^2], of `joints`.
         fps: [1/s].
-        settings: what is expected of detectors, bodies and motion.
+        settings: expected errors of detectors, bodies and motion.
         ground: height of the surface under the feet, in a world with z up; None where unknown.
-        known: shapes of people, by their place in `joints`, as other clips have them.
-        sightings: lines of sight beside what is triangulated, of the same frames and persons; a
-            person without joints is there as long as these last.
-        glimpses: of the same frames and persons, used where few joints are well known (S4).
-        common_bias: (17,) per axis, what all views err in common [m]; `covariance` contains it.
-            Bodies do not lessen it: fitted to real people (Shelf) their joints are as far from the
-            labels as the triangulated ones. None = none.
+        known: shapes of people from other clips, by their index in `joints`.
+        sightings: lines of sight of joints that are not triangulated, for the same frames and
+            persons; a person without joints is present as long as these last.
+        glimpses: monocular poses of the same frames and persons, used where few joints are well
+            determined (S4).
+        common_bias: (17,) per axis, error that all views share [m]; `covariance` contains it. Body
+            fitting does not reduce it: on real people (Shelf) joints of bodies are as far from the
+            labels as triangulated joints. None = none.
 
     Raises:
-        InputError: the shapes do not fit together.
+        InputError: the shapes do not match.
     """
     if joints.ndim != 4 or joints.shape[2:] != (17, 3) or covariance.shape != (*joints.shape, 3):
         raise InputError(
@@ -163,7 +164,7 @@ def fit_bodies(
             result.guided[spans[person], person] = guidance.used
     for person, span in spans.items():
         result.filled[span, person] = ~seen[span, person]
-        gone = _too_long(there[span, person], settings.longest_gap * fps)
+        gone = _too_long(there[span, person], settings.max_gap_s * fps)
         result.drop(person, span, gone)
     return result.fit(shapes)
 
@@ -176,7 +177,7 @@ def _guide(
     spans: Mapping[int, slice],
     fps: float,
 ) -> dict[int, Guidance]:
-    """Monocular poses of the persons who have some where few of their joints are well known."""
+    """Return monocular poses of persons for frames with few well-determined joints."""
     variance = np.trace(covariance[:, :, 5:], axis1=-2, axis2=-1) / 3.0
     sure = np.median(np.where(joint_seen[:, :, 5:], variance, np.inf), axis=-1) < SURE**2
     witnesses = 1.0 + GLIMPSE_TIME * fps
@@ -197,7 +198,7 @@ def _guide(
 
 
 def _too_long(seen: NDArray[np.bool_], most: float) -> NDArray[np.bool_]:
-    """Frames in gaps of more than `most` frames."""
+    """Return the frames in gaps of more than `most` frames."""
     places = np.flatnonzero(seen)
     long = np.zeros(len(seen), dtype=bool)
     for first, last in itertools.pairwise(places):
@@ -208,7 +209,7 @@ def _too_long(seen: NDArray[np.bool_], most: float) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class _Result:
-    """A fit under way."""
+    """Arrays of a fit in progress."""
 
     betas: Floats
     orient: Floats
@@ -248,7 +249,7 @@ class _Result:
         factor: BandedFactor,
         shapes: Shapes,
     ) -> None:
-        """Write one person's part."""
+        """Write the result of one person."""
         shape = shapes.people[person]
         body = solver.chained.differentiate(pose.parameters())
         planted = solver.planted(pose)
@@ -265,21 +266,21 @@ class _Result:
         )
         spread = factor.inverse_blocks()[:, None]
         axes = body_axes(body.keypoints)[:, None]
-        # A joint is what was seen less the offset: what is not known of it is not of the joint.
+        # A joint is the detector's joint minus the offset: the offset's covariance adds up.
         habits = axes @ shapes.offsets_covariance @ axes.swapaxes(-1, -2)
         own = (solver.settings.own_bias**2 + self.common_bias**2)[:, None, None] * np.eye(3)
         turned = by_frame.swapaxes(-1, -2)
         self.covariance[span, person] = by_frame @ spread @ turned + habits + own
 
     def drop(self, person: int, span: slice, gone: NDArray[np.bool_]) -> None:
-        """Take a person out of frames of a span."""
+        """Remove a person from frames of a span."""
         for array in (self.orient, self.body_pose, self.transl, self.joints, self.covariance):
             array[span, person][gone] = np.nan
         self.filled[span, person] &= ~gone
         self.guided[span, person] &= ~gone
 
     def fit(self, shapes: Shapes) -> BodyFit:
-        """The whole."""
+        """Return the complete fit."""
         betas = np.broadcast_to(self.betas, (*self.orient.shape[:2], self.betas.shape[-1]))
         parameters = BodyParameters(betas, self.orient, self.body_pose, self.transl)
         return BodyFit(

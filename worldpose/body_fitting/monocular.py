@@ -1,8 +1,8 @@
-"""Bodies that methods of one picture saw, read from files as those methods write them (S4).
+"""Monocular SMPL estimates, read from the files of the methods that make them (S4).
 
-4DHumans (HMR2) and HybrIK find a body in each crop of a picture: turns of joints that are much
-better than nothing, at a depth and size that are guesses. Only the turns and the place in the
-picture are taken. Every file is an npz of arrays; names as the methods have them are known.
+4DHumans (HMR2) and HybrIK estimate a body in each image crop: useful joint rotations, at a guessed
+depth and size. Only the rotations and the image position are used. Every file is an npz of arrays;
+the methods' own array names are supported.
 """
 
 from __future__ import annotations
@@ -24,58 +24,58 @@ from worldpose.ingest.text_files import require_file
 Floats = NDArray[np.float64]
 
 ESTIMATE_BYTES: Final = 1 << 30
-"""Most that the arrays of one file may fill [byte]: 1.5 million bodies as matrices."""
+"""Maximum size of the arrays of one file [byte]: 1.5 million bodies as matrices."""
 
 WHOLE: Final = ("pred_thetas", "pred_theta_mats", "poses", "pose", "thetas")
-"""Names of all 24 turns in one array."""
+"""Names of all 24 rotations in one array."""
 ROOT: Final = ("global_orient", "pred_global_orient")
 REST: Final = ("body_pose", "pred_body_pose")
-"""Names of the pelvis' turn and of the 23 others."""
+"""Names of the pelvis' rotation and of the 23 others."""
 CROPS: Final = ("box_center", "bbox", "bboxes")
-"""Names of crops: middles, or x0 y0 x1 y1. Bodies of crops face the crop's middle."""
+"""Names of crops: centers, or x0 y0 x1 y1. Bodies of crops face the crop's center."""
 PLACES: Final = ("transl", "pred_cam_t_full", "cam_t", "trans")
-"""Names of places in front of a whole picture [m], of full perspective."""
+"""Names of positions in front of a whole image [m], of full perspective."""
 
 
 @dataclass(frozen=True, eq=False)
 class MonocularEstimates:
-    """Bodies in the pictures of one camera, a row each."""
+    """Bodies in the images of one camera, one row each."""
 
     frame: NDArray[np.int64]
     """(rows,)"""
     rotations: Floats
     """(rows, 24, 3, 3): of the pelvis, from the body to a camera (x right, y down, z forward) that
-    looks at `center` where `cropped`, else along the picture's axis; of the others, relative to
-    the parent."""
+    looks at `center` if `cropped`, else along the optical axis; of the others, relative to the
+    parent."""
     center: Floats
-    """(rows, 2) [px], the middle of the body's box, or its place in the picture."""
+    """(rows, 2) [px], center of the body's box, or its position in the image."""
     cropped: bool
 
 
 def read_monocular(path: Path) -> MonocularEstimates:
-    """Return the bodies of an npz file of 4DHumans, HybrIK, or anything that estimates SMPL.
+    """Return the bodies of an npz file of 4DHumans, HybrIK, or another SMPL estimator.
 
-    Turns are axis-angle vectors or matrices, in one array (`pred_thetas`, `poses`, ...) or two
-    (`global_orient` and `body_pose`). Where a body is comes from its crop (`box_center`, `bbox`:
-    weak perspective, whose scale and offset are not needed) or from its place before the picture
-    (`transl` with `focal_length` and `img_size`: full perspective). `frame` counts the rows'
-    frames; without it each row is a frame of its own.
+    Rotations are axis-angle vectors or matrices, in one array (`pred_thetas`, `poses`, ...) or two
+    (`global_orient` and `body_pose`). The position of a body comes from its crop (`box_center`,
+    `bbox`: weak perspective, whose scale and offset are not needed) or from its position in front
+    of the camera (`transl` with `focal_length` and `img_size`: full perspective). `frame` gives the
+    rows' frames; without it each row is a frame of its own.
 
     Args:
-        path: written by `numpy.savez`; of a pickle, save its arrays so.
+        path: written by `numpy.savez`; save the arrays of a pickle this way.
 
     Raises:
-        InputError: unreadable, or lacking turns or places.
+        InputError: unreadable, or without rotations or positions.
     """
     require_file(path)
     return monocular_of(read_npz(path, ESTIMATE_BYTES), path)
 
 
 def monocular_of(arrays: Mapping[str, NDArray[Any]], where: Path) -> MonocularEstimates:
-    """Return the bodies of arrays as such a file holds them.
+    """Return the bodies of arrays in the layout of such a file.
 
     Raises:
-        InputError: naming `where`.
+        InputError: arrays are missing or have wrong shapes; the error names `where`.
     """
     whole = _first(arrays, WHOLE)
     if whole is None:
@@ -114,7 +114,7 @@ def _first(arrays: Mapping[str, NDArray[Any]], names: tuple[str, ...]) -> NDArra
 
 
 def _turns(given: NDArray[Any], where: Path, name: str, joints: int) -> Floats:
-    """Matrices (rows, joints, 3, 3) of axis-angle vectors or matrices of whatever shape."""
+    """Return matrices (rows, joints, 3, 3) of axis-angle vectors or matrices of any shape."""
     values = np.asarray(given, dtype=np.float64)
     rows, numbers = values.shape[:1], int(np.prod(values.shape[1:]))
     if values.ndim > 1 and numbers == 9 * joints:

@@ -1,4 +1,4 @@
-"""Bodies of one camera's pictures, turned into the world and given to tracks (S4)."""
+"""Monocular bodies of one camera, rotated into the world and assigned to tracks (S4)."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ from worldpose.cameras import Camera, Rigid
 Floats = NDArray[np.float64]
 
 GATE: Final = 0.35
-"""Farthest that an estimate is from its person in the picture [person height]."""
+"""Maximum image distance between an estimate and its person [person height]."""
 
 
 @dataclass(frozen=True, eq=False)
 class MonocularPoses:
-    """What one camera's pictures say of people's poses."""
+    """Poses of people, estimated from images of one camera."""
 
     orient: Floats
-    """(frames, persons, 3, 3), world from body; NaN where nothing is said."""
+    """(frames, persons, 3, 3), world from body; NaN without an estimate."""
     angles: Floats
-    """(frames, persons, 30) [rad], of `pose_space`; NaN where nothing is said."""
+    """(frames, persons, 30) [rad], of `pose_space`; NaN without an estimate."""
 
 
 def place_monocular_poses(
     estimates: MonocularEstimates, camera: Camera, frame: NDArray[np.int64], joints: Floats
 ) -> MonocularPoses:
-    """Return what estimates say of tracked people, in the world.
+    """Return the estimates of tracked people, in the world.
 
-    A method that looks at a crop takes the crop's middle for straight ahead; through the calibrated
-    camera that is a ray, and turning the picture's axis onto it turns the body, 10 degrees near the
-    border of a broadcast picture. Who is who is decided frame by frame by the least distance to the
-    middle of the projected joints.
+    A method that sees a crop treats its center as straight ahead; the calibrated camera has a ray
+    there, and rotating the optical axis onto it rotates the body, by 10 degrees near the border of
+    a broadcast image. The assignment minimizes the distances to the middle of the projected joints,
+    frame by frame.
 
     Args:
-        estimates: in pictures of the camera.
+        estimates: in images of the camera.
         camera: batch (frames,).
-        frame: (frames,), the numbers of the frames.
-        joints: (frames, persons, 17, 3) [m], world; gaps are bridged.
+        frame: (frames,), frame numbers.
+        joints: (frames, persons, 17, 3) [m], world; gaps are interpolated.
     """
     frames, persons = joints.shape[:2]
     orient = np.full((frames, persons, 3, 3), np.nan)
@@ -79,7 +79,7 @@ def place_monocular_poses(
 
 
 def _towards(plane: Floats) -> Floats:
-    """The least turns (n, 3, 3) from straight ahead to points (n, 2) of the plane z = 1."""
+    """Return the smallest rotations (n, 3, 3) from straight ahead to points (n, 2) at z = 1."""
     ahead = np.concatenate([plane, np.ones((len(plane), 1))], axis=-1)
     ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
     across = np.cross([0.0, 0.0, 1.0], ahead)

@@ -1,8 +1,8 @@
-"""How far monocular poses are to be believed, and what they add to the objective (S4).
+"""Accuracy of monocular poses, and their terms in the objective (S4).
 
-Where enough cameras see a person, the fit without them is much surer than they are, and their
-distance from it is their error. Its mean square, over all people, is their variance elsewhere: so a
-method that is wrong is all but ignored, and one that is right helps.
+With enough cameras on a person the fit without monocular poses is much more accurate, and their
+distance from it is their error. Its mean square, over all people, is their variance elsewhere. So
+an inaccurate method gets almost no weight, and an accurate one helps.
 """
 
 from __future__ import annotations
@@ -20,35 +20,36 @@ from worldpose.cameras import Rigid
 Floats = NDArray[np.float64]
 
 DOUBT: Final = 0.25
-"""Error of an angle before any is known [rad]: 80 mm on a limb of 0.3 m."""
+"""Prior standard deviation of an angle [rad]: 80 mm on a limb of 0.3 m."""
 WITNESSES: Final = 5.0
-"""As many independent estimates as that is worth [1]."""
+"""Weight of that prior in independent estimates [1]."""
 TAIL: Final = 2.5
-"""Deviation, root mean square over the angles, at which an estimate has half its weight
-[standard deviations]: backs taken for fronts."""
+"""Deviation, root mean square over the angles, at which an estimate has half its weight [standard
+deviations]: backs mistaken for fronts."""
 
 FRESH: Final = 0.3
-"""Share of an estimate's variance that is another in the next picture [1]."""
+"""Share of an estimate's variance that is independent from frame to frame [1]."""
 MEMORY: Final = 2.0
-"""As many times what errors last, others say nothing of them [1]: a fiftieth of their variance."""
+"""Range of known errors in correlation times [1]: farther ones explain a fiftieth of the
+variance."""
 
 
 @dataclass(frozen=True, eq=False)
 class Guidance:
-    """Monocular poses of one track, and how sure they are."""
+    """Monocular poses of one track, with precision."""
 
     orient: Floats
     """(frames, 3, 3), world from body."""
     angles: Floats
     """(frames, 30) [rad]."""
     used: NDArray[np.bool_]
-    """(frames,), where they count; elsewhere they may be NaN."""
+    """(frames,), frames that count; poses of others may be NaN."""
     precision: Floats
-    """(33, 33) [1/rad^2]: of turns of the body about the world's axes, and angles."""
+    """(33, 33) [1/rad^2]: of rotations of the body about the world's axes, and angles."""
     witnesses: float
-    """Frames that err alike, so that they count as one [1]."""
+    """Frames with correlated errors, which count as one [1]."""
     left: Floats | float = 1.0
-    """(frames,) share of the variance that frames which are known leave, as `carry_errors` has it
+    """(frames,) share of the variance left after correction by known frames (`carry_errors`)
     [1]."""
 
     def pull(self, orient: Floats, angles: Floats) -> tuple[Floats, Floats, float]:
@@ -80,14 +81,14 @@ def learn_precision(
     sure: NDArray[np.bool_],
     witnesses: float,
 ) -> Floats:
-    """Return the precision (33, 33) [1/rad^2] of a glimpse.
+    """Return the precision (33, 33) [1/rad^2] of a monocular pose.
 
     Args:
-        glimpses: of a clip.
-        orient: (frames, persons, 3) [rad], of bodies fitted without them.
+        glimpses: monocular poses of one clip.
+        orient: (frames, persons, 3) [rad], of bodies fitted without monocular poses.
         angles: (frames, persons, 30) [rad], of the same.
-        sure: (frames, persons), which of these are much surer than glimpses.
-        witnesses: frames that err alike, so that they count as one.
+        sure: (frames, persons), bodies much more accurate than monocular poses.
+        witnesses: frames with correlated errors, which count as one.
     """
     there = sure & np.isfinite(glimpses.angles[..., 0]) & np.isfinite(angles[..., 0])
     away = deviations(glimpses.orient[there], glimpses.angles[there], orient[there], angles[there])
@@ -98,20 +99,20 @@ def learn_precision(
 def carry_errors(
     known: Floats, known_angles: Floats, off: Floats, used: NDArray[np.bool_], lasting: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Return estimates of one person without what they are expected to be wrong by.
+    """Return estimates of one person minus their expected errors.
 
-    What a method gets wrong of a person in a stretch that few cameras see, it mostly gets wrong
-    just before and after it too, where the fit tells (simple kriging).
+    The errors of a method for a person in an interval with few cameras mostly exist just before and
+    after it too, where the fit reveals them (simple kriging).
 
     Args:
         known: (frames, 3, 3), world from body.
         known_angles: (frames, 30) [rad].
-        off: (frames, 33) [rad], from estimates to fits that are surer; NaN where there is none.
-        used: (frames,), estimates that are asked for.
-        lasting: time in which errors forget themselves by a factor e [frame].
+        off: (frames, 33) [rad], from estimates to more accurate fits; NaN without one.
+        used: (frames,), estimates to correct.
+        lasting: correlation time of errors, to a factor e [frame].
 
     Returns:
-        The first two so, and the share (frames,) of the variance that is left.
+        The first two arguments, corrected, and the share (frames,) of the variance that is left.
     """
     turn, angles, left = known.copy(), known_angles.copy(), np.ones(len(off))
     there = np.flatnonzero(np.isfinite(off).all(axis=-1))
@@ -133,14 +134,14 @@ def carry_errors(
 
 
 def deviations(known: Floats, known_angles: Floats, orient: Floats, angles: Floats) -> Floats:
-    """Return turns about the world's axes and angles (frames, 33) [rad] from known poses."""
+    """Return rotations about the world's axes and angles (frames, 33) [rad] from known poses."""
     turned = Rigid.from_rotvec(orient, np.zeros(3)).rotation @ known.swapaxes(-1, -2)
     safe = np.where(np.isfinite(turned), turned, np.eye(3))
     return np.concatenate([Rigid(safe, np.zeros(3)).rotvec, angles - known_angles], axis=-1)
 
 
 def left_jacobian(vectors: Floats) -> Floats:
-    """Return the turns about the world's axes by axis-angle vectors (frames, 3), (frames, 3, 3)."""
+    """Return the left Jacobians (frames, 3, 3) of axis-angle vectors (frames, 3)."""
     angle = np.linalg.norm(vectors, axis=-1)[:, None, None]
     axis = vectors / np.maximum(angle[..., 0], 1e-12)
     cross = np.zeros((len(vectors), 3, 3))

@@ -1,4 +1,4 @@
-"""The moving camera as one more view: whom it sees, and along which lines (S4)."""
+"""The moving camera as one more view: detections of known people, and lines of sight (S4)."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from worldpose.cameras import Camera
 Floats = NDArray[np.float64]
 
 GATE: Final = 0.2
-"""Farthest that keypoints are on average from their person's joints [person height]."""
+"""Maximum mean distance between keypoints and their person's joints [person height]."""
 FEWEST: Final = 6
-"""Fewer keypoints tell nobody [1]."""
+"""Minimum keypoints to identify people [1]."""
 
 
 def recognise_people(camera: Camera, keypoints: NDArray[np.floating], joints: Floats) -> Floats:
     """Return the keypoints (frames, persons, 17, 2) [px] of known people; NaN where not seen.
 
-    Who is who is decided frame by frame by the least mean distance to projected joints.
+    The assignment minimizes the mean distances to projected joints, frame by frame.
 
     Args:
         camera: batch (frames,).
         keypoints: (frames, detections, 17, 2) [px]; NaN where not found.
-        joints: (frames, persons, 17, 3) [m], world, where the people were when pictures were taken.
+        joints: (frames, persons, 17, 3) [m], world, at the times of the images.
     """
     frames, persons = joints.shape[:2]
     image = camera.project(joints.reshape(frames, -1, 3)).reshape(frames, persons, 17, 2)
@@ -50,12 +50,12 @@ def recognise_people(camera: Camera, keypoints: NDArray[np.floating], joints: Fl
 
 
 def sight_people(camera: Camera, keypoints: Floats, joints: Floats) -> Sightings:
-    """Return the lines on which a moving camera sees joints.
+    """Return the lines of sight of joints in a moving camera.
 
     Args:
         camera: batch (frames,).
         keypoints: (frames, persons, 17, 2) [px] of each person; NaN where not seen.
-        joints: (frames, persons, 17, 3) [m], world, near which the lines' points are taken.
+        joints: (frames, persons, 17, 3) [m], world; the lines' points are the nearest to these.
     """
     frames, persons = joints.shape[:2]
     rays = camera.unproject(keypoints.reshape(frames, -1, 2))
@@ -65,7 +65,7 @@ def sight_people(camera: Camera, keypoints: Floats, joints: Floats) -> Sightings
 
 
 def between_frames(values: Floats, late: float) -> Floats:
-    """Return values (frames, ...) so many frames later, on straight lines; NaN beyond the ends."""
+    """Return values (frames, ...) `late` frames later, linearly interpolated; NaN beyond ends."""
     before = np.arange(len(values)) + int(np.floor(late))
     share = late - np.floor(late)
 

@@ -1,10 +1,9 @@
-"""The objective of one person's track, and its normal equations (S3).
+"""Objective of one person's track, and its normal equations (S3).
 
-Terms: joints where triangulation puts them, less what the detector always gets wrong; small second
-differences of keypoints; angles as people hold them, within limits, and as pictures of one camera
-have them; ankles that stand, and none below the ground. A triangulated joint with its covariance
-carries what the agreeing views' reprojections say, to first order, so these are not counted a
-second time.
+Terms: triangulated joints, minus the detector's systematic offsets; small second differences of
+keypoints; pose prior and joint limits; monocular poses; standing ankles, and none below the ground.
+A triangulated joint with its covariance represents the reprojections of the inlier views, to first
+order, so these are not counted a second time.
 """
 
 from __future__ import annotations
@@ -27,16 +26,16 @@ from worldpose.body_fitting.shared_bias import MIRRORED_OFFSETS, body_axes
 Floats = NDArray[np.float64]
 
 UNKNOWNS: Final = 6 + SIZE
-"""Of a frame: translation, orientation and angles."""
+"""Unknowns per frame: translation, orientation and angles."""
 LIVELINESS: Final = np.array([1, 1, 1, 1, 1, 1, 1, 2, 2, 3, 3, 1, 1, 5, 5, 5, 5], dtype=np.float64)
-"""Accelerations of joints as multiples of the hips'; what simulated players do on average."""
+"""Accelerations of joints as multiples of the hips'; averages of simulated players."""
 _LARGEST_TURN: Final = 0.6
-"""Of an angle in a step [rad]; beyond it the linear model means nothing."""
+"""Maximum change of an angle per step [rad]; beyond it the linear model is invalid."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A track's unknowns."""
+    """Unknowns of a track."""
 
     transl: Floats
     """(frames, 3) [m]"""
@@ -48,15 +47,15 @@ class Pose:
     """(shapes,)"""
 
     def parameters(self) -> BodyParameters:
-        """The bodies (frames,)."""
+        """Return the bodies (frames,)."""
         return BodyParameters(self.betas, self.orient, self.angles @ SPREAD.T, self.transl)
 
     def moved(self, step: Floats, betas: Floats | float = 0.0) -> Pose:
-        """Return the pose after a step (frames, 36), its turns held to what is linear."""
+        """Return the pose after a step (frames, 36), with rotations clipped to the linear range."""
         turns = np.clip(step[:, 3:], -_LARGEST_TURN, _LARGEST_TURN)
         orient = self.orient + turns[:, :3]
         angle = np.linalg.norm(orient, axis=-1, keepdims=True)
-        # The same turn, the shorter way round.
+        # The same rotation by the smaller angle.
         shorter = orient * (1.0 - 2.0 * np.pi / np.maximum(angle, np.pi))
         orient = np.where(angle > np.pi, shorter, orient)
         transl, angles = self.transl + step[:, :3], self.angles + turns[:, 3:]
@@ -82,7 +81,7 @@ class NormalEquations:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One person's evidence and what is expected of the motion."""
+    """Evidence and priors of one person's track."""
 
     chained: ChainedKeypoints
     evidence: Evidence
@@ -92,7 +91,7 @@ class Track:
     acceleration: float
     """Standard deviation of the hips' acceleration [m/s^2]."""
     pose_weight: float
-    """Of the pose prior in each frame [1]."""
+    """Weight of the pose prior in each frame [1]."""
     contacts: Contacts | None = None
     guidance: Guidance | None = None
 
@@ -101,7 +100,7 @@ class Track:
 
         Args:
             pose: where to linearise.
-            offsets: (17, 3) [m] forward, left, up, from joints to what the detector takes for them.
+            offsets: (17, 3) [m] forward, left, up, from a body's joints to the detector's.
             bordered: with betas and offsets; else the border is empty.
         """
         frames, settings = len(pose.transl), self.settings
@@ -160,9 +159,9 @@ class Track:
         return self._standing(equations, body.keypoints, by_frame, body.betas)
 
     def _smoothness(self, keypoints: Floats) -> tuple[list[Floats], Floats, float]:
-        """Weights (frames, 17) on the three diagonals, pull (frames, 17, 3) and cost.
+        """Return weights (frames, 17) on the three diagonals, gradient (frames, 17, 3) and cost.
 
-        Of second differences of keypoints, and of the steps of standing ankles.
+        They cover second differences of keypoints, and motion of standing ankles.
         """
         settings, frames = self.settings, len(keypoints)
         bands = [np.zeros((frames, 17)) for _ in range(3)]
@@ -208,7 +207,7 @@ class Track:
     def _standing(
         self, equations: NormalEquations, keypoints: Floats, by_frame: Floats, by_betas: Floats
     ) -> NormalEquations:
-        """Return the equations with ankles at the height of standing ones, and none below it."""
+        """Return the equations with terms for the height of standing ankles, and none below it."""
         contacts = self.contacts
         assert contacts is not None
         blocks, gradient = equations.blocks, equations.gradient

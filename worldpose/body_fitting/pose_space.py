@@ -1,9 +1,9 @@
-"""The angles that keypoints can tell, and what people do with them.
+"""Pose coordinates that keypoints determine, with joint limits and a pose prior.
 
-Of a body's 69 angles COCO's 17 points leave many open: how the spine shares its bend, what hands
-and feet do. 30 coordinates remain: bend of the whole spine and of the whole neck, hips, knees,
-shoulders and elbows. What they leave out follows from them (spine and neck share evenly) or from
-the ground (feet).
+COCO's 17 points leave many of a body's 69 angles undetermined: the bend of single spine joints,
+hands and feet. 30 coordinates remain: bend of the whole spine and of the whole neck, hips, knees,
+shoulders and elbows. The other angles follow from them (spine and neck share evenly) or from the
+ground (feet).
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ COORDINATES: Final = (
     ("left_elbow",),
     ("right_elbow",),
 )
-"""Joints that share a turn evenly; three coordinates each."""
+"""Joints that share a rotation evenly; three coordinates each."""
 SIZE: Final = 3 * len(COORDINATES)
 
 _LIMITS: Final = {
-    # Ranges of motion that only contortionists leave [rad]: lowest, highest by axis. The body's
+    # Ranges of motion that only contortionists exceed [rad]: lowest, highest by axis. The body's
     # unposed arms point sideways, so a shoulder's third angle hangs the arm.
     "spine": ((-0.6, 1.6), (-1.0, 1.0), (-0.7, 0.7)),
     "neck": ((-1.2, 1.0), (-1.5, 1.5), (-0.8, 0.8)),
@@ -46,7 +46,7 @@ _LIMITS: Final = {
     "shoulder": ((-2.0, 2.0), (-2.0, 1.2), (-2.0, 1.8)),
     "elbow": ((-0.5, 0.5), (-2.7, 0.1), (-0.5, 0.5)),
 }
-"""Of the middle and the left side; the right side mirrors the second and third angle."""
+"""Limits of the middle and the left side; the right side mirrors the second and third angle."""
 
 
 def _limits() -> tuple[Floats, Floats]:
@@ -74,14 +74,14 @@ def _spread() -> Floats:
 
 
 SPREAD: Final = _spread()
-"""(69, 30): `body_pose` by the coordinates [1]; feet and hands straight."""
+"""(69, 30): matrix from coordinates to `body_pose` [1]; feet and hands are straight."""
 GATHER: Final = (SPREAD.T > 0.0).astype(np.float64)
-"""(30, 69): the coordinates of a `body_pose`, its shared turns added up."""
+"""(30, 69): matrix from `body_pose` to coordinates; shared rotations are summed."""
 
 
 @dataclass(frozen=True, eq=False)
 class PosePrior:
-    """How people hold themselves: a normal distribution of the coordinates."""
+    """Pose prior: a normal distribution of the coordinates."""
 
     mean: Floats
     """(30,) [rad]."""
@@ -91,10 +91,10 @@ class PosePrior:
 
 @functools.cache
 def load_pose_prior() -> PosePrior:
-    """Return the prior made from this project's own simulated football, left as right.
+    """Return the prior from this project's own simulated football, symmetric left to right.
 
-    Every standard deviation is widened in squares by 0.15 rad, 0.1 rad in knees and elbows about
-    other axes than their hinge: the simulation's people are stiffer than people.
+    0.15 rad, 0.1 rad in knees and elbows, is added in quadrature to every standard deviation:
+    simulated people are stiffer than real people.
     """
     with np.load(Path(__file__).parent / "pose_prior.npz", allow_pickle=False) as file:
         mean, covariance = file["mean"], file["covariance"]

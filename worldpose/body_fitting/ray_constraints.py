@@ -1,8 +1,8 @@
-"""Joints that one camera alone sees: somewhere on a line, which is much better than nowhere.
+"""Lines of sight of joints that only one camera sees.
 
-All lines of a person in a frame are taken for parallel: how far away he is would follow from how
-large he looks, and a hundredth of that, less than any detector's bias, is 0.7 m at 70 m. Motion and
-feet on the ground know it better.
+All lines of a person in a frame count as parallel. Otherwise the image size would determine the
+person's distance, and a hundredth of it, less than any detector's bias, is 0.7 m at 70 m. Motion
+and feet on the ground determine the distance better.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ class Sightings:
     """Lines of sight of joints that are not triangulated."""
 
     points: Floats
-    """(frames, persons, 17, 3) [m], world: of the line, the point nearest to where the track puts
-    the joint; NaN without a line."""
+    """(frames, persons, 17, 3) [m], world: of the line, the point nearest to the expected joint;
+    NaN without a line."""
     across: Floats
-    """(frames, persons, 17, 3, 3) [1], what takes the part along his lines from a vector."""
+    """(frames, persons, 17, 3, 3) [1], projection that removes the part along the person's lines
+    from a vector."""
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -42,13 +43,14 @@ def find_sightings(
 ) -> Sightings:
     """Return the lines of sight of joints that exactly one camera sees.
 
-    Where several cameras see a joint and triangulation refused it, they contradict each other, and
-    nobody knows which one is right.
+    If several cameras see a joint and triangulation rejected it, they contradict each other, and
+    the correct one is unknown.
 
     Args:
         cameras: batch (cameras,).
-        keypoints: (frames, cameras, detections, 17, 2) [px], sides put right; NaN where not found.
-        detection_index: (frames, cameras, persons), place among the detections; -1 = not seen.
+        keypoints: (frames, cameras, detections, 17, 2) [px], left-right swaps undone; NaN where not
+            found.
+        detection_index: (frames, cameras, persons), index of the detection; -1 = not seen.
         joints: (frames, persons, 17, 3) [m], world, triangulated.
     """
     frames, count, persons = detection_index.shape
@@ -72,12 +74,12 @@ def find_sightings(
 
 
 def lines_of_sight(origins: Floats, directions: Floats, expected: Floats) -> Sightings:
-    """Return rays as lines of sight, all of a person in a frame as one bundle.
+    """Return rays as lines of sight, parallel per person and frame.
 
     Args:
         origins: (frames, persons, 17, 3) [m], world.
         directions: (frames, persons, 17, 3), of any length; NaN without a ray.
-        expected: (frames, persons, 17, 3) [m], world, where the joints are about.
+        expected: (frames, persons, 17, 3) [m], world, approximate joints.
     """
     along = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     far = np.maximum(((expected - origins) * along).sum(-1, keepdims=True), 0.0)
@@ -92,9 +94,9 @@ def lines_of_sight(origins: Floats, directions: Floats, expected: Floats) -> Sig
 
 
 def expected_joints(joints: Floats) -> Floats:
-    """Return where tracks put joints in every frame; NaN for persons who are never seen.
+    """Return expected joints of tracks in every frame; NaN for persons never seen.
 
-    A joint is on the way between where it was seen, one that never was in the middle of the others.
+    A joint is interpolated between observations; a joint never seen is in the middle of the others.
     """
     full = np.stack([bridged(joints[:, person]) for person in range(joints.shape[1])], axis=1)
     known = np.isfinite(full)

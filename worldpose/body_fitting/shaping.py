@@ -1,11 +1,11 @@
-"""Shape of every person together with what the detector always gets wrong (S1).
+"""Shape of every person, estimated together with the detector's systematic offsets (S1).
 
-Both are what many frames have in common, and each can stand in for the other: taller people, or a
-detector that sees all ankles too high. So nothing may push along that direction frame by frame, for
-pushes add up while the two priors do not. Three things would: a pose prior, whose unbent limbs
-have to be longer; noise, which lengthens bones; and a clip of many minutes, whose errors are not as
-independent as its frames. The prior is all but left out here, limbs are shortened by what noise
-adds, and no more than some seconds of each person are looked at.
+Many frames share both, and each can compensate for the other: taller people, or a detector that
+sees all ankles too high. So no term may push along that direction frame by frame, because pushes
+add up while the two priors do not. Three terms would: a pose prior, whose unbent limbs have to be
+longer; noise, which lengthens bones; and a clip of many minutes, whose errors are less independent
+than its frames. So the prior has almost no weight here, limbs are shortened by the contribution of
+noise, and only some seconds of each person are used.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ Floats = NDArray[np.float64]
 Joints = tuple[Floats, Floats]
 
 PIECE: Final = 1.0
-"""Length of the parts that long tracks are looked at in [s]."""
+"""Length of the intervals sampled from long tracks [s]."""
 BIAS_WITNESSES: Final = 8.0
-"""As many squared offsets, of `bias_spread`, as that spread is worth before any is seen [1]."""
+"""Weight of `bias_spread` as a prior, in squared offsets [1]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """Betas and offsets of a clip."""
+    """Betas and offsets of one clip."""
 
     people: dict[int, Shape]
     offsets: Floats
-    """(17, 3) [m] forward, left and up: from joints to what the detector takes for them."""
+    """(17, 3) [m] forward, left and up: from a body's joints to the detector's."""
     offsets_covariance: Floats
     """(17, 3, 3) [m^2]."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Piece:
-    """A part of a person's track, and its bodies so far."""
+    """An interval of a person's track, with its current bodies."""
 
     person: int
     track: Track
@@ -57,12 +57,12 @@ class _Piece:
 def fit_shapes(
     solver: Solver, people: Mapping[int, Joints], known: Mapping[int, Shape], fps: float
 ) -> Shapes:
-    """Return everybody's betas and the detector's offsets, by Gauss-Newton over poses as well.
+    """Return all persons' betas and the detector's offsets, by Gauss-Newton over poses as well.
 
     Args:
         solver: body, prior, settings and ground.
         people: joints (frames, 17, 3) [m] and covariance (frames, 17, 3, 3) [m^2] of each.
-        known: what other clips say of some of them; nobody in particular without.
+        known: shapes of some persons from other clips; the others start from the prior.
         fps: [1/s].
     """
     settings, count = solver.settings, solver.chained.model.shapes
@@ -77,8 +77,8 @@ def fit_shapes(
     unknowns = np.zeros(MIRRORED_OFFSETS.shape[-1])
     spread = settings.bias_spread**2 * np.eye(len(unknowns))
     expected = settings.bias_spread**2
-    # A posterior that stops getting surer (Miller and Dunson 2019): what the objective does not
-    # know of pushes the same way in everybody's frames.
+    # A posterior of limited precision (Miller and Dunson 2019): errors of the model push the same
+    # way in the frames of all persons.
     seconds = sum(len(piece.pose.transl) / piece.track.fps for piece in pieces)
     firmness = max(1.0, seconds / settings.bias_time)
     for step in range(settings.shape_steps if pieces else 0):
@@ -112,13 +112,13 @@ def fit_shapes(
         spread = np.linalg.inv(matrix).astype(np.float64)
         change = -spread @ right
         unknowns = unknowns + change
-        # How far this detector goes is learnt with where it goes (expectation-maximisation).
+        # Learn the spread of offsets together with the offsets (expectation-maximisation).
         if step >= settings.shape_steps // 2:
             size = float(unknowns @ unknowns + np.trace(spread))
             prior = BIAS_WITNESSES * settings.bias_spread**2
             expected = (size + prior) / (len(unknowns) + BIAS_WITNESSES)
         betas_change = {
-            # Far steps of the first, roughest linearisation leave the people.
+            # Large steps of the first, roughest linearisation leave the range of human shapes.
             person: np.clip(-inverses[person] @ pull[:count] - ways[person] @ change, -1.0, 1.0)
             for person, pull in pulls.items()
         }
@@ -141,7 +141,7 @@ def fit_shapes(
 def _cut(
     solver: Solver, person: int, joints: Floats, covariance: Floats, fps: float
 ) -> list[_Piece]:
-    """The parts of a person's track that shape is estimated from, with bodies to start at."""
+    """Return intervals of a person's track for shape estimation, with initial bodies."""
     settings, model = solver.settings, solver.chained.model
     stride = max(1, int(fps / settings.shape_rate))
     rate = fps / stride
@@ -169,7 +169,7 @@ def _cut(
 
 
 def _parts(frames: int, fps: float, settings: BodyFittingSettings) -> list[slice]:
-    """Evenly spread parts of `frames`, `shape_time` together; the whole of less."""
+    """Return evenly spread intervals of `frames`, `shape_time` in total; all frames if fewer."""
     if frames <= settings.shape_time * fps:
         return [slice(0, frames)]
     length = max(3, round(PIECE * fps))

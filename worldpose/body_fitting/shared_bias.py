@@ -1,8 +1,8 @@
-"""What a detector always gets wrong: offsets of joints along the axes of the body.
+"""Systematic offsets of a detector's joints along the axes of the body.
 
-Training labels have an idea of each joint that is not the body model's, the same for all people and
-cameras, and mirrored from left to right. No number of views removes it; bones of constant length
-that turn, and bodies of human proportions, tell it from the pose.
+Training labels define joints differently than the body model, the same way for all people and
+cameras, and mirrored from left to right. No number of views removes these offsets; rotating bones
+of constant length, and human proportions, separate them from the pose.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ Floats = NDArray[np.float64]
 
 
 def _basis() -> Floats:
-    """Offsets (17, 3, unknowns) by unknowns: forward, left and up of each joint or pair."""
+    """Return offsets (17, 3, unknowns) by unknowns: forward, left and up of each joint or pair."""
     columns = []
     for joint, name in enumerate(COCO17):
         if name.startswith("right"):
             continue
         mirrored = COCO17.index(name.replace("left", "right"))
-        # The middle of a body that is its own mirror image is in its middle.
+        # A joint that is its own mirror image lies in the middle plane.
         for axis in (0, 1, 2) if mirrored != joint else (0, 2):
             column = np.zeros((len(COCO17), 3))
             column[joint, axis] = 1.0
@@ -34,7 +34,7 @@ def _basis() -> Floats:
 
 
 FAR: Final = 3.0
-"""Offsets beyond this are no detector's usual ones [standard deviations]: one in 34."""
+"""Offsets beyond this are unusual for any detector [standard deviations]: one in 34."""
 MIRRORED_OFFSETS: Final = _basis()
 """(17, 3, 26)"""
 
@@ -42,7 +42,7 @@ MIRRORED_OFFSETS: Final = _basis()
 def body_axes(joints: Floats) -> Floats:
     """Return columns forward, left and up (..., 3, 3) of bodies whose joints are (..., 17, 3).
 
-    Left is that of hips and shoulders, up that of the trunk.
+    Left follows hips and shoulders, up follows the trunk.
     """
     left = joints[..., 5, :] + joints[..., 11, :] - joints[..., 6, :] - joints[..., 12, :]
     up = joints[..., 5, :] + joints[..., 6, :] - joints[..., 11, :] - joints[..., 12, :]
@@ -54,17 +54,17 @@ def body_axes(joints: Floats) -> Floats:
 
 
 def far_offsets(offsets: Floats, common_bias: Floats) -> dict[str, tuple[float, float]]:
-    """Return where bodies contradict the joints that they are fitted to.
+    """Return the joints of bodies with unusually large offsets.
 
     Shape and offsets together follow the detector: an offset much larger than a detector's common
-    bias says that one of them is wrong, the joints or the bodies.
+    bias means that either the joints or the bodies are wrong.
 
     Args:
         offsets: (17, 3) [m], of joints of bodies.
         common_bias: (17,) per axis [m]; 0 = not known.
 
     Returns:
-        By joint, left and right as one: length of the offset and the largest usual one [m].
+        By joint, left and right as one: length of the offset and its usual maximum [m].
     """
     length = np.linalg.norm(offsets, axis=-1)
     far = (length > FAR * common_bias) & (common_bias > 0.0)

@@ -27,13 +27,13 @@ from worldpose.errors import DegenerateError
 Floats = NDArray[np.float64]
 
 ALIKE: Final = float((1.0 / LIVELINESS**2).sum())
-"""As many accelerations of the hips are those of all keypoints, each for itself [1]. But a body
-accelerates as one: the search may count them all, how sure its poses are may not."""
+"""Number of hip accelerations that equal independent accelerations of all keypoints [1]. But a body
+accelerates as one: the search may count them all, the covariance of its poses may not."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solver:
-    """What all persons' fits have in common."""
+    """Solver of poses, shared by the fits of all persons."""
 
     chained: ChainedKeypoints
     prior: PosePrior
@@ -48,11 +48,11 @@ class Solver:
         fps: float,
         guidance: Guidance | None = None,
     ) -> tuple[Pose, BandedFactor]:
-        """Return one person's poses in all frames, and the factor that tells how sure they are.
+        """Return one person's poses in all frames, and the factor of their information matrix.
 
-        With `guidance` there are two searches, of which one begins where it puts the poses, and
-        the one that ends lower counts: a body that turned unseen is beyond where steps from the
-        way between its ends arrive, and how high a start lies says little of where it ends.
+        With `guidance` there are two searches. One starts from the monocular poses, and the result
+        of lower cost counts: steps from an interpolated start do not reach a body that turned
+        unseen, and the cost of a start says little about the cost of its result.
         """
         settings, model = self.settings, self.chained.model
         track = Track(
@@ -74,7 +74,7 @@ class Solver:
         searched = self.search(track, pose, offsets)
         if guidance is not None:
             guided = self.search(track, led(pose, guidance), offsets)
-            # Of the same terms: which ankles stand is each search's own.
+            # Compare the same terms: each search has its own standing ankles.
             costs = [
                 track.equations(p, offsets, bordered=False).cost for p, _ in (searched, guided)
             ]
@@ -88,7 +88,7 @@ class Solver:
         return pose, factor(doubtful.equations(pose, offsets, bordered=False).blocks)
 
     def search(self, track: Track, pose: Pose, offsets: Floats) -> tuple[Pose, Track]:
-        """Return where Gauss-Newton steps from a pose arrive, and the track with who stands."""
+        """Return the pose after Gauss-Newton steps, and the track with standing ankles."""
         for step in range(self.settings.steps):
             if self.ground is not None and step == self.settings.steps // 2:
                 track = self.standing(track, pose)
@@ -106,7 +106,7 @@ class Solver:
         return replace(track, contacts=contacts)
 
     def planted(self, pose: Pose) -> BodyParameters:
-        """The bodies of a pose, with feet on the ground where they are near it."""
+        """Return the bodies of a pose, with feet on the ground where they are near it."""
         parameters = pose.parameters()
         if self.ground is None:
             return parameters
@@ -123,10 +123,10 @@ class Solver:
 
 
 def led(pose: Pose, guidance: Guidance) -> Pose:
-    """Return a pose as pictures of one camera have it where they count.
+    """Return a pose with the monocular poses of the frames where they count.
 
-    Where they miss a person for no longer than their errors last, it is that of the nearest frame:
-    between poses of two searches would be a jump, which no step takes back.
+    Gaps between these, no longer than their errors last, take the pose of the nearest frame: no
+    step would remove a jump between poses of two sources.
     """
     frames, used = np.arange(len(guidance.used)), np.flatnonzero(guidance.used)
     before = used[(np.searchsorted(used, frames, side="right") - 1).clip(min=0)]
@@ -149,7 +149,7 @@ def factor(blocks: Floats) -> BandedFactor:
     """
     places = np.arange(UNKNOWNS)
     blocks[0][:, places, places] *= 1.0 + 1e-4
-    # 10 m and 10 rad: only a lone joint leaves a direction that free.
+    # 10 m and 10 rad: only a lone joint leaves a direction that uncertain.
     blocks[0][:, places, places] += 0.01
     solved = BandedFactor.of(blocks)
     if not solved.determined:

@@ -1,8 +1,7 @@
-"""Where a fit begins: bodies that point their limbs as joints do, frame by frame (S2).
+"""Initial poses of a fit: bodies with limbs along the joints, frame by frame (S2).
 
-Root alignment follows the paper: translation and orientation from hips and torso alone. Limbs
-follow by two-bone directions, which puts elbows and knees near the right side of a least-squares
-problem that has other minima.
+Root alignment follows the paper: translation and orientation from hips and torso alone. Two-bone
+directions orient the limbs, which starts elbows and knees near the correct one of several minima.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ TORSO: Final = (5, 6, 11, 12)
 _KNEE: Final = (1.0, 0.0, 0.0)
 _FORWARD: Final = (0.0, 0.0, 1.0)
 _LIMBS: Final = (
-    # COCO's joints, the body's joints, where their coordinates are, and how the second bends.
+    # COCO's joints, the body's joints, slices of their coordinates, and the hinge of the second.
     ((5, 7, 9), (16, 18, 20), (slice(18, 21), slice(24, 27)), "elbow"),
     ((6, 8, 10), (17, 19, 21), (slice(21, 24), slice(27, 30)), "elbow"),
     ((11, 13, 15), (1, 4, 7), (slice(6, 9), slice(12, 15)), "knee"),
@@ -32,7 +31,7 @@ _LIMBS: Final = (
 
 
 def bridged(joints: Floats) -> Floats:
-    """Return joints (frames, joints, 3) without gaps: linear between what is seen, constant beyond.
+    """Return joints (frames, joints, 3) without gaps: linear between observations, constant beyond.
 
     A joint that is never seen stays NaN.
     """
@@ -47,12 +46,12 @@ def bridged(joints: Floats) -> Floats:
 
 
 def align_root(rest: Floats, torso: Floats) -> tuple[Floats, Floats]:
-    """Return orientation (frames, 3, 3) and the place of `rest`'s mean (frames, 3) [m] (S2).
+    """Return orientation (frames, 3, 3) and position of `rest`'s mean (frames, 3) [m] (S2).
 
     Args:
         rest: (4, 3) [m], shoulders and hips of the unposed body.
-        torso: (frames, 4, 3) [m], world; points that are NaN do not count. With fewer than three
-            the frame has the orientation of the nearest that has them; upright without any.
+        torso: (frames, 4, 3) [m], world; NaN points do not count. A frame with fewer than three
+            takes the orientation of the nearest frame that has them; upright without any.
     """
     seen = np.asarray(np.isfinite(torso[..., 0]))
     weight = seen / np.maximum(seen.sum(-1, keepdims=True), 1)
@@ -86,12 +85,12 @@ def start_poses(
         model: the body.
         betas: (shapes,).
         joints: (frames, 17, 3) [m], world, without gaps; a joint never seen is NaN.
-        prior: gives limbs that no frame shows, and the side to which straight ones would bend.
+        prior: pose of limbs that no frame shows, and the bending direction of straight ones.
     """
     rest = model.joint_template + model.joint_directions @ betas
     torso = rest[[16, 17, 1, 2]]
     turns, place = align_root(torso, joints[:, TORSO])
-    # A person whose torso no frame shows stands where the rest is.
+    # Without torso joints, the person is at the mean of the other joints.
     shown = np.asarray(np.isfinite(joints[..., 0]))
     center = np.where(shown[..., None], joints, 0.0).sum(1) / np.maximum(shown.sum(1), 1)[:, None]
     some = np.asarray(shown[:, TORSO].any(-1))
@@ -108,7 +107,7 @@ def start_poses(
         first, second = (rest[bones[k + 1]] - rest[bones[k]] for k in (0, 1))
         axis = np.array(_KNEE) if hinge == "knee" else _unit(np.cross(first, _FORWARD))
         usual = Rigid.from_rotvec(prior.mean[places[0]], np.zeros(3)).rotation @ axis
-        # The limb's own bend says where the hinge is, the more the more it bends.
+        # The bend of the limb determines the hinge, with a weight that grows with the bend.
         across = np.cross(_unit(upper), _unit(lower)) + 0.1 * (turns @ usual)
         outer = turns
         for bone, along, own in ((first, upper, places[0]), (second, lower, places[1])):
@@ -126,7 +125,7 @@ def _unit(vectors: Floats) -> Floats:
 
 
 def _frame(first: Floats, second: Floats) -> Floats:
-    """Orthonormal columns (..., 3, 3): along the first, then towards the second."""
+    """Return orthonormal columns (..., 3, 3): along the first, then towards the second."""
     along = _unit(first)
     third = _unit(np.cross(along, second))
     return np.stack([along, np.cross(third, along), third], axis=-1)

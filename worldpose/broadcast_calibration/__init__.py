@@ -1,7 +1,7 @@
-"""Broadcast calibration: a clip's moving camera from a few picked frames (M1-M6).
+"""Broadcast calibration: a clip's moving camera from clicks in a few key frames (M1-M6).
 
-Input: clicks in key frames, the clip's pictures, people of the static cameras. Output: a camera a
-frame with one center, its uncertainty, and a report.
+Input: clicks in key frames, the clip's frames, people of the static cameras. Output: a camera per
+frame with one center, its covariance, and a report.
 """
 
 from worldpose.broadcast_calibration.calibrating import (

@@ -1,4 +1,4 @@
-"""Adam on the same cost as the solver's, as in the paper (M5)."""
+"""Adam on the cost of the Levenberg-Marquardt solver, as in the paper (M5)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE,
 from worldpose.broadcast_calibration.solving import Problem, Solution, equations_at
 
 RATE = 1e-3
-"""Step of every number [its unit; thousands of pixels for the principal point] (M5)."""
+"""Learning rate of every parameter [its unit; thousands of pixels for the principal point] (M5)."""
 _DECAY = (0.9, 0.999)
 _SMALL = 1e-8
 
@@ -16,13 +16,13 @@ _SMALL = 1e-8
 def descend(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
     """Return the camera after some iterations of Adam (Kingma and Ba) at a rate of 1e-3.
 
-    Steps are those of the solver: rotations in radians, logarithms of focal lengths, distortion,
-    metres. The principal point moves in thousandths of 1,000 px.
+    Parameters are those of the solver: rotations in radians, logarithms of focal lengths,
+    distortion, metres. The principal point is in units of 1,000 px.
 
     Args:
         camera: the start.
         problem: evidence, smoothness and priors.
-        iterations: how many.
+        iterations: number of iterations.
     """
     frames = len(camera) * FRAME_SIZE
     beside = np.zeros((len(problem.painted), 3))

@@ -1,4 +1,4 @@
-"""A broadcast clip's camera in every frame, from a few picked ones (M1 to M6)."""
+"""Calibration of every frame of a broadcast clip from a few key frames (M1 to M6)."""
 
 from __future__ import annotations
 
@@ -45,20 +45,20 @@ from worldpose.pitch import PitchTemplate
 Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Pictures = Callable[[], Iterator[Picture]]
-"""A new pass over all pictures of a clip, grey (height, width), in order."""
+"""Starts a new pass over all frames of the clip, grey (height, width), in order."""
 
 
 @dataclass(frozen=True, eq=False)
 class BroadcastCalibration:
-    """A moving camera, how well it is known, and why.
+    """A moving camera, its covariance and its report.
 
     Attributes:
         camera: all frames.
         uncertainty: its covariance.
-        report: residuals, drift, frames to pick next.
-        tracked: what came from key frames and followed points alone, before any refinement.
-        before: the same with every frame turned and zoomed onto its painted lines, before players
-            and all frames together.
+        report: residuals, drift, frames to click next.
+        tracked: camera from key frames and followed points alone, before any refinement.
+        before: `tracked` with rotation and focal length of each frame corrected on its painted
+            lines, before players and the joint fit.
     """
 
     camera: MovingCamera
@@ -74,8 +74,8 @@ class Tracked:
 
     Attributes:
         keys: calibrated key frames.
-        chain: a first camera for every frame.
-        flow: followed points that move with it.
+        chain: an initial camera for every frame.
+        flow: followed points consistent with the chain.
     """
 
     keys: Keys
@@ -95,29 +95,29 @@ def calibrate_broadcast(
     where: str = "broadcast clip",
     first: int = 0,
 ) -> BroadcastCalibration:
-    """Return the camera of every frame of a clip.
+    """Return the calibrated camera of every frame.
 
-    Key frames give cameras of one place; points that stand still are followed from each to the
-    next; painted lines are looked for in every frame; players of the static cameras are matched
-    with those in the pictures; then all frames are fitted at once.
+    The steps are: calibrate key frames with one center; follow static points from frame to frame;
+    detect painted lines in every frame; match players of the static cameras with detections in the
+    clip; fit all frames jointly.
 
     Args:
         pitch: the stadium's template.
-        key_frames: what was clicked, in one frame or more.
-        pictures: makes a new pass over the clip's grey pictures; it is gone through once to track,
-            and once in each round.
-        fps: frames a second.
-        people: those of the static cameras, and those seen in the clip; None = markings alone.
-        boxes: (frames, detections, 4) x0 y0 x1 y1 [px] of who moves in the pictures; those of
+        key_frames: clicks in one frame or more.
+        pictures: starts a new pass over the clip's grey frames: one to track, and one per
+            iteration.
+        fps: frames per second.
+        people: joints of the static cameras, and keypoints in the clip; None = markings alone.
+        boxes: (frames, detections, 4) x0 y0 x1 y1 [px] of moving people in the frames; those of
             `people` if None.
         settings: weights, noise and gates.
         where: clip or file, for messages.
-        first: number of the first picture in its video, which key frames are numbered in, and
-            whatever is said of frames.
+        first: number of the clip's first frame in its video; key frames and messages use the
+            numbers of the video.
 
     Raises:
-        InputError: the clip has cuts, or no key frame can be used.
-        DegenerateError: a frame is not determined.
+        InputError: the clip has cuts, or no key frame is usable.
+        DegenerateError: the evidence does not determine a frame.
 
     Note:
         M1 to M6; paper section "Broadcasting Camera Calibration" and its supplement.
@@ -137,7 +137,7 @@ def track(
     where: str,
     first: int = 0,
 ) -> Tracked:
-    """Return a clip's cameras from its key frames and followed points (M2); as above."""
+    """Return cameras from key frames and followed points (M2); see `calibrate_broadcast`."""
     wanted = {key.frame - first for key in key_frames}
     if len(wanted) < len(key_frames):
         raise InputError(
@@ -173,12 +173,12 @@ def refine(
     settings: BroadcastCalibrationSettings,
     first: int = 0,
 ) -> BroadcastCalibration:
-    """Return the fit of all frames at once (M3 to M6); as `calibrate_broadcast`."""
+    """Return the joint fit of all frames (M3 to M6); see `calibrate_broadcast`."""
     samples = FieldSamples.of(pitch)
     camera = tracked.chain.camera
     spread = smoothness_of(camera, fps)
     if not settings.smooth:
-        # The rotation of frames without evidence is bridged all the same.
+        # Smoothness of the rotation still bridges frames without evidence.
         spread[3:] = np.inf
     clicks = replace(tracked.keys.clicks, frame=tracked.keys.frames[tracked.keys.clicks.frame])
     deviation = float(tracked.flow.deviation[0]) if len(tracked.flow) else 0.0
@@ -193,7 +193,7 @@ def refine(
         parts = [clicks, lines.evidence]
         if people is not None and settings.player_weight > 0.0:
             if offset is None:
-                # Before any camera rests on these players.
+                # Before any fit includes these players.
                 offset = estimate_feed_offset(lines.camera, people)
                 if settings.feed_offset == "correct" and offset.determined:
                     people = people.later(offset.frames)
@@ -204,7 +204,7 @@ def refine(
         problem = _problem(points, tracked.flow, share, lines.camera, spread, settings)
         solution = solve(lines.camera, problem, settings.iterations)
         camera = solution.camera
-    assert solution is not None  # settings have one round or more
+    assert solution is not None  # settings require one iteration or more
     if settings.solver == "adam":
         solution = descend(tracked.chain.camera, problem, settings.adam_iterations)
     lasting = lasting_of(tracked.chain.camera, fps)
@@ -248,7 +248,7 @@ def _problem(
 def _flow(
     followed: Sequence[Followed], links: Chain, settings: BroadcastCalibrationSettings
 ) -> FlowEvidence:
-    """Return the points that move with the camera, with the deviation that they show."""
+    """Return the followed points consistent with the camera, with their measured deviation."""
     kept = links.kept
     counts = [int(mine.sum()) for mine in kept]
     residual = np.concatenate(
@@ -270,7 +270,7 @@ def _stacked(parts: Sequence[Floats]) -> Floats:
 def _keeping(
     pictures: Iterator[Picture], wanted: set[int], kept: dict[int, Picture]
 ) -> Iterator[Picture]:
-    """Pass pictures on, and keep those of the wanted frames."""
+    """Yield all frames, and store the wanted ones in `kept`."""
     for number, picture in enumerate(pictures):
         if number in wanted:
             kept[number] = picture
@@ -278,5 +278,5 @@ def _keeping(
 
 
 def _number(value: float) -> float:
-    """Return a spread for a record, which has no infinity: 0 stands for none."""
+    """Return a spread for a record, which cannot hold infinity: 0 means none."""
     return float(value) if np.isfinite(value) else 0.0

@@ -1,4 +1,4 @@
-"""Every frame's camera from the key frames', along followed points (M2)."""
+"""Initial camera of every frame, tracked from key frames along followed points (M2)."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """A first camera for every frame.
+    """Initial cameras of all frames, tracked from key frames.
 
     Attributes:
         camera: all frames.
-        kept: for every pair of neighbours, which of its followed points (n,) move with it.
-        residual: for every pair, theirs (n, 2) [px].
-        determined: (frames - 1,) whether the pair's points told the motion.
-        drift: (gaps,) by how much tracking from one key frame missed the next, root mean square
-            over the picture [px].
+        kept: inlier mask (n,) of the followed points, per pair of neighbours.
+        residual: residuals (n, 2) [px] of the followed points, per pair.
+        determined: (frames - 1,) whether the pair's points determine the motion.
+        drift: (gaps,) tracking error from one key frame to the next, root mean square over the
+            image [px].
     """
 
     camera: MovingCamera
@@ -40,13 +40,13 @@ class Chain:
 def chain(
     key_frames: Sequence[int], keys: MovingCamera, followed: Sequence[Followed], outlier: float
 ) -> Chain:
-    """Return cameras tracked from each key frame to the next, what they miss it by spread evenly.
+    """Return cameras tracked between key frames, with the drift distributed linearly.
 
     Args:
-        key_frames: their indices, rising.
-        keys: their cameras, in that order.
+        key_frames: indices of the key frames, rising.
+        keys: cameras of the key frames, in that order.
         followed: points between all neighbouring frames.
-        outlier: largest modified z-score of a point that moves with the camera.
+        outlier: maximum modified z-score of an inlier.
     """
     frames = len(followed) + 1
     cameras: list[MovingCamera | None] = [None] * frames
@@ -85,14 +85,14 @@ def chain(
 
 
 def _there(camera: MovingCamera | None) -> MovingCamera:
-    assert camera is not None  # every frame is reached from the one before it
+    assert camera is not None  # tracking reaches every frame from its neighbour
     return camera
 
 
 def _toward(
     camera: MovingCamera, reached: MovingCamera, key: MovingCamera, share: float
 ) -> MovingCamera:
-    """Return a camera moved by a share of the step from one camera to another."""
+    """Return a camera after a share of the step from one camera to another."""
     way = Rigid(key.rotation @ np.swapaxes(reached.rotation, -1, -2), np.zeros(3)).rotvec
     step = np.concatenate(
         [way, np.log(key.focal / reached.focal)[:, None], key.distortion - reached.distortion],
@@ -102,7 +102,7 @@ def _toward(
 
 
 def _apart(one: MovingCamera, other: MovingCamera) -> float:
-    """Return how far two single cameras put the same directions apart [px]."""
+    """Return the root mean square pixel distance of equal directions in two single cameras [px]."""
     width, height = one.image_size - 1.0
     grid = np.stack(np.meshgrid([0.1, 0.5, 0.9], [0.1, 0.5, 0.9]), axis=-1).reshape(-1, 2)
     pixels = grid * [width, height]

@@ -1,4 +1,4 @@
-"""Cuts: neighbouring frames that no turning and zooming camera connects."""
+"""Detection of cuts: neighbouring frames that no rotation and zoom of a camera relates."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from worldpose.errors import InputError
 
 
 def find_cuts(followed: Sequence[Followed], share: float) -> list[int]:
-    """Return frames that begin a new shot.
+    """Return the first frames of new shots.
 
     Args:
         followed: points between all neighbouring frames.
-        share: at least this much of them moves as one picture within a shot [1].
+        share: minimum share of them consistent with one homography within a shot [1].
     """
     return [number + 1 for number, pair in enumerate(followed) if pair.together < share]
 
@@ -21,16 +21,16 @@ def find_cuts(followed: Sequence[Followed], share: float) -> list[int]:
 def require_one_shot(
     followed: Sequence[Followed], share: float, where: str, first: int = 0
 ) -> None:
-    """Refuse a clip of several shots.
+    """Raise InputError if a clip has several shots.
 
     Args:
         followed: points between all neighbouring frames.
         share: as in `find_cuts`.
         where: clip or file, for the message.
-        first: number of the first picture in its video.
+        first: number of the first frame in its video.
 
     Raises:
-        InputError: naming the frames at which other shots begin.
+        InputError: the clip has cuts; the message lists their frames.
     """
     cuts = find_cuts(followed, share)
     if cuts:

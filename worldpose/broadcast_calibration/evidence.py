@@ -1,4 +1,4 @@
-"""What a moving camera is fitted to: places of known points in pictures, and followed points."""
+"""Evidence of a moving camera: pixels of known world points, and followed points."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 ENDS = 2
-"""Points of the template that a place hangs on, at most: the ends of its line, or the center of its
-arc, or itself."""
+"""Maximum template points that define a place: the ends of its line, or the center of its arc, or
+itself."""
 CLICK, MARKING, PLAYER = 0, 1, 2
 """Kinds of `PointEvidence`: clicked points and drawn markings, painted lines, players' joints."""
 
 
 @dataclass(frozen=True, eq=False)
 class PointEvidence:
-    """Pixels of known world points, frame by frame.
+    """Pixels of known world points, per frame.
 
     Attributes:
         frame: (n,) index of the frame, rising.
         world: (n, 3) [m], world.
         image: (n, 2) [px].
-        whitening: (n, 2, 2) [1/px] takes a pixel error to standard deviations; a place along a
+        whitening: (n, 2, 2) [1/px] converts a pixel error to standard deviations; a place along a
             line has one row, the other is zero.
         weight: (n,) factor on the loss [1].
         loss: (n,) scale of the Geman-McClure loss [standard deviations]; infinite = squares.
         kind: (n,) CLICK, MARKING or PLAYER.
-        source: (n,) which marking or person, -1 for clicks.
-        ends: (n, 2) indices of the template's points that the place hangs on; -1 = none.
-        shares: (n, 2) [m] how far it moves when these are painted one standard deviation beside
-            where the survey has them.
+        source: (n,) index of the marking or person, -1 for clicks.
+        ends: (n, 2) indices of the template's points that define the place; -1 = none.
+        shares: (n, 2) [m] displacement of the place per standard deviation of these points' survey
+            error.
     """
 
     frame: Integers
@@ -79,7 +79,7 @@ class PointEvidence:
         ends: Integers | None = None,
         shares: Floats | None = None,
     ) -> PointEvidence:
-        """Return places that are known across a line only.
+        """Return evidence that constrains places only across a line.
 
         Args:
             frame: (n,), rising.
@@ -89,8 +89,8 @@ class PointEvidence:
             deviation: (n,) standard deviation [px].
             loss: scale of the loss [standard deviations].
             kind: CLICK or MARKING.
-            source: (n,) which marking.
-            ends: (n, 2) points of the template that they hang on; None where it is exact.
+            source: (n,) index of the marking.
+            ends: (n, 2) points of the template that define the places; None = no survey error.
             shares: (n, 2) [m], with `ends`.
         """
         whitening = np.zeros((len(frame), 2, 2))
@@ -114,7 +114,7 @@ class PointEvidence:
         ends: Integers | None = None,
         shares: Floats | None = None,
     ) -> PointEvidence:
-        """Return places that are known alike in both directions.
+        """Return evidence with equal noise in both image directions.
 
         Args:
             frame: (n,), rising.
@@ -124,8 +124,8 @@ class PointEvidence:
             weight: factor on the loss [1].
             loss: scale of the loss [standard deviations].
             kind: CLICK, MARKING or PLAYER.
-            source: (n,) which person.
-            ends: (n, 2) points of the template that they hang on; None for others.
+            source: (n,) index of the person.
+            ends: (n, 2) points of the template that define the places; None = no survey error.
             shares: (n, 2) [m], with `ends`.
         """
         ones = np.ones(len(frame))
@@ -141,17 +141,17 @@ class PointEvidence:
         return PointEvidence(*(getattr(self, name)[index] for name in _POINT_PARTS))
 
     def in_frame(self, frame: int) -> PointEvidence:
-        """Return evidence of a single frame as that of the frame with another index."""
+        """Return evidence of a single frame with another frame index."""
         return replace(self, frame=np.full(len(self), frame))
 
 
 @dataclass(frozen=True, eq=False)
 class FlowEvidence:
-    """Points of what does not move, followed from one frame to the next (M6).
+    """Static points, followed from one frame to the next (M6).
 
     Attributes:
         frame: (n,) index of the first frame, rising.
-        start: (n, 2) [px] there.
+        start: (n, 2) [px] in the first frame.
         end: (n, 2) [px] in the next frame.
         deviation: (n,) standard deviation of their difference, each axis [px].
     """
@@ -175,7 +175,7 @@ class FlowEvidence:
 
 
 def _hung(count: int, ends: Integers | None, shares: Floats | None) -> tuple[Integers, Floats]:
-    """Return what places hang on, nothing where it is not said."""
+    """Return `ends` and `shares`, or empty ones where not given."""
     if ends is None or shares is None:
         return np.full((count, ENDS), -1), np.zeros((count, ENDS))
     return ends, shares
@@ -188,7 +188,7 @@ _FLOW_PARTS = ("frame", "start", "end", "deviation")
 
 
 def together(parts: Sequence[PointEvidence]) -> PointEvidence:
-    """Return all of several pieces of evidence, by frame."""
+    """Return the concatenated evidence, sorted by frame."""
     arrays = {
         name: np.concatenate([getattr(part, name) for part in [PointEvidence.none(), *parts]])
         for name in _POINT_PARTS
@@ -198,5 +198,5 @@ def together(parts: Sequence[PointEvidence]) -> PointEvidence:
 
 
 def bounds(frame: Integers, frames: int) -> Integers:
-    """Return where each frame's entries begin, and where the last one's end (frames + 1,)."""
+    """Return the first entry of each frame, and the end of the last (frames + 1,)."""
     return np.searchsorted(frame, np.arange(frames + 1)).astype(np.int64)

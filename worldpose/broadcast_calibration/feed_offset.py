@@ -1,4 +1,4 @@
-"""By how many frames the broadcast feed is beside the static cameras, seen in how people move."""
+"""Clock offset of the broadcast feed from the static cameras, estimated from people's motion."""
 
 from __future__ import annotations
 
@@ -14,30 +14,31 @@ from worldpose.broadcast_calibration.players import People, boxes_of, match
 Floats = NDArray[np.float64]
 
 _COARSE: Final = 25.0
-"""Whole frames up to here are tried [frame]."""
+"""Maximum offset of the search [frame]."""
 _COARSELY: Final = 80
-"""Frames that are looked at while whole frames are tried, at most [1]."""
+"""Maximum sample frames in the search over all offsets [1]."""
 _FINELY: Final = 400
-"""Frames that are looked at about the best of them, at most [1]."""
+"""Maximum sample frames about the best offset [1]."""
 _SHARE: Final = 0.03
-"""A keypoint's usual error, of the person's height in the picture [1]; the loss bends at three."""
+"""Typical keypoint error, as a share of the person's height in the image [1]; the loss scale is
+three times this."""
 _LASTS: Final = 0.3
-"""Errors of one person are worth one for this long [s]."""
+"""Correlation time of one person's errors [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class FeedOffset:
-    """The broadcast clip's clock.
+    """Clock offset of a broadcast clip.
 
     Attributes:
-        frames: the clip's frame t shows what the static cameras show at t + frames; NaN where
+        frames: the clip's frame t corresponds to the static cameras' frame t + frames; NaN where
             `determined` is false.
-        standard_error: of it [frame]; infinite where nothing moves.
-        determined: whether it is told: the best offset lies within those tried, and is known to
-            better than half a frame.
-        tried: (n,) offsets tried [frame].
+        standard_error: of the offset [frame]; infinite without motion.
+        determined: whether the best offset lies inside the search range, with a standard error
+            below half a frame.
+        tried: (n,) tested offsets [frame].
         cost: (n,) mean loss of a matched keypoint at each.
-        pairs: people matched, over all frames.
+        pairs: number of matched people, over all frames.
     """
 
     frames: float
@@ -51,17 +52,18 @@ class FeedOffset:
 def estimate_feed_offset(
     camera: MovingCamera, people: People, *, reach: float = _COARSE
 ) -> FeedOffset:
-    """Return how the feed's frames lie beside those of the static cameras.
+    """Return the clock offset between the feed and the static cameras.
 
-    For every whole offset people are matched anew and what their keypoints miss is weighed; between
-    the best and its neighbours the answer is where a parabola is lowest. The camera must not rest
-    on these players, or it has absorbed what is looked for: give one of markings alone.
+    For every integer offset the function matches people again and evaluates the loss of their
+    keypoint residuals; a parabola through the best offset and its neighbours gives the minimum. The
+    camera must be independent of these players, or it has absorbed the offset: give one fitted to
+    markings alone.
 
     Args:
         camera: all frames of the clip, from markings and followed points.
-        people: joints of the static cameras in the clip's frames as they are thought to be, and
-            keypoints of the clip.
-        reach: offsets up to this far to either side are tried [frame].
+        people: joints of the static cameras at the clip's assumed frames, and keypoints of the
+            clip.
+        reach: maximum offset to either side [frame].
     """
     whole = np.arange(-np.floor(reach), np.floor(reach) + 1.0)
     some, every = (
@@ -71,8 +73,8 @@ def estimate_feed_offset(
     if not np.isfinite(coarse).any():
         return FeedOffset(np.nan, np.inf, False, whole, coarse, 0)
     best = float(whole[int(np.nanargmin(coarse))])
-    # Between whole frames joints would be means of two, with less noise: a parabola through whole
-    # ones favours none.
+    # Joints between integer frames would be means of two, with less noise: a parabola through
+    # integer offsets avoids this bias.
     near = best + np.arange(-2.0, 3.0)
     results = [_cost(camera, people, offset, every) for offset in near]
     fine = np.array([cost for cost, _ in results])
@@ -84,7 +86,7 @@ def estimate_feed_offset(
     if not bend > 0.0:
         return FeedOffset(np.nan, np.inf, False, near, fine, pairs)
     offset = float(near[middle] + 0.5 * (left - right) / bend)
-    # Half a loss of one unit is one standard deviation; a person counts once in a while.
+    # Half a loss of one unit is one standard deviation; a person counts once per correlation time.
     stride = -(-len(camera) // len(every))
     independent = pairs / max(1.0, _LASTS * people.fps / stride)
     error = float(np.sqrt(1.0 / (0.5 * bend * independent)))
@@ -95,7 +97,7 @@ def estimate_feed_offset(
 def _cost(
     camera: MovingCamera, people: People, offset: float, frames: NDArray[np.int64]
 ) -> tuple[float, int]:
-    """Return the mean loss of a keypoint at an offset, and the pairs."""
+    """Return the mean loss of a keypoint at an offset, and the number of pairs."""
     at = frames + int(offset)
     inside = (at >= 0) & (at < len(people.joints))
     frames, joints = frames[inside], people.joints[at[inside]]

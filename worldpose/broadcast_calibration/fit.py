@@ -1,4 +1,4 @@
-"""How far markings and people lie from where a moving camera puts them."""
+"""Reprojection residuals of markings and people in a moving camera."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Floats = NDArray[np.float64]
 
 
 def pixels_off(camera: MovingCamera, points: PointEvidence) -> Floats:
-    """Return projected minus seen pixels (n, 2); infinite where there is no projection."""
+    """Return projected minus observed pixels (n, 2); infinite where there is no projection."""
     off = np.full((len(points), 2), np.inf)
     for frame in np.unique(points.frame):
         mine = np.flatnonzero(points.frame == frame)
@@ -22,14 +22,14 @@ def pixels_off(camera: MovingCamera, points: PointEvidence) -> Floats:
 
 
 def misses(camera: MovingCamera, points: PointEvidence) -> tuple[float, float]:
-    """Return by how much a camera misses markings and people in the median [px]; NaN without any.
+    """Return the median residuals of markings and of people [px]; NaN without any.
 
-    Painted lines across them, within their loss; people by the mean over a person's keypoints in a
-    frame, in which what keypoints err by averages out and what the camera errs by does not.
+    Residuals of painted lines are distances across them, of inliers. Residuals of people are means
+    over a person's keypoints per frame, which average out keypoint errors but not camera errors.
 
     Args:
         camera: all frames.
-        points: what was seen.
+        points: the evidence.
     """
     off = pixels_off(camera, points)
     lines = points.kind == MARKING
@@ -38,7 +38,7 @@ def misses(camera: MovingCamera, points: PointEvidence) -> tuple[float, float]:
     across = white / np.linalg.norm(points.whitening[lines, 0], axis=-1)
     across = across[white < points.loss[lines]]
     people = np.flatnonzero((points.kind == PLAYER) & np.isfinite(off).all(axis=-1))
-    # Keypoints that are put far off are not the camera's doing.
+    # Keypoints with gross errors say nothing about the camera.
     far = np.linalg.norm(off[people] * points.whitening[people][:, [0, 1], [0, 1]], axis=-1)
     people = people[far < 2.0 * points.loss[people]]
     key = np.column_stack([points.frame[people], points.source[people]])

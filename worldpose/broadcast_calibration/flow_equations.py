@@ -1,4 +1,4 @@
-"""Compiled cost and normal equations of followed points, which tie neighbouring frames (M6)."""
+"""Compiled cost and normal equations of followed points between neighbouring frames (M6)."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 _UNDISTORT: Final = 30
-"""Newton steps at most; three or four in a lens that bends a picture's corner by a twentieth."""
+"""Maximum Newton steps; a lens that displaces the corner by a twentieth takes three or four."""
 
 
 @compiled
 def undistorted(xd: float, yd: float, k: Floats) -> tuple[float, float, bool]:
-    """Return the point on the plane z = 1 that the lens moves to (xd, yd), and whether it is."""
+    """Return the undistorted point on the plane z = 1 of (xd, yd), and whether it exists."""
     far = math.sqrt(xd * xd + yd * yd)
     radius = far
     for _ in range(_UNDISTORT):
@@ -47,9 +47,9 @@ def flow_row(
     image: Floats,
     jacobian: Floats,
 ) -> bool:
-    """Write where a point of the first of two frames is in the second, and derivatives (2, 16).
+    """Write the pixel in the second of two frames of a point in the first, and derivatives (2, 16).
 
-    The place in the world is a direction from the center, which both frames share.
+    The point is a direction from the center, which both frames share.
 
     Args:
         principal: (2,) [px].
@@ -65,7 +65,7 @@ def flow_row(
     a, b, known = undistorted(xd, yd, k)
     if not known:
         return False
-    # From the first camera's axes to the second's.
+    # Rotation from the first camera's axes to the second's.
     turn = rotation[1] @ rotation[0].T
     x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2]
     y = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2]
@@ -84,7 +84,7 @@ def flow_row(
         row, second = jacobian[axis], full[axis]
         # `direction_row` gave minus the derivative by the direction in the first camera's axes.
         ha, hb, hc = -second[7], -second[8], -second[9]
-        # By the undistorted place, then by the distorted one.
+        # Derivatives by the undistorted place, then by the distorted one.
         da, db = ha, hb
         pa = (gyy * da - gxy * db) / determinant
         pb = (gxx * db - gxy * da) / determinant
@@ -119,7 +119,7 @@ def add_flow(
     right: Floats,
     right_corner: Floats,
 ) -> float:
-    """Add followed points to the normal equations and return their cost; as `add_points`.
+    """Add followed points to the normal equations and return their cost; see `add_points`.
 
     Args:
         principal: (2,) [px].

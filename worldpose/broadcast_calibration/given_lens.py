@@ -1,4 +1,4 @@
-"""A clip whose lens is known in every frame, and whose rotation only in the first."""
+"""Rotations of a clip with a given lens in every frame and a given pose of the first frame."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ def follow_given_lens(
     settings: BroadcastCalibrationSettings = BroadcastCalibrationSettings(),  # noqa: B008
     where: str = "broadcast clip",
 ) -> tuple[MovingCamera, Uncertainty]:
-    """Return the rotations of a clip whose focal lengths, distortion and first pose are known.
+    """Return the rotations of a clip from its focal lengths, distortion and first pose.
 
-    The setting of the public challenge: K and k for every frame, R and t of the first one.
+    This is the setting of the public challenge: K and k for every frame, R and t of the first one.
 
     Args:
-        camera: all frames; the rotation of the first one counts, and every frame's lens.
-        pictures: makes a new pass over the clip's grey pictures.
-        pitch: look for its painted lines too; None = followed points alone.
-        boxes: (frames, detections, 4) [px] of who moves in the pictures; None = nobody.
+        camera: all frames; the function uses the first frame's rotation and every frame's lens.
+        pictures: starts a new pass over the clip's grey frames.
+        pitch: also detect its painted lines; None = followed points alone.
+        boxes: (frames, detections, 4) [px] of moving people in the frames; None = no people.
         settings: weights and noise.
         where: clip or file, for messages.
 
     Raises:
-        InputError: the clip has cuts, or not as many frames as the lens.
+        InputError: the clip has cuts, or its frame count differs from the camera's.
     """
     followed = follow(pictures(), boxes, settings.flow_points)
     if len(followed) + 1 != len(camera):
@@ -83,7 +83,7 @@ def follow_given_lens(
     if pitch is not None:
         found = follow_lines(tracked, FieldSamples.of(pitch), pictures(), boxes, settings)
         lines = found.evidence
-        # A given lens stays as it is.
+        # Keep the given lens.
         tracked = replace(tracked, rotation=found.camera.rotation)
     known = np.zeros((len(camera), FRAME_SIZE), dtype=np.bool_)
     known[0] = True

@@ -1,4 +1,4 @@
-"""Picked frames: each by itself, then all with one center and principal point (M1, M2)."""
+"""Calibration of key frames: each alone, then all with one center and principal point (M1, M2)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 _ROUNDS = 3
-"""Times that drawn markings and painted lines are met anew [1]."""
+"""Iterations that match drawn markings and painted lines again [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +37,11 @@ class Keys:
     """Key frames with one center.
 
     Attributes:
-        frames: (k,) their places in the clip, from 0, rising.
-        camera: theirs (k,).
+        frames: (k,) indices in the clip, from 0, rising.
+        camera: cameras (k,).
         clicks: evidence of points and drawn markings; `frame` counts key frames.
-        refused: frames that could not be used, and why.
-        wrong: names of clicks and markings that a frame does not rest on, by frame.
+        refused: unusable frames and the reasons.
+        wrong: names of outliers among clicks and markings, by frame.
     """
 
     frames: NDArray[np.int64]
@@ -60,27 +60,27 @@ def calibrate_keys(
     where: str,
     first: int = 0,
 ) -> Keys:
-    """Return the key frames' cameras, of one place.
+    """Return the key frames' cameras with one center and principal point.
 
     Args:
         pitch: the stadium's template.
-        key_frames: what was clicked.
+        key_frames: clicks per key frame.
         image_size: width, height [px].
-        pictures: grey (height, width) of the key frames, by number; frames without one rest on
+        pictures: grey images (height, width) of the key frames, by number; frames without one use
             their clicks alone.
         settings: noise, prior.
         where: clip or file, for messages.
-        first: number of the clip's first picture in its video, which key frames are numbered in.
+        first: number of the clip's first frame in its video; key frames have numbers of the video.
 
     Raises:
-        InputError: no key frame can be used; the message has each one's reason.
+        InputError: no key frame is usable; the message gives the reason for each.
     """
     found: dict[int, StaticCalibration] = {}
     refused: dict[int, str] = {}
     for key in sorted(key_frames, key=lambda each: each.frame):
         place = f"{where}: frame {key.frame}"
         try:
-            # Painted lines come in below, for all key frames at once.
+            # The joint fit of all key frames below adds painted lines.
             found[key.frame - first] = calibrate(
                 pitch, key.markings, image_size, settings=settings.key_frame, where=place
             )
@@ -120,7 +120,7 @@ def calibrate_keys(
 
 
 def _of_one_place(estimates: Sequence[CameraEstimate]) -> MovingCamera:
-    """Return cameras with the center and principal point that their covariances agree on."""
+    """Return cameras with the covariance-weighted mean of centers and principal points."""
     information, right = np.zeros((5, 5)), np.zeros(5)
     for estimate in estimates:
         camera = estimate.camera
@@ -143,17 +143,17 @@ def _of_one_place(estimates: Sequence[CameraEstimate]) -> MovingCamera:
 
 
 def _kept_aim(camera: MovingCamera, center: Floats, principal_point: Floats) -> MovingCamera:
-    """Return a single frame turned and zoomed so that its picture shows the same ground.
+    """Return a single frame with rotation and focal length changed to show the same ground.
 
     Args:
-        camera: with the rotation and focal length that it had from another place.
-        center: that place (3,) [m].
-        principal_point: that it had (2,) [px].
+        camera: with the new center and principal point, but the old rotation and focal length.
+        center: old center (3,) [m].
+        principal_point: old principal point (2,) [px].
     """
     before = camera.rotation[0]
     ray = np.append((camera.image_size - 1.0 - 2.0 * principal_point) / 2.0 / camera.focal[0], 1.0)
     down = before.T @ ray
-    # A camera that does not look down shows nothing of the ground; it looks far ahead.
+    # A camera that does not look down shows no ground; assume a distant aim.
     reach = -center[2] / down[2] if down[2] < -0.02 else 100.0
     aim = center + reach * down
     old, new = aim - center, aim - camera.center
@@ -188,7 +188,7 @@ def _clicks(
     wrong: Sequence[str],
     settings: BroadcastCalibrationSettings,
 ) -> PointEvidence:
-    """Return one key frame's clicks, the wrong ones left out."""
+    """Return the evidence of one key frame's clicks without outliers."""
     points = [point for point in key.markings.points if point.name not in wrong]
     drawn = [marking for marking in key.markings.drawn if marking.name not in wrong]
     template = {name: number for number, name in enumerate(pitch.points)}
@@ -242,7 +242,7 @@ def _clicks(
 
 
 def _hung(pitch: PitchTemplate, marking: str, places: Floats) -> tuple[tuple[str, str], Floats]:
-    """Return the two points that a marking hangs on, and their shares (n, 2) of places on it."""
+    """Return the two points that define a marking, and their shares (n, 2) of places on it."""
     if marking in pitch.arcs:
         center = pitch.arcs[marking].center
         return (center, center), np.tile([1.0, 0.0], (len(places), 1))

@@ -1,4 +1,4 @@
-"""Painted lines of every frame, looked for across the template's projection (M2, M3)."""
+"""Detection of painted lines in every frame, across the template's projection (M2, M3)."""
 
 from __future__ import annotations
 
@@ -33,28 +33,28 @@ Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 _SPACING: Final = 0.25
-"""Between samples in the world [m]."""
+"""Spacing of samples in the world [m]."""
 _LINE_WIDTH: Final = 0.12
-"""Of the paint [m]; Law 1 allows no more, and most pitches have it."""
+"""Width of the paint [m]: the maximum of Law 1, which most pitches have."""
 _CONTRAST: Final = 6.0
-"""Least brightness of paint above the grass on either side [levels of 255]."""
+"""Minimum brightness of paint above the grass on either side [levels of 255]."""
 _FEW: Final = 15
-"""Fewer samples of lines correct nothing [1]."""
+"""Minimum line samples for a correction of the camera [1]."""
 _FINE: Final = 3.0
-"""Reach of the second look, after the first has corrected the camera [px]."""
+"""Half width of the second search, after the first has corrected the camera [px]."""
 _SCALES: Final = (12.0, 6.0, 3.0, 1.5, 1.0)
-"""Of the loss while the correction tightens [px]."""
+"""Decreasing scales of the loss of the correction [px]."""
 _HOLD: Final = np.array([3e-3, 3e-3, 1.5e-3, 4e-3])
-"""How far a frame's turn [rad] and log focal may be corrected, standard deviations."""
+"""Prior of a frame's correction of rotation [rad] and log focal, standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
 class FieldSamples:
-    """The template's markings as samples that lines are looked for at.
+    """Samples of the template's markings for the line search.
 
     Attributes:
         lines: samples of the painted markings.
-        whites: all that is white, which bars must keep clear of.
+        whites: all white structures, for the clearance test.
     """
 
     lines: LineSamples
@@ -75,15 +75,14 @@ def find_lines(
 ) -> tuple[PointEvidence, MovingCamera]:
     """Return one frame's painted lines, and its camera corrected by them.
 
-    A first look reaches far and corrects turn and zoom; a second near the corrected lines says
-    where they are.
+    A first, wide search corrects rotation and zoom; a second, narrow search measures the lines.
 
     Args:
-        camera: a single frame, about right.
+        camera: a single frame, approximate.
         samples: of the pitch.
         picture: grey (height, width).
-        people: boxes (detections, 4) [px] that hide lines; None = nobody.
-        settings: reach, noise, number of samples.
+        people: boxes (detections, 4) [px] that occlude lines; None = no people.
+        settings: search width, noise, number of samples.
     """
     first = _look(camera, samples, picture, people, settings, settings.line_reach)
     if len(first) < _FEW:
@@ -165,7 +164,7 @@ def _look(
 
 
 def _near(camera: MovingCamera, lines: LineSamples) -> LineSamples:
-    """Return the samples that a pinhole without distortion has in or near the picture."""
+    """Return the samples in or near the image of a pinhole camera without distortion."""
     gone = (lines.points_world - camera.center) @ camera.rotation[0].T
     ahead = gone[:, 2] > 1.0
     place = gone[:, :2] / np.where(ahead, gone[:, 2], 1.0)[:, None]
@@ -175,7 +174,7 @@ def _near(camera: MovingCamera, lines: LineSamples) -> LineSamples:
 
 
 def _hidden(places: Floats, people: Floats, reach: float) -> NDArray[np.bool_]:
-    """Return which places (n,) lie in or near a person's box."""
+    """Return a mask of the places (n,) in or near a person's box."""
     x, y = places[:, 0, None], places[:, 1, None]
     x0, y0, x1, y1 = people.T
     with np.errstate(invalid="ignore"):
@@ -184,7 +183,7 @@ def _hidden(places: Floats, people: Floats, reach: float) -> NDArray[np.bool_]:
 
 
 def _corrected(camera: MovingCamera, lines: PointEvidence) -> MovingCamera:
-    """Return a single frame turned and zoomed onto its lines."""
+    """Return a single frame with rotation and focal length fitted to its lines."""
     begin, edges = camera, bounds(lines.frame, 1)
     gone = np.zeros(4)
     across = lines.whitening / np.linalg.norm(lines.whitening, axis=(1, 2))[:, None, None]
@@ -219,12 +218,12 @@ def _corrected(camera: MovingCamera, lines: PointEvidence) -> MovingCamera:
 
 
 def carried(camera: MovingCamera, begin: MovingCamera, corrected: MovingCamera) -> MovingCamera:
-    """Return a frame's camera with the correction that another frame's has had.
+    """Return a frame's camera with the correction of another frame applied.
 
     Args:
         camera: a single frame.
-        begin: another before its correction.
-        corrected: the same after it.
+        begin: the other frame before its correction.
+        corrected: the other frame after its correction.
     """
     turn = corrected.rotation @ np.swapaxes(begin.rotation, -1, -2)
     return replace(
@@ -236,11 +235,11 @@ def carried(camera: MovingCamera, begin: MovingCamera, corrected: MovingCamera) 
 
 @dataclass(frozen=True, eq=False)
 class FollowedLines:
-    """Painted lines of a clip.
+    """Painted lines detected in all frames, and the corrected cameras.
 
     Attributes:
         evidence: of all frames.
-        camera: the clip's cameras, turned and zoomed onto their lines.
+        camera: all frames, with rotation and focal length fitted to their lines.
     """
 
     evidence: PointEvidence
@@ -254,14 +253,14 @@ def follow_lines(
     boxes: Floats | None,
     settings: BroadcastCalibrationSettings,
 ) -> FollowedLines:
-    """Return the painted lines of all frames; what one frame corrects, the next begins with.
+    """Return the painted lines of all frames; each frame's correction initializes the next.
 
     Args:
         camera: all frames, as tracked.
         samples: of the pitch.
         pictures: grey (height, width), in order.
-        boxes: (frames, detections, 4) [px] of people, who hide lines; None = nobody.
-        settings: reach, noise, number of samples.
+        boxes: (frames, detections, 4) [px] of people, which occlude lines; None = no people.
+        settings: search width, noise, number of samples.
     """
     parts, cameras = [], []
     before = after = camera.frames(slice(0, 1))

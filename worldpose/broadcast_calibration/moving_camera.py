@@ -1,4 +1,4 @@
-"""The moving camera: one center and principal point, and a rotation and a lens a frame (M1)."""
+"""Moving camera: one center and principal point, with a rotation and a lens per frame (M1)."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from worldpose.cameras import Camera, Rigid
 Floats = NDArray[np.float64]
 
 FRAME_SIZE = 7
-"""Numbers of a frame's step: rotation [rad] in the camera's axes, log focal, k1, k2, k3."""
+"""Parameters of a frame's step: rotation [rad] in the camera's axes, log focal, k1, k2, k3."""
 CLIP_SIZE = 5
-"""Numbers of the clip's step: center [m], world, and principal point [px]."""
+"""Parameters of the clip's step: center [m], world, and principal point [px]."""
 
 
 @dataclass(frozen=True, eq=False)
 class MovingCamera:
-    """A camera that turns and zooms about a fixed center.
+    """A camera that rotates and zooms about a fixed center.
 
     Attributes:
         center: (3,) [m], world.
@@ -39,10 +39,10 @@ class MovingCamera:
 
     @classmethod
     def of(cls, camera: Camera, center: ArrayLike, principal_point: ArrayLike) -> MovingCamera:
-        """Return cameras (frames,) with a center and a principal point in common.
+        """Return a moving camera with given center and principal point.
 
         Args:
-            camera: their rotations, focal lengths and distortion are kept.
+            camera: batch (frames,) with the rotations, focal lengths and distortion.
             center: (3,) [m], world.
             principal_point: (2,) [px].
         """
@@ -57,7 +57,7 @@ class MovingCamera:
 
     @classmethod
     def from_batch(cls, camera: Camera) -> MovingCamera:
-        """Return cameras (frames,) that have a center and a principal point in common."""
+        """Return a batch (frames,) with one center and principal point as a moving camera."""
         return cls.of(camera, camera.center[0], camera.principal_point[0])
 
     def __len__(self) -> int:
@@ -65,7 +65,7 @@ class MovingCamera:
 
     @property
     def camera(self) -> Camera:
-        """The same as a batch (frames,)."""
+        """Batch (frames,) of cameras."""
         distortion = np.zeros((len(self), 5))
         distortion[:, [0, 1, 4]] = self.distortion
         return Camera(
@@ -105,12 +105,12 @@ class MovingCamera:
         )
 
     def between(self, start: int, stop: int, frames: ArrayLike) -> MovingCamera:
-        """Return cameras at frame numbers between two given ones, turned and zoomed evenly.
+        """Return cameras interpolated between two frames.
 
         Args:
-            start: index of the first.
-            stop: index of the second.
-            frames: (n,) shares of the way, 0 at the first and 1 at the second.
+            start: index of the first frame.
+            stop: index of the second frame.
+            frames: (n,) interpolation weights, 0 at the first and 1 at the second frame.
         """
         share = np.asarray(frames, dtype=np.float64)[:, None]
         way = Rigid(self.rotation[stop] @ self.rotation[start].T, np.zeros(3)).rotvec
@@ -126,7 +126,7 @@ class MovingCamera:
 
 
 def joined(parts: list[MovingCamera]) -> MovingCamera:
-    """Return the frames of several parts one after another; what is shared is the first's."""
+    """Return the concatenated frames, with center and principal point of the first part."""
     return replace(
         parts[0],
         rotation=np.concatenate([part.rotation for part in parts]),

@@ -1,7 +1,7 @@
 """Compiled cost and normal equations of known points in all frames (M3, M4).
 
-Unknown are seven numbers a frame, five that all frames share, and where the template's points are
-painted; the matrix is an arrow: blocks of frames along a band, and a border of what is shared.
+Unknowns are seven parameters per frame, five shared by all frames, and the paint errors of the
+template's points; the matrix is an arrow: a band of frame blocks, and a border of shared unknowns.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 _NEAR = 0.5
-"""Nearer points [m] are none that a camera in the stands sees."""
+"""Minimum depth of a point [m]: a camera in the stands sees none nearer."""
 
 
 @compiled
@@ -29,7 +29,7 @@ def point_row(
     image: Floats,
     jacobian: Floats,
 ) -> bool:
-    """Write the pixel (2,) of a point and its derivatives (2, 12); False where there is none.
+    """Write the pixel (2,) of a point and its derivatives (2, 12); return whether it exists.
 
     Args:
         r: (3, 3) rotation.
@@ -62,12 +62,12 @@ def direction_row(
     image: Floats,
     jacobian: Floats,
 ) -> bool:
-    """Write the pixel of a point in the camera's axes and its derivatives, as `point_row`."""
+    """Write the pixel of a point in camera axes and its derivatives, as `point_row`."""
     a, b = x / z, y / z
     s = a * a + b * b
     radial = 1.0 + s * (k[0] + s * (k[1] + s * k[2]))
     slope = 2.0 * (k[0] + s * (2.0 * k[1] + 3.0 * s * k[2]))
-    # Where the lens model folds back there is no picture.
+    # Where the lens model folds back there is no image.
     if not (radial + s * slope > 0.0 and radial > 0.0):
         return False
     image[0], image[1] = focal * radial * a + principal[0], focal * radial * b + principal[1]
@@ -124,10 +124,10 @@ def add_points(
         image: (n, 2) [px].
         whitening: (n, 2, 2) [1/px].
         weight: (n,).
-        loss: (n,) scale of Geman and McClure; infinite = squares.
-        ends: (n, 2) which of `beside` a point hangs on; -1 = none.
-        shares: (n, 2) [m] how far it moves with these.
-        beside: (painted, 3) where points of the template lie beside it [standard deviations].
+        loss: (n,) scale of the Geman-McClure loss; infinite = squares.
+        ends: (n, 2) rows of `beside` that define a point; -1 = none.
+        shares: (n, 2) [m] displacement of the point per unit of these.
+        beside: (painted, 3) paint errors of the template's points [standard deviations].
         blocks: (3, frames, 7, 7), the diagonal added to.
         border: (frames, 7, 5 + 3 painted), added to.
         corner: (5 + 3 painted, 5 + 3 painted), added to.
@@ -153,7 +153,7 @@ def add_points(
                 rotation[t], center, principal, focal[t], distortion[t], place, pixel, rows
             )
             if not seen:
-                # As far off as the loss can tell.
+                # The maximum of the loss.
                 cost += 0.5 * weight[i] * min(limit, 1e12)
                 continue
             u, v = pixel[0] - image[i, 0], pixel[1] - image[i, 1]
@@ -181,7 +181,7 @@ def add_points(
                     for m in range(j + 1):
                         normal[j, m] += value * white[m]
                 for end in range(2):
-                    # A point moves in the picture as if the center moved the other way.
+                    # The derivative by the point is minus the derivative by the center.
                     for j in range(3):
                         moved[3 * end + j] = -white[7 + j] * shares[i, end]
                 for one in range(6):

@@ -1,4 +1,4 @@
-"""Points of what stands still, followed from each frame of a clip to the next (M2, M6)."""
+"""Optical flow of static points between neighbouring frames of a clip (M2, M6)."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ Picture = NDArray[np.uint8]
 
 _WINDOW: Final = (21, 21)
 _LEVELS: Final = 4
-"""Of the pyramid: motion of 150 px a frame at most."""
+"""Levels of the pyramid: motion up to 150 px per frame."""
 _RETURN: Final = 0.3
-"""A point followed forth and back comes home within this [px]."""
+"""Maximum forward-backward error [px]."""
 _CELLS: Final = (16, 9)
 """Columns and rows of cells, each with its share of the points."""
 _QUALITY: Final = 0.002
-"""Least strength of a corner, of the strongest in the picture [1]."""
+"""Minimum strength of a corner, relative to the strongest in the frame [1]."""
 _AWAY: Final = 0.15
-"""Around a person's box, of its height [1]."""
+"""Margin around a person's box, relative to its height [1]."""
 _CONSISTENT: Final = 1.5
-"""Points within this of one homography move together [px]."""
+"""Maximum inlier distance of a homography [px]."""
 _TELLING: Final = 12
-"""Fewer points tell nothing of a cut [1]."""
+"""Minimum points to decide on a cut [1]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """Points of one frame in the next.
+    """Points followed from one frame to the next.
 
     Attributes:
         start: (n, 2) [px].
         end: (n, 2) [px].
-        together: share of the points looked for that was found and moves as one picture [1]; NaN
-            where there was nothing to follow.
+        together: share of the searched points that are inliers of one homography [1]; NaN with too
+            few points.
     """
 
     start: Floats
@@ -47,15 +47,16 @@ class Followed:
 
 
 def follow(pictures: Iterable[Picture], boxes: Floats | None, points: int) -> list[Followed]:
-    """Return the points followed between all neighbouring pictures.
+    """Return the points followed between all neighbouring frames.
 
-    Corners are chosen anew in every frame, evenly over the picture, so that errors do not add up
-    along a track. Pyramidal Lucas-Kanade forth and back; who does not come home is dropped.
+    The function selects new corners in every frame, evenly over the image, so that errors do not
+    accumulate along a track. Pyramidal Lucas-Kanade runs forward and backward; points with a large
+    forward-backward error are dropped.
 
     Args:
         pictures: grey (height, width), in order.
-        boxes: (frames, detections, 4) x0 y0 x1 y1 [px] of people, who move; NaN = none there.
-        points: how many to follow, about.
+        boxes: (frames, detections, 4) x0 y0 x1 y1 [px] of people, which move; NaN = missing.
+        points: approximate number of points.
     """
     followed: list[Followed] = []
     before: Picture | None = None
@@ -78,7 +79,7 @@ def _follow(before: Picture, after: Picture, people: Floats | None, points: int)
         after, before, end, end.copy(), winSize=_WINDOW, maxLevel=_LEVELS
     )
     size = np.array([before.shape[1], before.shape[0]])
-    # Near the border the window reaches out of the picture.
+    # Near the border the window extends beyond the image.
     inside = ((end > _WINDOW[0] / 2) & (end < size - 1 - _WINDOW[0] / 2)).all(axis=-1)
     same = np.linalg.norm(home - start, axis=-1) < _RETURN
     kept = (found[:, 0] == 1) & (back[:, 0] == 1) & same & inside
@@ -92,7 +93,7 @@ def _follow(before: Picture, after: Picture, people: Floats | None, points: int)
 
 
 def _corners(picture: Picture, people: Floats | None, points: int) -> NDArray[np.float32]:
-    """Return corners (n, 2) [px], the strongest of each cell of the picture, off people."""
+    """Return corners (n, 2) [px], the strongest of each image cell, outside people's boxes."""
     half = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     strength = cv2.cornerMinEigenVal(half, 5)
     margin = _WINDOW[0] // 2
@@ -114,5 +115,5 @@ def _corners(picture: Picture, people: Floats | None, points: int) -> NDArray[np
     first = np.searchsorted(cell, cell)
     each = max(1, round(points / (_CELLS[0] * _CELLS[1])))
     chosen = order[np.arange(len(cell)) - first < each]
-    # A pixel of the half picture has its middle between two of the whole one's.
+    # The center of a half-resolution pixel is between two full-resolution pixels.
     return np.stack([2 * u[chosen] + 0.5, 2 * v[chosen] + 0.5], axis=-1).astype(np.float32)

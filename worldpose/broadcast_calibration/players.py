@@ -1,4 +1,4 @@
-"""Players of the static cameras matched with those detected in the broadcast pictures (M4)."""
+"""Matches of players of the static cameras with detections in the broadcast frames (M4)."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ BONES: Final = np.array(
 )
 """A tree over the 17 joints of COCO: J - 1 bones."""
 _LEAST: Final = 0.05
-"""Pairs less alike are no pairs [1]: a twentieth of shared area, or bones at random."""
+"""Minimum similarity of a pair [1]: a twentieth of shared area, or random bones."""
 _JOINTS: Final = 6
-"""Fewer joints seen on both sides make no pair [1]."""
+"""Minimum joints present on both sides of a pair [1]."""
 _START: Final = 0.05
-"""Deviation of a keypoint before the clip has told it, of the person's height in the picture."""
+"""Default keypoint deviation without an estimate, relative to the person's height in the image."""
 _LAG: Final = 1.0
-"""Errors are taken as independent beyond this [s]."""
+"""Maximum correlation time of errors [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class People:
-    """People in space and in the picture, frame by frame.
+    """3D joints of people and keypoints of detections, per frame.
 
     Attributes:
         joints: (frames, persons, 17, 3) [m], world; NaN where missing.
         keypoints: (frames, detections, 17, 2) [px]; NaN where missing.
-        fps: frames a second.
+        fps: frames per second.
 
     Raises:
-        InputError: the frames differ.
+        InputError: the frame counts differ.
     """
 
     joints: Floats
@@ -61,12 +61,12 @@ class People:
             )
 
     def later(self, frames: float) -> People:
-        """Return these keypoints with joints so many frames later, on straight lines between.
+        """Return these keypoints with joints of later frames, interpolated linearly.
 
         Joints beyond the clip's ends are missing.
 
         Args:
-            frames: how much [frame]; below zero = earlier.
+            frames: shift [frame]; below zero = earlier.
         """
         if frames == 0.0:
             return self
@@ -87,12 +87,12 @@ class People:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Who is who.
+    """Matched pairs of persons and detections.
 
     Attributes:
         frame: (n,) rising.
-        person: (n,).
-        detection: (n,).
+        person: (n,) index.
+        detection: (n,) index.
         similarity: (n,).
     """
 
@@ -104,11 +104,11 @@ class Matches:
 
 @dataclass(frozen=True)
 class PlayerNoise:
-    """What the residuals of matched players say of the detector.
+    """Keypoint noise, estimated from the residuals of matched players.
 
     Attributes:
-        share: standard deviation of a keypoint, of the person's height in the picture [1].
-        frames: of how many frames in a row the errors are worth one frame's [frame].
+        share: standard deviation of a keypoint, relative to the person's height in the image [1].
+        frames: number of successive frames worth one independent frame [frame].
     """
 
     share: float
@@ -125,10 +125,10 @@ def boxes_of(keypoints: Floats) -> Floats:
 
 
 def similarity(projected: Floats, detected: Floats) -> Floats:
-    """Return how alike projected and detected people are (persons, detections) [-1..1] (M4).
+    """Return the similarity of projected and detected people (persons, detections) [-1..1] (M4).
 
     Intersection over union of the boxes about all keypoints, times the mean cosine between
-    corresponding bones; the mean over those that both have. 0 where too little is seen.
+    corresponding bones, over the bones that both have. 0 with too few common joints.
 
     Args:
         projected: (persons, 17, 2) [px].
@@ -153,7 +153,7 @@ def similarity(projected: Floats, detected: Floats) -> Floats:
 
 
 def match(camera: MovingCamera, people: People) -> Matches:
-    """Return the best pairs of every frame, by weighted bipartite matching."""
+    """Return the best pairs per frame, by weighted bipartite matching."""
     frames, persons, count = people.joints.shape[:3]
     projected = camera.camera.project(people.joints.reshape(frames, -1, 3))
     projected = projected.reshape(frames, persons, count, 2)
@@ -175,15 +175,15 @@ def player_evidence(
     matches: Matches,
     settings: BroadcastCalibrationSettings,
 ) -> tuple[PointEvidence, PlayerNoise]:
-    """Return matched keypoints as evidence, and the noise that it is weighed with.
+    """Return matched keypoints as evidence, and the estimated keypoint noise.
 
-    A keypoint's deviation is a share of the person's height in the picture, and its weight falls
-    with the number of frames over which errors last; the clip's own residuals tell both.
+    A keypoint's deviation is a share of the person's height in the image, and its weight falls with
+    the correlation time of the errors; the clip's residuals give both.
 
     Args:
-        camera: all frames, about right.
+        camera: all frames, approximate.
         people: joints and keypoints.
-        matches: who is who.
+        matches: pairs of persons and detections.
         settings: weight and loss.
     """
     world = people.joints[matches.frame, matches.person]
@@ -213,7 +213,7 @@ def player_evidence(
 
 
 def _noise(scaled: Floats, matches: Matches, fps: float) -> PlayerNoise:
-    """Return spread and persistence of residuals (n, 17, 2) over heights."""
+    """Return spread and correlation time of residuals (n, 17, 2), relative to heights."""
     known = scaled[np.isfinite(scaled)]
     if len(known) < 100:
         return PlayerNoise(_START, 1.0)

@@ -1,4 +1,4 @@
-"""One place for several clips of a match, where they agree (M1)."""
+"""Common camera center of several clips of one match, if they are consistent (M1)."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from worldpose.broadcast_calibration.uncertainty import Uncertainty
 Floats = NDArray[np.float64]
 
 _UNLIKELY = 1e-3
-"""Clips whose places differ by more than all but this share of honest ones are not pooled [1]."""
+"""Significance level of the test that clips have one center [1]."""
 
 
 @dataclass(frozen=True, eq=False)
 class PooledCenter:
-    """The place of a camera in several clips.
+    """Common camera center of several clips.
 
     Attributes:
-        center: (3,) [m], world; NaN where the clips do not agree.
+        center: (3,) [m], world; NaN if the clips are inconsistent.
         covariance: (3, 3) [m^2].
-        agree: whether one place explains all clips.
-        distance: (clips,) how far each is from the common place [standard deviations].
+        agree: whether one center explains all clips.
+        distance: (clips,) Mahalanobis distance of each clip from the common center.
     """
 
     center: Floats
@@ -36,7 +36,7 @@ class PooledCenter:
 
 
 def pool_centers(centers: Sequence[Floats], covariances: Sequence[Floats]) -> PooledCenter:
-    """Return the place that several clips' centers have in common.
+    """Return the covariance-weighted mean of several clips' centers.
 
     Args:
         centers: (3,) each [m], world.
@@ -57,14 +57,14 @@ def pool_centers(centers: Sequence[Floats], covariances: Sequence[Floats]) -> Po
 def drawn_to(
     camera: MovingCamera, uncertainty: Uncertainty, pooled: PooledCenter
 ) -> tuple[MovingCamera, Uncertainty]:
-    """Return one of the pooled clips' cameras at their common place, and how well it is known.
+    """Return a clip's cameras conditioned on the pooled center, and their covariance.
 
-    What of a frame's turn, zoom and lens went along with its own place goes back along with it.
+    Rotation, focal length and distortion follow the center by their covariance with it.
 
     Args:
         camera: all frames of the clip.
         uncertainty: its covariance.
-        pooled: clips that agree, this one among them.
+        pooled: common center of consistent clips, this clip included.
     """
     known = uncertainty.frame
     place = slice(FRAME_SIZE, FRAME_SIZE + 3)

@@ -1,4 +1,4 @@
-"""The prior of a clip's camera, as numbers of its frames."""
+"""Conversion of the prior settings to the parameters of a clip's frames."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from worldpose.broadcast_calibration.settings import BroadcastPrior
 from worldpose.broadcast_calibration.solving import Prior
 
 REFERENCE: Final = 2.19
-"""Focal length that the prior's distortion is given at, in widths of the picture [1]."""
+"""Reference focal length of the prior's distortion, in image widths [1]."""
 
 
 def prior_of(
     settings: BroadcastPrior, focal: NDArray[np.float64], image_size: NDArray[np.int64]
 ) -> Prior:
-    """Return the prior of frames with about these focal lengths.
+    """Return the prior of frames with given approximate focal lengths.
 
     Args:
         settings: middles and spreads.
-        focal: (frames,) [px], about.
+        focal: (frames,) [px], approximate.
         image_size: (2,) width, height [px].
     """
     width = float(image_size[0])

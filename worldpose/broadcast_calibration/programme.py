@@ -1,4 +1,4 @@
-"""Shots of a whole programme, and which of them are clips of the main camera (paper, rule X1)."""
+"""Segmentation of a programme into shots, and selection of main-camera clips (paper, rule X1)."""
 
 from __future__ import annotations
 
@@ -17,53 +17,53 @@ from worldpose.broadcast_calibration.optical_flow import follow
 Picture = NDArray[np.uint8]
 
 _POINTS: Final = 200
-"""Followed between two pictures, about [1]."""
+"""Approximate number of points followed between two frames [1]."""
 _GREEN: Final = ((25, 35, 25), (95, 255, 255))
 """Hue [2 deg], saturation and value [1/255] of grass in sun, shade and floodlight."""
 _LOOK: Final = 0.5
-"""Between pictures whose grass and people are looked at [s]."""
+"""Interval between frames for grass and people statistics [s]."""
 _SETTLED: Final = 1.0
-"""What is shorter is part of a transition between two shots [s]."""
+"""Minimum duration of a shot [s]; shorter parts belong to a transition between two shots."""
 _PICTURES: Final = 8
-"""Of a shot that are kept to be shown, at most [1]."""
+"""Maximum preview frames per shot [1]."""
 _UNLIKE: Final = 30.0
-"""Mean change of brightness that parts two shots where nothing can be followed [1/255]."""
+"""Mean change of brightness that separates two shots without followed points [1/255]."""
 
 
 class ProgrammeSettings(Record):
-    """What a shot of a programme must be to be proposed as a clip."""
+    """Criteria for shots of a programme as clip proposals."""
 
     rate: float = Field(default=25.0, ge=1e-6, le=10000)
-    """Pictures a second that are looked at, about [1/s]; a cut is found to one of them."""
+    """Approximate sampling rate of frames [1/s]; it limits the accuracy of cuts."""
     cut_share: float = Field(default=0.25, gt=0, lt=1)
-    """As in calibration: within a shot at least this share of the points moves together [1]."""
+    """As in calibration: minimum share of homography inliers within a shot [1]."""
     transition: float = Field(default=0.1, ge=1e-6, le=10)
-    """Between two shots without a cut, such as a wipe or a dissolve, at least [s]: a shot between
-    two of them is a replay."""
+    """Minimum duration of a transition, such as a wipe or a dissolve [s]: a shot between two is a
+    replay."""
     shortest: float = Field(default=4.0, ge=1e-6, le=1000)
-    """Of a clip [s]."""
+    """Minimum duration of a clip [s]."""
     grass: float = Field(default=0.5, gt=0, lt=1)
-    """Least share of grass in the picture of a main camera, in the median [1]."""
+    """Minimum median share of grass in frames of a main camera [1]."""
     tallest: float = Field(default=0.35, ge=1e-6, le=100)
-    """Of what stands on the grass there, in heights of the picture, in the median [1]: people of a
-    main camera are a tenth, those of other cameras half and more."""
+    """Maximum median height of the tallest region on the grass, in image heights [1]: people are a
+    tenth in a main camera, half and more in other cameras."""
     pan: float = Field(default=0.25, ge=0, le=100)
-    """Least pan of a clip, in widths of the picture [1]: 7 degrees at a usual focal length."""
+    """Minimum pan of a clip, in image widths [1]: 7 degrees at a usual focal length."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """Pictures of one camera without a cut.
+    """Consecutive frames of one camera without a cut.
 
     Attributes:
-        first: number of its first picture.
-        count: of its pictures.
-        seconds: how long it lasts [s].
-        grass: share of the picture, median [1].
-        tallest: of what stands on the grass, in heights of the picture, median [1].
-        pan: from its leftmost to its rightmost view, in widths of the picture [1].
-        pictures: some of it, small, in RGB.
-        unfit: why it is not proposed; empty = it is.
+        first: number of its first frame.
+        count: number of its frames.
+        seconds: duration [s].
+        grass: median share of grass in the frame [1].
+        tallest: median height of the tallest region on the grass, in image heights [1].
+        pan: from its leftmost to its rightmost view, in image widths [1].
+        pictures: small preview frames, in RGB.
+        unfit: reasons against it as a clip; empty = proposed.
     """
 
     first: int
@@ -78,7 +78,7 @@ class Shot:
 
 @dataclass
 class _Course:
-    """A shot while it lasts: memory grows by two numbers for half a second of it."""
+    """Running statistics of a shot: memory grows by two numbers per half second."""
 
     first: int
     last: int
@@ -91,7 +91,7 @@ class _Course:
     right: float = 0.0
 
     def look(self, picture: Picture) -> None:
-        """Take in how much grass there is and what stands on it."""
+        """Record the grass share and the tallest region of a frame."""
         grass, tallest = grass_and_people(picture)
         if len(self.grass) % self.every == 0:
             self.pictures.append(picture)
@@ -102,7 +102,7 @@ class _Course:
         self.tallest.append(tallest)
 
     def turn(self, share: float) -> None:
-        """Take in by how much of its width the picture moved to the right."""
+        """Record a motion of the image to the right, as a share of its width."""
         self.aim -= share
         self.left, self.right = min(self.left, self.aim), max(self.right, self.aim)
 
@@ -112,15 +112,15 @@ def find_shots(
     fps: float,
     settings: ProgrammeSettings = ProgrammeSettings(),  # noqa: B008
 ) -> Iterator[Shot]:
-    """Yield the shots of a programme in order, each with what speaks against it as a clip.
+    """Yield the shots of a programme in order, each with the reasons against it as a clip.
 
-    One pass in bounded memory. Whether a shot is of the main camera is told by cheap evidence:
-    grass, the size of who stands on it, a pan, and the wipes about replays; a person confirms.
+    One pass in bounded memory. Simple features select shots of the main camera: grass, the size of
+    people, a pan, and the wipes about replays; a person confirms the selection.
 
     Args:
-        pictures: numbers, rising by one, and small RGB pictures, about 320 px wide; None where a
-            picture is damaged, which ends a shot.
-        fps: pictures a second.
+        pictures: numbers, rising by one, and small RGB frames, about 320 px wide; None for a
+            damaged frame, which ends a shot.
+        fps: frames per second.
         settings: limits.
     """
     stride = max(1, round(fps / settings.rate))
@@ -161,17 +161,17 @@ def find_shots(
 
 
 def grass_and_people(picture: Picture) -> tuple[float, float]:
-    """Return the share of grass [1] and the height of the tallest thing on it [1].
+    """Return the share of grass [1] and the height of the tallest region on it [1].
 
-    The latter in heights of the picture: of the highest connected region that is not green within
-    the convex hull of what is.
+    The height is in image heights: that of the tallest connected region that is not green within
+    the convex hull of the grass.
 
     Args:
         picture: RGB (height, width, 3), small.
     """
     green = cv2.inRange(cv2.cvtColor(picture, cv2.COLOR_RGB2HSV), *map(np.array, _GREEN))
     kernel = np.ones((3, 3), np.uint8)
-    # Green specks in the stands are no grass.
+    # Remove green specks in the stands.
     grass = cv2.morphologyEx(green, cv2.MORPH_OPEN, np.ones((7, 7), np.uint8))
     share = float((grass > 0).mean())
     places = cv2.findNonZero(grass)
@@ -188,7 +188,7 @@ def grass_and_people(picture: Picture) -> tuple[float, float]:
 def _moved(
     before: Picture, picture: Picture | None, settings: ProgrammeSettings
 ) -> tuple[bool, float]:
-    """Return whether a picture goes on with a shot, and its motion to the right [widths]."""
+    """Return whether a frame continues a shot, and its motion to the right [widths]."""
     if picture is None:
         return False, 0.0
     grey = [
@@ -213,11 +213,11 @@ def _shot(
     stride: int,
     settings: ProgrammeSettings,
 ) -> Shot:
-    """Return a shot that is over; the neighbours' last and first pictures tell wipes."""
+    """Return a finished shot; gaps to the neighbouring shots indicate wipes."""
     count = course.last - course.first + 1
     grass, tallest = float(np.median(course.grass)), float(np.median(course.tallest))
     pan, seconds = course.right - course.left, count / fps
-    # Two neighbours in one shot are a stride apart, and so are they across a cut.
+    # Neighbouring samples are a stride apart, in a shot and across a cut.
     wipe = settings.transition * fps + stride
     sides = (
         before is not None and course.first - before > wipe,

@@ -1,4 +1,4 @@
-"""What a broadcast calibration says about itself, frame by frame."""
+"""Report of a broadcast calibration: status, residuals and expected errors per frame."""
 
 from __future__ import annotations
 
@@ -32,42 +32,42 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 _FEW_LINES: Final = 30
-"""Fewer samples of lines do not hold a camera by themselves [1]."""
+"""Minimum line samples that determine a frame's camera [1]."""
 _FEW_PLAYERS: Final = 3
-"""Fewer players do not [1]."""
+"""Minimum players that determine a frame's camera [1]."""
 _PICKS: Final = 5
-"""Frames to pick next that are named."""
+"""Maximum number of proposed key frames."""
 _LATE: Final = 0.5
-"""A feed further beside the static cameras than this is said to be so [frame]."""
+"""Clock offset above which the report warns [frame]."""
 _GRID: Final = 4.0
-"""Between places of the pitch whose expected error is looked at [m]."""
+"""Grid spacing of places on the pitch for expected errors [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class BroadcastReport:
-    """How well a clip's camera is known, and why.
+    """Accuracy of a clip's camera, its evidence and warnings.
 
     Attributes:
-        status: (frames,) what each frame rests on, an index into FRAME_STATUS.
-        reprojection_error: (frames,) expected error of places on the pitch in the picture, root
-            mean square over what is seen [px].
+        status: (frames,) main evidence of each frame, an index into FRAME_STATUS.
+        reprojection_error: (frames,) expected image error of places on the pitch, root mean square
+            over the visible places [px].
         marking_rms: (frames,) of the samples of painted lines, across them [px]; NaN without any.
         player_rms: (frames,) of matched keypoints [px]; NaN without any.
         marking_count: (frames,) samples of painted lines.
         player_count: (frames,) matched players.
         flow_count: (frames,) followed points from the frame to the next.
-        key_frames: those used.
-        refused: those that could not be used, and why.
-        wrong: clicks and markings that a key frame does not rest on, by frame.
-        drift: (gaps,) by how much tracking from one key frame missed the next [px].
-        feed_offset: the clip's clock, as people show it; None without people.
+        key_frames: used key frames.
+        refused: unusable key frames and the reasons.
+        wrong: outliers among a key frame's clicks and markings, by frame.
+        drift: (gaps,) tracking error from one key frame to the next [px].
+        feed_offset: the clip's clock offset, from people; None without people.
         weights: of the terms.
         pick_next: frames whose clicks would help most, the best first.
         markings_off: median distance of painted lines from their projection [px], before players
-            and all frames together, and after; NaN without any.
+            and the joint fit, and after; NaN without any.
         players_off: the same of people, by the mean over a person's keypoints.
-        decisions: what was chosen, and the figures that decided.
-        reasons: why a person must look at it; empty where nobody must.
+        decisions: choices and the metrics behind them.
+        reasons: why a person must review the clip; empty if not necessary.
     """
 
     status: NDArray[np.uint8]
@@ -105,22 +105,22 @@ def report_of(
     offset: FeedOffset | None,
     first: int,
 ) -> BroadcastReport:
-    """Return what there is to say about a calibrated clip.
+    """Return the report of a calibrated clip.
 
     Args:
         camera: all frames.
-        before: the same before players and all frames together.
-        uncertainty: its covariance.
-        points: what it rests on.
-        flow: followed points that it rests on.
+        before: all frames before players and the joint fit.
+        uncertainty: covariance of `camera`.
+        points: evidence of the fit.
+        flow: followed points of the fit.
         keys: its key frames.
-        links: how it was tracked.
+        links: the chain of tracked cameras.
         matches: players; None without.
         weights: of the terms.
         pitch: the template.
         settings: thresholds.
-        offset: the clip's clock; None without people.
-        first: number of the clip's first picture in its video, for what is said in words.
+        offset: the clip's clock offset; None without people.
+        first: number of the clip's first frame in its video, for messages.
     """
     frames = len(camera)
     off, across = _residuals(camera, points)
@@ -186,9 +186,9 @@ def report_of(
 
 
 def expected_errors(camera: MovingCamera, uncertainty: Uncertainty, pitch: PitchTemplate) -> Floats:
-    """Return the expected error of places on the pitch in each picture (frames,) [px].
+    """Return the expected image error of places on the pitch per frame (frames,) [px].
 
-    Root mean square over the places that the picture shows; NaN where it shows none.
+    Root mean square over the visible places; NaN if the frame shows none.
     """
     half = 0.5 * np.array([pitch.length, pitch.width])
     x, y = np.meshgrid(*(np.arange(-h, h + 1e-9, _GRID) for h in half))
@@ -201,7 +201,7 @@ def expected_errors(camera: MovingCamera, uncertainty: Uncertainty, pitch: Pitch
         inside = np.asarray(((seen >= 0.0) & (seen <= [width - 1.0, height - 1.0])).all(axis=-1))
     for frame in np.flatnonzero(inside.any(axis=1)):
         total, count = 0.0, 0
-        # A dozen places tell a frame's mean.
+        # A dozen places suffice for a frame's mean.
         chosen = np.flatnonzero(inside[frame])
         for place in places[chosen[:: max(1, len(chosen) // 12)]]:
             if point_row(
@@ -221,7 +221,7 @@ def expected_errors(camera: MovingCamera, uncertainty: Uncertainty, pitch: Pitch
 
 
 def _said_of(offset: FeedOffset, settings: BroadcastCalibrationSettings) -> tuple[str, bool]:
-    """Return what the clip's clock is in words, and whether a person must look at it."""
+    """Return a sentence on the clip's clock offset, and whether a person must review it."""
     if not offset.determined:
         return "the feed's offset in time cannot be told from how people move", False
     said = (
@@ -240,7 +240,7 @@ def _said_of(offset: FeedOffset, settings: BroadcastCalibrationSettings) -> tupl
 
 
 def _residuals(camera: MovingCamera, points: PointEvidence) -> tuple[Floats, Floats]:
-    """Return residuals (n,) in pixels, those of lines across them, and in deviations (n,)."""
+    """Return residuals (n,) in pixels (lines: across them) and in standard deviations (n,)."""
     off = np.clip(pixels_off(camera, points), -1e6, 1e6)
     white = np.linalg.norm(np.einsum("nij,nj->ni", points.whitening, off), axis=-1)
     scale = np.linalg.norm(points.whitening[:, 0], axis=-1)
@@ -254,7 +254,7 @@ def _rms(off: Floats, points: PointEvidence, chosen: NDArray[np.bool_], frames: 
 
 
 def _picks(expected: Floats) -> tuple[int, ...]:
-    """Return the frames that are known worst, apart from one another."""
+    """Return the frames of largest expected error, at a distance from one another."""
     left = np.where(np.isfinite(expected), expected, -1.0)
     apart = max(1, len(expected) // (2 * _PICKS))
     picks: list[int] = []

@@ -15,28 +15,28 @@ _Offset = Annotated[float, Field(ge=-1, le=1)]
 
 
 class BroadcastPrior(Record):
-    """What is known of a main camera before anything is clicked: middles and spreads.
+    """Gaussian prior of a main camera: middles and spreads.
 
-    Of 20 released clips of the 2022 World Cup (K, k, R, t of WorldPose), widened where one
-    broadcaster's lenses and stadiums need not be everybody's.
+    From 20 released clips of the 2022 World Cup (K, k, R, t of WorldPose), widened for lenses and
+    stadiums of other broadcasters.
     """
 
     principal_point: tuple[_Offset, _Offset] = (0.0, -0.018)
-    """From the picture's middle, in widths of the picture [1]; 2022: 0, and -35 px of 1920."""
+    """From the image center, in image widths [1]; 2022: 0, and -35 px of 1920."""
     principal_point_spread: tuple[Positive, Positive] = (0.01, 0.012)
     """In widths [1]; 2022: 19 and 23 px of 1920."""
     focal: float = Field(default=2.1, ge=1e-6, le=1000)
-    """In widths of the picture [1]; 2022: 1.25 to 3.7."""
+    """In image widths [1]; 2022: 1.25 to 3.7."""
     focal_spread: float = Field(default=0.4, ge=1e-6, le=100)
     """Of the focal length's logarithm [1]."""
     k1: float = Field(default=0.4, ge=-100, le=100)
     """At a focal length of 2.19 widths [1]; it grows with the focal length to the power 1.6."""
     k1_spread: float = Field(default=0.25, ge=1e-6, le=100)
-    """As `k1`, growing alike [1]; 2022: 0.08. Wide enough for a lens without distortion."""
+    """As `k1`, with the same growth [1]; 2022: 0.08. Wide enough for a lens without distortion."""
     k2: float = Field(default=1.5, ge=-100, le=100)
     """At a focal length of 2.19 widths [1]; it grows with the focal length."""
     k2_spread: float = Field(default=0.8, ge=1e-6, le=100)
-    """As `k2`, growing alike [1]; 2022: 0.5 to 0.8."""
+    """As `k2`, with the same growth [1]; 2022: 0.5 to 0.8."""
     k3_spread: float = Field(default=0.5, ge=1e-6, le=100)
     """As `k2_spread`, about zero [1]: the released cameras have none (trap 3)."""
     center: tuple[Coordinate, Coordinate, Coordinate] = (0.0, -75.0, 17.0)
@@ -49,7 +49,7 @@ class BroadcastCalibrationSettings(Record):
     """Weights, noise and gates of the moving camera."""
 
     prior: BroadcastPrior = BroadcastPrior()
-    """What the clip cannot tell."""
+    """Gaussian prior of the camera."""
     click_noise: float = Field(default=1.0, ge=1e-6, le=100)
     """Standard deviation of a clicked point, each axis [px]."""
     survey_error: float = Field(default=0.006, ge=0, le=1)
@@ -58,61 +58,61 @@ class BroadcastCalibrationSettings(Record):
     """Factor on the loss of markings (M3; the paper's 1)."""
     player_weight: float = Field(default=0.5, ge=0, le=100)
     """Factor on the loss of players' keypoints (M4; the paper's 0.5): with residuals in standard
-    deviations, two keypoints of a person are worth one; a detector errs alike for many at once."""
+    deviations, two keypoints of a person are worth one; a detector's errors are correlated."""
     loss: float = Field(default=3.0, ge=1e-6, le=1000)
     """Scale of the Geman-McClure losses [standard deviations]; the paper gives none."""
     line_noise: float = Field(default=0.3, ge=1e-6, le=100)
-    """Least standard deviation of a painted line's sample across it [px]: the survey's error and
-    the paint's edge, which the picture's noise does not show."""
+    """Minimum standard deviation of a painted line's sample across it [px]: survey error and paint
+    edges, which the image noise does not include."""
     line_shift: float = Field(default=0.05, ge=0, le=10)
-    """Of all painted lines in the picture, each axis, standard deviation [px], such as sharpening
-    makes, or a lens beyond k1 to k3: the covariance has it, for no residual shows it."""
+    """Common shift of all painted lines in the image, each axis, standard deviation [px], from
+    sharpening or a lens beyond k1 to k3: it enters the covariance, since no residual shows it."""
     player_shift: float = Field(default=0.05, ge=0, le=10)
-    """Of all keypoints of all people in all pictures, each axis, standard deviation [standard
-    deviations of a keypoint], such as joints by another definition make: the covariance has it;
-    0.05 is 3 mm on a person."""
+    """Common shift of all keypoints in all frames, each axis, standard deviation [standard
+    deviations of a keypoint], such as from another joint definition: it enters the covariance;
+    0.05 is 3 mm in the world."""
     line_samples: int = Field(default=240, ge=20, le=100_000)
-    """Samples of painted lines in one frame, at most, about [1]."""
+    """Approximate maximum number of line samples per frame [1]."""
     line_reach: float = Field(default=12.0, ge=1e-6, le=10000)
-    """Lines are looked for this far from their projection at most [px]."""
+    """Maximum distance of lines from their projection in the search [px]."""
     flow_points: int = Field(default=400, ge=30, le=100_000)
-    """Points followed from frame to frame, about [1]."""
+    """Approximate number of points followed from frame to frame [1]."""
     flow_noise: float = Field(default=0.1, ge=1e-6, le=10)
-    """Least standard deviation of a followed point's motion [px]; what the clip shows is taken
-    where that is more."""
+    """Minimum standard deviation of a followed point's motion [px]; a larger value measured in the
+    clip replaces it."""
     flow_outlier: float = Field(default=3.5, ge=1e-6, le=1000)
-    """Largest modified z-score of a followed point (M6; Iglewicz and Hoaglin's cut)."""
+    """Maximum modified z-score of a followed point (M6; threshold of Iglewicz and Hoaglin)."""
     flow_weight: float = Field(default=1.0, ge=0, le=100)
     """Factor on the loss of followed points (M6); 0 = without."""
     flow_drift: float = Field(default=0.15, ge=1e-6, le=100)
-    """What tracking misses by after one frame, growing with the square root of the frames [px];
-    where two key frames or more tell it, that is taken."""
+    """Drift of tracking after one frame, growing with the square root of the frames [px]; the drift
+    measured between two or more key frames replaces it."""
     smooth: bool = True
-    """Let focal length and distortion change evenly, as far as the clip itself does (M6)."""
+    """Smooth focal length and distortion as much as the clip's own tracking supports (M6)."""
     feed_offset: Literal["report", "correct"] = "report"
-    """What is done about a feed that shows people beside where the static cameras have them in
-    time: it is said, or people are taken as much earlier or later where that can be told."""
+    """Handling of the feed's clock offset from the static cameras: report it, or shift people in
+    time by it if it is determined."""
     rounds: int = Field(default=2, ge=1, le=1000)
-    """Times that players are matched and lines are looked for anew [1]."""
+    """Iterations of player matching and line search [1]."""
     iterations: int = Field(default=30, ge=1, le=10000)
-    """Of the solver in each round, at most [1]."""
+    """Maximum solver iterations in each of these passes [1]."""
     solver: Literal["levenberg_marquardt", "adam"] = "levenberg_marquardt"
-    """How the last fit is done; Adam is the paper's (M5)."""
+    """Solver of the last fit; Adam is the paper's (M5)."""
     adam_iterations: int = Field(default=2000, ge=1, le=1_000_000)
-    """Of Adam, where it is chosen [1]."""
+    """Iterations of Adam, if chosen [1]."""
     cut_share: float = Field(default=0.25, gt=0, lt=1)
-    """Between two frames of one shot at least this share of the followed points moves as a turning
-    and zooming camera moves them [1]."""
+    """Minimum share of followed points consistent with a rotating and zooming camera between two
+    frames of one shot [1]."""
     weak_error: float = Field(default=3.0, ge=1e-6, le=1000)
-    """A clip is weak where more than a twentieth of its frames expect a larger error of players'
-    places in the picture [px]."""
+    """A clip is weak if more than a twentieth of its frames have a larger expected image error of
+    places on the pitch [px]."""
 
     @property
     def key_frame(self) -> StaticCalibrationSettings:
-        """How a single key frame is calibrated."""
+        """Settings for the calibration of a single key frame."""
         prior = self.prior
-        # In the terms of static cameras: what k1 and k2 move the picture's corner by, in its
-        # distance from the middle, at a focal length of 2.19 widths.
+        # In units of the static prior: displacement of the image corner by k1 and k2, relative to
+        # its distance from the center, at a focal length of 2.19 widths.
         corner = (0.574 / 2.19) ** 2
         camera = CameraPrior(
             focal=prior.focal,

@@ -1,4 +1,4 @@
-"""Second differences over time: how evenly a camera turns, zooms and bends (M6)."""
+"""Smoothness prior on second differences of rotation, focal length and distortion (M6)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Floats = NDArray[np.float64]
 
 
 def second_differences(camera: MovingCamera) -> Floats:
-    """Return changes of the change from frame to frame (frames - 2, 7), as steps of a frame."""
+    """Return second differences over frames (frames - 2, 7), in the units of a frame's step."""
     turn = Rigid(
         camera.rotation[1:] @ np.swapaxes(camera.rotation[:-1], -1, -2), np.zeros(3)
     ).rotvec
@@ -23,8 +23,8 @@ def second_differences(camera: MovingCamera) -> Floats:
 def add_smoothness(camera: MovingCamera, spread: Floats, blocks: Floats, right: Floats) -> float:
     """Add squared second differences to the normal equations and return their cost.
 
-    The derivatives take the turn between neighbouring frames as small: a fast pan makes a
-    hundredth of a radian a frame.
+    The derivatives assume a small rotation between neighbouring frames: a fast pan has a hundredth
+    of a radian per frame.
 
     Args:
         camera: all frames.

@@ -1,4 +1,4 @@
-"""All frames at once: Levenberg-Marquardt on an arrow-shaped, banded system (M3 to M6)."""
+"""Joint fit of all frames: Levenberg-Marquardt on a banded arrow system (M3 to M6)."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ Integers = NDArray[np.int64]
 _START_DAMPING: Final = 1e-4
 _MOST_DAMPING: Final = 1e9
 _SETTLED: Final = 1e-7
-"""Relative fall of the cost that ends the iterations."""
+"""Relative decrease of the cost that ends the iterations."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known without any evidence, Gaussian.
+    """Gaussian prior of a clip's camera.
 
     Attributes:
         center: (3,) [m], world.
@@ -53,20 +53,20 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Everything that the frames of a clip are fitted to.
+    """Evidence, smoothness and priors of a clip's fit.
 
     Attributes:
         points: clicks, lines and players.
         flow: followed points.
-        prior: of places and lenses.
-        smoothness: (7,) standard deviation of second differences of a frame's numbers; infinite
+        prior: of center and lenses.
+        smoothness: (7,) standard deviation of second differences of a frame's parameters; infinite
             = free.
         flow_weight: factor on the loss of followed points [1].
-        flow_loss: scale of it [standard deviations].
-        free_frame: (7,) which of a frame's numbers are solved for.
-        free_clip: (5,) which of the clip's.
-        known: (frames, 7) numbers that are known beforehand in single frames, such as the first
-            frame's rotation.
+        flow_loss: scale of that loss [standard deviations].
+        free_frame: (7,) mask of a frame's free parameters.
+        free_clip: (5,) mask of the clip's free parameters.
+        known: (frames, 7) mask of fixed parameters in single frames, such as the first frame's
+            rotation.
     """
 
     points: PointEvidence
@@ -80,19 +80,19 @@ class Problem:
     known: NDArray[np.bool_] | None = None
 
     def held(self, frames: int) -> NDArray[np.bool_]:
-        """Which of every frame's numbers are not solved for (frames, 7)."""
+        """Return the mask of every frame's fixed parameters (frames, 7)."""
         held = np.broadcast_to(~self.free_frame, (frames, FRAME_SIZE))
         return held if self.known is None else held | self.known
 
     @cached_property
     def painted(self) -> Integers:
-        """Points of the template whose place is solved for, rising (m,)."""
+        """Indices of the template points with estimated paint errors, rising (m,)."""
         found = np.unique(self.points.ends)
         return np.asarray(found[found >= 0])
 
     @cached_property
     def ends(self) -> Integers:
-        """Which of `painted` each piece of evidence hangs on (n, 2); -1 = none."""
+        """Indices into `painted` of the points that define each evidence (n, 2); -1 = none."""
         number = np.searchsorted(self.painted, self.points.ends)
         return np.asarray(np.where(self.points.ends >= 0, number, -1))
 
@@ -120,15 +120,15 @@ class Equations:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The camera that costs least, and how the search went.
+    """The camera of least cost, and the course of the iterations.
 
     Attributes:
-        camera: the answer.
-        beside: (painted, 3) where points of the template are painted beside where the survey has
-            them [standard deviations].
-        cost: at it.
-        costs: after every iteration.
-        equations: at it.
+        camera: camera of least cost.
+        beside: (painted, 3) offsets of painted template points from the survey [standard
+            deviations].
+        cost: final cost.
+        costs: cost after every iteration.
+        equations: equations at the final camera.
     """
 
     camera: MovingCamera
@@ -143,14 +143,14 @@ def equations_at(camera: MovingCamera, beside: Floats, problem: Problem) -> Equa
 
     Args:
         camera: all frames.
-        beside: (painted, 3) where the template's points are painted [standard deviations].
+        beside: (painted, 3) offsets of painted template points [standard deviations].
         problem: evidence, smoothness and priors.
     """
     frames = len(camera)
     shared = CLIP_SIZE + beside.size
     blocks = np.zeros((3, frames, FRAME_SIZE, FRAME_SIZE))
     border = np.zeros((frames, FRAME_SIZE, shared))
-    # Their own prior, in standard deviations.
+    # Prior of the paint errors, in standard deviations.
     corner = np.diag(np.append(np.zeros(CLIP_SIZE), np.ones(beside.size)))
     right = np.zeros((frames, FRAME_SIZE))
     right_corner = np.append(np.zeros(CLIP_SIZE), beside.ravel())
@@ -199,7 +199,7 @@ def solve(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
         iterations: at most.
 
     Raises:
-        DegenerateError: the matrix is singular: some number has neither evidence nor prior.
+        DegenerateError: the matrix is singular: a parameter has neither evidence nor prior.
     """
     beside = np.zeros((len(problem.painted), 3))
     here = equations_at(camera, beside, problem)
@@ -224,7 +224,7 @@ def solve(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
 
 
 def _step(system: Equations, damping: float) -> tuple[Floats, Floats]:
-    """Return the damped Gauss-Newton step of the frames (frames, 7) and of what they share."""
+    """Return the damped Gauss-Newton step of the frames (frames, 7) and of shared parameters."""
     blocks = system.blocks.copy()
     blocks[0][:, range(FRAME_SIZE), range(FRAME_SIZE)] *= 1.0 + damping
     factor = BandedFactor.of(blocks)
@@ -279,7 +279,7 @@ def _fix(
     right: Floats,
     right_corner: Floats,
 ) -> None:
-    """Take what is not solved for out of the system, in place."""
+    """Remove fixed parameters from the system, in place."""
     fixed = problem.held(len(right))
     if fixed.any():
         for below in range(3):

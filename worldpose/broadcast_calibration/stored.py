@@ -1,4 +1,4 @@
-"""A calibrated clip as the arrays and attributes of `data_contracts.broadcast_calibration`."""
+"""Conversion of a calibrated clip to and from the arrays and attributes of its data contract."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from worldpose.cameras.stored import camera_from_arrays
 
 
 def broadcast_arrays(calibration: BroadcastCalibration) -> dict[str, NDArray[Any]]:
-    """The stored arrays of a calibrated clip, by name, without the frame numbers."""
+    """Return the stored arrays of a calibrated clip, by name, without the frame numbers."""
     report, before = calibration.report, calibration.before.camera
     return {
         **moving_arrays(calibration.camera, calibration.uncertainty),
@@ -37,7 +37,7 @@ def broadcast_arrays(calibration: BroadcastCalibration) -> dict[str, NDArray[Any
 
 
 def moving_arrays(moving: MovingCamera, uncertainty: Uncertainty) -> dict[str, NDArray[Any]]:
-    """The stored arrays of a moving camera and its covariance, by name."""
+    """Return the stored arrays of a moving camera and its covariance, by name."""
     camera, covariance = moving.camera, uncertainty.frame
     return {
         "focal": camera.focal,
@@ -54,14 +54,14 @@ def moving_arrays(moving: MovingCamera, uncertainty: Uncertainty) -> dict[str, N
 
 
 def camera_before(arrays: Mapping[Any, ArrayLike]) -> Camera:
-    """The stored camera (frames,) before players and all frames together."""
+    """Return the stored camera (frames,) before players and the joint fit."""
     names = ("focal", "principal_point", "distortion", "rotation", "translation")
     stored = {name: arrays[f"{name}_before"] for name in names}
     return camera_from_arrays({**stored, "image_size": arrays["image_size"]})
 
 
 def moving_from_arrays(arrays: Mapping[str, ArrayLike]) -> tuple[MovingCamera, Uncertainty]:
-    """The moving camera of stored arrays, and its covariance."""
+    """Return the moving camera of stored arrays, and its covariance."""
     names = ("covariance", "shared_covariance", "clip_covariance")
     own, across, shared = (np.asarray(arrays[name]) for name in names)
     whole = np.empty((len(own), FRAME_SIZE + CLIP_SIZE, FRAME_SIZE + CLIP_SIZE))
@@ -75,12 +75,12 @@ def moving_from_arrays(arrays: Mapping[str, ArrayLike]) -> tuple[MovingCamera, U
 def broadcast_attributes(
     clip_id: str, calibration: BroadcastCalibration, first: int = 0
 ) -> dict[str, Any]:
-    """The stored attributes of a calibrated clip; frames are numbered as in its video.
+    """Return the stored attributes of a calibrated clip, with frame numbers of its video.
 
     Args:
         clip_id: the clip.
         calibration: its camera.
-        first: number of its first picture in its video.
+        first: number of its first frame in its video.
     """
     report, offset = calibration.report, calibration.report.feed_offset
     return {
@@ -106,5 +106,5 @@ def broadcast_attributes(
 
 
 def _pair(values: tuple[float, float]) -> list[float | None]:
-    """Figures for a record, which has no NaN."""
+    """Return values for a record, which cannot hold NaN."""
     return [value if np.isfinite(value) else None for value in values]

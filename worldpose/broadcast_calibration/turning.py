@@ -1,4 +1,4 @@
-"""How the camera turned and zoomed between two frames, from followed points (M2, M6)."""
+"""Rotation and zoom of the camera between two frames, from followed points (M2, M6)."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from worldpose.compiled import compiled
 Floats = NDArray[np.float64]
 
 _SCALES: Final = (20.0, 5.0, 1.5, 0.6, 0.6)
-"""Of the loss while it tightens [px]."""
+"""Decreasing scales of the loss [px]."""
 _LENS: Final = np.array([1.6, 1.0, 1.0])
-"""k1, k2 and k3 grow with the focal length to these powers, as zoom lenses' do."""
+"""Powers of the focal length that k1, k2 and k3 of a zoom lens grow with."""
 _FEW: Final = 8
-"""Fewer points do not tell a turn and a zoom [1]."""
+"""Minimum points for rotation and zoom [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,9 +29,9 @@ class Turned:
 
     Attributes:
         camera: two frames: the given one, and the next.
-        residual: (n, 2) of the followed points, predicted minus found [px]; NaN where there is no
-            prediction.
-        determined: whether the points told the motion.
+        residual: (n, 2) of the followed points, predicted minus observed [px]; NaN where there is
+            no prediction.
+        determined: whether the points determine the motion.
     """
 
     camera: MovingCamera
@@ -40,11 +40,11 @@ class Turned:
 
 
 def turn(camera: MovingCamera, followed: Followed) -> Turned:
-    """Return the next frame's camera from one frame's.
+    """Return the next frame's rotation, zoom and lens from one frame's camera.
 
     Args:
         camera: a single frame.
-        followed: points of it in the next.
+        followed: its points in the next frame.
     """
     both = replace(
         camera,
@@ -56,10 +56,10 @@ def turn(camera: MovingCamera, followed: Followed) -> Turned:
 
 
 def turn_only(both: MovingCamera, followed: Followed) -> Turned:
-    """Return the second of two frames turned, each with its own known lens.
+    """Return the second of two frames with a fitted rotation and its given lens.
 
     Args:
-        both: two frames; the second's rotation does not count.
+        both: two frames; the second's rotation is ignored.
         followed: points of the first in the second.
     """
     both = replace(both, rotation=np.repeat(both.rotation[:1], 2, axis=0))
@@ -67,7 +67,7 @@ def turn_only(both: MovingCamera, followed: Followed) -> Turned:
 
 
 def flow_residuals(both: MovingCamera, followed: Followed) -> Floats:
-    """Return where two frames' cameras put followed points minus where they were found (n, 2)."""
+    """Return predicted minus observed pixels of followed points (n, 2)."""
     residual = np.full((len(followed.start), 2), np.nan)
     _residuals(
         both.principal_point,
@@ -98,12 +98,12 @@ def modified_z_scores(residual: Floats) -> Floats:
 
 
 def _fitted(both: MovingCamera, followed: Followed, count: int) -> Turned:
-    """Return the second of two frames turned and, with a count of 4 and not 3, zoomed."""
+    """Return the second of two frames with fitted rotation and, if `count` is 4, zoom."""
     if len(followed.start) < _FEW:
         return Turned(both, np.full((len(followed.start), 2), np.nan), False)
     bounds = np.array([0, len(followed.start), len(followed.start)])
     ones = np.ones(len(followed.start))
-    # The median motion is nearly right already, whatever some points do.
+    # The median motion is a robust start.
     x, y = np.median(followed.end - followed.start, axis=0) / float(both.focal[0])
     both = _moved(both, np.array([-y, x, 0.0, 0.0])[:count])
     for scale in _SCALES:
@@ -135,7 +135,7 @@ def _fitted(both: MovingCamera, followed: Followed, count: int) -> Turned:
 
 
 def _moved(both: MovingCamera, step: Floats) -> MovingCamera:
-    """Return both frames with a step of the second: its turn (3,), or with its log focal (4,)."""
+    """Return both frames after a step of the second: rotation (3,), or with log focal (4,)."""
     whole = np.zeros((2, 7))
     whole[1, : len(step)] = step
     moved = both.stepped(whole, np.zeros(5))
@@ -156,7 +156,7 @@ def _residuals(
     end: Floats,
     residual: Floats,
 ) -> None:
-    """Write residuals (n, 2) of followed points; what has no prediction stays."""
+    """Write residuals (n, 2) of followed points; rows without a prediction stay unchanged."""
     pixel, rows = np.empty(2), np.empty((2, 16))
     for i in range(len(start)):
         if flow_row(principal, focal, rotation, distortion, start[i], pixel, rows):

@@ -1,4 +1,4 @@
-"""How well every frame's camera is known, and what is common to all frames."""
+"""Covariance of every frame's camera and of the parameters shared by all frames."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ Integers = NDArray[np.int64]
 
 
 _LENS: Final = 3
-"""Numbers of a frame's step before those of its lens."""
+"""Parameters of a frame's step before those of its lens."""
 _STRETCHES: Final = 64
-"""Of a clip, in each of which its lens bends as one, at most [1]."""
+"""Maximum intervals per clip with a common error of lens second differences [1]."""
 _STRETCH: Final = 3.0
-"""Of a marking, whose paint errs as one [m]."""
+"""Cell size within which a marking has one common paint error [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,8 @@ class Uncertainty:
     """Covariance of a moving camera.
 
     Attributes:
-        frame: (frames, 12, 12) of a frame's step and the clip's, together; 0 for what was held.
+        frame: (frames, 12, 12) joint covariance of a frame's step and the clip's; 0 for fixed
+            parameters.
     """
 
     frame: Floats
@@ -51,24 +52,24 @@ def uncertainty_of(
     player_shift: float = 0.0,
     smooth_frames: float = 1.0,
 ) -> Uncertainty:
-    """Return the covariance of a solution, the places of the painted markings accounted for.
+    """Return the covariance of a solution, marginalized over paint errors.
 
-    Noise that is new in every sample comes with the inverse of the system. What a stretch of a
-    marking, or a person, gets wrong lasts for the whole clip and does not average out: the pull
-    that each of them is left with as a whole is carried to the solution and added, so that the
-    covariance is too wide by a factor of two where there is no such error. A shift of all lines in
-    the picture, or of all keypoints of all people, leaves no pull, since the camera goes along with
-    it: these are carried by their size. So is what makes a lens bend more evenly than chance does:
-    an operator who zooms in does so for many frames, and second differences err alike in these.
-    What the problem holds is taken for exact.
+    The inverse of the system covers noise that is independent per sample. The error of a piece of a
+    marking, or of a person, lasts for the whole clip and does not average out: the function
+    propagates the remaining gradient of each such source to the solution and adds it, which makes
+    the covariance too large by a factor of two without such errors. A shift of all lines in the
+    image, or of all keypoints of all people, leaves no gradient, since the camera follows it: the
+    function propagates such shifts by their given size. The same applies to correlated second
+    differences of the lens: a zoom lasts for many frames, and their errors are correlated over
+    them. Fixed parameters of the problem count as exact.
 
     Args:
-        solution: the camera, and where its markings lie.
-        problem: what it rests on.
-        line_shift: of all painted lines in the picture, each axis, standard deviation [px].
-        player_shift: of all keypoints in all pictures, each axis, standard deviation [standard
+        solution: the camera and the paint errors.
+        problem: evidence, smoothness and priors of the solution.
+        line_shift: of all painted lines in the image, each axis, standard deviation [px].
+        player_shift: of all keypoints in all frames, each axis, standard deviation [standard
             deviations of a keypoint].
-        smooth_frames: over how many frames second differences of the lens last [frame].
+        smooth_frames: correlation time of the lens's second differences [frame].
 
     Raises:
         DegenerateError: the system is singular.
@@ -101,7 +102,7 @@ def uncertainty_of(
     whole[:, FRAME_SIZE:, :FRAME_SIZE] = np.swapaxes(across, -1, -2)
     whole[:, FRAME_SIZE:, FRAME_SIZE:] = shared[:CLIP_SIZE, :CLIP_SIZE]
     whole += moved @ np.swapaxes(moved, -1, -2)
-    # The system has ones for what is held, lest it be singular; that is known exactly.
+    # The system has ones for fixed parameters, to stay regular; their covariance is zero.
     clip = np.broadcast_to(~problem.free_clip, (len(whole), CLIP_SIZE))
     held = np.concatenate([problem.held(len(whole)), clip], axis=1)
     whole[held[:, :, None] | held[:, None, :]] = 0.0
@@ -111,10 +112,10 @@ def uncertainty_of(
 def _left_pulls(
     solution: Solution, problem: Problem, shared: int, line_shift: float, player_shift: float
 ) -> tuple[Floats, Floats]:
-    """Return each lasting source's gradient (frames, 7, n) and (shared, n) at the solution.
+    """Return the gradients (frames, 7, n) and (shared, n) of each lasting error at the solution.
 
-    Behind them are those of a shift of all lines, and of all people, along x and y each, and what
-    all people together pull.
+    The last columns are a shift of all lines along x and y, of all people along x and y, and the
+    sum over all people.
     """
     points, camera = problem.points, solution.camera
     chosen = points.kind != CLICK
@@ -159,21 +160,22 @@ def _left_pulls(
 
 
 def _bends(problem: Problem, frames: int, lasting: float) -> Floats:
-    """Return the gradients (frames, 7, n) of second differences that are one deviation together.
+    """Return the gradients (frames, 7, n) of common errors of second differences.
 
-    In every number of the lens and every stretch of so many frames; none where they do not last.
+    One column per lens parameter and interval of about `lasting` frames, for an error of one
+    standard deviation; none without correlation.
     """
     length = max(round(lasting), -(-frames // _STRETCHES))
     numbers = np.flatnonzero(np.isfinite(problem.smoothness) & problem.free_frame)
     numbers = numbers[numbers >= _LENS]
     starts = range(0, frames - 2, length) if lasting > 1.0 else range(0)
-    # Longer stretches than errors last have as much less in common.
+    # Intervals longer than the correlation time have a smaller common error.
     common = np.sqrt(min(1.0, lasting / length))
     bends = np.zeros((frames, FRAME_SIZE, len(numbers), len(starts)))
     for place, begin in enumerate(starts):
         end = min(begin + length, frames - 2)
         for kind, number in enumerate(numbers):
-            # The sum of (1, -2, 1) over a stretch is its change at the end less that before it.
+            # The sum of (1, -2, 1) over an interval is its last difference less its first one.
             column = bends[:, number, kind, place]
             np.add.at(column, [begin, begin + 1, end, end + 1], [1.0, -1.0, -1.0, 1.0])
             column *= common / problem.smoothness[number]
@@ -206,7 +208,7 @@ def _add_pulls(
 ) -> None:
     """Add every point's gradient to its cluster's columns; arguments as `add_points`.
 
-    A shift [px] of the points (n,) along x and y is for the columns `common` (n,) and the next.
+    The columns `common` (n,) and the next get a shift [px] of the points (n,) along x and y.
     """
     pixel, rows, place = np.empty(2), np.empty((2, 12)), np.empty(3)
     for i in range(len(frame)):
@@ -224,14 +226,14 @@ def _add_pulls(
         two = whitening[i, 1, 0] * u + whitening[i, 1, 1] * v
         pull = weight[i] / (1.0 + (one * one + two * two) / loss[i] ** 2) ** 2
         for source in range(3):
-            # What is left, or a shift along x, or along y, in standard deviations.
+            # The residual, or a shift along x, or along y, in standard deviations.
             if source == 0:
                 column, e, f = cluster[i], one, two
             else:
                 column = common[i] + source - 1
                 e = shift[i] * whitening[i, 0, source - 1]
                 f = shift[i] * whitening[i, 1, source - 1]
-            # By the pixel itself, x and y.
+            # Gradient by the pixel, x and y.
             x = pull * (e * whitening[i, 0, 0] + f * whitening[i, 1, 0])
             y = pull * (e * whitening[i, 0, 1] + f * whitening[i, 1, 1])
             for j in range(7):

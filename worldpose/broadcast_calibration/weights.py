@@ -1,4 +1,4 @@
-"""Weights of smoothness and flow by what the clip itself shows (M6)."""
+"""Weights of smoothness and flow, estimated from the clip (M6)."""
 
 from __future__ import annotations
 
@@ -16,47 +16,47 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 _HAND: Final = 2e-3
-"""Largest plausible second difference of the rotation at 50 frames a second [rad]: it bridges
-frames without evidence and binds nothing else."""
+"""Largest plausible second difference of the rotation at 50 frames per second [rad]: it bridges
+frames without evidence and does not affect others."""
 _LEAST: Final = np.array([1e-5, 1e-5, 1e-4, 1e-4])
-"""Least deviation of a second difference of log focal, k1, k2, k3."""
+"""Minimum deviation of a second difference of log focal, k1, k2, k3."""
 _LENS: Final = np.array([1.6, 1.0, 1.0])
 """Powers of the focal length that k1, k2, k3 grow with."""
 _WINDOW: Final = 0.2
-"""Tracked focal lengths are evened over this time before their differences are taken [s]."""
+"""Smoothing window of tracked focal lengths before differencing [s]."""
 
 
 class Weights(Record):
-    """What the terms are weighed with, and the rule behind each number."""
+    """Weights of the cost terms, and the rule behind each number."""
 
     flow_deviation_px: float
-    """Of a followed point's motion: 1.4826 times the median absolute residual along an axis of the
-    points that move with the camera, and at least the setting."""
+    """Deviation of a followed point's motion: 1.4826 times the median absolute residual of the
+    inliers along an axis, and at least the setting."""
     flow_share: float
-    """Of its loss that a followed point counts: the drift from key frame to key frame that
-    independent points would leave over the drift found, squared; points of a frame err together."""
+    """Factor on a followed point's loss: the squared ratio of the drift between key frames that
+    independent points would cause to the measured drift; errors within a frame are correlated."""
     smooth_log_focal: float
-    """Deviation of second differences: their root mean square in the tracked focal lengths, evened
-    over 0.2 s."""
+    """Deviation of second differences: their root mean square in the logarithm of the tracked focal
+    lengths, smoothed over 0.2 s."""
     smooth_k1: float
-    """As the focal length's, times 1.6 and k1: a zoom lens bends as it zooms."""
+    """As the focal length's, times 1.6 and k1: a zoom lens's distortion changes with its zoom."""
     smooth_k2: float
     """As the focal length's, times k2."""
     smooth_frames: float
-    """Over how many frames these last: the sum of their autocorrelation."""
+    """Correlation time of these second differences: the sum of their autocorrelation [frame]."""
     player_share: float
     """Deviation of a keypoint over the person's height: 1.4826 times the median absolute
     residual."""
     player_frames: float
-    """Over how many frames a person's errors last: the sum of their autocorrelation."""
+    """Correlation time of a person's errors: the sum of their autocorrelation [frame]."""
 
 
 def smoothness_of(camera: MovingCamera, fps: float) -> Floats:
-    """Return the deviation (7,) of second differences that a tracked clip shows.
+    """Return the deviation (7,) of second differences in a tracked clip.
 
     Args:
         camera: all frames, as tracked.
-        fps: frames a second.
+        fps: frames per second.
     """
     spread = np.full(FRAME_SIZE, np.inf)
     spread[:3] = _HAND * (50.0 / fps) ** 2
@@ -66,20 +66,20 @@ def smoothness_of(camera: MovingCamera, fps: float) -> Floats:
         return spread
     change = float(np.sqrt(np.mean(_bends(camera, width) ** 2)))
     lens = np.median(np.abs(camera.distortion), axis=0)
-    # k3 is that of k2, which it stands beside.
+    # The deviation of k3 uses at least the size of k2.
     lens[2] = max(lens[2], lens[1])
     spread[3:] = np.maximum(np.concatenate([[change], change * _LENS * lens]), _LEAST)
     return spread
 
 
 def lasting_of(camera: MovingCamera, fps: float) -> float:
-    """Return over how many frames second differences of a tracked clip's zoom last [frame].
+    """Return the correlation time of second differences of a tracked clip's zoom [frame].
 
-    The sum of their autocorrelation: they are worth one of each so many.
+    The sum of their autocorrelation: so many frames are worth one independent frame.
 
     Args:
         camera: all frames, as tracked.
-        fps: frames a second.
+        fps: frames per second.
     """
     width = max(1, round(_WINDOW * fps))
     if len(camera) < 3 * width:
@@ -95,7 +95,7 @@ def lasting_of(camera: MovingCamera, fps: float) -> float:
 
 
 def _bends(camera: MovingCamera, width: int) -> Floats:
-    """Return second differences of log focal length, evened over so many frames."""
+    """Return second differences of the log focal length, smoothed over `width` frames."""
     window = np.hanning(width + 2)[1:-1]
     window /= window.sum()
     padded = np.pad(np.log(camera.focal), width, mode="reflect", reflect_type="odd")
@@ -103,18 +103,18 @@ def _bends(camera: MovingCamera, width: int) -> Floats:
 
 
 def flow_share_of(links: Chain, key_frames: Integers, deviation: float, drift: float) -> float:
-    """Return which share of its loss a followed point counts [0..1].
+    """Return the factor on a followed point's loss [0..1].
 
     Args:
-        links: a tracked clip; without a gap between key frames, `drift` is taken.
+        links: a tracked clip; without a gap between key frames, `drift` applies.
         key_frames: their numbers, rising.
         deviation: of a followed point's motion [px].
-        drift: what tracking misses by after one frame, growing with the square root of frames [px].
+        drift: tracking error after one frame, growing with the square root of frames [px].
     """
     points = np.array([kept.sum() for kept in links.kept])
     if not len(points) or points.max() == 0:
         return 1.0
-    # Four numbers a pair out of twice as many coordinates as points.
+    # Four parameters per pair from twice as many coordinates as points.
     independent = deviation * np.sqrt(4.0 / np.median(points[points > 0]))
     found = links.drift[np.isfinite(links.drift)]
     if len(found):

@@ -1,7 +1,7 @@
-"""Bundle adjustment: all cameras and some joints together (B1-B3).
+"""Bundle adjustment: joint refinement of all cameras and some 3D joints (B1-B3).
 
-Input: calibrated cameras, tracked and placed people, clicked markings. Output: cameras that agree
-with both, accepted only where people who had no part in it agree better.
+Input: calibrated cameras, tracked and triangulated people, clicked markings. Output: cameras that
+fit both, accepted only where they reduce the residuals of held-out people.
 """
 
 from worldpose.bundle_adjustment.adjusting import BundleAdjustment, adjust_cameras

@@ -1,4 +1,4 @@
-"""Cameras adjusted to people and markings, each accepted on its own (B1-B3)."""
+"""Adjustment of cameras to people and markings, with acceptance per camera (B1-B3)."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ from worldpose.static_calibration import PARAMETERS, project_with_jacobian
 
 _STRANGER: Final = "refused: it shows other people than the other cameras do under the same ids"
 _ROUNDS: Final = 3
-"""Solutions from which noise is learned; the third changes little."""
+"""Iterations of solution and noise estimation; the third changes little."""
 _LEAST_DOUBT: Final = 0.01
 """Smallest factor on the prior variance of given cameras [1]: a tenth of its deviations."""
 _FEW: Final = 4
-"""Cameras of a rig that needs significant evidence [1]: each joint of a left-out person then has
-at most three other views, whose errors are not averaged out."""
+"""Most cameras of a rig that needs significant evidence [1]: each joint of a held-out person then
+has at most three other views, whose errors do not average out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,23 +50,23 @@ class BundleAdjustment:
     """Cameras of a clip after adjustment.
 
     Attributes:
-        clip: what was adjusted, with the noise of its detector in its confidences.
-        cameras: (cameras,) batch; a camera whose change was refused is as it was.
+        clip: the input, with the noise of its detector in its confidences.
+        cameras: (cameras,) batch; unchanged where the change was refused.
         covariance: (cameras, 12, 12) of a step; as calibrated where the change was refused.
         accepted: (cameras,) bool.
         reasons: why each camera was accepted or refused.
-        proposed: match frames that suit adjustment best.
-        used: match frames that people were taken from.
-        judged: match frames that judges were taken from.
+        proposed: match frames best suited to adjustment.
+        used: match frames that supplied people.
+        judged: match frames for held-out validation.
         noise: of keypoints, as measured.
-        verdict: judges' errors with calibrated and with changed cameras, also where refused.
-        evidence: what all judges together say of the change that was asked for.
+        verdict: held-out errors with calibrated and with changed cameras, also where refused.
+        evidence: result of all held-out people together for the proposed change.
         motion: (cameras, 3) of the accepted cameras: of the center [m], of the axes [rad], of the
             focal length [1]; 0 where refused.
-        refused: (cameras,) batch as it would have been without the guard.
+        refused: (cameras,) batch as it would be without held-out validation.
         iterations: of the last solution.
-        converged: it came to rest.
-        observations: keypoints that cameras were adjusted to [1].
+        converged: whether the last solution converged.
+        observations: keypoints in the adjustment [1].
     """
 
     clip: Clip
@@ -91,12 +91,12 @@ def adjust_cameras(
     clip: Clip,
     settings: BundleAdjustmentSettings = BundleAdjustmentSettings(),  # noqa: B008
 ) -> BundleAdjustment:
-    """Return the cameras that agree with markings and people, where people left out confirm it.
+    """Return cameras adjusted to markings and people, where held-out people confirm the change.
 
-    People are split into groups. For each, cameras are adjusted without it, and the group judges:
-    its keypoints in a camera against its joints from the other cameras, in frames that had no part
-    either. A camera on which the judges' loss rises stands as it was, and the others are adjusted
-    without it. At last the accepted ones are adjusted to everybody.
+    People are split into groups. Each group in turn is held out of an adjustment and validates its
+    cameras: keypoints of the group in a camera against its joints from the other cameras, in frames
+    that are held out too. A camera whose held-out loss rises stays unchanged, and the others are
+    adjusted without it. Finally the accepted cameras are adjusted to all people.
 
     Args:
         clip: calibrated cameras and triangulated people.
@@ -133,7 +133,7 @@ def adjust_cameras(
             objection = "" if standing.all() else adjuster.objection(before, after, standing)
             if not objection:
                 break
-            # Calibrated cameras rest on their markings and may still change without the others.
+            # Markings hold calibrated cameras, which may still change without the others.
             confirmed = ~clip.given & (len(clip.given) > _FEW)
         standing |= ~confirmed
         if (~standing).sum() < 2:
@@ -171,14 +171,14 @@ def adjust_cameras(
 
 
 def camera_motion(before: Camera, after: Camera) -> NDArray[np.float64]:
-    """Return how far cameras moved: (cameras, 3) of center [m], axes [rad], focal length [1].
+    """Return the motion of cameras: (cameras, 3) of center [m], axes [rad], focal length [1].
 
     Args:
         before: (cameras,) batch.
         after: (cameras,) batch.
     """
     turned = before.cam_from_world.rotation @ after.cam_from_world.rotation.swapaxes(1, 2)
-    # By the chord: the trace loses half of the digits of a small angle.
+    # Use the chord: the trace loses half of the digits of a small angle.
     chord = np.linalg.norm(turned - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
     return np.stack(
         [
@@ -191,7 +191,7 @@ def camera_motion(before: Camera, after: Camera) -> NDArray[np.float64]:
 
 
 class _Adjuster:
-    """Solves for all people or without one group, and lets groups judge."""
+    """Solver for all people or without one group, with held-out validation."""
 
     def __init__(
         self,
@@ -210,37 +210,37 @@ class _Adjuster:
             found = find_contradictions(clip, judged, self.before, settings)
         self.stranger, self.doubt, self.offset = found.stranger, found.doubt, found.offset
         if clip.given.all():
-            # Of cameras that state nothing none is known to be the wrong one.
+            # If no camera states a covariance, the wrong one cannot be identified.
             self.doubt, self.offset = np.ones(len(self.doubt)), np.zeros_like(self.offset)
         if settings.evidence == "markings_and_players" and len(self.everybody.points):
             self._learn()
 
     def _learn(self) -> None:
-        """Find out how far keypoints are off, and whether calibration is as good as it says."""
+        """Estimate the keypoint noise, and the factor on the stated variance of calibration."""
         stranger, settings = self.stranger, self.settings
         for _ in range(_ROUNDS):
             observed = _only(self.everybody, ~stranger[self.everybody.camera_of])
             if not len(observed.points):
-                return  # No two cameras that agree show one person: nothing to learn from.
+                return  # No person is in two consistent cameras.
             problem = players_problem(
                 self.clip, observed, self.noise, stranger, settings, self.doubt
             )
             rough = solve(problem, settings.solver, self.offset)
-            # Where the next solution begins: two or three steps are left to it.
+            # The next solution starts here and needs two or three steps.
             self.offset, self.everybody = rough.offset, observed._replace(points=rough.points)
             self.noise = measured_noise(
                 rough.cameras, rough.points, self.everybody, settings.robust_scale
             )
-        # A stated covariance is never made smaller; the prior of given cameras states nothing.
-        # Once: repeated, one camera that shows other people would free all the others.
+        # A stated covariance never shrinks; the prior of given cameras may. Update only once: after
+        # more updates, one camera that shows other people would free all the others.
         least = np.where(self.clip.given, _LEAST_DOUBT, 1.0)
         self.doubt = self.doubt * np.maximum(measured_doubt(problem, rough), least)
 
     def objection(self, before: HeldOut, after: HeldOut, standing: NDArray[np.bool_]) -> str:
-        """Why the change is refused as a whole; empty where nothing speaks against it.
+        """Return the reason to refuse the whole change; empty without one.
 
-        Cameras with a covariance of their own, and others enough to judge them, need no more than
-        each camera's verdict.
+        Cameras with their own covariance, in a rig of more than `_FEW`, need only the verdict per
+        camera.
         """
         changed = ~standing
         given = self.clip.given & changed
@@ -271,12 +271,12 @@ class _Adjuster:
         return ""
 
     def solved(self, standing: NDArray[np.bool_], without: int | None = None) -> Adjusted:
-        """The adjustment to everybody, or to everybody but one group."""
+        """Return the adjustment to all people, or to all but one group."""
         if self.settings.evidence == "markings":
             return solve(markings_problem(self.clip, standing, self.settings), MARKINGS_SOLVER)
         observed = self.everybody
-        # A calibrated camera whose change was refused has no say: its markings contradict people.
-        # A given one that nothing contradicts enough stays as it is, and the others agree with it.
+        # A refused calibrated camera contributes nothing: its markings contradict people. A refused
+        # given camera without contradictions is held fixed, and the others adapt to it.
         say = ~standing | (self.clip.given & ~self.stranger)
         kept = say[observed.camera_of]
         if without is not None:
@@ -295,10 +295,10 @@ class _Adjuster:
     def _where_people_were(
         self, solution: Adjusted, observed: Observed, standing: NDArray[np.bool_]
     ) -> Adjusted:
-        """The solution with people where the given cameras had them, as a whole.
+        """Return the solution, aligned to the people as the given cameras had them.
 
         A similarity transform of all cameras and people changes no residual: only the given cameras
-        tell it, and people are where all of them together put them.
+        determine it, and people stay where all of them together put them.
         """
         first = np.searchsorted(observed.point_of, np.arange(len(solution.points)))
         person, joint = observed.person_of[first], observed.joint_of[first]
@@ -309,10 +309,10 @@ class _Adjuster:
         return replace(solution, cameras=cameras, points=back.move_points(solution.points))
 
     def uncertainty(self, adjusted: Adjusted) -> NDArray[np.float64]:
-        """The covariance (cameras, 12, 12) of adjusted cameras.
+        """Return the covariance (cameras, 12, 12) of adjusted cameras.
 
-        Where only given cameras tell where the world lies, it is relative to all of them together:
-        what they err by in common misplaces no person in one picture against the others.
+        If only given cameras define the world frame, it is relative to all of them together: their
+        common error shifts no person in one image against the others.
         """
         if self.clip.given.all() and self.settings.evidence == "markings_and_players":
             points = self.everybody.points
@@ -329,7 +329,7 @@ class _Adjuster:
         )
 
     def _keypoint_information(self, cameras: Camera) -> NDArray[np.float64]:
-        """What keypoints tell of a step of each camera (cameras, 12, 12), people being known."""
+        """Return keypoint information on a step of each camera (cameras, 12, 12), people fixed."""
         observed = self.everybody
         count = len(cameras.focal)
         information = np.zeros((count, len(PARAMETERS), len(PARAMETERS)))
@@ -343,7 +343,7 @@ class _Adjuster:
         return information
 
     def judgement(self, standing: NDArray[np.bool_] | None) -> HeldOut:
-        """Every group's errors with cameras adjusted without it; None = cameras as they were."""
+        """Return held-out errors by cameras adjusted without each group; None = initial cameras."""
         robust = self.settings.robust_scale
         groups = self._groups(len(self.judged))
         if standing is None or self.settings.evidence == "markings":
@@ -359,7 +359,7 @@ class _Adjuster:
         return HeldOut(loss, error, joints)
 
     def _groups(self, frames: int) -> NDArray[np.int64]:
-        """The group (frames, persons) of everybody; parts of the time where there is one person."""
+        """Return the group (frames, persons) of each person; time intervals for a single person."""
         persons = self.clip.detection_index.shape[2]
         folds = self.settings.folds
         if persons > 1:
@@ -368,9 +368,9 @@ class _Adjuster:
 
 
 def _only(observed: Observed, kept: NDArray[np.bool_]) -> Observed:
-    """The observations (n,) that are kept, and their points numbered anew.
+    """Return the observations (n,) that are kept, with renumbered points.
 
-    A point that is left with one of them tells nothing.
+    A point left with a single observation carries no information and is dropped.
     """
     kept = kept & (
         np.bincount(observed.point_of[kept], minlength=len(observed.points))[observed.point_of] > 1
@@ -381,7 +381,7 @@ def _only(observed: Observed, kept: NDArray[np.bool_]) -> Observed:
 
 
 def _where(changed: NDArray[np.bool_], new: Camera, old: Camera) -> Camera:
-    """The batch of new cameras where they changed and of old ones elsewhere."""
+    """Return the batch of new cameras where they changed and of old ones elsewhere."""
     return Camera.stack([(new if take else old)[c] for c, take in enumerate(changed)])
 
 
@@ -392,7 +392,7 @@ def _reason(
     settings: BundleAdjustmentSettings,
     objection: str,
 ) -> str:
-    """Why a camera's change was accepted or refused, with the numbers that decided."""
+    """Return why a camera's change was accepted or refused, with the deciding numbers."""
     judges = int(said.judges[c])
     if judges < settings.min_judges:
         return f"refused: {judges} left-out keypoints, {settings.min_judges} are asked for"
@@ -408,7 +408,7 @@ def _reason(
 
 
 def _motion(motion: NDArray[np.float64]) -> str:
-    """How far a camera moved."""
+    """Return the description of a camera's motion."""
     center, rotation, focal = motion.tolist()
     return (
         f"; moved {100.0 * center:.1f} cm and {np.degrees(rotation):.3f} degrees, focal length "
@@ -423,7 +423,7 @@ def _nothing(
     used: NDArray[np.int64],
     judged: NDArray[np.int64],
 ) -> BundleAdjustment:
-    """The clip's cameras as they were, for a reason that holds for all of them."""
+    """Return the clip's cameras unchanged, with one reason for all of them."""
     count = len(clip.clicks)
     nan = np.full((count, 2), np.nan)
     return BundleAdjustment(

@@ -1,4 +1,4 @@
-"""The problem that people and markings pose (B2)."""
+"""Bundle adjustment problems from people and from markings (B2)."""
 
 from __future__ import annotations
 
@@ -15,25 +15,24 @@ from worldpose.static_calibration import PARAMETERS
 
 _SIZE: Final = len(PARAMETERS)
 _UNKNOWN: Final = 100.0 * np.array([1.0] * 3 + [100.0] * 3 + [1.0, 300.0, 300.0, 3.0, 30.0, 300.0])
-"""Spreads that say nothing [rad, m, 1, px, 1]; they only keep the system regular. A hundredth of
-them would already hold the lens."""
+"""Standard deviations of an uninformative prior [rad, m, 1, px, 1]; they only keep the system
+regular. A hundredth of them would already constrain the lens."""
 MARKINGS_SOLVER: Final = SolverSettings(iterations=500, cost_change=1e-6)
-"""For a valley as long and flat as a lens that six clicks determine."""
+"""For ill-conditioned directions as long and flat as those of a lens determined by six clicks."""
 
 
 _FAITH: Final = 10.0
-"""Directions for which calibration's own word counts, and that of the other cameras [1]: as many as
-one camera has."""
+"""Weight of the median over all cameras, in directions [1]: as many as one camera has."""
 
 
 @dataclass(frozen=True)
 class KeypointNoise:
-    """How far keypoints really are off, and how long.
+    """Scale and temporal correlation of keypoint errors.
 
     Attributes:
         scale: factor on the stated standard deviation [1].
-        correlation: observations that are worth one independent one [1], at least 1: a joint that
-            a detector puts too low in one frame, it puts too low in the next.
+        correlation: observations that equal one independent observation [1], at least 1: a detector
+            that puts a joint too low in one frame puts it too low in the next.
     """
 
     scale: float = 1.0
@@ -48,17 +47,17 @@ def players_problem(
     settings: BundleAdjustmentSettings,
     doubt: NDArray[np.float64] | float = 1.0,
 ) -> Problem:
-    """Return the adjustment of cameras to people, on top of what calibration knows.
+    """Return the adjustment of cameras to people, with calibration as the prior.
 
-    Clicks, painted lines and priors enter as the Gaussian that calibration left; people as free
-    points under Cauchy's loss. An observation's weight is divided by the correlation, so that
-    twenty frames in which a detector errs alike count as the few that they are.
+    Clicks, painted lines and priors enter as the Gaussian posterior of calibration, people as free
+    points under Cauchy's loss. The correlation divides an observation's weight, so that twenty
+    frames with the same detector error count as few.
 
     Args:
-        clip: cameras and how well they are known.
+        clip: cameras with their covariance.
         observed: keypoints.
         noise: their scale and correlation.
-        standing: (cameras,) bool, those that may not move.
+        standing: (cameras,) bool, fixed cameras.
         settings: robust scale, and the prior of given cameras.
         doubt: (cameras,) factor on the variance that calibration states [1].
     """
@@ -82,15 +81,15 @@ def players_problem(
 
 
 def measured_doubt(problem: Problem, adjusted: Adjusted) -> NDArray[np.float64]:
-    """Return the factor (cameras,) on calibration's variances that adjustment asks for.
+    """Return the factor (cameras,) on calibration's variances, estimated from an adjustment.
 
     People move a camera in the directions that they determine; where its step is longer than its
-    calibration allows, the calibration was too sure of itself. The squared step in stated standard
-    deviations is divided by the number of these directions (MacKay 1992), drawn towards the
-    median of all cameras.
+    calibration allows, the calibration was overconfident. The squared step in stated standard
+    deviations is divided by the number of these directions (MacKay 1992), shrunk towards the median
+    of all cameras.
 
     Args:
-        problem: what was solved, with the variances that the factor is on.
+        problem: the solved problem, with the variances that the factor multiplies.
         adjusted: its solution.
     """
     count = len(problem.free)
@@ -100,7 +99,7 @@ def measured_doubt(problem: Problem, adjusted: Adjusted) -> NDArray[np.float64]:
     own = blocks[np.arange(count), :, np.arange(count)]
     kept = np.einsum("cij,cji->c", problem.camera_information, own)
     told = np.maximum(problem.free.sum(axis=1) - kept, 0.0)
-    # The median: a camera that shows somebody else must not free all the others.
+    # Use the median: a camera that shows other people must not free all the others.
     overall = float(np.median((squared + 1.0) / (told + 1.0)))
     return np.asarray((squared + _FAITH * overall) / (told + _FAITH))
 
@@ -108,11 +107,11 @@ def measured_doubt(problem: Problem, adjusted: Adjusted) -> NDArray[np.float64]:
 def markings_problem(
     clip: Clip, standing: NDArray[np.bool_], settings: BundleAdjustmentSettings
 ) -> Problem:
-    """Return the adjustment of cameras to clicks alone, everything free, nothing known (trap 1).
+    """Return the adjustment of cameras to clicks alone, all parameters free, no prior (trap 1).
 
     Args:
         clip: cameras and clicks.
-        standing: (cameras,) bool, those that may not move.
+        standing: (cameras,) bool, fixed cameras.
         settings: noise of clicks.
     """
     clicked = [np.flatnonzero(clicks.inlier) for clicks in clip.clicks]
@@ -138,11 +137,11 @@ def markings_problem(
 def camera_knowledge(
     clip: Clip, settings: BundleAdjustmentSettings
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the information (cameras, 12, 12) about a step, and what may move (cameras, 12).
+    """Return the prior information (cameras, 12, 12) on a step, and free parameters (cameras, 12).
 
     Args:
-        clip: cameras and how well they are known.
-        settings: what given cameras are taken to err by.
+        clip: cameras with their covariance.
+        settings: the prior of given cameras.
     """
     known = known_covariance(clip, settings)
     information = np.zeros_like(known)
@@ -158,11 +157,11 @@ def camera_knowledge(
 
 
 def known_covariance(clip: Clip, settings: BundleAdjustmentSettings) -> NDArray[np.float64]:
-    """Return the covariance (cameras, 12, 12) of a step by the camera's source.
+    """Return the prior covariance (cameras, 12, 12) of a step by the camera's source.
 
     Args:
         clip: cameras; the prior of given ones scales with their distance to people.
-        settings: that prior, and factors on what calibration states.
+        settings: that prior, and factors on the stated deviations of calibration.
     """
     count = len(clip.covariance)
     distance = clip.distance

@@ -1,4 +1,4 @@
-"""One clip as bundle adjustment sees it, and the keypoints of some of its people."""
+"""Input of bundle adjustment: one clip, and the keypoints of some of its people."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class Clicks:
     """The clicked points of one camera.
 
     Attributes:
-        names: of the pitch template.
+        names: of points of the pitch template.
         points_world: (n, 3) [m], world.
         points_image: (n, 2) [px].
-        inlier: (n,) bool, does the calibration rest on it.
+        inlier: (n,) bool, whether the calibration uses it.
     """
 
     names: tuple[str, ...]
@@ -35,7 +35,7 @@ class Clicks:
 
     @classmethod
     def none(cls) -> Clicks:
-        """Those of a camera in which nobody clicked."""
+        """Return the clicks of a camera without any."""
         return cls((), np.empty((0, 3)), np.empty((0, 2)), np.empty(0, dtype=np.bool_))
 
 
@@ -49,15 +49,15 @@ class Clip:
             camera.
         clicks: of every camera.
         frame: (frames,) match frames.
-        fps: frames a second.
+        fps: frames per second.
         keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
         confidence: (frames, cameras, detections, 17); NaN where not found.
         detection_index: (frames, cameras, persons); -1 = not seen.
         joints: (frames, persons, 17, 3) [m], world, as triangulated; NaN where not determined.
-        views: (frames, persons, 17) agreeing cameras.
+        views: (frames, persons, 17) inlier cameras.
         triangulation: settings that made the joints.
         pitch: as surveyed; None = not known.
-        on_lines: (cameras,) bool, was it calibrated on painted lines; None = nobody was.
+        on_lines: (cameras,) bool, whether it was calibrated on painted lines; None = no camera.
         names: of the cameras, for messages; empty = not known.
     """
 
@@ -83,7 +83,7 @@ class Clip:
 
     @cached_property
     def distance(self) -> NDArray[np.float64]:
-        """Median depth (cameras,) of people before each camera [m]; NaN where it sees nobody."""
+        """Median depth (cameras,) of people in each camera [m]; NaN without people."""
         frame, camera, person = np.nonzero(self.detection_index >= 0)
         found = np.isfinite(self.joints[..., 0])
         number = np.maximum(found.sum(axis=-1), 1)[..., None]
@@ -152,14 +152,14 @@ def keypoints_of(
 def observe(
     clip: Clip, frames: Integers, people: NDArray[np.bool_], cameras: Camera, min_views: int
 ) -> Observed:
-    """Return the keypoints of joints that enough cameras agree on.
+    """Return the keypoints of joints with enough inlier cameras.
 
     Args:
         clip: the clip.
         frames: (k,) indices of its frames.
-        people: (persons,) or (k, persons) bool, who counts.
-        cameras: (cameras,) batch that predicts how large people are in the picture.
-        min_views: least agreeing cameras of a joint.
+        people: (persons,) or (k, persons) bool, persons to include.
+        cameras: (cameras,) batch that predicts the size of people in the image.
+        min_views: minimum inlier cameras of a joint.
     """
     index = clip.detection_index[frames]
     image, confidence = keypoints_of(clip.keypoints[frames], clip.confidence[frames], index)
@@ -168,7 +168,7 @@ def observe(
     good &= np.broadcast_to(people, good.shape[:2])[..., None]
     predicted, noise = predict(cameras, joints, confidence, clip.triangulation)
     seen = good[:, None] & (confidence > 0.0) & np.isfinite(predicted).all(axis=-1)
-    # A joint that only one of these cameras can use tells nothing.
+    # A joint that only one of these cameras can use carries no information.
     seen &= (seen.sum(axis=1) >= 2)[:, None]
     by_point = seen.transpose(0, 2, 3, 1)
     frame, person, joint, camera = np.nonzero(by_point)
@@ -189,12 +189,12 @@ def observe(
 def with_learned_noise(clip: Clip, frames: Integers) -> Clip:
     """Return the clip with the noise of its detector in its confidences.
 
-    The variance of a keypoint is then the stated one over its confidence, and triangulation takes
-    cameras as they are: their errors are what adjustment is to see.
+    The variance of a keypoint is then the stated one over its confidence, and triangulation treats
+    cameras as exact, because adjustment must see their errors.
 
     Args:
         clip: the clip.
-        frames: (k,) indices of frames that the noise is learned from.
+        frames: (k,) indices of frames to learn the noise from.
     """
     settings = clip.triangulation
     if settings.learn_noise and len(frames):
@@ -222,17 +222,17 @@ def predict(
     confidence: NDArray[np.float64],
     settings: TriangulationSettings,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return where joints project, and the standard deviation of keypoints there per axis [px].
+    """Return projections of joints, and the standard deviation of keypoints there per axis [px].
 
     Args:
         cameras: (cameras,) batch.
         joints: (frames, persons, 17, 3) [m], world.
         confidence: (frames, cameras, persons, 17).
-        settings: of triangulation, which state the noise.
+        settings: of triangulation, with the stated noise.
 
     Returns:
         (frames, cameras, persons, 17, 2) and (frames, cameras, persons, 17); NaN and infinite
-        where there is no image.
+        without an image.
     """
     count = len(cameras.focal)
     shape = (count, *joints.shape[:3])

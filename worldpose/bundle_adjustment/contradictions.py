@@ -1,8 +1,8 @@
-"""Cameras that contradict all others, found before they can drag them.
+"""Cameras that contradict all others, detected before they can bias an adjustment.
 
-Either such a camera is not where its calibration says, which adjustment can mend once it does not
-believe the calibration; or it shows other people than the other cameras do under the same ids,
-which nothing mends.
+Either the calibration of such a camera is wrong, which adjustment can correct after a
+down-weighting of the calibration; or the camera shows other people than the other cameras under the
+same ids, which adjustment cannot correct.
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ _SIZE: Final = len(PARAMETERS)
 _MEDIAN: Final = 2.0 * np.log(2.0)
 """Median squared length of a standard Gaussian in two dimensions [1]."""
 _LIMIT: Final = 4.0
-"""Median squared error, over what noise and calibration state, from which a camera is placed by the
-others' people [1]: twice as far off as it says, as one honest camera in thirty is."""
+"""Median squared error, over the stated variance of noise and calibration, from which the others'
+people place a camera [1]: twice the stated error, as for one correct camera in thirty."""
 _CONTRADICTS: Final = 9.0
-"""Squared step to there in stated standard deviations, per parameter, from which its calibration is
-not believed [1]: three of them in every direction."""
+"""Squared step to that place in stated standard deviations, per parameter, from which its
+calibration is distrusted [1]: three of them in every direction."""
 _DISBELIEF: Final = 16.0
-"""Factor on the variances of a camera while it is placed so [1]: what people tell exceeds it, what
-they do not tell stays."""
+"""Factor on the variances of a camera during this placement [1]: people outweigh the prior where
+they carry information; elsewhere the camera stays."""
 _SCALES: Final = (30.0, 3.0)
-"""Of the loss, one after the other [standard deviations]: first it must get there."""
+"""Scales of the loss, one after the other [standard deviations]: the first allows a far step."""
 _SEEN: Final = 20
-"""Fewest keypoints that can contradict [1]: one person, hardly more than once."""
+"""Minimum keypoints for a contradiction [1]: one person, hardly more than once."""
 
 
 @dataclass(frozen=True, eq=False)
 class Contradictions:
-    """What is known of cameras before they are adjusted.
+    """Contradictions of cameras, found before adjustment.
 
     Attributes:
         doubt: (cameras,) factor on the variance that calibration states [1].
-        offset: (cameras, 12) steps to where the others' people put contradicting cameras.
-        stranger: (cameras,) bool, does it show other people.
+        offset: (cameras, 12) steps of contradicting cameras to their place by the others' people.
+        stranger: (cameras,) bool, whether it shows other people.
     """
 
     doubt: Floats
@@ -59,7 +59,7 @@ class Contradictions:
 
     @classmethod
     def none(cls, count: int) -> Contradictions:
-        """Those of cameras that nothing speaks against."""
+        """Return the result for cameras without contradictions."""
         return cls(np.ones(count), np.zeros((count, _SIZE)), np.zeros(count, dtype=np.bool_))
 
 
@@ -69,12 +69,12 @@ def find_contradictions(
     held: HeldOut,
     settings: BundleAdjustmentSettings,
 ) -> Contradictions:
-    """Return which cameras disagree with all others far beyond what they state.
+    """Return the cameras that disagree with all others far beyond their stated errors.
 
     Args:
         clip: cameras and people.
         frames: (k,) indices of frames.
-        held: their errors in every camera with joints from the other cameras.
+        held: errors of people in every camera against joints from the other cameras.
         settings: the prior of given cameras.
     """
     keypoints, confidence = clip.keypoints[frames], clip.confidence[frames]
@@ -83,7 +83,7 @@ def find_contradictions(
     _, noise = predict(clip.cameras, joints, weight, clip.triangulation)
     known = known_covariance(clip, settings)
     stated = stated_errors(clip.cameras, joints, clip.triangulation, known)
-    # What the others' joints may be off, as the camera sees it.
+    # Noise, and the error of the other cameras' joints in this image.
     place = noise**2 + (stated.scale**2 * _joint_variance(stated))[..., None]
     with np.errstate(invalid="ignore"):
         squared = held.error**2 / (place + stated.variance[..., None])
@@ -130,7 +130,7 @@ def find_contradictions(
 
 
 def _placed(problem: Problem, settings: BundleAdjustmentSettings) -> Adjusted | None:
-    """The camera where these points put it; None where none has them all in its picture."""
+    """Return the camera fitted to these points; None if it cannot image all of them."""
     offset = None
     for scale in _SCALES:
         loss = np.full(len(problem.points), scale)
@@ -143,7 +143,7 @@ def _placed(problem: Problem, settings: BundleAdjustmentSettings) -> Adjusted | 
 
 
 def _joint_variance(stated: StatedErrors) -> Floats:
-    """What calibrations of the other cameras do to their joints (frames, cameras, persons) [m^2].
+    """Return the joints' variance by the other calibrations (frames, cameras, persons) [m^2].
 
     Per axis: n views of equal variance leave 3 / (2 n) of it, each seeing two of three axes.
     """

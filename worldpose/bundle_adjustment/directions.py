@@ -1,4 +1,4 @@
-"""The direction in which a camera is known least, by name."""
+"""Direction of largest camera uncertainty, with the names of its parameters."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from worldpose.cameras import Camera
 from worldpose.static_calibration import PARAMETERS, project_with_jacobian
 
 _DISTANCE: Final = 60.0
-"""Of the points whose motion in the picture makes parameters comparable [m]."""
+"""Distance of the points whose image motion makes parameters comparable [m]."""
 _NAMED: Final = 0.25
 """Share of the largest component from which a parameter is named [1]."""
 
 
 @dataclass(frozen=True, eq=False)
 class WeakDirection:
-    """Where a camera can move farthest before people and markings notice.
+    """Direction in which people and markings constrain a camera least.
 
     Attributes:
         step: (12,) one standard deviation along it, in the units of `PARAMETERS`.
-        about: parameters that move together, and how far.
+        about: parameters that move together, with their steps.
     """
 
     step: NDArray[np.float64]
@@ -33,8 +33,8 @@ class WeakDirection:
 def weak_direction(camera: Camera, covariance: NDArray[np.float64]) -> WeakDirection:
     """Return the direction of largest variance.
 
-    Parameters are compared by how far each alone moves the picture; along a weak direction these
-    motions cancel.
+    Parameters are scaled by the image motion of each alone; along a weak direction these motions
+    cancel.
 
     Args:
         camera: a single camera.

@@ -1,4 +1,4 @@
-"""Which frames cameras are adjusted on (B1): many views, well spread over pitch and time."""
+"""Selection of frames for bundle adjustment (B1): many views, spread over pitch and time."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from worldpose.bundle_adjustment.clip import Clip
 
 _CELL: Final = 8.0
-"""Of the pitch, side [m]: a quarter of what a static camera sees across."""
+"""Side of a pitch cell [m]: a quarter of the width that a static camera sees."""
 _WORTH: Final = 17.0
-"""Keypoints of one cell in one camera after which more of them count half [1]: one person."""
+"""Keypoints of one cell in one camera after which further ones count half [1]: one person."""
 
 
 def propose_frames(
@@ -22,18 +22,18 @@ def propose_frames(
     min_views: int,
     taken: NDArray[np.int64] | None = None,
 ) -> NDArray[np.int64]:
-    """Return indices of frames that tell most about all cameras, ascending.
+    """Return indices of the most informative frames for all cameras, ascending.
 
-    Each frame adds keypoints of well-seen joints to cells of the pitch, camera by camera; what a
-    cell has already makes more of it worth less (the sum of logarithms). The next frame is always
-    the one that adds most, `gap` away from those before.
+    Each frame adds keypoints of joints with enough views to cells of the pitch, per camera; further
+    keypoints of a cell have diminishing value (the sum of logarithms). A greedy search takes the
+    frame that adds most, `gap` away from those before.
 
     Args:
-        clip: cameras, joints and who saw them.
-        count: at most this many.
-        gap: between two of them [s].
-        min_views: least agreeing cameras of a joint that counts.
-        taken: (k,) indices that are not to be proposed.
+        clip: cameras, joints and their detections.
+        count: maximum number of frames.
+        gap: minimum time between two of them [s].
+        min_views: minimum inlier cameras of a joint.
+        taken: (k,) indices to exclude.
 
     Note:
         B1.
@@ -56,7 +56,7 @@ def propose_frames(
 
 
 def _offered(clip: Clip, min_views: int) -> NDArray[np.float64]:
-    """Keypoints (frames, cells) of every camera's cells; only cells that anybody enters."""
+    """Return keypoint counts (frames, cells) of every camera's cells; only cells with people."""
     good = np.isfinite(clip.joints[..., 0]) & (clip.views >= min_views)
     number = good.sum(axis=-1)
     place = np.where(good[..., None], clip.joints, 0.0)[..., :2].sum(axis=-2)

@@ -1,7 +1,7 @@
-"""What no keypoint can see: a similarity transform of all cameras and people together.
+"""Gauge freedom: a similarity transform of all cameras and people, which no keypoint observes.
 
-Where no camera was calibrated on markings, nothing but the given cameras says where the world lies,
-how it is turned and how large it is. Adjustment must not change that.
+If no camera was calibrated on markings, only the given cameras define position, orientation and
+scale of the world. Adjustment must not change them.
 """
 
 from __future__ import annotations
@@ -51,15 +51,16 @@ class Similarity:
 def align_points(points: Floats, targets: Floats) -> Similarity:
     """Return the similarity transform that brings points to their targets.
 
-    Each pair counts by its distance over the median distance (Cauchy's weight), so that a person
-    or a joint that really moved does not take the others along.
+    The weight of a pair depends on its distance over the median distance (Cauchy's weight), so that
+    a person or a joint that really moved has little influence.
 
     Args:
         points: (n, 3) [m].
         targets: (n, 3) [m].
 
     Returns:
-        The identity for fewer than three pairs, or for pairs on one line, which leave it open.
+        The identity for fewer than three pairs, or for pairs on one line, which leave it
+        undetermined.
 
     Note:
         Umeyama, PAMI 1991.
@@ -99,7 +100,7 @@ def similarity_steps(cameras: Camera, origin: Floats) -> Floats:
     there = pose.rotation @ origin + pose.translation
     steps[:, 3:6, :3] = -pose.rotation
     steps[:, :3, 3:6] = -pose.rotation
-    # A turn by R theta about the point that lies at `there` in the camera's frame.
+    # A rotation by R theta about the point at `there` in the camera's frame.
     cross = np.cross(np.eye(3), there[:, None, :])
     steps[:, 3:6, 3:6] = cross.swapaxes(1, 2) @ pose.rotation
     steps[:, 3:6, 6] = there
@@ -109,7 +110,7 @@ def similarity_steps(cameras: Camera, origin: Floats) -> Floats:
 def relative_covariance(
     covariance: Floats, cameras: Camera, information: Floats, origin: Floats
 ) -> tuple[Floats, Floats]:
-    """Split what is not known of cameras into what each errs alone and what all err together.
+    """Split the covariance of cameras into individual errors and a common error.
 
     The common part is the similarity transform that best explains the cameras' errors as pixels at
     the people; the rest is relative.
@@ -117,8 +118,8 @@ def relative_covariance(
     Args:
         covariance: (12 cameras, 12 cameras) of steps.
         cameras: (cameras,) batch.
-        information: (cameras, 12, 12) that keypoints have of each camera alone, which weighs it.
-        origin: (3,) [m], world: where the people are.
+        information: (cameras, 12, 12) of keypoints on each camera alone, used as its weight.
+        origin: (3,) [m], world: position of the people.
 
     Returns:
         (cameras, 12, 12) of each camera's relative step, and (7, 7) of the transform's parameters

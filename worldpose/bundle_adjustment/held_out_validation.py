@@ -1,4 +1,4 @@
-"""The guard (B3): people who had no part in it judge every camera's change."""
+"""Held-out validation (B3): people outside the adjustment validate every camera's change."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ from worldpose.cameras import Camera
 from worldpose.triangulation import triangulate_joints
 
 _PARTS: Final = 4
-"""Of the time; what left-out people say in one of them counts as one observation."""
+"""Intervals of the time; the errors of a held-out person in one of them count as one
+observation."""
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Errors of left-out people's keypoints in every camera.
+    """Errors of held-out people's keypoints in every camera.
 
     Each joint is triangulated from the other cameras alone.
 
     Attributes:
-        loss: (frames, cameras, persons, 17) Cauchy's loss [1]; NaN where there is none.
+        loss: (frames, cameras, persons, 17) Cauchy's loss [1]; NaN without data.
         error: (frames, cameras, persons, 17) length [px].
-        joints: (frames, persons, 17, 3) [m], world, from all cameras; NaN where there is none.
+        joints: (frames, persons, 17, 3) [m], world, from all cameras; NaN without data.
     """
 
     loss: NDArray[np.float64]
@@ -41,13 +42,13 @@ def held_out(
     people: NDArray[np.bool_],
     robust_scale: float,
 ) -> HeldOut:
-    """Return how well cameras agree about people.
+    """Return the errors of keypoints against joints from the other cameras.
 
     Args:
-        clip: keypoints and who is who.
-        cameras: (cameras,) batch to be judged.
+        clip: keypoints and their persons.
+        cameras: (cameras,) batch to validate.
         frames: (k,) indices of frames.
-        people: (k, persons) bool, the judges.
+        people: (k, persons) bool, held-out people.
         robust_scale: of Cauchy's loss [standard deviations].
     """
     keypoints, confidence = clip.keypoints[frames], clip.confidence[frames]
@@ -77,9 +78,9 @@ def joints_without(
     """Return joints (k, persons, 17, 3) from all cameras but one [m], world.
 
     Args:
-        clip: keypoints and who is who.
+        clip: keypoints and their persons.
         cameras: (cameras,) batch.
-        camera: the one that is left out.
+        camera: the camera to leave out.
         frames: (k,) indices of frames.
     """
     index = clip.detection_index[frames].astype(np.int16)
@@ -102,12 +103,12 @@ def _without(
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """Left-out people's errors before and after a change, over what both can tell.
+    """Held-out errors before and after a change, over the keypoints valid in both.
 
     Attributes:
-        judges: (cameras,) keypoints that tell [1].
-        loss: (cameras, 2) mean of Cauchy's loss before and after [1]; NaN without judges.
-        error: (cameras, 2) median length before and after [px]; NaN without judges.
+        judges: (cameras,) number of these keypoints [1].
+        loss: (cameras, 2) mean of Cauchy's loss before and after [1]; NaN without keypoints.
+        error: (cameras, 2) median length before and after [px]; NaN without keypoints.
     """
 
     judges: NDArray[np.int64]
@@ -116,7 +117,7 @@ class Verdict:
 
 
 def verdict(before: HeldOut, after: HeldOut) -> Verdict:
-    """Return the comparison, camera by camera."""
+    """Return the comparison per camera."""
     count = before.loss.shape[1]
     both = np.isfinite(before.loss) & np.isfinite(after.loss)
     judges = both.sum(axis=(0, 2, 3))
@@ -130,15 +131,15 @@ def verdict(before: HeldOut, after: HeldOut) -> Verdict:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What all left-out people say of a change of all cameras together.
+    """Result of all held-out people together for a change of all cameras.
 
     Attributes:
-        gain: part of the loss that the change removes [1]; negative where it adds.
-        significance: the fall of the loss over its standard error [1]. A person in a quarter of
-            the time is one observation, since a detector's errors last.
-        shift: how far people moved together [m].
-        turn: and turned together [rad].
-        scale: and grew together [1].
+        gain: relative decrease of the loss [1]; negative if it rises.
+        significance: decrease of the loss over its standard error [1]. A person in a quarter of the
+            time is one observation, since detector errors last.
+        shift: common shift of people [m].
+        turn: common rotation of people [rad].
+        scale: common growth of people [1].
     """
 
     gain: float
@@ -149,12 +150,12 @@ class Evidence:
 
 
 def all_evidence(before: HeldOut, after: HeldOut, cameras: NDArray[np.bool_]) -> Evidence:
-    """Return what left-out people say.
+    """Return the result of all held-out people together.
 
     Args:
-        before: with cameras as they were.
-        after: with changed cameras.
-        cameras: (cameras,) bool, those whose keypoints count.
+        before: errors with the initial cameras.
+        after: errors with changed cameras.
+        cameras: (cameras,) bool, cameras whose keypoints count.
     """
     fall = (before.loss - after.loss)[:, cameras]
     told = np.isfinite(fall)
@@ -182,6 +183,6 @@ def all_evidence(before: HeldOut, after: HeldOut, cameras: NDArray[np.bool_]) ->
 
 
 def common_motion(before: NDArray[np.float64], after: NDArray[np.float64]) -> Similarity:
-    """Return the similarity transform by which joints (..., 3) moved together."""
+    """Return the common similarity transform of joints (..., 3)."""
     both = np.isfinite(before).all(axis=-1) & np.isfinite(after).all(axis=-1)
     return align_points(before[both], after[both])

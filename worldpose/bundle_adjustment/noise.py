@@ -1,4 +1,4 @@
-"""How large and how lasting errors of keypoints are, from what an adjustment leaves over."""
+"""Scale and temporal correlation of keypoint errors, from the residuals of an adjustment."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ def measured_noise(
 ) -> KeypointNoise:
     """Return the scale and the correlation of the keypoints' errors.
 
-    The scale is that of the median; every point takes three numbers out of its observations. The
-    correlation is what the sum of a joint's residuals over time, in one camera, exceeds that of
-    independent ones by: its squared length over the sum of squared lengths.
+    The scale comes from the median; every point takes three degrees of freedom out of its
+    observations. The correlation is the squared length of the sum of a joint's residuals over time,
+    in one camera, over the sum of their squared lengths; 1 for independent residuals.
 
     Args:
         cameras: (cameras,) batch, adjusted.

@@ -1,4 +1,4 @@
-"""What disagrees after adjustment, for people to look at (B3): nothing is removed here."""
+"""Outlier keypoints and clicks after adjustment, for manual review (B3); nothing is removed."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from worldpose.static_calibration import image_problems, project_with_jacobian
 from worldpose.triangulation import triangulate_joints
 
 _WHOLE: Final = 0.5
-"""Share of a person's keypoints in one picture from which all of them are off together [1]: taken
-for someone else, or left for right."""
+"""Share of outliers among a person's keypoints in one image from which all are listed together [1]:
+another person, or a left-right swap."""
 _BLOCK: Final = 256
-"""Frames at a time: bounds the memory, not the result."""
+"""Frames at a time: limits the memory, not the result."""
 
 
 @dataclass(frozen=True, eq=False)
 class KeypointOutliers:
-    """The review list of people's keypoints, the most surprising first.
+    """Review list of people's keypoints, by descending Mahalanobis distance.
 
     Attributes:
         frame: (n,) index into the clip's frames.
         camera: (n,)
         person: (n,) index into the clip's people.
-        joint: (n,) -1 where most keypoints of this person in this picture are off.
-        surprise: (n,) length in standard deviations [1]; the median of a person's.
-        found: how many there are, also beyond the list.
+        joint: (n,) -1 where most keypoints of this person in this image are outliers.
+        surprise: (n,) Mahalanobis distance [1]; the median over keypoints for a whole person.
+        found: number of outliers, including those beyond the list.
     """
 
     frame: NDArray[np.int64]
@@ -44,15 +44,15 @@ class KeypointOutliers:
 
 @dataclass(frozen=True, eq=False)
 class ClickReview:
-    """All clicked points against the adjusted cameras, the most surprising first.
+    """All clicked points against the adjusted cameras, by descending Mahalanobis distance.
 
     Attributes:
         camera: (n,)
         name: of each point of the pitch.
         residual: (n, 2) [px], projected minus clicked; NaN where the camera cannot image the point.
-        surprise: (n,) residual in standard deviations of what everything else predicts [1];
-            infinite where the camera cannot image the point.
-        problem: of each, why the camera cannot image the point; empty where it can.
+        surprise: (n,) Mahalanobis distance from the prediction of all other data [1]; infinite
+            where the camera cannot image the point.
+        problem: reason why the camera cannot image each point; empty where it can.
     """
 
     camera: NDArray[np.int64]
@@ -65,14 +65,14 @@ class ClickReview:
 def keypoint_outliers(
     clip: Clip, cameras: Camera, noise: KeypointNoise, limit: float, longest: int
 ) -> KeypointOutliers:
-    """Return the keypoints that the other cameras contradict.
+    """Return the keypoints that disagree with the joints from all cameras.
 
     Args:
-        clip: keypoints and who is who.
+        clip: keypoints and their persons.
         cameras: (cameras,) batch, adjusted.
         noise: of keypoints, as measured.
-        limit: standard deviations from which one is listed [1].
-        longest: entries at most.
+        limit: Mahalanobis distance from which a keypoint is listed [1].
+        longest: maximum number of entries.
     """
     parts = [
         _of_block(
@@ -89,7 +89,7 @@ def keypoint_outliers(
 def _of_block(
     clip: Clip, cameras: Camera, noise: KeypointNoise, limit: float, frames: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Rows (n, 5) of frame, camera, person, joint and surprise."""
+    """Return rows (n, 5) of frame, camera, person, joint and Mahalanobis distance."""
     keypoints, confidence = clip.keypoints[frames], clip.confidence[frames]
     index = clip.detection_index[frames]
     joints = triangulate_joints(
@@ -114,7 +114,7 @@ def review_clicks(
     covariance: NDArray[np.float64],
     click_noise: float,
 ) -> ClickReview:
-    """Return every clicked point's residual, and how surprising it is.
+    """Return every clicked point's residual and its Mahalanobis distance.
 
     Args:
         clicks: of every camera.
@@ -135,11 +135,11 @@ def review_clicks(
         off = pixel - clicked.points_image
         by_step = np.where(imaged[:, None, None], by_step, 0.0)
         spread = np.einsum("nij,jk,nlk->nil", by_step, covariance[c], by_step)
-        # A click that the camera rests on has drawn the camera towards it.
+        # A click used in the calibration has pulled the camera towards it.
         sign = np.where(clicked.inlier, -1.0, 1.0)[:, None, None]
         values, vectors = np.linalg.eigh(click_noise**2 * np.eye(2) + sign * spread)
         along = np.einsum("nij,ni->nj", vectors, off)
-        # Never less than a tenth of the noise: rounding may leave nothing of it.
+        # At least a tenth of the noise: rounding may leave zero.
         values = np.maximum(values, 0.01 * click_noise**2)
         camera += [c] * len(clicked.names)
         name += clicked.names

@@ -1,9 +1,9 @@
-"""Compiled kernels of the reduced camera system: points are eliminated one by one.
+"""Compiled kernels of the Schur complement: points are eliminated one by one.
 
-Every point meets only the cameras that see it. With its block of the normal equations factored as
-L L^T, the cameras' system loses Y^T Y, where the three rows of Y are L^-1 times the mixed block.
-L^-1 times the gradient by the point stands in a last column of Y: Y^T Y has what the cameras'
-gradient loses there.
+Every point couples only the cameras that see it. With its block of the normal equations factored as
+L L^T, the reduced camera system subtracts Y^T Y, where the three rows of Y are L^-1 times the mixed
+block. The last column of Y is L^-1 times the gradient by the point, so Y^T Y also has the
+correction of the cameras' gradient.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 STEPS = 12
-"""Parameters of a camera, in the order of `worldpose.static_calibration.PARAMETERS`."""
+"""Parameters per camera, in the order of `worldpose.static_calibration.PARAMETERS`."""
 
 _ROUNDING: Final = 1e-10
-"""Share of a diagonal entry of a point's normal equations below which it is rounding [1]: rays that
-meet at an angle under 2e-5 rad."""
+"""Share of a diagonal entry of a point's normal equations below which it is rounding error [1]:
+rays that meet at an angle under 2e-5 rad."""
 
 
 class Evidence(NamedTuple):
-    """What is known of the points, and where cameras saw them, sorted by point."""
+    """Priors and observations of the points, sorted by point."""
 
     anchors: Floats
-    """(points, 3) [m], world; where prior knowledge has them."""
+    """(points, 3) [m], world; means of the priors."""
     information: Floats
-    """(points,) [1/m^2] of that knowledge; 0 = none, infinite = the point is fixed."""
+    """(points,) [1/m^2] of the priors; 0 = none, infinite = the point is fixed."""
     first_of: Integers
     """(points + 1,); observations of point p are `first_of[p]` to `first_of[p + 1]`."""
     camera_of: Integers
@@ -66,10 +66,10 @@ def eliminate(
         cameras: (cameras, 22).
         points: (points, 3) [m], world.
         evidence: of all points.
-        damping: Marquardt's, of the points.
-        first: of the points.
-        last: exclusive.
-        columns: (cameras, 12); those of the parameters in Y, -1 = the parameter may not move.
+        damping: Marquardt damping of the points.
+        first: first point.
+        last: last point, exclusive.
+        columns: (cameras, 12); columns of the parameters in Y, -1 = fixed parameter.
         rows: (3 (last - first), free parameters + 1), written: Y and, last, L^-1 times the
             gradient by the points.
         blocks: (cameras, 12, 12), added to; lower triangle.
@@ -127,13 +127,13 @@ def substitute(
     steps: Floats,
     trial: Floats,
 ) -> None:
-    """Write where the points go when the cameras step.
+    """Write the points after a step of the cameras.
 
     Args:
         cameras: (cameras, 22), before the step.
         points: (points, 3) [m], world, before it.
         evidence: of all points.
-        damping: that of the elimination.
+        damping: as in the elimination.
         steps: (cameras, 12).
         trial: (points, 3) [m], written.
     """
@@ -167,7 +167,7 @@ def substitute(
 
 @compiled
 def cost(cameras: Floats, points: Floats, evidence: Evidence) -> float:
-    """Return the robust sum of squares with the points' priors; infinite where one has no image.
+    """Return the robust sum of squares with the points' priors; infinite if one has no image.
 
     Args:
         cameras: (cameras, 22).
@@ -197,7 +197,7 @@ def cost(cameras: Floats, points: Floats, evidence: Evidence) -> float:
 
 @compiled
 def _prior(point: Floats, anchor: Floats, known: float, normal: Floats, slope: Floats) -> None:
-    """Start a point's normal equations with what is known of it beforehand."""
+    """Initialise a point's normal equations with its prior."""
     normal[:] = 0.0
     slope[:] = 0.0
     if 0.0 < known < np.inf:
@@ -224,7 +224,7 @@ def _add_point(
 def _factor(normal: Floats, damping: float) -> tuple[float, float, float, float, float, float]:
     """Return the Cholesky factor by rows, the diagonal raised by the damping.
 
-    Rays of one direction leave the depth of a point to rounding: it then stays where it is.
+    Parallel rays leave the depth of a point to rounding; the point then does not move.
     """
     more = 1.0 + damping
     a = _pivot(more * normal[0], normal[0])
@@ -237,7 +237,7 @@ def _factor(normal: Floats, damping: float) -> tuple[float, float, float, float,
 
 @compiled
 def _pivot(left: float, whole: float) -> float:
-    """Return the square root of what elimination leaves of a diagonal entry, never of rounding."""
+    """Return the square root of a reduced diagonal entry, at least that of its rounding error."""
     if whole <= 0.0:
         return 1.0
     return float(np.sqrt(max(left, _ROUNDING * whole)))
@@ -256,7 +256,7 @@ def _observe(
 ) -> tuple[float, float, float]:
     """Write both Jacobians of observation `o` of point `p`; return its weight and residual [px].
 
-    In scalars and without views of rows: that is a quarter of the time.
+    Scalars without views of rows take a quarter of the time.
     """
     fx, fy = cameras[c, 0], cameras[c, 1]
     r00, r01, r02 = cameras[c, 9], cameras[c, 10], cameras[c, 11]

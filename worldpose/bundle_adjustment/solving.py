@@ -1,4 +1,4 @@
-"""Cameras and points adjusted together (B2): Levenberg-Marquardt on the reduced camera system."""
+"""Bundle adjustment solver (B2): Levenberg-Marquardt on the reduced camera system."""
 
 from __future__ import annotations
 
@@ -28,31 +28,31 @@ Floats = NDArray[np.float64]
 BLOCK: Final = 256
 """Points eliminated at a time: their rows for 18 cameras (1.3 MB) stay in the cache."""
 _MOVING: Final = 0.1
-"""Share of the weakest direction, of what each camera would have of an equal division, from which a
-message names a camera [1]."""
+"""Share of the weakest direction from which a message names a camera, relative to an equal share of
+all cameras [1]."""
 
 
 class SolverSettings(Record):
-    """When the solver stops, and how it begins."""
+    """Stopping rule and initial damping of the solver."""
 
     iterations: int = Field(default=50, ge=1, le=10000)
-    """At most so many steps [1]; a dozen are usual."""
+    """Maximum steps [1]; a dozen are usual."""
     cost_change: float = Field(default=1e-8, ge=1e-12, le=1)
-    """Relative gain of a step below which it is the last [1]: two orders below what moves a joint
-    by a tenth of a millimetre."""
+    """Relative gain below which a step is the last [1]: two orders below the gain that moves a
+    joint by a tenth of a millimetre."""
     damping: float = Field(default=1e-4, ge=1e-12, le=1e6)
-    """Marquardt's, at the start [1]: starts are a few pixels off, where plain steps work."""
+    """Initial Marquardt damping [1]: initial errors are a few pixels, where plain steps work."""
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What is known: cameras and points roughly, pixels and priors.
+    """Bundle adjustment problem: initial cameras and points, pixels and priors.
 
     Attributes:
         cameras: (cameras,) batch with square pixels.
         free: (cameras, 12) bool, parameters that may move, in the order of `PARAMETERS`.
-        camera_information: (cameras, 12, 12) of a step from `cameras`: what is known of them
-            beside the observations here.
+        camera_information: (cameras, 12, 12) of a step from `cameras`: the prior, without the
+            observations here.
         points: (points, 3) [m], world.
         point_information: (points,) [1/m^2] per axis; 0 = free, infinite = fixed where it is.
         point_of: (n,) point of every observation, ascending.
@@ -79,18 +79,18 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """The solution.
+    """Solution of a bundle adjustment problem.
 
     Attributes:
         cameras: (cameras,) batch.
         offset: (cameras, 12) steps from the problem's cameras to these.
         points: (points, 3) [m], world.
         cost: robust sum of squares with priors.
-        start_cost: the same before.
-        iterations: steps that were tried.
-        converged: the last step gained less than asked for.
+        start_cost: the same at the start.
+        iterations: number of steps tried.
+        converged: whether the last step gained less than `cost_change`.
         camera_covariance: (12 cameras, 12 cameras) of steps from the solution, the points being
-            free; zero for parameters that may not move, empty if nobody asked.
+            free; zero for fixed parameters, empty if not requested.
     """
 
     cameras: Camera
@@ -109,14 +109,14 @@ def solve(
     offset: Floats | None = None,
     covariance: bool = True,
 ) -> Adjusted:
-    """Return the cameras and points that explain all observations and priors best.
+    """Return the cameras and points that fit all observations and priors best.
 
     Args:
-        problem: what is known.
+        problem: cameras, points, observations and priors.
         settings: when to stop.
-        offset: (cameras, 12) steps from the problem's cameras to where to begin, that of the
-            solution of a similar problem; None = none.
-        covariance: of the cameras is wanted; it takes as long as half a step.
+        offset: (cameras, 12) initial steps from the problem's cameras, such as the solution of a
+            similar problem; None = none.
+        covariance: whether to compute the cameras' covariance, which takes as long as half a step.
 
     Raises:
         InputError: a free point has fewer than two cameras, a point lies behind a camera that sees
@@ -145,7 +145,7 @@ def solve(
         moved = stepped(cameras, step)
         tried = system.cost(moved, trial, offset + step)
         gain = reached - tried
-        # Where no step gains more than rounding can tell, it is at rest.
+        # A gain below rounding error means convergence, too.
         converged = abs(gain) <= settings.cost_change * reached
         if gain > 0.0:
             cameras, points, offset, reached = moved, trial, offset + step, tried
@@ -171,7 +171,7 @@ def _require_two_views(problem: Problem) -> None:
 
 
 class _System:
-    """The normal equations of a problem, the points eliminated, with scratch arrays."""
+    """Normal equations of a problem, with points eliminated, and scratch arrays."""
 
     def __init__(self, problem: Problem) -> None:
         self.names = problem.names
@@ -192,14 +192,14 @@ class _System:
         self.rows = np.zeros((3 * BLOCK, self.free.size + 1))
 
     def cost(self, cameras: Camera, points: Floats, offset: Floats) -> float:
-        """The robust sum of squares with all priors."""
+        """Return the robust sum of squares with all priors."""
         known = float(np.einsum("ci,cij,cj->", offset, self.prior, offset))
         return cost(cameras.numbers, points, self.evidence) + known
 
     def step(
         self, cameras: Camera, points: Floats, damping: float, offset: Floats
     ) -> tuple[Floats, Floats]:
-        """A damped step of the cameras (cameras, 12), and where the points go with it."""
+        """Return a damped step of the cameras (cameras, 12), and the points after it."""
         matrix, diagonal, slope = self._assembled(cameras, points, damping)
         matrix[np.diag_indices_from(matrix)] += damping * diagonal
         slope += np.einsum("cij,cj->ci", self.prior, offset).ravel()[self.free]
@@ -210,14 +210,14 @@ class _System:
         return step, trial
 
     def covariance(self, cameras: Camera, points: Floats) -> Floats:
-        """The inverse of the undamped system, zero where nothing is free."""
+        """Return the inverse of the undamped system, zero for fixed parameters."""
         matrix, _, _ = self._assembled(cameras, points, 0.0)
         covariance = np.zeros((self.columns.size, self.columns.size))
         covariance[np.ix_(self.free, self.free)] = self._solved(matrix, np.eye(self.free.size))
         return covariance
 
     def _solved(self, matrix: Floats, right: Floats) -> Floats:
-        """The system solved; scaled, for its units differ by many powers of 10.
+        """Return the solution, computed with scaling: units differ by many powers of 10.
 
         Raises:
             InputError: the system is singular.
@@ -235,7 +235,7 @@ class _System:
         return np.asarray(columns * cho_solve(factor, columns * right, check_finite=False))
 
     def _movable(self, scaled: Floats) -> InputError:
-        """The error of a singular system: it names the cameras that can move."""
+        """Return the error of a singular system, which names the cameras that can move."""
         weakest = np.linalg.eigh(scaled)[1][:, 0]
         share = np.zeros(self.columns.shape)
         share.ravel()[self.free] = weakest**2
@@ -256,7 +256,7 @@ class _System:
     def _assembled(
         self, cameras: Camera, points: Floats, damping: float
     ) -> tuple[Floats, Floats, Floats]:
-        """Of the free parameters: reduced matrix, diagonal before the reduction, and slope."""
+        """Return reduced matrix, diagonal before the reduction and slope of free parameters."""
         numbers = cameras.numbers
         width = self.free.size
         blocks = np.zeros((len(numbers), STEPS, STEPS))

@@ -1,4 +1,4 @@
-"""An adjustment as the arrays and attributes of `data_contracts.bundle_adjustment`."""
+"""Arrays and attributes of an adjustment, as in `data_contracts.bundle_adjustment`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def adjustment_arrays(
     settings: BundleAdjustmentSettings,
     person: NDArray[np.integer[Any]],
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """The stored arrays and attributes of adjusted cameras, without the people.
+    """Return the stored arrays and attributes of adjusted cameras, without the people.
 
     Args:
         adjusted: the adjustment.
@@ -29,7 +29,7 @@ def adjustment_arrays(
         person: (persons,) ids.
 
     Returns:
-        Arrays by name, and attributes by name but for the camera ids.
+        Arrays by name, and attributes by name, except the camera ids.
     """
     clip = adjusted.clip
     outliers = keypoint_outliers(
@@ -81,7 +81,7 @@ def adjustment_arrays(
 
 
 def marking_errors(clip: Clip, cameras: Camera) -> NDArray[np.float64]:
-    """The root mean square error per axis (cameras,) [px] of clicks that calibration rests on.
+    """Return the root mean square error per axis (cameras,) [px] of clicks used in calibration.
 
     Args:
         clip: its clicks.

@@ -1,7 +1,7 @@
-"""What a survey's errors do to all cameras at once.
+"""Effect of survey errors on all cameras together.
 
 Cameras calibrated on the same painted lines share the errors of the survey of these lines. Each
-camera's covariance has them in it; but averaging over sixteen cameras does not lessen them.
+camera's covariance includes them, but averaging over sixteen cameras does not reduce them.
 """
 
 from __future__ import annotations
@@ -18,38 +18,38 @@ from worldpose.static_calibration.line_settings import LineRefinementSettings
 Floats = NDArray[np.float64]
 
 _SPACING: Final = 0.25
-"""Of samples along painted lines [m]."""
+"""Spacing of samples along painted lines [m]."""
 _LINE_WIDTH: Final = LineRefinementSettings().line_width
 _APART: Final = 8.0
-"""Least distance of two independent samples in a picture [px]: as far as a bar across a line is
-wide."""
+"""Minimum distance of two independent samples in an image [px]: the width of a bar across a
+line."""
 _MOST: Final = 700
-"""Samples of a picture, about [1]."""
+"""Samples per image, approximately [1]."""
 _NOISE: Final = 0.1
-"""Of a sample across its line, standard deviation [px]. With it, and the true errors of a survey,
-the response foretells how far all cameras put everybody beside himself to 0.6 of 6 mm on simulated
-matches; 0.3 foretells two thirds of it, 0.03 the same."""
+"""Standard deviation of a sample across its line [px]. With it, and the true errors of a survey,
+the response predicts the displacement of people by all cameras to 0.6 of 6 mm on simulated matches;
+0.3 predicts two thirds of it, 0.03 the same."""
 _SHIFT: Final = LineRefinementSettings().line_shift
-"""Of a whole line in one picture, standard deviation [px]; no other camera shares it."""
+"""Standard deviation of the shift of a whole line in one image [px]; no other camera shares it."""
 
 
 def survey_response(clip: Clip, survey_error: float) -> Floats:
-    """Return how calibrated cameras (cameras, 12, unknowns) move with the survey's errors.
+    """Return the response (cameras, 12, unknowns) of calibrated cameras to survey errors.
 
-    A calibration that knows about unknowns s of unit variance errs by
-    C H (K + 1)^-1 s, where C is its covariance, and H and K are the blocks of its normal equations
-    that lines give for camera and unknowns, and for the unknowns alone. Unknowns are the places of
-    the template's points, which cameras share, and a shift of each marking in the picture, which
-    is a camera's own. The lines are those that the camera sees; clicks err by far more than the
-    survey, and are left out.
+    The error of a calibration with unknowns s of unit variance is C H (K + 1)^-1 s, where C is its
+    covariance, and H and K are the blocks of lines in its normal equations, for camera and
+    unknowns, and for the unknowns alone. Unknowns are the positions of the template's points, which
+    cameras share, and a shift of each marking in the image, which each camera has on its own. The
+    lines are those that the camera sees. Clicks are left out, because their errors are far larger
+    than those of the survey.
 
     Args:
-        clip: cameras, their covariance, the pitch and who was calibrated on its lines.
-        survey_error: of the template's points, each axis, standard deviation [m].
+        clip: cameras, their covariance, the pitch, and the cameras calibrated on its lines.
+        survey_error: standard deviation of the template's points along each axis [m].
 
     Returns:
-        Zero for cameras that do not rest on lines; no unknowns without a pitch, else three for
-        each point of the template.
+        Zero for cameras not calibrated on lines; no unknowns without a pitch, else three per point
+        of the template.
     """
     count = len(clip.covariance)
     if clip.pitch is None or clip.on_lines is None or not clip.on_lines.any():
@@ -71,15 +71,15 @@ def survey_response(clip: Clip, survey_error: float) -> Floats:
 
 
 def with_shared_errors(covariance: Floats, information: Floats, response: Floats) -> Floats:
-    """Return the covariance (cameras, 12, 12) of each camera when calibrations err together.
+    """Return the covariance (cameras, 12, 12) of each camera for correlated calibrations.
 
-    The adjustment takes them for independent, which says what it weighs; how far it errs is
-    another question (the sandwich of White 1980).
+    The weights of the adjustment treat calibrations as independent; its errors follow from their
+    correlation (the sandwich of White 1980).
 
     Args:
-        covariance: (12 cameras, 12 cameras) of the adjustment as if they were.
-        information: (cameras, 12, 12) that calibrations entered with.
-        response: (cameras, 12, unknowns) of each calibration to unknowns that all share.
+        covariance: (12 cameras, 12 cameras) of the adjustment with independent calibrations.
+        information: (cameras, 12, 12) of the calibrations in the adjustment.
+        response: (cameras, 12, unknowns) of each calibration to the shared unknowns.
     """
     count, size = information.shape[:2]
     blocks = covariance.reshape(count, size, count, size)
@@ -87,13 +87,13 @@ def with_shared_errors(covariance: Floats, information: Floats, response: Floats
     pull = np.einsum("cij,cjk->cik", information, response)
     moved = np.einsum("cidj,djk->cdik", blocks, pull)
     together = moved.sum(axis=1)
-    # What a camera's own part adds to itself is in the covariance already.
+    # The covariance already has the contribution of each camera to itself.
     alone = np.einsum("cdik,cdjk->cij", moved, moved)
     return np.asarray(own + together @ together.swapaxes(1, 2) - alone)
 
 
 def _share(covariance: Floats, response: Floats) -> float:
-    """The largest share of a camera's standard deviation that a response explains."""
+    """Return the largest share of a camera's standard deviation that a response explains."""
     free = np.diag(covariance) > 0.0
     size = np.sqrt(np.diag(covariance)[free])
     factor = np.linalg.cholesky(covariance[np.ix_(free, free)] / np.outer(size, size))

@@ -1,4 +1,4 @@
-"""Finds cameras that contradict the others, and says what is wrong with them."""
+"""Detection and diagnosis of cameras that are inconsistent with the others."""
 
 from worldpose.camera_consistency.diagnosis import Consistency, Fault, check_consistency
 from worldpose.camera_consistency.explanation import describe_faults, faulty_cameras

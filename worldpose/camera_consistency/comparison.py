@@ -1,4 +1,4 @@
-"""Compares cameras of a rig at sampled frames, as they are stated and under hypotheses."""
+"""Comparison of a rig's cameras at sampled frames, as stated and under fault hypotheses."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 HEIGHTS: Final = (-0.4, 2.2)
-"""Mean heights of a person's joints above the ground that are accepted [m]."""
+"""Accepted mean heights of a person's joints above the ground [m]."""
 ORBITS_DEG: Final = (105.0, 215.0, 50.0, 320.0, 160.0, 270.0)
-"""Turns of a camera about the people at which only chance makes detections match [degree]."""
+"""Rotations of a camera about the people that leave only chance matches [degree]."""
 JOINT_NOISES: Final = (0.015, 0.025, 0.04, 0.06, 0.08)
-"""Standard deviations of a detector's joint on the body that are tried [m]."""
+"""Candidate standard deviations of a detector's joint on the body [m]."""
 KEPT: Final = 0.75
-"""Share of the matches that the least noise must keep."""
+"""Share of the most matches that the chosen noise must keep."""
 MIN_ANGLE: Final = 0.03
-"""Angle between the rays of two cameras to the people from which on these can be compared [rad]: a
-centimetre across the rays is 0.3 m along them."""
+"""Least angle between the rays of two cameras to the people for a comparison [rad]: a centimetre
+across the rays is 0.3 m along them."""
 PIVOT_RANGE: Final = (3.0, 150.0)
-"""Distances of that place from the camera [m]."""
+"""Range of distances of the pivot of rotation from the camera [m]."""
 SAME_PIXELS: Final = 1.5
-"""Distance between keypoints of two videos that counts as none [px]: compression moves them."""
+"""Distance below which keypoints of two videos are the same [px]: compression moves them."""
 SAME_SHARE: Final = 0.015
 """The same as a share of a person's height in the image."""
 UNCERTAIN: Final = 2.0
-"""Standard deviations of a camera's rays by which the gate around a person is wider."""
+"""Factor on the standard deviation of a camera's rays that widens the gate around a person."""
 IN_VIEW: Final = 0.7
-"""Share of a person's joints in the image from which on a camera should find the person."""
+"""Share of a person's joints in the image from which on a camera should detect the person."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +61,12 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """How a camera agrees with its partners under a hypothesis.
+    """Agreement of a camera with its partners under a hypothesis.
 
     Attributes:
         hypothesis: the fault, with its correction.
         matches: matches above chance, summed over the partners [persons per frame].
-        chance: matches that chance brings [persons per frame].
+        chance: matches expected by chance [persons per frame].
         partners: cameras that agree clearly.
         by_frame: (frames,) matches with all partners, chance included; NaN where the camera has
             no frame.
@@ -79,27 +79,27 @@ class Trial:
     by_frame: Floats
 
     def certainty(self, other: Trial) -> float:
-        """Return how many standard errors more matches this has than another trial."""
+        """Return the gain of matches over another trial, in standard errors."""
         gain = self.by_frame - other.by_frame
         gain = gain[np.isfinite(gain)]
         if len(gain) < 4:
             return 0.0
-        # Frames next to each other show the same people: half of them count.
+        # Neighbouring frames show the same people: half of them count.
         error = float(np.std(gain, ddof=1)) / math.sqrt(0.5 * len(gain))
         return float(gain.mean()) / max(error, 1e-3)
 
 
 class Comparison:
-    """Cameras, their detections, and how many of these match.
+    """Cameras, their detections, and the agreement between them.
 
     Attributes:
         cameras: as stated, batch (cameras,).
         count: number of cameras.
         frames: number of frames.
         sample: (n,) frames at which cameras are compared.
-        search: places among the sampled frames at which hypotheses are fitted.
-        held_out: places at which they are tested.
-        people_seen: (cameras,) mean number of detections in a frame.
+        search: indices of the sampled frames at which hypotheses are fitted.
+        held_out: indices of those at which hypotheses are tested.
+        people_seen: (cameras,) mean number of detections per frame.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class Comparison:
         ground: bool,
         settings: ConsistencySettings,
     ) -> None:
-        """Sample frames and turn their detections into rays.
+        """Sample frames and convert their detections to rays.
 
         Args:
             cameras: batch (cameras,).
@@ -144,7 +144,7 @@ class Comparison:
         Args:
             c: the camera.
             hypothesis: its correction.
-            frames: (n,) frames that get rays, -1 = none; None = the sampled ones.
+            frames: (n,) frames of the rays, -1 = none; None = the sampled ones.
         """
         camera = self.cameras[c] if hypothesis.camera is None else hypothesis.camera
         points = self._keypoints[c if hypothesis.source is None else hypothesis.source]
@@ -179,7 +179,7 @@ class Comparison:
         )
 
     def quick(self, c: int, hypothesis: Hypothesis, partners: Sequence[int]) -> float:
-        """Return the matches per frame under a hypothesis where it is fitted, with chance."""
+        """Return the matches per frame in the fitting frames under a hypothesis, with chance."""
         view = self.view(c, hypothesis, self.times(hypothesis)[self.search])
         places = np.arange(len(self.search))
         return float(
@@ -187,7 +187,7 @@ class Comparison:
         )
 
     def trial(self, c: int, hypothesis: Hypothesis, partners: Sequence[int]) -> Trial:
-        """Return how camera `c` agrees with its partners under a hypothesis, in held-out frames."""
+        """Return how camera `c` agrees with partners under a hypothesis in held-out frames."""
         view, there = self.view(c, hypothesis), self.held_out
         at = np.where(self.times(hypothesis)[there] < 0, -1, there)
         matches = chance = 0.0
@@ -225,8 +225,7 @@ class Comparison:
     def is_side_by_side(self, a: int, b: int) -> bool:
         """Return whether people see two cameras in nearly one direction.
 
-        Rays of such cameras meet anywhere along themselves, so that they cannot contradict each
-        other.
+        Rays of such cameras meet anywhere along themselves, so the cameras cannot be inconsistent.
         """
         view, partner = self.views[a], self.views[b]
         ray = _mean_ray(view)
@@ -237,10 +236,10 @@ class Comparison:
         return apart < MIN_ANGLE * float(np.clip(depth, *PIVOT_RANGE))
 
     def fit_noise(self) -> None:
-        """Take the least noise of joints with which the cameras agree nearly as much as with most.
+        """Choose the least joint noise with nearly as much agreement as the best one.
 
-        People close together are told apart, and small faults seen, only at the noise that there
-        is; it differs between detectors and with people's size in the image.
+        People close together can be separated, and small faults detected, only at the actual noise;
+        it differs between detectors and with people's size in the image.
         """
         pairs = [(a, b) for a in range(self.count) for b in range(a)]
         totals = []
@@ -283,7 +282,7 @@ class Comparison:
 
         Args:
             among: the cameras.
-            views: least cameras that must see a person.
+            views: least number of cameras with a view of each person.
         """
         found = []
         most = max(self.views[c].rays.shape[1] for c in among)
@@ -304,11 +303,11 @@ class Comparison:
     def shares(
         self, c: int, hypothesis: Hypothesis, people: Sequence[Floats]
     ) -> tuple[float, float, int]:
-        """Return how a camera agrees with people whom others found.
+        """Return the agreement of a camera with people detected by others.
 
         Returns:
-            Share of the camera's detections that are one of them, share of those in the camera's
-            image that it found, and how many are in its image [person-frames].
+            Share of the camera's detections that match these people, share of the people in its
+            image that it detected, and their number [person-frames].
         """
         camera = self.cameras[c] if hypothesis.camera is None else hypothesis.camera
         view = self.view(c, hypothesis)
@@ -319,7 +318,7 @@ class Comparison:
             if at[n] < 0:
                 continue
             rays = view.rays[n][None]
-            # An uncertain pose may put all people beside their detections.
+            # An uncertain pose may shift all people off their detections.
             distance = np.linalg.norm(np.nanmean(joints, axis=1) - view.center, axis=-1)
             gates = gate + UNCERTAIN * float(view.spread[n].max(initial=0.0)) * distance
             weights = np.isfinite(rays[..., 0]).astype(np.float64)
@@ -345,17 +344,17 @@ class Comparison:
 
 
 def chance_noise(chance: float) -> float:
-    """Return the standard deviation of matches per frame that chance brings.
+    """Return the standard deviation of the number of chance matches per frame.
 
-    A clip has some ten independent moments: people move on slowly.
+    A clip has some ten independent moments: people move slowly.
     """
     return 0.3 * math.sqrt(float(chance) + 0.05)
 
 
 def _orbited(view: View, partner: View, degrees: Sequence[float]) -> Iterator[View]:
-    """Yield the camera turned about the vertical through the place at which both look.
+    """Yield the view rotated about the vertical through the point that both cameras look at.
 
-    It sees as many people at the same heights as before, at wrong places: a displacement would
+    It shows as many people at the same heights as before, at wrong positions: a translation would
     keep matches along the rays.
     """
     pivot = _meeting_place(view, partner)
@@ -372,7 +371,7 @@ def _orbited(view: View, partner: View, degrees: Sequence[float]) -> Iterator[Vi
 
 
 def _meeting_place(view: View, partner: View) -> Floats:
-    """Return the place (3,) [m] on a view's mean ray that is nearest to its partner's."""
+    """Return the point (3,) [m] on a view's mean ray that is nearest to its partner's."""
     ray, other = (_mean_ray(each) for each in (view, partner))
     way = partner.center - view.center
     cosine = float(ray @ other)

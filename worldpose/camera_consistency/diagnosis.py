@@ -1,4 +1,4 @@
-"""Which cameras contradict the others, and the fault that explains it best."""
+"""Cameras that are inconsistent with the others, and the most probable fault of each."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from worldpose.tracking.clip_arrays import ClipArray
 Floats = NDArray[np.float64]
 
 PARTNERS: Final = 4
-"""Cameras that a camera which agrees is compared with more closely."""
+"""Number of partners for the closer comparison of a camera that agrees with others."""
 PARTNERS_OF_GROSS: Final = 6
-"""The same for a camera that agrees with less than half: those that the others confirm most."""
+"""The same for a camera that agrees with less than half: those with most agreement with others."""
 GIVEN_TILT: Final = 0.003
-"""How far a given camera may be turned without being wrong [rad]."""
+"""Largest plausible rotation error of a given camera [rad]."""
 MIN_FOCAL_ERROR: Final = 0.03
-"""Logarithm of a focal length's ratio from which on it is called wrong."""
+"""Least logarithm of a focal length's ratio that is a fault."""
 MIN_SHIFT: Final = 2
-"""Shift of a clock from which on it is called wrong [frame]; less is estimated in triangulation."""
+"""Least clock offset that is a fault [frame]; triangulation estimates smaller ones."""
 CLEAR: Final = 0.5
-"""Share of a camera's detections that match those of one other, below which all is tried."""
+"""Share of a camera's detections that match another camera's, below which all faults are tried."""
 RATES: Final = (0.5, 2.0, 24 / 25, 25 / 24, 25 / 30, 30 / 25, 24 / 30, 30 / 24)
-"""Ratios of the real to the stated frame rate that are tried."""
+"""Candidate ratios of the actual to the stated frame rate."""
 CLOCK_BAND_S: Final = 0.5
-"""Shift of a clock that is tried where a camera agrees in part [s]; else the whole stretch."""
+"""Range of clock offsets for a camera in partial agreement [s]; else the whole chunk."""
 MIN_GAIN: Final[dict[FaultKind, float]] = {
     "flipped": 1.5,
     "mirrored": 1.5,
@@ -54,35 +54,35 @@ MIN_GAIN: Final[dict[FaultKind, float]] = {
     "clock": 1.15,
     "frame_rate": 1.15,
 }
-"""Least ratio of matches with and without the correction. Lens orders have no free number."""
+"""Least ratio of matches with and without the correction. Lens orders have no free parameter."""
 SIMPLER: Final[dict[FaultKind, float]] = {
     "pose": 1.05,
     "focal": 1.02,
     "lens": 1.02,
     "frame_rate": 1.05,
 }
-"""How many times as many matches an explanation needs to be preferred to a simpler one."""
+"""Ratio of matches at which an explanation is preferred to a simpler one."""
 FINE: Final = ("focal", "lens", "clock", "frame_rate")
 """Faults that may be small."""
 MIN_CERTAINTY: Final = 3.5
 """Least certainty of a small fault, in standard errors."""
 CONTRADICTED: Final = 0.2
-"""Share of the people in a camera's image below which, if it finds so few, others contradict it."""
+"""Share of the people in its image below which a camera's detections are inconsistent."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A camera that contradicts the others.
+    """A camera that is inconsistent with the others.
 
     Attributes:
-        camera: its place among the cameras.
+        camera: its index.
         kind: the most probable fault.
-        detail: what exactly, in words; may be empty.
-        value: ratio or frames, where the fault has one.
-        other: place of the other camera of a swap, duplicate or contradiction.
+        detail: description; may be empty.
+        value: ratio or frames, if the fault has one.
+        other: index of the other camera of a swap, duplicate or contradiction.
         cause: of a contradiction, the fault of this camera that would explain it.
         share_now: share of its detections that agree with others as stated [1].
-        share_corrected: the same with the fault corrected; None where no correction is known.
+        share_corrected: the same after correction of the fault; None without a known correction.
     """
 
     camera: int
@@ -97,12 +97,12 @@ class Fault:
 
 @dataclass(frozen=True)
 class Consistency:
-    """What cameras say of each other.
+    """Result of the consistency check.
 
     Attributes:
-        faults: cameras that contradict the others, the clearest first.
-        confirmed: cameras that others agree with.
-        unconfirmed: cameras that share nobody with others: nothing is known of them.
+        faults: inconsistent cameras, the clearest first.
+        confirmed: cameras in agreement with others.
+        unconfirmed: cameras without people in common with others, which cannot be checked.
         agreement: (cameras, cameras) matches of two cameras above chance [persons per frame].
     """
 
@@ -122,22 +122,22 @@ def check_consistency(
     *,
     ground: bool = True,
 ) -> Consistency:
-    """Return which cameras contradict the others, and the most probable fault of each.
+    """Return the inconsistent cameras, and the most probable fault of each.
 
-    Every two cameras are compared by how many of their detections meet in space, one to one, above
-    what chance brings. The largest group that agrees is taken for right. For every other camera,
-    and for those of the group that agree in part, hypotheses are tried: each corrects the camera's
-    calibration, images or clock. What makes clearly more detections match, in frames that it
-    was not fitted to, is the fault.
+    The agreement of two cameras is the number of their detections that meet in 3D, one to one,
+    above chance. The largest group of cameras in agreement counts as correct. Every other camera,
+    and those of the group in partial agreement, are tested against hypotheses that each correct
+    the camera's calibration, images or clock. The fault is the one whose correction clearly
+    increases matches, in frames that it was not fitted to.
 
     Args:
         cameras: batch (cameras,).
         covariance: (cameras, 12, 12) of a step of each; NaN or None for given cameras.
         keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
-        confidence: (frames, cameras, detections, 17); 0 or less leaves a keypoint out. Its size
-            says nothing here.
+        confidence: (frames, cameras, detections, 17); 0 or less excludes a keypoint, only the sign
+            counts.
         fps: frames per second [1/s].
-        settings: frames that are compared, and noise.
+        settings: number of compared frames, and noise.
         ground: whether people stand on z = 0; else they may be anywhere.
 
     Raises:
@@ -173,7 +173,7 @@ def check_consistency(
 
 
 def _busiest(confidence: ClipArray, longest: int) -> slice:
-    """Return the stretch of frames, of at most `longest`, with the most detections."""
+    """Return the chunk of frames, of at most `longest`, with the most detections."""
     frames = confidence.shape[0]
     if frames <= longest:
         return slice(0, frames)
@@ -185,7 +185,7 @@ def _busiest(confidence: ClipArray, longest: int) -> slice:
 
 
 def _calibration_noise(camera: Camera, covariance: Floats) -> float:
-    """Return how far off the camera's uncertainty puts people in its image [px]."""
+    """Return the standard deviation of people's image positions due to the calibration [px]."""
     size = camera.image_size
     grid = np.stack(np.meshgrid(*(s * np.array([0.2, 0.5, 0.8]) for s in size)), -1).reshape(-1, 2)
     rays = camera.unproject(grid)
@@ -201,7 +201,7 @@ def _calibration_noise(camera: Camera, covariance: Floats) -> float:
 
 
 class _Diagnosis:
-    """Peels off the camera with the clearest fault until none is left."""
+    """Iterative diagnosis: removes the camera with the clearest fault until none is left."""
 
     def __init__(
         self,
@@ -224,7 +224,7 @@ class _Diagnosis:
         self.faults: list[Fault] = []
 
     def run(self) -> Consistency:
-        """Return the faults, and which cameras others confirm."""
+        """Return the faults, and the confirmed and unconfirmed cameras."""
         count = self.comparison.count
         self.find_duplicates()
         core = self.core([c for c in range(count) if c not in self.faulty])
@@ -247,11 +247,11 @@ class _Diagnosis:
 
     @property
     def faulty(self) -> set[int]:
-        """Cameras that are known to be wrong."""
+        """Cameras with a fault."""
         return {fault.camera for fault in self.faults}
 
     def core(self, among: Sequence[int]) -> list[int]:
-        """Return the connected cameras with the most agreement; none where no two agree."""
+        """Return the connected group of cameras with the most agreement; empty if no two agree."""
         edges = self.agreement > 4.0 * self.deviation
         left, best, most = set(among), list[int](), 0.0
         while left:
@@ -268,7 +268,7 @@ class _Diagnosis:
         return best
 
     def peel(self, core: list[int]) -> None:
-        """Find faults among cameras that agree in part, the clearest first."""
+        """Find faults among cameras in partial agreement, the clearest first."""
         seen = self.comparison.people_seen
         share = self.agreement / np.maximum(1.0, np.minimum(seen[:, None], seen))
         suspects = list(core)
@@ -277,7 +277,7 @@ class _Diagnosis:
             for c in suspects:
                 partners = [p for p in core if p != c and p not in self.faulty]
                 gross = bool(share[c].max() < CLEAR)
-                if gross:  # those that agree with it by chance would not test it
+                if gross:  # partners that agree with it by chance would not test it
                     support = {p: sum(share[p, q] for q in partners) for p in partners}
                     partners.sort(key=lambda p: -support[p])
                 else:
@@ -293,7 +293,7 @@ class _Diagnosis:
             suspects = [c for _, c, _ in found if c != worst]
 
     def blame(self, c: int, trial: Trial, core: Sequence[int]) -> None:
-        """Note a fault that the cameras of `core` show; with one camera alone, a contradiction."""
+        """Record a fault shown by the cameras of `core`; by one camera alone, a contradiction."""
         others = [p for p in core if p != c]
         people = self.comparison.people(others) if len(others) > 1 else None
         now = corrected = 0.0
@@ -329,7 +329,7 @@ class _Diagnosis:
     # -- faults of cameras that agree with no others -----------------------------------------
 
     def find_duplicates(self) -> None:
-        """Find cameras with the same video: the one that others confirm less is wrong."""
+        """Record cameras with the same video: the one with less agreement with others is wrong."""
         count = self.comparison.count
         support = np.where(self.agreement > 4.0 * self.deviation, self.agreement, 0.0).sum(axis=1)
         for a in range(count):
@@ -340,14 +340,14 @@ class _Diagnosis:
                 self.faults.append(Fault(wrong, "duplicate", other=right))
 
     def complete_swaps(self, core: Sequence[int]) -> None:
-        """Note the other camera of each swap, unless others confirm it."""
+        """Record the other camera of each swap, unless others confirm it."""
         for fault in list(self.faults):
             other = fault.other
             if fault.kind == "swapped" and other not in {None, *core, *self.faulty}:
                 self.faults.append(replace(fault, camera=int(other or 0), other=fault.camera))
 
     def contradictions(self) -> None:
-        """Where no two cameras agree, find the single fault that makes them agree."""
+        """Record the single fault whose correction makes cameras agree, if no two of them do."""
         comparison = self.comparison
         judged = [c for c in range(comparison.count) if c not in self.faulty]
         left = [
@@ -377,7 +377,7 @@ class _Diagnosis:
             self.blame(c, trial, [next(p for p in left if p != c)])
 
     def exchanged(self, a: int, b: int) -> Trial | None:
-        """Return the agreement of two cameras with each other's videos; None without."""
+        """Return the agreement of two cameras after a swap of their videos, or None."""
         comparison = self.comparison
         views = [
             comparison.view(c, Hypothesis("swapped", "", source=s)) for c, s in ((a, b), (b, a))
@@ -393,7 +393,7 @@ class _Diagnosis:
         return Trial(Hypothesis("swapped", "", source=b), found - now, now, 1, by_frame)
 
     def unexplained(self, c: int, core: Sequence[int]) -> None:
-        """Note a camera that misses the people whom the others see, whatever is the reason."""
+        """Record a camera that misses people seen by the others, without a known cause."""
         people = self.comparison.people(core, views=3)
         share, found, expected = self.comparison.shares(c, STATED, people)
         seen = np.isfinite(self.comparison.views[c].rays[..., 0]).any(axis=-1).sum()
@@ -404,14 +404,14 @@ class _Diagnosis:
     # -- one camera --------------------------------------------------------------------------
 
     def explain(self, c: int, partners: Sequence[int], gross: bool) -> tuple[Trial, Trial] | None:
-        """Return the fault of a camera that its partners confirm and the camera as stated.
+        """Return the trial of a camera's best confirmed fault, and of the camera as stated.
 
         Every kind of fault is fitted to a third of the frames and tested on the others.
 
         Args:
             c: the camera.
-            partners: cameras that are taken for right.
-            gross: whether it agrees with none, so that everything is tried.
+            partners: cameras assumed correct.
+            gross: whether the camera agrees with none, so that all kinds are tried.
         """
         if not partners:
             return None
@@ -425,7 +425,7 @@ class _Diagnosis:
                 continue
             if now is None:
                 now = comparison.trial(c, self.polished(c, STATED, partners), partners)
-            # The camera as stated was turned to fit best; its small corrections get the same.
+            # The stated camera was rotated for the best fit; its small corrections get the same.
             fine = hypothesis.kind in FINE
             tried = self.polished(c, hypothesis, partners) if fine else hypothesis
             trial = comparison.trial(c, tried, partners)
@@ -437,9 +437,9 @@ class _Diagnosis:
 
     @staticmethod
     def certain(trial: Trial, now: Trial) -> bool:
-        """Return whether a correction brings more matches than chance does.
+        """Return whether a correction increases matches beyond chance.
 
-        Frames that agree make a small change certain; several partners make a large one.
+        Consistent gains over frames prove a small change; several partners prove a large one.
         """
         if trial.hypothesis.kind in FINE and trial.certainty(now) > MIN_CERTAINTY:
             return True
@@ -450,13 +450,13 @@ class _Diagnosis:
 
     @staticmethod
     def rank(trial: Trial) -> float:
-        """Return how good an explanation is: matches, less for what has more freedom."""
+        """Return the rank of an explanation: matches, reduced for kinds with more freedom."""
         return trial.matches / SIMPLER.get(trial.hypothesis.kind, 1.0)
 
     def polished(self, c: int, hypothesis: Hypothesis, partners: Sequence[int]) -> Hypothesis:
-        """Return the hypothesis with the camera turned, within its uncertainty, to fit best.
+        """Return the hypothesis with the camera rotated, within its uncertainty, for the best fit.
 
-        A small turn of a camera looks like some faults of its lens.
+        A small rotation of a camera resembles some faults of its lens.
         """
         camera = self.comparison.cameras[c] if hypothesis.camera is None else hypothesis.camera
         best, value = hypothesis, self.comparison.quick(c, hypothesis, partners)
@@ -478,7 +478,7 @@ class _Diagnosis:
     def proposals(
         self, c: int, partners: Sequence[int], gross: bool
     ) -> Iterator[tuple[float, Hypothesis]]:
-        """Yield the best correction of each kind, with the matches where it was fitted."""
+        """Yield the best correction of each kind, with its matches in the fitting frames."""
         comparison, camera = self.comparison, self.comparison.cameras[c]
 
         def best(options: Iterable[Hypothesis]) -> Iterator[tuple[float, Hypothesis]]:
@@ -504,7 +504,7 @@ class _Diagnosis:
     def clocks(
         self, c: int, partners: Sequence[int], gross: bool
     ) -> Iterator[tuple[float, Hypothesis]]:
-        """Yield the best constant shift of a camera's clock, and the best other frame rate."""
+        """Yield the best constant clock offset, and the best other frame rate."""
         comparison, search = self.comparison, self.comparison.search
         view = comparison.view(c, STATED, np.arange(comparison.frames))
         longest = comparison.frames - 1
@@ -519,7 +519,7 @@ class _Diagnosis:
                 table[:, k] += comparison.scores(view, comparison.views[p], at, there)
         moments = comparison.sample[search]
         rates = np.array((1.0, *RATES))
-        # Matches along lines of the table, of every rate and start.
+        # Matches along lines of the table, for every rate and start.
         rows = shifts[:, None] + np.round((rates[:, None, None] - 1.0) * moments) + band
         rows = rows.astype(np.int64)
         inside = (rows >= 0) & (rows < len(shifts))
@@ -533,13 +533,13 @@ class _Diagnosis:
         yield float(along[1:].max()), self.timed("frame_rate", rate, int(shifts[column]), rate)
 
     def timed(self, kind: FaultKind, value: float, start: int, rate: float) -> Hypothesis:
-        """Return the hypothesis that a camera's clock starts and runs otherwise."""
+        """Return the hypothesis of another start and rate of a camera's clock."""
         frames = np.round(start + rate * self.comparison.sample).astype(np.int64)
         inside = (frames >= 0) & (frames < self.comparison.frames)
         return Hypothesis(kind, "", value=value, time=np.where(inside, frames, -1))
 
 
 def focal_lengths(camera: Camera, around: float, reach: float, steps: int) -> Iterator[Hypothesis]:
-    """Yield focal lengths about `around` times the stated one, in logarithmic steps."""
+    """Yield focal lengths around `around` times the stated one, in logarithmic steps."""
     for ratio in around * np.exp(np.linspace(-reach, reach, 2 * steps + 1)):
         yield Hypothesis("focal", "", focal_scaled(camera, float(ratio)), value=float(1.0 / ratio))

@@ -1,4 +1,4 @@
-"""What people are told of a camera that contradicts the others."""
+"""Descriptions of inconsistent cameras for users."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from worldpose.camera_consistency.diagnosis import Consistency, Fault
 
 
 def faulty_cameras(found: Consistency) -> set[int]:
-    """Return the places of cameras that are known to be wrong.
+    """Return the indices of cameras with a known fault.
 
-    Where two cameras contradict each other, nothing tells which of them is.
+    If two cameras contradict each other, it is unknown which one is wrong.
     """
     return {fault.camera for fault in found.faults if fault.kind != "contradiction"}
 
@@ -22,7 +22,7 @@ def describe_faults(
     """Return the faults with the cameras' names and a reason that says what to do.
 
     Args:
-        found: what the cameras say of each other.
+        found: result of the consistency check.
         cameras: ids in the order of the cameras.
         offset_frames: stated offset of each camera's video [frame].
         fps: frames per second of the match [1/s].
@@ -42,7 +42,7 @@ def describe_faults(
 
 
 def _reason(fault: Fault, cameras: Sequence[str], offset: int, fps: float) -> str:
-    """Return one sentence: what is wrong, what to do, and how many detections show it."""
+    """Return one sentence: the fault, the correction, and the share of detections in support."""
     other = "" if fault.other is None else cameras[fault.other]
     if fault.kind == "contradiction":
         cause = _cause(fault, fault.cause or "pose", fault.detail, other, offset, fps)

@@ -1,4 +1,4 @@
-"""What may be wrong with a camera; a hypothesis says how to correct its calibration or images."""
+"""Hypotheses about a camera's fault, each with a correction of its calibration or images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from data_contracts.camera_consistency import FaultKind
 from worldpose.cameras import Camera, Rigid
 
 LEFT_RIGHT: Final = np.array([0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15])
-"""COCO-17 with left and right exchanged."""
+"""COCO-17 with left and right swapped."""
 LENS_ORDERS: Final = (
     (0, 1, 3, 4, 2),
     (0, 1, 4, 2, 3),
@@ -29,7 +29,7 @@ LENS_ORDERS: Final = (
     (1, 2, 3, 4, 0),
     (4, 0, 1, 2, 3),
 )
-"""Places at which k1 k2 p1 p2 k3 may stand among the five stated numbers."""
+"""Possible positions of k1 k2 p1 p2 k3 among the five stated numbers."""
 LENGTH_UNITS: Final = {
     "millimetres": 1e-3,
     "centimetres": 1e-2,
@@ -37,22 +37,23 @@ LENGTH_UNITS: Final = {
     "feet": 0.3048,
     "yards": 0.9144,
 }
-"""Metres of the units that a position may be stated in."""
+"""Metres per unit that a position may be stated in."""
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One possible fault of a camera, by its correction.
+    """A possible fault of a camera, represented by its correction.
 
     Attributes:
         kind: of the fault.
-        detail: what exactly, for people.
+        detail: description for users.
         camera: the corrected calibration; None = as stated.
-        mirrored: whether the detections are mirrored back, left for right.
-        upside_down: whether the detections are turned by 180 degrees.
-        value: the number that was estimated: ratio, frames; None without.
-        source: camera whose detections it gets; None = its own.
-        time: (sampled frames,) its frame at each of them, -1 = none; None = the same frame.
+        mirrored: whether the detections are mirrored back, with left and right swapped.
+        upside_down: whether the detections are rotated by 180 degrees.
+        value: the estimated number: ratio, frames; None without.
+        source: camera whose detections are used; None = its own.
+        time: (sampled frames,) the camera's frame at each of them, -1 = none; None = the same
+            frame.
     """
 
     kind: FaultKind
@@ -67,7 +68,7 @@ class Hypothesis:
     def corrected(
         self, stated: NDArray[np.float64], size: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return detections (..., 17, 2) [px] as a right video would have shown them."""
+        """Return detections (..., 17, 2) [px] as a correct video would show them."""
         if self.mirrored:
             image = stated[..., LEFT_RIGHT, :].copy()
             image[..., 0] = size[0] - 1.0 - image[..., 0]
@@ -78,7 +79,7 @@ class Hypothesis:
 
 
 STATED: Final = Hypothesis("pose", "")
-"""A camera as it is stated."""
+"""A camera as stated."""
 
 
 def posed(
@@ -94,13 +95,13 @@ def focal_scaled(camera: Camera, ratio: float) -> Camera:
 
 
 def turned(camera: Camera, rotvec: NDArray[np.float64]) -> Camera:
-    """Return the camera turned about its own centre by a rotation vector [rad] of its axes."""
+    """Return the camera rotated about its own centre by a rotation vector [rad] of its axes."""
     rotation = Rotation.from_rotvec(rotvec).as_matrix() @ camera.cam_from_world.rotation
     return posed(camera, rotation, -rotation @ camera.center)
 
 
 def pose_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
-    """Yield how a whole pose may be wrong: other end, mirrored, units, conventions."""
+    """Yield possible errors of a whole pose: other end, mirrored, units, conventions."""
     rotation, t = camera.cam_from_world.rotation, camera.cam_from_world.translation
     half = np.diag([-1.0, -1.0, 1.0])
     yield Hypothesis("flipped", "", posed(camera, rotation @ half, t))
@@ -145,7 +146,7 @@ def pose_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
 
 
 def lens_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
-    """Yield how lens coefficients may be misread: in another order, inverted, not there."""
+    """Yield possible misreadings of lens coefficients: other order, inverted, absent."""
     stated = camera.distortion
     tried = [stated]
     orders = [(stated[list(order)], order) for order in LENS_ORDERS]

@@ -1,4 +1,4 @@
-"""Agreement of two cameras: how many detections show the same person, frame by frame."""
+"""Agreement of two cameras: number of detections of the same person, frame by frame."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from worldpose.compiled import compiled
 
 MIN_JOINTS = 6
-"""Least joints that two detections must have in common."""
+"""Least number of common joints of two detections."""
 MIN_SINE = 0.08
 """Least sine of the angle between two rays: nearly parallel rays meet everywhere."""
 CLIP = 16.0
 """Largest squared deviation of one joint: an outlier counts no more."""
 EARLY_JOINTS, EARLY_LIMIT = 4, 13.0
-"""After so many joints a pair with a larger mean squared deviation is given up."""
+"""After this number of joints a pair with a larger mean squared deviation is rejected."""
 WIDTH = 1.5
-"""Deviation at which a match counts 61 %: the noise is known to a factor of about two."""
+"""Deviation at which a match counts 61 %: the noise is uncertain by a factor of about two."""
 SIZE_RANGE = (0.15, 1.1)
 """Accepted root mean square distance of a person's joints from their mean [m]: about 0.45 for a
 standing adult, more along nearly parallel rays."""
@@ -37,21 +37,21 @@ def pair_scores(
     heights: tuple[float, float],
     joint_noise: float,
 ) -> NDArray[np.float64]:
-    """Return how many detections of two cameras match one to one, frame by frame.
+    """Return the number of one-to-one matches between two cameras' detections, frame by frame.
 
-    A match counts between 0 and 1, by the distance between its rays in standard deviations.
-    Matches are taken greedily, best first.
+    A match counts between 0 and 1, by the distance between its rays in standard deviations. The
+    assignment is greedy, best first.
 
     Args:
         rays_a: (frames, detections, 17, 3) unit rays of the first camera, world; NaN where not
             seen.
         center_a: (3,) [m], world, its position.
         spread_a: (frames, detections) standard deviation of a ray's direction [rad].
-        frames_a: (n,) frames that are compared; -1 = none.
+        frames_a: (n,) compared frames; -1 = none.
         rays_b: the same of the second camera.
         center_b: its position.
         spread_b: its spread.
-        frames_b: (n,) frame compared with each of `frames_a`.
+        frames_b: (n,) frame of the second camera for each of `frames_a`.
         heights: lowest and highest mean height of a person's joints [m]; infinite where the
             ground is unknown.
         joint_noise: standard deviation of a detector's joint, on the body [m].
@@ -107,7 +107,7 @@ def _weights(
     heights: tuple[float, float],
     joint_noise: float,
 ) -> NDArray[np.float64]:
-    """Return how well each two detections (a, b) match, 0 to 1."""
+    """Return the match weights of every two detections (a, b), 0 to 1."""
     count_a, joints, _ = rays_a.shape
     count_b = rays_b.shape[0]
     weights = np.zeros((count_a, count_b))

@@ -1,4 +1,4 @@
-"""Cameras: where a world point appears, and which ray a pixel sees.
+"""Camera models: projection of world points to pixels, and unprojection of pixels to rays.
 
 Inputs: calibrations, world points [m] or pixels. Outputs: pixels with Jacobians, rays, distances.
 """

@@ -1,7 +1,7 @@
 """Lens distortion with OpenCV's five coefficients k1 k2 p1 p2 k3, and the radius where it folds.
 
 With s = r^2 the radial part moves radius r to h(r) = r (1 + k1 s + k2 s^2 + k3 s^3). At the first
-zero of its slope h turns back; beyond it the formula gives numbers without meaning.
+zero of its slope h folds back; beyond it the formula has no meaning.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ def fold_radius(distortion: ArrayLike) -> NDArray[np.float64]:
         distortion: (..., 5) k1 k2 p1 p2 k3.
 
     Returns:
-        (...) radius; infinite where there is no fold within a radius of 1e6, NaN where a
-        coefficient is missing.
+        (...) radius; infinite without a fold within a radius of 1e6, NaN where a coefficient is
+        missing.
 
     Raises:
         InputError: the last dimension is not 5.
@@ -90,7 +90,7 @@ def fold_squared(k1: float, k2: float, k3: float) -> float:
 
 @compiled
 def _turning_points(a: float, b: float, c: float) -> tuple[float, float]:
-    """Return the positive roots of a + 2 b s + 3 c s^2 in rising order, infinity for missing."""
+    """Return the positive roots of a + 2 b s + 3 c s^2 in rising order, infinity if missing."""
     discriminant = b * b - 3.0 * a * c
     if discriminant < 0.0:
         return np.inf, np.inf

@@ -1,4 +1,4 @@
-"""Surfaces in a picture: every vertex through the lens."""
+"""Projection of surface vertices into an image, through the lens."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _OK = int(RayStatus.OK)
 
 @dataclass(frozen=True, eq=False)
 class Outlines:
-    """Where surfaces are in a picture.
+    """Image positions of surfaces.
 
     Attributes:
         pixels: (surfaces, vertices, 3) pixel [px] and depth [m]; NaN without an image.
@@ -32,7 +32,7 @@ class Outlines:
     boxes: Floats
 
     def box(self, number: int, margin: int, width: int, height: int) -> Box | None:
-        """Return the part of the picture with one of them: left, top, right, bottom."""
+        """Return the part of the image that shows a surface: left, top, right, bottom."""
         if not np.isfinite(self.boxes[number]).all():
             return None
         left, top, right, bottom = self.boxes[number]
@@ -46,7 +46,7 @@ class Outlines:
 
 
 def outline_surfaces(camera: Camera, vertices: Singles) -> Outlines:
-    """Return outlines in a single camera's picture of (surfaces, vertices, 3) [m], world."""
+    """Return outlines in a single camera's image of (surfaces, vertices, 3) [m], world."""
     pixels, boxes = np.empty_like(vertices), np.empty((len(vertices), 4))
     _project(camera.numbers, vertices, pixels, boxes)
     return Outlines(pixels, boxes)

@@ -1,4 +1,4 @@
-"""Pinhole cameras with lens distortion: projection with Jacobians, and back to rays."""
+"""Pinhole cameras with lens distortion: projection with Jacobians, and unprojection to rays."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _PARTS = {"focal": 2, "principal_point": 2, "distortion": 5, "image_size": 2}
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Pixels of world points, and how they move with the point and with the camera.
+    """Pixels of world points, and their derivatives by the point and by the camera.
 
     All arrays are NaN where `status` is not OK.
     """
@@ -51,8 +51,8 @@ class Projection:
 class Camera:
     """One pinhole camera with OpenCV's five distortion coefficients, or a batch of them.
 
-    Batch dimensions of the fields broadcast against each other. A camera with a NaN is missing:
-    it sees nothing.
+    Batch dimensions of the fields broadcast against each other. A camera with a NaN is missing: its
+    pixels and rays are NaN.
 
     Raises:
         InputError: a field has the wrong shape, or the batches do not broadcast.
@@ -90,7 +90,7 @@ class Camera:
 
     @classmethod
     def stack(cls, cameras: Sequence[Camera]) -> Camera:
-        """Return one batch of cameras, the first dimension counting the given ones.
+        """Return one batch of cameras, stacked along a new first dimension.
 
         Raises:
             InputError: there are none, or their batch shapes differ.

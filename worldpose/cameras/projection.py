@@ -23,10 +23,10 @@ _BEYOND_FOLD = int(RayStatus.BEYOND_FOLD)
 _NOT_CONVERGED = int(RayStatus.NOT_CONVERGED)
 
 _MAX_ITERATIONS = 100
-# Largest accepted misfit of an inverse on the plane z = 1: 7e-10 px at the longest focal length
-# met in practice, 7100 px.
+# Largest accepted residual of an inverse on the plane z = 1: 7e-10 px at the longest focal length
+# in practice, 7100 px.
 _MISFIT = 1e-13
-# Relative misfit that the rounding of the polynomial alone can leave: two units.
+# Relative residual that rounding of the polynomial alone can leave: two units.
 _ROUNDING = 4.5e-16
 
 
@@ -78,7 +78,7 @@ def project_with_jacobians(
             s = a * a + b * b
             for k in range(2):
                 f = c[k]
-                # The chain: distorted from undistorted (g), undistorted from camera (h).
+                # Chain rule: distorted from undistorted (g), undistorted from camera (h).
                 gx, gy = (dxx, dxy) if k == 0 else (dxy, dyy)
                 hx, hy = f * gx / z, f * gy / z
                 hz = -(hx * a + hy * b)
@@ -141,7 +141,7 @@ def point_rays(cameras: Floats, plane: Floats, directions: Floats) -> None:
 
 @compiled
 def is_finite(c: Floats) -> bool:
-    """Return whether the camera is there; its fold may be infinite all the same."""
+    """Return whether the camera has all parameters; its fold radius may be infinite."""
     total = 0.0
     for value in c[:-1]:
         total += abs(value)
@@ -165,7 +165,7 @@ def project_point(
         status = _BEHIND
     else:
         one_to_one = a * a + b * b < c[21] * c[21] and abs(xd) + abs(yd) < np.inf
-        # Tangential terms bend the fold; without them the radius alone decides.
+        # Tangential terms deform the fold; without them the radius alone decides.
         if c[6] != 0.0 or c[7] != 0.0:
             one_to_one = one_to_one and dxx * dyy - dxy * dxy > 0.0
         if not one_to_one:
@@ -194,7 +194,7 @@ def _undistort(c: Floats, xd: float, yd: float) -> tuple[float, float, int]:
 def _undistort_radius(c: Floats, radius_d: float) -> tuple[float, int]:
     """Return the radius below the fold that the radial part moves to `radius_d`, and a RayStatus.
 
-    Beyond the fold the answer is a radius just inside it, a start for the tangential polish.
+    Beyond the fold the result is a radius just inside it, a start for the tangential refinement.
     """
     k1, k2, k3 = c[4], c[5], c[8]
     low, high = 0.0, c[21]
@@ -227,7 +227,7 @@ def _undistort_radius(c: Floats, radius_d: float) -> tuple[float, int]:
 def _polish(
     c: Floats, x: float, y: float, xd: float, yd: float
 ) -> tuple[float, float, float, bool]:
-    """Return the point after damped Newton steps on the full model, its misfit, and the obstacle.
+    """Return the point after damped Newton steps on the full model, its residual, and the obstacle.
 
     A step is halved until it lowers the misfit and stays where the model is one to one; the last
     entry says whether the fold was in the way of the last step.

@@ -1,8 +1,8 @@
-"""Triangles in a picture: a z-buffer with four samples a pixel, each at its moment of the shutter.
+"""Triangle rasterizer: z-buffer with four samples per pixel, spread over the exposure time.
 
-A sample lies at its own place within the pixel and at its own moment while the shutter is open,
-so that one pass smooths edges and blurs what moves. Vertices are projected through the lens one
-by one; between them edges are straight, over some centimetres.
+Each sample has its own position within the pixel and its own moment while the shutter is open, so
+one pass antialiases edges and blurs motion. Vertices are projected through the lens one by one;
+between them edges are straight, over some centimetres.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ Bytes = NDArray[np.uint8]
 SAMPLES = 4
 _ACROSS = (-0.125, 0.375, -0.375, 0.125)
 _DOWN = (-0.375, -0.125, 0.125, 0.375)
-"""Where samples lie in a pixel [px]: on a turned square, so that no two share a row or column."""
+"""Positions of samples in a pixel [px]: on a rotated square, no two share a row or column."""
 _WHEN = (0.125, 0.625, 0.375, 0.875)
-"""When, as a share of the time that the shutter is open."""
+"""Moments of samples, as a share of the time that the shutter is open."""
 NOBODY = -1
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What the samples of a part of a picture hit.
+    """Samples of a part of an image.
 
     Attributes:
-        left, top: pixel of the picture that is the first one here.
-        depth: (height, width, 4) [m] along the camera's axis; infinite where nothing is.
-        who: (height, width, 4) the thing hit; -1 where nothing is.
+        left, top: pixel of the image that is the first one here.
+        depth: (height, width, 4) [m] along the camera's axis; infinite without a hit.
+        who: (height, width, 4) number of the object hit; -1 without a hit.
         color: (height, width, 4, 3) RGB.
-        last: (height, width, 4) the thing drawn there last, hidden or not.
+        last: (height, width, 4) number of the object drawn there last, visible or not.
     """
 
     left: int
@@ -47,7 +47,7 @@ class Samples:
 
     @classmethod
     def empty(cls, left: int, top: int, right: int, bottom: int) -> Samples:
-        """Return samples of pixels from left and top to before right and bottom."""
+        """Return empty samples of pixels from left and top to before right and bottom."""
         shape = (bottom - top, right - left, SAMPLES)
         return cls(
             left,
@@ -77,20 +77,20 @@ def draw_triangles(
     color: Bytes,
     last: NDArray[np.int16],
 ) -> int:
-    """Draw one thing among those already drawn, and return how many samples it would fill alone.
+    """Draw one object into the z-buffer, and return the number of samples it would cover alone.
 
-    Triangles that face away or have a vertex without an image are left out.
+    Triangles that face away or have a vertex without an image are skipped.
 
     Args:
         opened: (vertices, 3) pixel [px] and depth [m] when the shutter opens.
         closed: the same when it closes.
         faces: (triangles, 3), counter-clockwise seen from outside.
-        backs: (triangles,) which of the two pictures has their colours.
+        backs: (triangles,) which of the two textures has their colours.
         texels: (vertices, 2) column and row there.
         pictures: (2, rows, columns, 3) RGB.
-        light: (vertices,) on each vertex, 1 = as the pictures are.
-        haze: (4,) share of the haze before it, and the haze's colour [levels of 255].
-        which: number of the thing, from 0.
+        light: (vertices,) brightness of each vertex, 1 = as in the texture.
+        haze: (4,) share of the haze in front of it, and the haze's colour [levels of 255].
+        which: number of the object, from 0.
         left: of the samples' first pixel.
         top: of the samples' first pixel.
         depth: of `Samples`, written.
@@ -113,7 +113,7 @@ def draw_triangles(
             cx = opened[c, 0] + share * (closed[c, 0] - opened[c, 0]) - right
             cy = opened[c, 1] + share * (closed[c, 1] - opened[c, 1]) - down
             area = (cx - ax) * (by - ay) - (bx - ax) * (cy - ay)
-            # Also false where a vertex has no image.
+            # Also false if a vertex has no image.
             if not area > 1e-9:
                 continue
             u0 = max(int(np.ceil(min(ax, bx, cx))), 0)
@@ -148,10 +148,10 @@ def draw_triangles(
 
 @compiled
 def cover_triangles(pixels: Singles, faces: NDArray[np.int32], bit: int, mask: Bytes) -> None:
-    """Set a bit in the pixels whose middles lie within triangles, whichever way these face.
+    """Set a bit in the pixels whose centres lie within triangles of either orientation.
 
     Args:
-        pixels: (vertices, 2) [px]; triangles with a NaN are left out.
+        pixels: (vertices, 2) [px]; triangles with a NaN are skipped.
         faces: (triangles, 3).
         bit: to set, a power of 2.
         mask: (height, width), written.
@@ -184,14 +184,15 @@ def resolve(
     persons: NDArray[np.int16],
     seen: NDArray[np.int64],
 ) -> None:
-    """Mix samples into a part of a picture, and write who is in at least half of each pixel.
+    """Blend samples into a part of an image, and write the person in at least half of each pixel.
 
     Args:
         who: (height, width, 4) of `Samples`.
         color: (height, width, 4, 3) of `Samples`.
         picture: (height, width, 3) RGB, changed in place.
-        persons: (height, width), written where somebody is; things from len(seen) on are nobody.
-        seen: (persons,) samples of each, added to.
+        persons: (height, width), written where half of the samples show a person; objects from
+            len(seen) on are no people.
+        seen: (persons,) number of samples of each, added to.
     """
     for v in range(who.shape[0]):
         for u in range(who.shape[1]):

@@ -13,7 +13,7 @@ from worldpose.errors import InputError
 
 
 class RayStatus(IntEnum):
-    """Why a point has no image, or an image point no ray."""
+    """Reason for a point without image, or an image point without ray."""
 
     OK = 0
     MISSING = 1
@@ -23,7 +23,7 @@ class RayStatus(IntEnum):
     BEYOND_FOLD = 3
     """The lens model is not one to one there: a point has no meaningful image, a pixel no ray."""
     NOT_CONVERGED = 4
-    """The inverse of the lens model was not found."""
+    """The inverse of the lens model did not converge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class Rays:
 def distance_to_rays(points: ArrayLike, rays: Rays) -> NDArray[np.float64]:
     """Return the distance of points to rays.
 
-    A ray begins at its camera: a point behind it is as far as the camera itself.
+    A ray begins at its camera: for a point behind it, the distance to the camera counts.
 
     Args:
         points: (..., 3) [m], world; broadcasts against the rays.

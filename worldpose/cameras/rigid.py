@@ -19,11 +19,11 @@ Index: TypeAlias = (
     | NDArray[np.bool_]
     | tuple[int | slice | EllipsisType | NDArray[np.integer] | NDArray[np.bool_] | None, ...]
 )
-"""What numpy accepts between brackets; it always addresses the batch dimensions only."""
+"""Index types of numpy; an index addresses the batch dimensions only."""
 
-# Six decimals, cut off rather than rounded, put at most 2 sqrt(3) 1e-6 into rotation^T rotation.
+# Six decimals, truncated rather than rounded, put at most 2 sqrt(3) 1e-6 into rotation^T rotation.
 _ORTHONORMAL = 4e-6
-# Rotations written with all digits of float64 come back within this and are taken as they are.
+# Rotations with all digits of float64 read back within this error and need no correction.
 _EXACT = 1e-14
 
 
@@ -52,7 +52,7 @@ class Rigid:
 
     @classmethod
     def identity(cls) -> Rigid:
-        """Return the transform that moves nothing."""
+        """Return the identity transform."""
         return cls(np.eye(3), np.zeros(3))
 
     @classmethod
@@ -83,7 +83,7 @@ class Rigid:
 
     @property
     def rotvec(self) -> NDArray[np.float64]:
-        """The rotation as axis-angle vectors (..., 3) [rad] with angles in [0, pi]."""
+        """Axis-angle vectors of the rotation (..., 3) [rad] with angles in [0, pi]."""
         r = self.rotation
         diagonal = np.diagonal(r, axis1=-2, axis2=-1)
         trace = diagonal.sum(-1)
@@ -152,10 +152,10 @@ class Rigid:
 
 
 def nearest_rotation(where: str, matrix: ArrayLike) -> NDArray[np.float64]:
-    """Return the rotation that a matrix written with at least six decimals stands for.
+    """Return the exact rotation nearest to a matrix given with at least six decimals.
 
     Args:
-        where: file and place of the matrix, for the message.
+        where: file and position of the matrix, for the message.
         matrix: (3, 3), R of x_b = R x_a + t.
 
     Raises:

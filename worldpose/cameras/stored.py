@@ -1,4 +1,4 @@
-"""A single camera as the arrays of `data_contracts.cameras`, and back."""
+"""Conversion between a single camera and the arrays of `data_contracts.cameras`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from worldpose.cameras.rigid import Rigid
 
 
 def camera_arrays(camera: Camera) -> dict[str, NDArray[Any]]:
-    """The stored arrays of a single camera, by name."""
+    """Return the stored arrays of a single camera, by name."""
     return {
         "focal": camera.focal,
         "principal_point": camera.principal_point,
@@ -25,7 +25,7 @@ def camera_arrays(camera: Camera) -> dict[str, NDArray[Any]]:
 
 
 def camera_from_arrays(arrays: Mapping[Any, ArrayLike]) -> Camera:
-    """The camera of stored arrays, bit for bit the one that was stored."""
+    """Return the camera of stored arrays, bit for bit the one that was stored."""
     stored = {name: np.asarray(arrays[name]) for name in _NAMES}
     return Camera(
         focal=stored["focal"],

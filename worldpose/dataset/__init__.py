@@ -1,1 +1,1 @@
-"""A released data set: its manifest, its statistics, and the check of its content."""
+"""Released data sets: manifest, statistics, and validation."""

@@ -1,4 +1,4 @@
-"""Whether a data set explains itself: what is wrong with it, by name, and the figures."""
+"""Validation of a data set: named faults and metrics."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ from worldpose.dataset.skeletons import box_findings, skeleton_findings
 
 
 def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures, list[Finding]]:
-    """Return figures and findings of one clip.
+    """Return metrics and findings of one clip.
 
-    2D decides where there is any: a fault is named that makes 3D and 2D agree. What is then still
-    implausible, or has no 2D, is judged by people who must stand on a pitch and be in sight.
+    2D data takes precedence: a fault is named if its repair makes 3D and 2D agree. Remaining
+    implausible data, and data without 2D, is judged by people's position on the pitch and in the
+    image.
     """
     findings = list(clip.findings)
     agreements = [
@@ -94,7 +95,7 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
 
 
 def _challenge_findings(clip: ShippedClip, settings: CheckSettings) -> Iterator[Finding]:
-    """What is wrong with boxes and skeletons about the mid-hip."""
+    """Yield findings on boxes and skeletons relative to the mid-hip."""
     if clip.given is None:
         return
     yield from box_findings(clip.given.boxes, clip.given.skel_2d, clip.name)
@@ -105,7 +106,7 @@ def _challenge_findings(clip: ShippedClip, settings: CheckSettings) -> Iterator[
 
 
 def _repaired(source: PointSource, agreements: Iterable[Agreement]) -> PointSource:
-    """The source with the fault undone that its 2D names most often."""
+    """Repair the source for the fault that its 2D data indicates most often."""
     faults = [a.fault for a in agreements if a.source == source.name and a.fault.points is not None]
     if not faults:
         return source
@@ -131,7 +132,7 @@ def _world_finding(source: PointSource, fault: Fault, before: float, after: floa
 
 
 def _merged(findings: Iterable[Finding]) -> Iterator[Finding]:
-    """One finding for each fault in the same words, with all places."""
+    """Merge findings of the same fault and text into one, with all places."""
     groups: dict[tuple[str, str], list[Finding]] = {}
     for finding in findings:
         groups.setdefault((finding.fault, finding.says), []).append(finding)

@@ -1,4 +1,4 @@
-"""A data set as its files give it: 3D points, cameras and 2D points of every clip, unjudged."""
+"""Content of a data set's files, unvalidated: 3D points, cameras and 2D points per clip."""
 
 from __future__ import annotations
 
@@ -23,57 +23,58 @@ class PointSource:
     name: str
     """The file, relative to the data set."""
     skeleton: tuple[str, ...]
-    """What the points are."""
+    """Names of the points."""
     points: Floats
     """(frames, persons, points, 3) [m], world."""
     place: Floats | None = None
-    """(frames, persons, 3), `transl` of poses; None where the file has points themselves."""
+    """(frames, persons, 3), `transl` of poses; None if the file has points instead of poses."""
     pivot: Floats | None = None
-    """(frames, persons, 3) [m], what turning about the origin and not the pelvis adds."""
+    """(frames, persons, 3) [m], difference between rotation about the origin and about the
+    pelvis."""
     in_degrees: Floats | None = None
-    """The points if the file's angles were degrees; None where they cannot be."""
+    """The points if the file's angles were degrees; None if they cannot be."""
 
     def moved(self, points: Floats) -> PointSource:
-        """The same source with other points."""
+        """Return the same source with other points."""
         return PointSource(self.name, self.skeleton, points)
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One camera, and where it has people in its picture."""
+    """One camera and its 2D points of people."""
 
     name: str
     rows: CameraRows
     pixels: Floats | None = None
-    """(frames, persons, points, 2) [px]; None where the data set has no 2D."""
+    """(frames, persons, points, 2) [px]; None if the data set has no 2D."""
     skeleton: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class ShippedClip:
-    """Everything that a data set has of one clip."""
+    """All data of one clip."""
 
     name: str
     fps: float
     sources: tuple[PointSource, ...]
     views: tuple[View, ...]
     pitch: bool = True
-    """Whether the ground is z = 0; otherwise the world is that of the cameras' calibration."""
+    """Whether the ground is z = 0; otherwise the world frame is that of the camera calibration."""
     findings: tuple[Finding, ...] = field(default=())
-    """What reading alone has shown."""
+    """Findings of the reader."""
     given: ChallengeClip | None = None
     """Boxes and skeletons of the challenge's layout."""
 
 
 def absent_rows(name: str, arrays: Mapping[str, NDArray[Any]]) -> tuple[Floats, list[Finding]]:
-    """Return which of a file's persons and frames are missing, and what is wrong about it.
+    """Return a mask of missing persons and frames of a file, and findings on it.
 
     Args:
         name: the file.
-        arrays: (rows, columns, ...), what must be missing together.
+        arrays: (rows, columns, ...), which must be missing together.
 
     Returns:
-        (rows, columns) bool, missing in any array or written as zeros in all; and findings.
+        (rows, columns) bool, missing in any array or zero in all; and findings.
     """
     flat = {key: array.reshape(*array.shape[:2], -1) for key, array in arrays.items()}
     partly = {key: np.isnan(array).any(-1) for key, array in flat.items()}

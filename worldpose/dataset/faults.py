@@ -1,4 +1,4 @@
-"""What a data set would be if one convention were broken: repairs with the name of the fault."""
+"""Repairs of broken conventions in a data set, each with the name of its fault."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from worldpose.formats.camera_rows import CameraRows
 Floats = NDArray[np.float64]
 
 LATEST: Final = 3
-"""Largest slip of frames that is looked for [frame]."""
+"""Maximum frame offset that is tested [frame]."""
 _LENS: Final = "k1 k2 p1 p2 k3"
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A broken convention, and what undoes it."""
+    """A broken convention and its repair."""
 
     name: str
     says: str
     points: Callable[[PointSource], Floats | None] | None = None
-    """Gives the right points; None where it cannot be this fault."""
+    """Returns the repaired points; None if this fault is impossible."""
     camera: Callable[[CameraRows], CameraRows] | None = None
-    """Gives the right camera."""
+    """Returns the repaired camera."""
     later_points: int = 0
     """The 2D of frame f shows the points of frame f + this."""
     later_camera: int = 0
@@ -37,7 +37,7 @@ class Fault:
 
 
 def point_faults() -> Iterator[Fault]:
-    """Faults of where 3D points are."""
+    """Yield faults of 3D positions."""
     yield Fault(
         "root_about_origin",
         "global_orient turns about the model's origin and not about the pelvis joint",
@@ -54,7 +54,7 @@ def point_faults() -> Iterator[Fault]:
 
 
 def camera_faults() -> Iterator[Fault]:
-    """Faults of how a camera is written."""
+    """Yield faults of the camera format."""
     yield Fault(
         "transposed_rotation",
         "R is world_from_cam, the transpose of what x_cam = R x_world + t has",
@@ -91,7 +91,7 @@ def camera_faults() -> Iterator[Fault]:
 
 
 def frame_faults(moving: bool) -> Iterator[Fault]:
-    """Faults of which frame is which; only a camera that moves has a clock of its own."""
+    """Yield faults of frame alignment; only a moving camera has its own clock."""
     for late in sorted({*range(-LATEST, LATEST + 1)} - {0}, key=abs):
         frames = f"{abs(late)} frame{'s' if abs(late) > 1 else ''}"
         order = "late" if late > 0 else "early"
@@ -109,7 +109,7 @@ def frame_faults(moving: bool) -> Iterator[Fault]:
 
 
 def axis_orders() -> Iterator[tuple[str, Floats]]:
-    """All other orders and signs of three axes: in words, and as shipped from right (3, 3)."""
+    """Yield all other orders and signs of three axes: description, and shipped-from-true (3, 3)."""
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             axes = np.eye(3)[list(order)] * np.array(signs)[:, None]
@@ -127,7 +127,7 @@ def _shrink(size: float) -> Callable[[PointSource], Floats]:
 
 
 def _axis_faults() -> Iterator[Fault]:
-    """All other orders and signs of the axes, first for whole points, then for `transl` alone."""
+    """Yield all other orders and signs of the axes, for whole points, then for `transl` alone."""
     for _, shipped_from_world in axis_orders():
         name, says = _axis_name(shipped_from_world)
         yield Fault(name, says, _turn(shipped_from_world, whole=True))
@@ -149,7 +149,7 @@ def _turn(shipped_from_world: Floats, whole: bool) -> Callable[[PointSource], Fl
 
 
 def _axis_name(shipped_from_world: Floats) -> tuple[str, str]:
-    """Name of the fault of having these axes, and what they are in words."""
+    """Return the fault's name for these axes, and a description."""
     axes = _axis_words(shipped_from_world)
     says = f"x, y, z are the world's {', '.join(axes)}"
     if axes == ["x", "-z", "y"]:
@@ -166,12 +166,12 @@ def _axis_name(shipped_from_world: Floats) -> tuple[str, str]:
 
 
 def _axis_words(axes: Floats) -> list[str]:
-    """What each axis is, such as -y."""
+    """Return the description of each axis, such as -y."""
     return [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in axes]
 
 
 def _lens_in(order: str) -> Callable[[CameraRows], CameraRows]:
-    """Gives a camera whose coefficients were written in another order."""
+    """Return a repair for a camera whose coefficients were written in another order."""
     place = [order.split().index(name) for name in _LENS.split()]
 
     def repaired(camera: CameraRows) -> CameraRows:

@@ -1,4 +1,4 @@
-"""manifest.json: what a release is, what it was made from, and how to prove that it is whole."""
+"""manifest.json: name, sources and checksums of a release."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MANIFEST: Final = "manifest.json"
 
 
 def released_files(folder: Path, paths: Iterable[Path]) -> tuple[ReleasedFile, ...]:
-    """Sizes and checksums of files in `folder`, by name."""
+    """Return sizes and checksums of files in `folder`, by name."""
     files = []
     for path in sorted(paths):
         with path.open("rb") as file:
@@ -30,17 +30,17 @@ def released_files(folder: Path, paths: Iterable[Path]) -> tuple[ReleasedFile, .
 
 
 def write_manifest(folder: Path, manifest: ReleaseManifest) -> Path:
-    """Write manifest.json, whole or not at all; returns it."""
+    """Write manifest.json, whole or not at all; return its path."""
     with whole_file(folder / MANIFEST) as draft:
         draft.write_text(manifest.model_dump_json(indent=2) + "\n", encoding="utf-8")
     return folder / MANIFEST
 
 
 def read_manifest(folder: Path) -> ReleaseManifest | None:
-    """The manifest of a release; None where the folder has none.
+    """Read the manifest of a release; None if the folder has none.
 
     Raises:
-        InputError: it is no manifest, or one of another contract.
+        InputError: it is not a manifest, or has another contract version.
     """
     path = folder / MANIFEST
     if not path.is_file():
@@ -57,7 +57,7 @@ def read_manifest(folder: Path) -> ReleaseManifest | None:
 
 
 def changed_files(folder: Path, manifest: ReleaseManifest) -> list[str]:
-    """Names of released files that are gone or have other bytes."""
+    """Return the names of released files that are missing or changed."""
     changed = []
     for file in manifest.files:
         path = folder / file.path
@@ -71,10 +71,10 @@ _RATES = TypeAdapter(dict[str, PositiveFloat])
 
 
 def write_frame_rates(folder: Path, rates: Mapping[str, float]) -> Path:
-    """Add clips' frames a second [1/s] to those that the folder says already; returns the file.
+    """Add clips' frames per second [1/s] to the folder's existing ones; return the file.
 
     Raises:
-        InputError: what is there is no such file.
+        InputError: the existing file has another format.
     """
     known = {**read_frame_rates(folder), **rates}
     with whole_file(folder / FRAME_RATES) as draft:
@@ -83,10 +83,10 @@ def write_frame_rates(folder: Path, rates: Mapping[str, float]) -> Path:
 
 
 def read_frame_rates(folder: Path) -> dict[str, float]:
-    """Frames a second [1/s] by clip; empty where the folder does not say.
+    """Read frames per second [1/s] by clip; empty if the folder has no such file.
 
     Raises:
-        InputError: the file is not clips and numbers.
+        InputError: the file does not map clips to numbers.
     """
     path = folder / FRAME_RATES
     if not path.is_file():
@@ -103,7 +103,7 @@ def read_frame_rates(folder: Path) -> dict[str, float]:
 
 
 def frame_rate_of(rates: Mapping[str, float], clip: str) -> float | None:
-    """Frames a second of a clip; one that no file names (`joints.npz`) has the rate of all."""
+    """Return the frame rate of a clip; without an entry (`joints.npz`), the common rate."""
     if clip in rates:
         return rates[clip]
     return next(iter(rates.values())) if len(set(rates.values())) == 1 else None

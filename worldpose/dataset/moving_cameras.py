@@ -1,4 +1,4 @@
-"""Whether a camera without 2D shows people as a camera of a match does, and if not, why not."""
+"""Plausibility of cameras without 2D data, and the fault that explains implausible ones."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from worldpose.formats.camera_rows import CameraRows
 Floats = NDArray[np.float64]
 
 TALL: Final = (8.0, 1500.0)
-"""Least and greatest height of a person in the picture [px]."""
+"""Minimum and maximum height of a person in the image [px]."""
 STAND: Final = (0.5, 150.0)
-"""Least and greatest height of a camera above the ground [m]."""
+"""Minimum and maximum height of a camera above the ground [m]."""
 FAR: Final = 500.0
-"""Greatest distance of a camera from the centre spot [m]."""
+"""Maximum distance of a camera from the centre spot [m]."""
 TRAVEL: Final = 2.0
-"""Distance of a camera's centre from its median beyond which its pose is nonsense [m]."""
+"""Distance of a camera's centre from its median beyond which its pose is invalid [m]."""
 _PEOPLE: Final = 4000
-"""Bodies that are looked at."""
+"""Maximum number of sampled bodies."""
 
 
 def sight_share(source: PointSource, points: Floats, rows: CameraRows) -> float:
-    """Return which part of all people a camera shows, upright and of a person's size.
+    """Return the share of people that a camera shows upright and at a person's size.
 
     Args:
-        source: says what the points are.
+        source: names of the points.
         points: (frames, persons, points, 3) [m], world.
-        rows: the camera; one that stands in no stadium, or travels, shows nobody.
+        rows: the camera; with an implausible or varying position its share is zero.
     """
     center = center_of(rows)
     if not STAND[0] < center[2] < STAND[1] or np.linalg.norm(center) > FAR:
@@ -63,11 +63,11 @@ def sight_share(source: PointSource, points: Floats, rows: CameraRows) -> float:
 
 
 def is_blind(source: PointSource, rows: CameraRows, settings: CheckSettings) -> bool:
-    """Return whether a camera shows hardly anybody though it should.
+    """Return whether a camera shows fewer people than expected.
 
-    A camera that never moves may look at a part of the pitch where nobody comes: it is only
-    expected to stand upright in the stadium and to have the pitch in the middle of its picture.
-    Of a camera that moves nothing is known without people in frames in which it has a pose.
+    A static camera can show an empty part of the pitch: it is only expected to be upright in the
+    stadium with the pitch in the centre of its image. For a moving camera nothing is known without
+    people in frames with a pose.
     """
     if sight_share(source, source.points, rows) >= settings.least_seen:
         return False
@@ -85,10 +85,10 @@ def is_blind(source: PointSource, rows: CameraRows, settings: CheckSettings) -> 
 def sight_findings(
     source: PointSource, views: Sequence[View], settings: CheckSettings
 ) -> Iterator[tuple[Finding, Fault | None]]:
-    """Yield findings on cameras that show hardly anybody, and the fault that explains each.
+    """Yield findings on cameras that show too few people, and the fault that explains each.
 
-    One writer makes one mistake: of the faults without which cameras show people, at least ten
-    times `least_seen` of them, the one that explains most cameras is named first.
+    One writer makes one mistake: among the faults whose repair lets cameras show at least ten times
+    `least_seen` of the people, the fault that explains most cameras comes first.
     """
     if not views:
         return
@@ -130,18 +130,18 @@ def _finding(
 
 
 _FRAMES: Final = 150
-"""Frames that are looked at."""
+"""Maximum number of sampled frames."""
 _POINTS: Final = 30
-"""Points in a frame from which its angles are found: those of two people and more."""
+"""Minimum number of points of a frame for a rotation estimate: more than one person."""
 
 
 def turning_findings(source: PointSource, view: View, settings: CheckSettings) -> Iterator[Finding]:
-    """Yield the slip of frames that explains a source and the 2D of a camera without its poses.
+    """Yield the frame offset that explains a source and a camera's 2D, independent of its poses.
 
     Args:
         source: 3D points.
         view: a camera with 2D of the same people; others yield nothing.
-        settings: what counts as an explanation.
+        settings: thresholds for an explanation.
     """
     posed = np.isfinite(view.rows.rotation).all((-1, -2))
     if view.pixels is None or view.pixels.shape[1] != source.points.shape[1]:
@@ -165,11 +165,11 @@ def turning_findings(source: PointSource, view: View, settings: CheckSettings) -
 
 
 def _left(source: PointSource, view: View, late: int) -> float:
-    """Median distance [px] of the 2D from the 3D of later frames, each turned as fits best.
+    """Return the median residual [px] between 2D and 3D of later frames, after optimal rotations.
 
-    A frame without enough points is left out; infinite where all are.
+    A frame without enough points is skipped; infinite without any frame.
     """
-    assert view.pixels is not None  # asked for only with 2D
+    assert view.pixels is not None  # the caller checks that there is 2D
     shared = [name for name in view.skeleton if name in source.skeleton]
     seen = view.pixels[:, :, [view.skeleton.index(name) for name in shared]]
     points = source.points[:, :, [source.skeleton.index(name) for name in shared]]
@@ -193,7 +193,7 @@ def _left(source: PointSource, view: View, late: int) -> float:
 
 
 def _turn(ways: Floats, rays: Floats) -> Floats:
-    """The rotation (3, 3) that brings unit vectors (n, 3) nearest to others."""
+    """Return the rotation (3, 3) that best aligns unit vectors (n, 3) with others."""
     u, _, vt = np.linalg.svd(rays.T @ ways)
     straight = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))])
     return np.asarray(u @ straight @ vt)

@@ -1,4 +1,4 @@
-"""Where every joint of a clip comes from: computed from views, filled in, or set by a person."""
+"""Origin of every joint of a clip: triangulated from views, filled in, or corrected."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from worldpose.formats.archives import Member, read_archive, write_archive
 from worldpose.formats.joints_file import JOINTS, JointTracks
 
 ORIGINS: Final = ("absent", "automatic", "filled", "corrected")
-"""Meanings of an origin's number."""
+"""Meanings of the origin codes."""
 
 MEMBERS: Final = {
     "frames": Member(("frames",), "int"),
@@ -25,9 +25,9 @@ MEMBERS: Final = {
 def origins_of(
     tracks: JointTracks, corrected: NDArray[np.bool_] | None = None
 ) -> NDArray[np.uint8]:
-    """Return where joints come from (frames, persons, 17), numbers of `ORIGINS`.
+    """Return the origin of joints (frames, persons, 17), indices of `ORIGINS`.
 
-    A joint that no camera carries was filled in, by motion or by the rest of the body.
+    A joint without a contributing camera was filled in, from motion or from the rest of the body.
 
     Args:
         tracks: joints with their views; unknown views count as seen.
@@ -43,7 +43,7 @@ def origins_of(
 
 
 def write_origins(path: Path, tracks: JointTracks, origin: NDArray[np.uint8]) -> None:
-    """Write origins/<clip>.npz: `frames`, `person_ids`, `origin`, and what its numbers mean."""
+    """Write origins/<clip>.npz: `frames`, `person_ids`, `origin`, and the meanings of its codes."""
     write_archive(
         path,
         {
@@ -56,10 +56,10 @@ def write_origins(path: Path, tracks: JointTracks, origin: NDArray[np.uint8]) ->
 
 
 def read_origins(path: Path) -> NDArray[np.int64]:
-    """The origins (frames, persons, 17) of a file.
+    """Read the origins (frames, persons, 17) of a file.
 
     Raises:
-        InputError: naming file and member.
+        InputError: names file and member.
     """
     origin: NDArray[np.int64] = read_archive(path, MEMBERS)["origin"]
     return origin

@@ -1,4 +1,4 @@
-"""Whether people are of human size and speed and stand on a pitch, and cameras are cameras."""
+"""Plausibility of body sizes, speeds, positions on the pitch, and cameras."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 FEET = ("left_big_toe", "right_big_toe", "left_heel", "right_heel", "left_ankle", "right_ankle")
 ANKLE = 0.09
-"""Height of an ankle above the ground where a skeleton has no sole [m]."""
+"""Height of an ankle above the ground if a skeleton has no sole [m]."""
 BONES = {
     "upper arms": ("shoulder", "elbow"),
     "forearms": ("elbow", "wrist"),
@@ -27,11 +27,11 @@ BONES = {
 
 
 def plausible_share(source: PointSource, settings: CheckSettings) -> float:
-    """Return which part of all bodies is near the ground, head up, within the bounds.
+    """Return the share of bodies near the ground, head up, within the bounds.
 
-    A body counts from 0.3 to 2.3 m of height from its lowest foot to its nose, so that one who
-    kneels counts and one in other units or axes does not; who lies does not either. Where most
-    bodies have left and right exchanged, none counts.
+    A body counts if its nose is 0.3 to 2.3 m above its lowest foot: this includes a kneeling person
+    and excludes other units or axes, and also a lying person. If most bodies have a left-right
+    swap, the share is zero.
     """
     feet, nose = _feet(source), _point(source, "nose")
     here = np.isfinite(feet) & np.isfinite(nose).all(-1)
@@ -44,10 +44,10 @@ def plausible_share(source: PointSource, settings: CheckSettings) -> float:
 
 
 def world_fault(source: PointSource, settings: CheckSettings) -> tuple[Fault | None, float, float]:
-    """Return what would make people stand on a pitch, and the plausible share before and after.
+    """Return the fault whose repair places people on the pitch; plausible share before and after.
 
-    Among faults that do equally well the one that puts feet nearest to the ground is named, and
-    of these the first.
+    Among equally good faults the one with feet nearest to the ground is returned, and among these
+    the first.
     """
     before = plausible_share(source, settings)
     if before >= settings.plausible_share:
@@ -72,7 +72,7 @@ def foot_height(source: PointSource) -> float:
 
 
 def ground_findings(source: PointSource, settings: CheckSettings) -> Iterator[Finding]:
-    """Feet above or below the pitch, and for poses whether their pivot explains it."""
+    """Yield feet above or below the pitch, and for poses whether their pivot explains it."""
     height = foot_height(source)
     if np.isnan(height) or settings.ground_low <= height <= settings.ground_high:
         return
@@ -94,7 +94,7 @@ def ground_findings(source: PointSource, settings: CheckSettings) -> Iterator[Fi
 
 
 def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> Iterator[Finding]:
-    """Limbs of no human length, people faster than people are."""
+    """Yield implausible limb lengths and speeds."""
     for name, (upper, lower) in BONES.items():
         bone = np.stack(
             [
@@ -130,7 +130,7 @@ def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> I
 
 
 def pitch_findings(source: PointSource, settings: CheckSettings) -> Iterator[Finding]:
-    """People off the pitch."""
+    """Yield people off the pitch."""
     middle = _hips(source)
     here = np.isfinite(middle).all(-1)
     away = np.abs(middle[here][:, :2]) > np.array(settings.bounds)
@@ -145,7 +145,7 @@ def pitch_findings(source: PointSource, settings: CheckSettings) -> Iterator[Fin
 
 
 def camera_findings(view: View, settings: CheckSettings) -> Iterator[Finding]:
-    """Rotations that are none, and a moving camera's centre that travels."""
+    """Yield invalid rotations, and a moving camera's centre that is not constant."""
     rotation, translation = view.rows.rotation, view.rows.translation
     known = np.isfinite(rotation).all((-1, -2)) & np.isfinite(translation).all(-1)
     rotation, translation = rotation[known], translation[known]
@@ -181,7 +181,7 @@ def camera_findings(view: View, settings: CheckSettings) -> Iterator[Finding]:
 
 
 def centers(rows: CameraRows) -> Floats:
-    """Return the centres (n, 3) [m], world, of a camera's rows that have a pose."""
+    """Return the centres (n, 3) [m], world, of a camera's rows with a pose."""
     all_centers = -(np.swapaxes(rows.rotation, -1, -2) @ rows.translation[..., None])[..., 0]
     found: Floats = all_centers[np.isfinite(all_centers).all(-1)]
     return found
@@ -194,17 +194,17 @@ def center_of(rows: CameraRows) -> Floats:
 
 
 def _point(source: PointSource, name: str) -> Floats:
-    """One point of everybody (frames, persons, 3) [m]."""
+    """Return one point of all people (frames, persons, 3) [m]."""
     return source.points[:, :, source.skeleton.index(name)]
 
 
 def _hips(source: PointSource) -> Floats:
-    """The middle of everybody's hips (frames, persons, 3) [m]."""
+    """Return the mid-hip of all people (frames, persons, 3) [m]."""
     return 0.5 * (_point(source, "left_hip") + _point(source, "right_hip"))
 
 
 def _handedness(source: PointSource) -> float:
-    """1 where noses or toes are ahead, as left and up have it, in most bodies; -1 if behind."""
+    """Return 1 if most noses or toes point ahead, according to left and up; -1 if behind."""
 
     def middle(name: str) -> Floats:
         return 0.5 * (_point(source, f"left_{name}") + _point(source, f"right_{name}"))
@@ -221,7 +221,7 @@ def _handedness(source: PointSource) -> float:
 
 
 def _feet(source: PointSource) -> Floats:
-    """Height (frames, persons) [m] of every body's lowest foot above z = 0."""
+    """Return the height (frames, persons) [m] of every body's lowest foot above z = 0."""
     soles = [name for name in FEET if name in source.skeleton]
     lift = 0.0
     if soles and all("ankle" in name for name in soles):

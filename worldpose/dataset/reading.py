@@ -1,4 +1,4 @@
-"""Reading a data set of any of the exported layouts, as far as it goes, to be checked."""
+"""Reading of a data set in any exported layout, with findings on faults."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ Floats = NDArray[np.float64]
 
 SUBMISSIONS = ("submission.zip", "submission.npz")
 _FRAMES = 200
-"""Frames of all people that are posed at a time."""
+"""Maximum number of frames, with all people, posed per chunk."""
 ONLY = "clip"
-"""Name of the one clip of a data set that names none."""
+"""Name of the one clip of a data set without clip names."""
 
 
 def clips_in(folder: Path) -> tuple[str, ...]:
-    """Names of the clips of a data set.
+    """Return the names of the clips of a data set.
 
     Raises:
         InputError: the folder has neither poses, joints nor a submission.
@@ -66,15 +66,15 @@ def read_clip(
     fps: float,
     pitch: bool = True,
 ) -> ShippedClip:
-    """Everything that a data set has of one clip.
+    """Read all data of one clip.
 
     Args:
         folder: the data set.
         clip: one of `clips`.
-        clips: all of the data set; a camera named after none of them never moves.
-        body: gives the body model of a name, or of a file that names none.
-        manifest: of the release, where it is one.
-        fps: frames in a second.
+        clips: all of the data set; a camera with none of their names is static.
+        body: returns the body model for a name, or for a file without one.
+        manifest: of the release, if it is one.
+        fps: frames per second.
         pitch: whether the ground is z = 0.
 
     Raises:
@@ -115,15 +115,15 @@ def read_clip(
 
 
 def read_coco(path: Path, ids: tuple[int, ...], frames: int) -> Floats:
-    """2D points (frames, persons, 17, 2) [px] of a COCO file; NaN where v is 0.
+    """Read 2D points (frames, persons, 17, 2) [px] of a COCO file; NaN if v is 0.
 
     Args:
         path: the file.
         ids: people in the order of the person dimension; others are left out.
-        frames: how many there are; the first picture is the first.
+        frames: number of frames; the first image is frame 0.
 
     Raises:
-        InputError: it is no COCO keypoints file.
+        InputError: it is not a COCO keypoints file.
     """
     pixels = np.full((frames, len(ids), len(COCO17), 2), np.nan)
     person_of = {person: place for place, person in enumerate(ids)}
@@ -145,7 +145,7 @@ def read_coco(path: Path, ids: tuple[int, ...], frames: int) -> Floats:
 def _sources(
     folder: Path, clip: str, clips: tuple[str, ...], body: Callable[[str | None], BodyModel]
 ) -> tuple[list[PointSource], list[Finding], tuple[int, ...]]:
-    """3D points of every file of a clip, what reading shows, and person ids."""
+    """Return the 3D points of every file of a clip, the reader's findings, and person ids."""
     sources: list[PointSource] = []
     findings: list[Finding] = []
     ids: tuple[int, ...] = ()
@@ -176,7 +176,7 @@ def _sources(
 def _posed(
     path: Path, name: str, body: Callable[[str | None], BodyModel]
 ) -> tuple[PointSource, list[Finding]]:
-    """The points of a pose file's bodies, and what they would be in other conventions."""
+    """Return the points of a pose file's bodies, and their values under other conventions."""
     poses, model_name = read_poses(path)
     model = body(model_name)
     gone, findings = absent_rows(
@@ -194,7 +194,7 @@ def _posed(
         ..., 0
     ]
     in_degrees = None
-    # An angle beyond a turn and a bit is no axis-angle that anybody writes.
+    # An angle far beyond a full turn is not a plausible axis-angle value.
     angles = np.concatenate([poses.global_orient, poses.body_pose], axis=-1)
     if np.nanmax(np.abs(angles), initial=0.0) > 7.0:
         degrees = (np.radians(poses.global_orient), np.radians(poses.body_pose))
@@ -211,7 +211,7 @@ def _posed(
 
 
 def _points(model: BodyModel, poses: BodyParameters) -> Floats:
-    """BODY25 (frames, persons, 25, 3) [m] of bodies (persons, frames), in bounded memory."""
+    """Return BODY25 (frames, persons, 25, 3) [m] of bodies (persons, frames), in bounded memory."""
     keypoints = fold_keypoints(model, BODY25)
     persons, frames = poses.batch_shape
     points = np.empty((frames, persons, len(BODY25), 3))
@@ -228,7 +228,7 @@ def _has_challenge(folder: Path) -> bool:
 def _rows_of_boxes(
     sources: list[PointSource], clip: str, shape: tuple[int, ...]
 ) -> tuple[list[PointSource], list[Finding]]:
-    """Sources whose frames and persons are those of the boxes, and those that have them swapped."""
+    """Return sources with the boxes' frames and persons, and findings on swapped dimensions."""
     kept, findings = [], []
     for source in sources:
         swapped = source.points.shape[:2] == shape[::-1] and shape[0] != shape[1]

@@ -1,4 +1,4 @@
-"""Whether 3D points, seen through the cameras, are where the 2D says, and if not, why not."""
+"""Reprojection check of 3D points against 2D data, with the fault that explains residuals."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 SOUND = Fault("none", "as shipped")
-"""Nothing is undone."""
+"""No repair."""
 
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """How far a source's points are from a view's 2D."""
+    """Residuals between a source's points and a view's 2D."""
 
     view: str
     source: str
@@ -35,14 +35,14 @@ class Agreement:
     height_px: float
     """Median height of a person's 2D."""
     fault: Fault
-    """What would explain it best; `SOUND` where nothing explains it better."""
+    """Best explanation; `SOUND` if none is better."""
     explained_px: float
-    """The median with the fault undone."""
+    """The median after repair of the fault."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Sample:
-    """2D points of a view, each with its frame, person and place in the source's skeleton."""
+    """2D points of a view, each with its frame, person and index in the source's skeleton."""
 
     frame: Ints
     person: Ints
@@ -51,18 +51,18 @@ class _Sample:
 
 
 def agreement(source: PointSource, view: View, settings: CheckSettings) -> Agreement | None:
-    """Return how a source and a view agree, and the fault that would explain it best.
+    """Return the residuals between a source and a view, and the fault that explains them best.
 
-    A fault is named where undoing it takes away most of the error; a 2D point where the camera
-    cannot see counts as infinitely far. Slips of frames are also looked for in whole bodies.
+    A fault is named if its repair removes most of the error; a 2D point that the camera cannot see
+    has infinite error. Frame offsets are also searched with whole bodies.
 
     Args:
         source: 3D points.
         view: a camera with 2D.
-        settings: what counts as an explanation.
+        settings: thresholds for an explanation.
 
     Returns:
-        None where they have nothing in common.
+        None if they have no points in common.
     """
     sample = _sample(source, view, settings.sample)
     if sample is None:
@@ -78,10 +78,10 @@ def agreement(source: PointSource, view: View, settings: CheckSettings) -> Agree
             continue
         rows = view.rows if fault.camera is None else fault.camera(view.rows)
         error = _median(_errors(points, rows, sample, fault))
-        # A tie goes to the fault named first.
+        # A tie goes to the first fault.
         if error < least - 1e-9:
             best, least = fault, error
-    # In this order infinity is more than any part of itself.
+    # This order also works for infinity.
     height = _height(view)
     explains = shipped - least > settings.least_gain_px and least < settings.explained * shipped
     explains = explains and least <= settings.left * height
@@ -104,7 +104,7 @@ def agreement(source: PointSource, view: View, settings: CheckSettings) -> Agree
 
 
 def agreement_findings(found: Iterable[Agreement], settings: CheckSettings) -> Iterator[Finding]:
-    """Findings about agreements, one for each fault of a source and the cameras that show it."""
+    """Yield findings, one per fault of a source, with the cameras that show it."""
     named: dict[tuple[str, str, str], list[Agreement]] = {}
     for one in found:
         if one.fault is not SOUND:
@@ -134,7 +134,7 @@ def _candidates(moving: bool) -> Iterator[Fault]:
 
 
 def _sample(source: PointSource, view: View, size: int) -> _Sample | None:
-    """Evenly picked 2D points that the source has as well."""
+    """Sample 2D points evenly from those that the source also has."""
     if view.pixels is None or view.pixels.shape[1] != source.points.shape[1]:
         return None
     shared = [name for name in view.skeleton if name in source.skeleton]
@@ -157,7 +157,7 @@ def _sample(source: PointSource, view: View, size: int) -> _Sample | None:
 
 
 def _errors(points: Floats, rows: CameraRows, sample: _Sample, fault: Fault) -> Floats:
-    """Distances (n,) [px] between projected points and 2D; infinite where nothing is seen."""
+    """Return residuals (n,) [px] between projected points and 2D; infinite for invisible points."""
     frame = sample.frame + fault.later_points
     row = sample.frame + fault.later_camera
     moving = len(rows.rotation) > 1
@@ -173,7 +173,7 @@ def _errors(points: Floats, rows: CameraRows, sample: _Sample, fault: Fault) -> 
     )
     away = np.linalg.norm(pixels - sample.pixels[within], axis=-1)
     errors: Floats = np.where(np.isnan(away), np.inf, away)
-    # A person who comes or goes in between is no evidence.
+    # A person who enters or leaves in between is no evidence.
     return errors[np.isfinite(here).all(-1)] if fault.later_points else errors
 
 
@@ -182,7 +182,7 @@ def _median(errors: Floats) -> float:
 
 
 def _height(view: View) -> float:
-    """Median height [px] of the people in a view."""
+    """Return the median height [px] of the people in a view."""
     if view.pixels is None:
         return np.nan
     y = view.pixels[..., 1]
@@ -193,23 +193,23 @@ def _height(view: View) -> float:
 
 
 def _capped(values: list[float]) -> float:
-    """The median, finite for a record: 1e6 stands for what no camera sees."""
+    """Return the median, capped for a record: 1e6 stands for invisible points."""
     return float(min(np.sort(values)[len(values) // 2], 1e6))
 
 
 _POINTS: Final = 8
-"""Points that a body needs: their middle is three times as sure as each."""
+"""Minimum number of points of a body: their mean has a third of the error of each."""
 _BODIES: Final = 1500
-"""Bodies that are looked at."""
+"""Maximum number of sampled bodies."""
 
 
 def slip(source: PointSource, view: View, settings: CheckSettings) -> tuple[Fault, float] | None:
-    """Return the slip of frames that explains a source and a view, and the share of error left.
+    """Return the frame offset that explains a source and a view, and the remaining error share.
 
     Args:
         source: 3D points.
         view: a camera with 2D of the same people.
-        settings: what counts as an explanation; here for the errors of whole bodies.
+        settings: thresholds for an explanation, here for the errors of whole bodies.
     """
     if view.pixels is None or view.pixels.shape[1] != source.points.shape[1]:
         return None
@@ -241,7 +241,7 @@ def _error(
     person: NDArray[np.int64],
     fault: Fault | None,
 ) -> float:
-    """Median length [px] of the median error of a body's points; infinite without bodies."""
+    """Return the median length [px] of bodies' median residuals; infinite without bodies."""
     there = frame + (0 if fault is None else fault.later_points)
     row = frame + (0 if fault is None else fault.later_camera)
     moving = len(view.rows.rotation) > 1

@@ -1,4 +1,4 @@
-"""Whether the challenge's boxes and skeletons about the mid-hip agree with its 2D skeletons."""
+"""Consistency of the challenge's boxes and mid-hip skeletons with its 2D skeletons."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from worldpose.formats.camera_rows import CameraRows
 Floats = NDArray[np.float64]
 
 _BODIES: Final = 400
-"""Bodies that are looked at."""
+"""Maximum number of sampled bodies."""
 _OVERLAP: Final = 0.35
-"""Least median intersection over union of sound boxes and those around 2D skeletons [1]: skin
-reaches beyond joints, which leaves 0.5 to 0.7."""
+"""Minimum median intersection over union of valid boxes and those around 2D skeletons [1]:
+bodies extend beyond joints, so 0.5 to 0.7 is normal."""
 _AS_SHIPPED: Final = "the camera's x, y, z"
 
 
 def box_findings(boxes: Floats, skel_2d: Floats, clip: str) -> Iterator[Finding]:
-    """Boxes that do not hold their skeletons, and whether another order of numbers explains it.
+    """Yield boxes without their skeletons, and whether another number order explains it.
 
     Args:
-        boxes: (frames, persons, 4) as the file has them.
+        boxes: (frames, persons, 4) as in the file.
         skel_2d: (frames, persons, points, 2) [px].
         clip: its name.
     """
@@ -65,18 +65,18 @@ def skeleton_findings(
     clip: str,
     settings: CheckSettings,
 ) -> Iterator[Finding]:
-    """3D skeletons in camera axes that no place before the camera brings onto their 2D.
+    """Yield 3D skeletons in camera axes that no translation brings onto their 2D.
 
-    Every body is put where its points come nearest to the 2D; what is then left has other axes.
-    The size of a body says nothing there, so units are told from thighs.
+    Every body is translated to minimize its 2D residual; the remaining residual indicates other
+    axes. The residual does not depend on body size, so units are checked by thigh lengths.
 
     Args:
-        skel_3d: (frames, persons, points, 3) as the file has them.
+        skel_3d: (frames, persons, points, 3) as in the file.
         skel_2d: (frames, persons, points, 2) [px].
-        skeleton: what the points are.
+        skeleton: names of the points.
         rows: the clip's camera; a frame without a pose has K and k.
         clip: its name.
-        settings: what counts as an explanation.
+        settings: thresholds for an explanation.
     """
     where = (f"skel_3d of {clip}",)
     count = len(rows.intrinsics) if len(rows.intrinsics) > 1 else len(skel_3d)
@@ -128,7 +128,7 @@ def skeleton_findings(
 
 
 def _overlap(boxes: Floats, skel_2d: Floats) -> float:
-    """Median intersection over union with the boxes around the 2D points; 1 without any."""
+    """Return the median intersection over union with boxes around the 2D points; 1 without any."""
     known = np.isfinite(skel_2d).all((-1, -2)) & np.isfinite(boxes).all(-1)
     if not np.any(known):
         return 1.0
@@ -141,14 +141,14 @@ def _overlap(boxes: Floats, skel_2d: Floats) -> float:
 
 
 def _left(bodies: Floats, plane: Floats, focal: Floats) -> float:
-    """Median distance [px] from the 2D of bodies at the places that bring them nearest to it.
+    """Return the median 2D residual [px] of bodies after optimal translation.
 
     Args:
         bodies: (n, points, 3) [m], camera axes.
-        plane: (n, points, 2), the 2D without the lens, at depth 1.
+        plane: (n, points, 2), the undistorted 2D at depth 1.
         focal: (n, 2) [px].
     """
-    # x (Z + tz) = X + tx, and the same for y: linear in the place.
+    # x (Z + tz) = X + tx, and the same for y: linear in the translation.
     ones, zeros = np.ones_like(plane[..., 0]), np.zeros_like(plane[..., 0])
     across = np.stack([ones, zeros, -plane[..., 0]], axis=-1)
     down = np.stack([zeros, ones, -plane[..., 1]], axis=-1)

@@ -1,4 +1,4 @@
-"""How much there is in a data set: clips, frames, poses, distances (X1, X2)."""
+"""Statistics of a data set: clips, frames, poses, distances (X1, X2)."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from worldpose.formats.pose_file import read_poses
 Floats = NDArray[np.float64]
 CameraKind = Literal["S", "M", "M+Z"]
 KINDS: Final[tuple[CameraKind, ...]] = ("S", "M", "M+Z")
-"""Cameras that stand still, move, or move and zoom, as the paper's table has them."""
+"""Static, moving, or moving and zooming cameras, as in the paper's table."""
 
 _TURN: Final = 1e-3
-"""A camera whose rotation differs by less [rad] stands still: a pixel in a broadcast picture."""
+"""Maximum rotation of a static camera [rad]: a pixel in a broadcast image."""
 _ZOOM: Final = 1e-2
-"""A camera whose focal length changes by less than this share does not zoom."""
+"""Maximum relative change of focal length without zoom."""
 
 
 def read_places(folder: Path, clip: str) -> Floats:
-    """Return where everybody is (frames, persons, 3) [m]; NaN where a person is missing.
+    """Return people's positions (frames, persons, 3) [m]; NaN where a person is missing.
 
-    The pelvis of poses, up to a shift of each person, or the middle of the hips.
+    The pelvis of poses, up to an offset per person, or the mid-hip.
 
     Args:
         folder: the data set.
         clip: one of `clips_in`.
 
     Raises:
-        InputError: a file is damaged, or the clip has none.
+        InputError: a file is damaged, or the clip has no positions.
     """
     poses = folder / "poses" / f"{clip}.npz"
     if poses.is_file():
@@ -52,7 +52,7 @@ def read_places(folder: Path, clip: str) -> Floats:
             return np.asarray(read_joints(folder / name).joints[:, :, hips].mean(2))
     for name in ("submission.zip", "submission.npz"):
         if (folder / name).is_file():
-            # Of the challenge's 15 joints, 7 and 8 are the hips.
+            # Joints 7 and 8 of the challenge's 15 are the hips.
             joints = read_submission(folder / name, (clip,))[clip]
             return np.asarray(joints[:, :, 7:9].mean(2)).swapaxes(0, 1)
     raise InputError(
@@ -64,15 +64,14 @@ def read_places(folder: Path, clip: str) -> Floats:
 
 
 def clip_statistics(places: Floats, fps: float, camera: CameraKind | None = None) -> ClipStatistics:
-    """Return how much there is in one clip.
+    """Return the statistics of one clip.
 
-    A person's way is that over the ground, from frame to frame; where a person is missing in
-    between, nothing is added.
+    A person's distance is the path length over the ground, from frame to frame; gaps add nothing.
 
     Args:
         places: (frames, persons, 3) [m], world; NaN where a person is missing.
-        fps: frames in a second [1/s].
-        camera: what the camera of the pictures does.
+        fps: frames per second [1/s].
+        camera: kind of the camera.
     """
     there = np.asarray(np.isfinite(places).all(-1))
     steps = np.linalg.norm(np.diff(places[..., :2], axis=0), axis=-1)
@@ -88,11 +87,11 @@ def clip_statistics(places: Floats, fps: float, camera: CameraKind | None = None
 
 
 def data_set_statistics(clips: Mapping[str, ClipStatistics]) -> DataSetStatistics:
-    """Return how much there is in all clips together."""
+    """Return the statistics of all clips together."""
     frames = sum(clip.frames for clip in clips.values())
     poses = sum(clip.poses for clip in clips.values())
     ways = [way for clip in clips.values() for way in clip.trajectories_m]
-    # Of every pose, the time until the next one.
+    # Duration of a pose: the time until the next one.
     seconds = sum(clip.poses * clip.seconds / clip.frames for clip in clips.values() if clip.frames)
     kinds = [clip.camera for clip in clips.values() if clip.camera is not None]
     return DataSetStatistics(
@@ -109,7 +108,7 @@ def data_set_statistics(clips: Mapping[str, ClipStatistics]) -> DataSetStatistic
 
 
 def camera_kind(path: Path) -> CameraKind | None:
-    """Return what the camera of a file does; None where there is no such file, or it tells not.
+    """Return the kind of a file's camera; None if there is no such file, or it is unknown.
 
     Raises:
         InputError: the file is damaged.
@@ -121,11 +120,11 @@ def camera_kind(path: Path) -> CameraKind | None:
 
 
 def kind_of(focal: Floats, rotation: Floats) -> CameraKind | None:
-    """Return what a camera does; None where its turns are not known.
+    """Return the kind of a camera; None if its rotations are unknown.
 
     Args:
         focal: (frames,) [px].
-        rotation: (frames, 3, 3), or (1, 3, 3) where only the first one is known.
+        rotation: (frames, 3, 3), or (1, 3, 3) if only the first one is known.
     """
     known = np.isfinite(focal)
     if known.any() and np.ptp(focal[known]) > _ZOOM * focal[known].mean():

@@ -1,7 +1,7 @@
-"""Detection: the people of each camera's pictures, with boxes and keypoints (D1-D3).
+"""Detection of people in each camera's frames, with boxes and keypoints (D1-D3).
 
-Inputs: pictures in order, detectors and a pose estimator, the calibrated camera and the pitch.
-Outputs: `Stretch`es of boxes, scores, keypoints and confidences; the crowd is left out.
+Inputs: frames in order, detectors and a pose estimator, the calibrated camera and the pitch.
+Outputs: `Stretch` chunks of boxes, scores, keypoints and confidences, without the crowd.
 """
 
 from worldpose.detection.interfaces import Detector, People, PoseEstimator, Poses

@@ -1,4 +1,4 @@
-"""Boxes of people: how much they overlap, and one box from several of a person."""
+"""Bounding boxes of people: intersection over union, suppression and weighted boxes fusion."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from worldpose.detection.interfaces import People, Poses
 Floats = NDArray[np.float64]
 
 SUREST: Final = 12
-"""Keypoints that tell whether somebody is there: of many people some are hidden."""
+"""Number of surest keypoints that decide whether a box holds a person: others may be hidden."""
 
 
 def overlaps(a: Floats, b: Floats) -> Floats:
-    """Intersection over union of every pair of boxes (n, m), 0 where they are apart.
+    """Return the intersection over union of every pair of boxes (n, m), 0 for disjoint boxes.
 
     Args:
         a: (n, 4) x0, y0, x1, y1 [px].
@@ -30,16 +30,16 @@ def overlaps(a: Floats, b: Floats) -> Floats:
 
 
 def areas(boxes: Floats) -> Floats:
-    """Area of boxes (n,) [px^2]."""
+    """Return the areas of boxes (n,) [px^2]."""
     return np.asarray(np.prod(np.maximum(boxes[:, 2:] - boxes[:, :2], 0.0), axis=1))
 
 
 def best_of(people: People, overlap: float) -> NDArray[np.intp]:
-    """Places of the people whose boxes overlap no better one by more than `overlap`, best first.
+    """Return the indices of boxes that pass non-maximum suppression, best first.
 
     Args:
-        people: of one picture.
-        overlap: [1].
+        people: of one frame.
+        overlap: a better box with a larger intersection over union suppresses a box [1].
     """
     order = _best_first(people)
     boxes = people.boxes[order]
@@ -51,17 +51,17 @@ def best_of(people: People, overlap: float) -> NDArray[np.intp]:
 
 
 def suppress(people: People, overlap: float) -> People:
-    """The people without boxes that overlap a better one by more than `overlap`, best first."""
+    """Return the people after non-maximum suppression at `overlap` [1], best first."""
     best = best_of(people, overlap)
     return People(people.boxes[best], people.scores[best])
 
 
 def seen_closer(people: People, poses: Poses) -> People:
-    """The same people with the boxes of who looked closer, where there are some.
+    """Return the people with the boxes of the pose estimator, where it gives any.
 
     Args:
         people: as a detector found them.
-        poses: of each. A score becomes its geometric mean with the expected fit and the mean
+        poses: of each person. A score becomes its geometric mean with the expected fit and the mean
             confidence of the surest keypoints.
     """
     if poses.boxes is None or poses.fit is None:
@@ -73,15 +73,16 @@ def seen_closer(people: People, poses: Poses) -> People:
 
 
 def fuse(members: list[People], overlap: float) -> People:
-    """One box a person from what the members of an ensemble found, best first.
+    """Return one box per person from the detections of an ensemble, best first.
 
-    Weighted boxes fusion: boxes join the best scored cluster that they overlap; a cluster's box is
-    the mean of its boxes weighted by score, and its score their sum over the number of members, so
-    that whom only one of them saw counts less. Each member's own doubles go first.
+    Weighted boxes fusion: a box joins the best scored cluster that it overlaps. A cluster's box is
+    the mean of its boxes weighted by score. Its score is the sum of their scores over the number of
+    members, so a person that only one member detects scores less. Each member's duplicates are
+    suppressed first.
 
     Args:
-        members: what each detector found in one picture.
-        overlap: above which two boxes are of one person [1].
+        members: detections of each detector in one frame.
+        overlap: boxes with a larger intersection over union are of one person [1].
 
     Note:
         D3. Solovyev et al., Weighted boxes fusion, 2021.
@@ -100,7 +101,7 @@ def fuse(members: list[People], overlap: float) -> People:
     joined: list[set[int]] = []
     for box, score, who in zip(boxes, scores, member, strict=True):
         shared = overlaps(box[None], fused)[0]
-        shared[[who in cluster for cluster in joined]] = 0.0  # a member sees a person once
+        shared[[who in cluster for cluster in joined]] = 0.0  # one box per member and person
         best = int(np.argmax(shared)) if len(shared) else -1
         if best >= 0 and shared[best] > overlap:
             total = weight[best] + score
@@ -116,5 +117,5 @@ def fuse(members: list[People], overlap: float) -> People:
 
 
 def _best_first(people: People) -> NDArray[np.intp]:
-    """Order by falling score, and by place where scores are equal: it must not depend on luck."""
+    """Return the order by falling score, then by position, so that ties have a fixed order."""
     return np.lexsort((people.boxes[:, 1], people.boxes[:, 0], -people.scores))

@@ -1,7 +1,7 @@
-"""The detector and the pose estimator that ship with the project, small and quick on a CPU.
+"""The detector and the pose estimator that ship with the project, small and fast on a CPU.
 
-They were trained on rendered matches alone (infra/embedded_detector): at home there, and a
-fallback on real pictures, for which fine-tuned or larger models are meant.
+Their training data are rendered matches alone (infra/embedded_detector). On real footage they are
+a fallback; fine-tuned or larger models serve better.
 """
 
 from __future__ import annotations
@@ -45,23 +45,24 @@ EMBEDDED: Final = (
     Path(__file__).with_name("embedded_people.safetensors"),
     Path(__file__).with_name("embedded_keypoints.safetensors"),
 )
-"""The shipped weights: of the detector, and of the pose estimator."""
+"""Shipped weights of the detector and of the pose estimator."""
 MOST_PEOPLE: Final = 300
-"""In one picture."""
+"""Most people per frame."""
 OVERLAP: Final = 0.7
-"""Two boxes of one person overlap by more [1, intersection over union]."""
+"""Boxes with a larger intersection over union are of one person [1]."""
 CLOSE: Final = 0.8
-"""Boxes are looked at again where the one that was seen and the one given share less [1]."""
+"""A crop is computed again if the given and the estimated box overlap less [1, intersection over
+union]."""
 KNOWN: Final = 0.25
-"""From this product of fit and surest keypoints on, somebody is there for sure [1]."""
+"""A product of fit and surest keypoints from which a person is certain [1]."""
 WORTH: Final = 0.1
-"""Below this product nobody is looked at again [1]."""
+"""Below this product no crop is computed again [1]."""
 NEIGHBOUR: Final = 0.05
-"""Who shares more with somebody is looked at again [1, intersection over union]."""
+"""A person that overlaps a neighbour more gets a second crop [1, intersection over union]."""
 PLACES: Final = 4
-"""Where each joint may be [1]."""
+"""Candidate positions per joint [1]."""
 BATCH: Final = 16
-"""Crops computed at once, always as many: kernels for other numbers round otherwise."""
+"""Crops per batch, always the same number: kernels for other numbers round differently."""
 
 
 def embedded_detector(
@@ -75,7 +76,7 @@ def embedded_detector(
         half: compute in half precision, on a GPU only.
 
     Raises:
-        InputError: the file is none of this detector, or torch is not installed.
+        InputError: the file holds other weights than this detector's, or torch is not installed.
     """
     nets = _nets()
     net = load_weights(weights or EMBEDDED[0], nets.PeopleNet())
@@ -85,16 +86,16 @@ def embedded_detector(
 def embedded_pose(
     weights: Path | None = None, device: str = "cpu", half: bool = False
 ) -> PoseEstimator:
-    """Return the embedded pose estimator; arguments and errors are those of `embedded_detector`."""
+    """Return the embedded pose estimator; `embedded_detector` describes arguments and errors."""
     nets = _nets()
     net = load_weights(weights or EMBEDDED[1], nets.KeypointNet())
     return EmbeddedPose(net, device, half)
 
 
 class EmbeddedDetector:
-    """A net that finds the middles of people and the sides of their boxes.
+    """A net that detects the centres of people and the sides of their boxes.
 
-    Groups of people who hide one another are looked at again, from nearer.
+    The detector runs a second time on enlarged crops of groups of people who occlude one another.
     """
 
     def __init__(self, net: PeopleNet, device: str = "cpu", half: bool = False) -> None:
@@ -102,11 +103,11 @@ class EmbeddedDetector:
 
     @property
     def view_size(self) -> None:
-        """None: pictures of any size, whole."""
+        """None: the detector takes whole frames of any size."""
         return
 
     def detect(self, pictures: Sequence[Picture]) -> list[People]:
-        """The people of each picture, computed one by one."""
+        """Return the people in each frame, computed one by one."""
         return [self._people(picture) for picture in pictures]
 
     def _people(self, picture: Picture) -> People:
@@ -123,7 +124,7 @@ class EmbeddedDetector:
         return suppress(People(boxes, scores), OVERLAP)
 
     def _look(self, picture: Picture) -> People:
-        """Whose middles a picture shows; the same person may be there twice."""
+        """Return the detections in an image; the same person may be there twice."""
         import torch
 
         from worldpose.detection.bundled_nets import COARSEST, normalised
@@ -144,18 +145,18 @@ class EmbeddedDetector:
 
 
 class EmbeddedPose:
-    """A net that finds the joints of the person in a crop."""
+    """A net that estimates the joints of the person in a crop."""
 
     def __init__(self, net: KeypointNet, device: str = "cpu", half: bool = False) -> None:
         self._net, self._device, self._half = _placed(net, device), device, half
 
     def estimate(self, picture: Picture, boxes: NDArray[np.float64]) -> Poses:
-        """The pose of each box; confidence is the chance that a keypoint is right.
+        """Return the pose in each box; confidence is the probability that a keypoint is correct.
 
-        Right is within a twentieth of the box's longer side, about a fifth of a torso. Whose box
-        turns out to be another than the one given is looked at once more, in that one; so is who
-        has neighbours, now that it is known where they stand. Joints that two people's maps put
-        in one place are shared out.
+        A correct keypoint is within a twentieth of the box's longer side, about a fifth of a torso.
+        If the estimated box differs from the given one, a second crop shows the estimated box.
+        People with neighbours also get a second crop, because the positions of the neighbours are
+        then known. Candidate joints that the maps of two people share are assigned to one of them.
         """
         looked = self._look(picture, boxes, [np.empty((0, 4))] * len(boxes))
         seen = looked.boxes
@@ -173,18 +174,18 @@ class EmbeddedPose:
         return looked.poses(shared_out(looked.places, looked.mass, looked.boxes))
 
     def beside(self, picture: Picture, people: People) -> tuple[People, Poses]:
-        """Those beside the people who were found, whom these hide in part, with their poses."""
+        """Return people partly occluded by the detected ones, with their poses."""
         return find_occluded_people(
             lambda boxes, others: self._look(picture, boxes, others), people
         )
 
     def _look(self, picture: Picture, boxes: Floats, others: Sequence[Floats]) -> Look:
-        """What a crop around each box shows.
+        """Return the net's output for a crop around each box.
 
         Args:
-            picture: the whole.
+            picture: the whole frame.
             boxes: (people, 4) [px].
-            others: of each person, the boxes (others, 4) of those about him [px].
+            others: boxes (others, 4) of the neighbours of each person [px].
         """
         import torch
 
@@ -230,7 +231,7 @@ class EmbeddedPose:
 
 
 def _nets() -> ModuleType:
-    """The module of the nets, which needs torch."""
+    """Return the module of the nets, which needs torch."""
     try:
         from worldpose.detection import bundled_nets
     except ImportError as error:
@@ -244,7 +245,7 @@ def _nets() -> ModuleType:
 
 
 def _placed(net: Net, device: str) -> Net:
-    """The net on a device, its normalisations folded into convolutions."""
+    """Return the net on a device, its batch normalisations folded into convolutions."""
     import torch
 
     from worldpose.detection.bundled_nets import folded

@@ -1,4 +1,4 @@
-"""Crops of a fixed size around boxes, and the way back from their pixels."""
+"""Crops of a fixed size around boxes, and the transform back from their pixels."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 MARGIN: Final = 1.25
-"""Size of a crop over that of the box it shows [1]: keypoints may lie outside of a box."""
+"""Size of a crop over that of its box [1]: keypoints may lie outside of a box."""
 
 
 def crops_of_boxes(boxes: Floats, size: tuple[int, int], margin: float = MARGIN) -> Floats:
-    """Return the crops (people, 3) that show boxes whole: middle x, y [px], picture px a crop px.
+    """Return the crops (people, 3) that show boxes whole: centre x, y [px], frame px per crop px.
 
     Args:
         boxes: (people, 4) x0, y0, x1, y1 [px].
@@ -31,13 +31,13 @@ def crops_of_boxes(boxes: Floats, size: tuple[int, int], margin: float = MARGIN)
 def picture_from_crop(
     crop: Floats, size: tuple[int, int], turn: float = 0.0, mirrored: bool = False
 ) -> Floats:
-    """Return the affine map (2, 3) from pixels of a crop to pixels of the picture.
+    """Return the affine map (2, 3) from pixels of a crop to pixels of the frame.
 
     Args:
-        crop: (3,) as of `crops_of_boxes`.
+        crop: (3,) from `crops_of_boxes`.
         size: width, height of the crop [px].
-        turn: of the crop within the picture, from x to y [rad].
-        mirrored: left is right in the crop.
+        turn: rotation of the crop within the frame, from x to y [rad].
+        mirrored: whether the crop is mirrored left to right.
     """
     x, y, scale = crop
     cos, sin = scale * np.cos(turn), scale * np.sin(turn)
@@ -51,17 +51,17 @@ def picture_from_crop(
 def cut(
     picture: NDArray[np.uint8], mapping: Floats, size: tuple[int, int], outside: int = 115
 ) -> NDArray[np.uint8]:
-    """Return a crop (height, width, 3); what lies outside of the picture is grey.
+    """Return a crop (height, width, 3), grey outside of the frame.
 
     Args:
         picture: (height, width, 3).
-        mapping: (2, 3) from pixels of the crop to those of the picture.
+        mapping: (2, 3) from pixels of the crop to those of the frame.
         size: width, height of the crop [px].
-        outside: level of what is outside [of 255].
+        outside: grey level outside of the frame [of 255].
     """
     shrink = np.sqrt(abs(np.linalg.det(mapping[:, :2])))
     if shrink > 2.0:
-        # Bilinear reading alone would skip pixels.
+        # Bilinear interpolation alone would skip pixels.
         picture, mapping = _shrunk(picture, mapping, int(shrink), size)
     return np.asarray(
         cv2.warpAffine(
@@ -79,7 +79,7 @@ def cut(
 def _shrunk(
     picture: NDArray[np.uint8], mapping: Floats, factor: int, size: tuple[int, int]
 ) -> tuple[NDArray[np.uint8], Floats]:
-    """Return the part of a picture that a crop shows, shrunk by a whole number, and its map."""
+    """Return the part of a frame that a crop shows, shrunk by a whole number, and its map."""
     corners = np.array([[0.0, 0.0], [size[0], 0.0], [0.0, size[1]], [*size]])
     seen = corners @ mapping[:, :2].T + mapping[:, 2]
     high = np.array([picture.shape[1], picture.shape[0]])

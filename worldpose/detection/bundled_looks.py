@@ -1,4 +1,4 @@
-"""What the embedded pose net sees in crops around boxes."""
+"""Output of the embedded pose net for crops around boxes."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What crops around boxes show.
+    """Candidate joints, boxes and scores from crops around boxes.
 
     Attributes:
-        places: (people, 17, count, 2) where each joint may be, the likeliest first [px].
-        mass: (people, 17, count) probability about each place.
-        sure: (people, 17, count) chance that a place is right.
+        places: (people, 17, count, 2) candidate positions of each joint, the likeliest first [px].
+        mass: (people, 17, count) probability around each position.
+        sure: (people, 17, count) probability that a position is correct.
         boxes: (people, 4) [px].
-        fit: (people,) how much of their union these and the true boxes share, as expected [1].
+        fit: (people,) expected intersection over union of these and the true boxes [1].
     """
 
     places: Floats
@@ -32,22 +32,22 @@ class Look:
     fit: Floats
 
     def only(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> Look:
-        """What it sees of some people."""
+        """Return the output for some people."""
         return Look(*(getattr(self, field.name)[which] for field in fields(self)))
 
     def replace(self, which: NDArray[np.bool_], other: Look) -> None:
-        """Put what another look shows in the place of some people, in place."""
+        """Overwrite the output of some people with that of another look."""
         for field in fields(self):
             getattr(self, field.name)[which] = getattr(other, field.name)
 
     @property
     def score(self) -> Floats:
-        """How sure it is that somebody is there (people,): fit times surest keypoints [1]."""
+        """Return the confidence that a box holds a person (people,): fit times surest keypoints."""
         surest = np.sort(self.sure[..., 0], axis=1)[:, -SUREST:].mean(axis=1)
         return np.asarray(self.fit * surest)
 
     def poses(self, taken: NDArray[np.intp]) -> Poses:
-        """The poses whose joints are in the places (people, 17) that are taken."""
+        """Return the poses whose joints are at the chosen candidates (people, 17)."""
         one = taken[..., None]
         return Poses(
             np.take_along_axis(self.places, one[..., None], axis=2)[:, :, 0],

@@ -1,6 +1,6 @@
-"""The two small nets that ship with the project: people in a picture, keypoints in a crop.
+"""The two small nets that ship with the project: a person detector and a keypoint estimator.
 
-Needs torch. Nothing else of worldpose imports this file before it is asked to. Both nets are plain
+Needs torch; the rest of the package imports this module only on demand. Both nets are plain
 residual pyramids of 3 x 3 convolutions, which CPUs compute fastest; they differ in their heads.
 """
 
@@ -20,22 +20,22 @@ from worldpose.detection.bundled_surroundings import MAPS
 Net = TypeVar("Net", bound=nn.Module)
 
 STRIDE: Final = 4
-"""Pixels of the picture a cell of the people map [px]."""
+"""Pixels of the frame per cell of the people map [px]."""
 COARSEST: Final = 32
-"""Pictures are padded to multiples of this [px]."""
+"""Frames are padded to multiples of this [px]."""
 CROP: Final = (96, 128)
 """Width, height of the crops that the keypoint net takes [px]."""
 CELL: Final = 2
-"""Pixels of the crop a cell of the keypoint maps [px]."""
+"""Pixels of the crop per cell of the keypoint maps [px]."""
 EDGE_CELL: Final = 4
-"""Pixels of the crop a cell of the maps of edges [px]."""
+"""Pixels of the crop per cell of the edge maps [px]."""
 JOINTS: Final = 17
 _SCALE: Final = 16.0
-"""A box side of logarithm 0 lies this far from its cell [px]: that of a person of about 60 px."""
+"""Distance of a box side of logarithm 0 from its cell [px]: that of a person of about 60 px."""
 
 
 class Block(nn.Sequential):
-    """Convolution, batch normalisation and rectification."""
+    """Convolution, batch normalisation and ReLU."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> None:
         padding = (kernel - stride + 1) // 2 if kernel > 1 else 0
@@ -47,24 +47,24 @@ class Block(nn.Sequential):
 
 
 class Residual(nn.Module):
-    """Two convolutions beside the identity."""
+    """Two convolutions with an identity shortcut."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.first, self.second = Block(width, width), Block(width, width)
 
     def forward(self, features: Tensor) -> Tensor:
-        """(batch, width, height, width) of the same shape."""
+        """Return features (batch, width, height, width) of the same shape."""
         changed: Tensor = self.second(self.first(features))
         return features + changed
 
 
 class Pyramid(nn.Module):
-    """Features of a finest map that know what all coarser ones see.
+    """Features of the finest map, with the context of all coarser ones.
 
     Args:
-        stem: layers from the picture to the finest map.
-        widths: channels of the maps, each of half the size of the one before it.
+        stem: layers from the image to the finest map.
+        widths: channels of the maps, each half the size of the one before it.
         depths: residual blocks on each map.
     """
 
@@ -82,7 +82,7 @@ class Pyramid(nn.Module):
         self.merged = nn.ModuleList(merged)
 
     def forward(self, picture: Tensor, added: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """The finest map, and the coarsest; `added` to what the stem makes of the picture."""
+        """Return the finest and the coarsest map; `added` is added to the output of the stem."""
         stem = self.stem(picture)
         maps = [self.stages[0](stem if added is None else stem + added)]
         for stage in self.stages[1:]:
@@ -95,25 +95,25 @@ class Pyramid(nn.Module):
 
 
 class PeopleNet(nn.Module):
-    """Where the middles of people are, and how far the sides of their boxes are from there."""
+    """Net for the centres of people and the distances to the sides of their boxes."""
 
     def __init__(self) -> None:
         super().__init__()
         self.pyramid = Pyramid(Block(3, 24, kernel=6, stride=4), (24, 40, 80, 128), (1, 2, 2, 1))
         last = nn.Conv2d(32, 5, 1)
-        # Few cells are the middle of anybody: training begins from a chance of 1 %.
+        # Few cells are a person's centre: training begins from a probability of 1 %.
         last.bias = nn.Parameter(torch.tensor([-4.6, 0.0, 0.0, 0.0, 0.0]))
         self.head = nn.Sequential(Block(24, 32), last)
 
     def forward(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the maps of pictures whose sides are multiples of `COARSEST`.
+        """Return the maps of frames whose sides are multiples of `COARSEST`.
 
         Args:
             pictures: (batch, 3, height, width) `normalised`.
 
         Returns:
-            Logits that a cell is the middle of somebody (batch, rows, columns), and distances from
-            the cell's middle to left, top, right and bottom (batch, 4, rows, columns) [px].
+            Logits that a cell is a person's centre (batch, rows, columns), and distances from the
+            cell's centre to left, top, right and bottom (batch, 4, rows, columns) [px].
         """
         features, _ = self.pyramid(pictures)
         maps = self.head(features).float()
@@ -121,14 +121,14 @@ class PeopleNet(nn.Module):
 
 
 class Seen(NamedTuple):
-    """What the keypoint net says of crops.
+    """Output of the keypoint net for crops.
 
     Attributes:
-        maps: logits of where each joint is (batch, 17, rows, columns), to be compared over the
-            cells of a map.
-        doubt: what the crop as a whole says of each joint's certainty (batch, 17).
+        maps: logits of each joint's position (batch, 17, rows, columns); a softmax over the cells
+            of a map gives probabilities.
+        doubt: logit of each joint from the crop as a whole (batch, 17).
         boxes: x0, y0, x1, y1 of the person (batch, 4) [px of the crop].
-        fit: logits of how much of their union these and the true boxes share (batch,).
+        fit: logits of the intersection over union of these and the true boxes (batch,).
     """
 
     maps: Tensor
@@ -138,7 +138,7 @@ class Seen(NamedTuple):
 
 
 class KeypointNet(nn.Module):
-    """Where the 17 joints and the box of the person in a crop are, and how sure that is."""
+    """Net for the 17 joints and the box of the person in a crop, with their confidences."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -153,26 +153,26 @@ class KeypointNet(nn.Module):
         self.fit = nn.Sequential(nn.Linear(128 + 4, 32), nn.ReLU(), nn.Linear(32, 1))
 
     def forward(self, crops: Tensor, surroundings: Tensor) -> Seen:
-        """Return what is seen in crops.
+        """Return the net's output for crops.
 
         Args:
             crops: (batch, 3, height, width) `normalised`.
-            surroundings: (batch, 3, rows, columns) who is asked for and who is about.
+            surroundings: (batch, 3, rows, columns) maps of the target box and its neighbours.
         """
         features, coarsest = self.pyramid(crops, self.around(surroundings))
         maps = functional.pixel_shuffle(self.head(features), CELL)
-        # How sure a joint is must not bend the features that find it.
+        # The confidence of a joint must not change the features that find it.
         whole = coarsest.float().mean(dim=(2, 3))
         boxes, spread = edges(self.outline(features).float())
         fit = self.fit(torch.cat([whole, spread], dim=1))[:, 0]
         return Seen(maps.float(), self.doubt(whole.detach()), boxes, fit)
 
     def sureness(self, doubt: Tensor, mass: Tensor) -> Tensor:
-        """Logits that joints are right, from `doubt` and their peaks' mass.
+        """Return logits that joints are correct, from `doubt` and the mass of their peaks.
 
         Args:
             doubt: (batch, 17)
-            mass: (batch, 17) or, of several places each, (batch, 17, places).
+            mass: (batch, 17) or, for several positions each, (batch, 17, places).
         """
         places = (1,) * (mass.ndim - 2)
         trusted = self.trust.view(-1, *places) * torch.logit(mass, eps=1e-4)
@@ -180,14 +180,14 @@ class KeypointNet(nn.Module):
 
 
 def normalised(pictures: Tensor) -> Tensor:
-    """Pictures (batch, height, width, 3) of bytes as the nets take them (batch, 3, ...)."""
+    """Return images (batch, height, width, 3) of bytes as the nets take them (batch, 3, ...)."""
     return pictures.permute(0, 3, 1, 2).float().sub_(115.0).div_(58.0)
 
 
 def peaks(maps: Tensor) -> tuple[Tensor, Tensor]:
-    """Where joints are, finer than cells, and the probability about that place.
+    """Return subcell positions of joints and the probability around each position.
 
-    The place is the mean over the 5 x 5 cells about the most likely one.
+    The position is the mean over the 5 x 5 cells around the most likely one.
 
     Args:
         maps: (batch, joints, rows, columns) logits.
@@ -211,9 +211,9 @@ def peaks(maps: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def edges(maps: Tensor) -> tuple[Tensor, Tensor]:
-    """Where the edges of a box are, and how far their probability spreads.
+    """Return the edges of a box and the standard deviations of their probabilities.
 
-    Every map is read along one axis alone, as an edge's probability over columns or rows.
+    Each map is reduced to one axis: an edge's probability over columns or rows.
 
     Args:
         maps: (batch, 4, rows, columns) logits of left, top, right and bottom.
@@ -233,7 +233,7 @@ def edges(maps: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def folded(net: Net) -> Net:
-    """Return `net` for computing alone: its normalisations are part of its convolutions.
+    """Return `net` for inference: its normalisations are part of its convolutions.
 
     Args:
         net: with its weights, changed in place.

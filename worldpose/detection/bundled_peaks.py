@@ -1,4 +1,4 @@
-"""From the people net's maps to boxes."""
+"""Boxes from the people net's maps."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from worldpose.detection.bundled_nets import STRIDE
 
 
 def cell_middles(count: int, device: torch.device) -> Tensor:
-    """Where the middles of cells in a row lie in the picture (count,) [px]."""
+    """Return the centres of the cells of a row in the frame (count,) [px]."""
     return torch.arange(count, device=device) * STRIDE + 0.5 * (STRIDE - 1)
 
 
 def boxes_at_peaks(logits: Tensor, sides: Tensor, least: float, most: int) -> tuple[Tensor, Tensor]:
-    """Return boxes (people, 4) [px] and scores (people,) of one picture, best first.
+    """Return boxes (people, 4) [px] and scores (people,) of one frame, best first.
 
     Args:
-        logits: (rows, columns) that a cell is the middle of somebody.
-        sides: (4, rows, columns) from there to left, top, right and bottom [px].
-        least: the lowest score reported.
-        most: the most people reported.
+        logits: (rows, columns) that a cell is a person's centre.
+        sides: (4, rows, columns) distances from there to left, top, right and bottom [px].
+        least: lowest score reported.
+        most: most people reported.
     """
     score = torch.sigmoid(logits)
     best = functional.max_pool2d(score[None, None], 3, stride=1, padding=1)[0, 0]

@@ -1,4 +1,4 @@
-"""From the keypoint net's maps to the places where a joint may be."""
+"""Candidate positions of joints from the keypoint net's maps."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from torch.nn import functional
 from worldpose.detection.bundled_nets import CELL
 
 APART: Final = 3
-"""Cells to either side of a place in which no other is taken."""
+"""Cells to either side of a position in which no other position is chosen."""
 
 
 def likely_places(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return where each joint may be, finer than cells, the likeliest place first.
+    """Return candidate positions of each joint, finer than cells, the likeliest first.
 
-    Places are the means over the 5 x 5 cells about the peaks of a map.
+    Positions are the means over the 5 x 5 cells around the peaks of a map.
 
     Args:
         maps: (batch, joints, rows, columns) logits.
-        count: places of each joint.
+        count: positions of each joint.
 
     Returns:
-        Places (batch, joints, count, 2) [px of the crop], and the probability about each
-        (batch, joints, count); 0 where there are fewer peaks.
+        Positions (batch, joints, count, 2) [px of the crop], and the probability around each
+        (batch, joints, count); 0 where a map has fewer peaks.
     """
     columns = maps.shape[-1]
     chance = functional.softmax(maps.flatten(2), dim=-1).view_as(maps)
     peak = chance == _highest_near(chance)
     _, cell = torch.where(peak, chance, 0.0).flatten(2).topk(2 * count, dim=-1)
     around = torch.arange(5, device=maps.device)
-    # In maps with a border of two cells, cells about a place begin at its own row and column.
+    # In maps padded by two cells, the 5 x 5 cells around a cell begin at its own row and column.
     padded = functional.pad(chance, (2, 2, 2, 2)).flatten(2)
     first = cell // columns * (columns + 4) + cell % columns
     at = first[..., None, None] + around[:, None] * (columns + 4) + around
@@ -48,7 +48,7 @@ def likely_places(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def _highest_near(maps: Tensor) -> Tensor:
-    """The highest value within `APART` cells of each, down and across."""
+    """Return the highest value within `APART` cells of each, along rows and columns."""
     for axis in (2, 3):
         border = (0, 0, APART, APART) if axis == 2 else (APART, APART)
         wide = functional.pad(maps, border)

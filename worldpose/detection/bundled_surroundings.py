@@ -1,4 +1,4 @@
-"""Who is asked for in a crop, who stands before him and who behind, as maps for a net."""
+"""Maps of a crop's target person, of occluders and of occluded people, as inputs of a net."""
 
 from __future__ import annotations
 
@@ -10,25 +10,24 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 CELL: Final = 4
-"""Pixels of the crop a cell of these maps [px]."""
+"""Pixels of the crop per cell of these maps [px]."""
 MAPS: Final = 3
-"""The box asked for, boxes of who stands before him, and of who stands behind him."""
+"""The target box, boxes of people in front of the target, and of people behind it."""
 SAME: Final = 0.6
-"""A box that shares more with the one asked for is the same person's [1, intersection over
-union]."""
+"""A box that overlaps the target box more is the same person's [1, intersection over union]."""
 
 
 def surroundings(
     box: Floats, others: Floats, mapping: Floats, size: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """Return how much of each cell of a crop boxes cover (3, rows, columns) [1].
+    """Return the share of each cell of a crop that boxes cover (3, rows, columns) [1].
 
-    Whose box ends lower in the picture stands nearer to the camera.
+    The person whose box ends lower in the frame stands nearer to the camera.
 
     Args:
-        box: (4,) of the person asked for x0, y0, x1, y1 [px].
+        box: (4,) of the target person x0, y0, x1, y1 [px].
         others: (people, 4) of others [px].
-        mapping: (2, 3) from pixels of the crop to those of the picture.
+        mapping: (2, 3) from pixels of the crop to those of the frame.
         size: width, height of the crop [px].
     """
     columns, rows = size[0] // CELL, size[1] // CELL

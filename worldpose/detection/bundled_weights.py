@@ -14,22 +14,22 @@ if TYPE_CHECKING:
 Net = TypeVar("Net", bound="nn.Module")
 
 FORMAT: Final = "worldpose-net"
-"""Key of a file's metadata that names what its weights are of."""
+"""Key of a file's metadata that names the class of the net."""
 
 
 def save_weights(path: Path, net: nn.Module, about: dict[str, str] | None = None) -> None:
-    """Write a net's weights, whole or not at all; equal weights give equal bytes.
+    """Write a net's weights atomically; equal weights give equal bytes.
 
     Args:
-        path: replaced if there.
+        path: an existing file is replaced.
         net: one of `worldpose.detection.bundled_nets`.
-        about: further metadata, such as where the weights come from.
+        about: further metadata, such as the origin of the weights.
     """
     from safetensors.torch import save
 
     tensors = {name: value.detach().contiguous() for name, value in net.state_dict().items()}
     data = save(tensors, {**(about or {}), FORMAT: type(net).__name__})
-    # The library orders metadata by chance.
+    # The library orders metadata at random.
     length = int.from_bytes(data[:8], "little")
     header = json.loads(data[8 : 8 + length])
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
@@ -42,7 +42,7 @@ def save_weights(path: Path, net: nn.Module, about: dict[str, str] | None = None
 
 
 def load_weights(path: Path, net: Net) -> Net:
-    """Return `net` with the weights of a file, ready to compute.
+    """Return `net` with the weights of a file, in evaluation mode.
 
     Raises:
         InputError: no safetensors file, weights of another net, or numbers that are not finite.

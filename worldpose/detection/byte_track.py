@@ -1,4 +1,4 @@
-"""Boxes of a camera followed from frame to frame (ByteTrack, Zhang et al. 2022)."""
+"""2D tracking of the boxes of one camera (ByteTrack, Zhang et al. 2022)."""
 
 from __future__ import annotations
 
@@ -14,36 +14,37 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 SURE_OVERLAP: Final = 0.2
-"""A sure box continues a track whose expected box it overlaps by more [1]: a small box moves by
-half of its width in a frame."""
+"""A high-score box continues a track whose predicted box it overlaps more [1]: a small box moves by
+half of its width per frame."""
 DOUBTFUL_OVERLAP: Final = 0.5
-"""A doubtful one must lie where it is expected."""
+"""A low-score box must lie near the prediction."""
 PLACE_NOISE: Final = 1.0 / 20.0
-"""Standard deviation of a box's place and size, of its height [1]; ByteTrack's."""
+"""Standard deviation of a box's position and size, over its height [1]; ByteTrack's."""
 SPEED_NOISE: Final = 1.0 / 160.0
-"""Of their change in a frame, of the height [1/frame]; ByteTrack's."""
+"""Standard deviation of their change per frame, over the height [1/frame]; ByteTrack's."""
 
 _STEP = np.eye(8) + np.eye(8, k=4)
-"""Places move by speeds."""
+"""Transition matrix: speeds move positions."""
 
 
 class BoxTracker:
     """Tracks of one camera.
 
-    A track's state is the middle, width and height of its box and their change a frame, with a
-    Kalman filter each. Sure boxes are assigned to tracks first; doubtful ones only to what is left
-    of the tracks that were seen a frame ago, and they begin none: a person half hidden keeps their
-    track, and what flickers in the crowd does not become one.
+    A Kalman filter per track estimates the centre, width and height of its box and their change
+    per frame. High-score boxes are assigned to tracks first. Low-score boxes only continue
+    unmatched tracks that were seen in the previous frame, and they begin none: a partly occluded
+    person keeps the track, and a flickering box in the crowd does not become one.
     """
 
-    def __init__(self, sure: float, patience: int) -> None:
+    def __init__(self, high_score_threshold: float, track_buffer_frames: int) -> None:
         """Begin without tracks.
 
         Args:
-            sure: score from which on a box may begin a track [1].
-            patience: frames after which a track that is not seen is given up.
+            high_score_threshold: score from which on a box may begin a track [1].
+            track_buffer_frames: frames after which an unseen track ends.
         """
-        self._sure, self._patience = sure, patience
+        self._high_score = high_score_threshold
+        self._buffer = track_buffer_frames
         self._mean: Floats = np.empty((0, 8))
         self._covariance: Floats = np.empty((0, 8, 8))
         self._id: Integers = np.empty(0, dtype=np.int64)
@@ -51,12 +52,12 @@ class BoxTracker:
         self._next = 0
 
     def follow(self, boxes: Floats, scores: Floats, frames: int = 1) -> Integers:
-        """The track of each box (boxes,), -1 for doubtful ones that continue none.
+        """Return the track of each box (boxes,), -1 for low-score boxes that continue none.
 
         Args:
-            boxes: (boxes, 4) x0, y0, x1, y1 [px] of the next frame that was looked at.
+            boxes: (boxes, 4) x0, y0, x1, y1 [px] of the next frame in which people were detected.
             scores: (boxes,).
-            frames: how many frames later it is.
+            frames: number of frames since the previous call's frame.
         """
         for _ in range(frames):
             self._predict()
@@ -64,7 +65,7 @@ class BoxTracker:
         track = np.full(len(boxes), -1, dtype=np.int64)
         seen = np.zeros(len(self._id), dtype=np.bool_)
         expected = _as_boxes(self._mean)
-        sure = scores >= self._sure
+        sure = scores >= self._high_score
         for candidates, tracks, least in (
             (np.flatnonzero(sure), np.ones_like(seen), SURE_OVERLAP),
             (np.flatnonzero(~sure), self._unseen == frames, DOUBTFUL_OVERLAP),
@@ -100,7 +101,7 @@ class BoxTracker:
         self._covariance[rows] = covariance - gain @ covariance[:, :4, :]
 
     def _forget(self) -> None:
-        kept = self._unseen <= self._patience
+        kept = self._unseen <= self._buffer
         self._mean, self._covariance = self._mean[kept], self._covariance[kept]
         self._id, self._unseen = self._id[kept], self._unseen[kept]
 
@@ -117,20 +118,20 @@ class BoxTracker:
 
 
 def _assigned(expected: Floats, boxes: Floats, least: float) -> list[tuple[int, int]]:
-    """Pairs of rows that overlap by more than `least`, so that most overlap in all is kept."""
+    """Return pairs of rows that overlap by more than `least`, with the largest total overlap."""
     shared = overlaps(expected, boxes)
-    # A pair that is not allowed gives nothing, so that it never costs an allowed one.
+    # A forbidden pair has value 0, so that it never displaces an allowed one.
     pairs = linear_sum_assignment(-np.where(shared > least, shared, 0.0))
     return [(int(a), int(b)) for a, b in zip(*pairs, strict=True) if shared[a, b] > least]
 
 
 def _as_states(boxes: Floats) -> Floats:
-    """Middle x, y, width, height of boxes (n, 4)."""
+    """Return the centre x, y, width, height of boxes (n, 4)."""
     size = np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0)
     return np.hstack([(boxes[:, :2] + boxes[:, 2:]) / 2.0, size])
 
 
 def _as_boxes(means: Floats) -> Floats:
-    """x0, y0, x1, y1 of states (n, 8)."""
+    """Return x0, y0, x1, y1 of states (n, 8)."""
     half = np.maximum(means[:, 2:4], 1.0) / 2.0
     return np.hstack([means[:, :2] - half, means[:, :2] + half])

@@ -1,4 +1,4 @@
-"""Boxes cut out of a picture at a net's size, and back."""
+"""Crops of boxes at a net's input size, and the transform back to frame pixels."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ Floats = NDArray[np.float64]
 
 
 def crop_frames(boxes: Floats, size: tuple[int, int], padding: float) -> Floats:
-    """Where crops of a net's shape lie around boxes (boxes, 3): left, top, pixels a crop pixel.
+    """Return crops with a net's aspect ratio around boxes (boxes, 3): left, top, px per crop px.
 
     Args:
         boxes: (boxes, 4) x0, y0, x1, y1 [px].
         size: width, height of a crop [px].
-        padding: how many times larger than the box the crop is, at its tighter side [1].
+        padding: size of the crop over that of the box, at its tighter side [1].
     """
     middle = (boxes[:, :2] + boxes[:, 2:]) / 2.0
     extent = np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0) * padding
@@ -26,13 +26,13 @@ def crop_frames(boxes: Floats, size: tuple[int, int], padding: float) -> Floats:
 
 
 def cut_crops(picture: Picture, frames: Floats, size: tuple[int, int], fill: int = 0) -> Picture:
-    """The crops (boxes, height, width, 3), smoothed where they are smaller than the picture.
+    """Return the crops (boxes, height, width, 3), smoothed where they are smaller than the frame.
 
     Args:
-        picture: the whole picture.
+        picture: the whole frame.
         frames: (boxes, 3) from `crop_frames`.
         size: width, height of a crop [px].
-        fill: grey beyond the picture's border.
+        fill: grey level beyond the frame's border.
     """
     import cv2  # late: it takes a fifth of a second, and planning a run needs none of it
 
@@ -76,7 +76,7 @@ def cut_crops(picture: Picture, frames: Floats, size: tuple[int, int], fill: int
 
 
 def in_picture(points: Floats, frames: Floats) -> Floats:
-    """Points of crops in the picture's pixels.
+    """Return points of crops in the frame's pixels.
 
     Args:
         points: (boxes, points, 2) [px of the crop].

@@ -1,4 +1,4 @@
-"""Who stands on the pitch, and who watches from outside (D2)."""
+"""Classification of people on the pitch and spectators outside of it (D2)."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from worldpose.pitch import PitchTemplate
 Floats = NDArray[np.float64]
 
 HEAD_HEIGHT: Final = 1.75
-"""Of a person whose feet the picture's lower border cuts off [m]."""
+"""Height of the head above the ground, for a person whose feet the lower border cuts off [m]."""
 CUT: Final = 3.0
-"""A box this near to the lower border goes on below it [px]."""
+"""The lower border cuts off a box that ends this near to it [px]."""
 
 
 def on_pitch(
     boxes: Floats, camera: Camera, image_size: tuple[int, int], pitch: PitchTemplate, margin: float
 ) -> NDArray[np.bool_]:
-    """Whether people stand on the pitch or close beside it (people,).
+    """Return whether people stand on the pitch or within a margin around it (people,).
 
-    The middle of a box's lower edge is where the feet touch the ground. Whoever sits in a stand is
-    seen against ground farther away than any margin. Where the picture's border cuts the feet off,
-    the head tells: it is at a man's height above the ground.
+    The middle of a box's lower edge is where the feet touch the ground. The ray to a spectator in
+    a stand meets the ground farther away than any margin. If the image border cuts off the feet,
+    the head position decides, at a person's height above the ground.
 
     Args:
         boxes: (people, 4) x0, y0, x1, y1 [px].
-        camera: one camera, whose picture it is.
+        camera: the camera that took the frame.
         image_size: width, height [px].
         pitch: its lines and its surface.
-        margin: how far outside of the lines is still on the pitch [m].
+        margin: largest distance outside of the lines that still counts as on the pitch [m].
     """
     cut = boxes[:, 3] > image_size[1] - 1 - CUT
     pixels = np.stack(
@@ -41,7 +41,7 @@ def on_pitch(
     rays = camera.unproject(pixels)
     height = np.where(cut, HEAD_HEIGHT, 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        for _ in range(3):  # the crown is flat: the second step moves by millimetres
+        for _ in range(3):  # the crown is flat: the second step changes millimetres
             along = (height - rays.origins[:, 2]) / rays.directions[:, 2]
             points = rays.origins + along[:, None] * rays.directions
             inside = np.isfinite(points).all(axis=1)

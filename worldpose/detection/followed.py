@@ -1,4 +1,4 @@
-"""People's boxes in every frame: flickers gone, short gaps filled, a few frames late."""
+"""People's boxes in every frame, without flickers, with short gaps filled, at a short delay."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 
 @dataclass
 class _Held:
-    """A frame that is held back until its gaps can be filled."""
+    """A buffered frame whose gaps may still be filled."""
 
     number: int
     picture: Picture | None
@@ -27,7 +27,7 @@ class _Held:
 
 @dataclass
 class _Track:
-    """Where a track was seen last, and how often it was."""
+    """Last frame, box and score of a track, and its number of sightings."""
 
     number: int
     box: Floats
@@ -36,11 +36,11 @@ class _Track:
 
 
 class Follower:
-    """Cleans what a detector found, frame by frame, in bounded memory (D3)."""
+    """Cleans detections frame by frame, in bounded memory (D3)."""
 
     def __init__(self, settings: DetectionSettings) -> None:
         self._settings = settings
-        self._tracker = BoxTracker(settings.sure, settings.patience)
+        self._tracker = BoxTracker(settings.high_score_threshold, settings.track_buffer_frames)
         self._held: deque[_Held] = deque()
         self._tracks: dict[int, _Track] = {}
         self._looks = 0
@@ -53,10 +53,10 @@ class Follower:
         """Yield each frame with the people in it.
 
         Args:
-            frames: rising numbers, pictures, and who was found; None where nobody looked.
+            frames: rising numbers, images, and detections; None where no detector ran.
         """
         settings = self._settings
-        lag = max(settings.bridge, settings.stride)
+        lag = max(settings.max_gap_frames, settings.stride)
         for number, picture, people in frames:
             self._held.append(_Held(number, picture))
             if people is not None:
@@ -85,7 +85,7 @@ class Follower:
             before.sightings += 1
 
     def _fill(self, track: int, before: _Track, number: int, box: Floats, score: float) -> None:
-        """Boxes that move evenly from where a track was seen to where it is seen again."""
+        """Interpolate boxes linearly between two sightings of a track."""
         for held in self._held:
             if before.number < held.number < number and held.picture is not None:
                 part = (held.number - before.number) / (number - before.number)
@@ -95,7 +95,7 @@ class Follower:
 
     def _released(self) -> tuple[int, Picture | None, People]:
         held = self._held.popleft()
-        least = min(self._settings.sightings, self._looks)
+        least = min(self._settings.min_hits, self._looks)
         kept = {
             track: box
             for track, box in sorted(held.boxes.items())
@@ -105,7 +105,7 @@ class Follower:
         gone = [
             track
             for track, last in self._tracks.items()
-            if held.number - last.number > self._settings.patience
+            if held.number - last.number > self._settings.track_buffer_frames
         ]
         for track in gone:
             del self._tracks[track]
@@ -120,13 +120,13 @@ def looked_at(
     stride: int,
     batch: int,
 ) -> Iterator[tuple[int, Picture | None, People | None]]:
-    """Yield each frame with who was found in it, looking at every `stride`-th and the last one.
+    """Yield each frame with its detections; detectors run on every `stride`-th and the last one.
 
     Args:
-        frames: rising numbers with pictures; None where there is none.
-        look: finds people in pictures of one size.
-        stride: frames from one look to the next.
-        batch: pictures that are looked at together.
+        frames: rising numbers with images; None where there is none.
+        look: detects people in images of one size.
+        stride: frames between runs of the detector.
+        batch: images per call of the detector.
     """
     waiting: list[tuple[int, Picture | None]] = []
     chosen: list[int] = []
@@ -149,5 +149,5 @@ def looked_at(
             yield from found()
     last = next((at for at in reversed(range(len(waiting))) if waiting[at][1] is not None), None)
     if last is not None and last not in chosen:
-        chosen.append(last)  # so that boxes reach the end
+        chosen.append(last)  # so that boxes reach the last frame
     yield from found()

@@ -1,4 +1,4 @@
-"""People who stand close together, to be looked at again from nearer."""
+"""Groups of people close together, for a second detection pass on enlarged crops."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from worldpose.detection.interfaces import People, Picture
 Floats = NDArray[np.float64]
 
 TALL: Final = (100.0, 160.0)
-"""People of a group are shown about so tall [px], once each: what the detector learns goes to 160;
-where one look takes two heads for one, the other may not."""
+"""The enlarged heights of a group's people [px], one pass per height: the detector is trained on
+heights up to 160; where one pass merges two heads, the other may separate them."""
 ZOOMS: Final = (1.25, 3.0)
-"""A group that needs less enlarging is seen well enough; none is enlarged more [1]."""
+"""A group that needs less enlargement is large enough; none is enlarged more [1]."""
 SURE: Final = 0.25
-"""Boxes from this score on make a group [1]."""
+"""Boxes from this score on form a group [1]."""
 SAME: Final = 0.6
-"""Boxes that share more are one person's [1, intersection over union]."""
+"""Boxes that overlap more are one person's [1, intersection over union]."""
 NEAR: Final = 0.15
-"""Neighbours in a group share more [1, intersection over union]."""
+"""Neighbours in a group overlap more [1, intersection over union]."""
 MARGIN: Final = 0.25
-"""Who stands so far beside a group belongs to it, as a share of its people's height [1]."""
+"""Margin within which people still belong to a group, as a share of its people's height [1]."""
 HEIGHTS: Final = (0.5, 2.0)
 """Shortest and tallest box in a group, as a share of its people's height [1]."""
 
 
 @dataclass(frozen=True)
 class Group:
-    """A part of a picture in which people hide one another.
+    """A part of a frame in which people occlude one another.
 
     Attributes:
-        corner: left, upper pixel of the part that is looked at.
+        corner: left, upper pixel of the crop.
         end: right, lower pixel, not included.
         zoom: enlargement [1].
-        inner: x0, y0, x1, y1 where the middles of its people are [px].
-        tall: height of its people [px].
+        inner: x0, y0, x1, y1 of the region that holds the centres of its people [px].
+        tall: median height of its people [px].
     """
 
     corner: tuple[int, int]
@@ -51,14 +51,14 @@ class Group:
     tall: float
 
     def shown(self, picture: Picture) -> Picture:
-        """The part of the picture, enlarged."""
+        """Return the enlarged crop of the frame."""
         (left, top), (right, bottom) = self.corner, self.end
         part = picture[top:bottom, left:right]
         size = (round(self.zoom * (right - left)), round(self.zoom * (bottom - top)))
         return np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
 
     def in_picture(self, people: People) -> People:
-        """The group's people among those found in `shown`, in the picture's pixels."""
+        """Return the group's people among those found in `shown`, in the frame's pixels."""
         sides = np.array(self.end) - self.corner
         scale = np.tile(sides / np.round(self.zoom * sides), 2)
         boxes = (people.boxes + 0.5) * scale - 0.5 + np.tile(self.corner, 2)
@@ -70,11 +70,11 @@ class Group:
 
 
 def groups(people: People, shape: tuple[int, ...]) -> list[Group]:
-    """Return the groups that are worth a look from nearer, each once for every enlargement.
+    """Return the groups that need a second detection pass, one entry per enlargement.
 
     Args:
-        people: as found in the whole picture.
-        shape: height, width of the picture [px].
+        people: detections in the whole frame.
+        shape: height, width of the frame [px].
     """
     sure = suppress(people, SAME)
     boxes = sure.boxes[sure.scores >= SURE]
@@ -88,7 +88,7 @@ def groups(people: People, shape: tuple[int, ...]) -> list[Group]:
         inner = np.concatenate([low - MARGIN * tall, high + MARGIN * tall])
         corner = np.maximum(np.floor(low - 2.0 * MARGIN * tall), 0).astype(int)
         end = np.minimum(np.ceil(high + 2.0 * MARGIN * tall), size).astype(int)
-        # No look costs more than the first.
+        # No second pass costs more than the first.
         widest = float(np.sqrt(np.prod(size) / np.prod(end - corner)))
         zooms = {min(height / tall, ZOOMS[1], widest) for height in TALL if len(own) > 1}
         found += [

@@ -1,4 +1,4 @@
-"""The two things that know how to look: a detector of people and an estimator of their poses."""
+"""Interfaces of person detectors and pose estimators, and their results."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 Picture = NDArray[np.uint8]
-"""(height, width, 3) RGB."""
+"""An image (height, width, 3) RGB."""
 
 LEAST_SCORE: Final = 0.05
-"""A detector reports every box from this score on; what is kept is decided by the stage."""
+"""A detector reports every box from this score on; the stage applies its own thresholds."""
 
 
 @dataclass(frozen=True)
 class People:
-    """People found in one picture.
+    """People detected in one frame.
 
     Attributes:
         boxes: (people, 4) x0, y0, x1, y1 [px]; (0, 0) is the centre of the top-left pixel.
@@ -31,14 +31,14 @@ class People:
 
 @dataclass(frozen=True)
 class Poses:
-    """Keypoints of some people of one picture.
+    """Keypoints of the people in one frame.
 
     Attributes:
         keypoints: (people, 17, 2) COCO-17 [px]; NaN where not found.
         confidence: (people, 17) in (0, 1]; NaN where not found.
-        boxes: (people, 4) as the estimator sees them, who looks closer than a detector [px]; None
-            from one that sees joints alone.
-        fit: (people,) how much of their union these and the true boxes share, as expected [1].
+        boxes: (people, 4) as the estimator sees them in a crop, finer than a detector's [px]; None
+            from an estimator of joints alone.
+        fit: (people,) expected intersection over union of these and the true boxes [1].
     """
 
     keypoints: NDArray[np.float64]
@@ -48,45 +48,45 @@ class Poses:
 
 
 class Detector(Protocol):
-    """Finds people in pictures; the same pictures give the same people."""
+    """A detector of people in images; the same images give the same people."""
 
     @property
     def view_size(self) -> tuple[int, int] | None:
-        """Width, height of the pictures it takes best [px]; None where any size does.
+        """Width, height of the images that it takes best [px]; None if it takes any size.
 
-        Larger pictures are cut into views of this size, which overlap, before they come here.
+        The caller cuts larger frames into overlapping views of this size.
         """
 
     def detect(self, pictures: Sequence[Picture]) -> list[People]:
-        """The people of each picture, from `LEAST_SCORE` on.
+        """Return the people in each image, from `LEAST_SCORE` on.
 
         Args:
-            pictures: of one size. How many are computed at once is for the detector to decide;
-                a person must not depend on what else is in the batch.
+            pictures: of one size. The detector chooses its batch size; a result must not depend on
+                the other images of a batch.
         """
 
 
 class PoseEstimator(Protocol):
-    """Finds the keypoints of people whose boxes are known."""
+    """An estimator of the keypoints of people whose boxes are known."""
 
     def estimate(self, picture: Picture, boxes: NDArray[np.float64]) -> Poses:
-        """The pose of each box, in the picture's pixels; keypoints may lie outside of their box.
+        """Return the pose in each box, in frame pixels; keypoints may lie outside of their box.
 
         Args:
-            picture: the whole picture.
-            boxes: (people, 4) x0, y0, x1, y1 [px]; may reach over the picture's border. Nobody
-                is a legal request.
+            picture: the whole frame.
+            boxes: (people, 4) x0, y0, x1, y1 [px]; may reach over the frame's border. No boxes is a
+                valid request.
         """
 
 
 @runtime_checkable
 class LooksBeside(PoseEstimator, Protocol):
-    """An estimator that also finds whom others hide from a detector."""
+    """An estimator that also finds occluded people that a detector misses."""
 
     def beside(self, picture: Picture, people: People) -> tuple[People, Poses]:
-        """Who stands beside people of a picture and is none of them, with boxes seen from near.
+        """Return occluded people next to the detected ones, with the estimator's boxes.
 
         Args:
-            picture: the whole picture.
-            people: who was found in it.
+            picture: the whole frame.
+            people: detected in it.
         """

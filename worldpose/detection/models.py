@@ -6,8 +6,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
+from worldpose.detection.flip_test import Mirrored
 from worldpose.detection.interfaces import Detector, PoseEstimator
-from worldpose.detection.mirrored import Mirrored
 from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
 from worldpose.ingest.registration import digest_of_files
@@ -17,23 +17,23 @@ LIBRARIES: Final = {
     "transformers": ("torch", "transformers"),
     "onnx": ("onnxruntime",),
 }
-"""What computes each kind of net, and so decides what it finds."""
+"""Libraries that compute each kind of net: their versions affect results."""
 
 
 def load_detectors(settings: DetectionSettings) -> list[Detector]:
-    """The detectors that the settings name.
+    """Return the detectors that the settings name.
 
     Raises:
-        InputError: an unknown kind, weights that are not there or not as expected, or a library
-            that is not installed.
+        InputError: an unknown kind, missing or unexpected weights, or a library that is not
+            installed.
     """
     return [_detector(name, settings) for name in settings.detector]
 
 
 def load_pose(settings: DetectionSettings) -> PoseEstimator:
-    """The pose estimator that the settings name; raises as `load_detectors`."""
+    """Return the pose estimator that the settings name; raises as `load_detectors`."""
     estimator = _pose(settings)
-    return Mirrored(estimator) if settings.mirrored else estimator
+    return Mirrored(estimator) if settings.flip_test else estimator
 
 
 def _pose(settings: DetectionSettings) -> PoseEstimator:
@@ -69,12 +69,12 @@ def _detector(name: str, settings: DetectionSettings) -> Detector:
 
 
 def weights_of(settings: DetectionSettings) -> dict[str, str | None]:
-    """SHA-256 of the weights that the settings name, by name, and versions of what computes them.
+    """Return SHA-256 of the named weights, and versions of the libraries that compute them.
 
-    The embedded weights are part of the code.
+    The embedded weights are part of the code and have no digest.
 
     Raises:
-        InputError: an unknown kind, or weights that are not there.
+        InputError: an unknown kind, or missing weights.
     """
     names = (*settings.detector, settings.pose)
     found: dict[str, str | None] = {}
@@ -90,10 +90,10 @@ def weights_of(settings: DetectionSettings) -> dict[str, str | None]:
 
 
 def digest_of_weights(path: Path) -> str:
-    """SHA-256 of a file, or of all files of a folder with their names.
+    """Return SHA-256 of a file, or of all files of a folder with their names.
 
     Raises:
-        InputError: it is not there.
+        InputError: the path does not exist.
     """
     if not path.exists():
         raise InputError(
@@ -106,7 +106,7 @@ def digest_of_weights(path: Path) -> str:
 
 
 def _parted(name: str) -> tuple[str, Path | None]:
-    """The kind of a model, and where its weights lie; None for those that ship."""
+    """Return the kind of a model and the path of its weights; None for those that ship."""
     kind, colon, path = name.partition(":")
     if kind not in LIBRARIES or (colon and not path) or (kind != "embedded" and not path):
         raise InputError(

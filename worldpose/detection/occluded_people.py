@@ -1,4 +1,4 @@
-"""People whom others hide: asked for a step to the side of everybody who was found."""
+"""Occluded people, found in crops shifted to the side of every detected person."""
 
 from __future__ import annotations
 
@@ -15,40 +15,41 @@ from worldpose.detection.interfaces import People, Poses
 Floats = NDArray[np.float64]
 
 SURE: Final = 0.25
-"""Beside whom is found with this score somebody may stand [1]."""
+"""Score of a detection from which on its neighbourhood is searched [1]."""
 STEP: Final = 0.35
-"""How far to either side one is asked for, as a share of the box's width [1]: people whom others
-hide by half. Closer, the net shows who was found; farther, detectors find them by themselves."""
+"""Shift to either side, as a share of the box's width [1], for people who are half occluded.
+Closer, the net shows the detected person; farther, detectors find the other without help."""
 CROWDED: Final = 0.6
-"""Where a box found shares more with the one to be asked about, nobody else is [1, intersection
-over union]."""
+"""If another detection overlaps the shifted box more, there is no room for a further person [1,
+intersection over union]."""
 SAME: Final = 0.7
-"""Who shares more with a person found is that person [1, intersection over union]."""
+"""A box that overlaps a detected person more is that person [1, intersection over union]."""
 WORTH: Final = 0.15
-"""Below this product of fit and surest keypoints an answer is not asked for its own [1]."""
+"""Below this product of fit and surest keypoints a result gets no second crop [1]."""
 THERE: Final = 0.4
-"""From this product on somebody is there [1]. Of those stored on scenes of training's kind one in
-five is a new person's; of boxes that a detector finds, with such scores, one in four is."""
+"""From this product on a result is a person [1]. In scenes like those of training, one in five of
+the results kept is a new person; of detector boxes with such scores, one in four is."""
 ONE: Final = 0.5
-"""Two who are found beside others and share more are one [1, intersection over union]."""
+"""Two occluded people that overlap more are one [1, intersection over union]."""
 UNSEEN: Final = 0.3
-"""What stands for the score of the detector, which does not see them [1]."""
+"""Replaces the score of the detector, which does not see these people [1]."""
 
 
 def find_occluded_people(
     look: Callable[[Floats, Sequence[Floats]], Look], people: People
 ) -> tuple[People, Poses]:
-    """Return those who are beside people found and were not found themselves, with their poses.
+    """Return occluded people next to detected ones that the detector missed, with their poses.
 
-    A net that is told who stands about answers of the one who is asked for. So it is asked, told
-    of everybody found, about boxes a step to either side; what it then sees is asked about again.
+    The net takes a target box and the boxes of its neighbours. It first runs on boxes a step to
+    either side of every detected person, then a second time on the boxes that it returned.
 
     Args:
-        look: shows what is in boxes (people, 4) [px], told of the boxes of others about each.
-        people: who was found, with boxes as seen from near.
+        look: returns the net's output for boxes (people, 4) [px], given the neighbours' boxes of
+            each.
+        people: detected people, with the estimator's boxes.
 
     Note:
-        Iterative detection told of what is found: Rukhovich et al., IterDet, 2020.
+        Iterative detection conditioned on earlier detections: Rukhovich et al., IterDet, 2020.
     """
     sure = people.scores >= SURE
     known = suppress(People(people.boxes[sure], people.scores[sure]), SAME).boxes
@@ -67,7 +68,7 @@ def find_occluded_people(
 
 
 def _others(seen: Look, known: Floats, least: float) -> NDArray[np.bool_]:
-    """Whether somebody is seen who is none of those known (people,)."""
+    """Return whether a result shows a person other than the known ones (people,)."""
     real = np.all(seen.boxes[:, 2:] - seen.boxes[:, :2] > 1.0, axis=1)
     apart = overlaps(seen.boxes, known).max(axis=1, initial=0.0) < SAME
     return np.asarray(real & apart & (seen.score >= least))

@@ -16,30 +16,30 @@ from worldpose.detection.onnx_session import OnnxNet, unknown_outputs
 PERSON: Final = 0
 """Class of people in nets trained on COCO."""
 VIEW_SIZE: Final = (640, 640)
-"""What a net that takes any size is given [px]."""
+"""Input size for a net that takes any size [px]."""
 DOUBLES: Final = 0.7
-"""Boxes of a raw grid that overlap by more are of one person [1]."""
+"""Boxes of a raw grid with a larger intersection over union are of one person [1]."""
 MULTIPOSE: Final = 56
-"""Numbers a person of MoveNet MultiPose: 17 y, x and scores, then the box and its score."""
+"""Numbers per person of MoveNet MultiPose: 17 y, x and scores, then the box and its score."""
 
 Reader = Callable[[NDArray[Any]], People]
 
 
 def onnx_detector(file: Path, device: str = "cpu") -> Detector:
-    """A detector of people from an ONNX file.
+    """Return a detector of people from an ONNX file.
 
-    The form of the output tells what it is: (batch, 4 + classes, anchors) of YOLOv8 and later with
-    middle, size and class scores; (batch, anchors, 5 + classes) of YOLOv5 with a score of being
-    anything before them; (batch, boxes, 6) of exports that end with suppression, corners, score
-    and class; (batch, people, 56) of MoveNet MultiPose. Pictures go in as RGB, as 0..1 for all but
-    MoveNet, which takes 0..255.
+    The shape of the output decides how it is read: (batch, 4 + classes, anchors) of YOLOv8 and
+    later with centre, size and class scores; (batch, anchors, 5 + classes) of YOLOv5 with an
+    objectness score before the class scores; (batch, boxes, 6) of exports with built-in
+    suppression: corners, score and class; (batch, people, 56) of MoveNet MultiPose. Inputs are
+    RGB, as 0..1 for all but MoveNet, which takes 0..255.
 
     Args:
         file: the net.
         device: `cpu` or `cuda`.
 
     Raises:
-        InputError: onnxruntime is not there, or the file is no such net.
+        InputError: onnxruntime is not installed, or the file is no such net.
     """
     net = OnnxNet(file, device, VIEW_SIZE)
     shape = net.outputs[0] if net.outputs else ()
@@ -64,18 +64,18 @@ _FORMS: Final = (
 
 
 class _OnnxDetector:
-    """A net that looks at views of its size."""
+    """A detector of people in views of the net's size."""
 
     def __init__(self, net: OnnxNet, scale: float, read: Reader) -> None:
         self._net, self._scale, self._read = net, scale, read
 
     @property
     def view_size(self) -> tuple[int, int]:
-        """What the net takes."""
+        """Input size of the net."""
         return self._net.size
 
     def detect(self, pictures: Sequence[Picture]) -> list[People]:
-        """The people of each view."""
+        """Return the people in each view."""
         if not pictures:
             return []
         given: NDArray[Any] = np.stack(pictures)
@@ -85,20 +85,20 @@ class _OnnxDetector:
 
 
 def _multipose(found: NDArray[np.float64], size: tuple[int, int]) -> People:
-    """Boxes y0, x0, y1, x1 in 0..1 behind the keypoints."""
+    """Return people from rows with keypoints first, then boxes y0, x0, y1, x1 in 0..1."""
     width, height = size
     corners = found[:, [52, 51, 54, 53]] * [width, height, width, height] - 0.5
     return _likely(corners, found[:, 55])
 
 
 def _corners(found: NDArray[np.float64]) -> People:
-    """Corners in pixels, score and class."""
+    """Return people from rows of corners in pixels, score and class."""
     people = found[found[:, 5].round() == PERSON]
     return _likely(people[:, :4] - 0.5, people[:, 4])
 
 
 def _grid(found: NDArray[np.float64], *, with_object: bool) -> People:
-    """Middle and size in pixels, perhaps a score of being anything, then a score a class."""
+    """Return people from rows of centre, size, perhaps objectness, then a score per class."""
     middle, size = found[:, :2], found[:, 2:4]
     score = found[:, 5 + PERSON] * found[:, 4] if with_object else found[:, 4 + PERSON]
     corners = np.hstack([middle - size / 2.0, middle + size / 2.0]) - 0.5
@@ -106,6 +106,6 @@ def _grid(found: NDArray[np.float64], *, with_object: bool) -> People:
 
 
 def _likely(boxes: NDArray[np.float64], scores: NDArray[np.float64]) -> People:
-    """Those above the least score; edges of pixels became their centres before."""
+    """Return those above the least score; callers converted pixel edges to pixel centres."""
     kept = scores >= LEAST_SCORE
     return People(boxes[kept], np.minimum(scores[kept], 1.0))

@@ -15,27 +15,27 @@ from worldpose.detection.onnx_session import OnnxNet, unknown_outputs
 Floats = NDArray[np.float64]
 
 CROP_SIZE: Final = (192, 256)
-"""What a net that takes any size is given [px]."""
+"""Input size for a net that takes any size [px]."""
 PADDING: Final = 1.25
-"""Crops are larger than boxes by this factor, as these nets were trained with [1]."""
+"""Size of crops over that of boxes, as in the training of these nets [1]."""
 MEAN: Final = np.array([123.675, 116.28, 103.53], dtype=np.float32)
 SPREAD: Final = np.array([58.395, 57.12, 57.375], dtype=np.float32)
-"""ImageNet's colours, with which RTMPose and ViTPose were trained [grey level]."""
+"""Mean and standard deviation of ImageNet, for RTMPose and ViTPose [grey level]."""
 
 
 def onnx_pose(file: Path, device: str = "cpu") -> PoseEstimator:
-    """A pose estimator from an ONNX file.
+    """Return a pose estimator from an ONNX file.
 
-    The form of the outputs tells what it is: (batch, 1, 17, 3) of MoveNet, y, x and score in 0..1;
-    two outputs (batch, 17, n) of RTMPose, a score for every column and row; (batch, 17, height,
-    width) heat maps. Crops go in as RGB, as 0..255 for MoveNet and in ImageNet's normal form else.
+    The shape of the outputs decides how they are read: (batch, 1, 17, 3) of MoveNet, y, x and
+    score in 0..1; two outputs (batch, 17, n) of RTMPose, a score for every column and row; (batch,
+    17, height, width) heat maps. Crops are RGB, 0..255 for MoveNet, else normalised as ImageNet.
 
     Args:
         file: the net.
         device: `cpu` or `cuda`.
 
     Raises:
-        InputError: onnxruntime is not there, or the file is no such net.
+        InputError: onnxruntime is not installed, or the file is no such net.
     """
     net = OnnxNet(file, device, CROP_SIZE)
     shape = net.outputs[0] if net.outputs else ()
@@ -50,13 +50,13 @@ def onnx_pose(file: Path, device: str = "cpu") -> PoseEstimator:
 
 
 class _OnnxPose:
-    """A net that looks at one person a crop."""
+    """A pose estimator that takes one person per crop."""
 
     def __init__(self, net: OnnxNet, *, normal: bool) -> None:
         self._net, self._normal = net, normal
 
     def estimate(self, picture: Picture, boxes: Floats) -> Poses:
-        """The pose in each box."""
+        """Return the pose in each box."""
         if not len(boxes):
             return Poses(np.empty((0, 17, 2)), np.empty((0, 17)))
         frames = crop_frames(boxes, self._net.size, PADDING)
@@ -71,26 +71,26 @@ class _OnnxPose:
 
 
 def _read(outputs: list[Floats], size: tuple[int, int]) -> tuple[Floats, Floats]:
-    """Points (boxes, 17, 2) in the crop's pixels, and confidences (boxes, 17)."""
+    """Return points (boxes, 17, 2) in the crop's pixels, and confidences (boxes, 17)."""
     first = outputs[0]
     if len(outputs) == 2:
         return _from_columns(first, outputs[1], size)
     if first.shape[2:] == (17, 3):
         single = first[:, 0]
-        # No half pixel: a picture and its mirror image agree only so.
+        # No half pixel: only so do an image and its mirror image agree.
         return single[..., [1, 0]] * size, single[..., 2]
     return from_heat_maps(first, size)
 
 
 def _from_columns(across: Floats, down: Floats, size: tuple[int, int]) -> tuple[Floats, Floats]:
-    """RTMPose's: the best column and row, each a whole number of parts of a pixel."""
+    """Return RTMPose's points: the best column and row, each a fraction of a pixel."""
     place = np.stack([across.argmax(axis=2), down.argmax(axis=2)], axis=2).astype(np.float64)
     points = place * size / [across.shape[2], down.shape[2]]
     return points, np.minimum(across.max(axis=2), down.max(axis=2))
 
 
 def from_heat_maps(maps: Floats, size: tuple[int, int]) -> tuple[Floats, Floats]:
-    """The peak of each map, to a part of a cell by its neighbours, and its height.
+    """Return the subcell peak of each map, from its neighbour cells, and its height.
 
     Args:
         maps: (boxes, 17, rows, columns).
@@ -110,7 +110,7 @@ def from_heat_maps(maps: Floats, size: tuple[int, int]) -> tuple[Floats, Floats]
             (padded[box, joint, y, x + 1], padded[box, joint, y + 2, x + 1]),
         )
     ):
-        # The top of the parabola through three logarithms is a Gaussian's middle.
+        # The vertex of the parabola through three logarithms is a Gaussian's mean.
         left, right = (np.log(np.maximum(side, 1e-10)) for side in (before, after))
         bend = left + right - 2.0 * middle
         shift = np.divide(0.5 * (left - right), bend, out=np.zeros_like(bend), where=bend < -1e-6)

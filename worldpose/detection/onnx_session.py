@@ -1,4 +1,4 @@
-"""Nets in ONNX files, run by onnxruntime on one thread: equal pictures give equal bytes."""
+"""Nets in ONNX files, run by onnxruntime on one thread: equal images give equal bytes."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from worldpose.errors import InputError
 
 
 class OnnxNet:
-    """A net with one picture as its input.
+    """A net with one image as its input.
 
     Attributes:
         where: the file, for messages.
-        size: width, height of the pictures it takes [px].
+        size: width, height of its input [px].
         channels_last: whether it takes (batch, height, width, 3), as TensorFlow has it.
         dtype: of its input.
-        batch: pictures it takes at once; None for any number.
-        outputs: shape of each output, with None for what is open.
+        batch: images per call; None for any number.
+        outputs: shape of each output, with None for dynamic sizes.
     """
 
     def __init__(self, file: Path, device: str, default_size: tuple[int, int]) -> None:
@@ -32,10 +32,10 @@ class OnnxNet:
         Args:
             file: the net.
             device: `cpu` or `cuda`.
-            default_size: width, height [px] to give to a net that takes any.
+            default_size: width, height [px] for a net that takes any.
 
         Raises:
-            InputError: onnxruntime is not there, or no GPU for it, or the file is no such net.
+            InputError: onnxruntime or a GPU for it is missing, or the file is no such net.
         """
         self.where = str(file)
         runtime = _runtime(self.where)
@@ -55,7 +55,7 @@ class OnnxNet:
             self._session = runtime.InferenceSession(str(file), options, providers=[provider])
         except MemoryError:
             raise
-        except Exception as error:  # onnxruntime's own, of no common class
+        except Exception as error:  # onnxruntime's errors have no common class
             raise InputError(
                 self.where,
                 expected="a net in an ONNX file",
@@ -83,9 +83,9 @@ class OnnxNet:
         ]
 
     def run(self, pictures: NDArray[Any]) -> list[NDArray[Any]]:
-        """All outputs for pictures (batch, height, width, 3), in the range that the net takes.
+        """Return all outputs for images (batch, height, width, 3), in the range that the net takes.
 
-        A picture's numbers must not depend on its neighbours: each goes through alone.
+        The result of an image must not depend on its neighbours: each runs alone.
         """
         each = []
         for picture in pictures:
@@ -96,7 +96,7 @@ class OnnxNet:
 
 
 def unknown_outputs(net: OnnxNet, expected: str) -> InputError:
-    """The error about a net whose outputs nothing here can read."""
+    """Return the error for a net with unknown outputs."""
     return InputError(
         net.where,
         expected=expected,

@@ -1,4 +1,4 @@
-"""People of one camera's video: boxes, then keypoints, a stretch of frames at a time (D1-D3)."""
+"""People in one camera's video: boxes, then keypoints, in chunks of frames (D1-D3)."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from worldpose.detection.boxes import areas, fuse, suppress
 from worldpose.detection.crowd import on_pitch
 from worldpose.detection.followed import Follower, looked_at
 from worldpose.detection.interfaces import Detector, People, Picture, PoseEstimator, Poses
+from worldpose.detection.oks_nms import told_apart
 from worldpose.detection.posed import find_poses
-from worldpose.detection.same_pose import told_apart
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.views import Tiled
 from worldpose.pitch import PitchTemplate
 
 STRETCH: Final = 64
-"""Frames of a stretch."""
+"""Frames per chunk."""
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """People in some neighbouring frames, in the form of given 2D poses.
+    """People in a chunk of consecutive frames, in the form of given 2D poses.
 
     Attributes:
         keypoints: (frames, most_people, 17, 2) float32 [px]; NaN where not found.
         confidence: (frames, most_people, 17) float32.
         boxes: (frames, most_people, 4) float32 [px].
         score: (frames, most_people) float32.
-        unreadable: frame numbers without a picture.
+        unreadable: numbers of frames without an image.
     """
 
     keypoints: NDArray[np.float32]
@@ -43,7 +43,7 @@ class Stretch:
     unreadable: tuple[int, ...]
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
-        """By name, as they are stored."""
+        """Return the arrays by name, as they are stored."""
         return {
             "keypoints": self.keypoints,
             "confidence": self.confidence,
@@ -54,18 +54,18 @@ class Stretch:
 
 @dataclass
 class DetectionReport:
-    """What happened on the way; complete when the last stretch has come.
+    """Counts of a detection run; complete after the last chunk.
 
     Attributes:
-        frames: that were asked for.
-        unreadable: without a picture.
-        empty: with a picture, and nobody in it.
+        frames: requested.
+        unreadable: frames without an image.
+        empty: frames with an image and without people.
         detections: people in all frames.
         crowd: boxes outside of the pitch.
         bridged: boxes that were filled in.
-        flickers: boxes of tracks seen too seldom.
-        unsure: people without a single keypoint, or the second of one pose.
-        beside: found beside others, of whom some are not kept.
+        flickers: boxes of tracks with too few sightings.
+        unsure: people without a single keypoint, or with the pose of a better box.
+        beside: occluded people found next to others; later steps may drop some.
     """
 
     frames: int = 0
@@ -81,11 +81,11 @@ class DetectionReport:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a camera stands, so that the crowd can be told from the players.
+    """Camera and pitch, which separate the crowd from the players.
 
     Attributes:
         camera: the calibrated camera.
-        pitch: what it looks at.
+        pitch: the pitch in its view.
     """
 
     camera: Camera
@@ -96,23 +96,23 @@ class PeopleFinder:
     """Detectors, an estimator and settings, for the videos of a match.
 
     Attributes:
-        report: of the video that was gone through last.
+        report: of the last video.
     """
 
     def __init__(
         self, detectors: Sequence[Detector], estimator: PoseEstimator, settings: DetectionSettings
     ) -> None:
-        """Put them together.
+        """Combine detectors, an estimator and settings.
 
         Args:
             detectors: one, or an ensemble.
-            estimator: finds keypoints in their boxes.
+            estimator: finds keypoints in boxes.
             settings: of the stage.
         """
         self._detectors = [
             detector
             if detector.view_size is None
-            else Tiled(detector, settings.zooms, settings.view_overlap, settings.overlap)
+            else Tiled(detector, settings.zooms, settings.view_overlap, settings.nms_iou)
             for detector in detectors
         ]
         self._estimator, self._settings = estimator, settings
@@ -121,11 +121,11 @@ class PeopleFinder:
     def find(
         self, frames: Iterable[tuple[int, Picture | None]], place: Place | None = None
     ) -> Iterator[Stretch]:
-        """Yield the people of a video, stretch by stretch.
+        """Yield the people of a video in chunks of frames.
 
         Args:
-            frames: numbers that rise by one, each with its picture; None where there is none.
-            place: where the camera stands; None keeps everybody.
+            frames: numbers that rise by one, each with its image; None where there is none.
+            place: camera and pitch; None keeps the crowd.
         """
         self.report = DetectionReport()
         follower = Follower(self._settings)
@@ -150,20 +150,20 @@ class PeopleFinder:
         self.report.bridged, self.report.flickers = follower.bridged, follower.flickers
 
     def _people(self, pictures: list[Picture], place: Place | None) -> list[People]:
-        """Who is on the pitch in each picture."""
+        """Return the people on the pitch in each frame."""
         settings = self._settings
         found = [detector.detect(pictures) for detector in self._detectors]
         everybody = []
         for members in zip(*found, strict=True):
             if settings.fusion == "weighted":
-                people = fuse(list(members), settings.overlap)
+                people = fuse(list(members), settings.nms_iou)
             else:
                 together = People(
                     np.concatenate([member.boxes for member in members]),
                     np.concatenate([member.scores for member in members]),
                 )
-                people = suppress(together, settings.overlap)
-            kept = (people.scores >= settings.doubtful) & (areas(people.boxes) > 0.0)
+                people = suppress(together, settings.nms_iou)
+            kept = (people.scores >= settings.low_score_threshold) & (areas(people.boxes) > 0.0)
             people = People(people.boxes[kept], people.scores[kept])
             if place is not None:
                 inside = self._inside(people, pictures[0], place)
@@ -173,33 +173,33 @@ class PeopleFinder:
         return everybody
 
     def _inside(self, people: People, picture: Picture, place: Place) -> NDArray[np.bool_]:
-        """Whose feet are on the pitch or near it (people,)."""
+        """Return whether people's feet are on the pitch or near it (people,)."""
         size = (picture.shape[1], picture.shape[0])
         margin = self._settings.pitch_margin_m
         return on_pitch(people.boxes, place.camera, size, place.pitch, margin)
 
     def _posed(self, picture: Picture, people: People, place: Place | None) -> tuple[People, Poses]:
-        """Keypoints of everybody; who has none, or the pose of somebody better, is not kept."""
+        """Return keypoints of people; drop those without any or with the pose of a better box."""
         found = len(people.scores)
         people, poses = find_poses(self._estimator, picture, people, self._settings)
         self.report.beside += len(people.scores) - found
         if place is not None:
-            # Those found are on the pitch; whom they hide may be a bystander.
+            # Detected people are on the pitch; a person they occlude may be a bystander.
             kept = self._inside(people, picture, place) | (np.arange(len(people.scores)) < found)
             people = People(people.boxes[kept], people.scores[kept])
             poses = Poses(poses.keypoints[kept], poses.confidence[kept])
         known, own = told_apart(
-            people, poses, self._settings.least_keypoint, self._settings.same_pose
+            people, poses, self._settings.min_keypoint_confidence, self._settings.oks_nms
         )
         self.report.unsure += len(people.scores) - len(known.scores)
-        best = np.sort(np.argsort(-known.scores, kind="stable")[: self._settings.most_people])
+        best = np.sort(np.argsort(-known.scores, kind="stable")[: self._settings.max_people])
         return (
             People(known.boxes[best], known.scores[best]),
             Poses(own.keypoints[best], own.confidence[best]),
         )
 
     def _stretch(self, rows: list[tuple[People, Poses]], unreadable: list[int]) -> Stretch:
-        shape = (len(rows), self._settings.most_people)
+        shape = (len(rows), self._settings.max_people)
         stretch = Stretch(
             keypoints=np.full((*shape, 17, 2), np.nan, dtype=np.float32),
             confidence=np.full((*shape, 17), np.nan, dtype=np.float32),

@@ -1,4 +1,4 @@
-"""Keypoints of people in boxes, and who else these looks find."""
+"""Keypoints of people in boxes, and occluded people next to them."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from worldpose.detection.settings import DetectionSettings
 def find_poses(
     estimator: PoseEstimator, picture: Picture, people: People, settings: DetectionSettings
 ) -> tuple[People, Poses]:
-    """Return people with boxes as seen from near and poses, then those found beside them.
+    """Return people with the estimator's boxes and poses, then occluded people next to them.
 
     Args:
         estimator: of poses.
-        picture: the whole picture.
-        people: as a detector found them.
+        picture: the whole frame.
+        people: detected people.
         settings: of the stage.
     """
     poses = estimator.estimate(picture, people.boxes)
     people = seen_closer(people, poses)
-    if not (settings.beside and isinstance(estimator, LooksBeside)):
+    if not (settings.find_occluded and isinstance(estimator, LooksBeside)):
         return people, poses
     others, theirs = estimator.beside(picture, people)
     return (

@@ -1,4 +1,4 @@
-"""Which of the places where joints may be is whose, among people who hide one another."""
+"""Assignment of candidate joints to people who occlude one another."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.detection.boxes import overlaps
-from worldpose.detection.mirrored import SIDES
+from worldpose.detection.flip_test import SIDES
 
 Floats = NDArray[np.float64]
 
 RIVALRY: Final = 2.0
-"""What it costs to take a place that is another person's for certain [nats]."""
+"""Cost of a candidate that certainly is another person's joint [nats]."""
 CLOSE: Final = 0.03
-"""Standard deviation of how far apart one joint is put by two looks, as a share of the longer side
-of the smaller box [1]."""
+"""Standard deviation of the distance between two estimates of one joint, as a share of the longer
+side of the smaller box [1]."""
 TOUCHING: Final = 0.02
-"""People whose boxes share more are rivals [1, intersection over union]."""
+"""People whose boxes overlap more are rivals [1, intersection over union]."""
 LEAST: Final = 0.01
-"""Places with less of the probability are not taken, but for the first [1]."""
+"""Candidates of less probability are dropped, except the first [1]."""
 ROUNDS: Final = 4
-"""Of choosing; few change after the second."""
+"""Passes of assignment; few joints change after the second."""
 
 
 def shared_out(places: Floats, mass: Floats, boxes: Floats) -> NDArray[np.intp]:
-    """Return which place of each joint is taken (people, 17).
+    """Return the index of the chosen candidate for each joint (people, 17).
 
-    A map often shows the joints of a neighbour too. Everybody takes the likeliest places in turn,
-    the surest first; those that a neighbour has for the same joint, of either side, are the less
-    likely the surer he is of them.
+    A map often shows the joints of a neighbour too. People choose their likeliest candidates in
+    turn, the most certain person first. A candidate costs more, the more certainly a neighbour has
+    the same joint, of either side, there.
 
     Args:
         places: (people, 17, count, 2) [px], the likeliest first.
@@ -38,7 +38,7 @@ def shared_out(places: Floats, mass: Floats, boxes: Floats) -> NDArray[np.intp]:
         boxes: (people, 4) [px].
 
     Note:
-        Li et al., CrowdPose, 2019: joints of a crowd are found by sharing out candidates.
+        Li et al., CrowdPose, 2019: assigns candidate joints to people in crowds.
     """
     people, joints, _ = mass.shape
     taken = np.zeros((people, joints), dtype=np.intp)
@@ -68,6 +68,6 @@ def shared_out(places: Floats, mass: Floats, boxes: Floats) -> NDArray[np.intp]:
 
 
 def _rivalry(places: Floats, at: Floats, sure: Floats, spread: Floats) -> Floats:
-    """How much each place (17, count) is one of neighbours' `at` (neighbours, 17, 1, 2) [1]."""
+    """Return the overlap (17, count) [1] of candidates with joints `at` (neighbours, 17, 1, 2)."""
     apart = np.square(places - at).sum(axis=-1)
     return np.asarray((sure * np.exp(-0.5 * apart / spread**2)).sum(axis=0))

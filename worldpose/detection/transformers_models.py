@@ -1,6 +1,6 @@
-"""RT-DETR, RT-DETRv2, D-FINE and ViTPose from a folder that transformers saved; nothing is fetched.
+"""RT-DETR, RT-DETRv2, D-FINE and ViTPose from a folder that transformers saved, without download.
 
-Weights are read from safetensors alone: a pickle could run anything.
+Weights come from safetensors alone: a pickle could run any code.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ PERSON: Final = 0
 
 
 def transformers_detector(folder: Path, device: str = "cpu", half: bool = False) -> Detector:
-    """A detector of people from a saved checkpoint.
+    """Return a detector of people from a saved checkpoint.
 
     Args:
         folder: with config.json, model.safetensors and preprocessor_config.json.
         device: `cpu` or `cuda`.
-        half: compute in half precision, on a GPU alone.
+        half: compute in half precision, on a GPU only.
 
     Raises:
-        InputError: transformers is not there, or no GPU, or the folder holds no such detector.
+        InputError: transformers or a GPU is missing, or the folder holds no such detector.
     """
     return _TransformersDetector(folder, device, half)
 
 
 def transformers_pose(folder: Path, device: str = "cpu", half: bool = False) -> PoseEstimator:
-    """A ViTPose from a saved checkpoint; arguments and errors are those of the detector."""
+    """Return a ViTPose from a saved checkpoint; arguments and errors are those of the detector."""
     return _TransformersPose(folder, device, half)
 
 
@@ -56,7 +56,7 @@ class _TransformersDetector:
     def __init__(self, folder: Path, device: str, half: bool) -> None:
         self._torch, library = _libraries(folder)
         kind = _kind(folder, library, DETECTORS)
-        # The processors without a suffix ask for torchvision.
+        # The processors without a suffix need torchvision.
         named = library.DetrImageProcessorPil if kind == "detr" else library.RTDetrImageProcessorPil
         self._processor = _loaded(folder, named)
         net = _loaded(folder, library.AutoModelForObjectDetection, use_safetensors=True)
@@ -71,13 +71,13 @@ class _TransformersDetector:
 
     @property
     def view_size(self) -> tuple[int, int]:
-        """What the processor scales pictures to."""
+        """Size to which the processor scales images."""
         return self._size
 
     def detect(self, pictures: Sequence[Picture]) -> list[People]:
-        """The people of each picture."""
+        """Return the people in each image."""
         people = []
-        for picture in pictures:  # alone: kernels for other batches round otherwise
+        for picture in pictures:  # one by one: kernels for other batches round differently
             given = _tensors(self._processor([picture], return_tensors="pt"), self)
             with self._torch.inference_mode():
                 outputs = self._net(**given)
@@ -93,7 +93,7 @@ class _TransformersDetector:
 
 
 class _TransformersPose:
-    """A ViTPose."""
+    """A ViTPose estimator."""
 
     def __init__(self, folder: Path, device: str, half: bool) -> None:
         self._torch, library = _libraries(folder)
@@ -106,7 +106,7 @@ class _TransformersPose:
         self._expert = 0 if experts > 1 else None  # of ViTPose+, the one for COCO
 
     def estimate(self, picture: Picture, boxes: NDArray[np.float64]) -> Poses:
-        """The pose in each box."""
+        """Return the pose in each box."""
         if not len(boxes):
             return Poses(np.empty((0, 17, 2)), np.empty((0, 17)))
         each = [self._one(picture, box) for box in boxes]

@@ -1,4 +1,4 @@
-"""Pictures cut into overlapping views, for detectors that take one size or lose small people."""
+"""Frames cut into overlapping views, for detectors of one input size or that miss small people."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from worldpose.detection.boxes import suppress
 from worldpose.detection.interfaces import Detector, People, Picture
 
 EDGE: Final = 3.0
-"""A box this near to a view's cut edge is of a person who was cut [px of the view]."""
+"""A view's edge cuts a person whose box ends this near to it [px of the view]."""
 FILLING: Final = 114
-"""Grey beyond a picture's border, as detectors are trained with."""
+"""Grey level beyond a frame's border, as in the training of detectors."""
 
 
 @dataclass(frozen=True)
 class View:
-    """A part of a picture as a detector gets it.
+    """A part of a frame as input of a detector.
 
     Attributes:
-        x: left edge in the scaled picture [px].
+        x: left edge in the scaled frame [px].
         y: upper edge [px].
-        scale: pixels of the view a pixel of the picture.
+        scale: pixels of the view per pixel of the frame.
     """
 
     x: int
@@ -33,13 +33,13 @@ class View:
     scale: float
 
     def in_picture(self, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Boxes of the view in the picture's pixels: pixel centres are whole in both."""
+        """Return boxes of the view in frame pixels: pixel centres are whole numbers in both."""
         corner = np.array([self.x, self.y, self.x, self.y], dtype=np.float64)
         return (boxes + corner + 0.5) / self.scale - 0.5
 
 
 class Tiled:
-    """A detector that looks at views of pictures of any size."""
+    """A detector that splits frames of any size into views."""
 
     def __init__(
         self, detector: Detector, zooms: Sequence[float], view_overlap: float, overlap: float
@@ -48,21 +48,21 @@ class Tiled:
 
         Args:
             detector: one with a view size.
-            zooms: pictures are scaled by each before they are cut, beside the whole in one view.
-            view_overlap: share of a view that its neighbour shows as well.
-            overlap: above which two boxes are of one person [1].
+            zooms: frames are scaled by each and cut, in addition to one view of the whole frame.
+            view_overlap: share of a view that its neighbour shows too.
+            overlap: boxes with a larger intersection over union are of one person [1].
         """
-        assert detector.view_size is not None  # others take pictures as they are
+        assert detector.view_size is not None  # others take frames whole
         self._detector, self._size = detector, detector.view_size
         self._zooms, self._view_overlap, self._overlap = tuple(zooms), view_overlap, overlap
 
     @property
     def view_size(self) -> None:
-        """None: any picture."""
+        """None: frames of any size."""
         return
 
     def detect(self, pictures: Sequence[Picture]) -> list[People]:
-        """The people of each picture, each in the view that shows all of them."""
+        """Return the people in each frame, from views that do not cut them."""
         people = []
         for picture in pictures:
             views = list(self._views(picture.shape[1], picture.shape[0]))
@@ -92,7 +92,7 @@ class Tiled:
                 yield from (View(x, y, zoom) for y in down for x in across)
 
     def _whole(self, view: View, people: People, width: int, height: int) -> People:
-        """Those whom the view's cut edges do not cut, in the picture's pixels."""
+        """Return the people that no inner edge of the view cuts, in frame pixels."""
         x0, y0, x1, y1 = people.boxes.T
         right, low = round(width * view.scale), round(height * view.scale)
         cut = (
@@ -105,7 +105,7 @@ class Tiled:
 
 
 def _starts(length: int, view: int, overlap: float) -> list[int]:
-    """Where views begin so that they cover a length, evenly spread."""
+    """Return the evenly spaced starts of views that cover a length."""
     if length <= view:
         return [0]
     count = 1 + int(np.ceil((length - view) / (view * (1.0 - overlap))))
@@ -113,7 +113,7 @@ def _starts(length: int, view: int, overlap: float) -> list[int]:
 
 
 def _cut(picture: Picture, views: Sequence[View], size: tuple[int, int]) -> list[Picture]:
-    """Each view of a picture, filled with grey beyond the picture's border."""
+    """Return each view of a frame, filled with grey beyond the frame's border."""
     import cv2  # late: it takes a fifth of a second, and planning a run needs none of it
 
     scaled: dict[float, Picture] = {}

@@ -1,4 +1,4 @@
-"""The similarity or rigid motion that brings one set of points nearest to another."""
+"""Least-squares alignment of point sets by a similarity or a rigid motion."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from worldpose.cameras.rigid import checked
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """`x_b = scale R x_a + t`, one or a batch of them."""
+    """Similarity transform `x_b = scale R x_a + t`, single or a batch."""
 
     scale: NDArray[np.float64]
     """(...)"""
@@ -37,10 +37,10 @@ class Similarity:
 def align(source: ArrayLike, target: ArrayLike, *, with_scale: bool) -> Similarity:
     """Return the motion of `source` with the least sum of squared distances to `target`.
 
-    Points that either side lacks do not count. The rotation is always proper: a mirrored set
-    stays mirrored. Where the points leave the motion open the distances are the least all the
-    same: points on a line may turn about it, and points that coincide are only shifted
-    (identity, scale 1). Without a common point the motion is NaN.
+    The function ignores points that are missing on either side. The rotation is always proper: a
+    mirrored set stays mirrored. If the motion is not unique, the result is one of the minima:
+    collinear points leave the rotation about their line open, and coinciding points give a
+    translation (identity, scale 1). Without a common point the motion is NaN.
 
     Args:
         source: (..., n, 3) [m]; NaN where missing.
@@ -65,7 +65,7 @@ def align(source: ArrayLike, target: ArrayLike, *, with_scale: bool) -> Similari
     handed[..., 2] = np.where(np.linalg.det(u) * np.linalg.det(v) < 0.0, -1.0, 1.0)
     rotation = (u * handed[..., None, :]) @ v
     spread = np.square(a_offset).sum((-1, -2))
-    # Offsets of coinciding points are the rounding of their mean; they say nothing.
+    # Offsets of coinciding points are only rounding errors of their mean.
     single = spread <= count * np.square(8.0 * np.finfo(float).eps * np.abs(a_mean).max(-1))
     rotation = np.where(single[..., None, None], np.eye(3), rotation)
     scale = np.ones(spread.shape)
@@ -79,7 +79,7 @@ def align(source: ArrayLike, target: ArrayLike, *, with_scale: bool) -> Similari
 def _centred(
     points: NDArray[np.float64], common: NDArray[np.bool_], count: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the mean of the common points and their offsets from it, 0 where not common."""
+    """Return the mean of the common points and their offsets from it; 0 for other points."""
     known = np.where(common[..., None], points, 0.0)
     mean = known.sum(-2) / np.maximum(count, 1)[..., None]
     return mean, np.where(common[..., None], known - mean[..., None, :], 0.0)

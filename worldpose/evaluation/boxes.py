@@ -1,4 +1,4 @@
-"""Boxes of people in a picture and how much they overlap (E3)."""
+"""Bounding boxes of people in an image, and their intersection over union (E3)."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from worldpose.cameras import Camera
 def joint_boxes(joints: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
     """Return boxes around projected joints (frames, persons, 4) x0 y0 x1 y1 [px].
 
-    NaN where no joint is in front of the camera. Boxes are not cut at the border of the picture.
+    NaN where no joint is in front of the camera. Boxes are not clipped to the image.
 
     Args:
         joints: (frames, persons, joints, 3) [m], world; NaN where missing.
-        camera: one camera, or one for every frame.
+        camera: one camera, or one per frame.
     """
     frames, persons, count, _ = joints.shape
     image = camera.project(joints.reshape(frames, persons * count, 3))

@@ -1,4 +1,4 @@
-"""Errors of estimated cameras: their parameters, and what these do on the pitch."""
+"""Errors of estimated cameras: parameter, ground and reprojection errors."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ class CameraScore(Record):
 
     camera_id: str
     kind: str
-    """`broadcast` where the true camera has several rows, else `static`."""
+    """`broadcast` if the true camera has several rows, else `static`."""
     errors: CameraErrors
 
 
 @dataclass(frozen=True, eq=False)
 class CameraSamples:
-    """Single errors of one camera, from which the figures are taken."""
+    """Individual errors of one camera, the input of its metrics."""
 
     center: NDArray[np.float64]
-    """(frames,) distance of the centres [m]; NaN where the estimate is missing, as below."""
+    """(frames,) distance of the centres [m]; here and below, NaN without an estimate."""
     rotation: NDArray[np.float64]
     """(frames,) angle between the orientations [rad]."""
     focal: NDArray[np.float64]
@@ -47,16 +47,16 @@ def evaluate_cameras(
     pitch: PitchTemplate | None,
     settings: CameraErrorSettings | None = None,
 ) -> tuple[CameraEvaluation | None, tuple[CameraScore, ...]]:
-    """Return errors of static and broadcast cameras, and of each camera.
+    """Return errors of all static and all broadcast cameras, and of each camera.
 
     Args:
         estimated: single cameras or batches (frames,), by camera or clip id.
-        true: single cameras or batches (frames,); ids that only one side has are left out.
+        true: single cameras or batches (frames,); the function skips ids that only one side has.
         pitch: the surface; without one there are neither ground nor reprojection errors.
         settings: the defaults if None.
 
     Raises:
-        InputError: a camera's two sides have different numbers of frames.
+        InputError: an estimated and a true camera have different numbers of frames.
     """
     settings = settings or CameraErrorSettings()
     names = [name for name in true if name in estimated]
@@ -84,17 +84,17 @@ def camera_samples(
     pitch: PitchTemplate | None,
     settings: CameraErrorSettings,
 ) -> CameraSamples:
-    """Return the errors of one camera in its frames and in the points that it truly sees.
+    """Return the errors of one camera per frame and per point that the true camera sees.
 
     Args:
         name: camera or clip, for messages.
-        estimated: one camera, or one a frame; NaN in frames without an estimate.
-        true: one camera, or one a frame.
+        estimated: one camera, or one per frame; NaN in frames without an estimate.
+        true: one camera, or one per frame.
         pitch: the surface; without one there are no points.
-        settings: which points are looked at.
+        settings: grid of test points.
 
     Raises:
-        InputError: the two sides have different numbers of frames.
+        InputError: the cameras have different numbers of frames.
     """
     frames = max(_frames(estimated), _frames(true))
     if {_frames(estimated), _frames(true)} - {1, frames}:
@@ -128,13 +128,13 @@ def camera_samples(
 
 
 def surface_points(rays: Rays, pitch: PitchTemplate) -> NDArray[np.float64]:
-    """Return where rays from above first meet the pitch surface (..., 3) [m], world.
+    """Return the first intersections of rays from above with the pitch surface (..., 3) [m], world.
 
-    NaN where a ray is missing or goes over the horizon.
+    NaN if a ray is missing or passes above the horizon.
 
     Args:
         rays: (...) rays.
-        pitch: the surface, continued beyond the touch lines.
+        pitch: the surface, extended beyond the touch lines.
     """
     origins, directions = rays.origins, rays.directions
     down = directions[..., 2] < 0.0
@@ -148,13 +148,13 @@ def surface_points(rays: Rays, pitch: PitchTemplate) -> NDArray[np.float64]:
             along = along - above / (ahead - behind)
         points = origins + along[..., None] * directions
         height = pitch.height(points[..., 0], points[..., 1])
-        # A tenth of a millimetre: what is not there after the steps will never be.
+        # A tenth of a millimetre: points that have not converged by now never will.
         met = (along > 0.0) & (np.abs(points[..., 2] - height) < 1e-4)
     return np.where(met[..., None], points, np.nan)
 
 
 _NEWTON_STEPS = 8
-"""Squares the error every time; the surface is within 0.2 m of the plane of the start."""
+"""Each step squares the error; the surface is within 0.2 m of the start plane."""
 
 
 def _above(
@@ -174,9 +174,9 @@ def _ground_errors(
     pitch: PitchTemplate,
     reach: float,
 ) -> NDArray[np.float64]:
-    """Return the distance on the surface between true points and those of their true pixels [m].
+    """Return distances on the surface between true points and their back-projected pixels [m].
 
-    A pixel that the estimated camera does not put on the pitch's plain is off by `reach`.
+    If the estimated camera's ray misses the pitch surface, the error is `reach`.
     """
     seen, pixels = _seen(true, surface)
     found = surface_points(estimated.unproject(pixels), pitch)
@@ -187,7 +187,7 @@ def _ground_errors(
 def _reprojection_errors(
     estimated: Camera, true: Camera, points: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return pixel distances; a point that the estimated camera cannot see is off by a picture."""
+    """Return pixel distances; the image diagonal if the estimated camera cannot see a point."""
     seen, pixels = _seen(true, points)
     diagonal = float(np.linalg.norm(true.image_size))
     distance = np.linalg.norm(estimated.project(seen) - pixels, axis=-1)
@@ -197,7 +197,7 @@ def _reprojection_errors(
 def _seen(
     camera: Camera, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the points inside the camera's picture, and their pixels."""
+    """Return the points inside the camera's image, and their pixels."""
     pixels = camera.project(points)
     with np.errstate(invalid="ignore"):
         inside = ((pixels >= -0.5) & (pixels <= camera.image_size - 0.5)).all(-1)
@@ -207,7 +207,7 @@ def _seen(
 def _points(
     pitch: PitchTemplate, settings: CameraErrorSettings
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a grid (n, 3) on the surface, and the same at player height [m]."""
+    """Return a grid (n, 3) on the surface, and the same grid at player height [m]."""
     along, across = (
         np.linspace(-0.5 * side, 0.5 * side, int(np.ceil(side / settings.spacing)) + 1)
         for side in (pitch.length, pitch.width)
@@ -218,7 +218,7 @@ def _points(
 
 
 def _figures(samples: Sequence[CameraSamples]) -> CameraErrors:
-    """Return the figures over all frames and points of some cameras."""
+    """Return the metrics over all frames and points of some cameras."""
     center, rotation, focal, ground, reprojection = (
         np.concatenate([getattr(each, name) for each in samples])
         for name in ("center", "rotation", "focal", "ground", "reprojection")
@@ -239,7 +239,7 @@ def _figures(samples: Sequence[CameraSamples]) -> CameraErrors:
 
 
 def _angle(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the angle of rotation matrices (...) [rad], exact for small ones too."""
+    """Return the angle of rotation matrices (...) [rad], accurate also for small angles."""
     trace = np.trace(rotation, axis1=-2, axis2=-1)
     skew = rotation - np.swapaxes(rotation, -1, -2)
     # The skew part's norm is 2 sqrt(2) sin(angle), the trace 1 + 2 cos(angle).
@@ -256,7 +256,7 @@ def _frames(camera: Camera) -> int:
 
 
 def _at(camera: Camera, frame: int) -> Camera:
-    """Return the camera of one frame; a camera that never moves has all frames."""
+    """Return the camera of one frame; a static camera is the same in all frames."""
     if not camera.batch_shape:
         return camera
     return camera[frame if _frames(camera) > 1 else 0]

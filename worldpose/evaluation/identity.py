@@ -1,4 +1,4 @@
-"""Whether people keep their ids: IDF1, switches, fragmentations, HOTA."""
+"""Identity metrics of tracks: IDF1, switches, fragmentations, HOTA."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 HOTA_LEVELS: Final = np.arange(1, 20) / 20.0
-"""Similarities from 0.05 to 0.95 at which HOTA is taken and averaged."""
+"""Similarity thresholds from 0.05 to 0.95 that HOTA averages over."""
 
 
 @dataclass(frozen=True)
 class IdentityScores:
-    """Scores of ids over time; None where there is nobody on either side."""
+    """Identity scores over time; None without people on both sides."""
 
     idf1: float | None
     """[0..1]"""
@@ -35,13 +35,13 @@ def identity_scores(
     predicted_exists: NDArray[np.bool_],
     gate: float,
 ) -> IdentityScores:
-    """Return how well predicted ids stand for true people.
+    """Return the identity scores of predicted tracks against true people.
 
     Args:
         distances: (frames, true persons, predicted persons) [m]; infinite where either is absent.
         true_exists: (frames, true persons).
         predicted_exists: (frames, predicted persons).
-        gate: largest distance at which two can be the same person [m].
+        gate: maximum distance of a match [m].
 
     Note:
         IDF1: Ristani et al., ECCV-W 2016. Switches and fragmentations: Bernardin and Stiefelhagen,
@@ -55,7 +55,7 @@ def identity_scores(
     switches, fragmentations = _interruptions(distances, true_exists, gate)
     together = (distances <= gate).sum(axis=0)
     idf1 = 2.0 * together[linear_sum_assignment(-together)].sum() / people
-    # A prediction at the gate is no more alike than one that is not there.
+    # A prediction at the gate has similarity 0, like a missing one.
     similarity = np.maximum(0.0, 1.0 - distances / gate)
     detection, association = _hota_parts(similarity, true_exists, predicted_exists)
     return IdentityScores(
@@ -71,10 +71,10 @@ def identity_scores(
 def _interruptions(
     distances: NDArray[np.float64], true_exists: NDArray[np.bool_], gate: float
 ) -> tuple[int, int]:
-    """Return switches and fragmentations.
+    """Return the numbers of switches and fragmentations.
 
-    In every frame, people keep the prediction of the frame before while it is within the gate;
-    the others are matched anew (Hungarian method).
+    In every frame, true people keep the prediction of the frame before while it is within the
+    gate; the Hungarian method matches the others.
     """
     _, true, predicted = distances.shape
     people = np.arange(true)
@@ -116,7 +116,7 @@ def _hota_parts(
     matches = np.zeros((len(HOTA_LEVELS), *shared.shape))
     for frame in similarity:
         rows, columns = linear_sum_assignment(-alike * frame)
-        # A similarity that equals a level but for rounding reaches it.
+        # The tolerance lets a similarity that equals a level up to rounding reach it.
         matches[:, rows, columns] += frame[rows, columns] >= HOTA_LEVELS[:, None] - 1e-12
     found = matches.sum((-1, -2))
     detection = found / (true_count.sum() + predicted_count.sum() - found)

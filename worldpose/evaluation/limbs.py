@@ -1,4 +1,4 @@
-"""The ten limbs of PCP3D on COCO-17 joints."""
+"""Ten limbs of PCP3D on COCO-17 joints, and their correctness."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LIMBS: Final = {
     "torso": ((11, 12), (5, 6)),
     "head": ((5, 6), (3, 4)),
 }
-"""Each end is the middle of the COCO-17 joints named: torso from mid-hip to mid-shoulder, head from
+"""Each end is the mean of the named COCO-17 joints: torso from mid-hip to mid-shoulder, head from
 mid-shoulder to the middle of the ears."""
 
 
@@ -44,7 +44,7 @@ def limb_ends(joints: NDArray[np.float64]) -> NDArray[np.float64]:
 def correct_limbs(
     predicted: NDArray[np.float64], true: NDArray[np.float64], alpha: float
 ) -> NDArray[np.bool_]:
-    """Return which limbs (..., 10) are right: mean error of ends up to alpha times length.
+    """Return a mask of correct limbs (..., 10): mean error of ends at most alpha times length.
 
     Args:
         predicted: (..., 17, 3) [m]; a limb with a missing joint is wrong.
@@ -52,8 +52,8 @@ def correct_limbs(
         alpha: share of the true length.
 
     Note:
-        Burenius et al., CVPR 2013, in the form used for Shelf and Campus, with the mean of the
-        two errors where the first form asks each to be below the bound.
+        Burenius et al., CVPR 2013, in the form used for Shelf and Campus: the mean of both errors
+        is below the bound, not each error as in the original form.
     """
     true_ends = limb_ends(true)
     error = np.linalg.norm(limb_ends(predicted) - true_ends, axis=-1).mean(axis=-1)

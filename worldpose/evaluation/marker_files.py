@@ -1,4 +1,4 @@
-"""Marker-based reference: C3D and TRC files, and which markers make which joints (X1)."""
+"""Marker-based reference: readers for C3D and TRC files, and joints from markers (X1)."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from data_contracts.conventions import COCO17
 from worldpose.errors import InputError
 
 METRES: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-"""Length of the units that such files name [m]."""
+"""Length of each unit in such files [m]."""
 SUFFIXES: Final = (".c3d", ".trc")
-"""Files that are read as markers."""
+"""Suffixes of marker files."""
 People = Mapping[str, Mapping[str, tuple[str, ...]]]
-"""By person and joint: the markers whose mean is the joint."""
+"""Markers by person and joint; their mean is the joint."""
 
 
 @dataclass(frozen=True, eq=False)
 class Markers:
-    """Points of a motion capture system over time."""
+    """Marker trajectories of a motion capture system."""
 
     rate: float
-    """Samples in a second [1/s]."""
+    """Samples per second [1/s]."""
     names: tuple[str, ...]
     points: NDArray[np.float64]
     """(samples, markers, 3) [m], the system's own world; NaN where missing."""
@@ -37,7 +37,7 @@ def read_markers(path: Path) -> Markers:
     """Return the markers of a C3D or TRC file.
 
     Raises:
-        InputError: the file cannot be read, names no unit, or c3d is not installed.
+        InputError: the file is unreadable, has no unit, or c3d is not installed.
     """
     if not path.is_file():
         raise _wrong(path, "a C3D or TRC file", "nothing")
@@ -45,17 +45,17 @@ def read_markers(path: Path) -> Markers:
         return _read_c3d(path)
     try:
         rate, names, points, unit = _read_trc(path)
-    # A line, cell or key that a cut-off file lacks, and text that is no number or no UTF-8.
+    # A truncated file lacks lines, cells or keys; text may be no number or no UTF-8.
     except (OSError, LookupError, ValueError) as error:
         raise _wrong(path, "a whole C3D or TRC file", f"{error!r}") from error
     return _checked(path, rate, names, points, unit)
 
 
 def joints_of_markers(names: tuple[str, ...]) -> dict[str, dict[str, tuple[str, ...]]]:
-    """Return people and joints where markers are called after them: `joint` or `person:joint`.
+    """Return people and joints from marker names of the form `joint` or `person:joint`.
 
     Args:
-        names: markers; others than COCO-17's are left out.
+        names: markers; the function skips names outside COCO-17.
     """
     people: dict[str, dict[str, tuple[str, ...]]] = {}
     for name in names:
@@ -69,7 +69,7 @@ def read_marker_map(path: Path) -> dict[str, dict[str, tuple[str, ...]]]:
     """Return people and joints of a YAML file: `person: {joint: marker, joint: [marker, ...]}`.
 
     Raises:
-        InputError: it is no such file, or a joint is none of COCO-17's.
+        InputError: the file has another structure, or a joint is not in COCO-17.
     """
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -92,10 +92,10 @@ def read_marker_map(path: Path) -> dict[str, dict[str, tuple[str, ...]]]:
 def marker_joints(markers: Markers, people: People) -> NDArray[np.float64]:
     """Return joints (samples, persons, 17, 3) [m] in the system's world; NaN where missing.
 
-    A joint is the mean of its markers, and missing where one of them is.
+    A joint is the mean of its markers, and missing if one of them is missing.
 
     Raises:
-        InputError: nobody, or a marker that the file lacks.
+        InputError: there is no person, or the file lacks a marker.
     """
     if not people:
         raise _wrong(
@@ -125,7 +125,7 @@ def _read_c3d(path: Path) -> Markers:
             reader = c3d.Reader(file)
             unit = reader.get("POINT:UNITS").string_value.strip().lower()
             names = tuple(label.strip() for label in reader.point_labels)
-            # Copies: the reader gives the same array again and again. Residual -1 means missing.
+            # Copies: the reader reuses its array. Residual -1 means missing.
             rows = [points[:, :4].copy() for _, points, _ in reader.read_frames()]
             rate = float(reader.point_rate)
     except MemoryError:

@@ -1,4 +1,4 @@
-"""Marker-based reference laid over a prediction in time and space (X1)."""
+"""Alignment of a marker-based reference to a prediction in time and space (X1)."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ Floats = NDArray[np.float64]
 
 
 class ReferenceSettings(Record):
-    """How the reference is laid over the prediction."""
+    """Search range and gate of the alignment."""
 
     max_offset: float = Field(default=2.0, gt=0)
-    """Largest difference of the clocks that is looked for, either way [s]."""
+    """Maximum clock offset of the search, either way [s]."""
     step: float = Field(default=0.2, gt=0)
-    """Between differences that are tried at first [s]: a walk of 30 cm, within the gate."""
+    """Step of the initial grid over clock offsets [s]: a walk of 30 cm, within the gate."""
     match_gate: float = Field(default=1.0, gt=0)
-    """Largest mean joint distance of a match, once laid over [m], as in the evaluation."""
+    """Maximum mean joint distance of a match after alignment [m], as in the evaluation."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceAlignment:
-    """How a reference lies over a prediction."""
+    """Clock offset and motion that align a reference to a prediction."""
 
     offset: float
     """Time on the reference's clock at match frame 0 [s]."""
     motion: Similarity
     """From the reference's world into the prediction's; scale 1."""
     residual: float
-    """Root mean square distance of joints after it [m]."""
+    """Root mean square distance of joints after the motion [m]."""
 
 
 def lay_over(
@@ -49,21 +49,21 @@ def lay_over(
     fps: float,
     settings: ReferenceSettings | None = None,
 ) -> tuple[JointTracks, ReferenceAlignment]:
-    """Return the reference in the prediction's frames and world, and how it came there.
+    """Return the reference in the prediction's frames and world, and its alignment.
 
-    The clocks' difference is the one that leaves the least distance: tried on a grid with people
-    registered anew each time, then refined with people as they are matched. The motion is rigid:
-    a wrong size of the prediction stays an error.
+    The clock offset minimizes the distance: a grid search with a new registration of people at each
+    offset, then a refinement with fixed matches. The motion is rigid: a wrong size of the
+    prediction remains an error.
 
     Args:
         prediction: estimated joints.
         joints: (samples, persons, 17, 3) [m] in the reference's world; NaN where missing.
-        rate: samples in a second [1/s].
-        fps: match frames in a second [1/s].
+        rate: samples per second [1/s].
+        fps: match frames per second [1/s].
         settings: the defaults if None.
 
     Raises:
-        DegenerateError: nowhere do prediction and reference look alike.
+        DegenerateError: prediction and reference match at no offset.
     """
     settings = settings or ReferenceSettings()
     times = prediction.frames / fps
@@ -83,7 +83,7 @@ def lay_over(
     def error(shift: float) -> float:
         return _fitted(prediction.joints, sampled(joints, rate, times + shift), match)[1]
 
-    # Tenths of a millisecond: a runner's millimetre.
+    # Tenths of a millisecond: a millimetre of a runner's path.
     found = minimize_scalar(
         error,
         bounds=(offset - settings.step, offset + settings.step),
@@ -99,13 +99,13 @@ def lay_over(
 
 
 def sampled(joints: Floats, rate: float, times: Floats) -> Floats:
-    """Return joints (times, persons, 17, 3) at times on their own clock, straight between samples.
+    """Return joints (times, persons, 17, 3) at times on their own clock, interpolated linearly.
 
-    NaN outside the samples, and where either neighbour is missing.
+    NaN outside the samples, and if either neighbour is missing.
 
     Args:
         joints: (samples, persons, 17, 3) [m].
-        rate: samples in a second [1/s].
+        rate: samples per second [1/s].
         times: (times,) [s] since the first sample.
     """
     place = np.round(times * rate, 9)
@@ -114,7 +114,7 @@ def sampled(joints: Floats, rate: float, times: Floats) -> Floats:
     last = len(joints) - 1
     inside = (place >= 0.0) & (place <= last)
     low, high = np.clip(before, 0, last), np.clip(before + 1, 0, last)
-    # On a sample, the next one has no say, also where it is missing.
+    # Exactly on a sample, ignore the next one, which may be missing.
     between = (1.0 - share) * joints[low] + np.where(share > 0.0, share * joints[high], 0.0)
     return np.where(inside[:, None, None, None], between, np.nan)
 
@@ -122,7 +122,7 @@ def sampled(joints: Floats, rate: float, times: Floats) -> Floats:
 def _left(
     people: Floats, reference: Floats, settings: ReferenceSettings
 ) -> tuple[float, NDArray[np.int64] | None]:
-    """Mean distance of everybody there, cut at the gate, and who is whom after registration."""
+    """Return the sum of joint distances, clipped at the gate, and the match after registration."""
     motion = register_world(reference, people, settings.match_gate)
     if motion is None:
         return np.inf, None
@@ -136,7 +136,7 @@ def _left(
     total = np.where(match >= 0, chosen, 0.0).sum() + settings.match_gate * (
         there - (match >= 0).sum()
     )
-    # A long overlap counts more than a short one that happens to fit.
+    # Missing people cost the gate, so that a short overlap that fits by chance does not win.
     missing = settings.match_gate * (len(reference) * reference.shape[1] - there)
     return float(total + missing), match
 
@@ -144,7 +144,7 @@ def _left(
 def _fitted(
     people: Floats, reference: Floats, match: NDArray[np.int64]
 ) -> tuple[Similarity, float]:
-    """The rigid motion of the reference onto matched people, and the distance left [m]."""
+    """Return the rigid motion of the reference onto matched people, and the rms residual [m]."""
     target = taken(people, match).reshape(-1, 3)
     motion = align(reference.reshape(-1, 3), target, with_scale=False)
     squares = np.square(motion.apply(reference.reshape(-1, 3)) - target).sum(-1)

@@ -1,4 +1,4 @@
-"""Which predicted person is which true one: frame by frame, and whole tracks."""
+"""Matches of predicted to true people: per frame, and per track."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 _CHUNK: Final = 64
-"""Frames whose distances are taken at once: tens of megabytes for 25 people on either side."""
+"""Frames per batch of distances: tens of megabytes for 25 people on either side."""
 
 
 def joint_distances(
@@ -17,7 +17,7 @@ def joint_distances(
 ) -> NDArray[np.float64]:
     """Return the distance of every pair of people in every frame (frames, true, predicted) [m].
 
-    It is the mean over the joints that both have, infinite where they share none.
+    The distance is the mean over common joints, infinite without common joints.
 
     Args:
         predicted: (frames, predicted persons, joints, 3) [m]; NaN where missing.
@@ -36,14 +36,14 @@ def joint_distances(
 
 
 def match_people(distances: NDArray[np.float64], gate: float) -> NDArray[np.int64]:
-    """Return the predicted person that stands for each true one (frames, true), -1 for none.
+    """Return the predicted person matched to each true one (frames, true), -1 for none.
 
-    One-to-one in every frame, with the least sum of distances, where leaving a true person
-    unmatched costs as much as a match at the gate (Hungarian method). Ids play no part.
+    One-to-one per frame, with the least sum of distances, where an unmatched true person costs as
+    much as a match at the gate (Hungarian method). Matching ignores ids.
 
     Args:
         distances: (frames, true persons, predicted persons) [m].
-        gate: largest distance of a match [m].
+        gate: maximum distance of a match [m].
     """
     match = np.full(distances.shape[:2], -1, dtype=np.int64)
     costs = np.minimum(distances, gate)
@@ -55,13 +55,13 @@ def match_people(distances: NDArray[np.float64], gate: float) -> NDArray[np.int6
 
 
 def match_boxes(overlap: NDArray[np.float64], least: float) -> NDArray[np.int64]:
-    """Return the predicted person that stands for each true one (frames, true), -1 for none.
+    """Return the predicted person matched to each true one (frames, true), -1 for none.
 
-    One-to-one and greedy in every frame: the pair that overlaps most comes first (E3).
+    One-to-one and greedy per frame, by falling overlap (E3).
 
     Args:
         overlap: (frames, true persons, predicted persons) intersection over union [1].
-        least: smallest overlap of a match [1].
+        least: minimum overlap of a match [1].
     """
     frames, true, predicted = overlap.shape
     match = np.full((frames, true), -1, dtype=np.int64)
@@ -77,14 +77,14 @@ def match_boxes(overlap: NDArray[np.float64], least: float) -> NDArray[np.int64]
 
 
 def merge_tracks(pairs: NDArray[np.int64], cost: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the predicted person of each true one (frames, true), whole tracks at a time.
+    """Return the predicted person of each true one (frames, true), by whole tracks.
 
-    A track belongs to the true person with whom it is paired in most frames, for all its frames:
-    after an exchange of identities it is wrong, however near another person it is. Tracks of one
-    true person are merged; where several exist at once the cheapest counts.
+    A track belongs to the true person of its most frequent match, in all its frames: after an
+    identity switch it is wrong, however near another person is. The function merges tracks of one
+    true person; if several exist in one frame, it takes the one of least cost.
 
     Args:
-        pairs: (frames, true persons) matches of single frames, -1 for none.
+        pairs: (frames, true persons) matches per frame, -1 for none.
         cost: (frames, true persons, predicted persons); infinite where either does not exist.
 
     Note:
@@ -104,11 +104,11 @@ def merge_tracks(pairs: NDArray[np.int64], cost: NDArray[np.float64]) -> NDArray
 
 
 def taken(people: NDArray[np.float64], match: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return predicted people in the places of the true ones (frames, true, joints, 3).
+    """Return predicted people in the order of the true ones (frames, true, joints, 3).
 
     Args:
         people: (frames, predicted persons, joints, 3) [m].
-        match: (frames, true persons) index of the predicted person, -1 for none, which is NaN.
+        match: (frames, true persons) index of the predicted person, -1 for none, which gives NaN.
     """
     if not people.shape[1]:
         return np.full((*match.shape, *people.shape[2:]), np.nan)

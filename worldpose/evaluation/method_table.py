@@ -1,4 +1,4 @@
-"""The paper's table of other methods: text, CSV and LaTeX (E1, E2, E5)."""
+"""Table of baseline methods as in the paper: text, CSV and LaTeX (E1, E2, E5)."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ COLUMNS: Final = {
     "per_meter_drift_cm_per_m": "Per-Meter Drift [cm/m]",
     "track_coverage": "Coverage [%]",
 }
-"""Figures of a row, and what the table calls them. The paper's are the first three."""
+"""Metrics of a row, and their titles. The first three are the paper's."""
 PER_PERSON: Final = {
     "g_mpjpe_mm": "per_person_g_mpjpe_mm",
     "per_meter_drift_cm_per_m": "per_person_drift_cm_per_m",
 }
-"""Figures of a row whose alignment is that of each person (E2)."""
+"""Metrics of a row with one alignment per person (E2)."""
 
 _LOCAL: Final = ("pa_mpjpe_mm", "pa_mpjpe_rigid_mm", "track_coverage", "persons", "frames")
 _ALONE: Final = (
@@ -34,12 +34,12 @@ _KEPT: Final = {"camera": _LOCAL, "own": _ALONE}
 
 
 def meaningful(evaluation: Evaluation, world: str) -> Evaluation:
-    """Return the scores that a method's world gives a meaning.
+    """Return the scores that are defined in a method's world.
 
     Args:
         evaluation: all scores.
-        world: `shared`, `own` or `camera`; people relative to a moving camera have no paths, those
-            in worlds of their own no common one.
+        world: `shared`, `own` or `camera`; people relative to a moving camera have no paths, people
+            in separate worlds have no common alignment.
     """
     if world not in _KEPT:
         return evaluation
@@ -47,16 +47,16 @@ def meaningful(evaluation: Evaluation, world: str) -> Evaluation:
 
 
 def table_rows(scores: Sequence[MethodScore]) -> list[tuple[str, ...]]:
-    """Return the table: a title and the figures, `N/A` where one has no meaning.
+    """Return the table: a title and the metrics, `N/A` where undefined.
 
-    First local methods, then all others, then those with one alignment a person, as in the paper.
+    First local methods, then all others, then these with one alignment per person, as in the paper.
     """
     groups = _groups(scores)
     return [row for group in groups for row in group]
 
 
 def table_csv(scores: Sequence[MethodScore]) -> str:
-    """Return the table as CSV with a header, an empty cell where a figure has no meaning."""
+    """Return the table as CSV with a header, with empty cells for undefined metrics."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(("method", *COLUMNS))
@@ -66,7 +66,7 @@ def table_csv(scores: Sequence[MethodScore]) -> str:
 
 
 def table_latex(scores: Sequence[MethodScore]) -> str:
-    """Return the table as LaTeX, to be set with the package booktabs."""
+    """Return the table as LaTeX for the package booktabs."""
     arrows = ("$\\downarrow$", "$\\downarrow$", "$\\downarrow$", "$\\uparrow$")
     heads = [f"{title} {arrow}" for title, arrow in zip(COLUMNS.values(), arrows, strict=True)]
     lines = [f"\\begin{{tabular}}{{l{'c' * len(heads)}}}", "  \\toprule"]
@@ -100,7 +100,7 @@ def _row(title: str, score: MethodScore, instead: dict[str, str]) -> tuple[str, 
 
 
 def _spaced(cell: str) -> str:
-    """A number with thin spaces between thousands."""
+    """Return a number with thin spaces between thousands."""
     return cell if cell == _ABSENT else f"{float(cell):,.1f}".replace(",", "\\,")
 
 

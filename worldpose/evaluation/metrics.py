@@ -1,4 +1,4 @@
-"""Scores of predicted joints against true ones."""
+"""Metrics of predicted joints against true joints."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from worldpose.formats import JointTracks
 
 
 class PersonScore(Record):
-    """How well one true person was found; an absent figure could not be computed."""
+    """Metrics of one true person; None where a metric is undefined."""
 
     person_id: int
     frames: int
     """Frames in which this person counts."""
     coverage: float | None = None
-    """Share of those with a matched prediction [0..1]."""
+    """Share of these frames with a matched prediction [0..1]."""
     joint_coverage: float | None = None
     """Share of true joints that have a predicted joint [0..1]."""
     mpjpe_mm: float | None = None
@@ -40,13 +40,13 @@ class PersonScore(Record):
     pcp3d: float | None = None
     """Share of correct limbs, missing limbs counted wrong [%]."""
     g_mpjpe_mm: float | None = None
-    """Mean joint distance after the alignment of everybody's trajectories [mm]."""
+    """Mean joint distance after one alignment of all people's trajectories [mm]."""
     per_person_g_mpjpe_mm: float | None = None
     """Mean joint distance after the alignment of this person's trajectory [mm]."""
     pa_mpjpe_mm: float | None = None
     """Mean joint distance after alignment in each frame [mm]."""
     path_m: float | None = None
-    """Length of the true path on which these are taken [m]."""
+    """Length of the true path over the compared frames [m]."""
 
 
 def evaluate_joints(
@@ -58,24 +58,24 @@ def evaluate_joints(
     camera: Camera | None = None,
     boxes: NDArray[np.float64] | None = None,
 ) -> tuple[Evaluation, tuple[PersonScore, ...]]:
-    """Return scores over all frames of the reference, and per true person.
+    """Return metrics over all frames of the reference, and per true person.
 
-    Frames are paired by number: a reference frame that the prediction lacks is all missed, a
-    predicted frame that the reference lacks is not looked at. Within a frame people are paired by
-    `match_people`; their ids play no part. Trajectories are paired by `merge_tracks` (E3).
+    Frames are paired by number: people are missing in reference frames that the prediction lacks,
+    and the function ignores predicted frames that the reference lacks. `match_people` pairs people
+    per frame, without their ids; `merge_tracks` pairs trajectories (E3).
 
     Args:
         prediction: estimated joints.
-        reference: true joints; with `views`, only what enough cameras saw counts.
-        settings: gates, limb bound and what counts; the defaults if None.
-        fps: match frames in a second [1/s]; without it there are no figures in time.
-        camera: the camera in whose picture tracks are matched by their boxes, single or one for
-            each frame of the reference; without it they are matched by distance.
-        boxes: (frames, persons, 4) x0 y0 x1 y1 [px] of the prediction in that picture, for one
-            whose joints are not where the camera sees them; None = around the joints.
+        reference: true joints; with `views`, only joints seen by enough cameras count.
+        settings: gates, limb bound and visibility thresholds; the defaults if None.
+        fps: match frames per second [1/s]; without it there are no metrics over time.
+        camera: camera to match tracks in by their boxes, single or one per frame of the reference;
+            without it distances decide.
+        boxes: (frames, persons, 4) x0 y0 x1 y1 [px] of the prediction in that image, if its joints
+            do not project there; None = around the joints.
 
     Raises:
-        InputError: the camera has another number of frames than the reference.
+        InputError: camera and reference have different numbers of frames.
     """
     settings = settings or EvaluationSettings()
     people = _in_frames(prediction, reference.frames, prediction.joints)
@@ -85,7 +85,7 @@ def evaluate_joints(
     present = np.asarray(counts.any(axis=-1))
     exists = np.asarray(np.isfinite(people[..., 0]).any(axis=-1))
     frames = len(reference.frames)
-    # Who is matched to a true person that does not count is neither right nor false.
+    # A prediction matched to a true person that does not count is no false positive.
     idle = np.zeros_like(exists)
     frame, person = np.nonzero((match >= 0) & ~present)
     idle[frame, match[frame, person]] = True
@@ -129,7 +129,7 @@ def evaluate_joints(
 
 @dataclass(frozen=True, eq=False)
 class _Tally:
-    """What counts and what was right; first dimensions frames and true persons."""
+    """Counts and errors of matched people; the first dimensions are frames and true persons."""
 
     frames: NDArray[np.bool_]
     matched: NDArray[np.bool_]
@@ -140,7 +140,7 @@ class _Tally:
     correct: NDArray[np.bool_]
 
     def scores(self, part: tuple[slice, slice | int]) -> dict[str, float | None]:
-        """Figures over a part of the frames and persons."""
+        """Return metrics over a part of the frames and persons."""
         return {
             "coverage": _ratio(self.matched[part].sum(), self.frames[part].sum()),
             "joint_coverage": _ratio(self.found[part].sum(), self.joints[part].sum()),
@@ -172,7 +172,7 @@ def _ratio(part: float, whole: float) -> float | None:
 
 
 def _mean(values: NDArray[np.float64], factor: float = 1.0) -> float | None:
-    """Return the mean of what is not NaN times a factor, None where there is nothing."""
+    """Return the mean of finite values times a factor, None without any."""
     known = np.isfinite(values)
     return _ratio(factor * np.where(known, values, 0.0).sum(), int(known.sum()))
 
@@ -180,7 +180,7 @@ def _mean(values: NDArray[np.float64], factor: float = 1.0) -> float | None:
 def _in_frames(
     prediction: JointTracks, frames: NDArray[np.int64], rows: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return rows of predicted frames in these frames, NaN in those that the prediction lacks."""
+    """Return predicted rows at the given frames, NaN in frames that the prediction lacks."""
     people = np.full((len(frames), *rows.shape[1:]), np.nan)
     _, own, places = np.intersect1d(
         prediction.frames, frames, assume_unique=True, return_indices=True
@@ -190,7 +190,7 @@ def _in_frames(
 
 
 def _counting_joints(reference: JointTracks, settings: EvaluationSettings) -> NDArray[np.bool_]:
-    """Return which true joints count (frames, persons, 17)."""
+    """Return the mask of true joints that count (frames, persons, 17)."""
     exists = np.isfinite(reference.joints[..., 0])
     counts = exists
     if reference.views is not None:
@@ -213,7 +213,7 @@ def _track_figures(
     fps: float | None,
     settings: EvaluationSettings,
 ) -> tuple[dict[str, float | None], list[dict[str, float | None]]]:
-    """Return the scores of whole tracks, and those of each person."""
+    """Return the metrics of whole tracks, overall and per person."""
     free, rigid = (
         aligned_errors(
             predicted, true, with_scale=with_scale, min_joints=settings.min_aligned_joints

@@ -1,4 +1,4 @@
-"""How many true joints lie in the stated confidence regions of predicted ones."""
+"""Calibration of stated covariances: true joints inside predicted confidence regions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ JOINT_GROUPS: Final = {
     "head": ("nose", "eye", "ear"),
     **{name: (name,) for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")},
 }
-"""Groups of joints, by parts of their names."""
+"""Parts of joint names, by group of joints."""
 
 
 def region_counts(
@@ -29,15 +29,15 @@ def region_counts(
     level: float = 0.95,
     settings: EvaluationSettings | None = None,
 ) -> dict[str, tuple[int, int]]:
-    """Return, for each group of joints, how many lie in their regions, and how many there are.
+    """Return the number of joints inside their confidence region and in total, per group.
 
-    A region is the ellipsoid of the stated covariance that holds the true joint with probability
-    `level` if errors are normal: d^T C^-1 d is below the quantile of the chi-square distribution
-    with three degrees of freedom. People are paired frame by frame as for the other scores.
+    A region is the ellipsoid of the stated covariance that contains the true joint with probability
+    `level` for normal errors: d^T C^-1 d is below the quantile of the chi-square distribution with
+    three degrees of freedom. People are matched per frame as for the other metrics.
 
     Args:
         prediction: estimated joints with covariance.
-        reference: true joints; with `views`, only joints that enough cameras saw count.
+        reference: true joints; with `views`, only joints seen by enough cameras count.
         level: stated probability, above 0 and below 1.
         settings: gate and views; the defaults if None.
 

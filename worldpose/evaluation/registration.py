@@ -1,4 +1,4 @@
-"""The motion that takes a prediction from a world of its own into the true one."""
+"""Registration of a prediction in its own world to the true world."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from worldpose.evaluation.alignment import Similarity, align
 from worldpose.evaluation.matching import joint_distances, match_people, taken
 
 _FRAMES: Final = 48
-"""Frames looked at, evenly spread: enough to tell paths apart."""
+"""Sample frames, evenly spread: enough to distinguish paths."""
 _PAIRS: Final = 400
-"""Pairs of people tried, those who share most joints first: all of a match of 20 against 20."""
+"""Maximum pairs of people to try, by falling number of common joints: all of 20 against 20."""
 _ROUNDS: Final = 3
-"""Matching and aligning by turns, after which nothing changes any more."""
+"""Iterations of matching and alignment, enough to converge."""
 
 
 def register_world(
     predicted: NDArray[np.float64], true: NDArray[np.float64], gate: float
 ) -> Similarity | None:
-    """Return the similarity that brings most predicted people to true ones, None without any.
+    """Return the similarity that matches most predicted people to true ones, None without a match.
 
-    Every pair of a predicted and a true person gives one, from the whole path of both. The one
-    that leaves the true people nearest to predicted ones, each distance cut at the gate, wins and
-    is fitted anew to all whom it matches.
+    Every pair of a predicted and a true person gives a candidate, from their whole paths. The
+    candidate with the least sum of distances from true to predicted people, each clipped at the
+    gate, wins; a fit to all its matches refines it.
 
     Args:
         predicted: (frames, predicted persons, joints, 3) [m]; NaN where missing.
         true: (frames, true persons, joints, 3) [m]; NaN where missing.
-        gate: largest distance of a match, after the motion [m].
+        gate: maximum distance of a match, after the motion [m].
     """
     shared = np.flatnonzero(_any_joint(predicted) & _any_joint(true))
     if not len(shared):
@@ -61,19 +61,19 @@ def register_world(
 
 
 def _any_joint(people: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return the frames in which there is anybody (frames,)."""
+    """Return the mask of frames with at least one person (frames,)."""
     return np.asarray(np.isfinite(people[..., 0]).any((-1, -2)))
 
 
 def _flat(people: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (frames, persons * joints, 3)."""
+    """Return people reshaped to (frames, persons * joints, 3)."""
     return people.reshape(len(people), -1, 3)
 
 
 def _pairs(
     predicted: NDArray[np.float64], true: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return true and predicted person of the pairs that share most joints."""
+    """Return true and predicted persons of the pairs with most common joints."""
     known_true = np.isfinite(np.swapaxes(true[..., 0], 0, 1)).reshape(true.shape[1], -1)
     known = np.isfinite(np.swapaxes(predicted[..., 0], 0, 1)).reshape(predicted.shape[1], -1)
     common = known_true.astype(np.int64) @ known.astype(np.int64).T
@@ -84,7 +84,7 @@ def _pairs(
 
 
 def _middles(people: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean of the joints of every person (frames, persons, 3), NaN without joints."""
+    """Return the mean joint of every person (frames, persons, 3), NaN without joints."""
     known = np.isfinite(people).all(-1, keepdims=True)
     count = known.sum(-2)
     total = np.where(known, people, 0.0).sum(-2)
@@ -94,7 +94,7 @@ def _middles(people: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _left_over(predicted: NDArray[np.float64], true: NDArray[np.float64], gate: float) -> float:
-    """Return the sum over true people of the distance to the next predicted one, cut at gate."""
+    """Return the summed distance of true people to the nearest predicted one, clipped at gate."""
     distance = np.linalg.norm(predicted[:, None] - true[:, :, None], axis=-1)
     nearest = np.where(np.isnan(distance), gate, distance).min(axis=-1)
     return float(np.minimum(nearest, gate).sum())

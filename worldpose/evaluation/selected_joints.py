@@ -1,4 +1,4 @@
-"""The joints that the paper and the challenge score, taken from COCO-17."""
+"""Joint subsets of the paper and the challenge, from COCO-17."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def challenge_joints(joints: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def mid_hip(joints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the middle of the hips (..., 3) [m], NaN where one is missing.
+    """Return the middle of the hips (..., 3) [m], NaN if one is missing.
 
     Args:
         joints: (..., 17, 3) [m], COCO-17.

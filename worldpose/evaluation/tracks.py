@@ -1,4 +1,4 @@
-"""Which predicted person is which true one over whole tracks, by boxes, by distance or anyhow."""
+"""Matches of predicted tracks to true people: by boxes, by distance or after registration."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ def match_tracks(
         people: (frames, predicted persons, 17, 3) [m]; NaN where missing.
         true: (frames, true persons, 17, 3) [m]; NaN where missing.
         distances: (frames, true persons, predicted persons) [m] of all pairs.
-        match: (frames, true persons), pairs by these distances.
-        camera: in whose picture boxes are compared; None = by distance.
+        match: (frames, true persons), matches by these distances.
+        camera: compares boxes in its image; None = match by distance.
         boxes: (frames, predicted persons, 4) [px] of the prediction there; None = of its joints.
-        settings: least overlap, gate, and when a prediction is registered first.
+        settings: minimum overlap, gate, and threshold for registration.
 
     Raises:
-        InputError: the camera has another number of frames than the truth.
+        InputError: camera and truth have different numbers of frames.
     """
     if camera is not None:
         if camera.batch_shape not in ((), (1,), (len(true),)):

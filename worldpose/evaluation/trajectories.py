@@ -1,4 +1,4 @@
-"""Errors of whole trajectories, aligned to the truth in the paper's ways or not at all."""
+"""Trajectory errors with the paper's alignments and without alignment."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from worldpose.evaluation.selected_joints import challenge_joints, mid_hip, pape
 
 @dataclass(frozen=True, eq=False)
 class AlignedErrors:
-    """Distances of joints after alignment; NaN where a joint is missing on either side.
+    """Joint distances after alignment; NaN where a joint is missing on either side.
 
-    All are (frames, persons, 14) [m], on the joints of E4.
+    Distances are (frames, persons, 14) [m], on the joints of E4.
     """
 
     shared: NDArray[np.float64]
@@ -25,8 +25,8 @@ class AlignedErrors:
     per_frame: NDArray[np.float64]
     """One alignment for each person in each frame (E1)."""
     scale: float
-    """Of the shared alignment: true over predicted size; 1 where it is rigid, NaN without joints
-    in common."""
+    """Scale of the shared alignment: true over predicted size; 1 if rigid, NaN without common
+    joints."""
 
 
 def aligned_errors(
@@ -39,10 +39,10 @@ def aligned_errors(
     """Return joint errors after the three alignments of the paper.
 
     Args:
-        predicted: (frames, persons, 17, 3) [m], in the places of the true people; NaN = missing.
-        true: (frames, persons, 17, 3) [m]; NaN where missing or not to be counted.
+        predicted: (frames, persons, 17, 3) [m], in the order of the true people; NaN = missing.
+        true: (frames, persons, 17, 3) [m]; NaN where missing or not counted.
         with_scale: similarities if true, rigid motions if not.
-        min_joints: people with fewer joints in common are not aligned frame by frame.
+        min_joints: minimum common joints of a person for the alignment per frame.
     """
     source, target = paper_joints(predicted), paper_joints(true)
     frames, persons, joints, _ = target.shape
@@ -73,11 +73,11 @@ def aligned_errors(
 def path_lengths(true: NDArray[np.float64], compared: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return the length of every true person's path (persons,) [m].
 
-    The path of the mid-hip, through the frames that are compared, straight across the others.
+    The path of the mid-hip through the compared frames, with straight lines across gaps.
 
     Args:
         true: (frames, persons, 17, 3) [m]; NaN where missing.
-        compared: (frames, persons) frames in which both sides have the person.
+        compared: (frames, persons) whether both sides have the person.
     """
     hips = mid_hip(true)
     used = compared & np.isfinite(hips[..., 0])
@@ -91,16 +91,16 @@ def path_lengths(true: NDArray[np.float64], compared: NDArray[np.bool_]) -> NDAr
 def drift_per_meter(
     errors: NDArray[np.float64], lengths: NDArray[np.float64], min_length: float
 ) -> float | None:
-    """Return the mean over people of mean error over path length [1], None where nobody moved.
+    """Return the mean over people of mean error over path length [1], None without long paths.
 
     Args:
         errors: (frames, persons, joints) [m]; NaN where missing.
         lengths: (persons,) path lengths [m].
-        min_length: people with shorter paths are left out [m].
+        min_length: minimum path length of a person [m].
 
     Note:
-        E1. The published columns do not give one another's ratio, so theirs is no ratio of means
-        over all people; the mean of each trajectory's own ratio is taken.
+        E1. The ratio of the published columns does not give the published drift, so that the drift
+        is no ratio of means over all people; this function averages the ratio of each trajectory.
     """
     known = np.isfinite(errors)
     count = known.sum((0, 2))
@@ -116,10 +116,10 @@ def challenge_errors(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return global and local joint errors (frames, persons, 13) [m], without any alignment.
 
-    Local errors are taken after the mid-hip of each side is subtracted.
+    Local errors are relative to the mid-hip of each side.
 
     Args:
-        predicted: (frames, persons, 17, 3) [m], in the places of the true people; NaN = missing.
+        predicted: (frames, persons, 17, 3) [m], in the order of the true people; NaN = missing.
         true: (frames, persons, 17, 3) [m]; NaN where missing.
     """
     offset = challenge_joints(predicted) - challenge_joints(true)
@@ -135,14 +135,13 @@ def acceleration_errors(
 ) -> NDArray[np.float64]:
     """Return errors of joint acceleration (frames - 2, persons, 14) [m/s^2], NaN where unknown.
 
-    Second differences of three frames that follow one another at the usual step, on the joints
-    of E4.
+    Second differences of three successive frames at the minimum step, on the joints of E4.
 
     Args:
-        predicted: (frames, persons, 17, 3) [m], in the places of the true people; NaN = missing.
+        predicted: (frames, persons, 17, 3) [m], in the order of the true people; NaN = missing.
         true: (frames, persons, 17, 3) [m]; NaN where missing.
         frames: (frames,) match frames, rising.
-        fps: match frames in a second [1/s].
+        fps: match frames per second [1/s].
     """
     offset = paper_joints(predicted) - paper_joints(true)
     steps = np.diff(frames)

@@ -1,7 +1,7 @@
-"""Exchange: people in pictures out to annotators that a team has, and back in.
+"""Exchange of detections with external annotation tools.
 
 Inputs and outputs: `AnnotatedPicture`s; COCO keypoints JSON, CVAT for images XML 1.1 or Label
-Studio JSON; what an annotator changed, as corrections.
+Studio JSON; an annotator's changes, as corrections.
 """
 
 from worldpose.exchange.changes import Changes, changes_of

@@ -1,4 +1,4 @@
-"""What is carried beside a person's shape, in whichever way a format has for it."""
+"""Attributes of an annotated person besides its shape, as text."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from worldpose.exchange.pictures import AnnotatedPerson, ContentError
 
 
 class Attributes(TypedDict):
-    """Fields of `AnnotatedPerson` that are no shape."""
+    """Fields of `AnnotatedPerson` besides its shape."""
 
     detection: int | None
     origin: Origin | None
@@ -19,16 +19,16 @@ class Attributes(TypedDict):
 
 
 def attributes_of(person: AnnotatedPerson) -> dict[str, str]:
-    """What is known of a person, as text by name."""
+    """Return the attributes of a person, as text by name."""
     given = {"detection": person.detection, "origin": person.origin, "score": person.score}
     return {name: str(value) for name, value in given.items() if value is not None}
 
 
 def read_attributes(given: Mapping[str, str]) -> Attributes:
-    """The same, read again; names that others gave are passed over, an empty text is nothing.
+    """Parse attributes; unknown names are ignored, an empty text means none.
 
     Raises:
-        ContentError: one is not what it must be.
+        ContentError: a value is invalid.
     """
     detection, origin, score = (given.get(name) for name in ("detection", "origin", "score"))
     origins: tuple[Origin, ...] = get_args(Origin)

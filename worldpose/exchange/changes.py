@@ -1,4 +1,4 @@
-"""What an annotator changed, as corrections of what a camera saw (D4, D6)."""
+"""An annotator's changes, as corrections of a camera's detections (D4, D6)."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from worldpose.review.detections import SAME, DetectionEdit
 
 @dataclass(frozen=True)
 class Changes:
-    """What an annotator changed.
+    """Changes of an annotator.
 
     Attributes:
-        edits: in the order they are to be applied.
-        pictures: how many pictures the annotator's file has.
-        boxes: how many boxes were changed of people who were there: no correction takes that in.
+        edits: in the order of application.
+        pictures: number of images in the annotator's file.
+        boxes: number of changed boxes of existing people: corrections cannot express these.
     """
 
     edits: tuple[DetectionEdit, ...]
@@ -32,27 +32,27 @@ class Changes:
 
 
 def picture_name(camera: str, frame: int) -> str:
-    """The name of a camera's picture of a match frame."""
+    """Return the name of a camera's image of a match frame."""
     return f"{camera}_{frame:06d}.png"
 
 
 def changes_of(
     exported: Sequence[AnnotatedPicture], edited: Sequence[AnnotatedPicture], where: str
 ) -> Changes:
-    """Return what is other in an annotator's file than in what was exported.
+    """Return the changes between an export and an annotator's file.
 
-    A picture that the annotator's file lacks was not worked on. Places closer than a hundredth of a
-    pixel are the same: annotators round.
+    An image that the annotator's file lacks counts as unchanged. Positions closer than a hundredth
+    of a pixel count as equal, since annotation tools round.
 
     Args:
-        exported: as `picture_name` names them, people with their `detection`.
-        edited: as they came back; names may have a folder, or a prefix that ends in `-`, before
+        exported: named by `picture_name`, people with their `detection`.
+        edited: from the annotator; names can have a folder, or a prefix that ends in `-`, before
             them.
         where: the annotator's file, for messages.
 
     Raises:
-        InputError: a picture that was not exported or has another size, one person twice, or a
-            person who was not there with the number of one who was.
+        InputError: an image that was not exported or has another size, a duplicate person, or an
+            unknown detection index.
     """
     known = {PurePosixPath(picture.name).name: picture for picture in exported}
     edits: list[DetectionEdit] = []
@@ -80,7 +80,7 @@ def changes_of(
         there = {person.detection: person for person in picture.people}
         free = max((each for each in before if each is not None), default=-1) + 1
         for detection, person in before.items():
-            assert detection is not None  # an export numbers everybody
+            assert detection is not None  # an export numbers all people
             at = {"camera": camera, "frame": int(number), "detection": detection}
             if detection not in there:
                 edits.append(DeletedDetection.model_validate(at))
@@ -96,7 +96,7 @@ def changes_of(
 
 
 def _exported_name(given: str, known: dict[str, AnnotatedPicture]) -> str | None:
-    """Of the exported pictures the one that an annotator means."""
+    """Return the exported image's name for an annotator's name."""
     name = PurePosixPath(given.replace("\\", "/")).name
     return next((each for each in known if name == each or name.endswith(f"-{each}")), None)
 

@@ -1,4 +1,4 @@
-"""People in pictures as COCO keypoints JSON."""
+"""COCO keypoints JSON for annotated images."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Scalar = str | int | float | bool | None
 
 
 class _Given(BaseModel):
-    """Part of a file that others wrote: what is not needed is passed over."""
+    """Part of an external file; unknown fields are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
@@ -47,7 +47,7 @@ class _Dataset(_Given):
 
 
 def coco_bytes(pictures: Sequence[AnnotatedPicture]) -> bytes:
-    """The content of a COCO keypoints file; `attributes` has what COCO has no place for."""
+    """Write a COCO keypoints file; `attributes` holds the fields that COCO lacks."""
     images: list[dict[str, Any]] = []
     people: list[dict[str, Any]] = []
     for number, picture in enumerate(pictures):
@@ -61,10 +61,10 @@ def coco_bytes(pictures: Sequence[AnnotatedPicture]) -> bytes:
 
 
 def read_coco(content: bytes) -> list[AnnotatedPicture]:
-    """The pictures of a COCO keypoints file, in its order.
+    """Read the images of a COCO keypoints file, in its order.
 
     Raises:
-        ContentError: it is none, of other joints, or contradicts itself.
+        ContentError: it has another format, other joints, or contradictions.
     """
     dataset = _Dataset.model_validate_json(content)
     for category in dataset.categories:

@@ -1,4 +1,4 @@
-"""People in pictures as CVAT for images XML 1.1: a box and a skeleton each, in one group."""
+"""CVAT for images XML 1.1 for annotated images: per person a box and a skeleton in one group."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from worldpose.exchange.pictures import (
 from worldpose.exchange.xml_reading import read_xml
 
 BOX: Final = "person"
-"""Label of boxes; that of skeletons may not have the same name."""
+"""Label of boxes; must differ from the label of skeletons."""
 SKELETON: Final = "pose"
 """Label of skeletons, whose points are the 17 joints of COCO."""
 
 
 def cvat_bytes(pictures: Sequence[AnnotatedPicture]) -> bytes:
-    """The content of a CVAT for images file."""
+    """Write a CVAT for images file."""
     root = Element("annotations")
     SubElement(root, "version").text = "1.1"
     for number, picture in enumerate(pictures):
@@ -44,13 +44,13 @@ def cvat_bytes(pictures: Sequence[AnnotatedPicture]) -> bytes:
 
 
 def read_cvat(content: bytes) -> list[AnnotatedPicture]:
-    """The pictures of a CVAT for images file, in its order.
+    """Read the images of a CVAT for images file, in its order.
 
     A skeleton and a box of one detection or one group are one person; a skeleton alone has the box
-    around its points. Shapes of other kinds or labels are passed over.
+    around its points. Shapes of other kinds or labels are ignored.
 
     Raises:
-        ContentError: it is none, or a shape is not what it must be.
+        ContentError: it has another format, or a shape is invalid.
     """
     root = read_xml(content)
     if root.tag != "annotations":
@@ -67,7 +67,7 @@ def _write(image: Element, group: int, person: AnnotatedPerson) -> None:
     shape = {name: str(value) for name, value in corners}
     box = SubElement(image, "box", {"label": BOX, "occluded": "0", **shape, **common})
     skeleton = SubElement(image, "skeleton", {"label": SKELETON, **common})
-    middle = (person.box[:2] + person.box[2:]) / 2  # where an annotator finds what is not there
+    middle = (person.box[:2] + person.box[2:]) / 2  # position of missing keypoints
     for joint, xy, visible in zip(COCO17, person.keypoints, person.visible, strict=True):
         x, y = ((xy if visible else middle) + CORNER).tolist()
         SubElement(
@@ -102,7 +102,7 @@ def _read_image(image: Element) -> AnnotatedPicture:
         keypoints, visible = _skeleton(skeleton)
         own = boxes.pop(key, None)
         if own is None and not visible.any():
-            continue  # it shows nobody
+            continue  # no keypoints, so no person
         corners = hull(keypoints) if own is None else _box(own)
         attributes = read_attributes(_attributes(skeleton))
         people.append(AnnotatedPerson(corners, keypoints, visible, **attributes))
@@ -116,7 +116,7 @@ def _read_image(image: Element) -> AnnotatedPicture:
 def _of_label(
     image: Element, tag: str, label: str | None
 ) -> Iterator[tuple[tuple[str, str], Element]]:
-    """Shapes, each with what it has in common with the other shape of its person."""
+    """Yield shapes, each with the identifier that the two shapes of a person share."""
     for number, element in enumerate(image.findall(tag)):
         if label is not None and element.get("label") != label:
             continue
@@ -165,7 +165,7 @@ def _skeleton(element: Element) -> tuple[Floats, NDArray[np.int8]]:
 
 
 def _nowhere() -> tuple[Floats, NDArray[np.int8]]:
-    """Keypoints that are not there."""
+    """Return missing keypoints."""
     return np.full((17, 2), np.nan), np.zeros(17, dtype=np.int8)
 
 

@@ -1,4 +1,4 @@
-"""The formats by name, and files of them."""
+"""Annotation formats by name, and their files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from worldpose.exchange.pictures import AnnotatedPicture, ContentError
 Format: TypeAlias = Literal["coco", "cvat", "label-studio"]
 FORMATS: Final[tuple[Format, ...]] = get_args(Format)
 MOST: Final = 1 << 28
-"""Largest file that is read [bytes]: a hundred thousand people take about as much."""
+"""Maximum file size [bytes], about that of a hundred thousand people."""
 
 
 class _Codec(NamedTuple):
@@ -35,12 +35,12 @@ _CODECS: Final[dict[Format, _Codec]] = {
 
 
 def suffix_of(form: Format) -> str:
-    """How names of files of a format end."""
+    """Return the file name suffix of a format."""
     return _CODECS[form].suffix
 
 
 def format_of(content: bytes) -> Format:
-    """The format of a file's content, by how it begins: XML, a list of tasks, or an object."""
+    """Detect the format of a file from its first characters: XML, a list of tasks, or an object."""
     begin = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1]
     return "cvat" if begin == b"<" else "label-studio" if begin == b"[" else "coco"
 
@@ -48,25 +48,25 @@ def format_of(content: bytes) -> Format:
 def write_annotations(
     path: Path, pictures: Sequence[AnnotatedPicture], form: Format = "coco"
 ) -> None:
-    """Write pictures' people in a format.
+    """Write annotated images in a format.
 
     Args:
         path: the file; overwritten.
-        pictures: of names that differ.
+        pictures: with unique names.
         form: the format.
     """
     path.write_bytes(_CODECS[form].encode(pictures))
 
 
 def read_annotations(path: Path, form: Format | None = None) -> list[AnnotatedPicture]:
-    """Return the pictures of a file, in its order.
+    """Return the images of a file, in its order.
 
     Args:
         path: the file.
-        form: its format; None = as its content says.
+        form: its format; None = detect from its content.
 
     Raises:
-        InputError: it is not what it must be; nothing of it is taken.
+        InputError: the content is invalid; nothing is read.
     """
     try:
         size = path.stat().st_size

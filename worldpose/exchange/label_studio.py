@@ -1,4 +1,4 @@
-"""People in pictures as Label Studio JSON: a rectangle each, and keypoints that belong to it."""
+"""Label Studio JSON for annotated images: per person a rectangle with child keypoints."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from worldpose.exchange.pictures import (
 )
 
 HIDDEN: Final = "hidden"
-"""Note at a keypoint that cannot be seen: Label Studio has no field for that."""
+"""Note at an occluded keypoint: Label Studio has no field for that."""
 POINT: Final = 0.3
-"""How large a keypoint is drawn [% of the picture's width]."""
+"""Displayed size of a keypoint [% of the image width]."""
 
 
 class _Given(BaseModel):
-    """Part of a file that others wrote: what is not needed is passed over."""
+    """Part of an external file; unknown fields are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
@@ -73,7 +73,7 @@ class _Task(_Given):
 
 
 def label_studio_bytes(pictures: Sequence[AnnotatedPicture]) -> bytes:
-    """The content of a file of Label Studio tasks; what is known stands in their predictions."""
+    """Write Label Studio tasks, with the detections as predictions."""
     tasks = [
         {
             "data": {
@@ -89,13 +89,13 @@ def label_studio_bytes(pictures: Sequence[AnnotatedPicture]) -> bytes:
 
 
 def read_label_studio(content: bytes) -> list[AnnotatedPicture]:
-    """The pictures of a Label Studio export, in its order.
+    """Read the images of a Label Studio export, in its order.
 
-    Of each task the last annotation that was not cancelled is taken, or else the last prediction. A
-    keypoint belongs to the rectangle that it is a child of, or else to the only one around it.
+    For each task the last annotation that was not cancelled is used, or else the last prediction. A
+    keypoint belongs to its parent rectangle, or else to the only one around it.
 
     Raises:
-        ContentError: it is none, or a region is not what it must be.
+        ContentError: it has another format, or a region is invalid.
     """
     return [_read(task) for task in TypeAdapter(tuple[_Task, ...]).validate_json(content)]
 
@@ -219,5 +219,5 @@ def _owner(name: str, region: _Region, place: Floats, boxes: dict[str, Floats]) 
 
 
 def _rounded(pixels: Floats) -> Floats:
-    """In single precision, as detections are stored: what percentages lose is far below."""
+    """Round to single precision, as stored: errors from percentages are far smaller."""
     return pixels.astype(np.float32).astype(np.float64)

@@ -1,4 +1,4 @@
-"""People in pictures, as annotators show and change them."""
+"""Annotated images and people in them."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from data_contracts.review import Origin
 
 Floats = NDArray[np.float64]
 CORNER: Final = 0.5
-"""What the corner of a picture is from the centre of its first pixel [px]: CVAT and Label Studio
+"""Offset of the image corner from the centre of the first pixel [px]: CVAT and Label Studio
 count from the corner, the conventions of worldpose and its COCO files from the centre."""
 SEEN: Final = 0.5
-"""Keypoints from this confidence on are written as seen, others as hidden [1]."""
+"""Minimum confidence of a visible keypoint; others are written as hidden [1]."""
 
 
 class ContentError(ValueError):
-    """What another program wrote is not what its format says; no other error is the file's."""
+    """Another program's file does not match its format; errors of the file raise only this."""
 
 
 @dataclass(frozen=True, eq=False)
 class AnnotatedPerson:
-    """One person in one picture.
+    """One person in one image.
 
     Attributes:
         box: (4,) x0, y0, x1, y1 [px]; (0, 0) is the centre of the top-left pixel.
-        keypoints: (17, 2) COCO-17 [px]; NaN where not there.
-        visible: (17,) int8: 2 seen, 1 hidden, 0 not there.
-        detection: the person's place among the camera's detections of the frame; None where an
+        keypoints: (17, 2) COCO-17 [px]; NaN if missing.
+        visible: (17,) int8: 2 visible, 1 hidden, 0 missing.
+        detection: the person's index among the camera's detections of the frame; None if an
             annotator added the person.
-        origin: who says so.
-        score: the detector's confidence [1]; None where there is none.
+        origin: source of the annotation.
+        score: the detector's confidence [1]; None if there is none.
     """
 
     box: Floats
@@ -46,12 +46,12 @@ class AnnotatedPerson:
 
 @dataclass(frozen=True, eq=False)
 class AnnotatedPicture:
-    """One picture and the people in it.
+    """One image and the people in it.
 
     Attributes:
-        name: of its file; `/` between folders.
+        name: file name; `/` between folders.
         size: width, height [px].
-        people: in no order that matters.
+        people: in arbitrary order.
     """
 
     name: str
@@ -60,10 +60,10 @@ class AnnotatedPicture:
 
 
 def hull(keypoints: Floats) -> Floats:
-    """The box (4,) around a person's keypoints [px], of one that was annotated without.
+    """Return the box (4,) around a person's keypoints [px], for a person without a box.
 
     Args:
-        keypoints: (17, 2) [px], at least one of them there.
+        keypoints: (17, 2) [px], at least one of them not NaN.
     """
     there = keypoints[np.isfinite(keypoints).all(axis=1)]
     return np.concatenate([there.min(axis=0), there.max(axis=0)])

@@ -1,4 +1,4 @@
-"""XML from strangers: what can make a small file large, or read another one, is refused."""
+"""Safe XML parsing: entity expansion and external references are refused."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from xml.parsers import expat
 from worldpose.exchange.pictures import ContentError
 
 DEEPEST: Final = 16
-"""Elements within each other; annotations have five."""
+"""Maximum nesting of elements; annotations have five."""
 
 
 def read_xml(content: bytes) -> ElementTree.Element:
-    """The root element of a document without a document type, and so without any entity.
+    """Return the root element of a document without a document type and thus without entities.
 
     Raises:
-        ContentError: it is no XML, declares a document type, or is nested deeply.
+        ContentError: it is not XML, declares a document type, or is nested deeply.
     """
     parser, builder = expat.ParserCreate(), ElementTree.TreeBuilder()
     depth = 0
@@ -43,7 +43,7 @@ def read_xml(content: bytes) -> ElementTree.Element:
         parser.Parse(content, True)
     except ContentError:
         raise
-    # ValueError and LookupError: an encoding that expat or Python does not know.
+    # ValueError and LookupError: an encoding unknown to expat or Python.
     except (expat.ExpatError, ValueError, LookupError) as error:
         raise ContentError(f"no XML: {error}") from error
     return builder.close()

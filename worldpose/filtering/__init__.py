@@ -1,7 +1,7 @@
-"""Filtering: which detected keypoints and boxes the fitted bodies contradict (R2).
+"""Filtering: detected keypoints and boxes that contradict the fitted bodies (R2).
 
-Input: fitted bodies, the cameras, what they detected and who was taken for whom. Output: what the
-next iteration leaves out or takes off keypoints, and how well left-out cameras are foreseen.
+Input: fitted bodies, cameras, detections and their matches to people. Output: keypoints to leave
+out and corrections to subtract in the next iteration, and prediction errors in held-out cameras.
 """
 
 from worldpose.filtering.held_out import HeldOut, measure_held_out

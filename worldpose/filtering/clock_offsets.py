@@ -1,8 +1,8 @@
-"""Clocks of the cameras, told apart from where they stand.
+"""Clock offsets of the cameras, estimated together with their poses.
 
-Cameras that were adjusted to people have taken in much of what their clocks are late: people who
-all run one way look shifted. So clocks and cameras are estimated together here, with every joint
-free to follow both.
+Cameras that were adjusted to people have absorbed much of their clock offsets, since people who all
+run one way look shifted. So clocks and cameras are estimated together here, with every joint free
+to follow both.
 """
 
 from __future__ import annotations
@@ -20,56 +20,56 @@ from worldpose.static_calibration.parameters import by_step
 Floats = NDArray[np.float64]
 
 STEP: Final = 7
-"""Rotation, shift and focal length, of a camera's step."""
+"""Parameters of a camera's step: rotation, shift and focal length."""
 EXPECTED: Final = np.array([*(0.003,) * 3, *(0.5,) * 3, 0.005])
-"""Standard deviation of a camera's turns [rad], shift [m] and focal length [1]: ten times what
-careful calibration leaves."""
+"""Standard deviation of a camera's rotation [rad], shift [m] and focal length [1]: ten times the
+error of careful calibration."""
 LEAST: Final = 1e-6
 """Added to the information of a point [1/m^2]."""
 ROUNDS: Final = 40
-"""Of learning how far clocks are apart: exact ones then come out 0.02 frames apart."""
+"""Iterations to learn the spread of clock offsets: exact clocks then come out 0.02 frames apart."""
 LEAST_SPREAD: Final = 0.005
-"""Of clocks [frame]."""
+"""Minimum spread of clock offsets [frame]."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What one camera saw, an entry for each joint of each row that counts."""
+    """Observations of one camera, one entry per joint of each row that counts."""
 
     row: Places
     joint: Places
     place: Places
-    """Which point it is."""
+    """Index of the point."""
     held: Floats
-    """(n, 2, 1 + STEP) how its unknowns move the keypoint, weighted."""
+    """(n, 2, 1 + STEP) weighted derivative of the keypoint by the camera's unknowns."""
     held_points: Floats
-    """(n, 2, 3) how the point does."""
+    """(n, 2, 3) weighted derivative by the point."""
 
 
 @dataclass(frozen=True, eq=False)
 class ClockEquations:
-    """Normal equations of clocks and cameras, with every joint solved for (Schur complement)."""
+    """Normal equations of clocks and cameras, with joints eliminated (Schur complement)."""
 
     seen: tuple[_Seen, ...]
     """By camera."""
     used: NDArray[np.bool_]
-    """(points,) that anybody saw."""
+    """(points,) bool, points with observations."""
     follow: Floats
-    """(3 used, cameras (1 + STEP)) how these go along with the unknowns."""
+    """(3 used, cameras (1 + STEP)) motion of these points with the unknowns."""
     matrix: Floats
-    """(cameras (1 + STEP),) twice."""
+    """(cameras (1 + STEP), cameras (1 + STEP))."""
 
     @classmethod
     def of(
         cls, cameras: Camera, joints: Floats, way: Floats, residuals: Residuals
     ) -> ClockEquations:
-        """Return the equations; which keypoints count is all that they take from `residuals`.
+        """Return the equations; they use the weights of `residuals`, not its values.
 
         Args:
             cameras: batch (cameras,).
             joints: (frames, persons, 17, 3) [m], world, of bodies.
-            way: (n, 17, 2) [px], of each row's joints in its picture within a frame; NaN = unknown.
-            residuals: of these joints, whose `frame` are theirs.
+            way: (n, 17, 2) [px], image motion of each row's joints per frame; NaN = unknown.
+            residuals: of these joints; `frame` indexes the first axis of `joints`.
         """
         persons, joint_count = joints.shape[1:3]
         count, width = cameras.batch_shape[0], 1 + STEP
@@ -88,7 +88,7 @@ class ClockEquations:
             held = weight[row, joint, None, None] * by_all
             held_points = weight[row, joint, None, None] * by_points.d_points
             matrix[camera, :, camera] = np.einsum("nak,nal->kl", held, by_all)
-            # A camera sees a joint of a person at most once in a frame.
+            # A camera sees a joint of a person at most once per frame.
             normal[place] += np.einsum("nai,naj->nij", held_points, by_points.d_points)
             mixed[place, :, camera] = np.einsum("nai,nak->nik", held_points, by_all)
             seen.append(_Seen(row, joint, place, held, held_points))
@@ -100,10 +100,10 @@ class ClockEquations:
         return cls(tuple(seen), used, follow, whole)
 
     def learn_lateness(self, residuals: Residuals) -> Floats:
-        """Return by how many frames each camera shows people later than the mean (cameras,).
+        """Return clock offsets relative to the mean (cameras,) [frame]; positive = later time.
 
         Args:
-            residuals: with the keypoints that count in the equations, as far as they still miss.
+            residuals: remaining residuals of the keypoints in the equations.
         """
         right = np.zeros((len(self.seen), 1 + STEP))
         pulled = np.zeros((len(self.used), 3))
@@ -116,9 +116,9 @@ class ClockEquations:
 
 
 def _late(matrix: Floats, right: Floats, count: int) -> Floats:
-    """The first unknown of every camera; how far these differ is learnt (expectation-maximisation).
+    """Return each camera's first unknown; expectation-maximisation learns their spread.
 
-    Where nothing tells clocks from cameras, or all agree, they come out equal.
+    If nothing separates clocks from cameras, or all clocks agree, the offsets come out equal.
     """
     spread = 1.0
     for _ in range(ROUNDS):

@@ -1,4 +1,4 @@
-"""How well people are foreseen in cameras that had no part in placing them."""
+"""Prediction error of people in held-out cameras."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from worldpose.triangulation import TriangulationSettings, triangulate_joints
 Floats = NDArray[np.float64]
 
 FOLDS: Final = 4
-"""Parts of the cameras; each is left out once."""
+"""Groups of cameras; each is held out once."""
 FARTHEST: Final = 0.2
-"""A keypoint that is farther off, or that nobody foresees, counts as this much [box height]: half
-a metre is no measure of how well somebody is placed."""
+"""Maximum error of a keypoint, also of one without a prediction [box height]: half a metre does not
+measure the accuracy of a person's position."""
 SMALLEST: Final = 10.0
-"""Boxes count as at least this high [px]."""
+"""Minimum height of a box [px]."""
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Keypoints in cameras that were left out.
+    """Prediction error of keypoints in held-out cameras.
 
     Attributes:
-        error: mean distance to where the other cameras put the nearest person [box height].
-        keypoints: how many.
+        error: mean distance to the nearest person predicted by the other cameras [box height].
+        keypoints: number of keypoints.
     """
 
     error: float
@@ -43,19 +43,20 @@ def measure_held_out(
     settings: TriangulationSettings,
     camera_covariance: Floats | None = None,
 ) -> HeldOut | None:
-    """Return how well left-out cameras are foreseen; None where nothing tells.
+    """Return the prediction error in held-out cameras; None without data.
 
-    A quarter of the cameras after the other is left out; the others place everybody, and every
-    keypoint that was detected in it is compared with them. What is compared is the same whoever was
-    followed and whatever was rejected: nothing gets better by being left away. Nothing tells
-    without keypoints, nor where the others are too few to place anybody, as one of two is.
+    One quarter of the cameras after the other is held out; the others triangulate all people, and
+    every keypoint detected in the held-out cameras is compared with them. The compared keypoints do
+    not depend on tracking or rejection, so leaving detections out cannot reduce the error. There is
+    no data without keypoints, nor if the other cameras are too few to triangulate, such as one of
+    two.
 
     Args:
         cameras: batch (cameras,).
-        used: keypoints (frames, cameras, detections, 17, 2) [px] and confidence that people are
-            placed from; NaN where rejected.
+        used: keypoints (frames, cameras, detections, 17, 2) [px] and confidence for triangulation;
+            NaN where rejected.
         detected: (frames, cameras, detections, 17, 2) [px], all keypoints; NaN where not found.
-        detection_index: (frames, cameras, persons), place among the detections; -1 = not seen.
+        detection_index: (frames, cameras, persons), index of the detection; -1 = not seen.
         settings: of triangulation.
         camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
     """
@@ -78,7 +79,7 @@ def measure_held_out(
 
 
 def _distances(camera: Camera, seen: Floats, joints: Floats) -> Floats:
-    """Distances (frames, detections, 17) [box height] to the nearest person, 0 where not seen."""
+    """Return distances (frames, detections, 17) [box height] to the nearest person, or 0."""
     frames, persons, count = joints.shape[:3]
     there = np.isfinite(seen).all(-1)
     high = np.where(there, seen[..., 1], -np.inf).max(-1, initial=-np.inf)

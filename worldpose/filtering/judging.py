@@ -196,7 +196,7 @@ def judge_detections(
     away = rows.surprise(spread)
     alike = rows.similarity()
     count, fitting = _counts(away, settings)
-    judged = count >= settings.fewest
+    judged = count >= settings.min_keypoints
     good = judged & _is_fit(count, fitting, alike, settings)
     at = frame, camera, place
     fits[at] = np.where(good, person, -1)
@@ -208,7 +208,7 @@ def judge_detections(
     taken = np.zeros(shape[:3], dtype=np.bool_)
     taken[at] = True
     open_ = dropped | ~taken
-    open_ &= np.isfinite(suspects.keypoints[..., 0]).sum(-1) >= settings.fewest
+    open_ &= np.isfinite(suspects.keypoints[..., 0]).sum(-1) >= settings.min_keypoints
     for n in np.unique(np.nonzero(open_)[0]):
         _look_for_others(n, open_[n], views, suspects, spread, settings, fits, similarity, surprise)
     dropped = (dropped | suspects.dropped) & (fits < 0)
@@ -267,8 +267,8 @@ def _is_fit(
     count: Places, fitting: Places, similarity: Floats, settings: FilteringSettings
 ) -> Flags:
     with np.errstate(invalid="ignore"):
-        alike = similarity >= settings.least_similarity
-    enough = (count >= settings.fewest) & (fitting >= settings.least_fitting * count)
+        alike = similarity >= settings.min_similarity
+    enough = (count >= settings.min_keypoints) & (fitting >= settings.min_inlier_share * count)
     return np.asarray(enough & alike)
 
 

@@ -1,4 +1,4 @@
-"""By how much keypoints miss the bodies of those they were taken for."""
+"""Residuals between keypoints and the bodies that they were matched to."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ Places = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Keypoints beside bodies, a row for each detection; joints are those of the body.
+    """Residuals of keypoints, one row per detection; joints are those of the body.
 
     Attributes:
         frame: (n,)
         camera: (n,)
         person: (n,)
-        missed: (n, 17, 2) from the body to the keypoint [px]; NaN = does not count.
+        missed: (n, 17, 2) vector from the body to the keypoint [px]; NaN = does not count.
         variance: (n, 17) of it per axis [px^2].
-        repeated: rows of a person that err alike, so that they count as one.
+        repeated: rows of a person with correlated errors, which count as one.
     """
 
     frame: Places
@@ -38,5 +38,5 @@ class Residuals:
         return np.where(there, 1.0 / (np.where(there, self.variance, 1.0) * self.repeated), 0.0)
 
     def less(self, shift: Floats) -> Residuals:
-        """Return what is left of them when a shift (n, 17, 2) [px] is taken off."""
+        """Return the residuals minus a shift (n, 17, 2) [px]."""
         return replace(self, missed=self.missed - shift)

@@ -1,4 +1,4 @@
-"""How far detected keypoints lie from bodies that are right, as a clip shows it."""
+"""Spread of detected keypoints about correct bodies, learned per clip."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 BINS: Final = 8
-"""Classes of confidence."""
+"""Confidence classes."""
 ROUNDS: Final = 6
-"""Of learning; the last changes a factor by less than a hundredth."""
+"""Iterations; the last changes a factor by less than a hundredth."""
 MEDIAN: Final = 2.0 * math.log(2.0)
 """Median squared distance in two dimensions, in variances of an axis."""
 LEAST: Final = 0.05
-"""Smallest factor: bodies that follow their keypoints everywhere must not make any odd."""
+"""Smallest factor: bodies that follow their keypoints exactly must not create outliers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class Spread:
 
     Attributes:
         joint: (17,)
-        knots: (bins - 1,) confidences that part the classes.
+        knots: (bins - 1,) confidences that separate the classes.
         confidence: (bins,) by class.
     """
 
@@ -42,11 +42,11 @@ class Spread:
 
 
 def learn_spread(squared: Floats, stated: Floats, known: Floats, confidence: Floats) -> Spread:
-    """Return the spread of keypoints about bodies, from medians, which wrong ones hardly move.
+    """Return the spread of keypoints about bodies, from medians, which outliers hardly move.
 
     Args:
         squared: (n, 17) squared distance of each keypoint to its body [px^2]; NaN = none.
-        stated: (n, 17) variance that keypoints are stated to have per axis [px^2].
+        stated: (n, 17) stated variance of keypoints per axis [px^2].
         known: (n, 17) variance of the body's joint per axis [px^2].
         confidence: (n, 17).
     """
@@ -66,7 +66,7 @@ def learn_spread(squared: Floats, stated: Floats, known: Floats, confidence: Flo
             for each in np.unique(group):
                 mine = group == each
                 median = float(np.median(ratio[mine])) / MEDIAN
-                # What the body is unsure of is no part of the factor.
+                # The factor excludes the variance of the body.
                 share = float(np.median((expected / (expected + given))[mine]))
                 factor[each] = max(LEAST, factor[each] * (1.0 + (median - 1.0) / max(share, 0.3)))
     return Spread(by_joint, knots, by_bin)

@@ -1,7 +1,7 @@
-"""What keypoints are beside bodies by for reasons that last: sides seen, and clocks.
+"""Systematic errors of keypoints: bias by viewing direction, and clock offsets.
 
-Both are learned from all people of a clip together. What they come to for each keypoint is taken
-off in the next iteration; nobody's own error is in it.
+Both are learned from all people of a clip together. The next iteration subtracts them from each
+keypoint; they contain no error of a single person.
 """
 
 from __future__ import annotations
@@ -22,20 +22,21 @@ from worldpose.filtering.views import BodyViews
 Floats = NDArray[np.float64]
 
 LASTING: Final = 0.3
-"""Time in which a detector's error forgets itself by a factor e [s]."""
+"""Correlation time of a detector's error, to a factor e [s]."""
 ROUNDS: Final = 2
-"""Of judging and learning: the second judges by what the first has learnt."""
+"""Passes of judging and learning: the second judges with the result of the first."""
 TURNS: Final = 3
-"""Of learning sides and clocks after each other, within a round."""
+"""Alternations between view bias and clock offsets within a pass."""
 
 
 @dataclass(frozen=True, eq=False)
 class SystematicErrors:
-    """What a clip's detector and clocks always get wrong.
+    """Systematic errors of a clip's detector and clocks.
 
     Attributes:
-        view_bias: by the side that a body is seen from.
-        late: (cameras,) by how much each camera shows people later than the cameras' mean [frame].
+        view_bias: by viewing direction.
+        late: (cameras,) clock offset of each camera relative to the cameras' mean [frame]; positive
+            = the camera shows a later time.
     """
 
     view_bias: ViewBias
@@ -43,22 +44,22 @@ class SystematicErrors:
 
     @classmethod
     def none(cls, cameras: int) -> SystematicErrors:
-        """Nothing."""
+        """Return zero errors."""
         return cls(ViewBias.none(), np.zeros(cameras))
 
     def shift(self, motion: BodyMotion, views: BodyViews) -> Floats:
-        """Return by how far keypoints are beside joints (frames, cameras, persons, 17, 2) [px].
+        """Return the systematic error of keypoints (frames, cameras, persons, 17, 2) [px].
 
-        NaN where a body, or its motion, is not known.
+        NaN where a body, or its motion, is unknown.
         """
         sides = self.view_bias.shift(motion.azimuth, _scale(views))
         return np.asarray(sides + self.late[:, None, None, None] * motion.way)
 
     def late_in_offsets(self, offsets: Floats, motion: BodyMotion) -> Floats:
-        """Return which part of the lateness people's offsets hold already (cameras,) [frame].
+        """Return the part of the clock offsets that people's offsets contain (cameras,) [frame].
 
-        They are of joints placed before anybody knew of clocks, so that a camera seems to see
-        people beside where they are along their way.
+        People's offsets belong to joints triangulated without clock offsets, so a camera seems to
+        see people displaced along their motion.
 
         Args:
             offsets: (frames, cameras, persons, 2) [px], as of `Suspects`.
@@ -72,21 +73,21 @@ class SystematicErrors:
 
 @dataclass(frozen=True, eq=False)
 class BodyMotion:
-    """How bodies are turned and move in all pictures."""
+    """Azimuth and image motion of bodies in all images."""
 
     azimuth: Floats
     """(frames, cameras, persons) of the camera, seen from the body [rad]."""
     way: Floats
-    """(frames, cameras, persons, 17, 2) that joints go in a frame [px]."""
+    """(frames, cameras, persons, 17, 2) motion of joints per frame [px]."""
 
 
 def watch_motion(cameras: Camera, joints: Floats, step: Floats) -> BodyMotion:
-    """Return how bodies are turned and move in all pictures.
+    """Return azimuth and image motion of bodies in all images.
 
     Args:
         cameras: batch (cameras,).
         joints: (frames, persons, 17, 3) [m], world.
-        step: (frames, persons, 17, 3) [m], their way in a frame.
+        step: (frames, persons, 17, 3) [m], their motion per frame.
     """
     ends = [
         cameras.project((joints + part * step).reshape(len(joints), 1, -1, 3))
@@ -105,15 +106,15 @@ def learn_systematic_errors(
     settings: FilteringSettings,
     fps: float,
 ) -> SystematicErrors:
-    """Return what keypoints that fit their bodies are beside them by.
+    """Return the systematic errors of keypoints that fit their bodies.
 
     Args:
         cameras: batch (cameras,).
         joints: (frames, persons, 17, 3) [m], world, of the bodies, as the detector sees them.
-        views: these in all pictures.
-        motion: of these.
-        suspects: what was detected there.
-        settings: what counts as a contradiction.
+        views: projections of the bodies in all images.
+        motion: of the bodies.
+        suspects: detections in these frames.
+        settings: limits of the consistency check.
         fps: of these frames [1/s].
     """
     systematic = SystematicErrors.none(cameras.batch_shape[0])
@@ -135,5 +136,5 @@ def learn_systematic_errors(
 
 
 def _scale(views: BodyViews) -> Floats:
-    """How large a metre is at a body's hips (frames, cameras, persons) [px/m]."""
+    """Return the image scale at a body's hips (frames, cameras, persons) [px/m]."""
     return np.asarray(views.scale[..., (11, 12)].mean(axis=-1))

@@ -1,8 +1,8 @@
-"""What a detector gets wrong by the side that it sees a body from.
+"""Detector bias as a function of the direction from which a camera sees a body.
 
-A hip seen from the side is taken for a point nearer to the front than one seen from ahead: an error
-that all people and cameras have in common and that no further view of the same side averages out.
-Bodies that all views agree on show it.
+From the side, a detector puts a hip closer to the front than from ahead: an error that all people
+and cameras share and that more views of the same side do not average out. Bodies fitted to all
+views reveal it.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from worldpose.filtering.residuals import Residuals
 Floats = NDArray[np.float64]
 
 WAVES: Final = (2, 3)
-"""Changes with direction that are told, in a turn. What is the same from all sides or changes once
-in a turn is how a point beside the joint looks, and for that body fitting has offsets; finer ones
-would have sides differ within a sixth of a turn."""
+"""Harmonics of the azimuth. A constant bias and the first harmonic are those of a point next to the
+joint, which the offsets of body fitting cover; higher harmonics would let the bias vary within a
+sixth of a turn."""
 TERMS: Final = 2 * len(WAVES)
 EXPECTED: Final = 0.02
-"""Standard deviation of each coefficient before anything is seen [m]: a hundredth of a body."""
+"""Prior standard deviation of each coefficient [m]: a hundredth of a body."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewBias:
-    """Errors of keypoints by direction.
+    """Bias of keypoints by viewing direction.
 
     Attributes:
-        coefficient: (17, 2, 4) [m], of each joint along the axes of the picture: cosines, then
-            sines, of the multiples of the azimuth in `WAVES`.
+        coefficient: (17, 2, 4) [m], of each joint along the image axes: cosines, then sines, of the
+            multiples of the azimuth in `WAVES`.
     """
 
     coefficient: Floats
 
     @classmethod
     def none(cls) -> ViewBias:
-        """That of a detector which errs the same way from all sides."""
+        """Return the zero bias of a detector with equal errors from all directions."""
         return cls(np.zeros((17, 2, TERMS)))
 
     def shift(self, azimuth: NDArray[np.floating], scale: NDArray[np.floating]) -> Floats:
-        """Return by how far keypoints (..., 17, 2) are beside their joints [px].
+        """Return the bias of keypoints (..., 17, 2) [px].
 
         Args:
             azimuth: (...) of the camera seen from the body [rad]; NaN = unknown.
@@ -56,7 +56,7 @@ class ViewBias:
 
 
 def find_azimuths(cameras: Camera, joints: Floats) -> Floats:
-    """Return from where each camera sees bodies (frames, cameras, persons) [rad].
+    """Return the azimuth of each camera as seen from bodies (frames, cameras, persons) [rad].
 
     0 is in front of a body, a quarter turn to its left; NaN without a body.
 
@@ -72,7 +72,7 @@ def find_azimuths(cameras: Camera, joints: Floats) -> Floats:
 
 
 def learn_view_bias(residuals: Residuals, azimuth: Floats, scale: Floats) -> ViewBias:
-    """Return the bias that goes with the direction of the view, by linear least squares.
+    """Return the bias by viewing direction, from linear least squares.
 
     Args:
         residuals: of bodies.

@@ -1,4 +1,4 @@
-"""Fitted bodies as every static camera should see them, and how sure that is."""
+"""Projections of fitted bodies into every static camera, with variance."""
 
 from __future__ import annotations
 
@@ -18,44 +18,43 @@ class BodyViews:
     """Projected bodies, (frames, cameras, persons, 17) each."""
 
     image: Floats
-    """(..., 2) [px]; NaN where there is no body, or it is not before the camera."""
+    """(..., 2) [px]; NaN without a body in front of the camera."""
     variance: Floats
-    """Of `image` [px^2], mean over both axes: how well the joint is known across the view."""
+    """Variance of `image` [px^2], mean over both axes."""
     scale: Floats
-    """How large a metre is there [px/m]."""
+    """Image scale there [px/m]."""
 
 
 def perceived_joints(joints: Floats, offsets: Floats) -> Floats:
-    """Return where a detector sees the joints (frames, persons, 17, 3) of bodies [m], world.
+    """Return the detector's joints (frames, persons, 17, 3) of bodies [m], world.
 
     Args:
         joints: (frames, persons, 17, 3) [m], world.
-        offsets: (17, 3) [m] from a joint to what is taken for it: forward, left, up.
+        offsets: (17, 3) [m] from a body's joint to the detector's: forward, left, up.
     """
     moved: Floats = joints + np.einsum("fpab,jb->fpja", body_axes(joints), offsets)
     return moved
 
 
 def perceived_covariance(covariance: Floats, common_bias: Floats) -> Floats:
-    """Return how sure it is where a detector sees the joints of bodies (frames, persons, 17, 3, 3).
+    """Return the covariance of the detector's joints of bodies (frames, persons, 17, 3, 3).
 
-    What it takes for a joint is followed by the offsets, however far from the joint that is.
+    The offsets follow the detector's joints, so the common bias is no part of the covariance.
 
     Args:
         covariance: (frames, persons, 17, 3, 3) [m^2], of the bodies' joints.
-        common_bias: (17,) per axis, of what all views err in common [m]; in `covariance`.
+        common_bias: (17,) per axis, error that all views share [m]; included in `covariance`.
     """
     seen: Floats = covariance - common_bias[:, None, None] ** 2 * np.eye(3)
     return seen
 
 
 def view_bodies(cameras: Camera, joints: Floats, covariance: Floats) -> BodyViews:
-    """Return bodies in all pictures.
+    """Return projections of bodies into all images.
 
     Args:
         cameras: batch (cameras,).
-        joints: (frames, persons, 17, 3) [m], world, where the detector sees joints; NaN without a
-            body.
+        joints: (frames, persons, 17, 3) [m], world, the detector's joints; NaN without a body.
         covariance: (frames, persons, 17, 3, 3) [m^2].
     """
     frames, persons = joints.shape[:2]
@@ -69,7 +68,7 @@ def view_bodies(cameras: Camera, joints: Floats, covariance: Floats) -> BodyView
         scale = cameras.focal.mean(axis=-1)[:, None, None] / depth
     total = np.einsum("...aa", covariance)[:, None]
     along = np.einsum("ca,fpjab,cb->fcpj", ahead, covariance, ahead)
-    # A picture's axis of view stands for each line of sight in it: of the variance across it, that
-    # is off by the square of the sine between them.
+    # The optical axis replaces each line of sight of the image: the relative error of the variance
+    # is the squared sine of the angle between them.
     variance = 0.5 * (total - along) * scale**2
     return BodyViews(image, variance, scale)

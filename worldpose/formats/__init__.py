@@ -1,4 +1,4 @@
-"""Files that carry results between tools: written from plain arrays, and read back.
+"""Exchange file formats, written from plain arrays and read back.
 
 Joints, cameras, body poses, COCO keypoints, the FIFA skeletal tracking challenge, motion capture
 (TRC, BVH); docs/formats.md describes each of them.

@@ -1,4 +1,4 @@
-"""npz archives: bytes that depend on the arrays alone, and reading that trusts nothing."""
+"""npz archives: deterministic writing, and reading that validates everything."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from worldpose.errors import InputError
 from worldpose.formats.files import whole_file
 
 ARRAY_BYTES: Final = 16 << 30
-"""Most that the arrays of one file may fill [byte]: two hours of 25 people with covariance at
-50 frames/s are 13 GB."""
+"""Maximum size of one file's arrays [byte]: two hours of 25 people with covariance at 50
+frames/s are 13 GB."""
 
 _KINDS: Final = {"float": "f", "int": "iu", "text": "U"}
 _MEANINGS: Final = {"float": "float numbers", "int": "int numbers", "text": "text"}
@@ -27,7 +27,7 @@ _READ_AS: Final[Mapping[str, type]] = {"float": np.float64, "int": np.int64, "te
 
 @dataclass(frozen=True)
 class Member:
-    """One array of an archive: what it must look like."""
+    """Expected form of one array of an archive."""
 
     dims: tuple[str | int, ...]
     """Lengths, or names of lengths that must agree between members."""
@@ -37,11 +37,11 @@ class Member:
 
 
 def write_archive(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays as npz, whole or not at all; the same arrays give the same bytes."""
+    """Write arrays as npz, whole or not at all; equal arrays give equal bytes."""
     with whole_file(path) as draft, zipfile.ZipFile(draft, "w") as file:
         for name, array in arrays.items():
             little = np.asarray(array, array.dtype.newbyteorder("<"), order="C")
-            # A ZipInfo made by name alone carries the fixed date 1980-01-01.
+            # A ZipInfo created by name alone has the fixed date 1980-01-01.
             with file.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
                 npy.write_array(member, little, version=(1, 0), allow_pickle=False)
 
@@ -49,18 +49,18 @@ def write_archive(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 def read_archive(
     path: Path, members: Mapping[str, Member], only: Collection[str] | None = None
 ) -> dict[str, NDArray[Any]]:
-    """Read the arrays of an npz file after their types, shapes and sizes were checked.
+    """Read the arrays of an npz file after validating their types, shapes and sizes.
 
     Args:
         path: the file.
-        members: what it must hold; nothing else may be in it.
-        only: members that are wanted; None = all. The others do not come into memory.
+        members: expected content; no other member is allowed.
+        only: requested members; None = all. The others are not loaded.
 
     Returns:
         float64, int64 and str arrays by name; optional members that are absent are left out.
 
     Raises:
-        InputError: naming file and member: absent, truncated, no npz, members missing or unknown,
+        InputError: names file and member: absent, truncated, not npz, members missing or unknown,
             another type or shape, too large.
     """
     if not path.is_file():
@@ -79,7 +79,7 @@ def read_archive(
 
 
 def wrong(where: str, expected: str, found: str, todo: str = "Write the file anew.") -> InputError:
-    """The error about one place of a file."""
+    """Return the error about one place of a file."""
     return InputError(where, expected=expected, found=found, todo=todo)
 
 
@@ -107,7 +107,7 @@ def _check_headers(
     infos: Mapping[str, zipfile.ZipInfo],
     members: Mapping[str, Member],
 ) -> None:
-    """Compare every declared shape before anything of its size is allocated."""
+    """Check every declared shape before allocating memory for it."""
     sizes: dict[str, int] = {}
     for name, info in infos.items():
         where, member = f"{path}: {name}", members[name]
@@ -117,7 +117,7 @@ def _check_headers(
                     raise ValueError("another version than npy 1.0")  # others allow 4 GB headers
                 shape, _, dtype = npy.read_array_header_1_0(stream)
                 start = stream.tell()
-        except Exception as error:  # a hostile header can raise nearly anything
+        except Exception as error:  # a hostile header can raise nearly any exception
             raise wrong(where, "an npy array", f"{error}" or type(error).__name__) from error
         if dtype.kind not in _KINDS[member.kind]:
             raise wrong(where, _MEANINGS[member.kind], dtype.str)
@@ -138,7 +138,7 @@ def _array(
     try:
         with file.open(info) as stream:
             array = npy.read_array(stream, allow_pickle=False)
-            stream.read()  # to the end, where the checksum is compared
+            stream.read()  # to the end, where the checksum is verified
     except MemoryError:
         raise
     except Exception as error:  # see _check_headers

@@ -1,4 +1,4 @@
-"""What other methods are given to work with: tracked boxes and true cameras (E6)."""
+"""Inputs of baseline methods: tracked boxes and true cameras (E6)."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from worldpose.formats.archives import write_archive
 from worldpose.formats.files import whole_file
 
 Y_DOWN: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Takes world points into axes with y down, so that the ground lies as SLAHMR takes it to."""
+"""Rotation of world points to axes with y down, the ground orientation of SLAHMR."""
 
 
 def write_tracks(path: Path, boxes: NDArray[np.float64], ids: NDArray[np.int64]) -> None:
     """Write boxes as a MOTChallenge text, whole or not at all.
 
-    One line for each person and picture: picture from 1, id, left, top, width, height [px] and
-    confidence 1, then three times -1. As that format has it, (1, 1) is the top-left corner of the
-    top-left pixel.
+    One line for each person and image: image from 1, id, left, top, width, height [px] and
+    confidence 1, then three times -1. In that format, (1, 1) is the top-left corner of the top-left
+    pixel.
 
     Args:
         path: the file.
-        boxes: (frames, persons, 4) x0 y0 x1 y1 [px]; NaN where a person is not in the picture.
-        ids: (persons,), made to count from 1.
+        boxes: (frames, persons, 4) x0 y0 x1 y1 [px]; NaN if a person is not in the image.
+        ids: (persons,), renumbered from 1.
     """
     frames, people = np.nonzero(np.isfinite(boxes).all(-1))
     found = boxes[frames, people]
-    # (0, 0) is the middle of a pixel here, (1, 1) its upper left corner there.
+    # (0, 0) is the centre of a pixel here, (1, 1) its upper left corner there.
     corners = np.concatenate([found[:, :2] + 1.5, found[:, 2:] - found[:, :2]], axis=1)
     lines = [
         f"{frame + 1},{ids[person] + 1},{x:.2f},{y:.2f},{w:.2f},{h:.2f},1,-1,-1,-1"
@@ -46,8 +46,8 @@ def write_slahmr_cameras(path: Path, camera: Camera) -> None:
     """Write `cameras.npz` as SLAHMR reads it, for its variant with true cameras (E5).
 
     Members: `height`, `width`, `focal` [px], `intrins` (frames, 4) fx fy cx cy [px] and `w2c`
-    (frames, 4, 4), in world axes with y down: x as in the world, z along the world's y. The
-    method knows no distortion.
+    (frames, 4, 4), in world axes with y down: x as in the world, z along the world's y. The method
+    has no distortion model.
 
     Args:
         path: the file.
@@ -57,7 +57,7 @@ def write_slahmr_cameras(path: Path, camera: Camera) -> None:
         InputError: a frame has no camera.
 
     Note:
-        The layout is that which vye16/slahmr at commit 58518fe reads, slahmr/data/dataset.py
+        Layout as read by vye16/slahmr at commit 58518fe, slahmr/data/dataset.py
         (`load_cameras_npz`).
     """
     missing = np.flatnonzero(np.isnan(camera.numbers).any(-1))
@@ -86,6 +86,6 @@ def write_slahmr_cameras(path: Path, camera: Camera) -> None:
 
 
 def write_baseline_settings(path: Path, settings: BaselineSettings) -> None:
-    """Write the settings with which methods are run, as JSON."""
+    """Write the settings for running the methods, as JSON."""
     with whole_file(path) as draft:
         draft.write_text(settings.model_dump_json(indent=2) + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Cameras in the form of the WorldPose release: K, k, R, t over time."""
+"""Camera files of the WorldPose release: K, k, R, t over time."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ MEMBERS: Final = {
     "R": Member(("rows", 3, 3), "float"),
     "t": Member(("rows", 3), "float"),
 }
-"""Arrays of a camera file; one row for a camera that never moves, else one a frame."""
+"""Arrays of a camera file; one row for a static camera, else one per frame."""
 
 RELEASE_SIZE: Final = (1920, 1080)
-"""Picture of every released camera [px]; the files do not hold it."""
+"""Image size of every released camera [px]; the files do not contain it."""
 
 
 def write_static_camera(path: Path, calibration: CameraCalibration) -> None:
-    """Write a camera that never moves as npz with one row.
+    """Write a static camera as npz with one row.
 
     Members, float64: `K` (1, 3, 3) [px], `k` (1, 5) k1 k2 p1 p2 k3, `R` (1, 3, 3) and `t` (1, 3)
     [m] of x_cam = R x_world + t.
 
     Note:
-        X3: the names and shapes are those of the released files, which have one row a frame.
+        X3: the names and shapes are those of the released files, which have one row per frame.
     """
     (fx, fy), (cx, cy) = calibration.focal_px, calibration.principal_point_px
     arrays = {
@@ -46,11 +46,11 @@ def write_static_camera(path: Path, calibration: CameraCalibration) -> None:
 
 
 def write_moving_camera(path: Path, camera: Camera) -> None:
-    """Write a camera that moves as npz with one row a frame, in the same layout.
+    """Write a moving camera as npz with one row per frame, in the same layout.
 
     Args:
         path: the file.
-        camera: a batch (frames,); a frame with a NaN is one without a camera.
+        camera: a batch (frames,); NaN marks a frame without a camera.
     """
     intrinsics = np.zeros((len(camera.focal), 3, 3))
     intrinsics[:, (0, 1), (0, 1)] = camera.focal
@@ -64,17 +64,17 @@ def write_moving_camera(path: Path, camera: Camera) -> None:
 
 
 def read_camera(path: Path, image_size: tuple[int, int] = RELEASE_SIZE) -> Camera:
-    """The camera of a file: a single one where it has one row, else a batch (frames,).
+    """Read the camera of a file: a single one if it has one row, else a batch (frames,).
 
-    A row with a NaN is a frame without a camera.
+    NaN marks a frame without a camera.
 
     Args:
         path: the file.
         image_size: width and height [px].
 
     Raises:
-        InputError: naming file and place: absent, members missing or unknown, wrong shapes, no
-            rows, a K with skew or without focal length, an R that is no rotation.
+        InputError: names file and place: absent, members missing or unknown, wrong shapes, no rows,
+            a K with skew or without focal length, an R that is not a rotation.
     """
     arrays = read_archive(path, MEMBERS)
     k, rotation = arrays["K"], arrays["R"].copy()

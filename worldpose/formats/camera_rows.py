@@ -1,4 +1,4 @@
-"""Camera files of any origin as the plain arrays that they hold, right or wrong."""
+"""Raw arrays of camera files of any origin, without validation."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ MEMBERS: Final = {
     "t": Member(("poses", 3), "float"),
     "Rt": Member(("poses", 3, 4), "float", required=False),
 }
-"""Arrays of a camera file; the challenge gives R and t of the first frame only, and its 2025
+"""Arrays of a camera file; the challenge has R and t of the first frame only, and its 2025
 edition repeats them as Rt."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraRows:
-    """A camera as a file gives it: one row for a camera that never moves, else one a frame."""
+    """Raw arrays of a camera file: one row for a static camera, else one per frame."""
 
     intrinsics: NDArray[np.float64]
     """(rows, 3, 3), K [px]."""
     distortion: NDArray[np.float64]
     """(rows, 5) k1 k2 p1 p2 k3."""
     rotation: NDArray[np.float64]
-    """(rows, 3, 3), R in x_cam = R x_world + t; NaN where the file has none."""
+    """(rows, 3, 3), R in x_cam = R x_world + t; NaN if the file has none."""
     translation: NDArray[np.float64]
-    """(rows, 3) [m], t; NaN where the file has none."""
+    """(rows, 3) [m], t; NaN if the file has none."""
 
     def camera(self) -> Camera:
-        """Return the camera (rows,), with pictures as wide as their middle says."""
+        """Return the camera (rows,), with the image size derived from the principal point."""
         middle = self.intrinsics[:, :2, 2]
         usual = np.where(np.all(np.isfinite(middle), axis=-1)[:, None], middle, 0.5)
         return Camera(
@@ -49,17 +49,17 @@ class CameraRows:
         )
 
     def lens(self) -> Camera:
-        """Return the camera (rows,) at the origin, also where its pose is not known."""
+        """Return the camera (rows,) at the origin, for any pose."""
         count = len(self.intrinsics)
         still = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
         return CameraRows(self.intrinsics, self.distortion, *still).camera()
 
 
 def read_camera_rows(path: Path) -> CameraRows:
-    """The rows of a camera file, unjudged; `read_camera` refuses what is no camera.
+    """Read the rows of a camera file without validation; `read_camera` refuses invalid cameras.
 
     Raises:
-        InputError: naming file and member: absent, members missing or unknown, wrong shapes.
+        InputError: names file and member: absent, members missing or unknown, wrong shapes.
     """
     arrays = read_archive(path, MEMBERS)
     count, poses = len(arrays["K"]), len(arrays["R"])

@@ -1,4 +1,4 @@
-"""Fitted bodies as the FIFA skeletal tracking challenge has players: boxes and skeletons."""
+"""Files of the FIFA skeletal tracking challenge: boxes and skeletons of fitted bodies."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from worldpose.formats.files import whole_file
 Floats = NDArray[np.float64]
 
 _FRAMES: Final = 8
-"""Frames whose surfaces are held at a time; 33 MB for 25 people."""
+"""Frames whose surfaces are in memory at a time; 33 MB for 25 people."""
 
 
 @dataclass(frozen=True, eq=False)
 class ChallengeClip:
-    """Players of one clip in the moving camera's picture, as the challenge gives them."""
+    """Players of one clip in the moving camera's image, in the challenge's format."""
 
     boxes: Floats
     """(frames, persons, 4) x0, y0, x1, y1 [px]; NaN when absent."""
@@ -41,27 +41,27 @@ class ChallengeClip:
 
 @dataclass(frozen=True, eq=False)
 class ChallengeTruth:
-    """A clip of the challenge, and what its participants are to find."""
+    """A clip of the challenge, and its ground truth."""
 
     clip: ChallengeClip
     persons: NDArray[np.int64]
-    """(persons,) places in the poses that it was made from: those ever in the picture."""
+    """(persons,) indices into the poses that it was made from: people visible in any frame."""
     submission: Floats
-    """(persons, frames, 15, 3) [m], world; NaN where there is no body."""
+    """(persons, frames, 15, 3) [m], world; NaN if there is no body."""
 
 
 def challenge_truth(model: BodyModel, poses: BodyParameters, camera: Camera) -> ChallengeTruth:
-    """Return what the moving camera shows of fitted bodies.
+    """Return boxes and skeletons of fitted bodies in the moving camera's image.
 
-    A box holds the part of a body that is in the picture; whoever is out of the picture has
-    neither box nor skeleton in that frame. Skeletons are BODY25 and go on beyond the picture's
-    edges. `skel_3d` is what a single-view estimator would give at best: the skeleton turned into
-    the camera's axes, with the mid-hip as origin.
+    A box contains the part of a body inside the image; a person outside the image has neither box
+    nor skeleton in that frame. Skeletons are BODY25 and extend beyond the image border. `skel_3d`
+    is the ideal result of a single-view estimator: the skeleton in the camera's axes, with the
+    mid-hip as origin.
 
     Args:
-        model: the body that the parameters belong to.
+        model: body model of the parameters.
         poses: (persons, frames).
-        camera: (frames,); a frame with a NaN is one without a camera.
+        camera: (frames,); NaN marks a frame without a camera.
     """
     persons, frames = poses.batch_shape
     points = fold_keypoints(model, BODY25)
@@ -87,13 +87,13 @@ def challenge_truth(model: BodyModel, poses: BodyParameters, camera: Camera) -> 
 
 
 def _project(camera: Camera, points: Floats) -> Floats:
-    """Pixels (frames, persons, n, 2) of points (frames, persons, n, 3)."""
+    """Project points (frames, persons, n, 3) to pixels (frames, persons, n, 2)."""
     frames, persons, count = points.shape[:3]
     return camera.project(points.reshape(frames, -1, 3)).reshape(frames, persons, count, 2)
 
 
 def _boxes(camera: Camera, surface: Floats) -> Floats:
-    """Boxes (frames, persons, 4) of points (frames, persons, n, 3), cut at the picture's edges."""
+    """Return boxes (frames, persons, 4) of points (frames, persons, n, 3), clipped to the image."""
     pixels = _project(camera, surface)
     edge = camera.image_size[:, None, None] - 0.5
     missing = np.isnan(pixels).any(-1, keepdims=True)
@@ -150,7 +150,7 @@ def write_challenge_camera(path: Path, camera: Camera, edition: Edition) -> None
 def write_challenge(
     folder: Path, clips: Mapping[str, ChallengeClip], edition: Edition
 ) -> list[Path]:
-    """Write boxes and skeletons of clips; returns the files."""
+    """Write boxes and skeletons of clips; return the files."""
     written = []
     for kind in KINDS:
         arrays = {clip: getattr(data, kind).astype(np.float64) for clip, data in clips.items()}
@@ -176,20 +176,20 @@ def write_submission(path: Path, joints: Mapping[str, Floats]) -> None:
 
 
 def write_pitch_points(path: Path, points: Floats) -> None:
-    """Write points (n, 3) [m, world] along the markings, one a line."""
+    """Write points (n, 3) [m, world] along the markings, one per line."""
     with whole_file(path) as draft:
         np.savetxt(draft, points, fmt="%.4f")
 
 
 def read_challenge(folder: Path, only: str | None = None) -> dict[str, ChallengeClip]:
-    """The clips of a challenge folder of either edition, by name.
+    """Read the clips of a challenge folder of either edition, by name.
 
     Args:
         folder: the folder.
-        only: the clip that is wanted, if it is there; None = all. No other comes into memory.
+        only: the requested clip, if it is there; None = all. No other is loaded.
 
     Raises:
-        InputError: naming file and place: absent, wrong types or shapes, kinds that disagree.
+        InputError: names file and place: absent, wrong types or shapes, kinds that disagree.
     """
     kinds: dict[str, dict[str, Floats]] = {}
     for kind in KINDS:
@@ -223,24 +223,24 @@ def read_challenge(folder: Path, only: str | None = None) -> dict[str, Challenge
 
 
 def submission_clips(path: Path) -> tuple[str, ...]:
-    """Names of the clips of a submission, zipped or bare; none of them comes into memory.
+    """Return the names of the clips of a submission, zipped or bare, without loading them.
 
     Raises:
-        InputError: no such file, or no submission in it.
+        InputError: there is no such file, or no submission in it.
     """
     with _npz_of(path) as file:
         return _clips_of(file)
 
 
 def read_submission(path: Path, only: Collection[str] | None = None) -> dict[str, Floats]:
-    """The joints (persons, frames, 15, 3) [m, world] of a submission by clip, zipped or bare.
+    """Read the joints (persons, frames, 15, 3) [m, world] of a submission by clip, zipped or bare.
 
     Args:
         path: the file.
-        only: clips that are wanted; None = all. The others do not come into memory.
+        only: requested clips; None = all. The others are not loaded.
 
     Raises:
-        InputError: no such file, no submission in it, or arrays of another type or shape.
+        InputError: there is no such file, no submission in it, or arrays of another type or shape.
     """
     with _npz_of(path) as file:
         return _by_clip(file, ("persons", "frames", 15, 3), only)
@@ -248,7 +248,7 @@ def read_submission(path: Path, only: Collection[str] | None = None) -> dict[str
 
 @contextmanager
 def _npz_of(path: Path) -> Iterator[Path]:
-    """The npz file of a submission; that of a zipped one lies on the disk meanwhile."""
+    """Yield the npz file of a submission, unzipped to a temporary file if necessary."""
     if not path.is_file():
         raise wrong(str(path), "a submission", "nothing", "Check the path.")
     try:
@@ -273,7 +273,7 @@ def _clips_of(path: Path) -> tuple[str, ...]:
 def _by_clip(
     path: Path, dims: tuple[str | int, ...], only: Collection[str] | None = None
 ) -> dict[str, Floats]:
-    """Arrays of an npz file by clip; lengths that are named may differ between clips."""
+    """Read arrays of an npz file by clip; named lengths can differ between clips."""
     members = {
         name: Member(tuple(f"{d} of {name}" if isinstance(d, str) else d for d in dims), "float")
         for name in _clips_of(path)
@@ -283,7 +283,7 @@ def _by_clip(
 
 
 def _read_npy(path: Path, kind: str) -> Floats:
-    """A clip's array of one kind, checked."""
+    """Read and validate a clip's array of one kind."""
     try:
         array = npy.read_array(io.BytesIO(path.read_bytes()), allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:

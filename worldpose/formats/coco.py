@@ -1,4 +1,4 @@
-"""3D joints seen through a static camera, as a COCO keypoints data set."""
+"""COCO keypoints data set from 3D joints projected into a static camera."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def coco_dataset(
 ) -> dict[str, Any]:
     """Return the people of one static camera as a COCO keypoints data set.
 
-    One image a frame: `id` is the camera's own frame number, `file_name` is <camera>/<frame with
-    six digits>. One annotation a person with at least one joint in the picture: `keypoints` are
-    the reprojected 3D joints with v = 2 where this camera's own observation agrees with the joint,
-    v = 1 where the joint comes from other cameras only, and 0, 0, 0 where there is no joint or it
-    is outside the picture. `bbox` and `area` are those of the keypoints; `track_id` is the person.
+    One image per frame: `id` is the camera's own frame number, `file_name` is <camera>/<frame with
+    six digits>. One annotation per person with at least one joint in the image: `keypoints` are the
+    reprojected 3D joints with v = 2 if this camera's own observation is an inlier of the joint, v =
+    1 if the joint comes from other cameras only, and 0, 0, 0 if there is no joint or it is outside
+    the image. `bbox` and `area` are those of the keypoints; `track_id` is the person.
 
     Args:
-        camera_id: names the pictures.
+        camera_id: prefix of the image names.
         camera: a single camera.
         tracks: frames are match frames.
         observed: (frames, persons, 17), the camera's observation of the joint was an inlier.
@@ -97,7 +97,7 @@ def write_coco(path: Path, dataset: Mapping[str, Any]) -> None:
 
 
 def _labels(pixels: NDArray[np.float64], visible: NDArray[np.int64]) -> dict[str, Any]:
-    """Keypoints and box of one person: (17, 2) [px] and v (17,) of which one is above 0."""
+    """Return keypoints and box of one person: (17, 2) [px] and v (17,), at least one above 0."""
     seen = visible > 0
     low, high = pixels[seen].min(axis=0), pixels[seen].max(axis=0)
     width, height = np.round(high - low, DECIMALS).tolist()

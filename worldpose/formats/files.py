@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Atomic writing of files."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from pathlib import Path
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Give a draft's path that becomes `path` in one step when the block ends well.
+    """Yield a draft's path that becomes `path` in one step when the block succeeds.
 
-    The draft lies beside its place and is synced to disk; a block that raises, or a killed
-    process, leaves what was at `path` before.
+    The draft is in the same folder and is synced to disk; a block that raises, or a killed process,
+    leaves the previous content of `path`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as workshop:
-        # One level down: a temporary folder is private, the file has the usual rights.
+        # In a subfolder: a temporary folder is private, but the file gets the usual permissions.
         draft = Path(workshop) / path.name
         yield draft
         _sync(draft)

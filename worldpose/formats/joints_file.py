@@ -1,4 +1,4 @@
-"""3D joints of people over time, and the npz file that carries them between tools."""
+"""3D joints of people over time, and their npz file format."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MEMBERS: Final = {
     "covariance": Member(("frames", "persons", JOINTS, 3, 3), "float", required=False),
     "views": Member(("frames", "persons", JOINTS), "int", required=False),
 }
-"""Arrays of a joints file; `covariance` and `views` may be absent."""
+"""Arrays of a joints file; `covariance` and `views` are optional."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,20 +30,21 @@ class JointTracks:
     """3D joints of several people over time, estimated or true.
 
     Raises:
-        InputError: shapes disagree, frames do not rise, an id comes twice, a value is infinite, or
-            a joint has some but not all of its coordinates.
+        InputError: shapes disagree, frames do not ascend, a duplicate id, a value is infinite, or a
+            joint has some but not all of its coordinates.
     """
 
     frames: NDArray[np.int64]
-    """(frames,) match frames, rising."""
+    """(frames,) match frames, ascending."""
     person_ids: NDArray[np.int64]
-    """(persons,), each once."""
+    """(persons,), unique."""
     joints: NDArray[np.float64]
     """(frames, persons, 17, 3) [m], world, COCO-17 order; NaN where missing."""
     covariance: NDArray[np.float64] | None = None
-    """(frames, persons, 17, 3, 3) [m^2]; None where unknown."""
+    """(frames, persons, 17, 3, 3) [m^2]; None if unknown."""
     views: NDArray[np.int64] | None = None
-    """(frames, persons, 17) cameras that carry the joint, or that saw it where this is truth."""
+    """(frames, persons, 17) number of cameras used for the joint, or that saw it for ground
+    truth."""
 
     def __post_init__(self) -> None:
         shape = (*self.frames.shape, *self.person_ids.shape, JOINTS)
@@ -89,7 +90,7 @@ class JointTracks:
 
 
 def write_joints(path: Path, tracks: JointTracks) -> None:
-    """Write a joints file, whole or not at all; the same tracks give the same bytes.
+    """Write a joints file, whole or not at all; equal tracks give equal bytes.
 
     Members: `frames` (frames,) int64, `person_ids` (persons,) int64, `joints` (frames, persons,
     17, 3) float64 [m, world], and where known `covariance` (frames, persons, 17, 3, 3) float64
@@ -108,10 +109,10 @@ def write_joints(path: Path, tracks: JointTracks) -> None:
 
 
 def read_joints(path: Path) -> JointTracks:
-    """The tracks of a joints file.
+    """Read the tracks of a joints file.
 
     Raises:
-        InputError: naming file and place: absent, truncated, members missing or unknown, wrong
+        InputError: names file and place: absent, truncated, members missing or unknown, wrong
             shapes, infinite values.
     """
     arrays = read_archive(path, MEMBERS)

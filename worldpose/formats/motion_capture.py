@@ -1,4 +1,4 @@
-"""A person's joints as markers in a TRC file, which OpenSim and motion capture tools read."""
+"""Motion capture files: a person's joints as TRC markers for OpenSim, and BVH motion."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
 
 Y_UP: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""Takes world points into the axes of OpenSim and of animation tools: x stays, y is up."""
+"""Rotation of world points to the axes of OpenSim and of animation tools: x stays, y is up."""
 MILLIMETRES: Final = 1000.0
-"""In a metre: TRC files are in millimetres, and say so."""
+"""In a metre: TRC files are in millimetres, and state it."""
 TRC_DECIMALS: Final = 3
 """Of all coordinates: a micrometre."""
 
@@ -27,15 +27,15 @@ TRC_DECIMALS: Final = 3
 def write_markers(path: Path, tracks: JointTracks, person: int, fps: float) -> None:
     """Write the joints of one person as a TRC file, whole or not at all.
 
-    Rows go from the first to the last frame in which the person has a joint, none left out; a
-    missing joint has empty cells. `Frame#` is the match frame plus one, as such files count from
-    one, and `Time` is that of the match frame [s]. Coordinates are y up, in millimetres.
+    Rows cover every frame from the person's first to last joint; a missing joint has empty cells.
+    `Frame#` is the match frame plus one, as such files count from one, and `Time` is that of the
+    match frame [s]. Coordinates are y up, in millimetres.
 
     Args:
         path: the file.
         tracks: joints of several people.
-        person: place of the person in `tracks`.
-        fps: frames in a second.
+        person: index of the person in `tracks`.
+        fps: frames per second.
     """
     first, markers = _rows(tracks, person)
     count = len(COCO17)
@@ -58,7 +58,7 @@ def write_markers(path: Path, tracks: JointTracks, person: int, fps: float) -> N
 
 
 def _rows(tracks: JointTracks, person: int) -> tuple[int, NDArray[np.float64]]:
-    """The first match frame, and markers (frames, 17, 3) [mm, y up] of every frame from there."""
+    """Return the first match frame, and markers (frames, 17, 3) [mm, y up] from there."""
     seen = np.flatnonzero(np.isfinite(tracks.joints[:, person]).any((-1, -2)))
     if not len(seen):
         return 0, np.empty((0, len(COCO17), 3))
@@ -72,26 +72,26 @@ def _rows(tracks: JointTracks, person: int) -> tuple[int, NDArray[np.float64]]:
 Floats = NDArray[np.float64]
 
 CENTIMETRES: Final = 100.0
-"""In a metre: animation tools take the numbers of a BVH file for centimetres."""
+"""In a metre: animation tools interpret the numbers of a BVH file as centimetres."""
 BVH_DECIMALS: Final = 6
-"""Of all numbers: a hundredth of a micrometre, and as many degrees as move a hand by that."""
+"""Of all numbers: a hundredth of a micrometre, and angles that move a hand by as much."""
 _LOCKED: Final = 1e-7
-"""Cosine of the middle angle below which the outer two turn about one axis [1]."""
+"""Cosine of the middle angle below which the outer two have the same axis (gimbal lock) [1]."""
 
 
 def write_motion(path: Path, model: BodyModel, poses: BodyParameters, fps: float) -> None:
     """Write one person's motion as a BVH file, whole or not at all.
 
-    The skeleton is that of the model's 24 joints in T-pose, with the bone lengths of the person's
-    betas; the last joints end in half of their bone, which only shows. The root has its place
-    and rotation, every other joint its rotation relative to its parent; angles are in degrees and
-    apply in the order z, x, y of the file's axes. Lengths are centimetres and y is up.
+    The skeleton has the model's 24 joints in T-pose, with the bone lengths of the person's betas;
+    leaf joints end in half of their bone, only for display. The root has position and rotation,
+    every other joint its rotation relative to its parent; angles are in degrees and apply in the
+    order z, x, y of the file's axes. Lengths are centimetres and y is up.
 
     Args:
         path: the file.
-        model: the body that the parameters belong to.
-        poses: (frames,) of one person, nothing missing; the betas are those of the first frame.
-        fps: frames in a second.
+        model: body model of the parameters.
+        poses: (frames,) of one person, complete; the betas are those of the first frame.
+        fps: frames per second.
 
     Raises:
         InputError: there are no frames, or a parameter is missing.
@@ -110,7 +110,7 @@ def write_motion(path: Path, model: BodyModel, poses: BodyParameters, fps: float
     turns[:, 0] = Y_UP @ turns[:, 0]
     roots = (rest[0] + poses.transl) @ Y_UP.T * CENTIMETRES
     channels = np.unwrap(np.degrees(_zxy(turns)), axis=0, period=360.0)
-    # Depth first, as the file names its joints.
+    # Depth first, the joint order of the file.
     order = list(_depth_first(model.parents, 0))
     rows = np.concatenate([roots, channels[:, order].reshape(len(roots), -1)], axis=1)
     lines = ["HIERARCHY", *_joint(rest * CENTIMETRES, model.parents, 0, "")]
@@ -121,7 +121,7 @@ def write_motion(path: Path, model: BodyModel, poses: BodyParameters, fps: float
 
 
 def stretches(poses: BodyParameters) -> list[slice]:
-    """Return the uninterrupted runs of frames in which a person (frames,) has a body."""
+    """Return the uninterrupted intervals of frames in which a person (frames,) has a body."""
     parts = (poses.betas, poses.global_orient, poses.body_pose, poses.transl)
     there = np.all([np.isfinite(part).all(-1) for part in parts], axis=0)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]])))
@@ -135,7 +135,7 @@ def _depth_first(parents: NDArray[np.int64], joint: int) -> Iterator[int]:
 
 
 def _joint(rest: Floats, parents: NDArray[np.int64], joint: int, indent: str) -> list[str]:
-    """The lines of a joint and all below it; `rest` (24, 3) is in the file's unit."""
+    """Return the lines of a joint and its descendants; `rest` (24, 3) is in the file's unit."""
     parent, children = int(parents[joint]), np.flatnonzero(parents == joint)
     offset = rest[joint] - rest[parent] if parent >= 0 else np.zeros(3)
     places = "" if parent >= 0 else "Xposition Yposition Zposition "
@@ -159,7 +159,7 @@ def _numbers(vector: Floats) -> str:
 
 
 def _zxy(rotation: Floats) -> Floats:
-    """Angles (..., 3) [rad] with rotation = Rz(first) Rx(second) Ry(third)."""
+    """Return angles (..., 3) [rad] with rotation = Rz(first) Rx(second) Ry(third)."""
     cosine = np.hypot(rotation[..., 2, 0], rotation[..., 2, 2])
     locked = cosine < _LOCKED
     about_z = np.where(

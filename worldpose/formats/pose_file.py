@@ -1,4 +1,4 @@
-"""Body poses of a clip as the WorldPose release has them (X3), and the npz file that holds them."""
+"""npz file format of body poses of a clip, as in the WorldPose release (X3)."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ MEMBERS: Final = {
 }
 """Arrays of a pose file; persons first, unlike everywhere else here."""
 PLURALS: Final = {"global_orients": "global_orient", "body_poses": "body_pose"}
-"""Names in the release's own note, which are read as well."""
+"""Names in the release's own note, which are also accepted."""
 
 
 def write_poses(path: Path, poses: BodyParameters, body_model: str) -> None:
-    """Write `poses/<clip>.npz`, whole or not at all; the same poses give the same bytes.
+    """Write `poses/<clip>.npz`, whole or not at all; equal poses give equal bytes.
 
-    Members in single precision, 4 um at most beside the poses on a pitch of 105 m: `betas`
+    Members in single precision, with an error of at most 4 um on a pitch of 105 m: `betas`
     (persons, shapes), `global_orient` (persons, frames, 3) [rad], `body_pose` (persons, frames, 69)
-    [rad], `transl` (persons, frames, 3) [m, world]. NaN where a person is missing. The release
-    knows one body model; here `body_model` (1,) names it, since betas of another mean nothing.
+    [rad], `transl` (persons, frames, 3) [m, world]. NaN where a person is missing. The release has
+    one body model; here `body_model` (1,) names it, since betas of another are meaningless.
 
     Args:
         path: the file.
@@ -49,13 +49,13 @@ def write_poses(path: Path, poses: BodyParameters, body_model: str) -> None:
 
 
 def read_poses(path: Path) -> tuple[BodyParameters, str | None]:
-    """The poses (persons, frames) of a pose file, with singular or plural names.
+    """Read the poses (persons, frames) of a pose file, with singular or plural names.
 
     Returns:
-        The poses, and the name of their body model where the file tells it.
+        The poses, and the name of their body model if the file has it.
 
     Raises:
-        InputError: naming file and member: absent, truncated, members missing or unknown, wrong
+        InputError: names file and member: absent, truncated, members missing or unknown, wrong
             shapes.
     """
     errors: list[InputError] = []

@@ -1,7 +1,7 @@
-"""Ingest: a match folder on disk becomes checked records and dense arrays.
+"""Ingest: validated records and dense arrays from a match folder.
 
-Inputs: match.yaml, calibration.toml, clicked markings, detections/, pitch.json, videos; or other
-tools' files.
+Inputs: match.yaml, calibration.toml, clicked markings, detections/, pitch.json, videos; or files of
+other tools.
 Outputs: `MatchFolder`, `Registration`, `Observations` on match frames.
 """
 

@@ -1,4 +1,4 @@
-"""Clicked markings, of static cameras and of key frames, checked against the match's pitch."""
+"""Readers and writers of clicked markings, validated against the match's pitch."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ from worldpose.ingest.validation import validate_record
 from worldpose.pitch import PitchTemplate
 
 CLICKED_FOLDER: Final = "annotations/static_calibration"
-"""Where a match folder keeps `<camera>.json`, relative to it."""
+"""Folder of `<camera>.json`, relative to the match folder."""
 
 KEY_FRAMES_FOLDER: Final = "annotations/broadcast_calibration"
-"""Where a match folder keeps `<clip>.json`, relative to it."""
+"""Folder of `<clip>.json`, relative to the match folder."""
 
 
 def clicked_file(camera_id: str) -> str:
-    """Path of a camera's clicked markings, relative to the match folder."""
+    """Return the path of a camera's clicked markings, relative to the match folder."""
     return f"{CLICKED_FOLDER}/{camera_id}.json"
 
 
 def key_frames_file(clip_id: str) -> str:
-    """Path of a clip's clicked key frames, relative to the match folder."""
+    """Return the path of a clip's clicked key frames, relative to the match folder."""
     return f"{KEY_FRAMES_FOLDER}/{clip_id}.json"
 
 
 def read_clicked(
     folder: Path, spec: MatchSpec, pitch: PitchSpec | None
 ) -> dict[str, ClickedMarkings]:
-    """What was clicked in the static cameras of a match folder, in their order.
+    """Return the clicks of the static cameras of a match folder, in their order.
 
     Args:
         folder: the match folder.
         spec: its match.yaml.
-        pitch: its pitch; None where it has none.
+        pitch: its pitch; None without a pitch.
 
     Raises:
-        InputError: a file of no static camera, or one that is not as it must be.
+        InputError: a file belongs to no static camera, or is invalid.
     """
     static = {camera.id: camera for camera in spec.static_cameras}
     clicked = {}
@@ -57,16 +57,16 @@ def read_clicked(
 def read_clicked_markings(
     file: Path, camera: CameraSpec, pitch: PitchSpec | None
 ) -> ClickedMarkings:
-    """What a person clicked in one camera's picture.
+    """Return the clicks in one camera's image.
 
     Args:
         file: JSON, a `ClickedMarkings`.
-        camera: the camera; everything clicked lies in its picture.
-        pitch: the match's; the names are those of its template.
+        camera: the camera; all clicks must be inside its image.
+        pitch: the match's pitch; its template defines the names.
 
     Raises:
-        InputError: naming file and entry: not JSON, an unknown key or name, no number, a name given
-            twice, a place outside the picture, nothing clicked, or a match without a pitch.
+        InputError: with file and entry: not JSON, an unknown key or name, no number, a repeated
+            name, a pixel outside the image, no clicks, or a match without a pitch.
     """
     template = _template(file, pitch)
     clicked = validate_record(ClickedMarkings, read_json(file), str(file))
@@ -75,15 +75,15 @@ def read_clicked_markings(
 
 
 def read_key_frames(folder: Path, spec: MatchSpec, pitch: PitchSpec | None) -> dict[str, KeyFrames]:
-    """What was clicked in key frames of the broadcast camera, by clip, in the order of the clips.
+    """Return the clicked key frames of the broadcast camera, by clip, in the order of the clips.
 
     Args:
         folder: the match folder.
         spec: its match.yaml.
-        pitch: its pitch; None where it has none.
+        pitch: its pitch; None without a pitch.
 
     Raises:
-        InputError: a file of no clip with a broadcast camera, or one that is not as it must be.
+        InputError: a file belongs to no clip with a broadcast camera, or is invalid.
     """
     clips = {clip.id: clip for clip in spec.clips if clip.broadcast is not None}
     picked = {}
@@ -116,7 +116,7 @@ def write_key_frames(folder: Path, key_frames: Mapping[str, KeyFrames]) -> None:
 
 
 def _files(folder: Path, place: str, expected: str, known: Collection[str]) -> Iterator[Path]:
-    """The files of a folder of the match, sorted; each must be named after something known."""
+    """Yield the files of a folder of the match, sorted; raise InputError for an unknown name."""
     for name in sorted(path.name for path in (folder / place).glob("[!.]*")):
         file = existing_file(folder, f"{place}/{name}", str(folder))
         if file.suffix != ".json" or file.stem not in known:
@@ -143,7 +143,7 @@ def _template(file: Path, pitch: PitchSpec | None) -> PitchTemplate:
 def _require_markings(
     file: str, within: str, clicked: ClickedMarkings, camera: CameraSpec, template: PitchTemplate
 ) -> None:
-    """Refuse markings that the pitch does not have, or that lie outside of the picture."""
+    """Raise InputError for unknown markings, and for pixels outside the image."""
     if not (clicked.points or clicked.drawn):
         raise InputError(
             f"{file}: {within}" if within else file,
@@ -181,7 +181,7 @@ def _require_known(
     kind: str,
     known: Collection[str],
 ) -> None:
-    """Refuse names that the pitch does not have, and names that come twice."""
+    """Raise InputError for unknown and for repeated names."""
     places: dict[str, str] = {}
     for place, name, _ in entries:
         if name not in known:
@@ -203,7 +203,7 @@ def _require_known(
 
 
 def _require_inside(where: str, pixel: Pixel, camera: CameraSpec) -> None:
-    # A pixel more than the picture: tools that count from 1, and clicks on its very border.
+    # One pixel more than the image: for tools that count from 1, and clicks on its border.
     inside = all(
         -1.0 <= value <= size
         for value, size in zip(pixel, (camera.width, camera.height), strict=True)

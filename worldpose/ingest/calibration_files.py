@@ -1,4 +1,4 @@
-"""Calibrated cameras in other tools' files."""
+"""Readers of calibrated cameras from files of other tools."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ __all__ = ["read_calibration", "write_calibration_toml"]
 
 
 def read_calibration(path: Path) -> dict[str, CameraCalibration]:
-    """The cameras of a calibration file by name, in file order.
+    """Return the cameras of a calibration file by name, in file order.
 
     Args:
         path: `.toml` of Anipose, Pose2Sim or caliscope (see `calibration_toml`); `.txt` or `.xml`
             of Qualisys (see `calibration_qualisys`).
 
     Raises:
-        InputError: another kind of file, or naming file and key what is wrong in it.
+        InputError: an unknown file type, or an invalid entry, with file and key.
     """
     if path.suffix.lower() == ".toml":
         return read_calibration_toml(path)

@@ -1,4 +1,4 @@
-"""Calibrated cameras as Qualisys XML (`.qca.txt`)."""
+"""Reader of calibrated cameras from Qualisys XML (`.qca.txt`)."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from worldpose.ingest.text_files import SETTINGS_BYTES, require_file
 
 
 def read_calibration_qualisys(path: Path) -> dict[str, CameraCalibration]:
-    """The active cameras of a Qualisys calibration by serial, in file order.
+    """Return the active cameras of a Qualisys calibration by serial, in file order.
 
     Raises:
-        InputError: naming file, camera and attribute: unreadable, missing, no finite number, not a
-            rotation, no camera, or two of one serial.
+        InputError: with file, camera and attribute: unreadable, missing, no finite number, no
+            rotation, no camera, or two cameras of one serial.
     """
     size = require_file(path)
     if size > SETTINGS_BYTES:
@@ -41,24 +41,24 @@ def read_calibration_qualisys(path: Path) -> dict[str, CameraCalibration]:
 
 
 class _PlainTree(ET.TreeBuilder):
-    """Builds a tree without entities, which could make a small file grow without end."""
+    """A tree builder that rejects entities, which could expand a small file without limit."""
 
     def doctype(self, name: str, pubid: str, system: str) -> None:
         raise ValueError(f"a DOCTYPE ({name}), which no calibration has")
 
 
 def _qualisys_camera(where: str, element: ET.Element) -> CameraCalibration:
-    """One `<camera>` of a Qualisys calibration, called by its `serial`.
+    """Return one `<camera>` of a Qualisys calibration, with its `serial` as name.
 
     `<transform>`: x y z is the camera centre C [mm]; r11..r33 is A, row by row, whose rows are the
     camera's axes in the world: x right, y up, z backward. So R = diag(1, -1, -1) A, t = -R C.
 
-    `<intrinsic>`: focal length and centre point count in 1/64 px of the sensor; `<fov_video>` (px,
-    both ends included) is the part of it that the video shows. The radial and tangential (in the
-    file: tangental) coefficients act on the normalised image plane and have no unit, so they are
-    taken as they stand: only lengths on the sensor count in 1/64 px. (Pose2Sim's reader divides
-    them by 64 as well, which all but removes the distortion.) `viewrotation` turns only the view
-    in QTM, and is ignored.
+    `<intrinsic>`: focal length and centre point are in 1/64 px of the sensor; `<fov_video>` (px,
+    both ends included) is the part of the sensor in the video. The radial and tangential (in the
+    file: tangental) coefficients act on the normalised image plane and have no unit, so that they
+    need no conversion: only lengths on the sensor are in 1/64 px. (Pose2Sim's reader divides them
+    by 64 as well, which nearly removes the distortion.) `viewrotation` rotates only the view in
+    QTM; the function ignores it.
     """
     parts = {}
     for tag in ("transform", "intrinsic", "fov_video"):

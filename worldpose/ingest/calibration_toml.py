@@ -1,9 +1,9 @@
-"""Calibrated cameras as TOML: what Anipose, Pose2Sim and caliscope write.
+"""Reader and writer of calibrated cameras as TOML of Anipose, Pose2Sim and caliscope.
 
 One table per camera with `size`, `matrix`, `distortions` (k1 k2 p1 p2 k3, as OpenCV), `rotation`
-(Rodrigues vector [rad], or 3x3) and `translation` [m] of x_cam = R x_world + t. A camera is called
-by its `name`, else by its table. caliscope's own file keeps the tables under `cameras`, by number:
-camera 3 is `cam_3`, as in its Anipose export. `metadata` and further keys are ignored.
+(Rodrigues vector [rad], or 3x3) and `translation` [m] of x_cam = R x_world + t. A camera's id is
+its `name`, else its table. caliscope's own file has the tables under `cameras`, by number: camera 3
+is `cam_3`, as in its Anipose export. The reader ignores `metadata` and further keys.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from worldpose.ingest.text_files import read_toml
 
 
 def read_calibration_toml(path: Path) -> dict[str, CameraCalibration]:
-    """The cameras of a TOML file by name, in file order.
+    """Return the cameras of a TOML file by name, in file order.
 
     Raises:
-        InputError: naming file and key: unreadable, a missing or misshapen entry, not finite, not a
-            rotation, a fisheye camera, no camera, or two of one name.
+        InputError: with file and key: unreadable, a missing or misshapen entry, not finite, no
+            rotation, a fisheye camera, no camera, or two cameras of one name.
     """
     content = read_toml(path)
     nested = content.get("cameras")
@@ -112,7 +112,7 @@ def _rotation(table: Mapping[str, Any], where: str) -> NDArray[np.float64]:
 def _numbers(
     table: Mapping[str, Any], where: str, key: str, shape: tuple[int, ...] | None
 ) -> NDArray[np.float64]:
-    """Entry `key` as float64; a column or row vector is as good as a flat one."""
+    """Return entry `key` as float64; column and row vectors become flat."""
     if key not in table:
         raise InputError(
             f"{where}.{key}",
@@ -137,7 +137,7 @@ def _numbers(
 
 
 def _plain_numbers(value: object) -> NDArray[np.float64] | None:
-    """A list, or list of lists, of numbers as an array; None for anything else."""
+    """Return a list, or list of lists, of numbers as an array; None for anything else."""
     rows = value if isinstance(value, list) else [value]
     flat = [x for row in rows for x in (row if isinstance(row, list) else [row])]
     # bool is an int to Python, and numpy would read text as a number.
@@ -152,8 +152,8 @@ def _plain_numbers(value: object) -> NDArray[np.float64] | None:
 def write_calibration_toml(path: Path, calibrations: Mapping[str, CameraCalibration]) -> None:
     """Write cameras in the form that Anipose, Pose2Sim and `read_calibration` read.
 
-    Every number keeps all its digits. A rotation becomes a Rodrigues vector, the one form that all
-    of them read, and comes back to within rounding (1e-15).
+    Numbers keep all digits. A rotation becomes a Rodrigues vector, the only form that all of them
+    read, with rounding errors of 1e-15 on reading.
     """
     lines = []
     for index, (name, camera) in enumerate(calibrations.items()):

@@ -1,9 +1,9 @@
-"""COCO keypoint results: a JSON list of people, or a COCO data set with `annotations`.
+"""Reader of COCO keypoint results: a JSON list of people, or a data set with `annotations`.
 
 Per person: `image_id`, the frame index; `keypoints`, x y c of the 17 COCO joints, where c is the
 confidence in 0..1 (in a data set it may be COCO's visibility 0, 1, 2) and 0 means missing; `bbox`
-(x y width height) and `score` may be absent: the box of the found joints and their mean confidence
-stand in. People keep the order of the file within a frame.
+(x y width height) and `score` are optional: the defaults are the box of the found joints and their
+mean confidence. People keep the order of the file within a frame.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from worldpose.ingest.npz_files import PACKED_BYTES, PACKED_RATIO
 from worldpose.ingest.observations import Observations
 
 JSON_BYTES: Final = 1 << 30
-"""Largest JSON file that is read [byte], about two million people; npz takes more in less time."""
+"""Maximum size of a JSON file [byte], about two million people; npz holds more and is faster."""
 
 OVERSHOOT: Final = 1.1
-"""Largest confidence that is taken for 1: an interpolated heat map's peak rises a little above."""
+"""Maximum confidence that counts as 1: the peak of an interpolated heat map slightly exceeds 1."""
 
 BATCH: Final = 4096
-"""Results that are held as Python's objects at a time."""
+"""Results per batch of Python objects."""
 
 _JOINTS: Final = len(COCO17)
 _COUNT_TODO: Final = "Export all 17 joints in COCO's order, and 0, 0, 0 where one is missing."
@@ -43,13 +43,13 @@ _CONFIDENCE_TODO: Final = "Scale the detector's scores so that 1 is certain and 
 
 
 def read_coco_results(path: Path) -> Observations:
-    """The people of a results file by rising frame; frames without people are not listed.
+    """Return the people of a results file by rising frame, without frames that have no people.
 
-    Read a batch at a time: memory is bounded by the arrays, not by Python's objects.
+    The function reads in batches: the arrays bound the memory, not Python objects.
 
     Raises:
-        InputError: naming file, result and joint: unreadable, another number of joints, NaN, a
-            confidence outside 0..1, not a frame index, or more people than a picture can hold.
+        InputError: with file, result and joint: unreadable, another number of joints, NaN, a
+            confidence outside 0..1, no frame index, or too many people in a frame.
     """
     items = JsonItems(path, "annotations", JSON_BYTES)
     batches = [_read_batch(path, results, first) for first, results in _batches(path, items)] or [
@@ -64,7 +64,7 @@ def read_coco_results(path: Path) -> Observations:
         )
     frames, triples, boxes, scores = (np.concatenate(each) for each in zip(*batches, strict=True))
     if items.is_mapping and np.all(np.isin(triples[..., 2], (0, 1, 2))):
-        triples[..., 2] = np.minimum(triples[..., 2], 1)  # visibility: 1 hidden, 2 visible
+        triples[..., 2] = np.minimum(triples[..., 2], 1)  # visibility: 1 occluded, 2 visible
     confidence = triples[..., 2]
     right = np.asarray((confidence >= 0) & (confidence <= OVERSHOOT), dtype=np.bool_)
     _require_right(path, triples, right, 0, "a confidence from 0 to 1", _CONFIDENCE_TODO)
@@ -76,7 +76,7 @@ _Batch = tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float64], NDAr
 
 
 def _batches(path: Path, items: Iterable[Any]) -> Iterator[tuple[int, list[dict[str, Any]]]]:
-    """Results a batch at a time, with the place of the first in the file."""
+    """Yield batches of results, each with the index of its first result in the file."""
     batch: list[dict[str, Any]] = []
     for index, result in enumerate(items):
         if type(result) is not dict:
@@ -119,12 +119,12 @@ def _table(
     width: int,
     first: int,
 ) -> NDArray[np.float64]:
-    """Entry `key` of some results as (results, width); NaN and infinity are let through."""
+    """Return entry `key` of some results as (results, width), including NaN and infinity."""
     rows = [results[index].get(key) for index in indices]
     if width == 1:
         rows = [[row] for row in rows]
     well_formed = set(map(type, rows)) <= {list} and set(map(len, rows)) <= {width}  # type: ignore[arg-type]
-    # Types are looked at because numpy would take "1" and True for numbers.
+    # Check types, since numpy would accept "1" and True as numbers.
     if well_formed and set(map(type, chain.from_iterable(rows))) <= {int, float}:  # type: ignore[arg-type]
         try:
             return np.array(rows, dtype=np.float64).reshape(-1, width)
@@ -168,7 +168,7 @@ def _require_right(
 def _optional(
     path: Path, results: list[dict[str, Any]], key: str, width: int, first: int
 ) -> NDArray[np.float64]:
-    """Entry `key` as (results, width) [px], or scores; NaN rows where it is absent or null."""
+    """Return entry `key` as (results, width) [px], or scores; NaN rows if absent or null."""
     given = [index for index, result in enumerate(results) if result.get(key) is not None]
     values = np.full((len(results), width), np.nan)
     table = _table(path, results, given, key, width, first)

@@ -1,4 +1,4 @@
-"""A unit's video on the match's clock: which picture shows which frame, and which are missing."""
+"""Map from match frames to the frames of a unit's video, and missing frames."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from worldpose.video import FrameIndex, index_video
 
 @dataclass(frozen=True, eq=False)
 class Footage:
-    """A video, and how it lies on the match's clock.
+    """A video and its synchronization with the match's clock.
 
     Attributes:
-        index: all its pictures.
+        index: all frames of the video.
         frame: (frames,) match frames of all clips, rising.
-        picture: (frames,) number of the picture that shows each; -1 where the video lacks it.
+        picture: (frames,) video frame of each match frame; -1 where the video lacks it.
     """
 
     index: FrameIndex
@@ -31,7 +31,7 @@ class Footage:
 
     @property
     def missing(self) -> list[list[int]]:
-        """First and last match frame of each stretch that the video lacks."""
+        """First and last match frame of each interval that the video lacks."""
         return stretches(self.frame[self.picture < 0])
 
 
@@ -42,17 +42,17 @@ def read_footage(
     frames: UnitFrames,
     clips: Sequence[tuple[str, int, int]],
 ) -> Footage:
-    """How a video lies on the match's clock; no picture but the first is decoded.
+    """Return a video's synchronization with the match's clock, decoding only its first frame.
 
     Args:
         path: a video file or a folder of images.
-        fps: frames a second of match time.
-        image_size: width, height that match.yaml says [px].
-        frames: how the unit's frames lie in the match.
-        clips: id, first match frame and number of frames of what is taken from it.
+        fps: frames per second of match time.
+        image_size: width, height from match.yaml [px].
+        frames: the unit's frames in the match.
+        clips: id, first match frame and number of frames of each clip.
 
     Raises:
-        InputError: no video, one of another size or rate, or one without a frame of some clip.
+        InputError: no video, another size or rate, or no frame of a clip.
     """
     index = index_video(path)
     if index.size != image_size:
@@ -83,7 +83,7 @@ def read_footage(
 
 
 def footage_clips(spec: MatchSpec, unit_id: str) -> list[tuple[str, int, int]]:
-    """What is taken from a video: every clip of a static camera, its own of a broadcast camera."""
+    """Return the clips of a video: all of a static camera, its own of a broadcast camera."""
     clips = spec.clips
     if unit_id in {clip.id for clip in clips}:
         clips = (spec.clip(unit_id),)
@@ -91,20 +91,20 @@ def footage_clips(spec: MatchSpec, unit_id: str) -> list[tuple[str, int, int]]:
 
 
 def footage_size(spec: MatchSpec, unit_id: str) -> tuple[int, int]:
-    """Width, height that match.yaml says of a static camera, or of a clip's broadcast camera."""
+    """Return width, height from match.yaml of a static camera or a clip's broadcast camera."""
     broadcast = {clip.id: clip.broadcast for clip in spec.clips}.get(unit_id)
     camera = spec.camera(broadcast or unit_id)
     return camera.width, camera.height
 
 
 def require_footage(spec: MatchSpec, unit_id: str, path: Path) -> None:
-    """Refuse a video that cannot be what match.yaml says; raises as `read_footage`."""
+    """Raise InputError as `read_footage` if a video contradicts match.yaml."""
     frames, clips = unit_frames(spec, unit_id), footage_clips(spec, unit_id)
     read_footage(path, spec.fps, footage_size(spec, unit_id), frames, clips)
 
 
 def stretches(numbers: NDArray[np.int64]) -> list[list[int]]:
-    """First and last of each run of neighbours in rising numbers."""
+    """Return first and last of each run of consecutive numbers in rising numbers."""
     if not len(numbers):
         return []
     breaks = np.flatnonzero(np.diff(numbers) > 1)

@@ -1,4 +1,4 @@
-"""Cameras that another tool calibrated, checked before they become records."""
+"""Validation of cameras calibrated by other tools."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
 
 SIZE_LIMIT: Final = 1 << 16
-"""Widest or highest picture that is believed [px]; OpenCV's own limit for most operations."""
+"""Maximum width and height of an image [px]; OpenCV's own limit for most operations."""
 
 NUMBER_LIMIT: Final = 1e9
-"""Largest number that is believed in any entry, whatever its unit."""
+"""Maximum absolute value of any entry, whatever its unit."""
 
 FOCAL_RATIOS: Final = (0.05, 1000.0)
-"""Least and largest focal length over the image's longer side [1]: a field of view of 168 degrees,
-and a telescope's of 0.06."""
+"""Minimum and maximum focal length over the image's longer side [1]: a field of view of 168
+degrees, and a telescope's of 0.06."""
 
 CENTER_SIZES: Final = 10
-"""Farthest principal point from the image's centre, in longer sides of the image [1]: a small crop
-of a large sensor lies a few beside it."""
+"""Maximum distance of the principal point from the image center, in longer sides of the image [1]:
+a small crop of a large sensor has an offset of a few."""
 
 DISTANCE_LIMIT: Final = 1e7
-"""Largest coordinate of a translation [m]: from the Earth's equator to its pole."""
+"""Maximum coordinate of a translation [m]: from the Earth's equator to its pole."""
 
 ROTATION_TOLERANCE: Final = 1e-4
-"""Largest error of R R^T = I [1] that is taken for rounding; four decimals give less."""
+"""Maximum rounding error of R R^T = I [1]; four decimals give less."""
 
 
 def given_camera(
@@ -44,7 +44,7 @@ def given_camera(
     rotation: NDArray[np.float64],
     translation: NDArray[np.float64],
 ) -> CameraCalibration:
-    """The camera record; a rotation that was rounded in its file becomes the nearest rotation.
+    """Return the camera record; a rounded matrix becomes the nearest rotation.
 
     Args:
         where: file and camera, for messages.
@@ -57,8 +57,8 @@ def given_camera(
         translation: t [m].
 
     Raises:
-        InputError: the size is not whole, a focal length not positive, the rotation none, or the
-            name unfit for a file.
+        InputError: the size is not whole, a focal length is not positive, the matrix is no
+            rotation, or the name is unfit for a file.
     """
     if np.any(size < 1) or np.any(size > SIZE_LIMIT) or np.any(size != np.round(size)):
         raise calibration_error(
@@ -101,7 +101,7 @@ def _require_optics(
     focal: NDArray[np.float64],
     principal_point: NDArray[np.float64],
 ) -> None:
-    """Refuse a focal length or principal point that no image of this size can have."""
+    """Raise InputError for a focal length or principal point impossible at this image size."""
     ratio = focal / np.max(size)
     if np.any(ratio < FOCAL_RATIOS[0]) or np.any(ratio > FOCAL_RATIOS[1]):
         low, high = (bound * float(np.max(size)) for bound in FOCAL_RATIOS)
@@ -123,14 +123,14 @@ def _require_optics(
 def cameras_by_name(
     path: Path, cameras: list[tuple[str, CameraCalibration]]
 ) -> dict[str, CameraCalibration]:
-    """The cameras by id, in file order.
+    """Return the cameras by id, in file order.
 
     Args:
         path: the file, for messages.
-        cameras: place in the file, and camera.
+        cameras: pairs of place in the file and camera.
 
     Raises:
-        InputError: there is none, or two of one name.
+        InputError: there is no camera, or two cameras have one name.
     """
     by_name: dict[str, CameraCalibration] = {}
     for where, camera in cameras:
@@ -143,11 +143,11 @@ def cameras_by_name(
 
 
 def calibration_error(where: str, expected: str, found: str) -> InputError:
-    """The error for an entry of a calibration file."""
+    """Return the error for an entry of a calibration file."""
     return InputError(where, expected=expected, found=found, todo="Correct the calibration file.")
 
 
 def brief(value: object) -> str:
-    """A value as it fits into a message."""
+    """Return a value shortened for a message."""
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."

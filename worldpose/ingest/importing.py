@@ -1,4 +1,4 @@
-"""Match folders made from other tools' calibration and 2D poses."""
+"""Import of other tools' calibration and 2D poses into a match folder."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def import_match(
     match_id: str | None = None,
     pitch: Literal["none"] | None = "none",
 ) -> MatchSpec:
-    """Write a match folder with the cameras of a calibration and the people they saw.
+    """Write a match folder with the cameras of a calibration and their detections.
 
-    The one clip, `clip`, spans the first to the last frame with a person; frames keep the numbers
-    that they have in the files. 2D poses are checked whole and stored as npz.
+    The only clip, `clip`, spans the first to the last frame with a person; frames keep their
+    numbers from the files. The function validates all 2D poses and stores them as npz.
 
     Args:
         calibration: a file that `read_calibration` reads.
@@ -33,14 +33,14 @@ def import_match(
         fps: frame rate of all cameras [1/s].
         out: the match folder, absent or empty.
         match_id: id of the match; None = the name of `out`.
-        pitch: "none", or None for the standard pitch, when the calibration's world is the pitch's.
+        pitch: "none", or None for the standard pitch, if the calibration's world is the pitch's.
 
     Returns:
-        What stands in match.yaml.
+        Content of match.yaml.
 
     Raises:
-        InputError: a file is not as it must be, names do not match, there are no people, or `out`
-            is not empty; nothing is written then.
+        InputError: a file is invalid, names do not match, there are no people, or `out` is not
+            empty; nothing is written then.
     """
     cameras = read_calibration(calibration)
     files = files_by_camera(detections, list(cameras), calibration, (".json", ".npz"))
@@ -71,7 +71,7 @@ def import_match(
 def files_by_camera(
     folder: Path, cameras: list[str], calibration: Path, suffixes: tuple[str, ...]
 ) -> dict[str, Path]:
-    """The file of each camera in a folder, by the camera's name.
+    """Return the file of each camera in a folder, by the camera's name.
 
     Raises:
         InputError: a camera lacks its file, or a file its camera.
@@ -94,6 +94,6 @@ def files_by_camera(
 
 
 def name_of(folder: Path) -> str:
-    """The folder's name without what an id may not hold."""
+    """Return the folder's name without characters that ids do not allow."""
     name = re.sub(r"[^A-Za-z0-9._-]+", "-", folder.resolve().name).strip("-._")[:64]
     return name or "match"

@@ -1,4 +1,4 @@
-"""Match folders made from another tool's calibration and the cameras' videos."""
+"""Import of another tool's calibration and the cameras' videos into a match folder."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ def import_videos(
 ) -> MatchSpec:
     """Write a match folder with the cameras of a calibration and copies of their videos.
 
-    The one clip, `clip`, is as long as the shortest video. Videos begin together: shift one
-    afterwards by `offset_frames` in match.yaml.
+    The only clip, `clip`, is as long as the shortest video. Videos begin together: `offset_frames`
+    in match.yaml can shift them afterwards.
 
     Args:
         calibration: a file that `read_calibration` reads.
         videos: folder with `<camera>.mp4`, .mov, .mkv or .avi for each camera of the calibration.
         out: the match folder, absent or empty.
-        fps: frame rate of all videos [1/s]; None = what they say.
+        fps: frame rate of all videos [1/s]; None = from the videos.
         match_id: id of the match; None = the name of `out`.
 
     Returns:
-        What stands in match.yaml.
+        Content of match.yaml.
 
     Raises:
-        InputError: a file is not as it must be, names or rates do not match, or `out` is not empty;
-            nothing is written then.
+        InputError: a file is invalid, names or rates do not match, or `out` is not empty; nothing
+            is written then.
     """
     cameras = read_calibration(calibration)
     files = files_by_camera(videos, list(cameras), calibration, VIDEO_SUFFIXES)

@@ -1,6 +1,6 @@
-"""The entries of a long JSON list one by one: memory is that of one entry, whatever the file holds.
+"""Streaming reader for the entries of a long JSON list, with the memory of one entry.
 
-Python's objects take up to thirty times the room of their text; a file of a gigabyte, parsed whole,
+Python objects take up to thirty times the memory of their text; a file of a gigabyte, parsed whole,
 would end the process.
 """
 
@@ -16,23 +16,23 @@ from worldpose.errors import InputError
 from worldpose.ingest.text_files import require_file
 
 CHUNK: Final = 1 << 20
-"""Bytes that are read at a time."""
+"""Bytes per read."""
 ENTRY_LENGTH: Final = 1 << 20
-"""Characters that one entry may have; a person's keypoints have under a thousand."""
+"""Maximum characters of one entry; a person's keypoints have under a thousand."""
 
 _SPACE: Final = " \t\n\r"
 _DECODER: Final = json.JSONDecoder()
 
 
 class JsonItems:
-    """The entries of a JSON file: of its list, or of the list under a key of its mapping.
+    """Entries of a JSON file: of its list, or of the list under a key of its mapping.
 
-    Iterate once. NaN and Infinity are let through.
+    Iterate once. NaN and Infinity are valid.
 
     Attributes:
-        is_mapping: whether the file is a mapping; known once iteration has begun.
-        other: what is there in place of the list, None where there is nothing or the list.
-        has_list: whether a list was there; known when iteration has ended.
+        is_mapping: whether the file is a mapping; set when iteration begins.
+        other: value in place of the list, None if there is no value or the list.
+        has_list: whether the file has the list; set when iteration ends.
     """
 
     def __init__(self, path: Path, key: str, limit: int) -> None:
@@ -40,8 +40,8 @@ class JsonItems:
 
         Args:
             path: the file.
-            key: of the list where the file is a mapping.
-            limit: most bytes that the file may have.
+            key: of the list if the file is a mapping.
+            limit: maximum size of the file [byte].
 
         Raises:
             InputError: no such file, or too large.
@@ -60,10 +60,10 @@ class JsonItems:
         self.other: Any = None
 
     def __iter__(self) -> Iterator[Any]:
-        """The entries.
+        """Yield the entries.
 
         Raises:
-            InputError: the file cannot be read, is not JSON, or has an entry that is too long.
+            InputError: the file is unreadable, is not JSON, or has an entry that is too long.
         """
         try:
             with self.path.open("rb") as file:
@@ -76,7 +76,7 @@ class JsonItems:
             raise InputError(
                 str(self.path), expected="UTF-8 text", found=str(error), todo="Save it as UTF-8."
             ) from error
-        except ValueError as error:  # a number of more digits than Python converts
+        except ValueError as error:  # a number with more digits than Python converts
             raise self._wrong(str(error)) from error
         except OSError as error:
             raise self._wrong(str(error)) from error
@@ -140,7 +140,7 @@ def _skip(text: _Text) -> None:
 
 
 class _Text:
-    """A file's text, of which no more is held than the entry that is read."""
+    """Buffered text of a file, at most one entry and one chunk at a time."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
@@ -149,7 +149,7 @@ class _Text:
         self._is_whole = False
 
     def ahead(self) -> str:
-        """The next character that is no space; empty at the end."""
+        """Return the next character that is no space; empty at the end."""
         while True:
             while self._place < len(self._buffer):
                 if self._buffer[self._place] not in _SPACE:
@@ -160,13 +160,13 @@ class _Text:
             self._fill()
 
     def take(self, wanted: str) -> None:
-        """Go past a character that has to be there."""
+        """Consume a required character."""
         if self.ahead() != wanted:
             raise self.error(f"Expecting {wanted!r}")
         self._place += 1
 
     def value(self) -> Any:  # noqa: ANN401
-        """The next value."""
+        """Return the next value."""
         self.ahead()
         while True:
             try:
@@ -175,7 +175,7 @@ class _Text:
                 if self._is_whole:
                     raise self.error(error.msg, error.pos) from None
             else:
-                # Of a number, a part may be one too.
+                # A prefix of a number may be a number too.
                 if self._is_whole or self._buffer[end : end + 1] in (*_SPACE, *",:]}"):
                     self._place = end
                     return value
@@ -184,7 +184,7 @@ class _Text:
             self._fill()
 
     def error(self, message: str, place: int | None = None) -> json.JSONDecodeError:
-        """What is wrong, and at which character of the file."""
+        """Return the error with its position in the file."""
         error = json.JSONDecodeError(message, self._buffer, self._place if place is None else place)
         error.pos += self._before
         return error

@@ -1,4 +1,4 @@
-"""2D poses as an npz file: the arrays of `Observations`, for matches that JSON is too slow for.
+"""Reader and writer of 2D poses as npz: the arrays of `Observations`, faster than JSON.
 
 Members: `frame` (frames,) int64, `keypoints` (frames, detections, 17, 2), `confidence` (frames,
 detections, 17), `boxes` (frames, detections, 4) and `score` (frames, detections), all float32 in
@@ -30,18 +30,18 @@ from worldpose.ingest.observations import Observations
 from worldpose.ingest.text_files import require_file
 
 ARRAY_BYTES: Final = 4 << 30
-"""Most that the arrays of one file may fill [byte]; two hours of 25 people at 50 Hz are 2 GB."""
+"""Maximum size of one file's arrays [byte]; two hours of 25 people at 50 Hz are 2 GB."""
 
 PEOPLE_LIMIT: Final = 1000
-"""Most people per frame of one camera; a stadium's stands in one image have a few hundred."""
+"""Maximum people per frame of one camera; a stadium's stands in one image have a few hundred."""
 
 COORDINATE_LIMIT: Final = 1e6
-"""Farthest from the picture's origin that a keypoint or box corner is believed [px]."""
+"""Maximum absolute coordinate of a keypoint or box corner [px]."""
 
 _BLOCK: Final = 4096
-"""Frames checked at a time, which keeps the checks' own memory small."""
+"""Frames per block of checks, which limits their memory."""
 _BLOCK_PEOPLE: Final = 100_000
-"""Detections of those frames, at most."""
+"""Maximum detections per block."""
 
 _SHAPES: Final = {
     "frame": ("frames",),
@@ -53,25 +53,25 @@ _SHAPES: Final = {
 
 
 def write_keypoint_arrays(path: Path, people: Observations) -> None:
-    """Write an npz file; the same arrays give the same bytes, wherever they are written.
+    """Write an npz file; the same arrays give the same bytes on every machine.
 
-    Nothing is packed: a compressor's output changes with its version.
+    The file has no compression, since a compressor's output changes with its version.
     """
     with zipfile.ZipFile(path, "w") as file:
         for name, array in {"frame": people.frame, **people.arrays()}.items():
             dtype = "<i8" if name == "frame" else "<f4"
-            # A ZipInfo made by name alone carries the fixed date 1980-01-01.
+            # A ZipInfo from a name alone has the fixed date 1980-01-01.
             with file.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
                 npy.write_array(member, np.ascontiguousarray(array, dtype), allow_pickle=False)
 
 
 def read_keypoint_arrays(path: Path) -> Observations:
-    """The people of an npz file, as written; frames rise but may leave gaps.
+    """Return the people of an npz file as stored; frames rise, possibly with gaps.
 
-    Every declared type, shape and size is checked before anything is unpacked.
+    The function checks every declared type, shape and size before it unpacks data.
 
     Raises:
-        InputError: naming file and member: truncated or no npz, another type, shape or byte order,
+        InputError: with file and member: truncated or no npz, another type, shape or byte order,
             too large, frames that do not rise, infinite values, or a keypoint without confidence.
     """
     require_file(path)

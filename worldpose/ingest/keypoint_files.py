@@ -1,4 +1,4 @@
-"""2D poses of one camera from a file: COCO keypoint results (JSON), or their arrays (npz)."""
+"""Reader of one camera's 2D poses: COCO keypoint results (JSON), or arrays (npz)."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from worldpose.ingest.observations import Observations
 
 
 def read_observations(path: Path, ranges: Sequence[tuple[int, int]] | None = None) -> Observations:
-    """Return the people that one camera saw, dense over ranges of the camera's own frames.
+    """Return the detections of one camera, dense over ranges of the camera's own frames.
 
     Args:
         path: `.json` (see `coco_results`) or `.npz` (see `keypoint_arrays`).
         ranges: first frame and number of frames of each range, rising and disjoint; None = one
-            range, from the first to the last frame in the file. Frames outside are left out,
+            range, from the first to the last frame in the file. The result omits frames outside;
             frames that the file lacks have no people.
 
     Raises:
-        InputError: naming file and place: unreadable, not what the form says, or a file whose
-            people are all outside the wanted frames.
+        InputError: with file and place: unreadable, invalid, or all people are outside the wanted
+            frames.
     """
     people = read_keypoint_arrays(path) if path.suffix == ".npz" else read_coco_results(path)
     seen = people.frame
@@ -45,10 +45,10 @@ def read_observations(path: Path, ranges: Sequence[tuple[int, int]] | None = Non
 
 
 def on_frames(path: Path, people: Observations, ranges: Sequence[tuple[int, int]]) -> Observations:
-    """Return the people of `path` on exactly these frames; a frame that was not seen is all NaN.
+    """Return the people of `path` on exactly these frames; missing frames are NaN.
 
     Raises:
-        InputError: the frame numbers are beyond belief, or the arrays too large.
+        InputError: the frame numbers or the arrays are too large.
     """
     detections, joints = people.confidence.shape[1:]
     frame_bytes = 8 + 4 * (3 * joints + 5) * detections
@@ -66,6 +66,6 @@ def on_frames(path: Path, people: Observations, ranges: Sequence[tuple[int, int]
 
 
 def seen_frames(people: Observations) -> tuple[int, int] | None:
-    """First and last frame with a person in it; None when there is none."""
+    """Return the first and last frame with a person; None without people."""
     frames = people.frame[np.isfinite(people.confidence).any(axis=(1, 2))]
     return (int(frames[0]), int(frames[-1])) if len(frames) else None

@@ -1,4 +1,4 @@
-"""A match folder, checked: everything that it names is there, and nothing contradicts."""
+"""Reader of match folders, with checks for missing files and contradictions."""
 
 from __future__ import annotations
 
@@ -21,25 +21,24 @@ from worldpose.ingest.text_files import read_yaml
 from worldpose.ingest.validation import validate_record
 
 CLICKS_NEEDED: Final = "at least four points of the pitch, better 8 to 12 all over the picture,"
-"""What a person is asked for where a camera has no calibration."""
+"""Request in messages on cameras without calibration."""
 
 
 @dataclass(frozen=True)
 class MatchFolder:
-    """What a match folder holds.
+    """Content of a match folder.
 
     Attributes:
-        folder: the folder as it was given.
+        folder: path of the folder as given.
         spec: match.yaml.
         calibrations: given static cameras by id; may lack some.
         detections: given 2D poses, by id of a static camera or of a clip (its broadcast camera).
-        pitch: the surveyed or standard pitch; None where the match has none.
+        pitch: the surveyed or standard pitch; None without a pitch.
         videos: video file or folder of images, by id of a static camera or of a clip.
-        clicked: what people clicked, by id of a static camera; may lack some.
-        stills: one picture, by id of a static camera; may lack some.
-        key_frames: what people clicked in the broadcast camera's picture, by id of a clip; may
-            lack some.
-        estimates: bodies seen in single pictures of the broadcast camera, by id of a clip; may lack
+        clicked: clicked markings, by id of a static camera; may lack some.
+        stills: one image, by id of a static camera; may lack some.
+        key_frames: clicked key frames of the broadcast camera, by id of a clip; may lack some.
+        estimates: monocular body estimates of the broadcast camera, by id of a clip; may lack
             some.
     """
 
@@ -56,15 +55,15 @@ class MatchFolder:
 
 
 def read_match(folder: Path) -> MatchFolder:
-    """The checked content of a match folder; videos, stills and detections are found, not opened.
+    """Return the validated content of a match folder, without opening videos, stills, detections.
 
     Args:
-        folder: holds match.yaml and what that names.
+        folder: contains match.yaml and the files that it names.
 
     Raises:
-        InputError: the folder cannot be read (its disk is not mounted, or this user may not); a
-            file or key is missing, unknown, contradicts another or leads out of the folder; a
-            static camera has neither video nor detections.
+        InputError: the folder is unreadable (its disk is not mounted, or this user has no
+            permission); a file or key is missing, unknown, contradicts another or leads out of the
+            folder; a static camera has neither video nor detections.
     """
     with reachable(folder):
         return _read_match(folder)
@@ -107,10 +106,10 @@ def _read_match(folder: Path) -> MatchFolder:
 
 
 def require_calibrated(match: MatchFolder) -> None:
-    """Refuse a match with a static camera that is neither given nor clicked.
+    """Raise InputError for a match with a static camera without calibration and clicks.
 
     Raises:
-        InputError: naming the missing cameras and what each needs.
+        InputError: with the missing cameras and the required files.
     """
     known = {**match.calibrations, **match.clicked}
     missing = [camera.id for camera in match.spec.static_cameras if camera.id not in known]
@@ -255,7 +254,7 @@ def _require_footage(
 
 
 def _another_video(folder: Path, camera_id: str) -> str:
-    """What to do with a camera's video whose name does not end as usual."""
+    """Return a hint on a camera's video with an unusual suffix; empty without such a video."""
     files = sorted((folder / "videos").glob(f"{camera_id}.*"))
     found = [file.name for file in files if file.stem == camera_id]
     return f", or name it in match.yaml: `video: videos/{found[0]}`" if found else ""

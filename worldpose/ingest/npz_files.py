@@ -1,4 +1,4 @@
-"""Arrays of npz files that others wrote: nothing of a declared size is allocated unchecked."""
+"""Reader of untrusted npz files: checks every declared size before allocation."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from worldpose.errors import InputError
 
 PACKED_RATIO: Final = 200
-"""Largest ratio of unpacked to packed bytes: poses with much room for absent people reach 50."""
+"""Maximum ratio of unpacked to packed bytes: poses with much padding for absent people reach 50."""
 
 PACKED_BYTES: Final = 1 << 26
-"""Unpacked bytes up to which the ratio does not matter."""
+"""Unpacked bytes up to which any ratio is allowed."""
 
 Header = tuple[tuple[int, ...], bool, np.dtype[np.generic]]
-"""Shape, whether in Fortran's order, type."""
+"""Shape, whether in Fortran order, type."""
 
 
 def read_npz(path: Path, limit: int) -> dict[str, NDArray[np.generic]]:
@@ -28,11 +28,11 @@ def read_npz(path: Path, limit: int) -> dict[str, NDArray[np.generic]]:
 
     Args:
         path: written by `numpy.savez` or `numpy.savez_compressed`.
-        limit: most bytes of all arrays together, unpacked.
+        limit: maximum unpacked size of all arrays together [byte].
 
     Raises:
-        InputError: naming file and member: no npz, truncated, Python objects, sizes that disagree,
-            or too large.
+        InputError: with file and member: no npz, truncated, Python objects, inconsistent sizes, or
+            too large.
     """
     with open_npz(path) as file:
         infos = [info for info in file.infolist() if info.filename.endswith(".npy")]
@@ -46,20 +46,20 @@ def open_npz(path: Path) -> zipfile.ZipFile:
     """Return the archive.
 
     Raises:
-        InputError: it is none.
+        InputError: the file is no archive.
     """
     try:
         return zipfile.ZipFile(path)
-    # ValueError and NotImplementedError: a directory of nonsense, or of a later version.
+    # ValueError and NotImplementedError: a damaged directory, or one of a later version.
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
         raise npz_error(str(path), "an npz file", _brief(error)) from error
 
 
 def read_header(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> Header:
-    """Return what a member declares, which agrees with its size.
+    """Return the header of a member, checked against its size.
 
     Raises:
-        InputError: it is no npy array of plain values, or of another size than it declares.
+        InputError: the member is no npy array of plain values, or its size contradicts its header.
     """
     where = f"{path}: {info.filename}"
     try:
@@ -77,13 +77,13 @@ def read_header(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> Hea
 
 
 def require_size(path: Path, infos: list[zipfile.ZipInfo], limit: int) -> None:
-    """Refuse arrays beyond `limit` bytes, and a small file that would unpack to very much.
+    """Raise InputError for arrays beyond `limit` bytes, and for excessive compression ratios.
 
     Raises:
-        InputError: naming the file.
+        InputError: with the file.
     """
     total = sum(info.file_size for info in infos)
-    # What the archive's directory states may be more than there is.
+    # The archive's directory may state more bytes than the file has.
     packed = min(sum(info.compress_size for info in infos), path.stat().st_size)
     expected = None
     if total > limit:
@@ -104,7 +104,7 @@ def read_array(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDAr
     """Return a member's array; check its header and size first.
 
     Raises:
-        InputError: its bytes are damaged.
+        InputError: the bytes are damaged.
     """
     try:
         with file.open(info) as member:

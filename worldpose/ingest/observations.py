@@ -1,4 +1,4 @@
-"""The people that one camera saw, as a detector reported them."""
+"""Detections of people in one camera."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Observations:
-    """Detected people of one camera, frame by frame; absent ones are NaN.
+    """Detected people of one camera, per frame; missing entries are NaN.
 
     Attributes:
         frame: (frames,) int64, frame numbers, rising.
@@ -27,7 +27,7 @@ class Observations:
     score: NDArray[np.float32]
 
     def rows(self, rows: slice | NDArray[np.intp]) -> Observations:
-        """The same people on some rows of the frame dimension."""
+        """Return the people on some rows of the frame dimension."""
         return Observations(
             frame=self.frame[rows],
             keypoints=self.keypoints[rows],
@@ -37,7 +37,7 @@ class Observations:
         )
 
     def on_frames(self, frame: NDArray[np.int64]) -> Observations:
-        """The same people on exactly these frames (n,), which rise; not seen ones are all NaN."""
+        """Return the people on exactly these rising frames (n,); missing frames are NaN."""
         kept = self.rows(np.flatnonzero(np.isin(self.frame, frame)))
         row = np.searchsorted(frame, kept.frame)
         padded = {}
@@ -47,7 +47,7 @@ class Observations:
         return Observations(frame=frame, **padded)
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
-        """The stored arrays by name, as in `data_contracts.observations`."""
+        """Return the stored arrays by name, as in `data_contracts.observations`."""
         return {
             "keypoints": self.keypoints,
             "confidence": self.confidence,

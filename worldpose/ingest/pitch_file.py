@@ -1,4 +1,4 @@
-"""Which pitch a match folder has: surveyed, standard or none."""
+"""Reader of a match folder's pitch: surveyed, standard or none."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from worldpose.ingest.validation import validate_record
 from worldpose.pitch.laws import law_points
 
 SIZES: Final = {"length": (80.0, 130.0), "width": (40.0, 100.0)}
-"""What a football pitch may measure [m]: the Laws allow 90 to 120 by 45 to 90."""
+"""Allowed sizes of a football pitch [m]: the Laws allow 90 to 120 by 45 to 90."""
 UNITS: Final = {"millimetres": 0.001, "centimetres": 0.01, "feet": 0.3048, "yards": 0.9144}
-"""Other units that lengths are given in [m]."""
+"""Other units to guess in messages [m]."""
 FROM_LAWS: Final = 2.0
-"""How far a surveyed point may lie from where the Laws put it, in plan [m]."""
+"""Maximum distance of a surveyed point from its place in the Laws, in plan [m]."""
 NO_PITCH: Final = "none"
 """Value of `pitch` in match.yaml for footage without a pitch."""
 
 
 def pitch_file(folder: Path, spec: MatchSpec) -> Path | None:
-    """Where the surveyed pitch is written; None = no pitch, or the standard one.
+    """Return the file of the surveyed pitch; None = no pitch, or the standard one.
 
     Raises:
-        InputError: match.yaml names a pitch file that is not there or lies outside, or says that
-            there is no pitch beside pitch.json.
+        InputError: match.yaml names a pitch file that is missing or outside, or has `pitch: none`
+            although pitch.json exists.
     """
     if spec.pitch == NO_PITCH:
         if (folder / "pitch.json").exists():
@@ -43,7 +43,7 @@ def pitch_file(folder: Path, spec: MatchSpec) -> Path | None:
 
 
 def read_pitch(folder: Path, spec: MatchSpec) -> PitchSpec | None:
-    """The surveyed or standard pitch of a match; None where it has none.
+    """Return the surveyed or standard pitch of a match; None without a pitch.
 
     Raises:
         InputError: as `pitch_file`, or the file is no pitch.
@@ -60,10 +60,10 @@ def read_pitch(folder: Path, spec: MatchSpec) -> PitchSpec | None:
 
 
 def _check_size(content: object, file: str) -> None:
-    """Refuse a size that is none of a football pitch in metres, and say which unit it may be in.
+    """Raise InputError for an implausible pitch size in metres, with a guess of its unit.
 
     Raises:
-        InputError: naming the key, and the unit.
+        InputError: with the key, and the unit.
     """
     if not isinstance(content, dict) or content.get("any_size") is True:
         return
@@ -84,10 +84,10 @@ def _check_size(content: object, file: str) -> None:
 
 
 def _check_points(content: object, file: str) -> None:
-    """Refuse surveyed points that lie far from where the Laws put points of their names.
+    """Raise InputError for surveyed points far from their places in the Laws.
 
     Raises:
-        InputError: naming the point that is farthest off.
+        InputError: with the point of the largest distance.
     """
     if not isinstance(content, dict) or content.get("any_size") is True:
         return
@@ -128,10 +128,10 @@ def _is_number(value: object) -> TypeGuard[float]:
 
 
 def refuse_unread_pitch(folder: Path) -> None:
-    """Refuse to add pitch.json to a folder whose match.yaml names another pitch, or none.
+    """Raise InputError if match.yaml names another pitch than pitch.json, or none.
 
     Raises:
-        InputError: nothing would read the file.
+        InputError: nothing would read pitch.json.
     """
     file = folder / "match.yaml"
     content = read_yaml(file) if file.exists() else None

@@ -1,4 +1,4 @@
-"""Files that a match folder names: they are there, and nowhere else."""
+"""Checks that files named in a match folder exist inside it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from worldpose.errors import InputError
 
 
 def require_local(name: str, where: str) -> None:
-    """Refuse a name that is not plainly a place inside the match folder.
+    """Raise InputError for a name that is no path inside the match folder.
 
     Raises:
         InputError: an absolute path, one with `..`, or an empty one.
@@ -27,10 +27,10 @@ def require_local(name: str, where: str) -> None:
 
 @contextmanager
 def reachable(folder: Path) -> Iterator[None]:
-    """A block that reads a match folder: what the system refuses is an `InputError`.
+    """Convert OSError in a block that reads a match folder to InputError.
 
     Raises:
-        InputError: the folder, or something in it, does not answer or may not be read.
+        InputError: the folder, or a file in it, is unreachable or unreadable.
     """
     try:
         yield
@@ -44,16 +44,16 @@ def reachable(folder: Path) -> Iterator[None]:
 
 
 def existing_file(folder: Path, name: str, where: str, *, folders: bool = False) -> Path:
-    """The file `name` in the folder.
+    """Return the path of an existing file in the folder.
 
     Args:
         folder: the match folder.
-        name: relative to it.
-        where: what names it, for messages.
-        folders: whether a folder with something in it will do.
+        name: relative to the folder.
+        where: source of the name, for messages.
+        folders: also accept a folder that is not empty.
 
     Raises:
-        InputError: there is no such file, or it lies outside.
+        InputError: there is no such file, or it is outside.
     """
     require_local(name, where)
     path = folder / name

@@ -1,4 +1,4 @@
-"""What a match is: the digest of every file that it consists of."""
+"""Identity of a match: digests of all its files."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from worldpose.ingest.pitch_file import pitch_file
 from worldpose.ingest.places import reachable
 
 SETTLE_SECONDS: Final = 0.5
-"""A file that changed this recently is looked at again; recorders and copies write far oftener."""
+"""A file changed within this time [s] is checked again; recorders and copies write more often."""
 
 
 def register_match(match: MatchFolder, previous: Registration | None) -> Registration:
-    """The match with the SHA-256 of its files, and the identity that says which match it is.
+    """Return the match with the SHA-256 of its files, and its identity.
 
-    Registered are match.yaml, calibration.toml, the pitch file, videos, stills, detections,
-    estimates and annotations; `reference/` is not part of a match. The identity covers the paths
-    and contents of videos, detections and pitch alone, so neither the folder's name nor an edited
-    click, still, roster, estimate or calibration makes another match.
+    The registration covers match.yaml, calibration.toml, the pitch file, videos, stills,
+    detections, estimates and annotations; `reference/` is not part of a match. The identity covers
+    only the paths and contents of videos, detections and pitch, so that neither the folder's name
+    nor an edited click, still, roster, estimate or calibration changes it.
 
     Args:
         match: as read by `read_match`.
-        previous: the last registration of this folder, if any. A file whose size and modification
-            time are as registered keeps its digest. That is only a shortcut, as in git: a file
-            changed behind both keeps its old digest; without `previous` all is read.
+        previous: the last registration of this folder, if any. A file with unchanged size and
+            modification time keeps its digest. As in git, this is only a shortcut: it misses a
+            change that preserves both; without `previous` the function reads all files.
 
     Raises:
-        InputError: a file is empty, cannot be read, or is still being written.
+        InputError: a file is empty, unreadable, or still being written.
     """
     with reachable(match.folder):
         return _register(match, previous)
@@ -56,12 +56,12 @@ def _register(match: MatchFolder, previous: Registration | None) -> Registration
 
 
 def digest_of_files(path: Path) -> str:
-    """SHA-256 of a file, or of the names and contents of all files of a folder but hidden ones.
+    """Return the SHA-256 of a file, or of the names and contents of a folder's non-hidden files.
 
-    The same as `Registration.digest_of` of what was registered.
+    Equals `Registration.digest_of` of the registered files.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: a file is unreadable.
     """
     if not path.is_dir():
         with path.open("rb") as file:
@@ -86,7 +86,7 @@ def _further_files(match: MatchFolder) -> set[str]:
 
 
 def _files_under(folder: Path, root: Path) -> list[str]:
-    """`root`, or the files in and below it, relative to the match folder; hidden ones are not."""
+    """Return `root`, or the non-hidden files in and below it, relative to the match folder."""
     if root.is_file():
         return [root.relative_to(folder).as_posix()]
     return [
@@ -127,7 +127,7 @@ def _source_file(folder: Path, path: str, known: dict[tuple[str, int, int], str]
 
 
 def _require_settled(folder: Path, files: tuple[SourceFile, ...]) -> None:
-    """Refuse files that changed while they were read, or that change a moment later."""
+    """Raise InputError for files that changed during reading, or change a moment later."""
     newest = max(file.modified_ns for file in files) / 1e9
     wait = newest + SETTLE_SECONDS - time.time()
     if 0 < wait <= SETTLE_SECONDS:

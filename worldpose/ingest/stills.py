@@ -1,4 +1,4 @@
-"""Stills: one image of a static camera, as PNG (JPEG is read too)."""
+"""Reader and writer of stills: one image of a static camera, as PNG (JPEG is read too)."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from worldpose.ingest.text_files import require_file
 from worldpose.video.images import declared_size, decode_image
 
 STILL_BYTES = 1 << 28
-"""Most that a still may hold [byte]; a noisy 4K picture has 25 MB."""
+"""Maximum size of a still [byte]; a noisy 4K image has 25 MB."""
 
 
 def read_still(path: Path, image_size: tuple[int, int]) -> NDArray[np.uint8]:
-    """The picture (height, width, 3), RGB.
+    """Return the image (height, width, 3), RGB.
 
     Args:
         path: a PNG file.
-        image_size: width and height that the camera has [px].
+        image_size: width and height of the camera [px].
 
     Raises:
-        InputError: no such file, not a picture, or one of another size.
+        InputError: no such file, no image, or another image size.
     """
     size = require_file(path)
     content = np.fromfile(path, dtype=np.uint8) if size <= STILL_BYTES else np.empty(0, np.uint8)
@@ -47,7 +47,7 @@ def read_still(path: Path, image_size: tuple[int, int]) -> NDArray[np.uint8]:
 
 
 def write_still(path: Path, picture: NDArray[np.uint8]) -> None:
-    """Write a picture (height, width, 3), RGB, as PNG; the same picture gives the same bytes."""
+    """Write an image (height, width, 3), RGB, as PNG; equal images give equal bytes."""
     import cv2  # late: it takes a fifth of a second, and few commands open an image
 
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""YAML, JSON and TOML files as plain data; a hostile or broken one is an `InputError`."""
+"""Readers of untrusted YAML, JSON and TOML files; `InputError` for hostile or broken files."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ import yaml
 from worldpose.errors import InputError
 
 SETTINGS_BYTES: Final = 1 << 21
-"""Most that match.yaml, calibration.toml or pitch.json may hold [byte].
+"""Maximum size of match.yaml, calibration.toml or pitch.json [byte].
 
-A full match has 0.1 MB; 5,000 calibrated cameras, which the load test has, take 2.0 MB.
+A full match has 0.1 MB; 5,000 calibrated cameras, as in the load test, take 2.0 MB.
 """
 
 NESTING: Final = 32
-"""Most levels of lists and mappings in a YAML file; match.yaml has four."""
+"""Maximum levels of lists and mappings in a YAML file; match.yaml has four."""
 
 EVENTS: Final = 100_000
-"""Most keys, values and brackets in a YAML file, two seconds' work; 1000 clips have 10 000."""
+"""Maximum keys, values and brackets in a YAML file, two seconds' work; 1000 clips have 10 000."""
 
 
 TOML_LINE: Final = 4096
-"""Longest line of a TOML file; the time for a key of n dotted parts grows as n squared."""
+"""Maximum line length of a TOML file; the time for a key of n dotted parts grows as n squared."""
 
 
 def read_yaml(path: Path) -> Any:  # noqa: ANN401
-    """The one document of a YAML file, as plain values; no aliases, no key given twice.
+    """Return the only document of a YAML file, as plain values, without aliases or repeated keys.
 
     Dates stay text, so that `match_id: 2024-05-01` is a name.
 
@@ -42,7 +42,7 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401
 
 
 def read_json(path: Path, limit: int = SETTINGS_BYTES) -> Any:  # noqa: ANN401
-    """The content of a JSON file of at most `limit` bytes; NaN and Infinity are let through.
+    """Return the content of a JSON file of at most `limit` bytes, including NaN and Infinity.
 
     Raises:
         InputError: no such file, too large or not JSON.
@@ -51,7 +51,7 @@ def read_json(path: Path, limit: int = SETTINGS_BYTES) -> Any:  # noqa: ANN401
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The tables of a TOML file.
+    """Return the tables of a TOML file.
 
     Raises:
         InputError: no such file, too large, a line too long, or not TOML.
@@ -70,10 +70,10 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def require_file(path: Path) -> int:
-    """Size of a regular file [byte].
+    """Return the size of a regular file [byte].
 
     Raises:
-        InputError: there is no such file, it is something else, or it cannot be reached.
+        InputError: there is no such file, it is not a regular file, or it is unreachable.
     """
     try:
         if not path.is_file():
@@ -117,8 +117,8 @@ def _parsed(path: Path, form: str, parse: Callable[[str], Any], text: str) -> An
         raise InputError(
             str(path), expected=form, found="nesting without end", todo="Write the file anew."
         ) from error
-    # ValueError: json and tomllib, and numbers or dates that Python's constructors refuse.
-    # The others: PyYAML, where a tag such as !!int or !!bool stands before text that is none.
+    # ValueError: json and tomllib, and numbers or dates that Python's constructors reject.
+    # The others: PyYAML, where a tag such as !!int or !!bool precedes text of another type.
     except (yaml.YAMLError, ValueError, OverflowError, LookupError, AttributeError) as error:
         found = " ".join(str(error).replace('"<unicode string>", ', "").split())
         raise InputError(
@@ -127,7 +127,7 @@ def _parsed(path: Path, form: str, parse: Callable[[str], Any], text: str) -> An
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe loader that refuses aliases and repeated keys, and reads dates as text."""
+    """Safe loader that rejects aliases and repeated keys, and reads dates as text."""
 
     yaml_implicit_resolvers = {
         first: [(tag, regexp) for tag, regexp in rules if not tag.endswith(":timestamp")]
@@ -148,7 +148,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def _load_yaml(text: str) -> Any:  # noqa: ANN401
-    # Events come one by one, so a bomb is refused before anything is built from it.
+    # Events arrive one by one, so that the check rejects a bomb before construction.
     depth = 0
     for count, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):
         if isinstance(event, yaml.AliasEvent):

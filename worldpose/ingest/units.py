@@ -1,4 +1,4 @@
-"""What a match folder brought in for one camera, on the match's clock."""
+"""Detections and calibration of one unit of a match folder, in match frames."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from worldpose.ingest.observations import Observations
 
 @dataclass(frozen=True)
 class UnitFrames:
-    """How the frames of a static camera, or of a clip's broadcast camera, lie in the match.
+    """Match frames of a static camera, or of a clip's broadcast camera.
 
     Attributes:
         first: first match frame.
-        count: number of frames, those between clips included.
+        count: number of frames, including those between clips.
         offset: match frame = camera frame - offset.
-        ranges: first match frame and number of frames of every stretch that clips cover, rising
-            and disjoint: only these hold people.
+        ranges: first match frame and number of frames of every interval covered by clips, rising
+            and disjoint: only these contain people.
     """
 
     first: int
@@ -31,10 +31,10 @@ class UnitFrames:
 
 
 def unit_frames(spec: MatchSpec, unit_id: str) -> UnitFrames:
-    """The frames of a unit: all clips for a static camera, its clip for a broadcast camera.
+    """Return the frames of a unit: all clips of a static camera, the clip of a broadcast camera.
 
-    A broadcast offset that is not whole is taken to the nearest frame; the rest stays in the
-    clip's `broadcast_offset_frames`.
+    The function rounds a broadcast offset to the nearest frame; the rest stays in the clip's
+    `broadcast_offset_frames`.
     """
     clips = spec.clips
     if unit_id in {clip.id for clip in clips}:
@@ -55,17 +55,17 @@ def unit_frames(spec: MatchSpec, unit_id: str) -> UnitFrames:
 
 
 def read_unit(match: MatchFolder, unit_id: str) -> tuple[Observations, CameraCalibration | None]:
-    """The people and the given calibration of a static camera, or of a clip's broadcast camera.
+    """Return detections and given calibration of a static camera or a clip's broadcast camera.
 
     Args:
         match: as read by `read_match`.
         unit_id: id of a static camera, or of a clip that names a broadcast camera.
 
     Returns:
-        Observations with `frame` in match frames, and the calibration where one is given.
+        Observations with `frame` in match frames, and the calibration if given.
 
     Raises:
-        InputError: the match has no such unit, or no detections for it, or they are not in order.
+        InputError: the match has no such unit, or no or invalid detections for it.
     """
     if unit_id not in match.detections:
         raise InputError(

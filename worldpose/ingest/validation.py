@@ -1,4 +1,4 @@
-"""Plain data as a contract's record; what does not fit is an `InputError` naming file and key."""
+"""Validation of plain data as records; `InputError` with file and key for invalid data."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ _NAME_RULE: Final = "up to 64 letters, digits and . _ - with a letter or digit f
 
 
 def validate_record(model: type[R], data: object, file: str) -> R:
-    """The record that `data` from `file` describes; nothing is converted, nothing is skipped.
+    """Return the record in `data` from `file`, without conversions or ignored keys.
 
     Args:
         model: the contract.
-        data: mappings, lists, text and numbers, as a YAML or JSON reader returns them.
+        data: mappings, lists, text and numbers, as returned by a YAML or JSON reader.
         file: name of the file for messages.
 
     Raises:
-        InputError: a key is unknown or missing, or a value does not fit; a misspelt key is named
-            before the key that is missing because of it.
+        InputError: a key is unknown or missing, or a value is invalid; a misspelt key takes
+            precedence over the key that is missing because of it.
     """
     try:
         text = json.dumps(data)
@@ -93,7 +93,7 @@ def _input_error(model: type[Record], detail: ErrorDetails, file: str, others: i
 
 
 def _place(loc: tuple[int | str, ...]) -> str:
-    """Keys as a person writes them: `cameras[2].kind`."""
+    """Return a location in the notation `cameras[2].kind`."""
     return "".join(
         f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc
     ).removeprefix(".")
@@ -109,7 +109,7 @@ def _brief(value: object) -> str:
 
 
 def _known_keys(model: type[Record], loc: tuple[int | str, ...]) -> list[str]:
-    """Keys of the record at `loc` inside `model`."""
+    """Return the keys of the record at `loc` inside `model`."""
     kind: Any = model
     for part in loc:
         if isinstance(kind, type) and issubclass(kind, Record):

@@ -1,4 +1,4 @@
-"""Match folders written whole or not at all."""
+"""Atomic writer of match folders."""
 
 from __future__ import annotations
 
@@ -40,9 +40,10 @@ def write_match(
     key_frames: Mapping[str, KeyFrames] = MappingProxyType({}),
     further: Callable[[Path], None] | None = None,
 ) -> None:
-    """Write a match folder that `read_match` accepts, all or nothing.
+    """Write a match folder that `read_match` accepts, atomically.
 
-    The folder is built and read back beside its place, synced to disk and renamed into place.
+    The function builds and reads back a temporary folder in the same parent, syncs it to disk and
+    renames it.
 
     Args:
         folder: absent, or an empty folder.
@@ -50,15 +51,15 @@ def write_match(
         calibrations: static cameras by id.
         observations: by id of a static camera or clip; `frame` is the camera's (or the broadcast
             clip's) own frame number, as in the files, not the match frame.
-        pitch: written to the file that `spec.pitch` names, else to pitch.json.
-        clicked: what was clicked in static cameras, by id.
-        stills: pictures (height, width, 3), RGB, by camera id; written to the file that the
-            camera's `still` names, else to stills/<camera>.png.
-        key_frames: what was clicked in key frames of the broadcast camera, by clip.
-        further: called with the match folder under construction, to add videos and `reference/`.
+        pitch: written to the file named by `spec.pitch`, else to pitch.json.
+        clicked: clicked markings of static cameras, by id.
+        stills: images (height, width, 3), RGB, by camera id; written to the file named by the
+            camera's `still`, else to stills/<camera>.png.
+        key_frames: clicked key frames of the broadcast camera, by clip.
+        further: called with the temporary match folder, to add videos and `reference/`.
 
     Raises:
-        InputError: the folder is there and not empty, or what is given contradicts itself.
+        InputError: the folder exists and is not empty, or the arguments contradict each other.
     """
     _require_known(spec, [*calibrations, *observations, *clicked, *stills, *key_frames])
     require_local(spec.pitch or "pitch.json", "match.yaml: pitch")
@@ -67,7 +68,7 @@ def write_match(
     _require_empty(folder)
     _make_parent(folder)
     with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as workshop:
-        # One level down: a temporary folder is private, the match has the usual rights.
+        # One level down: the temporary folder is private, the match has the usual permissions.
         building = Path(workshop) / folder.name
         (building / "detections").mkdir(parents=True)
         (building / "match.yaml").write_text(_yaml(spec), encoding="utf-8")
@@ -163,7 +164,7 @@ def _write_pitch(folder: Path, spec: MatchSpec, pitch: PitchSpec) -> None:
 
 
 def _sync(folder: Path) -> None:
-    """Make every file of the tree and every folder entry survive a power cut."""
+    """Sync every file and folder of the tree to disk."""
     for parent, _, names in os.walk(folder):
         for name in names:
             with (Path(parent) / name).open("rb") as file:

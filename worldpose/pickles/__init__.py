@@ -1,9 +1,9 @@
-"""Pickles that others wrote, read without running them.
+"""Safe reading of untrusted pickles, without executing them.
 
-A pickle is a program whose instructions call whatever the file names. Here every name that may come
-leads to a class that only notes what it is given, and every other name ends the reading: nothing is
-imported, no foreign code runs. `plain` then checks the notes and turns them into arrays, lists and
-dictionaries. In: a stream, the names that may come. Out: plain content.
+A pickle is a program whose instructions call any function that the file names. Here every allowed
+name maps to a class that only records its arguments, and any other name aborts the reading: nothing
+is imported, no foreign code runs. `plain` then checks the recorded notes and converts them to
+arrays, lists and dictionaries. Input: a stream, the allowed names. Output: plain content.
 """
 
 from worldpose.pickles.notes import (

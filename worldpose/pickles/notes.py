@@ -1,4 +1,4 @@
-"""What a pickle names, as notes, and what the notes mean once all is read."""
+"""Notes for the classes of a pickle, and their conversion to plain data."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 LARGEST: Final = 1 << 30
-"""Most elements of one array: 1 GB of bytes, an hour of 25 surfaces is never in one."""
+"""Maximum number of elements of one array: 1 GB of bytes; no array holds an hour of 25 surfaces."""
 
 _TYPES: Final = re.compile(r"b1|[iu][1248]|f[248]|[US]\d{1,5}")
 
 
 class Note:
-    """Notes the arguments and the state that a pickle gives to some class."""
+    """Records the arguments and the state that a pickle passes to a class."""
 
     args: tuple[Any, ...]
     state: Any
 
-    # Pickles make objects both by calling the class and by __new__ alone.
+    # Pickles create objects both by calling the class and by __new__ alone.
     def __new__(cls, *args: object, **_: object) -> Self:  # noqa: D102
         note = super().__new__(cls)
         note.args, note.state = args, None
@@ -32,7 +32,7 @@ class Note:
     def __init__(self, *_: object, **__: object) -> None:
         pass
 
-    # Without it, the unpickler would set attributes of its own choice.
+    # Without it, the unpickler would set attributes that the file chooses.
     def __setstate__(self, state: object) -> None:
         self.state = state
 
@@ -54,15 +54,15 @@ class Scalar(Note):
 
 
 class Encoded(Note):
-    """`_codecs.encode`, how Python 3 writes bytes for Python 2; empty ones are plain `bytes`."""
+    """`_codecs.encode`, Python 3's encoding of bytes for Python 2; empty ones are plain `bytes`."""
 
 
 class Kind(Note):
-    """A class that is only named, as the type of an array is."""
+    """A class that is only named, such as the type of an array."""
 
 
 class Reconstructor(Note):
-    """`copyreg._reconstructor`: makes an object of the class it is given, here always a note."""
+    """`copyreg._reconstructor`: creates an object of the given class, here always a note."""
 
     def __new__(cls, kind: object = None, *_: object) -> Note:  # type: ignore[misc]  # noqa: D102
         if not (isinstance(kind, type) and issubclass(kind, Note)):
@@ -71,7 +71,7 @@ class Reconstructor(Note):
 
 
 class Table(dict[Any, Any]):
-    """A dictionary of whatever class; what else the class would keep is left out."""
+    """A dictionary of any class; other state of the class is dropped."""
 
     def __new__(cls, *_: object, **__: object) -> Self:  # noqa: D102
         return super().__new__(cls)
@@ -109,18 +109,18 @@ ALLOWED: Final[Mapping[tuple[str, str], type[Any]]] = {
         )
     },
 }
-"""Names that any pickle may use, and the class that stands for each."""
+"""Names allowed in any pickle, and the class that replaces each."""
 
 
 def plain(value: object, decoders: Mapping[type[Note], Callable[[Any], object]]) -> Any:  # noqa: ANN401
-    """Return what was read with arrays for notes: dictionaries, lists, numbers, text and arrays.
+    """Convert notes to arrays; return dictionaries, lists, numbers, text and arrays.
 
     Args:
-        value: what the unpickler gave.
-        decoders: what else than numpy's notes may come, and its meaning.
+        value: output of the unpickler.
+        decoders: additional note classes and their conversions.
 
     Raises:
-        ValueError: a note that says nothing meaningful, or something that holds itself.
+        ValueError: a malformed note, or an object that contains itself.
     """
     return _Plain({**_DECODERS, **decoders}).of(value)
 
@@ -128,8 +128,8 @@ def plain(value: object, decoders: Mapping[type[Note], Callable[[Any], object]])
 class _Plain:
     def __init__(self, decoders: Mapping[type[Note], Callable[[Any], object]]) -> None:
         self._decoders = decoders
-        # What is shared is turned once: nested sharing would otherwise grow without bound. The
-        # original is kept so that its address is not given to another object meanwhile.
+        # Shared objects are converted once: nested sharing would otherwise grow without bound. The
+        # original is kept so that its address is not reused for another object.
         self._done: dict[int, tuple[object, Any]] = {}
         self._open: set[int] = set()
 
@@ -158,17 +158,17 @@ class _Plain:
             if isinstance(value, kind):
                 found = decoded(value)
                 return self.of(found) if isinstance(found, list | dict) else found
-        # What has no part in it, such as a generator's state.
+        # State without a plain equivalent, such as a generator's.
         return None
 
 
 def _key(value: object) -> object:
-    """Lists, which tuples become, cannot be keys."""
+    """Convert lists, which tuples become, to valid keys."""
     return tuple(value) if isinstance(value, list) else value
 
 
 def type_of(note: object) -> np.dtype[Any]:
-    """Return the numpy type of a note, numbers and text alone.
+    """Return the numpy type of a note, for numbers and text only.
 
     Raises:
         ValueError: it is another type.
@@ -183,10 +183,10 @@ def type_of(note: object) -> np.dtype[Any]:
 
 
 def numbers(raw: object, kind: np.dtype[Any], shape: object, order: str) -> NDArray[Any]:
-    """Return bytes as an array; sizes that do not fit are refused.
+    """Return bytes as an array; sizes must match.
 
     Raises:
-        ValueError: no bytes, or another number of them.
+        ValueError: not bytes, or another number of them.
     """
     if isinstance(raw, Encoded):
         text, encoding = raw.args or ("", "latin1")

@@ -1,4 +1,4 @@
-"""Python's own unpickler, with notes for names and without anything to import."""
+"""Python's own unpickler, with notes for names and without imports."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, ClassVar, cast
 
 
 def no_storage(_: object) -> object:
-    """Refuse a persistent id where a file has no storages of its own.
+    """Refuse a persistent id if a file has no storages of its own.
 
     Raises:
         UnpicklingError: always.
@@ -19,10 +19,10 @@ def no_storage(_: object) -> object:
 
 
 class Unpickler(pickle._Unpickler):
-    """Reads one pickle; a name that is not allowed ends the reading.
+    """Reads one pickle; a name that is not allowed raises an error.
 
-    It is the one in Python, not the one in C: that one makes room for as many memorised objects as
-    a file of a few bytes says that it has.
+    It extends the Python implementation, not the C one: that one allocates memory for as many
+    memoized objects as a file of a few bytes claims.
     """
 
     def __init__(
@@ -44,14 +44,14 @@ class Unpickler(pickle._Unpickler):
         return self._storage(pid)
 
     def load_build(self) -> None:
-        """Give a state to what notes one; of other things it would set attributes."""
+        """Pass a state only to notes; on other objects it would set attributes."""
         instance = cast("list[object]", self.stack)[-2]  # type: ignore[attr-defined]
         if not hasattr(instance, "__setstate__") or isinstance(instance, type):
             raise pickle.UnpicklingError("a state for what has none")
         pickle._Unpickler.load_build(self)  # type: ignore[attr-defined]
 
     def load_bytearray8(self) -> None:
-        """Take bytes that are there; Python's own makes room for as many as the file says."""
+        """Read existing bytes; Python's own version allocates as many as the file claims."""
         (length,) = struct.unpack("<Q", self.read(8))  # type: ignore[attr-defined]
         content = self.read(length) if length < 1 << 62 else b""  # type: ignore[attr-defined]
         if len(content) != length:

@@ -1,7 +1,8 @@
-"""The pitch: its named points, its painted markings and the height of its surface.
+"""Pitch model: named points, painted markings and surface height.
 
 Input: a `PitchSpec` with surveyed points, or none; a surveyor's file. Output: a template in world
-metres to calibrate, draw and filter by; a survey in the world frame (`worldpose.pitch.survey`).
+metres for calibration, drawing and filtering; a survey in the world frame
+(`worldpose.pitch.survey`).
 """
 
 from worldpose.pitch.template import MarkingSamples, PitchTemplate

@@ -1,8 +1,8 @@
 """Points and markings that the Laws of the Game prescribe (IFAB, Law 1 "The Field of Play").
 
 Left is negative x, right positive x; near is negative y, the main camera's side, far positive y.
-All distances are taken between the centres of the lines: Law 1 measures to their outer edges,
-which differs by up to a line's width of 0.12 m; surveyed points carry what is really there.
+All distances are between the centres of the lines: Law 1 measures to their outer edges, which
+differs by up to a line's width of 0.12 m; surveyed points give the actual positions.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ GOAL_AREA = (5.5, 18.32)
 GOAL = (2.44, 7.32)
 """Height of the crossbar's lower edge, width between the posts [m]."""
 PENALTY_MARK_DISTANCE = 11.0
-"""From the goal line [m]."""
+"""Distance from the goal line [m]."""
 CIRCLE_RADIUS = 9.15
-"""Of the centre circle, and of the penalty arcs about the penalty marks [m]."""
+"""Radius of the centre circle, and of the penalty arcs around the penalty marks [m]."""
 CORNER_RADIUS = 1.0
-"""Of the corner arcs [m]."""
+"""Radius of the corner arcs [m]."""
 
 SIDES = {"left": -1.0, "right": 1.0}
 ENDS = {"near": -1.0, "far": 1.0}
@@ -103,7 +103,7 @@ def law_arcs() -> dict[str, ArcSpec]:
             center="center_mark", radius=CIRCLE_RADIUS, start_angle=0.0, end_angle=2.0 * math.pi
         )
     }
-    # Each begins at the angle at which it enters the pitch, turning from x towards y.
+    # Each begins at the angle at which it enters the pitch, in the direction from x towards y.
     quarters = (("left_near", 0), ("right_near", 1), ("right_far", 2), ("left_far", 3))
     for corner, quarter in quarters:
         arcs[f"corner_arc_{corner}"] = ArcSpec(

@@ -1,4 +1,4 @@
-"""A survey laid onto the world frame: rigid alignment, length, width, crown and what is left."""
+"""Alignment of a survey with the world frame: rigid transform, length, width, crown, residuals."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from worldpose.pitch.survey_settings import SurveySettings
 
 @dataclass(frozen=True, eq=False)
 class SurveyFit:
-    """A surveyed pitch, and how far the survey lies from the Laws of the Game.
+    """A surveyed pitch, and its residuals from the Laws of the Game.
 
     Attributes:
         pitch: length, width, crown and the surveyed points in the world frame.
         names: of the points, as in the survey.
         offset_plan: (n,) distance in plan between survey and law [m].
         offset_height: (n,) height of the survey above the crowned surface [m]; NaN without height.
-        scale: of the survey's lengths over true ones, from markings of prescribed size [1].
-        slope: fall of the pitch's plane that was levelled, along x and y of the world [1].
+        scale: survey lengths over true ones, from markings of prescribed size [1].
+        slope: slope of the pitch's plane before levelling, along x and y of the world [1].
         measured: which of length, width and crown the survey determined; others are standard.
     """
 
@@ -48,20 +48,20 @@ class SurveyFit:
 
 
 def fit_survey(survey: Survey, settings: SurveySettings | None = None) -> SurveyFit:
-    """The pitch of a survey in any frame whose heights are up, moved into the world frame.
+    """Fit the pitch to a survey in any frame with heights upwards, and move it to the world frame.
 
-    The names say which way round: left and right, near and far are those of a person at the main
-    camera, which stands at negative y. The frame is turned, shifted and levelled, never stretched
-    unless `fit_scale` says so. Length, width and crown are fitted by least squares; what the
-    survey does not tell stays near 105 m, 68 m and 0.2 m.
+    The names determine the orientation: left and right, near and far are those of a person at the
+    main camera, which stands at negative y. The frame is rotated, shifted and levelled, and scaled
+    only with `fit_scale`. Length, width and crown are fitted by least squares; values that the
+    survey does not determine stay near 105 m, 68 m and 0.2 m.
 
     Args:
-        survey: named places.
+        survey: named positions.
         settings: the defaults if None.
 
     Raises:
         InputError: fewer than four points, or all near one line; another unit than metres; a
-            mirror image; points that lie far from where their names belong.
+            mirror image; points far from the positions of their names.
 
     Note:
         C1.
@@ -104,7 +104,7 @@ def fit_survey(survey: Survey, settings: SurveySettings | None = None) -> Survey
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """The survey seen from above, in the world: survey and law (n, 2) [m], and the turn."""
+    """The survey in plan, in the world: survey and law (n, 2) [m], and the rotation."""
 
     places: NDArray[np.float64]
     law: NDArray[np.float64]
@@ -126,7 +126,7 @@ class _Heights:
 
 
 _ROUNDS: Final = 30
-"""Of reweighted Gauss-Newton; the loss has its final width after ten."""
+"""Iterations of reweighted Gauss-Newton; the loss has its final width after ten."""
 
 
 def _fit(
@@ -137,7 +137,7 @@ def _fit(
 
 
 def _levelled(places: NDArray[np.float64], level: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Places (n, 3) [m] after a rotation; a point without height is taken to lie on the plane."""
+    """Return points (n, 3) [m] after a rotation; a point without height lies on the plane."""
     taken = np.isfinite(places[:, 2])
     if not taken.any():
         return places
@@ -152,7 +152,7 @@ def _levelled(places: NDArray[np.float64], level: NDArray[np.float64]) -> NDArra
 def _fit_plan(
     survey: Survey, places: NDArray[np.float64], settings: SurveySettings, stretch: bool = False
 ) -> _Plan:
-    """Turn, shift, length and width by robust least squares, and the scale if it may differ."""
+    """Fit rotation, shift, length and width by robust least squares, with `stretch` the scale."""
     law, change = law_places(survey)
     middle = places.mean(axis=0)
     centred = places - middle
@@ -164,7 +164,7 @@ def _fit_plan(
     for round_ in range(_ROUNDS):
         turned = centred @ turn.T
         residual = scale * turned + shift - law[:, :2] - change * size
-        # Wide at first: the start may be metres off where the pitch is not 105 x 68 m.
+        # Wide at first: the start may be metres off if the pitch is not 105 x 68 m.
         loss = max(3.0 * settings.accuracy, 3.0 * 0.7**round_)
         weight = 1.0 / (1.0 + np.sum(residual**2, axis=-1) / loss**2)
         jacobian = np.zeros((len(places), 2, 6))
@@ -196,7 +196,7 @@ def _fit_plan(
 def _fit_heights(
     survey: Survey, plan: _Plan, heights: NDArray[np.float64], settings: SurveySettings
 ) -> _Heights:
-    """Level, slope and crown by least squares on the points with a height."""
+    """Fit level, slope and crown by least squares to the points with a height."""
     above = law_places(survey)[0][:, 2]
     ridge = -((plan.places[:, 1] / (0.5 * plan.width)) ** 2)
     taken = np.isfinite(heights)
@@ -227,7 +227,7 @@ def _fit_heights(
 
 
 def _levelling(slope: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotation (3, 3) that takes the normal of a plane with this slope to the vertical."""
+    """Return the rotation (3, 3) that makes a plane with this slope horizontal."""
     normal = np.array([-slope[0], -slope[1], 1.0]) / np.sqrt(1.0 + slope @ slope)
     x, y, z = normal
     return np.array(
@@ -240,16 +240,16 @@ def _levelling(slope: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _scale(survey: Survey, places: NDArray[np.float64], settings: SurveySettings) -> float:
-    """Lengths in the survey over true ones.
+    """Return the ratio of lengths in the survey to true ones.
 
     Raises:
-        InputError: they differ by more than any grid does.
+        InputError: the ratio differs from 1 by more than in any grid.
     """
     nominal = nominal_places(survey)
     extents = [np.linalg.norm(each - each.mean(axis=0)) for each in (places, nominal)]
     gross = float(extents[0] / extents[1])
     scale = gross
-    if abs(gross - 1.0) < 0.3:  # within the fit's reach: markings of prescribed size decide
+    if abs(gross - 1.0) < 0.3:  # within the fit's convergence range: prescribed markings decide
         turn = _fit_plan(survey, places, settings, stretch=True).turn
         scale = 1.0 / float(np.sqrt(np.linalg.det(turn)))
     if abs(scale - 1.0) <= settings.largest_scale:

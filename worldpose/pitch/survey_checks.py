@@ -1,4 +1,4 @@
-"""What a survey must be before, and after, it is laid onto the world frame."""
+"""Validation of a survey before and after its alignment with the world frame."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from worldpose.pitch.survey_file import Survey
 from worldpose.pitch.survey_settings import SurveySettings
 
 STANDARD_SIZE = (105.0, 68.0)
-"""Length and width that a pitch is taken to have at first [m]."""
+"""Initial length and width of a pitch [m]."""
 
 
 def law_places(survey: Survey) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where the Laws of the Game put the survey's points.
+    """Return the positions of the survey's points in the Laws of the Game.
 
     Returns:
-        Places (n, 3) [m] on a pitch of no length and width, z above the surface, and the change of
-        x by length and of y by width (n, 2) [1].
+        Positions (n, 3) [m] on a pitch of no length and width, z above the surface, and the change
+        of x by length and of y by width (n, 2) [1].
     """
     base, larger = law_points(0.0, 0.0), law_points(1.0, 1.0)
     at = np.array([base[name] for name in survey.names]).reshape(-1, 3)
@@ -28,28 +28,28 @@ def law_places(survey: Survey) -> tuple[NDArray[np.float64], NDArray[np.float64]
 
 
 def nominal_places(survey: Survey) -> NDArray[np.float64]:
-    """Where the points lie in plan (n, 2) [m] on a pitch of 105 x 68 m."""
+    """Return the points' positions in plan (n, 2) [m] on a pitch of 105 x 68 m."""
     law, change = law_places(survey)
     return np.asarray(law[:, :2] + change * STANDARD_SIZE)
 
 
 def best_turn(centred: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotation (2, 2) that brings centred places nearest to others."""
+    """Return the rotation (2, 2) that brings centred points nearest to others."""
     (a, b), (c, d) = centred.T @ (places - places.mean(axis=0))
     return plane_rotation(float(np.arctan2(b - c, a + d)))
 
 
 def plane_rotation(angle: float) -> NDArray[np.float64]:
-    """The rotation (2, 2) by an angle [rad], from x towards y."""
+    """Return the rotation (2, 2) by an angle [rad], from x towards y."""
     cosine, sine = np.cos(angle), np.sin(angle)
     return np.array([[cosine, -sine], [sine, cosine]])
 
 
 def require_spread(survey: Survey) -> None:
-    """Refuse fewer than four points, or points near one line.
+    """Reject fewer than four points, or points near one line.
 
     Raises:
-        InputError: naming what there is.
+        InputError: it names the points.
     """
     enough = len(survey.names) >= 4
     for places in (survey.places[:, :2], nominal_places(survey)) if enough else ():
@@ -67,15 +67,15 @@ def require_spread(survey: Survey) -> None:
 def require_orientation(
     survey: Survey, places: NDArray[np.float64], settings: SurveySettings
 ) -> None:
-    """Refuse a survey whose mirror image fits far better than itself.
+    """Reject a survey whose mirror image fits far better than the survey.
 
     Args:
         survey: for its names and messages.
-        places: (n, 2) [m], in a right-handed frame if the settings are true.
-        settings: what was said about the frame.
+        places: (n, 2) [m], in a right-handed frame if the settings are correct.
+        settings: stated handedness of the frame.
 
     Raises:
-        InputError: saying what may be the matter.
+        InputError: it names possible causes.
     """
     nominal = nominal_places(survey)
     target = nominal - nominal.mean(axis=0)
@@ -97,15 +97,15 @@ def require_orientation(
 
 
 def require_names(survey: Survey, offsets: NDArray[np.float64], settings: SurveySettings) -> None:
-    """Refuse points that are far from where their names belong.
+    """Reject points that are far from the positions of their names.
 
     Args:
         survey: for its names and messages.
         offsets: (n, 2) of the aligned survey from the Laws [m].
-        settings: how far a painter can be off.
+        settings: largest plausible error of the markings.
 
     Raises:
-        InputError: naming the points.
+        InputError: it names the points.
     """
     offset = np.linalg.norm(offsets, axis=-1)
     far = [

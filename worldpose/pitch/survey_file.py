@@ -1,4 +1,4 @@
-"""Surveyed markings as a surveyor hands them over: a CSV of named places."""
+"""Reader of a survey: a CSV file of named points."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from worldpose.errors import InputError
 from worldpose.pitch.laws import law_lines, law_points
 
 SURVEY_BYTES: Final = 1 << 20
-"""Most that a survey may hold [byte]; all named points take 3 kB."""
+"""Largest size of a survey [byte]; all named points take 3 kB."""
 
 COLUMNS: Final[Mapping[str, str]] = {
     "x": "x",
@@ -27,18 +27,18 @@ COLUMNS: Final[Mapping[str, str]] = {
     "northing": "y",
     "height": "z",
 }
-"""Names of columns and the axis each is; a grid's easting and northing make a right-handed frame
-whatever their order in the file."""
+"""Axis of each column; a grid's easting and northing make a right-handed frame whatever their order
+in the file."""
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Surveyed places of named points, in the surveyor's own frame.
+    """Surveyed positions of named points, in the surveyor's own frame.
 
     Attributes:
         where: the file, for messages.
         names: of the pitch template's points, each once.
-        places: (n, 3) [m]; z is up, NaN where no height was taken.
+        places: (n, 3) [m]; z is up, NaN without a height.
     """
 
     where: str
@@ -47,15 +47,15 @@ class Survey:
 
 
 def read_survey(path: Path) -> Survey:
-    """The places of a CSV file with the columns name, x, y and, where heights were taken, z.
+    """Read the positions in a CSV file with the columns name, x, y and, if heights are known, z.
 
     A name is a point of the pitch template, or an end of a line as `<line>.start` or `<line>.end`.
-    `easting`, `northing` and `height` may stand for x, y and z. Separators are commas, semicolons
-    or tabs.
+    `easting`, `northing` and `height` may replace x, y and z. Separators are commas, semicolons or
+    tabs.
 
     Raises:
-        InputError: naming file and row: unreadable, a column missing or unknown, an unknown name,
-            one that comes twice, or something that is no number.
+        InputError: it names file and row: unreadable, a missing or unknown column, an unknown or
+            repeated name, or text that is no number.
     """
     rows = _rows(path)
     if not rows:
@@ -90,7 +90,7 @@ def read_survey(path: Path) -> Survey:
 
 
 def line_ends() -> dict[str, str]:
-    """The point that every `<line>.start` and `<line>.end` is."""
+    """Return the point for every `<line>.start` and `<line>.end`."""
     lines = law_lines()
     starts = {f"{name}.start": line.start for name, line in lines.items()}
     return starts | {f"{name}.end": line.end for name, line in lines.items()}
@@ -114,7 +114,7 @@ def _rows(path: Path) -> list[list[str]]:
 
 
 def _number(where: str, title: str, values: Mapping[str, str]) -> float:
-    """A number; NaN for a height that is left empty."""
+    """Return a number; NaN for an empty height."""
     text = values[title]
     if COLUMNS[title] == "z" and not text:
         return math.nan

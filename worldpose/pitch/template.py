@@ -1,4 +1,4 @@
-"""The pitch as a non-planar template: named points, markings and the crowned surface."""
+"""Non-planar pitch template: named points, markings and the crowned surface."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from worldpose.pitch.laws import (
 
 @dataclass(frozen=True, eq=False)
 class MarkingSamples:
-    """Points along the painted markings, each with the marking that it lies on."""
+    """Points along the painted markings, each with the index of its marking."""
 
     points_world: NDArray[np.float64]
     """(n, 3) [m], world."""
     marking: NDArray[np.int64]
     """(n,) indices into `names`."""
     names: tuple[str, ...]
-    """The markings."""
+    """Names of the markings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +62,8 @@ class PitchTemplate:
     arcs: dict[str, ArcSpec]
     """`center_circle`, `penalty_arc_{side}`, `corner_arc_{side}_{end}`."""
     goals: dict[str, LineSpec]
-    """`goal_post_{side}_{end}`, `crossbar_{side}`: seen and drawn like markings, but not painted on
-    the surface."""
+    """`goal_post_{side}_{end}`, `crossbar_{side}`: visible and drawn like markings, but not painted
+    on the surface."""
 
     @classmethod
     def standard(cls) -> PitchTemplate:
@@ -101,7 +101,7 @@ class PitchTemplate:
         along, across = np.broadcast_arrays(
             np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
         )
-        # Adding 0 x keeps a missing x missing.
+        # The term 0 x propagates NaN in x.
         return np.asarray(_ridge(across, self.width, self.crown) + 0.0 * along)
 
     def positions(self, names: Sequence[str]) -> NDArray[np.float64]:
@@ -154,7 +154,7 @@ class PitchTemplate:
         """Return points along all markings, both ends included, evenly spaced in plan.
 
         Between its ends a marking follows the crown. Where surveyed ends lie above or below the
-        crown, the marking takes their offsets, changing evenly from one end to the other.
+        crown, the offset of the marking is interpolated linearly between its ends.
 
         Args:
             spacing: largest distance in plan between neighbours on one marking [m].
@@ -191,7 +191,7 @@ class PitchTemplate:
         steps = _steps(span * arc.radius, spacing)
         angle = np.linspace(arc.start_angle, arc.end_angle, steps + 1)
         if math.isclose(span, 2.0 * math.pi):
-            angle = angle[:-1]  # its end is its start
+            angle = angle[:-1]  # the end equals the start
         points = np.tile(self._above_surface(self.points[arc.center]), (len(angle), 1))
         points[:, 0] += arc.radius * np.cos(angle)
         points[:, 1] += arc.radius * np.sin(angle)
@@ -212,7 +212,7 @@ def _ridge(
 
 
 def _steps(extent: float, spacing: float) -> int:
-    # Rounding of the extent must not add a step to a whole number of them.
+    # Rounding errors of the extent must not add a step.
     return max(1, math.ceil(extent / spacing - 1e-9))
 
 

@@ -1,7 +1,7 @@
-"""Redetection: people looked for again where bodies say that a camera must show them (R2).
+"""Redetection of people at the predicted projections of their bodies (R2).
 
-Input: bodies of the iteration before in one camera's pictures, whom it detected, a pose estimator.
-Output: whom it was asked for, what it answered, and which of the answers are theirs.
+Input: bodies of the previous iteration in one camera's frames, its detections, a pose estimator.
+Output: the people searched for, the estimator's results, and the accepted ones.
 """
 
 from worldpose.redetection.answers import Answers, Verdicts, judge_answers, look_again

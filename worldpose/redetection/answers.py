@@ -1,4 +1,4 @@
-"""What a pose estimator answers where people are sought, and whose poses those are."""
+"""Results of a pose estimator in predicted boxes, and their acceptance."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from worldpose.detection import People, PoseEstimator, Poses
 from worldpose.detection.boxes import SUREST, areas, overlaps, seen_closer
 from worldpose.detection.interfaces import Picture
-from worldpose.detection.same_pose import likeness
+from worldpose.detection.oks_nms import likeness
 from worldpose.filtering import (
     BodyViews,
     FilteringSettings,
@@ -28,14 +28,14 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 FEWEST: Final = 8
-"""Keypoints that an answer must have [1]: half a body."""
+"""Least number of keypoints of a result [1]: half a body."""
 FARTHEST: Final = 0.3
-"""A joint that is farther from a keypoint counts as this far [m]."""
+"""Cap on the distance between a joint and a keypoint [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """What was seen of each who is sought; NaN where there was no picture.
+    """Estimated poses of the people searched for; NaN where there was no frame.
 
     Attributes:
         keypoints: (n, 17, 2) [px]; NaN where not found.
@@ -51,26 +51,26 @@ class Answers:
 
     @classmethod
     def none(cls, count: int) -> Answers:
-        """Nothing of so many."""
+        """Return empty results for `count` people."""
         empty = (np.full((count, *shape), np.nan) for shape in ((17, 2), (17,), (4,), ()))
         return cls(*empty)
 
     @property
     def sureness(self) -> Floats:
-        """Mean confidence of the surest keypoints (n,), 0 without any."""
+        """Return the mean confidence of the surest keypoints (n,), 0 without any."""
         return np.asarray(np.sort(np.nan_to_num(self.confidence), axis=1)[:, -SUREST:].mean(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
 class Verdicts:
-    """Which answers are the person's; each is of one kind.
+    """Classification of results; each is of one kind.
 
     Attributes:
-        found: (n,) it is.
-        unsure: (n,) the estimator itself doubts it, or there was no picture.
+        found: (n,) it is the person's.
+        unsure: (n,) of low confidence, or there was no frame.
         elsewhere: (n,) it is not where the body is.
-        another: (n,) it is somebody else's, or there already.
-        rejected: (n, 17) keypoints of it that are not where the body is.
+        another: (n,) it is another person's, or a duplicate.
+        rejected: (n, 17) its keypoints that are not where the body is.
     """
 
     found: Flags
@@ -87,15 +87,15 @@ def look_again(
     least_keypoint: float,
     detected: Floats | None = None,
 ) -> Answers:
-    """Return what an estimator sees where people should be.
+    """Return the poses that an estimator finds in predicted boxes.
 
     Args:
-        pictures: by place among the frames, rising, at least those with somebody sought.
-        sought: who, and where.
+        pictures: images by index of the frame, rising, at least the frames to search in.
+        sought: people and boxes.
         estimator: of poses.
         least_keypoint: a keypoint below this confidence was not found [1].
-        detected: (frames, detections, 4) boxes of who was detected [px]: an estimator may tell
-            people apart by where their neighbours stand.
+        detected: (frames, detections, 4) boxes of detections [px]: an estimator may separate people
+            by the boxes of their neighbours.
     """
     answers = Answers.none(len(sought.frame))
     for frame, picture in pictures:
@@ -115,13 +115,13 @@ def look_again(
         answers.confidence[rows] = np.where(there, poses.confidence, np.nan)
         answers.boxes[rows] = people.boxes
         answers.score[rows] = people.scores
-    plain = answers.score >= 1.0  # of an estimator that tells no more
+    plain = answers.score >= 1.0  # of an estimator without boxes and fit
     answers.score[plain] = np.clip(answers.sureness[plain], 1e-3, 1.0)
     return answers
 
 
 def _first(poses: Poses, count: int) -> Poses:
-    """Return the poses of the first so many."""
+    """Return the first `count` poses."""
     boxes, fit = (None if each is None else each[:count] for each in (poses.boxes, poses.fit))
     return Poses(poses.keypoints[:count], poses.confidence[:count], boxes, fit)
 
@@ -135,24 +135,24 @@ def judge_answers(
     noise: tuple[float, float],
     settings: RedetectionSettings,
 ) -> Verdicts:
-    """Return which answers are of whom they were sought for.
+    """Return the classification of results.
 
-    An answer counts where the estimator is sure of it, where it agrees with the body within what
-    both are unsure of, and where it is nobody else's: no other body explains it better, no
-    detection of the picture has that pose already, nor has a better answer.
+    A result is accepted if the estimator is confident, if it agrees with the body within the
+    uncertainty of both, and if it is no other person's: no other body explains it better, and
+    neither a detection in the frame nor a better result has that pose already.
 
     Args:
         answers: of the estimator.
-        sought: whom they are for.
-        expected: all bodies before the camera.
+        sought: the people of these results.
+        expected: all bodies in view of the camera.
         detected: keypoints (frames, detections, 17, 2) and boxes (frames, detections, 4) [px] of
-            those who were detected in all frames.
-        spread: of keypoints about bodies.
-        noise: what keypoints are stated to err by, [px] and [m].
-        settings: what an answer must fulfil.
+            the detections in all frames.
+        spread: of keypoints around bodies.
+        noise: stated standard deviation of keypoints, [px] and [m].
+        settings: acceptance thresholds.
     """
     agrees, rejected = _agreeing(answers, sought, expected, spread, noise, settings)
-    unsure = ~(answers.sureness >= settings.least_confidence)
+    unsure = ~(answers.sureness >= settings.min_confidence)
     away = _distances(answers, sought, expected)
     rows = np.arange(len(away))
     own = away[rows, sought.person]
@@ -166,7 +166,7 @@ def judge_answers(
         boxes = np.concatenate([answers.boxes[here], detected[1][frame]])
         pose = np.concatenate([answers.keypoints[here], detected[0][frame]])
         alike = likeness(pose, np.nan_to_num(areas(boxes)))[: len(here)]
-        same = np.asarray(alike > settings.same_pose)
+        same = np.asarray(alike > settings.oks_nms)
         for k, row in enumerate(here):
             before = same[k, :k] & ~another[here[:k]]
             another[row] = before.any() or same[k, len(here) :].any()
@@ -181,7 +181,7 @@ def _agreeing(
     noise: tuple[float, float],
     settings: RedetectionSettings,
 ) -> tuple[Flags, Flags]:
-    """Which answers (n,) the bodies do not contradict, and which of their keypoints they do."""
+    """Return which results (n,) agree with their bodies, and which of their keypoints do not."""
     count = len(sought.frame)
     at = sought.frame, sought.person
     image, variance, scale = (
@@ -198,16 +198,16 @@ def _agreeing(
     )
     rules = FilteringSettings(
         max_deviation=settings.max_deviation,
-        least_fitting=settings.least_fitting,
-        least_similarity=settings.least_similarity,
-        fewest=FEWEST,
+        min_inlier_share=settings.min_inlier_share,
+        min_similarity=settings.min_similarity,
+        min_keypoints=FEWEST,
     )
     judged = judge_detections(BodyViews(image, variance, scale), suspects, spread, rules)
     return judged.fits[:, 0, 0] == 0, judged.rejected[:, 0, 0]
 
 
 def _distances(answers: Answers, sought: Sought, expected: Expected) -> Floats:
-    """Mean distances (n, persons) of an answer's keypoints to bodies of its frame [m]."""
+    """Return mean distances (n, persons) of a result's keypoints to bodies of its frame [m]."""
     image, scale = expected.image[sought.frame], expected.scale[sought.frame]
     with np.errstate(invalid="ignore"):
         away = np.linalg.norm(answers.keypoints[:, None] - image, axis=-1) / scale

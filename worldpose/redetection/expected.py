@@ -1,4 +1,4 @@
-"""Bodies as one camera's pictures should show them: where, how large, and behind whom."""
+"""Bodies projected into one camera's frames: positions, sizes and occlusions."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from worldpose.filtering import BodyViews
 Floats = NDArray[np.float64]
 
 AROUND: Final = (0.12, 0.20, 0.12, 0.10)
-"""How far a person reaches beyond the joints: left, up to the top of the head, right, and down to
-the soles [m]."""
+"""Margins of a person beyond the joints: left, up to the top of the head, right, and down to the
+soles [m]."""
 BEHIND: Final = 0.2
-"""A body hides what is farther away than it is by more than this [m]."""
+"""A body occludes joints that are farther away than it by more than this [m]."""
 _TRUNK: Final = tuple(
     COCO17.index(f"{side}_{part}") for part in ("shoulder", "hip") for side in ("left", "right")
 )
 
 
 def _capsules() -> tuple[NDArray[np.int64], Floats]:
-    """Pairs of joints that a body is solid between, and its radius there [m]."""
+    """Return pairs of joints at the ends of a body's solid parts, and their radii [m]."""
     trunk = set(_TRUNK)
     ends = [*COCO17_BONES, (_TRUNK[0], _TRUNK[3]), (_TRUNK[1], _TRUNK[2]), (3, 4)]
     radius = [0.12 if a < 5 and b < 5 else 0.11 if {a, b} <= trunk else 0.06 for a, b in ends]
@@ -36,13 +36,13 @@ _ENDS, _RADIUS = _capsules()
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Bodies before one camera, (frames, persons, 17) each; NaN without a body.
+    """Bodies in view of one camera, (frames, persons, 17) each; NaN without a body.
 
     Attributes:
-        image: (..., 2) where a detector is expected to see joints [px].
-        variance: of `image` per axis [px^2], as far as the bodies are unsure.
-        scale: how large a metre is there [px/m].
-        depth: along the camera's axis of view [m].
+        image: (..., 2) expected detections of joints [px].
+        variance: of `image` per axis [px^2], from the uncertainty of the bodies.
+        scale: pixels per metre there [px/m].
+        depth: along the camera's optical axis [m].
     """
 
     image: Floats
@@ -52,11 +52,11 @@ class Expected:
 
     @classmethod
     def of(cls, views: BodyViews, beside: Floats, focal: float) -> Expected:
-        """Return what the only camera of `views` should see.
+        """Return the expected image of the bodies in the only camera of `views`.
 
         Args:
-            views: bodies in the pictures of one camera.
-            beside: (frames, persons, 17, 2) [px] by which keypoints are expected beside them.
+            views: bodies in the frames of one camera.
+            beside: (frames, persons, 17, 2) [px] expected offset of keypoints from the joints.
             focal: of the camera [px].
         """
         scale = views.scale[:, 0]
@@ -66,7 +66,7 @@ class Expected:
 
     @property
     def boxes(self) -> Floats:
-        """Whole bodies (frames, persons, 4) x0, y0, x1, y1 [px]; NaN where a joint is missing."""
+        """Return bodies' boxes (frames, persons, 4) [px]: x0, y0, x1, y1; NaN if incomplete."""
         left, up, right, down = (side * self.scale for side in AROUND)
         x, y = self.image[..., 0], self.image[..., 1]
         sides = [(x - left).min(-1), (y - up).min(-1), (x + right).max(-1), (y + down).max(-1)]
@@ -74,12 +74,12 @@ class Expected:
 
     @property
     def unsure(self) -> Floats:
-        """Median standard deviation of a body's joints across the view (frames, persons) [m]."""
+        """Return median standard deviations of joints across the view (frames, persons) [m]."""
         with np.errstate(invalid="ignore"):
             return np.asarray(np.median(np.sqrt(self.variance) / self.scale, axis=-1))
 
     def hidden(self, frame: int) -> NDArray[np.bool_]:
-        """Which joints (persons, 17) of a frame lie behind somebody else's body."""
+        """Return which joints (persons, 17) of a frame another person's body occludes."""
         image, scale, depth = self.image[frame], self.scale[frame], self.depth[frame]
         begin, end = image[:, _ENDS[:, 0]], image[:, _ENDS[:, 1]]
         along = end - begin

@@ -1,4 +1,4 @@
-"""Whom to look for again, where, and in which pictures."""
+"""People missing from detections, with the boxes and frames to search."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ Places = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Sought:
-    """People to look for, a row each; frames rise.
+    """People to search for, one per row, by rising frames.
 
     Attributes:
-        frame: (n,) place among the frames.
-        person: (n,) place among the persons.
-        boxes: (n, 4) where they should be [px].
-        hidden: how many more there would be, did nobody stand before them.
+        frame: (n,) index of the frame.
+        person: (n,) index of the person.
+        boxes: (n, 4) predicted boxes [px].
+        hidden: number of further people, left out because others occlude them.
     """
 
     frame: Places
@@ -42,23 +42,23 @@ def whom_to_seek(
     place: Place | None = None,
     margin: float = 0.0,
 ) -> Sought:
-    """Return who should be seen well and is not.
+    """Return the people that should be visible and have no detection.
 
     Args:
-        expected: the bodies before one camera.
-        seen: (frames, persons) who was detected there.
-        size: width, height of the pictures [px].
-        settings: who counts as seen well.
-        place: where the camera stands; None where there is no pitch.
-        margin: how far outside of the lines is still on the pitch [m].
+        expected: the bodies in view of one camera.
+        seen: (frames, persons) whether the person was detected there.
+        size: width, height of the frames [px].
+        settings: thresholds of visibility.
+        place: camera and pitch; None where there is no pitch.
+        margin: largest distance outside of the lines that still counts as on the pitch [m].
     """
     boxes = expected.boxes
     with np.errstate(invalid="ignore"):
-        tall = boxes[..., 3] - boxes[..., 1] >= settings.least_height_px
-        wanted = ~seen & tall & (expected.unsure <= settings.most_unsure_m)
+        tall = boxes[..., 3] - boxes[..., 1] >= settings.min_height_px
+        wanted = ~seen & tall & (expected.unsure <= settings.max_uncertainty_m)
         within = (expected.image >= -0.5) & (expected.image <= np.array(size) - 0.5)
     shown = np.asarray(within.all(axis=-1))
-    wanted &= shown.mean(axis=-1) >= settings.least_in_sight
+    wanted &= shown.mean(axis=-1) >= settings.min_visible_share
     frame, person = np.nonzero(wanted)
     if place is not None and len(frame):
         cut = np.minimum(boxes[frame, person], np.array([*size, *size]) - 0.5)
@@ -68,18 +68,18 @@ def whom_to_seek(
     for each in np.unique(frame):
         rows = np.flatnonzero(frame == each)
         there = shown[each, person[rows]] & ~expected.hidden(int(each))[person[rows]]
-        bare[rows] = there.mean(axis=-1) >= settings.least_in_sight
+        bare[rows] = there.mean(axis=-1) >= settings.min_visible_share
     frame, person = frame[bare], person[bare]
     return Sought(frame, person, boxes[frame, person], int(np.count_nonzero(~bare)))
 
 
 def who_is_seen(index: NDArray[np.integer], fits: NDArray[np.integer], dropped: Flags) -> Flags:
-    """Return who was detected (frames, persons), by detections that fit or could not be judged.
+    """Return which people have detections (frames, persons) that fit or could not be judged.
 
     Args:
-        index: (frames, persons), place among the camera's detections; -1 = not seen.
-        fits: (frames, detections), place among the persons of the body that each fits; -1 = none.
-        dropped: (frames, detections), that fit nobody.
+        index: (frames, persons), index of the camera's detection; -1 = not seen.
+        fits: (frames, detections), index of the person whose body each fits; -1 = none.
+        dropped: (frames, detections), that fit no body.
     """
     detections = fits.shape[1]
     seen = np.zeros(index.shape, dtype=np.bool_)

@@ -1,6 +1,6 @@
-"""Reports that people read: HTML pages, plots, overlays and videos.
+"""Reports: HTML pages, plots, overlays and videos.
 
-The modules that draw load matplotlib; `html_page` and `run_report` do not.
+Drawing modules import matplotlib; `html_page` and `run_report` do not.
 """
 
 from worldpose.reports.html_page import Picture, Section, Table

@@ -1,4 +1,4 @@
-"""Fitted bodies over what a camera saw."""
+"""Rendering of fitted bodies over a camera's image."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 WIDTH: Final = 1540
-"""Of the picture [px]."""
+"""Width of the image [px]."""
 SHARE: Final = 0.3
-"""Part of the camera's picture that is shown: players of 80 px are 210 px tall then."""
+"""Share of the camera's image to show: players of 80 px are then 210 px tall."""
 _GROUND: Final = (206, 217, 202)
 _PALE: Final = 0.35
-"""Share of white in the colours of large bodies, on which shading is seen [1]."""
+"""Share of white in the colours of large bodies, to make shading visible [1]."""
 _SUBPIXEL: Final = 4
-"""Bits of a corner's place below the pixel."""
+"""Fractional bits of pixel coordinates."""
 
 
 def bodies_picture(
@@ -40,16 +40,16 @@ def bodies_picture(
     still: Picture | None = None,
     pitch: PitchSpec | None = None,
 ) -> bytes:
-    """Return a PNG of everybody's body as one camera sees it: the part with most of them.
+    """Return a PNG of all bodies in one camera: the part of the image with most people.
 
     Args:
         camera: a single camera.
-        title: says which camera, frame and body model.
-        surfaces: (persons, vertices, 3) [m], world; NaN for a person who is missing.
+        title: names camera, frame and body model.
+        surfaces: (persons, vertices, 3) [m], world; NaN for missing people.
         faces: (triangles, 3), counter-clockwise seen from outside.
         person_ids: (persons,).
-        still: the camera's picture (height, width, 3), RGB, beneath; None = plain ground.
-        pitch: its markings are drawn where there is no still; None where there is no pitch.
+        still: background image (height, width, 3), RGB, of the camera; None = plain ground.
+        pitch: draw its markings if there is no still; None without a pitch.
     """
     present = np.isfinite(surfaces[:, 0, 0])
     ids = np.asarray(person_ids)[present]
@@ -77,7 +77,7 @@ def bodies_picture(
 
 
 def crowded_part(camera: Camera, bodies: Floats) -> tuple[Floats, Floats]:
-    """Return corner and side lengths [px] of the part of a picture that shows most people.
+    """Return corner and side lengths [px] of the part of an image that shows most people.
 
     Args:
         camera: a single camera.
@@ -112,7 +112,7 @@ def _background(
     canvas: Picture = np.full((height, width, 3), _GROUND, dtype=np.uint8)
     for line in markings(pitch) if pitch is not None else ():
         pixels = camera.project(line)
-        # What is far outside has no place in 32 bits, and none in the picture.
+        # Points far outside do not fit into 32 bits, and are not visible.
         near: NDArray[np.bool_] = np.all(np.abs(pixels) < 1e4, axis=-1)
         for start in np.flatnonzero(near[:-1] & near[1:]):
             a, b = np.rint(pixels[start : start + 2] * 2**_SUBPIXEL).astype(int).tolist()

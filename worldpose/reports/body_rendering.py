@@ -1,4 +1,4 @@
-"""Bodies painted over a picture: shaded, the nearest on top, as solid as one likes."""
+"""Rasterizer for bodies over an image, with shading, depth test and opacity."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ Singles = NDArray[np.float32]
 Picture = NDArray[np.uint8]
 
 _SUN: Final = np.array([0.35, -0.45, 0.82], dtype=np.float32)
-"""Where light comes from, world: high, from the main camera's side."""
+"""Direction to the light, world: high, from the main camera's side."""
 _AMBIENT: Final = 0.45
 _SUNLIT: Final = 0.3
 _FACING: Final = 0.25
-"""Shares of the light: from all around, from the sun, from where the camera is."""
+"""Shares of ambient light, sunlight and light from the camera."""
 
 
 @dataclass(frozen=True, eq=False)
 class BodyTracks:
-    """Everybody's body in the frames of a clip."""
+    """Bodies of all people in the frames of a clip."""
 
     frames: NDArray[np.int64]
     """(frames,) match frames."""
@@ -38,17 +38,17 @@ class BodyTracks:
     poses: BodyParameters
     """A batch (frames, persons); NaN where a person is missing."""
     model: BodyModel
-    """Whose parameters these are."""
+    """Body model of `poses`."""
 
 
 def zoomed(camera: Camera, corner: Floats, scale: float, size: tuple[int, int]) -> Camera:
-    """Return the camera whose picture is a part of another's, enlarged.
+    """Return the camera of an enlarged part of another camera's image.
 
     Args:
-        camera: the other, a single one.
-        corner: top left of the part [px]; (-0.5, -0.5) is that of the picture.
+        camera: the other camera, single.
+        corner: top left of the part [px]; (-0.5, -0.5) is that of the image.
         scale: enlargement [1].
-        size: width and height of the new picture [px].
+        size: width and height of the new image [px].
     """
     return replace(
         camera,
@@ -67,15 +67,15 @@ def paint_bodies(
     *,
     opacity: float = 1.0,
 ) -> None:
-    """Paint bodies over a picture; where they overlap, the nearest is seen.
+    """Draw bodies over an image with a depth test.
 
     Args:
-        canvas: (height, width, 3), RGB, painted over.
-        camera: a single camera whose picture it is.
+        canvas: (height, width, 3), RGB, modified in place.
+        camera: the image's camera, single.
         bodies: (persons, vertices, 3) [m], world, finite.
         faces: (triangles, 3), counter-clockwise seen from outside.
         colors: (persons, 3) in 0..1.
-        opacity: of what is painted; 1 hides what is behind it. Below, each body has a solid rim.
+        opacity: of the bodies; 1 is opaque. Below 1, each body has an opaque rim.
     """
     height, width = canvas.shape[:2]
     surfaces = bodies.astype(np.float32)
@@ -116,7 +116,7 @@ def paint_bodies(
 
 
 def _rim(owner: NDArray[np.int16]) -> NDArray[np.bool_]:
-    """Pixels (height, width) of a body beside those of nobody or of somebody else."""
+    """Return the mask (height, width) of body pixels next to background or another body."""
     around = np.pad(owner, 1, mode="edge")
     inner = around[1:-1, 1:-1]
     beside = (around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:])
@@ -125,7 +125,7 @@ def _rim(owner: NDArray[np.int16]) -> NDArray[np.bool_]:
 
 
 def _corners(faces: NDArray[np.int32], vertices: int) -> scipy.sparse.csr_array:
-    """Which triangles meet at each vertex (vertices, triangles)."""
+    """Return the vertex-triangle incidence matrix (vertices, triangles)."""
     number = np.repeat(np.arange(len(faces)), 3)
     ones = np.ones(faces.size, dtype=np.float32)
     return scipy.sparse.csr_array((ones, (faces.ravel(), number)), (vertices, len(faces)))
@@ -134,7 +134,7 @@ def _corners(faces: NDArray[np.int32], vertices: int) -> scipy.sparse.csr_array:
 def _light(
     surface: Singles, faces: NDArray[np.int32], corners: scipy.sparse.csr_array, eye: Singles
 ) -> Singles:
-    """The light on each vertex (vertices,), 1 = as its colour is."""
+    """Return the light at each vertex (vertices,); 1 = unchanged colour."""
     a, b, c = (surface[faces[:, k]] for k in range(3))
     normals = _unit(corners @ np.cross(b - a, c - a))
     facing = np.einsum("vc,vc->v", normals, _unit(eye - surface))
@@ -144,6 +144,6 @@ def _light(
 
 
 def _unit(vectors: Singles) -> Singles:
-    """Vectors (..., 3) at length 1."""
+    """Return vectors (..., 3) normalized to length 1."""
     lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors / np.maximum(lengths, np.float32(1e-12)), dtype=np.float32)

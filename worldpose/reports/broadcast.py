@@ -1,4 +1,4 @@
-"""How a broadcast camera moves over a clip, and how surely that is known."""
+"""Plots of a broadcast camera over a clip, with uncertainty."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from worldpose.reports.drawing import (
 Floats = NDArray[np.float64]
 
 _STEP: Final = {"rx": 0, "ry": 1, "rz": 2, "log_focal": 3, "k1": 4, "k2": 5}
-"""Places in the covariance of a frame's step."""
+"""Indices into the covariance of a frame's step."""
 
 
 def course_picture(
@@ -36,14 +36,14 @@ def course_picture(
 ) -> bytes:
     """Return a PNG of focal length, pan, tilt, roll, k1 and k2 over a clip.
 
-    Bands are two standard deviations to either side; frames without a camera are left open.
+    Bands are two standard deviations to either side; frames without a camera stay empty.
 
     Args:
         frame: (frames,) match frames.
         camera: a batch (frames,).
         covariance: (frames, 7, 7) of a step, in the order of
             `data_contracts.broadcast_calibration.FRAME_STEP`.
-        before: the same frames, each on its own, without smoothing; drawn beneath.
+        before: the same frames, independent and without smoothing; drawn below.
     """
     curves = _curves(camera)
     rough = {} if before is None else _curves(before)
@@ -90,13 +90,13 @@ def _curves(camera: Camera) -> dict[str, Floats]:
 
 
 def largest_pose_changes(before: Camera, after: Camera, tracks: JointTracks) -> tuple[int, int]:
-    """Return the place in the clip and the person whom two cameras see farthest apart.
+    """Return the frame index and person index with the largest distance between two projections.
 
-    Among people well inside the picture; (0, 0) where there are none.
+    Only people well inside the image count; (0, 0) without any.
 
     Args:
         before: a batch (frames,).
-        after: another.
+        after: another batch (frames,).
         tracks: people in the same frames.
     """
     frames, persons = tracks.joints.shape[:2]
@@ -124,19 +124,19 @@ def before_after_picture(
     seen: Floats,
     pitch: PitchSpec | None = None,
 ) -> bytes:
-    """Return a PNG of a person and who is about, as two cameras put them and the markings.
+    """Return a PNG of a person, their surroundings and the markings in two camera estimates.
 
-    Crosses are where keypoints were seen, which neither camera moves.
+    Crosses are detected keypoints, which are the same in both.
 
     Args:
         before: a single camera.
-        after: another.
+        after: another single camera.
         tracks: people, one colour each.
-        frame: place in `tracks`.
-        person: place in `tracks` of whom the picture is about.
-        still: the picture (height, width, 3), RGB, beneath.
-        seen: keypoints of a detector in it (detections, 17, 2) [px].
-        pitch: its markings are drawn; None where there is no pitch.
+        frame: index in `tracks`.
+        person: index in `tracks` of the central person.
+        still: background image (height, width, 3), RGB.
+        seen: detected keypoints (detections, 17, 2) [px].
+        pitch: draw its markings; None without a pitch.
     """
     shown = after.project(tracks.joints[frame, person])
     middle = np.nan_to_num(shown[np.isfinite(shown).all(axis=-1)].mean(axis=0))
@@ -184,14 +184,14 @@ def flow_picture(
     rejected: NDArray[np.bool_],
     predicted: Floats,
 ) -> bytes:
-    """Return a PNG of how points of a picture move on, and of those that no camera moves so.
+    """Return a PNG of the optical flow from a frame to the next, with inliers and outliers.
 
     Args:
-        still: the picture (height, width, 3), RGB.
-        start: (n, 2) points of it [px].
-        end: (n, 2) where they are found in the next one [px].
-        rejected: (n,) which ones do not move with the camera.
-        predicted: (n, 2) where the found camera says that they go [px].
+        still: the frame (height, width, 3), RGB.
+        start: (n, 2) points in it [px].
+        end: (n, 2) their positions in the next frame [px].
+        rejected: (n,) outliers.
+        predicted: (n, 2) positions predicted by the estimated camera [px].
     """
     height, width = still.shape[:2]
     figure = Figure(figsize=(14.0, 14.0 * height / width + 0.5), dpi=110, facecolor="white")
@@ -199,7 +199,7 @@ def flow_picture(
     axes = figure.subplots()
     axes.imshow(still, zorder=0)
     longest = float(np.linalg.norm(end - start, axis=-1).max(initial=1e-6))
-    # The longest arrow is 6 % of the picture's width: motion from one frame to the next is small.
+    # The longest arrow is 6 % of the image width: motion from one frame to the next is small.
     stretch = max(1.0, 0.06 * width / longest)
     for chosen, color, label in (
         (~rejected, PALETTE[5], f"{int((~rejected).sum())} move with the camera"),

@@ -1,4 +1,4 @@
-"""Picture sheet of a programme's proposed clips, for the person who confirms them."""
+"""Contact sheet of a programme's proposed clips, for their confirmation."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from worldpose.broadcast_calibration.programme import Shot
 
 _SHOWN: Final = 5
-"""Pictures of a clip, in order and evenly."""
+"""Frames per clip, in order and evenly spaced."""
 _BAR: Final = 24
-"""Height of the line above them [px]."""
+"""Height of the title line above them [px]."""
 
 
 def programme_sheet(shots: Sequence[Shot]) -> bytes:
-    """Return a PNG with a row of pictures for each clip, under what `--take` wants of it."""
+    """Return a PNG with a row of frames per clip, under its argument for `--take`."""
     rows = [_row(shot) for shot in shots]
     if not rows:
         rows = [_text(np.zeros((_BAR, 5 * 320, 3), np.uint8), "no clip is proposed")]

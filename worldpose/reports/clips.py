@@ -1,4 +1,4 @@
-"""Pictures of a reconstruction: everybody's way seen from above, and one camera's view."""
+"""Plots of a reconstruction: paths from above, and the view of one camera."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def paths_picture(
     cameras: Mapping[str, Camera] | None = None,
     pitch: PitchSpec | None = None,
 ) -> bytes:
-    """Return a PNG of everybody's way over the ground: the whole place, and people close up.
+    """Return a PNG of all people's paths over the ground: the whole scene, and a close-up.
 
     Args:
-        tracks: a dot a frame and person, with the person's id at the end of its way.
-        truth: true ways, as broad grey lines under the dots.
+        tracks: one dot per frame and person, with the person's id at the end of the path.
+        truth: true paths, as broad grey lines under the dots.
         cameras: single cameras by id, as triangles.
-        pitch: its markings are drawn; None where there is no pitch.
+        pitch: draw its markings; None without a pitch.
     """
     ways = _ground(tracks)
     true_ways = _ground(truth) if truth is not None else np.empty((0, 0, 2))
@@ -94,7 +94,7 @@ def paths_picture(
 
 
 def _ground(tracks: JointTracks) -> NDArray[np.float64]:
-    """Mid-hips on the ground (frames, persons, 2) [m]."""
+    """Return mid-hips on the ground (frames, persons, 2) [m]."""
     middle: NDArray[np.float64] = tracks.joints[..., HIPS, :2].mean(axis=-2)
     return middle
 
@@ -102,7 +102,7 @@ def _ground(tracks: JointTracks) -> NDArray[np.float64]:
 def _frame(
     points: NDArray[np.float64], margin: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Corners of a box around points, widened to 4:3 so that both halves fill their place."""
+    """Return the corners of a box around points, widened to 4:3 so that both plots fit."""
     low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
     half = 0.5 * (high - low)
     half = np.maximum(half, [half[1] * 4.0 / 3.0, half[0] * 3.0 / 4.0])
@@ -111,7 +111,7 @@ def _frame(
 
 
 REACH: Final = 130.0
-"""How far a field of view is drawn [m]: a little more than a pitch is long."""
+"""Length of a drawn field of view [m]: a little more than a pitch's length."""
 
 
 def camera_picture(
@@ -123,15 +123,15 @@ def camera_picture(
     still: NDArray[np.uint8] | None = None,
     pitch: PitchSpec | None = None,
 ) -> bytes:
-    """Return a PNG of all that one camera shows: markings and people as it projects them.
+    """Return a PNG of markings and people projected into one camera.
 
     Args:
         camera: a single camera.
-        title: says which camera and frame.
+        title: names camera and frame.
         tracks: people, one colour each.
-        frame: place in `tracks` of the frame that is drawn.
-        still: the camera's picture (height, width, 3), RGB, beneath; None = plain ground.
-        pitch: its markings are drawn; None where there is no pitch.
+        frame: index in `tracks` of the frame to draw.
+        still: background image (height, width, 3), RGB, of the camera; None = plain ground.
+        pitch: draw its markings; None without a pitch.
     """
     width, height = (int(n) for n in camera.image_size)
     figure = Figure(figsize=(14.0, 14.0 * height / width + 0.4), dpi=110, facecolor="white")
@@ -160,17 +160,17 @@ def stadium_picture(
     *,
     pitch: PitchSpec | None = None,
 ) -> bytes:
-    """Return a PNG of the stadium from above in one frame: cameras, what they see, people.
+    """Return a PNG of the stadium from above in one frame: cameras, fields of view, people.
 
-    The ground that a camera sees is shaded, on and beside the pitch where there is one: the more
-    cameras see a place, the darker it is.
+    Shading shows the ground in each camera's field of view, on and near the pitch if there is one:
+    the more cameras see a place, the darker it is.
 
     Args:
         cameras: single cameras by id.
-        title: says which frame.
+        title: names the frame.
         tracks: people, one colour each, with their ids.
-        frame: place in `tracks` of the frame that is drawn.
-        pitch: its markings are drawn; None where there is no pitch.
+        frame: index in `tracks` of the frame to draw.
+        pitch: draw its markings; None without a pitch.
     """
     hips = tracks.joints[frame][:, HIPS, :2].mean(axis=1)
     places = [camera.center[None, :2] for camera in cameras.values()] + [hips]
@@ -203,7 +203,7 @@ def stadium_picture(
         center = camera.center[:2]
         width, height = camera.image_size
         sides = camera.unproject(np.array([[-0.5, 0.5 * height], [width - 0.5, 0.5 * height]]))
-        for x, y in sides.directions[:, :2]:  # a stretch of both sides says where it looks
+        for x, y in sides.directions[:, :2]:  # short lines along both sides show the direction
             toward = 18.0 * np.array([x, y]) / np.hypot(x, y)
             axes.plot(*np.stack([center, center + toward]).T, color=PALE, linewidth=1.2)
         axes.plot(*center, "^", color=INK, markersize=8.0, zorder=5)
@@ -218,7 +218,7 @@ def stadium_picture(
 
 
 def ground_seen(camera: Camera) -> NDArray[np.float64]:
-    """Return corners (n, 2) [m] of the ground in a camera's picture, up to `REACH` away.
+    """Return corners (n, 2) [m] of the ground in a camera's field of view, up to `REACH` away.
 
     The ground is the plane z = 0, world.
     """
@@ -232,6 +232,6 @@ def ground_seen(camera: Camera) -> NDArray[np.float64]:
     flat = np.linalg.norm(directions[:, :2], axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = -camera.center[2] / directions[:, 2] * flat
-        # Rays that go up never meet the ground: they see as far as is drawn.
+        # Rays that go up never meet the ground: clip them to the drawn length.
         distance = np.where((directions[:, 2] < 0.0) & (distance < REACH), distance, REACH)
         return np.asarray(camera.center[:2] + directions[:, :2] / flat[:, None] * distance[:, None])

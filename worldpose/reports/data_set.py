@@ -1,4 +1,4 @@
-"""One HTML page about a data set: how much there is, clip by clip, and what its check found."""
+"""HTML page about a data set: statistics, overall and per clip, and findings of its check."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from worldpose.reports.html_page import Failure, Picture, Section, Table, whole_
 
 
 def data_set_page(title: str, found: DataSetStatistics, checks: Mapping[str, CheckReport]) -> str:
-    """Return a whole HTML page that needs nothing beside itself.
+    """Return a self-contained HTML page.
 
     Args:
         title: heading of the page.
-        found: what was counted.
-        checks: what was found wrong in each folder.
+        found: statistics of the data set.
+        checks: findings of the check per folder.
     """
     people = "-" if found.subjects_per_frame is None else f"{found.subjects_per_frame:.1f}"
     wrong = sum(len(report.findings) for report in checks.values())
@@ -38,7 +38,7 @@ def data_set_page(title: str, found: DataSetStatistics, checks: Mapping[str, Che
 
 
 def counted_section(found: DataSetStatistics) -> Section:
-    """Return the row of the paper's table of data sets, its histograms, and each clip's share."""
+    """Return the row of the paper's table of data sets, its histograms, and a table of clips."""
     row = (
         found.camera or "-",
         _number(found.subjects_per_frame, ".1f"),
@@ -84,7 +84,7 @@ def counted_section(found: DataSetStatistics) -> Section:
 
 
 def _checked(checks: Mapping[str, CheckReport]) -> Section:
-    """What is wrong, then the figures of every clip."""
+    """Return the findings, then the metrics of every clip."""
     findings = tuple(
         (folder, Failure(finding.fault), finding.says, ", ".join(finding.where))
         for folder, report in checks.items()
@@ -117,7 +117,7 @@ def _number(value: float | None, form: str) -> str:
 
 
 BINS = 20
-"""Bars of a histogram, of one round width."""
+"""Maximum bars of a histogram, of one round width."""
 _BAR = "#3d6fa3"
 
 
@@ -142,7 +142,7 @@ def statistics_picture(statistics: DataSetStatistics) -> bytes:
 
 
 def bin_edges(values: Sequence[float]) -> NDArray[np.float64]:
-    """Return edges from 0 to beyond the largest value, 1, 2 or 5 times a power of ten apart."""
+    """Return edges from 0 to beyond the maximum, 1, 2 or 5 times a power of ten apart."""
     top = max(values, default=0.0)
     if top <= 0.0:
         return np.array([0.0, 1.0])

@@ -1,4 +1,4 @@
-"""A picture of what a detector said of one frame, and of what all cameras make of it (D1, D4)."""
+"""Plot of one frame's detections, and of the people reconstructed from all cameras (D1, D4)."""
 
 from __future__ import annotations
 
@@ -46,19 +46,19 @@ def detections_picture(
     pitch: PitchSpec | None = None,
     part: tuple[Floats, Floats] | None = None,
 ) -> bytes:
-    """Return a PNG of a part of a picture: as detected, and as found.
+    """Return a PNG of a part of an image: detections on the left, reconstruction on the right.
 
     Args:
         camera: a single camera.
-        boxes: (detections, 4) x0 y0 x1 y1 [px]; NaN where there is none.
+        boxes: (detections, 4) x0 y0 x1 y1 [px]; NaN where missing.
         keypoints: (detections, 17, 2) [px].
-        used: numbers of the detections that belong to somebody.
-        joints: (persons, 17, 3) [m], world, one colour a person.
+        used: indices of the detections assigned to a person.
+        joints: (persons, 17, 3) [m], world, one colour per person.
         person_ids: (persons,).
-        seen: (persons,) whether this camera's own detections carry any joint of the person.
-        still: the picture (height, width, 3), RGB, beneath; None = plain ground.
-        pitch: its markings are drawn on the right; None where there is no pitch.
-        part: corner and side lengths (2,) [px] of the part; None = that with most people.
+        seen: (persons,) whether this camera's own detections support any joint of the person.
+        still: background image (height, width, 3), RGB; None = plain ground.
+        pitch: draw its markings on the right; None without a pitch.
+        part: corner and side lengths (2,) [px] of the part; None = the part with most people.
     """
     whole = joints[np.isfinite(joints).all((-1, -2))]
     corner, side = crowded_part(camera, whole) if part is None else part

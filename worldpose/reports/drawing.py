@@ -1,4 +1,4 @@
-"""What all pictures share: colours, the pitch, skeletons, labels."""
+"""Shared drawing functions: colours, the pitch, skeletons, labels."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from data_contracts.pitch import PitchSpec
 from worldpose.pitch import PitchTemplate
 
 PALETTE: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6b4c9a")
-"""One colour a person, after Okabe and Ito: apart for people with any colour vision."""
+"""One colour per person, after Okabe and Ito: distinguishable with any colour vision."""
 
 INK: Final = "#2b2b2b"
 PALE: Final = "#9a9a9a"
 GRASS: Final = "#f1f5ef"
 LINE: Final = "#b5c4b1"
 TEMPLATE: Final = "#ffd54a"
-"""Markings over a still: on grass, nothing else is this yellow."""
+"""Colour of markings over a still: on grass, nothing else is this yellow."""
 HALO: Final = [withStroke(linewidth=2.5, foreground="white")]
 HIPS: Final = (11, 12)
-"""Places of the hips in COCO-17; their middle is where a person is, from above."""
+"""Indices of the hips in COCO-17; their middle is a person's position from above."""
 
 
 def draw_pitch(axes: Axes, pitch: PitchSpec) -> None:
-    """Paint the pitch and its lines from above."""
+    """Draw the pitch and its lines from above."""
     corner = (-0.5 * pitch.length, -0.5 * pitch.width)
     axes.add_patch(Rectangle(corner, pitch.length, pitch.width, color=GRASS, zorder=0))
     for line in markings(pitch):
@@ -40,7 +40,7 @@ def draw_pitch(axes: Axes, pitch: PitchSpec) -> None:
 
 
 def markings(pitch: PitchSpec) -> list[NDArray[np.float64]]:
-    """The painted lines as polylines (n, 3) [m], world; samples every half metre look smooth."""
+    """Return the painted lines as polylines (n, 3) [m], world, sampled every half metre."""
     template = PitchTemplate.from_spec(pitch)
     samples = template.sample_lines(0.5)
     lines = []
@@ -56,7 +56,7 @@ def markings(pitch: PitchSpec) -> list[NDArray[np.float64]]:
 def draw_skeleton(
     axes: Axes, keypoints: NDArray[np.floating], color: str, width: float, zorder: int
 ) -> None:
-    """Bones and joints of one person (17, 2) [px]; what is NaN is not drawn."""
+    """Draw bones and joints of one person (17, 2) [px], without NaN joints."""
     gap = np.full((len(COCO17_BONES), 1, 2), np.nan)
     bones = np.concatenate([keypoints[np.array(COCO17_BONES)], gap], axis=1).reshape(-1, 2)
     axes.plot(*bones.T, color=color, linewidth=width, solid_capstyle="round", zorder=zorder)
@@ -66,7 +66,7 @@ def draw_skeleton(
 def draw_label(
     axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, float], color: str
 ) -> None:
-    """Write a few words beside a place; a white halo keeps them readable on anything."""
+    """Write a label next to a place; a white halo keeps it readable on any background."""
     axes.annotate(
         text,
         at,
@@ -83,21 +83,21 @@ def draw_label(
 
 
 def style(axes: Axes) -> None:
-    """Make axes quiet."""
+    """Set muted colours and small ticks on axes."""
     axes.tick_params(colors=INK, labelsize=9, length=3)
     for spine in axes.spines.values():
         spine.set_color("#d0d0d0")
 
 
 def person_color(person_id: int) -> str:
-    """The colour of a person in every picture."""
+    """Return the colour of a person, the same in all plots."""
     return PALETTE[person_id % len(PALETTE)]
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as PNG; no date or version in it, so the same figure has the same bytes."""
+    """Return the figure as PNG without date or version: equal figures have equal bytes."""
     picture = io.BytesIO()
-    # Not savefig, which draws twice. Packing twice as tightly would take as long as drawing.
+    # Not savefig, which draws twice. Twice the compression would take as long as drawing.
     FigureCanvasAgg(figure).print_png(  # type: ignore[no-untyped-call]
         picture, metadata={"Software": None}, pil_kwargs={"compress_level": 1}
     )

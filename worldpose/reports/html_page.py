@@ -1,4 +1,4 @@
-"""Whole HTML pages from pictures, tables and scenes: nothing beside them, nothing from outside."""
+"""Self-contained HTML pages from images, tables and scenes, without external resources."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from worldpose.reports.scene import Scene, scene_html
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG and what it shows."""
+    """A PNG with a caption."""
 
     caption: str
     png: bytes
@@ -29,8 +29,8 @@ class Table:
     """A table with a heading.
 
     Attributes:
-        heading: what it is about.
-        columns: their titles; ">" before one aligns numbers.
+        heading: title of the table.
+        columns: titles; the prefix ">" marks numeric columns.
         rows: of text.
     """
 
@@ -41,12 +41,12 @@ class Table:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page that can be jumped to.
+    """A section of the page with a link in its navigation bar.
 
     Attributes:
-        heading: also in the page's bar.
+        heading: also in the navigation bar.
         blocks: in this order.
-        lead: what a reader should know first.
+        lead: introduction.
     """
 
     heading: str
@@ -55,16 +55,16 @@ class Section:
 
 
 class Failure(str):
-    """Text of a table's cell that is shown as a failure."""
+    """Text of a table cell with failure style."""
 
 
 @dataclass(frozen=True)
 class Folded:
-    """Tables at a page's end, for those who ask; all but the first are folded.
+    """Collapsible tables at the end of a page; all but the first are folded.
 
     Attributes:
-        heading: also in the page's bar.
-        tables: those without rows are left out.
+        heading: also in the navigation bar.
+        tables: tables without rows are left out.
     """
 
     heading: str
@@ -82,11 +82,11 @@ def whole_page(
     """Return a whole HTML page.
 
     Args:
-        title: its heading.
-        about: a line beneath.
-        sections: what there is to see; those without blocks are left out.
-        tiles: the few figures at the top, each with what it is.
-        last: what comes after the sections.
+        title: heading of the page.
+        about: subtitle.
+        sections: sections of the page; those without blocks are left out.
+        tiles: key metrics at the top, each with its label.
+        last: folded tables after the sections.
     """
     shown = [section for section in sections if section.blocks]
     script = _part("scene.js") if any(map(_has_scene, shown)) else ""
@@ -121,7 +121,7 @@ def whole_page(
 
 
 def _part(name: str) -> str:
-    """A file that pages are made of."""
+    """Return the text of a page resource."""
     return (files("worldpose.reports") / "page" / name).read_text(encoding="utf-8")
 
 
@@ -167,7 +167,7 @@ def _figure(picture: Picture) -> str:
 
 
 def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of plain text; columns from ">" on hold numbers."""
+    """Return a table of plain text; the prefix ">" marks numeric columns."""
     kinds = [' class="number"' if column.startswith(">") else "" for column in columns]
     lines = []
     if any(columns):
@@ -188,13 +188,13 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 LARGE: Final = 200_000
-"""Bytes of a PNG from which it holds a photograph, and not curves."""
+"""Size of a PNG [byte] from which it counts as a photograph, not a plot."""
 QUALITY: Final = 88
-"""Of WebP, at which lines a pixel wide stay sharp."""
+"""WebP quality that keeps lines of one pixel sharp."""
 
 
 def small_enough(png: bytes) -> tuple[str, bytes, tuple[int, int]]:
-    """Return kind, content and size (width, height) [px] of a picture: WebP where that is smaller.
+    """Return kind, content and size (width, height) [px] of an image: WebP if it is smaller.
 
     Args:
         png: a PNG.
@@ -202,7 +202,7 @@ def small_enough(png: bytes) -> tuple[str, bytes, tuple[int, int]]:
     size = (int.from_bytes(png[16:20], "big"), int.from_bytes(png[20:24], "big"))
     if len(png) < LARGE:
         return "png", png, size
-    import cv2  # late: pages without large pictures need none of it
+    import cv2  # late: pages without large images do not need it
 
     picture = np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR), np.uint8)
     _, webp = cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])

@@ -1,4 +1,4 @@
-"""A camera's video with markings and people drawn over it, as the camera has them."""
+"""Overlay of projected markings and people on a camera's video."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 _PARTS: Final = 16
-"""A line's place is told to this part of a pixel."""
+"""Subpixel steps of line coordinates per pixel."""
 _FAR: Final = 4.0
-"""Beyond so many widths of the picture nothing is drawn [1]."""
+"""Maximum absolute coordinate of drawn points, in image widths [1]."""
 _OPACITY: Final = 0.6
-"""Of bodies [1]: the player behind still tells whether the body lies on him."""
+"""Opacity of bodies [1]: the player in the image stays visible for comparison."""
 _MARGIN: Final = 0.1
-"""A body may reach into the picture from so many of its widths beside it [1]."""
+"""Margin around the image within which joints count as visible, in image widths [1]."""
 
 
 def overlay_frames(
@@ -37,21 +37,21 @@ def overlay_frames(
     pitch: PitchSpec | None = None,
     bodies: BodyTracks | None = None,
 ) -> Iterator[Picture]:
-    """Yield pictures at half their size with what the camera puts where.
+    """Yield frames at half size with projected markings and people.
 
     Args:
-        pictures: (height, width, 3) RGB, one for each of `frames`.
-        camera: a batch (frames,), theirs.
+        pictures: (height, width, 3) RGB, one per entry of `frames`.
+        camera: a batch (frames,).
         tracks: people, one colour each.
-        frames: (n,) match frames; people are drawn where `tracks` has them.
-        pitch: its markings are drawn; None where there is no pitch.
-        bodies: surfaces, drawn instead of bones for people who have them.
+        frames: (n,) match frames; the function draws people in frames of `tracks`.
+        pitch: draw its markings; None without a pitch.
+        bodies: surfaces to draw instead of bones, for people with bodies.
     """
     lines = markings(pitch) if pitch is not None else []
     rows = {int(frame): row for row, frame in enumerate(tracks.frames)}
     for place, (frame, picture) in enumerate(zip(frames, pictures, strict=True)):
         small = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        # What is encoded has even sides.
+        # Video encoding requires even sides.
         even = small[: small.shape[0] & ~1, : small.shape[1] & ~1]
         canvas = np.asarray(even, dtype=np.uint8, order="C")
         half = zoomed(camera[place], np.full(2, -0.5), 0.5, (canvas.shape[1], canvas.shape[0]))
@@ -76,7 +76,7 @@ def _paint(
     frame: int,
     bodies: BodyTracks | None,
 ) -> set[int]:
-    """Paint the bodies that are in the picture, and return the ids of all who have one."""
+    """Draw the bodies in the image, and return the ids of all people with bodies."""
     if bodies is None or frame not in bodies.frames:
         return set()
     poses = bodies.poses[int(np.searchsorted(bodies.frames, frame))]
@@ -95,7 +95,7 @@ def _paint(
 
 
 def _draw(canvas: Picture, pixels: Floats, color: tuple[int, int, int]) -> None:
-    """Draw a polyline (n, 2) [px] where it is known."""
+    """Draw the finite parts of a polyline (n, 2) [px]."""
     with np.errstate(invalid="ignore"):
         near = (np.abs(pixels) < _FAR * canvas.shape[1]).all(axis=-1)
     begins = np.flatnonzero(near & ~np.append(False, near[:-1]))

@@ -1,4 +1,4 @@
-"""A clip as a recording for the rerun viewer: people, markings and cameras over time."""
+"""Recording of a clip for the rerun viewer: people, markings and cameras over time."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ def write_recording(
     broadcast: Camera | None = None,
     pitch: PitchSpec | None = None,
 ) -> None:
-    """Write a recording (.rrd), whole or not at all, with timelines `frame` and `time`.
+    """Write a recording (.rrd) atomically, with timelines `frame` and `time`.
 
     Args:
         path: the file.
-        tracks: everybody's joints; what is missing is not there.
-        fps: frames in a second [1/s].
+        tracks: joints of all people; missing joints are left out.
+        fps: frames per second [1/s].
         cameras: single cameras by id.
-        broadcast: one camera for each frame of the tracks; NaN where there is none.
-        pitch: its markings.
+        broadcast: one camera per frame of the tracks; NaN where missing.
+        pitch: draw its markings; None without a pitch.
 
     Raises:
         UsageError: rerun-sdk is not installed.
@@ -76,7 +76,7 @@ def write_recording(
 
 
 def _skeletons(rr: Any, tracks: JointTracks, row: int) -> Any:  # noqa: ANN401
-    """The bones of everybody in one frame."""
+    """Return the bones of all people in one frame."""
     ends = tracks.joints[row][:, np.array(COCO17_BONES)]
     people, bones = np.nonzero(np.isfinite(ends).all((-1, -2)))
     shades = {
@@ -91,7 +91,7 @@ def _skeletons(rr: Any, tracks: JointTracks, row: int) -> Any:  # noqa: ANN401
 
 
 def _log_camera(rr: Any, stream: Any, place: str, camera: Camera, *, static: bool) -> None:  # noqa: ANN401
-    """One camera's place, orientation and picture; the viewer knows no distortion."""
+    """Log one camera's pose and image plane; the viewer supports no distortion."""
     pose = camera.cam_from_world.inverse()
     transform = rr.Transform3D(translation=pose.translation, mat3x3=pose.rotation)
     pinhole = rr.Pinhole(

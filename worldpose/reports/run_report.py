@@ -1,4 +1,4 @@
-"""One HTML page about a run: what was done, how good it is, and what it looks like."""
+"""HTML page about a run: units, quality metrics, scores and plots."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from worldpose.reports.score_names import score_rows, shown_number
 
 @dataclass(frozen=True)
 class CameraSummary:
-    """What is known of one static camera.
+    """Accuracy of one static camera.
 
     Attributes:
         camera_id: the camera.
-        origin: `given`, or what it was calibrated from.
-        ground_error_median_m: expected on the pitch, over what the camera sees [m].
-        ground_error_p95_m: the same; exceeded on a twentieth of it [m].
-        reprojection_rms_px: of the clicks that the camera rests on [px].
-        clicks_used: number of clicked points that it rests on.
-        clicks_wrong: names of those that it does not.
-        weak: why a person should look at it; empty where nothing is the matter.
+        origin: `given`, or the evidence of its calibration.
+        ground_error_median_m: expected ground error, median over the visible pitch [m].
+        ground_error_p95_m: the same, 95th percentile [m].
+        reprojection_rms_px: of the inlying clicks [px].
+        clicks_used: number of inlying clicks.
+        clicks_wrong: names of outliers among the clicks.
+        weak: why a person should review it; empty without warnings.
     """
 
     camera_id: str
@@ -45,15 +45,15 @@ def report_page(
     sections: Sequence[Section] = (),
     tiles: Sequence[tuple[str, str]] = (),
 ) -> str:
-    """Return a whole HTML page that needs nothing beside itself and asks for nothing outside.
+    """Return a self-contained HTML page without external resources.
 
     Args:
         title: heading of the page.
-        run: what was run, with the quality figures of its units.
-        seconds: how long each unit took when it was computed, by `stage/unit` [s].
-        scores: figures against truth, where there is a reference.
-        sections: what there is to see; those without blocks are left out.
-        tiles: the few figures at the top, each with what it is.
+        run: record of the run, with the quality metrics of its units.
+        seconds: computation time of each unit, by `stage/unit` [s].
+        scores: metrics against the truth, if there is a reference.
+        sections: sections of the page; those without blocks are left out.
+        tiles: key metrics at the top, each with its label.
     """
     shown = list(sections)
     if run.warnings:
@@ -73,7 +73,7 @@ def report_page(
 
 
 def _record(run: RunRecord, seconds: Mapping[str, float]) -> tuple[Table, ...]:
-    """How it came about, for those who ask."""
+    """Return tables of the run, its settings, units and quality metrics."""
     settings = ("stage", "setting", "value")
     return (
         Table("What was run", ("", ""), tuple(_about(run))),

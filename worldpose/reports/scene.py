@@ -1,4 +1,4 @@
-"""A clip in space, as a part of a page that turns and plays it: people, markings, cameras."""
+"""Interactive 3D view of a clip in an HTML page: people, markings, cameras."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from worldpose.cameras import Camera
 from worldpose.formats.joints_file import JointTracks
 
 UNIT: Final = 0.005
-"""Of the places of joints [m]: 164 m to either side fit into 16 bits."""
+"""Resolution of joint coordinates [m]: 164 m to either side fit into 16 bits."""
 MISSING: Final = -32768
 RATE: Final = 25.0
-"""Most frames a second; a browser plays between them [1/s]."""
+"""Maximum frames per second [1/s]; the browser interpolates."""
 NUMBERS: Final = 1_500_000
-"""Most coordinates of one clip: 4 MB of text, or 58 s of 20 people."""
+"""Maximum coordinates per clip: 4 MB of text, or 58 s of 20 people."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is shown of one clip.
+    """Content of the 3D view of one clip.
 
     Attributes:
-        caption: which clip.
-        tracks: everybody.
-        fps: frames in a second [1/s].
+        caption: names the clip.
+        tracks: all people.
+        fps: frames per second [1/s].
         cameras: single static cameras by id.
-        broadcast: a batch, one a frame of `tracks`; None where there is none.
-        pitch: its markings; None where there is no pitch.
+        broadcast: a batch, one per frame of `tracks`; None without a broadcast camera.
+        pitch: draw its markings; None without a pitch.
     """
 
     caption: str
@@ -49,9 +49,9 @@ class Scene:
 
 
 def scene_html(scene: Scene) -> str:
-    """Return the part of a page that the page's script turns and plays."""
+    """Return the HTML of a scene for the page's script."""
     data = json.dumps(_content(scene), separators=(",", ":"), allow_nan=False)
-    # Of all text, only this could end the element that holds it.
+    # Only this text could end the enclosing element.
     data = data.replace("</", "<\\/")
     buttons = "".join(
         f'<button type="button" data-do="{name}">{label}</button>'
@@ -109,7 +109,7 @@ def _content(scene: Scene) -> dict[str, object]:
 
 
 def _whole(joints: NDArray[np.float64]) -> NDArray[np.int16]:
-    """Joints in whole units; what is missing, or too far away, is `MISSING`."""
+    """Return joints in integer units; `MISSING` for missing or too distant joints."""
     known = np.isfinite(joints) & (np.abs(joints) < -MISSING * UNIT - 1.0)
     scaled = np.where(known, joints, 0.0) / UNIT
     whole = np.where(known.all(-1, keepdims=True), np.round(scaled), MISSING)
@@ -117,7 +117,7 @@ def _whole(joints: NDArray[np.float64]) -> NDArray[np.int16]:
 
 
 def _moving(camera: Camera, every: int) -> NDArray[np.float32]:
-    """Rotation, translation, focal length, width and height of every frame that is shown."""
+    """Return rotation, translation, focal length, width and height of every shown frame."""
     pose = camera.cam_from_world
     count = len(pose.translation)
     size = np.broadcast_to(camera.image_size, (count, 2))
@@ -128,7 +128,7 @@ def _moving(camera: Camera, every: int) -> NDArray[np.float32]:
 
 
 def _grid(middle: NDArray[np.float64]) -> list[list[list[float]]]:
-    """Lines on the ground 1 m apart, where there are no markings."""
+    """Return a ground grid of 1 m spacing, for scenes without markings."""
     around = np.round(middle)
     lines = []
     for step in np.arange(-8.0, 9.0):

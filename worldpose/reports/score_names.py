@@ -1,4 +1,4 @@
-"""What the scores of an evaluation are called and what they say, for people to read."""
+"""Labels, units and descriptions of the evaluation metrics."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ MEANINGS: Final = {
     "frames": ("Frames scored", "", "all frames of the reference"),
     "cameras": ("Cameras", "", "errors of the estimated cameras by kind"),
 }
-"""Label, unit and plain meaning of every score; shares are shown in per cent."""
+"""Label, unit and description of every metric; shares are shown in per cent."""
 
 CAMERA_MEANINGS: Final = {
     "ground_error_median_m": (
@@ -112,7 +112,7 @@ CAMERA_MEANINGS: Final = {
     "coverage": ("frames", "%", "share of the frames that have an estimate"),
     "cameras": ("number", "", "cameras compared"),
 }
-"""The same of the cameras' scores."""
+"""Label, unit and description of every camera metric."""
 
 SHARES: Final = (
     "coverage",
@@ -123,11 +123,11 @@ SHARES: Final = (
     "detection_accuracy",
     "association_accuracy",
 )
-"""Scores that are shares of a whole [0..1]."""
+"""Metrics that are shares of a whole [0..1]."""
 
 
 def score_rows(scores: Evaluation) -> list[tuple[str, str, str, str]]:
-    """Return name, label, value with unit, and meaning of every score there is."""
+    """Return name, label, value with unit, and description of every available metric."""
     figures = scores.model_dump(exclude_none=True)
     groups = figures.pop("cameras", {})
     rows = [(name, *_score_row(MEANINGS[name], name, value)) for name, value in figures.items()]
@@ -152,5 +152,5 @@ def _score_row(meaning: tuple[str, str, str], name: str, value: float) -> tuple[
 
 
 def shown_number(value: float) -> str:
-    """Return four digits, without powers of ten where they can be helped."""
+    """Return a number with four digits, without exponent if possible."""
     return f"{value:,.0f}" if float(value).is_integer() or abs(value) >= 1e4 else f"{value:.4g}"

@@ -1,4 +1,4 @@
-"""Pictures of how well a static camera is known: clicks on its still, and expected error."""
+"""Plots of a static camera's accuracy: clicks on its still, and expected ground error."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ ACCEPTED: Final = "#0072b2"
 REFUSED: Final = "#d55e00"
 
 ERROR_RANGE: Final = (0.005, 1.0)
-"""Expected ground errors between which colours change [m]."""
+"""Range of expected ground errors of the colour scale [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Click:
-    """A clicked point as a camera explains it.
+    """A clicked point, as inlier or outlier of a camera.
 
     Attributes:
         name: of the pitch template.
-        place: (2,) where it was clicked [px].
-        inlier: whether the camera rests on it.
+        place: (2,) the click [px].
+        inlier: whether the fit includes the click.
     """
 
     name: str
@@ -55,7 +55,7 @@ class ErrorMap:
     Attributes:
         x: (columns,) [m], world.
         y: (rows,) [m], world.
-        expected: (rows, columns) [m]; NaN where the camera does not see.
+        expected: (rows, columns) [m]; NaN outside the field of view.
     """
 
     x: NDArray[np.float64]
@@ -72,15 +72,15 @@ def calibration_picture(
     still: NDArray[np.uint8] | None = None,
     error_map: ErrorMap | None = None,
 ) -> bytes:
-    """Return a PNG: above, the template over the still with all clicks; below, the coverage map.
+    """Return a PNG with the template and all clicks over the still, and the coverage map below.
 
     Args:
         camera: a single camera.
-        title: says which camera.
-        pitch: its markings, projected.
-        clicks: circles; those the camera does not rest on are crosses with their names.
-        still: the camera's picture (height, width, 3), RGB; None = plain ground.
-        error_map: None leaves the map out.
+        title: names the camera.
+        pitch: its markings are projected.
+        clicks: inliers are circles, outliers crosses with their names.
+        still: the camera's image (height, width, 3), RGB; None = plain ground.
+        error_map: coverage map; None = no map.
     """
     width, height = (int(n) for n in camera.image_size)
     heights = [14.0 * height / width + 0.4] + ([] if error_map is None else [7.2])
@@ -145,19 +145,19 @@ def _draw_error_map(figure: SubFigure, error_map: ErrorMap, pitch: PitchSpec) ->
 Picture = NDArray[np.uint8]
 
 CONTRAST: Final = 18
-"""Brightness of paint above what is on both sides, at least [levels of 255]."""
+"""Minimum brightness of paint above both sides [levels of 255]."""
 WIDEST: Final = 15
-"""Bright stripes wider than this are no lines [px]."""
+"""Maximum width of lines [px]."""
 LONGEST: Final = 300.0
 """Distance from which the map is white [px]."""
 ON: Final = 1.5
-"""A sample of a marking is on paint when some is this near [px]."""
+"""Maximum distance to paint of a marking sample on paint [px]."""
 NEAR: Final = 12.0
-"""Samples of markings farther than this from any paint are hidden, or their paint is faint [px]."""
+"""Maximum distance of samples to paint [px]; beyond, they are occluded, or their paint is faint."""
 
 
 def paint_of(still: Picture) -> NDArray[np.bool_]:
-    """Return where (height, width) a picture is as bright as paint against both sides.
+    """Return the mask (height, width) of pixels as bright as paint against both sides.
 
     Args:
         still: (height, width, 3), RGB.
@@ -168,7 +168,7 @@ def paint_of(still: Picture) -> NDArray[np.bool_]:
     # Paint is colourless; shirts and boards mostly are not.
     spread = still.max(-1).astype(np.int16) - still.min(-1)
     found: NDArray[np.bool_] = bright & (spread < 70) & (grey > 90)
-    # Specks are no lines.
+    # Remove specks.
     _, labels, sizes, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8))
     long = np.maximum(sizes[:, cv2.CC_STAT_WIDTH], sizes[:, cv2.CC_STAT_HEIGHT]) >= 2 * WIDEST
     long[0] = False
@@ -186,14 +186,14 @@ def distance_to(paint: NDArray[np.bool_]) -> NDArray[np.float32]:
 def marking_distances(
     camera: Camera, pitch: PitchSpec, distance: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """Return how far samples of the projected markings are from paint (n,) [px].
+    """Return distances of projected marking samples to paint (n,) [px].
 
-    Those that no paint is near are left out: somebody stands there, or it is out of the picture.
+    The result omits samples without paint nearby, which are occluded or outside the image.
 
     Args:
         camera: a single camera.
-        pitch: whose markings.
-        distance: as `distance_to` gives it.
+        pitch: pitch with the markings.
+        distance: result of `distance_to`.
     """
     height, width = distance.shape
     pixels = np.concatenate([camera.project(line) for line in markings(pitch)])
@@ -208,9 +208,9 @@ def paint_picture(camera: Camera, still: Picture, pitch: PitchSpec) -> tuple[byt
     """Return a PNG of paint and of distances to it, and the share of markings on paint [1].
 
     Args:
-        camera: a single camera; its markings are drawn over the distances.
-        still: its picture (height, width, 3), RGB.
-        pitch: whose markings.
+        camera: a single camera; projects the markings over the distances.
+        still: its image (height, width, 3), RGB.
+        pitch: pitch with the markings.
     """
     paint = paint_of(still)
     distance = distance_to(paint)
@@ -220,7 +220,7 @@ def paint_picture(camera: Camera, still: Picture, pitch: PitchSpec) -> tuple[byt
     figure.set_layout_engine("constrained")
     left, right = figure.subplots(1, 2)
     left.imshow(np.where(paint, 255, 18).astype(np.uint8), cmap="gray", vmin=0, vmax=255)
-    # Of the root, so that a few pixels can be told from none.
+    # The square root makes distances of a few pixels visible.
     right.imshow(np.sqrt(np.minimum(distance, LONGEST)), cmap="gray", vmin=0.0)
     for line in markings(pitch):
         right.plot(*camera.project(line).T, color=TEMPLATE, linewidth=0.8)

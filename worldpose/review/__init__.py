@@ -1,7 +1,7 @@
-"""Review: what people said of results, and their corrections replayed over untouched output.
+"""Review: verdicts on results, and manual corrections replayed over unchanged output.
 
-Input: the journal of a match in the store, and what the match folder holds. Output: verdicts on
-results, corrected clicks, the corrections that no longer apply, and the origin of every value.
+Input: the journal of a match in the store, and the content of the match folder. Output: verdicts on
+results, corrected clicks, stale corrections, and the origin of every value.
 """
 
 from worldpose.review.clicks import Replay, replay_corrections, value_now, with_was

@@ -1,4 +1,4 @@
-"""Which detections nobody has looked at yet, the least certain first (D4, D6)."""
+"""Detections that await review, by rising confidence (D4, D6)."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from worldpose.review.detections import DetectionEdit
 
 @dataclass(frozen=True, eq=False)
 class OpenDetections:
-    """Detections that nobody accepted or corrected, the least certain first.
+    """Detections without acceptance or correction, by rising confidence.
 
     Attributes:
         frame: (n,) match frames.
-        detection: (n,) places among the detections of the frame.
+        detection: (n,) indices of the detections in the frame.
         score: (n,) the detector's confidence [1].
-        people: all detections, looked at or not.
+        people: number of all detections, reviewed or not.
     """
 
     frame: NDArray[np.int64]
@@ -35,13 +35,13 @@ def open_detections(
     acceptances: Iterable[Acceptance],
     edits: Iterable[DetectionEdit],
 ) -> OpenDetections:
-    """Return what is left to look at of one result of a camera.
+    """Return the detections of one camera's result that await review.
 
     Args:
         frame: (frames,) match frames, rising without gaps.
-        score: (frames, detections) without corrections; NaN where nobody is.
+        score: (frames, detections) without corrections; NaN = no detection.
         acceptances: of this result.
-        edits: of this camera: whom a person corrected, that person looked at.
+        edits: of this camera; a corrected detection counts as reviewed.
     """
     there = np.isfinite(score)
     waits = there.copy()
@@ -50,7 +50,7 @@ def open_detections(
     for acceptance in acceptances:
         looked_at += acceptance.people
         if acceptance.at_least is not None:
-            # Scores are stored in single precision, and a person names what a page shows.
+            # The store has scores in single precision, and a person enters the displayed value.
             waits &= ~(score >= np.float32(acceptance.at_least))
     for number, detection in looked_at:
         row = number - first

@@ -1,4 +1,4 @@
-"""Corrections of clicks, replayed over what the match folder holds (B3, C7)."""
+"""Replay of corrections over the clicks of a match folder (B3, C7)."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ Picture = tuple[str, int | None]
 
 @dataclass(frozen=True)
 class Replay:
-    """A match folder as people have corrected it; its files are as they were.
+    """A match folder with corrections applied; its files are unchanged.
 
     Attributes:
         folder: with the corrected clicks.
-        applied: the corrections that are in it, in the order they were made.
-        stale: those that no longer apply, each with the reason.
+        applied: the applied corrections, in the order they were made.
+        stale: the corrections that no longer apply, each with the reason.
     """
 
     folder: MatchFolder
@@ -41,13 +41,13 @@ class Replay:
 
 
 def replay_corrections(folder: MatchFolder, corrections: Iterable[Correction]) -> Replay:
-    """The match folder with corrections applied one after the other; none is ever dropped.
+    """Return the match folder with corrections applied in order, and the stale corrections.
 
-    A correction applies while what it changes is as the person saw it: a point that was clicked
-    anew in the match folder, or moved by somebody in between, is not moved back.
+    A correction applies only if the current value equals its `was`: the function does not move a
+    point that has a new click in the match folder or another correction in between.
 
     Args:
-        folder: as it was read.
+        folder: the folder as read.
         corrections: in the order they were made.
     """
     pictures = _pictures(folder)
@@ -56,7 +56,7 @@ def replay_corrections(folder: MatchFolder, corrections: Iterable[Correction]) -
     for correction in corrections:
         edit = correction.edit
         if isinstance(edit, IDENTITY_EDITS):
-            # Whether it fits the tracks is known where they are: the stage `tracking` says it.
+            # The stage `tracking`, which has the tracks, checks whether the edit applies.
             known = edit.clip in {clip.id for clip in folder.spec.clips}
             if known:
                 applied.append(correction)
@@ -64,7 +64,7 @@ def replay_corrections(folder: MatchFolder, corrections: Iterable[Correction]) -
                 stale.append((correction, f"there is no clip {edit.clip}"))
             continue
         if isinstance(edit, DETECTION_EDITS):
-            # Whether it fits what was seen is known where that is: the camera's stage says it.
+            # The camera's stage, which has the detections, checks whether the edit applies.
             reason = _unknown(folder, edit)
             if reason is None:
                 applied.append(correction)
@@ -88,11 +88,11 @@ def replay_corrections(folder: MatchFolder, corrections: Iterable[Correction]) -
 
 
 def with_was(folder: MatchFolder, edit: Edit) -> Edit:
-    """The edit with what it changes as it is now, unless it says that itself.
+    """Return the edit with the current value as `was`, unless it has one.
 
     Args:
         folder: with the corrections so far.
-        edit: as a person gave it.
+        edit: as given by a person.
     """
     if not isinstance(edit, MovedPoint | RedrawnMarking) or "was" in edit.model_fields_set:
         return edit
@@ -102,11 +102,11 @@ def with_was(folder: MatchFolder, edit: Edit) -> Edit:
 def value_now(
     folder: MatchFolder, edit: MovedPoint | RedrawnMarking
 ) -> Pixel | tuple[Pixel, ...] | None:
-    """What an edit changes, as it is: None or empty where it was not clicked.
+    """Return the current value of an edit's point or marking: None or empty without a click.
 
     Args:
         folder: with the corrections so far.
-        edit: names the place; what it makes of it decides nothing.
+        edit: names the point or marking; its new value is ignored.
     """
     return _now(_pictures(folder), edit)
 
@@ -126,7 +126,7 @@ def _objection(
     pictures: dict[Picture, ClickedMarkings],
     edit: MovedPoint | RedrawnMarking,
 ) -> str | None:
-    """Why an edit does not apply; None where it does."""
+    """Return why an edit does not apply; None if it does."""
     place = edit.camera if edit.frame is None else f"{edit.camera} frame {edit.frame}"
     if template is None:
         return "the match has no pitch"
@@ -149,7 +149,7 @@ def _objection(
 
 
 def _unknown(folder: MatchFolder, edit: DetectionEdit) -> str | None:
-    """Why a correction of detections names nothing in the match; None where it does."""
+    """Return why a correction of detections is invalid in the match; None if it is valid."""
     spec = folder.spec
     owners = {camera.id: camera.id for camera in spec.static_cameras}
     owners |= {clip.id: clip.broadcast for clip in spec.clips if clip.broadcast is not None}
@@ -178,7 +178,7 @@ def _is_inside(pixel: Pixel, size: tuple[int, int]) -> bool:
 
 
 def _picture_size(folder: MatchFolder, edit: MovedPoint | RedrawnMarking) -> tuple[int, int] | None:
-    """Size of the picture that an edit is in [px], None where the match has no such picture."""
+    """Return the size of an edit's image [px], None if the match has no such image."""
     spec = folder.spec
     owners = {camera.id: camera.id for camera in spec.static_cameras if edit.frame is None}
     if edit.frame is not None:
@@ -190,7 +190,7 @@ def _picture_size(folder: MatchFolder, edit: MovedPoint | RedrawnMarking) -> tup
 
 
 def _pixels(xy: Pixel | tuple[Pixel, ...] | None) -> tuple[Pixel, ...]:
-    """A point's place, or those along a marking, as a list of pixels."""
+    """Return the pixel of a point, or those of a marking, as a tuple of pixels."""
     if not xy:
         return ()
     return (xy,) if isinstance(xy[0], float | int) else xy
@@ -199,7 +199,7 @@ def _pixels(xy: Pixel | tuple[Pixel, ...] | None) -> tuple[Pixel, ...]:
 def _now(
     pictures: dict[Picture, ClickedMarkings], edit: MovedPoint | RedrawnMarking
 ) -> Pixel | tuple[Pixel, ...] | None:
-    """What an edit changes, as it is."""
+    """Return the current value of an edit's point or marking."""
     clicked = pictures.get((edit.camera, edit.frame), ClickedMarkings())
     if isinstance(edit, MovedPoint):
         return {point.name: point.xy for point in clicked.points}.get(edit.marking)
@@ -223,13 +223,13 @@ def _edited(clicked: ClickedMarkings, edit: MovedPoint | RedrawnMarking) -> Clic
 def _clicked(
     folder: MatchFolder, pictures: dict[Picture, ClickedMarkings]
 ) -> dict[str, ClickedMarkings]:
-    """Of the static cameras, in their order."""
+    """Return the clicks of the static cameras, in their order."""
     cameras = (camera.id for camera in folder.spec.static_cameras)
     return {camera: pictures[camera, None] for camera in cameras if (camera, None) in pictures}
 
 
 def _picked(pictures: dict[Picture, ClickedMarkings]) -> dict[str, KeyFrames]:
-    """Of the clips; a frame without a click is no key frame any more."""
+    """Return the key frames of the clips, without frames that have no clicks."""
     picked: dict[str, list[KeyFrame]] = {}
     for (clip, frame), markings in pictures.items():
         if frame is not None and (markings.points or markings.drawn):

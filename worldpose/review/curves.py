@@ -1,4 +1,4 @@
-"""A clip's figures over its frames, for the person who accepts it."""
+"""Metrics of a clip per frame, for its review."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """One figure over the frames of a clip.
+    """One metric over the frames of a clip.
 
     Attributes:
-        title: what it is, with its unit.
-        values: (frames,); NaN where there is nothing.
+        title: name with unit.
+        values: (frames,); NaN where undefined.
     """
 
     title: str
@@ -26,14 +26,14 @@ class Curve:
 def clip_curves(
     bodies: Floats, covariance: Floats, filled: NDArray[np.bool_], placed: Floats
 ) -> tuple[Curve, ...]:
-    """Return how many people there are in each frame, and how well they are known.
+    """Return the number of people and their uncertainty per frame.
 
     Args:
         bodies: (frames, persons, 17, 3) keypoints of the fitted bodies [m], world; NaN = no body.
-        covariance: (frames, persons, 17, 3, 3) theirs [m^2].
-        filled: (frames, persons) bodies that are there by motion alone.
-        placed: (frames, persons, 17, 3) joints that cameras placed [m], of the same people; NaN
-            where none did.
+        covariance: (frames, persons, 17, 3, 3) of these keypoints [m^2].
+        filled: (frames, persons) bodies from the motion model alone.
+        placed: (frames, persons, 17, 3) triangulated joints [m] of the same people; NaN where
+            missing.
     """
     there = np.isfinite(bodies).all(axis=-1)
     people = there.any(axis=-1)
@@ -54,7 +54,7 @@ def clip_curves(
 
 
 def _medians(values: Floats) -> Floats:
-    """The median of each frame over what it has; NaN where it has nothing."""
+    """Return the median of finite values per frame; NaN without any."""
     found = np.full(len(values), np.nan)
     for frame, row in enumerate(values):
         there = row[np.isfinite(row)]

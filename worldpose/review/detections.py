@@ -1,4 +1,4 @@
-"""Corrections of what a detector saw, laid over its keypoints and boxes (B3, D6)."""
+"""Replay of corrections over the keypoints and boxes of a detector (B3, D6)."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from worldpose.ingest import Observations
 DetectionEdit: TypeAlias = AddedDetection | DeletedDetection | MovedKeypoint
 DETECTION_EDITS = (AddedDetection, DeletedDetection, MovedKeypoint)
 SAME: Final = 0.01
-"""How far a keypoint may be from where a person saw it and be the same one [px]: places are stored
-in single precision, and shown rounded."""
+"""Maximum difference of equal keypoints [px]: the store has single precision, and pages show
+rounded values."""
 
 
 @dataclass(frozen=True, eq=False)
 class DetectionReplay:
-    """What one camera saw, with people's corrections.
+    """Detections of one camera with corrections applied.
 
     Attributes:
-        observations: as corrected.
-        objections: for each edit why it does not apply; None where it does.
+        observations: with corrections.
+        objections: per edit the reason why it does not apply; None if it does.
     """
 
     observations: Observations
@@ -33,14 +33,14 @@ class DetectionReplay:
 
 
 def replay_detections(found: Observations, edits: Iterable[DetectionEdit]) -> DetectionReplay:
-    """The people of one camera with corrections applied one after the other.
+    """Return the detections of one camera with corrections applied in order.
 
-    An edit applies while what it changes is as the person saw it. A keypoint that a person placed
-    has confidence 1, and so has an added person; other keypoints, and a person's place among the
-    detections, stay. Where all places are taken, an added person makes one more in every frame.
+    An edit applies only if the current value equals its `was`. Corrected keypoints and added people
+    have confidence 1; other keypoints, and the indices of detections, stay. If an added person
+    exceeds the number of detections, every frame gets one more.
 
     Args:
-        found: as detected, or given; stays as it is.
+        found: detected or given observations; not modified.
         edits: of this camera, in the order they were made.
     """
     changed = Observations(
@@ -75,7 +75,7 @@ def replay_detections(found: Observations, edits: Iterable[DetectionEdit]) -> De
 
 
 def objection_to(found: Observations, edit: DetectionEdit) -> str | None:
-    """Why an edit does not apply to what a camera saw; None where it does."""
+    """Return why an edit does not apply to a camera's detections; None if it does."""
     place = f"detection {edit.detection} of {edit.camera} in frame {edit.frame}"
     row = _row(found, edit.frame)
     if row is None:
@@ -100,7 +100,7 @@ def objection_to(found: Observations, edit: DetectionEdit) -> str | None:
 
 
 def _with_place(found: Observations, detection: int) -> Observations:
-    """The same with a place for a person, empty where there was none."""
+    """Return observations with room for a detection index; new entries are NaN."""
     if detection < found.score.shape[1]:
         return found
     widened = {
@@ -111,6 +111,6 @@ def _with_place(found: Observations, detection: int) -> Observations:
 
 
 def _row(found: Observations, frame: int) -> int | None:
-    """Return the row of a match frame; None where the camera has none."""
+    """Return the row of a match frame; None if the camera has no such frame."""
     row = int(np.searchsorted(found.frame, frame))
     return row if row < len(found.frame) and found.frame[row] == frame else None

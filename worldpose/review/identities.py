@@ -1,4 +1,4 @@
-"""Corrections of who is who, laid over what the tracker found (T2, D6)."""
+"""Replay of identity corrections over the tracker's result (T2, D6)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ IDENTITY_EDITS = (MergedTracks, SplitTrack, NamedTrack)
 
 @dataclass(frozen=True, eq=False)
 class Identities:
-    """Who is who in one clip, as the tracker found it or as people corrected it.
+    """Identities of one clip, from the tracker or with corrections.
 
     Attributes:
         frame: (frames,) match frames.
@@ -31,8 +31,8 @@ class Identities:
         detection_index: (frames, cameras, persons), -1 = not seen.
         ray_distance: (frames, cameras, persons) [m]; NaN = not seen.
         joints: (frames, persons, 17, 3) [m], world; NaN where missing.
-        names: roster id by person, of those that have one.
-        joins: where one track went on as another, or may have.
+        names: roster id by person, of named people.
+        joins: certain and possible continuations of one track as another.
     """
 
     frame: NDArray[np.integer]
@@ -46,7 +46,7 @@ class Identities:
 
     @property
     def tracks(self) -> tuple[Track, ...]:
-        """One summary a person, in the order of `person`."""
+        """One summary per person, in the order of `person`."""
         found = []
         for k, person in enumerate(self.person.tolist()):
             views = np.count_nonzero(self.detection_index[:, :, k] >= 0, axis=1)
@@ -66,11 +66,11 @@ class Identities:
 
 @dataclass(frozen=True, eq=False)
 class IdentityReplay:
-    """Identities with people's corrections.
+    """Identities with corrections applied.
 
     Attributes:
-        identities: as corrected.
-        objections: for each edit why it does not apply; None where it does.
+        identities: with corrections.
+        objections: per edit the reason why it does not apply; None if it does.
     """
 
     identities: Identities
@@ -78,7 +78,7 @@ class IdentityReplay:
 
 
 def stored_identities(result: xr.Dataset) -> Identities:
-    """The identities of a published result of stage `tracking`."""
+    """Return the identities of a published result of stage `tracking`."""
     tracks = (Track.model_validate(track) for track in result.attrs["tracks"])
     return Identities(
         frame=result["frame"].values,
@@ -93,13 +93,13 @@ def stored_identities(result: xr.Dataset) -> Identities:
 
 
 def replay_identities(found: Identities, edits: Iterable[IdentityEdit]) -> IdentityReplay:
-    """Identities with edits applied one after the other; nothing is computed anew.
+    """Return the identities with edits applied in order, without new computation.
 
-    Ids are those after the edits before. An edit applies while the people that it names are still
-    those that the person saw; what a merged person has goes to the kept one.
+    Each edit uses the ids after the previous edits. An edit applies only if the sightings of its
+    people still match; a merged person's detections go to the kept person.
 
     Args:
-        found: as the tracker found them.
+        found: identities from the tracker.
         edits: of this clip, in the order they were made.
     """
     objections = []
@@ -112,7 +112,7 @@ def replay_identities(found: Identities, edits: Iterable[IdentityEdit]) -> Ident
 
 
 def objection_to(found: Identities, edit: IdentityEdit) -> str | None:
-    """Why an edit does not apply to these identities; None where it does."""
+    """Return why an edit does not apply to these identities; None if it does."""
     if isinstance(edit, MergedTracks):
         people: Sequence[tuple[int, Sighting | None]] = (
             (edit.kept, edit.kept_seen),
@@ -150,7 +150,7 @@ def objection_to(found: Identities, edit: IdentityEdit) -> str | None:
 def sighting_of(
     found: Identities, person: int, first: int | None = None, last: int | None = None
 ) -> Sighting | None:
-    """A detection that tells who a person is: the one that fits best, None where there is none.
+    """Return the detection with the smallest ray distance of a person, None without detections.
 
     Args:
         found: the identities.
@@ -237,7 +237,7 @@ def _split(found: Identities, person: int, first_frame_of_new: int) -> Identitie
         return np.moveaxis(np.concatenate([old, new[:, None]], axis=1), 1, axis)
 
     number = int(found.person.max()) + 1
-    # Of a join that the person's two halves were joined by, the second half is another now.
+    # A join between the two halves of the person now leads to the new person.
     joins = tuple(
         join.model_copy(update={"after": number})
         if join.before == join.after == person

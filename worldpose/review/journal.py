@@ -1,12 +1,11 @@
-"""The journal of a match: what people said, added entry by entry, never changed.
+"""Append-only journal of a match: review requests, decisions and corrections.
 
-Each entry is one sealed file, `reviews/<match>/<number>.json`, created whole and durable or not at
-all, on a disk and in object storage alike; creation fails where another writer took the number, so
-that no entry is lost. Each names the checksum of the one before it, so that a lost or changed entry
-is seen.
+Each entry is one sealed file, `reviews/<match>/<number>.json`, created atomically and durably, on a
+disk and in object storage alike; creation fails if another writer took the number, so that no entry
+is lost. Each entry contains the checksum of its predecessor, so that a lost or changed entry is
+detectable.
 
-A process keeps what it has read: each further look reads the last entry it knows and those that any
-process added since.
+A process caches the journal: each later call reads only the last known entry and newer ones.
 """
 
 from __future__ import annotations
@@ -33,24 +32,24 @@ from worldpose.store.paths import checked_name
 
 _ENTRY = re.compile(r"(\d{6,})\.json")
 READERS = 8
-"""Entries fetched at a time: in object storage each is a request of its own."""
+"""Number of parallel readers: in object storage each entry is a separate request."""
 BATCH = 64
 """Entries that one reader fetches in a row."""
 
 
 @dataclass(frozen=True)
 class Journal:
-    """What the journal of a match holds.
+    """Content of a match's journal.
 
     Attributes:
         match_id: the match.
-        entries: the whole entries, first to last.
-        last: the highest number taken, by a whole entry or a damaged one.
-        damage: a line for each entry that is cut short, ignored, and to be said again.
-        tip: checksum of the last whole entry, on which the next one builds.
+        entries: the intact entries, first to last.
+        last: the highest number in use, by an intact or a damaged entry.
+        damage: a line for each damaged entry, which is ignored and must be repeated.
+        tip: checksum of the last intact entry, the predecessor of the next one.
         questions: the requests and decisions among the records, in order.
-        corrections: id to correction, also of those that were taken back.
-        standing: id to correction, in the order they were made, without those that were taken back.
+        corrections: correction by id, including withdrawn ones.
+        standing: correction by id, in the order they were made, without withdrawn ones.
     """
 
     match_id: str
@@ -64,20 +63,20 @@ class Journal:
 
     @property
     def records(self) -> Iterator[ReviewRecord]:
-        """All that was said, in order."""
+        """All records, in order."""
         for entry in self.entries:
             yield from entry.records
 
     def extended(
         self, entries: Sequence[JournalEntry], last: int, damage: Sequence[str], tip: str | None
     ) -> Journal:
-        """Return the journal with further entries; what it says is not gathered again.
+        """Return the journal with further entries, without processing earlier entries again.
 
         Args:
-            entries: the whole ones among them.
-            last: the highest number taken.
-            damage: a line for each further damaged entry.
-            tip: checksum of the last whole entry.
+            entries: the intact new entries.
+            last: the highest number in use.
+            damage: a line for each new damaged entry.
+            tip: checksum of the last intact entry.
         """
         questions = list(self.questions)
         corrections, standing = dict(self.corrections), dict(self.standing)
@@ -102,23 +101,22 @@ class Journal:
 
 
 def read_journal(store: Store, match_id: str) -> Journal:
-    """The journal of a match, empty before its first entry.
+    """Return the journal of a match, empty before its first entry.
 
-    A damaged entry that no later one builds on was never acknowledged, or its disk lost it: it is
-    ignored and told in `damage`.
+    A damaged entry without a successor was never acknowledged, or its disk lost it: the function
+    ignores it and lists it in `damage`.
 
-    A store object is given what it has read before, as long as the last entry is still the same;
-    only later ones are read. So damage that an earlier entry takes meanwhile is seen by `verify`
-    and by the next process.
+    The function caches per store object: if the last entry is unchanged, it reads only newer ones.
+    Only `verify` and the next process detect later damage to earlier entries.
 
     Raises:
-        CorruptionError: an entry that a later one builds on is damaged or gone.
-        InputError: an entry of another contract version.
+        CorruptionError: an entry with a successor is damaged or missing.
+        InputError: an entry has another contract version.
     """
     folder = f"reviews/{checked_name(match_id)}"
     with _KNOWN_LOCK:
         known = _KNOWN.setdefault(store, {}).setdefault(match_id, _Known())
-    with known.lock:  # requests that come at once read a long journal once
+    with known.lock:  # concurrent requests read a long journal only once
         journal = known.journal or Journal(match_id)
         if not _is_still(store, journal, known.last_data):
             journal, known.last_data = Journal(match_id), None
@@ -137,12 +135,12 @@ def read_journal(store: Store, match_id: str) -> Journal:
 
 @dataclass
 class _Known:
-    """What a store object has read of a journal.
+    """Cached journal of a store object.
 
     Attributes:
-        journal: None before the first look.
-        last_data: the bytes of its last entry, None where there is none.
-        lock: held by the one that reads.
+        journal: None before the first read.
+        last_data: the bytes of its last entry, None without entries.
+        lock: held by the reading thread.
     """
 
     journal: Journal | None = None
@@ -155,7 +153,7 @@ _KNOWN_LOCK = threading.Lock()
 
 
 def _contents(store: Store, match_id: str, numbers: Sequence[int]) -> list[tuple[int, bytes]]:
-    """Entries that are listed, with their bytes; none for one that is gone meanwhile."""
+    """Return the numbers and bytes of listed entries; no bytes for an entry that disappeared."""
 
     def read(some: Sequence[int]) -> list[tuple[int, bytes]]:
         return [(number, store.blobs.read(_path(match_id, number)) or b"") for number in some]
@@ -166,7 +164,7 @@ def _contents(store: Store, match_id: str, numbers: Sequence[int]) -> list[tuple
 
 
 def _is_still(store: Store, journal: Journal, last_data: bytes | None) -> bool:
-    """Is the last known entry there as it was; of an empty journal nothing is known."""
+    """Return whether the last known entry is unchanged; false for an empty journal."""
     return journal.last > 0 and store.blobs.read(_path(journal.match_id, journal.last)) == last_data
 
 
@@ -175,7 +173,7 @@ def _last(journal: Journal, found: Sequence[tuple[int, bytes]]) -> int:
 
 
 def _extended(journal: Journal, found: Sequence[tuple[int, bytes]], folder: str) -> Journal:
-    """The journal with further entries: the number of each, and its bytes."""
+    """Return the journal with further entries, given as numbers and bytes."""
     if not found:
         return journal
     entries: list[JournalEntry] = []
@@ -203,18 +201,18 @@ def _extended(journal: Journal, found: Sequence[tuple[int, bytes]], folder: str)
 
 
 def append(store: Store, journal: Journal, records: Sequence[ReviewRecord]) -> Journal | None:
-    """The journal with one more entry, durable when this returns.
+    """Return the journal with one more entry, which is durable on return.
 
     Args:
-        store: where it lies.
-        journal: as it was read; what `records` say was decided on it.
-        records: said at once: all of them are kept, or none.
+        store: store of the journal.
+        journal: the journal as read, on which `records` are based.
+        records: content of the entry, written atomically.
 
     Returns:
-        None when somebody said something since: nothing is written; read it again and decide anew.
+        None if another writer added an entry since: nothing is written; read and decide again.
 
     Raises:
-        StoreError: the store cannot take it; nothing is written.
+        StoreError: the store cannot write the entry; nothing is written.
     """
     number = journal.last + 1
     entry = JournalEntry(
@@ -231,13 +229,13 @@ def append(store: Store, journal: Journal, records: Sequence[ReviewRecord]) -> J
 def say(
     store: Store, match_id: str, decide: Callable[[Journal], Sequence[ReviewRecord]]
 ) -> Journal:
-    """The journal with what `decide` says of it, decided again whenever somebody was quicker.
+    """Return the journal with the records of `decide`, retried if another writer was first.
 
     Args:
-        store: where it lies.
+        store: store of the journal.
         match_id: the match.
-        decide: gives what is to be said, from the journal as it is; nothing to say is fine. What
-            it raises is raised here, and nothing is written.
+        decide: returns records for the current journal, possibly none. Its exceptions propagate,
+            and nothing is written.
     """
     while True:
         journal = read_journal(store, match_id)

@@ -1,4 +1,4 @@
-"""Where values come from: computed, corrected by a person, filled by motion, or refused."""
+"""Origins of values: computed, corrected by a person, filled by the motion model, or rejected."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from worldpose.review.detections import DETECTION_EDITS
 from worldpose.review.identities import IDENTITY_EDITS
 
 ORIGINS: Final[tuple[Origin, ...]] = get_args(Origin)
-"""In the order of their codes in arrays: automatic 0, corrected 1, filled 2, rejected 3."""
+"""Origins in the order of their codes in arrays: automatic 0, corrected 1, filled 2, rejected 3."""
 
 
 def unit_origins(
@@ -21,15 +21,15 @@ def unit_origins(
     applied: Iterable[Correction],
     rejected: Collection[str],
 ) -> dict[str, Origin]:
-    """Where each unit's result comes from, by `stage/unit`.
+    """Return the origin of each unit's result, by `stage/unit`.
 
-    A person's refusal reaches all that is made from what was refused; a correction marks the unit
-    whose evidence was corrected, and what is computed from that is automatic.
+    A rejection propagates to all units computed from the rejected one; a correction marks only the
+    unit with corrected evidence, and units computed from it are automatic.
 
     Args:
-        made_from: for each unit, the units that it is made from.
-        applied: the corrections that the results hold.
-        rejected: units whose last verdict is a refusal.
+        made_from: for each unit, its input units.
+        applied: the corrections in the results.
+        rejected: units whose last verdict is a rejection.
     """
     corrected = set()
     for edit in (correction.edit for correction in applied):
@@ -52,7 +52,7 @@ def unit_origins(
 
 
 def _seen_by(camera: str, units: Collection[str]) -> set[str]:
-    """The units with whom a camera sees: where it has none that found them, they were given."""
+    """Return the units of a camera's detections: its detection units, or else its ingest unit."""
     found = f"detection/{camera}"
     detected = {unit for unit in units if unit == found or unit.startswith(f"{found}.")}
     return detected or {f"ingest/{camera}"}
@@ -61,12 +61,12 @@ def _seen_by(camera: str, units: Collection[str]) -> set[str]:
 def joint_origins(
     joints: NDArray[np.floating], filled: NDArray[np.bool_], unit: Origin
 ) -> NDArray[np.int8]:
-    """The code of each joint's origin: a place in `ORIGINS`, -1 where there is no joint.
+    """Return the code of each joint's origin: an index into `ORIGINS`, -1 for missing joints.
 
     Args:
         joints: (frames, persons, joints, 3) [m], world; NaN where missing.
-        filled: (frames, persons, joints) or (frames, persons): there by motion alone.
-        unit: origin of the whole result; a refused one has refused joints only.
+        filled: (frames, persons, joints) or (frames, persons): from the motion model alone.
+        unit: origin of the whole result; all joints of a rejected result are rejected.
     """
     code = np.full(joints.shape[:-1], ORIGINS.index(unit), dtype=np.int8)
     if unit != "rejected":

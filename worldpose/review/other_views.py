@@ -1,7 +1,7 @@
-"""What the other cameras say of a keypoint: its epipolar curve, and where they expect it (D4, D6).
+"""Epipolar curves of a keypoint, and its prediction from the other cameras (D4, D6).
 
-A fix in one picture is checked in all: the curve is where another camera may show what this one
-shows at a pixel, the expectation where it must be if the others are right.
+They check a correction in one image against all: the curve contains the possible pixels of the
+point in another camera, the prediction is its pixel if the other keypoints are correct.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from worldpose.cameras import Camera, Rays, intersect_rays
 Floats = NDArray[np.float64]
 
 HEIGHTS: Final = (-0.3, 3.2)
-"""Where joints are above the ground [m]: the ground may lie lower at its edges, arms are raised in
-a jump."""
+"""Range of joint heights above the ground [m]: the ground may be lower at its edges, and arms are
+raised in a jump."""
 DISTANCES: Final = (0.5, 300.0)
-"""From a camera to what it shows [m]: across the largest stadium."""
+"""Range of distances of people from a camera [m]: across the largest stadium."""
 BEGIN: Final = 33
-"""Places along a ray that are looked at first."""
+"""Initial samples along a ray."""
 APART: Final = 12.0
-"""Most between two places of a curve [px]: its arc is within a hundredth of a pixel of their
-chord where the lens bends a line by 10 px over 400."""
+"""Maximum spacing of a curve's points [px]: arc and chord differ by less than a hundredth of a
+pixel in a lens that bends a line by 10 px over 400."""
 HALVINGS: Final = 8
-"""Most times that gaps are halved."""
+"""Maximum number of subdivisions."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewCheck:
-    """How the views of one person fit together.
+    """Multi-view consistency of one person's keypoints.
 
     Attributes:
-        joints: (joints, 3) [m], world: from all views; NaN with fewer than two.
-        expected: (cameras, joints, 2) [px]: where each camera should show a joint that the others
-            place; NaN where fewer than two others do.
+        joints: (joints, 3) [m], world: triangulated from all views; NaN with fewer than two.
+        expected: (cameras, joints, 2) [px]: prediction in each camera of the joint triangulated
+            from the others; NaN with fewer than two others.
         error: (cameras, joints) [px]: from each keypoint to the joint from all views.
     """
 
@@ -47,19 +47,18 @@ class ViewCheck:
 
 
 def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Floats]:
-    """Return where `target` may show what `source` shows at a pixel.
+    """Return the epipolar curves in `target` of a pixel in `source`.
 
-    The ray of the pixel, as far as people's joints can be on it, in the other picture: the lens
-    bends it, and its ends and the picture's border cut it.
+    The function projects the part of the pixel's ray where joints can be into the other image, with
+    lens distortion, and clips it to the image.
 
     Args:
         source: one camera.
-        target: another.
-        pixel: (2,) in the picture of `source` [px].
+        target: another camera.
+        pixel: (2,) in the image of `source` [px].
 
     Returns:
-        Polylines (n, 2) [px] within the picture of `target`; none where it shows nothing of the
-        ray.
+        Polylines (n, 2) [px] within the image of `target`; none if the ray is not visible.
     """
     rays = source.unproject(np.asarray(pixel, dtype=np.float64)[None])
     span = _span(rays)
@@ -76,7 +75,7 @@ def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Fl
         gap = np.linalg.norm(np.diff(places, axis=0), axis=1)
         inside = _inside(places, target)
         wide = np.flatnonzero((gap > APART) & (inside[1:] | inside[:-1]))
-        # One end may be behind the camera, or beyond what its lens model knows.
+        # One end may be behind the camera, or outside the valid range of its lens model.
         cut = np.flatnonzero(np.isfinite(places[1:, 0]) != np.isfinite(places[:-1, 0]))
         halved = np.union1d(wide, cut)
         if not len(halved):
@@ -91,9 +90,9 @@ def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Fl
 
 
 def check_views(cameras: Camera, keypoints: ArrayLike) -> ViewCheck:
-    """Return how the views of one person in one frame fit together.
+    """Return the multi-view consistency of one person in one frame.
 
-    A joint is where its rays pass nearest, each weighed by what a pixel is at its distance.
+    A joint is the nearest point to its rays, with weights from the size of a pixel at its distance.
 
     Args:
         cameras: a batch (cameras,).
@@ -110,7 +109,7 @@ def check_views(cameras: Camera, keypoints: ArrayLike) -> ViewCheck:
 
 
 def _joints(cameras: Camera, rays: Rays, chosen: Floats) -> Floats:
-    """Joints (choices, joints, 3) [m] from the cameras of each choice (choices, cameras)."""
+    """Return joints (choices, joints, 3) [m] from the cameras of each choice (choices, cameras)."""
     bundles = Rays(
         origins=np.broadcast_to(rays.origins, rays.directions.shape).swapaxes(0, 1),
         directions=rays.directions.swapaxes(0, 1),
@@ -130,7 +129,7 @@ def _joints(cameras: Camera, rays: Rays, chosen: Floats) -> Floats:
 
 
 def _span(rays: Rays) -> tuple[float, float] | None:
-    """From where to where on the ray joints can be [m]; None where they cannot."""
+    """Return the interval of possible joints along the ray [m]; None if empty."""
     if not rays.valid[0]:
         return None
     height, slope = float(rays.origins[0, 2]), float(rays.directions[0, 2])

@@ -1,4 +1,4 @@
-"""A camera while somebody clicks it: what it makes of the pitch, and what to click next (C7)."""
+"""Live preview of a calibration from clicks: projected pitch and proposed next clicks (C7)."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from worldpose.static_calibration import (
 )
 
 SPACING = 0.5
-"""Between the points of a drawn marking [m]: its chords are no more than a few pixels long where
-the marking is curved."""
+"""Spacing of points along a drawn marking [m]: the chords of a curved marking are only a few pixels
+long."""
 MARGIN = 0.25
-"""How far beyond the picture markings are drawn, in its size [1]: far outside, distortion that
-nothing there holds may fold them back."""
+"""Margin beyond the image for drawn markings, relative to its size [1]: far outside, unconstrained
+distortion may fold them back."""
 
 
 @dataclass(frozen=True, eq=False)
 class PitchDrawing:
-    """A pitch made ready to be drawn again and again.
+    """A pitch with cached sample points for repeated drawing.
 
     Attributes:
         template: the stadium's template.
@@ -48,7 +48,7 @@ class PitchDrawing:
         return self.template.positions(tuple(self.template.points))
 
     def drawn(self, camera: Camera) -> dict[str, list[NDArray[np.float64]]]:
-        """Polylines (n, 2) [px] of every marking that reaches the picture, by name."""
+        """Return polylines (n, 2) [px] of every marking in or near the image, by name."""
         stacked = camera.project(np.concatenate(list(self.markings.values())))
         found, begin = {}, 0
         for name, points in self.markings.items():
@@ -60,7 +60,7 @@ class PitchDrawing:
         return found
 
     def placed(self, camera: Camera) -> dict[str, NDArray[np.float64]]:
-        """Where the camera puts the named points that are in its picture (2,) [px], by name."""
+        """Return the projections of the named points inside the image (2,) [px], by name."""
         pixels = camera.project(self.points)
         inside = _inside(pixels, camera.image_size, 0.0)
         names = self.template.points
@@ -69,13 +69,13 @@ class PitchDrawing:
 
 @dataclass(frozen=True, eq=False)
 class Preview:
-    """What clicks make of a camera.
+    """Camera, report and projected pitch from the current clicks.
 
     Attributes:
         camera: the camera.
-        report: how well it is known and why.
+        report: its accuracy and warnings.
         markings: polylines (n, 2) [px] by name.
-        points: where it puts the named points (2,) [px], by name.
+        points: projections of the named points (2,) [px], by name.
     """
 
     camera: Camera
@@ -92,18 +92,18 @@ def preview(
     picture: NDArray[np.uint8] | None = None,
     settings: StaticCalibrationSettings = StaticCalibrationSettings(),  # noqa: B008
 ) -> Preview:
-    """The camera that clicks make, and the pitch as it projects it.
+    """Return the camera from the current clicks, and the projected pitch.
 
     Args:
         drawing: the pitch.
-        clicked: so far.
+        clicked: the current clicks.
         image_size: width, height [px].
-        picture: (height, width, 3); with it the camera is refined on the painted lines, which
-            takes seconds and not milliseconds.
-        settings: as the stage `static_calibration` takes them.
+        picture: (height, width, 3); if given, the calibration refines the camera on the painted
+            lines, which takes seconds and not milliseconds.
+        settings: as for the stage `static_calibration`.
 
     Raises:
-        InputError: the clicks do not determine a camera; the message says what to add.
+        InputError: the clicks do not determine a camera; the message says which clicks to add.
     """
     found = calibrate(
         drawing.template, clicked, image_size, picture=picture, settings=settings, where="so far"
@@ -115,7 +115,7 @@ def preview(
 def _pieces(
     pixels: NDArray[np.float64], image_size: NDArray[np.int64]
 ) -> list[NDArray[np.float64]]:
-    """The runs of two points or more that are in or about the picture."""
+    """Return the runs of two points or more in or near the image."""
     near = _inside(pixels, image_size, MARGIN)
     bounds = np.flatnonzero(np.diff(np.concatenate([[False], near, [False]])))
     runs = zip(bounds[::2], bounds[1::2], strict=True)
@@ -125,7 +125,7 @@ def _pieces(
 def _inside(
     pixels: NDArray[np.float64], image_size: NDArray[np.int64], margin: float
 ) -> NDArray[np.bool_]:
-    """Which pixels (n, 2) are in the picture, or about it by a share of its size; (n,)."""
+    """Return a mask (n,) of pixels (n, 2) in the image or within a margin relative to its size."""
     room = margin * np.asarray(image_size)
     with np.errstate(invalid="ignore"):
         inside = (pixels >= -0.5 - room) & (pixels <= image_size - 0.5 + room)

@@ -1,4 +1,4 @@
-"""What the journal says now: the last verdict on a result, and the corrections that stand."""
+"""Current state of the journal: the last verdict on a result, and the standing corrections."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from data_contracts.review import (
 
 
 def requests_by_id(records: Iterable[ReviewRecord]) -> dict[str, ReviewRequest]:
-    """All that people were asked, first to last."""
+    """Return all review requests by id, first to last."""
     asked = (record for record in records if isinstance(record, ReviewRequest))
     return {request.id: request for request in asked}
 
 
 def decision_on(records: Iterable[ReviewRecord], unit: str, content: str) -> ReviewDecision | None:
-    """The last verdict on a result's bytes, None where nobody has decided.
+    """Return the last verdict on a result's bytes, None without a decision.
 
     Args:
-        records: the journal's, in order.
+        records: records of the journal, in order.
         unit: as `stage/unit`.
-        content: digest of the result's files; its key may be another than when it was decided.
+        content: digest of the result's files; its key may differ from that at the decision.
     """
     about: set[str] = set()
     last = None
@@ -38,7 +38,7 @@ def decision_on(records: Iterable[ReviewRecord], unit: str, content: str) -> Rev
 
 
 def standing_corrections(records: Iterable[ReviewRecord]) -> tuple[Correction, ...]:
-    """The corrections in the order they were made, without those that were taken back."""
+    """Return the corrections in the order they were made, without withdrawn ones."""
     standing: dict[str, Correction] = {}
     for record in records:
         if isinstance(record, Correction):

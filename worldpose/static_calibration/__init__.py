@@ -1,6 +1,6 @@
-"""Static calibration: the pitch's markings in a picture to a camera (C1-C5).
+"""Static calibration: a camera from the pitch markings in its image (C1-C5).
 
-Input: a pitch template and what a person clicked. Output: a camera with its uncertainty.
+Input: a pitch template, clicked points and drawn markings. Output: a camera and its covariance.
 """
 
 from worldpose.static_calibration.calibrate import calibrate

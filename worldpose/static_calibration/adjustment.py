@@ -18,23 +18,23 @@ from worldpose.static_calibration.settings import StaticCalibrationSettings
 _ITERATIONS: Final = 60
 """Enough from any start in the basin; most end after ten."""
 _LEAST_DEPTH: Final = 1.0
-"""Nearer points [m] are none that anybody clicks, and the camera is far from the answer."""
+"""Depth [m] below which no point is clicked: the camera is far from the answer."""
 _LEAST_HEIGHT: Final = 0.5
-"""A camera below it is pushed up as if it were there [m]."""
+"""Height [m] below which the prior pushes a camera up as strongly as at this height."""
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """All that a camera is fitted to, in the form of the compiled kernels.
+    """Observations, noise and prior of a camera fit, as the compiled kernels expect them.
 
     Attributes:
         evidence: clicks and drawn markings.
         image_size: width, height [px].
         prior: (19,), see `prior_residuals`.
-        free: (12,) which parameters are solved for.
+        free: (12,) parameters to solve for.
         click_noise: standard deviation of each click (n,), each axis [px].
         drawn_noise: standard deviation of each drawn pixel (d,), across its marking [px]: larger
-            where others are drawn beside it, so that a marking counts by its length.
+            where other pixels are close, so that a marking counts by its length.
         drawn_loss: Cauchy scale of drawn points [standard deviations].
         where: file or camera, for messages.
     """
@@ -50,11 +50,11 @@ class Problem:
 
     @property
     def reach(self) -> float:
-        """Half the picture's diagonal [px]."""
+        """Half the image diagonal [px]."""
         return 0.5 * float(np.hypot(*self.image_size))
 
     def only(self, points: NDArray[np.bool_], markings: NDArray[np.bool_]) -> Problem:
-        """Return the problem of some clicked points (n,) and drawn markings (m,) only."""
+        """Return the problem restricted to some clicked points (n,) and drawn markings (m,)."""
         return replace(
             self,
             evidence=self.evidence.only(points, markings),
@@ -65,10 +65,10 @@ class Problem:
     def surveyed_from(
         self, row: NDArray[np.float64], settings: StaticCalibrationSettings
     ) -> Problem:
-        """Return the problem with what the survey's error adds to clicks, as a camera sees it.
+        """Return the problem with click noise that includes the projected survey error.
 
-        An error that is the same along all three axes covers as many pixels along both of the
-        picture's as the point's depth lets a meter cover.
+        A survey error that is equal along all three axes is the same along both image axes: the
+        error in meters times focal length over depth.
 
         Args:
             row: (22,) camera near the answer.
@@ -83,13 +83,13 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Fits:
-    """Cameras after some iterations.
+    """Fitted cameras, their costs and information matrices.
 
     Attributes:
         rows: (b, 22) cameras, see `worldpose.cameras.projection`.
         cost: (b,) half the sum of squared, loss-weighted residuals and priors.
         information: (b, 12, 12) inverse covariance of a step from the evidence and the prior.
-        evidence_information: (b, 12, 12) the evidence's share of it.
+        evidence_information: (b, 12, 12) contribution of the evidence alone.
     """
 
     rows: NDArray[np.float64]
@@ -105,7 +105,7 @@ def problem_of(
     distortion: str | None = None,
     where: str = "clicked markings",
 ) -> Problem:
-    """Return the problem that the settings make of the evidence.
+    """Return the fit problem of evidence and settings.
 
     Args:
         evidence: clicks and drawn markings.
@@ -148,10 +148,10 @@ def adjust(
     """Return cameras fitted from starts.
 
     Args:
-        problem: what to fit to.
+        problem: evidence, noise and prior.
         rows: (b, 22) starts.
         click_loss: Cauchy scale of clicks [standard deviations]; infinite = least squares.
-        iterations: at most; 0 only weighs the starts.
+        iterations: at most; 0 only evaluates the starts.
     """
     fitted = rows.copy()
     count = len(rows)
@@ -181,7 +181,7 @@ def adjust(
 
 
 def row_of(camera: Camera) -> NDArray[np.float64]:
-    """Return the (22,) row of a single camera; the solver keeps its own watch on folds."""
+    """Return the (22,) row of a single camera; the solver checks lens folds itself."""
     pose = camera.cam_from_world
     return np.concatenate(
         [

@@ -1,4 +1,4 @@
-"""Stage 3 with clicks that are worse than stated, or wrong: the painted lines tell (C4)."""
+"""Stage 3 where clicks are noisier than stated, or wrong: painted lines decide (C4)."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from worldpose.static_calibration.parameters import CameraEstimate
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 _WIDER: Final = (2.0, 4.0)
-"""Factors on the noise of clicks that do not lead to the lines [1]; none is believed to be worse
-than the last."""
+"""Factors on the click noise, tried in turn where the clicks do not lead to the lines [1]; the last
+is the largest plausible one."""
 _AS_STATED: Final = 1.5
-"""Up to this factor the noise that the lines tell is the stated one [1]: half of few clicks are
-farther off by chance."""
+"""Noise ratio from the lines up to which the stated noise stands [1]: the median residual of a few
+clicks exceeds it by chance."""
 
 
 def refine_and_judge(
@@ -42,19 +42,19 @@ def refine_and_judge(
     picture: NDArray[np.uint8],
     settings: StaticCalibrationSettings,
 ) -> tuple[Screened, LineRefinement]:
-    """Return stage 2 as the lines judge its clicks, and stage 3 from there.
+    """Return stage 2 with inliers chosen by the painted lines, and stage 3 from there.
 
-    Few clicks close together do not tell their own noise, nor which of them is wrong. The lines
-    do: a camera that they hold shows how far every click is off. Where they are not found, or
-    contradict the clicks, these are taken to be twice, then four times as far off as stated, and
-    then one of them to be wrong; if that is not it either, the camera is left to the clicks.
+    A few clicks close together determine neither their own noise nor the outliers among them. The
+    lines do: a camera fitted to the lines gives the residual of every click. Where the search finds
+    no lines, or the lines contradict the clicks, it retries with twice and four times the stated
+    noise, then without one click at a time. If every attempt fails, the clicks decide the camera.
 
     Args:
-        problem: what was clicked.
+        problem: clicks, noise and prior.
         fit: stage 2.
         pitch: the template.
-        picture: of the camera.
-        settings: noise, and what is wrong.
+        picture: image of the camera.
+        settings: noise and thresholds of outliers.
     """
     first = _refined(_estimate(problem, fit), pitch, picture, settings)
     tried = [(fit, first)]
@@ -82,7 +82,7 @@ def refine_and_judge(
 def _without_one(
     problem: Problem, fit: Screened, settings: StaticCalibrationSettings
 ) -> Iterator[Screened]:
-    """Yield the fits, at the widest noise, to all clicks but one."""
+    """Yield the leave-one-out fits at the largest noise."""
     wider, _ = at_noise(problem, _WIDER[-1], settings)
     for index in range(len(problem.evidence.points)):
         inliers = np.arange(len(problem.evidence.points)) != index
@@ -98,9 +98,9 @@ def _judged(
     picture: NDArray[np.uint8],
     settings: StaticCalibrationSettings,
 ) -> tuple[Screened, LineRefinement] | None:
-    """Return the fit to the clicks that a camera from its lines confirms, and stage 3 from there.
+    """Return the fit to the inliers of a camera refined on lines, and stage 3 from there.
 
-    None where there is no such camera, or it confirms too few of them.
+    None without such a camera, or with too few inliers.
     """
     if not lines.refined:
         return None
@@ -113,7 +113,7 @@ def _judged(
     if len(inliers) and 1.0 - inliers.mean() > settings.max_wrong_share:
         return None
     fit = rest_on(wider, row, inliers, fit.markings)
-    # What was drawn along a line that was found tells of the same paint, only worse.
+    # Pixels drawn along a detected line measure the same paint less accurately.
     read = {each.name for each in lines.markings if each.found}
     other = np.array([name not in read for name in problem.evidence.markings], dtype=bool)
     rest = wider.only(inliers, fit.markings & other)

@@ -1,7 +1,7 @@
-"""Where the middle of a painted line is, fitted to the pixels across it (C4).
+"""Subpixel center of a painted line, fitted to the pixels across it (C4).
 
-A bar as wide as the projected paint stands between two levels of grass, its edges blurred. A line
-along the edge of a mown stripe or of a shadow keeps its middle, as the levels are separate.
+The model is a bar as wide as the projected paint, with blurred edges, between two grass levels. The
+levels are separate, so that the edge of a mown stripe or of a shadow does not bias the center.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ _BLUR: Final = 0.75
 """Standard deviation of a bar's edges [px]: of a sharp lens, 0.7, and of a pixel's own size."""
 _ROOT_2, _ROOT_2PI = math.sqrt(2.0), math.sqrt(2.0 * math.pi)
 _MOST: Final = 1000
-"""Pixels of a bar that is fitted, at most [1]: none is 190 px wide."""
+"""Pixels of a fitted bar, at most [1]: no bar is 190 px wide."""
 _FITTINGS: Final = 5
-"""Gauss-Newton steps of a bar; it is found to a half pixel before."""
+"""Gauss-Newton steps per bar; the search before is accurate to half a pixel."""
 
 
 @compiled
@@ -35,7 +35,7 @@ def fit_bars(
     offsets: Floats,
     variances: Floats,
 ) -> None:
-    """Write the exact place of bars, and how well the picture tells it.
+    """Write the subpixel offsets of bars and their variances.
 
     Args:
         grey: (height, width).
@@ -43,8 +43,8 @@ def fit_bars(
         normals: (n, 2) unit vectors across the line.
         widths: (n,) of the bar [px].
         curvatures: (n,) of the line, positive where it turns towards its normal [1/px].
-        starts: (n,) along the normal [px], right to about a pixel; NaN = none.
-        contrast: least brightness above both sides [levels of 255].
+        starts: (n,) along the normal [px], accurate to about a pixel; NaN = none.
+        contrast: minimum brightness above both sides [levels of 255].
         offsets: (n,) along the normal [px], written; NaN where no bar fits.
         variances: (n,) [px^2], written.
     """
@@ -68,7 +68,7 @@ def fit_bars(
             and contrast_right > contrast
             and variance < np.inf
         ):
-            # Blur draws a curved bar inwards.
+            # Blur moves a curved bar inwards.
             offsets[i] = starts[i] + shift - 0.5 * curvatures[i] * _BLUR**2
             variances[i] = variance
 
@@ -83,13 +83,13 @@ def _gather(
     across: Floats,
     values: Floats,
 ) -> int:
-    """Write pixels about a place on a line, how far across they lie and how bright they are.
+    """Write the offsets across a line and the brightness of the pixels about a place on it.
 
-    Pixels themselves and not readings between them: what is interpolated between two pixels of a
-    line narrower than they are depends on where in the pixel it lies.
+    No interpolation: between two pixels, the interpolated value of a line narrower than a pixel
+    depends on the position of the line in the pixel.
 
     Returns:
-        How many; 0 if some lie outside the picture, or they are too many.
+        Count; 0 if pixels lie outside the image, or there are too many.
     """
     height, width = grey.shape
     wide = abs(normal[0]) * reach + abs(normal[1]) * ALONG
@@ -115,9 +115,9 @@ def _gather(
 
 @compiled
 def _fit_bar(across: Floats, values: Floats, half: float) -> tuple[float, float, float, float]:
-    """Return a bar's offset [px], its height above either side, and the offset's variance.
+    """Return a bar's offset [px], its contrast to either side, and the offset's variance [px^2].
 
-    The variance is infinite where nothing fits.
+    The variance is infinite where the fit fails.
     """
     count = len(across)
     shift = 0.0
@@ -134,7 +134,7 @@ def _fit_bar(across: Floats, values: Floats, half: float) -> tuple[float, float,
             rise = 0.5 + 0.5 * math.erf(low / _ROOT_2)
             fall = 0.5 + 0.5 * math.erf(high / _ROOT_2)
             row[0], row[1], row[2] = 1.0 - rise, rise - fall, fall
-            # The levels come with the first step, the place from the second on.
+            # The first step solves for the levels, later steps also for the offset.
             up, down = level[1] - level[0], level[1] - level[2]
             row[3] = down * math.exp(-0.5 * high * high) - up * math.exp(-0.5 * low * low)
             row[3] /= _BLUR * _ROOT_2PI
@@ -163,7 +163,7 @@ def _solve(normal: Floats, right: Floats) -> float:
     """Replace `right` by the solution; return the last unknown's information, 0 if singular.
 
     Args:
-        normal: (n, n) positive definite, its lower half is used and lost.
+        normal: (n, n) positive definite; the function overwrites its lower half.
         right: (n,).
     """
     size = len(right)

@@ -1,4 +1,4 @@
-"""One static camera from what was clicked in its picture (C1-C5)."""
+"""Calibration of one static camera from clicks in its image (C1-C5)."""
 
 from __future__ import annotations
 
@@ -45,26 +45,26 @@ from worldpose.static_calibration.reporting import report_of
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 _COARSE: Final = 60.0
-"""Cauchy scale of all residuals while starts compete [standard deviations]: the pull of what is
-hundreds of pixels off is bounded, and that of tens is not."""
+"""Cauchy scale of all residuals while starts compete [standard deviations]: it bounds the influence
+of residuals of hundreds of pixels, but not of tens."""
 _CLOSE: Final = 4.0
-"""Mean loss of an observation [1] above which a homography's camera is not trusted and the search
-over plausible cameras begins."""
+"""Mean loss per observation [1] above which the search over plausible cameras replaces the camera
+of a homography."""
 _STEPS: Final = 12
-"""Iterations of a start before the best are chosen [1]."""
+"""Iterations per start before the best start is chosen [1]."""
 _CROPPED: Final = 0.15
-"""Of the principal point of a cropped image, in widths [1]: wherever a crop of half its size is."""
+"""Spread of a cropped image's principal point, in widths [1]: covers crops of half the size."""
 _FARTHEST_CROP: Final = 0.5
-"""How far the principal point of a cropped image lies from its center at most, in widths and in
-heights [1]: a corner of an image of twice its size."""
+"""Largest offset of a cropped image's principal point from its center, in widths and in heights
+[1]: a corner of an image of twice its size."""
 _FOR_CROP: Final = 7
-"""Fewest clicked points, or markings, that tell a crop from wrong names [1]."""
+"""Minimum clicked points, or markings, that distinguish a crop from wrong names [1]."""
 _MOST_LEFT_OUT: Final = 16
-"""Clicks up to which each is left out in turn for another start [1]."""
+"""Maximum clicks for leave-one-out starts [1]."""
 _OTHER_STARTS: Final = 2
-"""Such starts that are followed, the best first [1]."""
+"""Leave-one-out starts to refine, the best first [1]."""
 _FOR_K3: Final = 24
-"""Fewest residuals that k3 is tried with [1]: twice the parameters."""
+"""Minimum residuals to try k3 [1]: twice the parameters."""
 
 
 def calibrate(
@@ -76,12 +76,12 @@ def calibrate(
     settings: StaticCalibrationSettings = StaticCalibrationSettings(),  # noqa: B008
     where: str = "clicked markings",
 ) -> StaticCalibration:
-    """Return the camera that took a picture, and how well it is known.
+    """Return the camera of an image, its covariance and its report.
 
     Stage 1 finds starts: homographies of the flattened pitch, or plausible cameras where clicks
     are too few for one. Stage 2 fits pose, focal length, principal point and distortion on the
-    crowned pitch, names wrong clicks and leaves them out. Stage 3 refines on the painted lines
-    where there is a picture.
+    crowned pitch, and excludes outliers among the clicks. Stage 3 refines on the painted lines of
+    the image, if there is one.
 
     Args:
         pitch: the stadium's template.
@@ -92,9 +92,9 @@ def calibrate(
         where: file or camera, for messages.
 
     Raises:
-        InputError: a name is unknown, a pixel lies outside the picture, names are mirrored, the
+        InputError: a name is unknown, a pixel lies outside the image, names are mirrored, the
             clicks contradict each other, or they do not determine the camera; the message says
-            what to add and where.
+            which clicks to add.
 
     Note:
         C1-C5; paper section "Static Camera Calibration".
@@ -126,18 +126,18 @@ def _agreed(
     settings: StaticCalibrationSettings,
     stated: StaticCalibrationSettings,
 ) -> tuple[Problem, Screened, StaticCalibrationSettings, tuple[str, ...]]:
-    """Return problem, fit and settings of clicks that agree, and what was assumed for that.
+    """Return problem, fit and settings of consistent clicks, and the assumptions behind them.
 
-    Before clicks are blamed, or taken to be far noisier than stated, other explanations are tried:
-    that drawn markings are wrong, and that the image is a crop, so that the principal point lies
-    elsewhere.
+    Before many clicks count as outliers, or as far noisier than stated, the search tries other
+    explanations: drawn markings are wrong, or the image is a crop, so that the principal point
+    lies elsewhere.
 
     Args:
-        problem: what was clicked, at the noise that explains it best.
-        fit: to it.
+        problem: the clicks, at the most probable noise.
+        fit: fit to them.
         pitch: the template.
-        settings: at that noise.
-        stated: as they were given.
+        settings: settings at that noise.
+        stated: settings as given.
 
     Raises:
         InputError: the names are mirrored, the pitch has another size or unit, or no camera
@@ -182,9 +182,9 @@ def _agreed(
 def _other_starts(
     problem: Problem, settings: StaticCalibrationSettings
 ) -> list[NDArray[np.float64]]:
-    """Return cameras (22,) that few clicks suggest when one of them is not heard.
+    """Return starts (22,) that leave out one click each.
 
-    A single click under a wrong name may hold the robust fit of all in another minimum.
+    A single click under a wrong name may hold the robust fit in another minimum.
     """
     count = len(problem.evidence.points)
     if count > _MOST_LEFT_OUT:
@@ -206,7 +206,7 @@ def _explained(
     factor: float,
     assumed: Callable[[Screened], str],
 ) -> tuple[Problem, Screened, StaticCalibrationSettings, tuple[str, ...]]:
-    """Return an explanation as that of the whole problem: markings that it lacks are wrong."""
+    """Return an explanation applied to the whole problem: markings that it lacks are outliers."""
     within, fit, settings = found
     said = (assumed(fit),)
     if len(other.evidence.drawn_image) == len(problem.evidence.drawn_image):
@@ -217,7 +217,7 @@ def _explained(
 
 
 def _explanations(problem: Problem) -> Iterator[tuple[Problem, Callable[[Screened], str]]]:
-    """Yield other problems that the clicks may be of, each with what it assumes, in words."""
+    """Yield alternative problems, each with a function that words its assumption."""
     evidence, prior = problem.evidence, problem.prior.copy()
     prior[4] = _CROPPED * problem.image_size[0]
     middle = problem.prior[2:4]
@@ -239,7 +239,7 @@ def _explanations(problem: Problem) -> Iterator[tuple[Problem, Callable[[Screene
 
 
 def _start(problem: Problem, settings: StaticCalibrationSettings) -> NDArray[np.float64]:
-    """Return the (22,) camera to screen from."""
+    """Return the (22,) camera that the outlier search starts from."""
     count = 2 * len(problem.evidence.points) + len(problem.evidence.drawn_image)
     rows = from_homographies(problem, settings.prior, leave_out=False)
     if len(rows):
@@ -259,8 +259,8 @@ def _descended(
 ) -> tuple[NDArray[np.float64], float]:
     """Return the best camera (22,) reached from starts (b, 22), and its robust cost.
 
-    What is far off first pulls every start into its basin; then the sharper loss decides, which
-    a marking under a wrong name cannot outvote.
+    A wide loss first moves every start into its basin; then a sharper loss decides, which a marking
+    under a wrong name cannot dominate.
     """
     coarse = replace(problem, drawn_loss=_COARSE)
     near = adjust(coarse, rows, click_loss=_COARSE, iterations=_STEPS)
@@ -274,7 +274,7 @@ def _descended(
 def _with_k3(
     problem: Problem, fit: Screened, settings: StaticCalibrationSettings
 ) -> tuple[Problem, Screened, tuple[str, ...]]:
-    """Return problem and fit with k3 where held-out error earns it, and the figures (C5)."""
+    """Return problem and fit, with k3 if it lowers the held-out error, and the decisions (C5)."""
     before = held_out_error(problem, fit)
     decisions = [f"held-out error {before:.2f} px with {settings.distortion}"]
     count = 2 * int(fit.inliers.sum()) + len(problem.evidence.drawn_image)

@@ -1,4 +1,4 @@
-"""Errors of a calibration that say what to add, and where."""
+"""Checks of clicks and fits, whose errors say which clicks to add."""
 
 from __future__ import annotations
 
@@ -26,37 +26,37 @@ from worldpose.static_calibration.parameters import CameraEstimate
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 _POINTS: Final = 4
-"""Fewest clicked points without a drawn marking [1]: a homography's."""
+"""Minimum clicked points without a drawn marking [1]: those of a homography."""
 _CONSTRAINTS: Final = 6
-"""Fewest independent numbers with a drawn marking [1]: pose; the prior holds the focal length."""
+"""Minimum constraints with a drawn marking [1]: pose; the prior holds the focal length."""
 _LINE: Final = 2
-"""Numbers that a straight marking gives, however long it is drawn [1]."""
+"""Constraints of a straight marking, whatever its drawn length [1]."""
 _ARC: Final = 4
-"""Numbers that an arc gives [1]: five of its ellipse, less one that turning the circle leaves."""
+"""Constraints of an arc [1]: five of its ellipse, less one for the rotation of the circle."""
 _OFF_LINE: Final = 1.0
-"""Points whose root mean square distance from one line is below this are on it [m]."""
+"""Root mean square distance from a line below which points count as collinear [m]."""
 _POSE_SPREAD: Final = np.array([1.0, 1.0, 1.0, 30.0, 30.0, 30.0, 0.7])
-"""What is not known of pose and focal length at all [rad, m, 1]: directions told less than this
-are not determined by the clicks."""
+"""Spread of pose and focal length without information [rad, m, 1]: the clicks do not determine
+directions with a larger standard deviation."""
 _UNTOLD: Final = 2
-"""Directions of pose and focal length that the clicks may not leave to the prior [1]."""
+"""Undetermined directions of pose and focal length from which the check fails [1]."""
 _MIRRORED_GAIN: Final = 0.25
-"""Names are mirrored where mirroring them leaves less than this share of the cost [1]."""
+"""Names count as mirrored if mirroring leaves less than this share of the cost [1]."""
 _SUSPICIOUS: Final = 0.2
-"""Share of wrong clicks above which mirrored names are looked for [1]."""
+"""Share of outliers above which the check tries mirrored names [1]."""
 _FAR: Final = 4.0
-"""Mean loss of an observation in the stated noise [1] from which other explanations are tried."""
+"""Mean loss per observation in the stated noise [1] from which to try other explanations."""
 _MANY: Final = 9.0
 """Cauchy scale of clicks [standard deviations] while mirrored names compete."""
 _BELIEVED: Final = 0.1
-"""Share of wrong clicks up to which a camera is believed that rests on an assumption [1]."""
+"""Maximum share of outliers of a camera that rests on an assumption [1]."""
 _CLOSE: Final = 4.0
-"""Mean loss of an observation [1] up to which it is: twice the stated noise."""
+"""Maximum mean loss per observation of such a camera [1]: twice the stated noise."""
 _SAME_SIZE: Final = 0.5
-"""Difference in length or width that clicks do not tell [m]."""
+"""Difference in length or width that clicks cannot resolve [m]."""
 _UNIT_GAIN: Final = 14.0
-"""Twice the logarithm of how much more probable clicks must be on a pitch in yards [1]: a thousand
-times, for few files have that fault."""
+"""Twice the logarithm of the minimum probability ratio in favor of a pitch in yards [1]: a
+thousand, since the fault is rare."""
 YARD: Final = 0.9144
 """[m]"""
 
@@ -101,7 +101,7 @@ def check_amount(evidence: Evidence, pitch: PitchTemplate, where: str) -> None:
 
 
 def has_enough_points(evidence: Evidence) -> bool:
-    """Whether the clicked points alone can determine a camera."""
+    """Return whether the clicked points alone can determine a camera."""
     plan = evidence.points_world[:, :2]
     if len(plan) < _POINTS:
         return False
@@ -110,17 +110,17 @@ def has_enough_points(evidence: Evidence) -> bool:
 
 
 def is_suspicious(fit: Screened, factor: float) -> bool:
-    """Whether so much is wrong or far off that names or the image may be other than told.
+    """Return whether outliers or residuals suggest wrong names or a cropped image.
 
     Args:
-        fit: to the clicks.
-        factor: on the stated noise that it was made at.
+        fit: fit to the clicks.
+        factor: its noise over the stated noise.
     """
     return _wrong_share(fit) > _SUSPICIOUS or fit.misfit * factor**2 >= _FAR
 
 
 def _explains(fit: Screened) -> bool:
-    """Whether a camera explains the clicks well enough to say what they were clicked on."""
+    """Return whether a fit has few outliers and small residuals."""
     return _wrong_share(fit) <= _BELIEVED and bool(fit.misfit < _CLOSE)
 
 
@@ -143,14 +143,14 @@ def check_agreement(
     settings: StaticCalibrationSettings,
     stated: StaticCalibrationSettings,
 ) -> None:
-    """Raise InputError when no camera explains most of the clicks, or a pitch of another size.
+    """Raise InputError if no camera explains most clicks, or a pitch of another size does.
 
     Args:
-        problem: what was clicked, at the noise that explains it best.
-        fit: to it.
+        problem: the clicks, at the most probable noise.
+        fit: fit to them.
         pitch: the template.
-        settings: at that noise.
-        stated: as they were given.
+        settings: settings at that noise.
+        stated: settings as given.
     """
     evidence, wrong = problem.evidence, _wrong_share(fit)
     factor = settings.click_noise / stated.click_noise
@@ -177,18 +177,17 @@ def check_unit(
 ) -> None:
     """Raise InputError when a pitch whose size is in yards explains the clicks far better.
 
-    A camera bends its lens and calls a click or two wrong until the others fit a pitch that is
-    9 % too large.
+    With lens distortion and one or two outliers, the clicks also fit a pitch that is 9 % too large.
 
     Args:
-        problem: what was clicked, at the stated noise.
+        problem: the clicks, at the stated noise.
         best: its best explanation in metres, which may assume a cropped image.
         pitch: the template.
-        settings: as they were given.
+        settings: settings as given.
     """
     size = YARD * pitch.length, YARD * pitch.width
     other = _start_on_size(problem, *size, settings)
-    # A score of points alone tells nothing where drawn markings decide as well.
+    # A score of points alone decides nothing where drawn markings also constrain the camera.
     if other is None or problem.evidence.markings:
         return
     try:
@@ -222,7 +221,7 @@ def _wrong_share(fit: Screened) -> float:
 def _fitting_size(
     problem: Problem, pitch: PitchTemplate, settings: StaticCalibrationSettings
 ) -> tuple[float, float, str] | None:
-    """Return length and width [m] that explain the clicked points, and what then is wrong."""
+    """Return length and width [m] that explain the clicked points, and the likely mistake."""
     sizes = [
         (YARD * pitch.length, YARD * pitch.width, "it seems to be in yards"),
         (105.0, 68.0, "it seems to be another pitch's"),
@@ -248,13 +247,13 @@ def _start_on_size(
     """Return the clicked points on a pitch of another size, and a camera (22,) near the answer.
 
     Args:
-        problem: what was clicked.
+        problem: clicks, noise and prior.
         length: of the other pitch [m].
-        width: of it [m].
+        width: of the other pitch [m].
         settings: with the prior of cameras.
 
     Returns:
-        None where a point is not of the Laws, or the points determine no camera.
+        None if a point is not in the Laws, or the points determine no camera.
     """
     evidence, laws = problem.evidence, law_points(length, width)
     if not set(evidence.points) <= laws.keys() or not has_enough_points(evidence):
@@ -283,7 +282,7 @@ def check_determined(
     settings: StaticCalibrationSettings,
     where: str,
 ) -> None:
-    """Raise InputError when the clicks leave several directions of the camera to the prior."""
+    """Raise InputError when the prior alone determines several directions of the camera."""
     block = fit.evidence_information[:7, :7] * np.outer(_POSE_SPREAD, _POSE_SPREAD)
     untold = int((np.linalg.eigvalsh(block) < 1.0).sum())
     if untold < _UNTOLD:

@@ -1,7 +1,7 @@
-"""Which samples of markings nothing else that is white comes near, as a picture has them.
+"""Selection of marking samples with no other white structure near them in the image.
 
-Across such a sample there is one bar and grass on both sides. A crossbar, and the other side of a
-far circle, lie beside a sample in the picture only.
+Across such a sample there is one bar, with grass on both sides. A crossbar, and the other side of a
+far circle, are close to a sample in the image only.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 _STEP: Final = 0.5
-"""Between corners of the polylines that stand for what is white [m]: a corner arc is then 3 cm
-off, a quarter of its width."""
+"""Spacing of the polylines' corners [m]: the error of a corner arc is then 3 cm, a quarter of its
+width."""
 
 
 @dataclass(frozen=True, eq=False)
 class Whites:
-    """All that is white about a pitch, as polylines one after another.
+    """White structures of a pitch: concatenated polylines of markings and goals.
 
     Attributes:
         points_world: (n, 3) corners [m], world.
-        label: (n,) which one; markings have the indices of `PitchTemplate.sample_lines`, goals'
-            posts and crossbars higher ones.
+        label: (n,) structure; markings have the indices of `PitchTemplate.sample_lines`, posts and
+            crossbars higher ones.
     """
 
     points_world: Floats
@@ -39,7 +39,7 @@ class Whites:
 
 
 def whites_of(pitch: PitchTemplate) -> Whites:
-    """Return markings and goals of a template."""
+    """Return the polylines of a template's markings and goals."""
     parts = [pitch.marking_points(name, _STEP) for name in pitch.marking_names]
     return Whites(
         np.concatenate(parts), np.repeat(np.arange(len(parts)), [len(part) for part in parts])
@@ -54,14 +54,14 @@ def clear(
     room: Floats,
     marking: Integers,
 ) -> NDArray[np.bool_]:
-    """Return which places (n,) have only their own marking within a distance.
+    """Return a mask of places (n,) with no structure but their own marking within a distance.
 
     Args:
         camera: a single camera.
         whites: of the template.
         half_width: of paint and posts [m].
         places: (n, 2) of samples [px].
-        room: (n,) that nothing else may come into [px].
+        room: (n,) minimum distance to other structures [px].
         marking: (n,) the samples' own labels.
     """
     depth = camera.cam_from_world.apply(whites.points_world)[:, 2]
@@ -95,7 +95,7 @@ def _clear(
             share = min(max(share, 0.0), 1.0)
             ax, ay = ax + share * dx, ay + share * dy
             limit = room[i] + max(radius[j], radius[j + 1])
-            # What is behind the camera is NaN, and compares false.
+            # Points behind the camera are NaN, which compares false.
             if ax * ax + ay * ay < limit * limit:
                 result[i] = False
                 break

@@ -1,4 +1,4 @@
-"""Which clicks are wrong, and how large the noise of the others is."""
+"""Outliers among clicks, and the noise of the inliers."""
 
 from __future__ import annotations
 
@@ -29,34 +29,34 @@ from worldpose.static_calibration.residuals import (
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 _ROBUST: Final = 3.0
-"""Cauchy scale of clicks [standard deviations] of the fit that the screening starts from."""
+"""Cauchy scale of clicks [standard deviations] of the fit that starts the outlier search."""
 _SINGULAR: Final = 1e-14
-"""Least eigenvalue of the scaled information [1]: below it a point lies in the camera's center,
+"""Minimum eigenvalue of the scaled information [1]: below it a point lies in the camera's center,
 and rounding decides."""
 _CLEARLY: Final = 0.002
-"""Probability that honest residuals of the stated noise say by chance that it is another [1]."""
+"""Significance level of the test that residuals contradict the stated noise [1]."""
 _STATED_FREEDOM: Final = 4.0
-"""Degrees of freedom that the stated noise is worth where residuals say that it is another [1]: a
-statement within a factor of 1.4."""
+"""Degrees of freedom of the stated noise as a prior where residuals contradict it [1]: it is
+correct within a factor of 1.4."""
 _LARGEST_SCALE: Final = 5.0
-"""Largest factor on the stated noise that is believed [1]; beyond, names are wrong."""
+"""Maximum factor on the stated noise [1]; beyond, names are wrong."""
 _NOISES: Final = (1.5, 2.0, 3.0, 4.0)
-"""Factors on the stated noise that are tried where the stated one does not explain the clicks [1];
-none is believed to be worse than the last."""
+"""Factors on the stated noise to try where it does not explain the clicks [1]; the last is the
+largest plausible one."""
 CLEAR_GAIN: Final = 6.0
-"""Twice the logarithm of how much more probable another noise than the stated one must be [1]:
-twenty times."""
+"""Twice the logarithm of the minimum probability ratio in favor of a noise other than the stated
+one [1]: twenty."""
 _NOISE_SPREAD: Final = 0.5
-"""Of the logarithm of this factor [1]: people click half to twice as well as they say."""
+"""Spread of this factor's logarithm [1]: true noise is half to twice the stated noise."""
 _TWO_PI: Final = float(np.log(2.0 * np.pi))
 _POINT_NUMBERS: Final = 2
 _LINE_NUMBERS: Final = 2
 _ARC_NUMBERS: Final = 4
-"""Numbers that a click, a straight marking and an arc tell, however long they are drawn [1]."""
+"""Constraints of a click, a straight marking and an arc, whatever their drawn length [1]."""
 _ALONE: Final = 1e-9
-"""One minus the leverage of a click or marking below which only it observes a parameter [1]."""
+"""One minus leverage [1] below which a click or marking alone observes a parameter."""
 _ENOUGH_NUMBERS: Final = 8
-"""Numbers that must be left for a marking to be taken for wrong [1]: four clicks."""
+"""Minimum constraints that must remain to reject a marking [1]: four clicks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,22 +78,22 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """The fit to the right clicks.
+    """A fit to the inliers among the clicks.
 
     Attributes:
         row: (22,) camera.
-        covariance: (12, 12) of a step, to the second order.
-        tangent_covariance: (12, 12) to the first.
+        covariance: (12, 12) of a step, to second order.
+        tangent_covariance: (12, 12) of a step, to first order.
         evidence_information: (12, 12) of the inliers, at the estimated noise.
         inliers: (n,) bool.
-        markings: (m,) bool, drawn markings that the camera rests on.
-        surprise: (n,) residual in standard deviations of what the other evidence predicts.
-        noise_scale: factor on the stated noise that is taken: 1 unless the residuals clearly say
-            another.
-        click_noise: standard deviation of the inlying clicks that their residuals say [px]; NaN
-            without degrees of freedom.
-        click_freedom: degrees of freedom that it rests on [1].
-        misfit: mean loss of an observation in the stated noise [1]; about 1 for honest ones.
+        markings: (m,) bool, inliers among the drawn markings.
+        surprise: (n,) Mahalanobis distance of each click from its prediction by the other evidence.
+        noise_scale: estimated noise over the stated noise: 1 unless the residuals clearly
+            contradict the stated noise.
+        click_noise: standard deviation of the inlying clicks, estimated from their residuals [px];
+            NaN without degrees of freedom.
+        click_freedom: degrees of freedom of that estimate [1].
+        misfit: mean loss per observation in the stated noise [1]; about 1 without gross errors.
     """
 
     row: NDArray[np.float64]
@@ -110,7 +110,7 @@ class Screened:
 
 
 def residual_rows(problem: Problem, row: NDArray[np.float64]) -> Rows:
-    """Return all residuals of a camera (22,), with derivatives of the fixed parameters zero."""
+    """Return all residuals at a camera (22,); derivatives by fixed parameters are zero."""
     evidence = problem.evidence
     n, d = len(evidence.points), len(evidence.drawn_image)
     rows = Rows(np.empty((n, 2)), np.empty((n, 2, 12)), np.empty(d), np.empty((d, 12)))
@@ -133,22 +133,22 @@ def residual_rows(problem: Problem, row: NDArray[np.float64]) -> Rows:
 def screen(
     problem: Problem, start: NDArray[np.float64], settings: StaticCalibrationSettings
 ) -> Screened:
-    """Return the fit to the clicks that agree, and which those are.
+    """Return the fit to the inliers among clicks and markings.
 
-    From a robust fit's inliers, one click at a time leaves or returns: the inlier whose own
-    residual would grow most beyond `limit` if it were left out, else the outlier that the others
-    predict. In the linear regime this is leave-one-out for every click at the price of one fit.
-    The noise that a click is judged by is that of the others: the stated one, unless their
-    residuals clearly say another. A click on a point that the camera cannot image never stays.
-    A drawn marking is wrong where half of it is far off: that is another marking's name.
+    From the inliers of a robust fit, the search removes or restores one click at a time: the inlier
+    with the largest leave-one-out residual above `limit`, else an outlier that the inliers predict.
+    In the linear regime this is leave-one-out for every click at the cost of one fit. The noise for
+    the test of a click comes from the other clicks: the stated noise, unless their residuals
+    clearly contradict it. A click on a point that the camera cannot image is always an outlier. A
+    drawn marking is an outlier if half of it has a large residual: it has the wrong name.
 
     Args:
-        problem: what was clicked.
+        problem: clicks, noise and prior.
         start: (22,) camera near the answer.
-        settings: what is wrong.
+        settings: thresholds of outliers.
 
     Raises:
-        InputError: only a camera that cannot be explains the clicks.
+        InputError: only an impossible camera explains the clicks.
     """
     limit = settings.wrong_click
     count = len(problem.evidence.points)
@@ -175,7 +175,7 @@ def screen(
         following_markings = _right_markings(problem, row, following, settings)
         if following.tobytes() + following_markings.tobytes() in seen:
             break
-        # Half of the clicks against the other half is no majority, whoever goes next.
+        # With half of the clicks as outliers, the inliers are no majority.
         if 2 * following.sum() < count:
             break
         inliers, markings = following, following_markings
@@ -185,20 +185,20 @@ def screen(
 def screen_at_best_noise(
     problem: Problem, start: NDArray[np.float64], settings: StaticCalibrationSettings
 ) -> tuple[Problem, Screened, StaticCalibrationSettings]:
-    """Return problem, fit and settings at the noise of clicks that explains them best.
+    """Return problem, fit and settings at the most probable click noise.
 
-    A few clicks far off are wrong ones at the stated noise, or honest ones at a larger noise. The
-    explanation with the larger posterior probability is taken: inliers are Gaussian, a wrong click
-    is anywhere in the image, and the noise is near the stated one, which stands unless another is
-    clearly more probable.
+    A few clicks with large residuals are outliers at the stated noise, or inliers at a larger
+    noise. The larger posterior probability decides: inliers are Gaussian, outliers are uniform in
+    the image, and the prior of the noise is centered on the stated noise, which stands unless
+    another noise is clearly more probable.
 
     Args:
-        problem: what was clicked.
+        problem: clicks, noise and prior.
         start: (22,) camera near the answer.
-        settings: the stated noise, and what is wrong.
+        settings: the stated noise, and thresholds of outliers.
 
     Raises:
-        InputError: only a camera that cannot be explains the clicks.
+        InputError: only an impossible camera explains the clicks.
     """
     fit = screen(problem, start, settings)
     best = problem.surveyed_from(fit.row, settings), fit, settings
@@ -221,7 +221,7 @@ def screen_at_best_noise(
 def at_noise(
     problem: Problem, factor: float, settings: StaticCalibrationSettings
 ) -> tuple[Problem, StaticCalibrationSettings]:
-    """Return problem and settings with so many times the noise of clicks and drawn pixels."""
+    """Return problem and settings with the noise of clicks and drawn pixels times a factor."""
     noisy = {name: factor * getattr(settings, name) for name in ("click_noise", "drawn_noise")}
     return (
         replace(
@@ -241,16 +241,15 @@ def improbability(
     factor: float,
     with_prior: bool,
 ) -> float:
-    """Return minus twice the logarithm of an explanation's posterior, but for a constant.
+    """Return minus twice the log posterior of an explanation, up to a constant.
 
     Args:
-        problem: what was clicked, at the noise of the explanation.
-        fit: to it.
-        settings: at this noise.
-        factor: on the stated noise.
-        with_prior: count how plausible the camera is: to compare other assumptions about it. Of
-            two noises it tells nothing, and a lens that the prior does not know would be taken
-            for noise.
+        problem: the clicks, at the noise of the explanation.
+        fit: fit to them.
+        settings: settings at this noise.
+        factor: this noise over the stated noise.
+        with_prior: include the camera prior: for comparisons of assumptions about the camera. For
+            comparisons of noise it would count a lens that is rare under the prior as noise.
     """
     kept = problem.only(fit.inliers, fit.markings)
     rows = residual_rows(kept, fit.row)
@@ -281,13 +280,13 @@ def rest_on(
     inliers: NDArray[np.bool_],
     markings: NDArray[np.bool_],
 ) -> Screened:
-    """Return the fit to some of the clicks, whatever the others say.
+    """Return the fit to given inliers.
 
     Args:
-        problem: what was clicked, and how well.
+        problem: clicks, noise and prior.
         row: (22,) camera near the answer.
-        inliers: (n,) clicks to rest on.
-        markings: (m,) drawn markings to rest on.
+        inliers: (n,) clicks to fit to.
+        markings: (m,) drawn markings to fit to.
     """
     kept = problem.only(inliers, markings)
     fit = adjust(kept, row[None])
@@ -315,10 +314,10 @@ def rest_on(
 
 
 def noise_of(problem: Problem, row: NDArray[np.float64]) -> float:
-    """Return by what factor half of the clicks are farther off a camera than stated.
+    """Return the ratio of the median click residual to its value at the stated noise.
 
     Args:
-        problem: what was clicked.
+        problem: clicks, noise and prior.
         row: (22,) camera.
     """
     length = np.linalg.norm(residual_rows(problem, row).click, axis=1)
@@ -326,11 +325,11 @@ def noise_of(problem: Problem, row: NDArray[np.float64]) -> float:
 
 
 def surprise_at(problem: Problem, estimate: CameraEstimate) -> NDArray[np.float64]:
-    """Return each click's residual (n,) in standard deviations of what a camera predicts.
+    """Return each click's Mahalanobis distance (n,) from its prediction by a camera.
 
     Args:
-        problem: what was clicked.
-        estimate: camera that does not rest on these clicks.
+        problem: clicks, noise and prior.
+        estimate: camera that is independent of these clicks.
     """
     rows = residual_rows(problem, row_of(estimate.camera))
     nobody = np.zeros(len(rows.click), dtype=np.bool_)
@@ -338,10 +337,10 @@ def surprise_at(problem: Problem, estimate: CameraEstimate) -> NDArray[np.float6
 
 
 def held_out_error(problem: Problem, fit: Screened) -> float:
-    """Return the root mean square error of predicting each click and marking from the rest [px].
+    """Return the root mean square leave-one-out error of clicks and markings [px].
 
-    One click, or all pixels of one marking, are left out at a time; the residual that they would
-    have then follows from the fit with them (the block form of the PRESS statistic).
+    The function leaves out one click, or all pixels of one marking, at a time; the fit with them
+    gives their residual without them (the block form of the PRESS statistic).
     """
     evidence = problem.evidence
     rows = residual_rows(problem, fit.row)
@@ -358,12 +357,12 @@ def held_out_error(problem: Problem, fit: Screened) -> float:
     values, axes = np.linalg.eigh(fit.tangent_covariance / np.outer(size, size))
     root = size[:, None] * axes * np.sqrt(np.maximum(values, 0.0))
     for residual, by_step, noise in units:
-        # A marking has thousands of pixels, but what they share with the fit has rank 12.
+        # A marking has thousands of pixels, but their hat matrix has rank 12.
         sigma = np.broadcast_to(noise * fit.noise_scale, len(residual))
         shared = by_step @ root / sigma[:, None]
         leverage, along = np.linalg.eigh(shared.T @ shared)
         is_predicted = np.abs(1.0 - leverage) > _ALONE
-        # What only this unit observes, the rest does not predict: no error counts there.
+        # The rest does not predict directions that only this unit observes: no error counts there.
         gain = np.where(is_predicted, 1.0, -1.0) / np.where(is_predicted, 1.0 - leverage, leverage)
         whitened = residual / sigma
         predicted = sigma * (whitened + shared @ (along @ (gain * (along.T @ shared.T @ whitened))))
@@ -378,10 +377,10 @@ def _right_markings(
     inliers: NDArray[np.bool_],
     settings: StaticCalibrationSettings,
 ) -> NDArray[np.bool_]:
-    """Return which drawn markings (m,) are near their projections; all where too little is left.
+    """Return a mask of drawn markings (m,) near their projections; all where too few remain.
 
-    Clicks and markings are one electorate: markings are wrong where what stays, clicks included,
-    tells most of all numbers, and enough of them for a camera.
+    The mask rejects markings only if the remaining clicks and markings hold most of all
+    constraints, and enough for a camera.
     """
     evidence = problem.evidence
     off = np.abs(residual_rows(problem, row).drawn)
@@ -398,7 +397,7 @@ def _right_markings(
 
 
 def _imaged(problem: Problem, row: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which clicked points (n,) a camera (22,) can image."""
+    """Return a mask of the clicked points (n,) that a camera (22,) can image."""
     camera = camera_of_row(row, problem.image_size)
     return np.asarray(np.isfinite(camera.project(problem.evidence.points_world)).all(axis=-1))
 
@@ -410,11 +409,11 @@ def _spread(length: NDArray[np.float64]) -> float:
 
 @dataclass(frozen=True)
 class _Noise:
-    """How far the residuals of a fit are off.
+    """Noise of a fit, estimated from its residuals.
 
     Attributes:
-        scale: factor on the stated noise that is taken.
-        worth: degrees of freedom that the scale rests on; infinite for the stated noise.
+        scale: estimated noise over the stated noise.
+        worth: degrees of freedom of the scale; infinite for the stated noise.
         squared: sum of squared residuals in the stated noise.
         freedom: degrees of freedom of that sum.
     """
@@ -426,7 +425,7 @@ class _Noise:
 
     @classmethod
     def told(cls, squared: float, freedom: float) -> _Noise:
-        """The stated noise, unless the residuals clearly say another."""
+        """Return the stated noise, unless the residuals clearly contradict it."""
         stated = cls(1.0, np.inf, squared, freedom)
         if freedom < 1.0:
             return stated
@@ -441,16 +440,16 @@ class _Noise:
 def _judged_clicks(
     problem: Problem, kept: Problem, fit: Fits, inliers: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], _Noise, NDArray[np.float64]]:
-    """Return the covariance (12, 12), the noise, and each click's surprise (n,).
+    """Return the covariance (12, 12), the noise, and each click's Mahalanobis distance (n,).
 
-    Surprise is in standard deviations of a Gaussian: that of a click of which the noise is only
-    estimated is less than its distance (Student's law in two dimensions).
+    Distances are as for a Gaussian: if the noise is only an estimate, the distance shrinks
+    (Student's t-distribution in two dimensions).
 
     Args:
-        problem: what was clicked.
-        kept: that of it which the fit rests on.
-        fit: a single one.
-        inliers: (n,) which clicks it rests on.
+        problem: clicks, noise and prior.
+        kept: the problem restricted to its inliers.
+        fit: a single fit to `kept`.
+        inliers: (n,) clicks of `kept`.
     """
     covariance, noise = _covariance(kept, fit)
     row = fit.rows[0]
@@ -462,7 +461,7 @@ def _judged_clicks(
         if inliers[index]:
             left = max(noise.squared - (own * noise.scale) ** 2, 0.0)
             others = _Noise.told(left, noise.freedom - 2.0)
-        # Drawn pixels that are nearer than stated do not make clicks nearer.
+        # Drawn pixels that are more accurate than stated do not make clicks more accurate.
         scale = max(others.scale, 1.0)
         surprise[index] = _as_gaussian(own * noise.scale / scale, others.worth)
     surprise[~_imaged(problem, row)] = np.inf
@@ -470,14 +469,14 @@ def _judged_clicks(
 
 
 def _as_gaussian(distance: float, worth: float) -> float:
-    """Return the distance of a Gaussian in two dimensions that is exceeded as often."""
+    """Return the Mahalanobis distance with the same tail probability for a 2D Gaussian."""
     if not worth < np.inf:
         return distance
     return float(np.sqrt(worth * np.log1p(distance**2 / worth)))
 
 
 def _covariance(problem: Problem, fit: Fits) -> tuple[NDArray[np.float64], _Noise]:
-    """Return the covariance (12, 12), and the noise that the residuals say."""
+    """Return the covariance (12, 12), and the noise estimated from the residuals."""
     observed = fit.evidence_information[0]
     prior = fit.information[0] - observed
     free = np.ix_(problem.free, problem.free)
@@ -499,7 +498,7 @@ def _covariance(problem: Problem, fit: Fits) -> tuple[NDArray[np.float64], _Nois
 
 
 def _is_invertible(information: NDArray[np.float64]) -> bool:
-    """Whether an information can be inverted, each parameter in its own unit.
+    """Return whether an information matrix is invertible after scaling of its parameters.
 
     Coefficients of the lens and meters differ by many powers of ten.
     """
@@ -533,9 +532,9 @@ def _surprise(
     noise: NDArray[np.float64],
     inliers: NDArray[np.bool_],
 ) -> NDArray[np.float64]:
-    """Return each click's residual in standard deviations of its prediction without it."""
+    """Return each click's Mahalanobis distance from its prediction by the other clicks."""
     spread = np.einsum("nij,jk,nlk->nil", rows.by_click, covariance, rows.by_click)
-    # A click that the fit rests on has drawn the fit towards it.
+    # An inlier has moved the fit towards itself.
     sign = np.where(inliers, -1.0, 1.0)[:, None, None]
     variance = noise[:, None] ** 2
     total = variance[..., None] * np.eye(2) + sign * spread

@@ -1,4 +1,4 @@
-"""A clip's picture without the people in it."""
+"""Background image of a clip: the median of its frames."""
 
 from __future__ import annotations
 
@@ -13,19 +13,18 @@ from worldpose.errors import InputError
 Picture = NDArray[np.uint8]
 
 _BAND: Final = 64
-"""Rows that the median is taken of at a time: sorting copies them."""
+"""Rows per median computation: sorting copies them."""
 
 
 def median_picture(frames: Iterable[Picture], most: int = 64) -> Picture:
-    """Return the median of a clip's frames, where nobody stands still: without people.
+    """Return the median of a clip's frames, which shows no moving people.
 
-    At most `most` frames are in memory, evenly spread over the clip however long it is: where
-    there are more, every second of those that are kept goes, and from then on only every second
-    of those that come is kept.
+    At most `most` frames are in memory, evenly spread over the clip: when the limit is reached, the
+    function drops every second frame and doubles the stride.
 
     Args:
         frames: (height, width) or (height, width, 3) each, of one camera that does not move.
-        most: frames that are kept, two or more.
+        most: maximum number of frames in memory, two or more.
 
     Raises:
         InputError: there are no frames, their sizes differ, or `most` is below two.
@@ -57,7 +56,7 @@ def median_picture(frames: Iterable[Picture], most: int = 64) -> Picture:
     median = np.empty_like(kept[0])
     for top in range(0, len(median), _BAND):
         band = np.stack([frame[top : top + _BAND] for frame in kept])
-        # The lower of the two in the middle: whole levels stay whole.
+        # The lower of the two middle values: levels stay integers.
         middle = (len(kept) - 1) // 2
         median[top : top + _BAND] = np.partition(band, middle, axis=0)[middle]
     return median

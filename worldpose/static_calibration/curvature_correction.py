@@ -1,8 +1,8 @@
-"""What the curvature of a long valley adds to a camera's covariance.
+"""Second-order correction of a camera's covariance along ill-conditioned directions.
 
 With a long lens and clicks close together, focal length and distance trade off along a curve that
-the tangent at the best camera leaves: cameras on it fit nearly as well, and a covariance that knows
-only the tangent's direction calls them impossible.
+departs from its tangent at the best camera: cameras on the curve fit nearly as well, but a
+first-order covariance excludes them.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from worldpose.static_calibration.residuals import (
 Floats = NDArray[np.float64]
 
 _POSE_SPREAD: Final = np.array([1.0] * 3 + [100.0] * 3 + [np.inf] * 6)
-"""Of a camera that the painted lines have found [rad, m]: far wider than they leave it, and clicks
-that tell nothing of some direction have a Gaussian still."""
+"""Pose prior of a camera refined on painted lines [rad, m]: far wider than its uncertainty; it
+keeps the covariance finite in directions that the clicks do not observe."""
 
 
 def with_bends(problem: Problem, row: Floats, covariance: Floats, scale: float) -> Floats:
-    """Return the covariance (12, 12) about the best camera, to the second order.
+    """Return the covariance (12, 12) about the best camera, to second order.
 
     Along one standard deviation t of the step, the best cameras bend away by
     ``a(t, t) / 2``, with ``a = -C J' r''`` of the whitened residuals' second differences
@@ -40,9 +40,9 @@ def with_bends(problem: Problem, row: Floats, covariance: Floats, scale: float) 
     of ``a a'`` over pairs of directions, and the square of the mean bend.
 
     Args:
-        problem: what was fitted to.
+        problem: evidence, noise and prior of the fit.
         row: (22,) the best camera.
-        covariance: (12, 12) to the first order.
+        covariance: (12, 12) to first order.
         scale: factor on the stated noise of the evidence.
     """
     free = np.ix_(problem.free, problem.free)
@@ -70,13 +70,13 @@ def with_bends(problem: Problem, row: Floats, covariance: Floats, scale: float) 
 
 
 def tangent_at(problem: Problem, row: Floats, scale: float) -> CameraEstimate:
-    """Return what clicks and prior say of a camera, linear where it is known to be.
+    """Return the Gaussian of clicks and prior, linearized at a given camera.
 
-    A Gaussian about the clicks' own best camera leaves the valley on the way to a camera that the
-    painted lines have found; this one is right there.
+    A Gaussian about the clicks' own best camera is wrong at a distant camera along an
+    ill-conditioned direction, such as one from the painted lines; this Gaussian is correct there.
 
     Args:
-        problem: what was clicked.
+        problem: clicks, noise and prior.
         row: (22,) camera near the truth.
         scale: factor on the stated noise of the evidence.
     """
@@ -96,10 +96,10 @@ def tangent_at(problem: Problem, row: Floats, scale: float) -> CameraEstimate:
 
 
 def weighted(problem: Problem, row: Floats, scale: float) -> tuple[Floats, Floats]:
-    """Return residuals (m,) of a camera and derivatives (m, 12), times the roots of their weights.
+    """Return residuals (m,) at a camera and derivatives (m, 12), times the roots of their weights.
 
     Args:
-        problem: what was clicked.
+        problem: clicks, noise and prior.
         row: (22,) camera.
         scale: factor on the stated noise of the evidence.
     """

@@ -1,4 +1,4 @@
-"""The compiled Levenberg-Marquardt loop of stage 2."""
+"""Compiled Levenberg-Marquardt loop of stage 2."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from worldpose.static_calibration.residuals import (
 )
 
 TOLERANCE: Final = 1e-10
-"""Relative fall of the cost at which a minimum counts as reached."""
+"""Relative decrease of the cost below which the loop counts as converged."""
 
 
 @compiled
@@ -41,7 +41,7 @@ def descend(
     information: Floats,
     observed: Floats,
 ) -> None:
-    """Minimise from each row in place; see `adjustment.adjust`."""
+    """Minimize the cost from each row in place; see `adjustment.adjust`."""
     trial = np.empty(22)
     system = np.empty((SIZE, SIZE))
     gradient = np.empty(SIZE)
@@ -112,7 +112,7 @@ def _linearize(
     observed: Floats,
     gradient: Floats,
 ) -> float:
-    """Return the cost at a camera; write its information and gradient, zero where not free."""
+    """Return the cost at a camera; write information and gradient, zero for fixed parameters."""
     n, d = len(world), len(drawn)
     click = np.empty((n, 2))
     by_click = np.empty((n, 2, SIZE))
@@ -146,9 +146,9 @@ def _linearize(
 
 @compiled
 def _solve(system: Floats, right: Floats) -> None:
-    """Solve a damped system in place by Cholesky's factors; write minus the solution.
+    """Solve a damped system in place by Cholesky factorization; write minus the solution.
 
-    The step is NaN, and so refused, where rounding has left the system indefinite.
+    If rounding makes the system indefinite, the step is NaN and the loop rejects it.
     """
     for j in range(SIZE):
         for k in range(j + 1):
@@ -179,7 +179,7 @@ def _add(by: Floats, residual: float, weight: float, system: Floats, gradient: F
 
 @compiled
 def _weight(squared: float, scale: float) -> float:
-    """Return Cauchy's weight of a squared residual; 1 for an infinite scale."""
+    """Return the Cauchy weight of a squared residual; 1 for an infinite scale."""
     return 1.0 / (1.0 + squared / (scale * scale))
 
 

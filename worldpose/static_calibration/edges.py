@@ -1,8 +1,8 @@
-"""Where painted lines lie in a picture, found across them (C4).
+"""Detection of painted lines in an image, on profiles across them (C4).
 
-A painted line has two edges, and an edge detector finds either: half a width beside the template's
-line. Here brightness is read across the projected line, where paint is a bar as wide as the paint
-is projected. The edge of a mown stripe or of a shadow is bright on one side only and is no bar.
+A painted line has two edges, and an edge detector finds either: half a width off the template's
+line. This module samples brightness across the projected line, where paint is a bar of the
+projected width. The edge of a mown stripe or of a shadow is bright on one side only and is no bar.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 CANDIDATES: Final = 4
-"""Bars that are kept across one place [1]."""
+"""Maximum bar candidates per place [1]."""
 _STEP: Final = 0.5
-"""Between readings across a line [px]."""
+"""Spacing of samples across a line [px]."""
 ALONG: Final = 2
-"""Pixels to either side along the line that a bar is found and fitted in."""
+"""Half length along the line of the window to detect and fit a bar in [px]."""
 _FLANK: Final = 3.0
-"""Grass that is looked at on either side of a bar [px]."""
+"""Width of the grass sample on either side of a bar [px]."""
 _GAP: Final = 1.0
-"""Blurred rim of a bar, neither paint nor grass [px]."""
+"""Width of a bar's blurred rim, neither paint nor grass [px]."""
 BESIDE: Final = _GAP + _FLANK
-"""Beside a bar there must be nothing else for this far [px]."""
+"""Minimum distance of a bar from other structures [px]."""
 
 
 def brightness(picture: Picture) -> Picture:
-    """Return the luma (height, width) of a picture; its colours have half the resolution in video.
+    """Return the luma (height, width) of an image; chroma has half the resolution in video.
 
     Raises:
-        InputError: the picture is neither (height, width) nor (height, width, 3) of bytes.
+        InputError: the image is neither (height, width) nor (height, width, 3) of bytes.
     """
     if (
         picture.dtype != np.uint8
@@ -67,7 +67,7 @@ def find_bars(
     offsets: Floats,
     strengths: Floats,
 ) -> None:
-    """Write bright bars across places, the strongest first.
+    """Write the bright bars found across places, the strongest first.
 
     Args:
         grey: (height, width).
@@ -75,8 +75,8 @@ def find_bars(
         normals: (n, 2) unit vectors across the line.
         widths: (n,) of the bar [px].
         curvatures: (n,) of the line, positive where it turns towards its normal [1/px].
-        reaches: (n,) how far to look to either side [px]; negative = not at all.
-        contrast: least brightness above both sides [levels of 255].
+        reaches: (n,) half width of the search [px]; negative = no search.
+        contrast: minimum brightness above both sides [levels of 255].
         offsets: (n, CANDIDATES) along the normal [px], written; NaN where there are no more.
         strengths: (n, CANDIDATES) brightness above the brighter side, written.
     """
@@ -114,7 +114,7 @@ def find_bars(
                 if score[near] > score[j] or (score[near] == score[j] and near < j):
                     best = False
             if best:
-                # Sorted in by strength; the weakest falls out when there are too many.
+                # Insert by strength; the weakest drops out when there are too many.
                 slot = min(found, CANDIDATES - 1)
                 if found >= CANDIDATES and score[j] <= strengths[i, slot]:
                     continue
@@ -131,10 +131,10 @@ def find_bars(
 
 @compiled
 def _read(grey: Picture, place: Floats, normal: Floats, curvature: float, profile: Floats) -> None:
-    """Write brightness across a line, its middle entry at `place`; NaN outside the picture.
+    """Write the brightness profile across a line, centered on `place`; NaN outside the image.
 
-    Readings are means along the line and follow its curve: at the ends of a flat ellipse, the
-    tangent leaves the paint within few pixels.
+    Samples are means along the line and follow its curvature: at the ends of a flat ellipse, the
+    tangent leaves the paint within a few pixels.
     """
     height, width = grey.shape
     for j in range(len(profile)):

@@ -1,4 +1,4 @@
-"""What was clicked, as positions on the template and in the picture."""
+"""Clicked points and drawn markings, as positions on the template and in the image."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 
 _MOST = 200
-"""Drawn pixels of a marking that are used [1]: more take time and tell nothing new."""
+"""Maximum drawn pixels per marking [1]: more cost time and add no information."""
 _OUTSIDE = 1.0
-"""Pixels by which a click may lie off the picture: rounding at its border."""
+"""Maximum distance of a click outside the image [px]: rounding at its border."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,10 +27,10 @@ class Evidence:
         points_image: (n, 2) [px].
         markings: names of the drawn markings, each once.
         samples_world: (s, 3) [m], world, along the drawn markings one after another.
-        bounds: (m + 1,) where each marking's samples begin and end.
+        bounds: (m + 1,) first sample of each marking, and the end.
         drawn_image: (d, 2) [px].
         drawn_marking: (d,) indices into `markings`.
-        straight: (m,) is the marking a straight one on the pitch's surface.
+        straight: (m,) whether the marking is a straight line on the pitch surface.
     """
 
     points: tuple[str, ...]
@@ -44,7 +44,7 @@ class Evidence:
     straight: NDArray[np.bool_]
 
     def only(self, points: NDArray[np.bool_], markings: NDArray[np.bool_]) -> Evidence:
-        """Return the evidence of some clicked points (n,) and drawn markings (m,) only."""
+        """Return the evidence restricted to some clicked points (n,) and drawn markings (m,)."""
         keep, on = points, markings[self.drawn_marking]
         return replace(
             self,
@@ -63,18 +63,18 @@ def gather(
     spacing: float,
     where: str,
 ) -> Evidence:
-    """Return the evidence of one picture.
+    """Return the evidence of one image.
 
     Args:
-        pitch: template that the names are of.
+        pitch: template that defines the names.
         clicked: points and drawn markings.
         image_size: width, height [px].
         spacing: of the samples along markings [m].
         where: file or camera, for messages.
 
     Raises:
-        InputError: nothing was clicked, a name is unknown or given twice, or a pixel lies outside
-            the picture.
+        InputError: there are no clicks, a name is unknown or given twice, or a pixel lies outside
+            the image.
     """
     if not clicked.points and not clicked.drawn:
         raise InputError(
@@ -122,9 +122,9 @@ def gather(
 
 
 def crowding(evidence: Evidence, reach: float) -> NDArray[np.float64]:
-    """Return how many pixels of its marking lie within `reach` [px] of each drawn pixel (d,).
+    """Return per drawn pixel (d,) the count of its marking's pixels within `reach` [px].
 
-    A hand errs alike over a stretch of a line: pixels that crowd there tell no more than one.
+    Errors of hand drawing are correlated along a line: pixels within `reach` count as one.
     """
     count = np.ones(len(evidence.drawn_image))
     for index in range(len(evidence.markings)):
@@ -136,7 +136,7 @@ def crowding(evidence: Evidence, reach: float) -> NDArray[np.float64]:
 
 
 def _thinned(pixels: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return at most `_MOST` of a marking's pixels, evenly from the order in which they are."""
+    """Return at most `_MOST` of a marking's pixels, evenly spaced in their order."""
     chosen = np.linspace(0, len(pixels) - 1, min(len(pixels), _MOST)).astype(np.int64)
     return [pixels[index] for index in chosen]
 

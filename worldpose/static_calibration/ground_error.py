@@ -1,4 +1,4 @@
-"""How far off a camera's uncertainty puts what stands on the pitch."""
+"""Expected error of positions on the pitch, from a camera's covariance."""
 
 from __future__ import annotations
 
@@ -12,22 +12,23 @@ from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.parameters import CameraEstimate, project_with_jacobian
 
 _MARGIN = 2.0
-"""How far beyond the outer lines people stand on the ground that counts [m]."""
+"""Margin of the map beyond the outer lines [m]: people stand there."""
 _NUDGE = 0.01
 """Step of the surface's slope [m]."""
 _GRAZING = 1e-9
-"""Least area that a square metre of ground covers [px^2]: less is the horizon."""
+"""Minimum image area of a square metre of ground [px^2]: less is the horizon."""
 
 
 @dataclass(frozen=True, eq=False)
 class GroundErrorMap:
-    """The expected ground error over the pitch: the coverage map of one camera.
+    """Expected ground error over the pitch: the coverage map of one camera.
 
     Attributes:
         x: (columns,) [m], world.
         y: (rows,) [m], world.
         expected: (rows, columns) [m], root mean square distance on the surface between a place
-            and where the estimated camera puts its true pixel; NaN where the camera does not see.
+            and the back-projection of its true pixel by the estimated camera; NaN outside the
+            field of view.
     """
 
     x: NDArray[np.float64]
@@ -36,12 +37,12 @@ class GroundErrorMap:
 
     @property
     def median(self) -> float:
-        """Median over what the camera sees [m]; infinite where it sees nothing."""
+        """Median over the field of view [m]; infinite if the camera sees nothing."""
         return self._quantile(0.5)
 
     @property
     def p95(self) -> float:
-        """Exceeded on a twentieth of what the camera sees [m]."""
+        """95th percentile over the field of view [m]."""
         return self._quantile(0.95)
 
     def _quantile(self, share: float) -> float:
@@ -54,8 +55,8 @@ def ground_error_map(estimate: CameraEstimate, pitch: PitchTemplate, step: float
 
     Args:
         estimate: camera and covariance.
-        pitch: its size and surface.
-        step: largest distance between the grid's places [m].
+        pitch: template with size and surface.
+        step: maximum grid spacing [m].
     """
     x, y = (
         np.linspace(-half, half, int(np.ceil(2.0 * half / step)) + 1)
@@ -77,11 +78,11 @@ def expected_ground_error(
 
     Args:
         estimate: camera and covariance.
-        pitch: its surface.
+        pitch: template with the surface.
         places: (n, 3) [m], world, on the surface.
 
     Returns:
-        NaN where the camera has no image of the place.
+        NaN where the camera cannot image the place.
     """
     motion = surface_motion(estimate.camera, pitch, places)
     squared = np.einsum("nij,jk,nik->n", motion, estimate.covariance, motion)
@@ -91,18 +92,18 @@ def expected_ground_error(
 def surface_motion(
     camera: Camera, pitch: PitchTemplate, places: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return how places on the surface, told by their pixels, move with the camera's step.
+    """Return derivatives of back-projected places on the surface by the camera's step.
 
-    The pixel of a place moves with the step; the place on the surface that has this pixel moves
-    by the inverse of the pixel's derivative along the surface.
+    The pixel of a place moves with the step; the place on the surface with this pixel moves by the
+    inverse of the pixel's derivative along the surface.
 
     Args:
         camera: a single camera.
-        pitch: its surface.
+        pitch: template with the surface.
         places: (n, 3) [m], world, on the surface.
 
     Returns:
-        (n, 2, 12) [m]; NaN where the camera has no image of the place.
+        (n, 2, 12) [m]; NaN where the camera cannot image the place.
     """
     _, by_step = project_with_jacobian(camera, places)
     by_place = camera.project_with_jacobians(places).d_points

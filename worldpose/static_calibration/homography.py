@@ -1,4 +1,4 @@
-"""From the pitch's plane to the picture: normalised DLT, and the camera in it (C2)."""
+"""Homographies between pitch plane and image by normalized DLT, and their cameras (C2)."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from worldpose.static_calibration.evidence import Evidence
 _PLANE_SCALE = 50.0
 """Half a pitch [m]: coordinates of order one keep the DLT well conditioned."""
 _ON_SURFACE = 0.5
-"""Greatest height off the flattened plane of what the homography uses [m]: crowns stay, goals'
-upper ends go."""
+"""Maximum height of points for a homography [m]: includes the crown, excludes the goals' upper
+ends."""
 _MAX_SUBSETS = 300
-"""Of four clicks [1]: with two of twelve wrong, 40 % of them are clean."""
+"""Maximum subsets of four clicks [1]: with two outliers of twelve, 40 % of them are clean."""
 
 
 def plane_from_image(
@@ -36,12 +36,12 @@ def plane_from_image(
         points_image: (n, 2) [px].
         points_plane: (n, 2) [m].
         line_pixels: (d, 2) [px].
-        lines: (d, 3) the line of each, a x + b y + c = 0 with a^2 + b^2 = 1 [m].
-        scale: half the picture [px].
-        middle: (2,) of the picture [px].
+        lines: (d, 3) line per pixel, a x + b y + c = 0 with a^2 + b^2 = 1 [m].
+        scale: half the image diagonal [px].
+        middle: (2,) image center [px].
 
     Returns:
-        None where the equations leave more than one homography.
+        None if the equations do not determine one homography.
     """
     pixel = _homogeneous((points_image - middle) / scale)
     x, y = (points_plane / _PLANE_SCALE).T
@@ -73,17 +73,18 @@ def camera_of(
     seen: NDArray[np.float64],
     focal_range: tuple[float, float],
 ) -> Camera | None:
-    """Return the camera that sees the plane z = 0 through a homography, or None.
+    """Return the camera of a homography from the plane z = 0, or None.
 
-    Assumes square pixels and the principal point in the picture's middle: a plane gives two
-    equations for the internal parameters, here both for the focal length. Where they contradict
-    or do not tell (a view straight down), the focal length comes from the ends of its range.
+    The function assumes square pixels and the principal point in the image center: a plane gives
+    two equations for the internal parameters, here both for the focal length. Where they contradict
+    each other or are degenerate (a view straight down), the function clips the focal length to its
+    range.
 
     Args:
         image_from_plane: (3, 3).
         image_size: width, height [px].
-        seen: (2,) [px], a pixel on the pitch: the plane lies before the camera there.
-        focal_range: smallest and largest believable focal length [px].
+        seen: (2,) [px], a pixel on the pitch: the plane is in front of the camera there.
+        focal_range: minimum and maximum plausible focal length [px].
 
     Note:
         C2, trap 10.
@@ -126,16 +127,17 @@ def camera_of(
 def homographies(
     evidence: Evidence, image_size: tuple[int, int], tolerance: float, *, leave_out: bool
 ) -> list[NDArray[np.float64]]:
-    """Return homographies (3, 3) from the plane to pixels worth a try, the best one first.
+    """Return candidate homographies (3, 3) from the plane to pixels, the best one first.
 
-    RANSAC over four clicks at a time where there are five or more, then the DLT over all clicks
-    that agree and all straight markings; and the DLT over straight markings alone.
+    Candidates are: the DLT over straight markings and the inliers of RANSAC (four clicks at a time,
+    from five clicks on), the DLT over straight markings and all clicks, and the DLT over straight
+    markings alone.
 
     Args:
-        evidence: what was clicked.
+        evidence: clicks and drawn markings.
         image_size: width, height [px].
-        tolerance: largest distance of an agreeing click [px]; covers distortion and the crown.
-        leave_out: try as well without each straight marking in turn.
+        tolerance: maximum inlier distance [px]; covers distortion and the crown.
+        leave_out: also leave out each straight marking in turn.
     """
     middle = np.array([0.5 * (image_size[0] - 1), 0.5 * (image_size[1] - 1)])
     scale = 0.5 * float(np.hypot(*image_size))
@@ -165,7 +167,7 @@ def _consensus(
     scale: float,
     tolerance: float,
 ) -> NDArray[np.bool_]:
-    """Return which clicks agree with the four clicks that most others agree with."""
+    """Return the inlier mask (n,) of the best homography from four clicks."""
     best = np.ones(len(plane), dtype=np.bool_)
     if len(plane) < 5:
         return best
@@ -190,7 +192,7 @@ def _consensus(
     with np.errstate(divide="ignore", invalid="ignore"):
         errors = np.linalg.norm(mapped[..., :2] / mapped[..., 2:] - target, axis=-1) * scale
     errors = np.where(np.isfinite(errors), errors, np.inf)
-    # Clipped squared errors rank equal consensus by how well it agrees.
+    # Clipped squared errors rank consensus sets of equal size by their residuals.
     costs = np.minimum(errors, tolerance) ** 2
     winner = int(np.argmin(costs.sum(axis=1)))
     return np.asarray(errors[winner] < tolerance)
@@ -199,7 +201,7 @@ def _consensus(
 def _surface_lines(
     evidence: Evidence,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Return pixels (d, 2) on straight surface markings, the line (d, 3) and marking of each."""
+    """Return pixels (d, 2) on straight surface markings, their lines (d, 3) and markings (d,)."""
     straight = evidence.straight[evidence.drawn_marking]
     lines = np.zeros((len(evidence.markings), 3))
     for index, (first, stop) in enumerate(itertools.pairwise(evidence.bounds)):

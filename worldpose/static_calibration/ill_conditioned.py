@@ -1,8 +1,8 @@
-"""A camera from clicks and lines where these leave a long valley of cameras that fit (C4).
+"""Camera and covariance from clicks and lines for an ill-conditioned problem (C4).
 
-Two parallel lines and one across them leave distance, height and focal length to the prior, and
-hold all else to a thousandth of that. The cameras that fit lie on a curve that no tangent follows
-so far.
+With two parallel lines and one across them, only the prior determines distance, height and focal
+length; all other uncertainties are a thousand times smaller. The cameras that fit lie on a curve,
+and its tangent is no approximation over that length.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ Floats = NDArray[np.float64]
 _TURNS: Final = 20
 """Gauss-Newton steps at most [1]."""
 _SETTLED: Final = 0.01
-"""Length of the last of them [standard deviations]."""
+"""Step length at which the iteration stops [standard deviations]."""
 _HALVINGS: Final = 6
-"""Times that a step may be halved until the fit is better [1]."""
+"""Maximum halvings of a step that does not lower the cost [1]."""
 _FIRST: Final = 8
 _DRAWS: Final = 64
-"""Cameras that tell whether more are needed, and all of them [1]."""
+"""Sampled cameras before the linearity test, and in total [1]."""
 _STRAIGHT: Final = 0.3
-"""Root mean square distance of the first from their tangents that needs no more of them [standard
-deviations]."""
+"""Root mean square deviation of the first cameras from their tangents below which sampling stops
+[standard deviations]."""
 
 
 @dataclass(frozen=True, eq=False)
 class ClicksAndBars:
-    """All that a camera rests on after its lines.
+    """Evidence of a camera after line refinement: clicks, prior and bars.
 
     Attributes:
         problem: the clicks and the prior.
@@ -52,18 +52,18 @@ class ClicksAndBars:
     bars: Bars
 
     def residuals(self, camera: Camera) -> tuple[Floats, Floats]:
-        """Return residuals (m,) in standard deviations, and derivatives (m, f) by a free step."""
+        """Return whitened residuals (m,) and derivatives (m, f) by the free parameters."""
         clicks, by_clicks = weighted(self.problem, row_of(camera), self.scale)
         lines, by_lines = self.bars.whitened(camera)
         rows = np.concatenate([by_clicks, by_lines])[:, self.problem.free]
         return np.concatenate([clicks, lines]), rows
 
     def fit(self, camera: Camera, noise: Floats | None = None) -> Camera:
-        """Return the best camera.
+        """Return the camera of least cost.
 
         Args:
             camera: near the answer.
-            noise: added to the residuals (m,).
+            noise: (m,) to add to the residuals; None = none.
         """
         residuals, rows = self.residuals(camera)
         noise = np.zeros(len(residuals)) if noise is None else noise
@@ -76,7 +76,7 @@ class ClicksAndBars:
                 step[self.problem.free] = free_step
                 trial = stepped(camera, step)
                 ahead, by_ahead = self.residuals(trial)
-                # What a camera does not see is NaN, and no better.
+                # Points that a camera does not see are NaN, which compares false.
                 if ((ahead + noise) ** 2).sum() < before:
                     break
                 free_step = 0.5 * free_step
@@ -90,16 +90,16 @@ class ClicksAndBars:
 
 
 def fit_and_bends(problem: Problem, camera: Camera, bars: Bars, scale: float) -> CameraEstimate:
-    """Return the camera that clicks and lines agree on, its covariance wide enough for its valley.
+    """Return the camera fitted to clicks and lines, with a covariance to second order.
 
-    Noise as large as that of clicks, prior and bars is drawn, and a camera fitted to it. By the
-    tangents these cameras have the inverse of the information as covariance; the mean square of
-    what they lie beside their tangents is added to it.
+    The function samples noise of clicks, prior and bars, and fits a camera to each sample. To first
+    order these cameras have the inverse information as covariance; the function adds the mean
+    square of their deviations from the tangent.
 
     Args:
-        problem: the clicks that the camera rests on.
+        problem: the inlying clicks.
         camera: near the answer.
-        bars: found on the lines.
+        bars: bars on the lines.
         scale: factor on the stated noise of the clicks.
     """
     evidence = ClicksAndBars(problem, scale, bars)
@@ -108,7 +108,7 @@ def fit_and_bends(problem: Problem, camera: Camera, bars: Bars, scale: float) ->
     size = 1.0 / np.linalg.norm(rows, axis=0)
     answer = np.linalg.pinv(rows * size)
     covariance = answer @ answer.T
-    # The same noise for every camera: the same evidence gives the same bits.
+    # A fixed seed: the same evidence gives bitwise equal results.
     rng = np.random.default_rng(0)
     beside: list[Floats] = []
     for _ in range(_DRAWS // 2):

@@ -1,4 +1,4 @@
-"""Cameras to start from: out of homographies, and plausible places in the stands."""
+"""Initial cameras from homographies, and from a grid of plausible places in the stands."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from worldpose.static_calibration.homography import camera_of, homographies
 from worldpose.static_calibration.settings import CameraPrior
 
 _AGREES: Final = 0.012
-"""Largest distance from a homography of a right click, in widths of the picture [1]: distortion
-of a few percent at the border and the crown's height."""
+"""Maximum inlier distance of a homography, in image widths [1]: distortion of a few percent at the
+border and the crown's height."""
 _AZIMUTHS: Final = 16
-"""Directions searched about the centre spot [1]: 22 degrees apart, within reach of the fit."""
+"""Directions of the grid about the centre spot [1]: 22 degrees apart, so that the fit converges."""
 _FACTORS: Final = (-1.0, 0.3)
-"""Heights and distances searched, in spreads from the middle [1]."""
+"""Heights and distances of the grid, in spreads from the middle [1]."""
 _FOCALS: Final = (-1.0, 0.0, 1.0)
-"""Focal lengths searched, in spreads from the middle [1]."""
+"""Focal lengths of the grid, in spreads from the middle [1]."""
 _FOCAL_REACH: Final = 2.5
-"""Focal lengths that a homography may have, in spreads about the middle [1]."""
+"""Maximum deviation of a homography's focal length, in spreads about the middle [1]."""
 
 
 def from_homographies(
     problem: Problem, prior: CameraPrior, *, leave_out: bool
 ) -> NDArray[np.float64]:
-    """Return cameras (b, 22) of the homographies that points and straight markings give.
+    """Return cameras (b, 22) of the homographies from points and straight markings.
 
     Args:
-        problem: evidence and picture.
+        problem: evidence and image size.
         prior: the range of focal lengths.
-        leave_out: try as well without each straight marking in turn: one name may be wrong.
+        leave_out: also leave out each straight marking in turn: one name may be wrong.
     """
     evidence, width = problem.evidence, problem.image_size[0]
     spread = np.exp(_FOCAL_REACH * prior.focal_spread)
@@ -51,13 +51,13 @@ def from_homographies(
 
 
 def plausible_cameras(problem: Problem, prior: CameraPrior) -> NDArray[np.float64]:
-    """Return level cameras (b, 22) all around the stadium that look at what was clicked.
+    """Return level cameras (b, 22) all around the stadium, oriented towards the clicks.
 
-    The middle of the clicked pixels looks at the middle of the clicked points, or at each of the
-    places along the drawn markings in turn.
+    The mean of the clicked pixels shows the mean of the clicked points, or each of the places along
+    the drawn markings in turn.
 
     Args:
-        problem: evidence and picture.
+        problem: evidence and image size.
         prior: heights, distances and focal lengths.
     """
     evidence = problem.evidence
@@ -82,7 +82,7 @@ def plausible_cameras(problem: Problem, prior: CameraPrior) -> NDArray[np.float6
 
 
 def _aims(problem: Problem) -> NDArray[np.float64]:
-    """Return places (a, 3) [m], world, that the middle of the clicked pixels may show."""
+    """Return places (a, 3) [m], world, that the mean of the clicked pixels may show."""
     evidence = problem.evidence
     middles = [
         evidence.samples_world[first:stop].mean(axis=0) for first, stop in pairwise(evidence.bounds)
@@ -90,7 +90,7 @@ def _aims(problem: Problem) -> NDArray[np.float64]:
     together = np.concatenate([evidence.points_world, np.array(middles).reshape(-1, 3)])
     aims = [together.mean(axis=0)]
     if len(evidence.points) < 2:
-        # Of a long line only a part is seen, and nobody said which.
+        # The image may show only a part of a long line, and the clicks do not tell which.
         for first, stop in pairwise(evidence.bounds):
             inner = np.linspace(first, stop - 1, 7)[1:-1:2].astype(np.int64)
             aims.extend(evidence.samples_world[inner])
@@ -104,10 +104,10 @@ def _looking(
     off: NDArray[np.float64],
     focal: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return rotations (b, 3, 3) of level cameras that see `aims` `off` [px] their middles."""
+    """Return rotations (b, 3, 3) of level cameras with `aims` at `off` [px] from the center."""
     forward = aims - centers
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    # Pan and tilt by the angles at which the clicked middle stands off the picture's.
+    # Pan and tilt by the angles between the mean of the clicks and the image center.
     tilt = np.arcsin(forward[:, 2]) + np.arctan(off[:, 1] / focal)
     pan = np.arctan2(forward[:, 1], forward[:, 0]) + np.arctan(off[:, 0] / focal)
     forward = np.stack(

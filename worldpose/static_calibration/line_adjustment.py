@@ -1,4 +1,4 @@
-"""The camera that explains measured lines best, given what was known before (C4)."""
+"""Robust least squares of a camera on measured lines, with a prior (C4)."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """A step of the free parameters, and what is left.
+    """A step of the free parameters, its information and its residuals.
 
     Attributes:
         step: (f,).
-        information: (f, f) inverse of the step's covariance, the paint's unknowns accounted for.
-        residuals: (n,) with the paint's unknowns taken off [px].
+        information: (f, f) inverse covariance of the step, marginalized over the paint's unknowns.
+        residuals: (n,) after subtraction of the paint's unknowns [px].
         weights: (n,) of the robust loss [1].
-        spent: samples that the unknowns are worth which the priors do not tell [1].
+        spent: degrees of freedom that the fit takes from the samples [1].
     """
 
     step: Floats
@@ -43,18 +43,18 @@ def adjust(
 ) -> Adjusted:
     """Return the step that moves projected markings onto measured ones.
 
-    Iteratively reweighted least squares with the loss of Geman and McClure. What is not known of
-    the paint has unit Gaussian priors: a thousand samples of one line tell where it is painted, and
-    no more about the camera than the survey of its ends allows.
+    Iteratively reweighted least squares with the Geman-McClure loss. The paint's unknowns have unit
+    Gaussian priors: a thousand samples of one line determine its paint, but the camera only within
+    the survey error of the line's ends.
 
     Args:
-        offsets: (n,) measured minus projected, along the normal [px]; NaN = nothing found.
+        offsets: (n,) measured minus projected, along the normal [px]; NaN = no measurement.
         variances: (n,) [px^2].
-        by_camera: (n, f) how the projection moves with a step of the free parameters.
-        by_paint: (n, k) how it moves with unknowns of the paint.
-        unknowns: (n, k) which ones.
-        prior: information (f, f), and the step (f,) that it expects.
-        scales: of the loss [standard deviations], one for each solution.
+        by_camera: (n, f) derivatives of the projection by the free parameters.
+        by_paint: (n, k) derivatives of the projection by unknowns of the paint.
+        unknowns: (n, k) indices of these unknowns.
+        prior: information (f, f) and mean (f,) of the step.
+        scales: of the loss [standard deviations], one per iteration.
     """
     known = np.isfinite(offsets)
     weights = known.astype(np.float64)

@@ -1,4 +1,4 @@
-"""Painted lines as they were found in a picture, for cameras near the one that found them."""
+"""Measured bars of painted lines, and their residuals at nearby cameras."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from worldpose.static_calibration.parameters import project_with_jacobian
 Floats = NDArray[np.float64]
 
 _STRIDE: Final = 0.1
-"""Along a marking, its course in the picture is told from [m]."""
+"""Step along a marking for finite differences of its projection [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bars:
-    """Bars in the picture, each with the sample of a marking that it is.
+    """Bars in the image, each with its marking sample.
 
     Attributes:
-        samples: (n,) where they were looked for.
-        pixels: (n, 2) where they are [px].
+        samples: (n,) marking samples.
+        pixels: (n, 2) positions of the bars [px].
         noise: (n,) across the marking, standard deviation [px].
-        by_paint: (n, 7) how the marking moves with what is not known of the paint.
+        by_paint: (n, 7) derivatives of the marking by the paint's unknowns.
         unknowns: (n, 7) numbers of these, see `SeenLines`.
     """
 
@@ -39,7 +39,7 @@ class Bars:
 
     @cached_property
     def _paint(self) -> Floats:
-        """Orthonormal columns that span what the paint's unknowns do to residuals and priors."""
+        """Orthonormal basis of the paint's unknowns, in residuals and priors."""
         numbers, index = np.unique(self.unknowns, return_inverse=True)
         count = len(self.noise)
         columns = np.zeros((count + len(numbers), len(numbers)))
@@ -48,11 +48,11 @@ class Bars:
         return np.linalg.qr(columns)[0]
 
     def whitened(self, camera: Camera) -> tuple[Floats, Floats]:
-        """Return how far markings lie beside their bars (m,), and how they move by a step (m, 12).
+        """Return whitened residuals (m,) of markings against bars, and derivatives (m, 12).
 
-        Beside the nearest point: a marking that slides along itself fits as well as before. Both
-        are independent and in standard deviations, the paint's unknowns and their priors taken off;
-        so there are more of them than bars.
+        Residuals are distances to the nearest point: a marking that slides along itself fits as
+        well as before. Residuals and derivatives are projected off the paint's unknowns and their
+        priors, so that m is larger than the number of bars.
         """
         before, after = (camera.project(self.samples.beside(way)) for way in (-_STRIDE, _STRIDE))
         middle, jacobian = project_with_jacobian(camera, self.samples.points_world)

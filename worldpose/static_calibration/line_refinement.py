@@ -1,9 +1,9 @@
-"""Stage 3: a camera refined on the painted lines of its picture (C4).
+"""Stage 3: refinement of a camera on the painted lines of its image (C4).
 
-The paper looks samples of the markings up in a map of the distance to the nearest edge pixel. Here
-each sample is looked for across its own projected line, which tells the side as well as the
-distance, keeps apart markings that lie near each other, and has no half-width and no rounding in
-it. `benchmarks/static_calibration.py` measures both.
+The paper looks up samples of the markings in a map of the distance to the nearest edge pixel. This
+module searches each sample across its own projected line, which gives a signed offset, separates
+neighboring markings, and adds no half-width and no rounding.
+`benchmarks/static_calibration.py` measures both.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MarkingFit:
-    """How one marking was found.
+    """Detection result of one marking.
 
     Attributes:
         name: of the line or arc.
-        samples: in the picture.
-        found: of them, where the fit puts them.
-        rms: of those found, measured minus projected across the line [px]; NaN if there are none.
+        samples: count in the image.
+        found: count of inliers among them.
+        rms: of the inliers, measured minus projected across the line [px]; NaN without inliers.
     """
 
     name: str
@@ -50,17 +50,17 @@ class MarkingFit:
 
 @dataclass(frozen=True, eq=False)
 class LineRefinement:
-    """A camera after its lines, or the start and why it was kept.
+    """A camera refined on lines, or its start and the reason of the failure.
 
     Attributes:
-        estimate: the refined camera; the start where it was kept.
-        refined: whether the lines were used.
-        reason: why not; empty if they were.
-        markings: those in the picture.
-        rms: of all samples found, measured minus projected across the line [px]; NaN without any.
+        estimate: the refined camera; the start if refinement failed.
+        refined: whether refinement succeeded.
+        reason: why it failed; empty on success.
+        markings: markings in the image.
+        rms: of all inliers, measured minus projected across the line [px]; NaN without inliers.
         correlation: of neighbouring residuals along a marking, mean over the samples [1].
-        effective_samples: independent ones that those found are worth [1].
-        bars: what the camera rests on; None where the start was kept.
+        effective_samples: equivalent number of independent inliers [1].
+        bars: bars of the fit; None if refinement failed.
     """
 
     estimate: CameraEstimate
@@ -82,23 +82,23 @@ def refine_on_lines(
     survey_error: float = SURVEY_ERROR,
     begin: CameraEstimate | None = None,
 ) -> LineRefinement:
-    """Return the camera that the painted lines and what was known before agree on.
+    """Return the maximum a posteriori camera from the painted lines and a Gaussian prior.
 
-    What is looked for, and how far off, follows from the start's covariance: samples whose
-    projection is well known come first, and what they tell brings the others within reach.
+    The start's covariance gives samples and search widths: the search begins with samples of small
+    projected uncertainty, which reduce the uncertainty of the others.
 
     Args:
         start: from clicks; its covariance is the Gaussian prior, and parameters without variance
-            stay as they are.
+            stay fixed.
         pitch: the template.
         picture: (height, width) or (height, width, 3) RGB.
         settings: the defaults if None.
         survey_error: of the template's points from the painted ones, each axis, standard
             deviation [m].
-        begin: where to look first, where more is known than the prior; the start if None.
+        begin: camera to begin the search at, if more accurate than the prior; the start if None.
 
     Raises:
-        InputError: the picture is not one of the start's camera.
+        InputError: the image size is not that of the start's camera.
     """
     settings = settings or LineRefinementSettings()
     grey = brightness(picture)
@@ -121,7 +121,7 @@ def refine_on_lines(
         return _kept(start, f"only {count} of {visible} samples of lines were found")
     correlation, excess = _noise(found, inliers)
     independent = (1.0 - correlation) / (1.0 + correlation)
-    # Neighbours tell partly the same: their variances grow until together they tell what they do.
+    # Neighbours are correlated: larger variances give them their joint information.
     found = search.reweighed(found, inliers, excess / independent)
     distance = search.distance(found.camera)
     if chdtrc(search.free.sum(), distance**2) < settings.contradiction:
@@ -143,14 +143,14 @@ def refine_on_lines(
 
 
 _WORLD_SPACING: Final = 0.2
-"""Between samples before they are thinned [m]; the nearest paint has 40 px a metre."""
+"""Spacing of samples before thinning [m]; the nearest paint has 40 px per metre."""
 _INLIER: Final = 0.25
-"""Weight above which a sample counts as found: within one scale of the loss [1]."""
+"""Weight above which a sample is an inlier: within one scale of the loss [1]."""
 _MOST_CORRELATED: Final = 0.95
 _OWN_WORTH: Final = 20.0
-"""Residuals of a marking that the expected noise is worth when its noise is told [1]."""
+"""Weight of the expected noise in the estimate of a marking's noise [residuals]."""
 _LEAST_KEPT: Final = 0.5
-"""Share of the samples that a fit leaves to tell the noise, at least [1]."""
+"""Minimum share of the samples that remain as degrees of freedom [1]."""
 
 
 def _check_size(camera: Camera, grey: NDArray[np.uint8]) -> None:
@@ -165,9 +165,9 @@ def _check_size(camera: Camera, grey: NDArray[np.uint8]) -> None:
 
 
 def _there(found: Found, inliers: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:
-    """Return which samples (n,) are of markings of which enough was found.
+    """Return a mask of samples (n,) whose markings have enough inliers.
 
-    Of a marking that is not there, something else is found here or there, and moves the camera.
+    Chance detections on a marking that is absent would move the camera.
     """
     marking, count = found.samples.marking, len(found.samples.names)
     seen = np.bincount(marking, found.seen.visible, count)
@@ -176,10 +176,10 @@ def _there(found: Found, inliers: NDArray[np.bool_], least: float) -> NDArray[np
 
 
 def _noise(found: Found, inliers: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """Return how neighbouring residuals correlate, and how much larger than expected they are.
+    """Return correlation and excess variance of neighbouring residuals.
 
-    Both for every sample (n,), from all of its marking: grass is rougher about a far line that is
-    as wide as a pixel than about a near one, and neighbours there share it.
+    Both per sample (n,), from its whole marking: grass is rougher about a far line as narrow as a
+    pixel than about a near one, and affects neighbours alike.
     """
     marking = found.samples.marking
     scaled = np.where(inliers, found.adjusted.residuals / np.sqrt(found.measured.variances), 0.0)
@@ -188,12 +188,12 @@ def _noise(found: Found, inliers: NDArray[np.bool_]) -> tuple[Floats, Floats]:
     def total(values: Floats, labels: NDArray[np.int64]) -> Floats:
         return np.bincount(labels, values, len(found.samples.names)).astype(np.float64)
 
-    # What the fit has spent on itself is missing from its residuals.
+    # The fit's degrees of freedom are missing from its residuals.
     used = float(inliers.sum())
     kept = max(1.0 - found.adjusted.spent / used, _LEAST_KEPT)
     squares = total(scaled**2, marking) / kept
     products = total(np.where(pairs, scaled[1:] * scaled[:-1], 0.0), marking[1:])
-    # Of few samples the mean square of all is more than their own.
+    # For a few samples, the mean square of all samples is the better estimate.
     mean = squares.sum() / used + np.finfo(np.float64).tiny
     correlation = products / np.maximum(squares, _OWN_WORTH * mean)
     excess = (squares + _OWN_WORTH) / (total(inliers.astype(np.float64), marking) + _OWN_WORTH)
@@ -201,7 +201,7 @@ def _noise(found: Found, inliers: NDArray[np.bool_]) -> tuple[Floats, Floats]:
 
 
 def _markings(found: Found, inliers: NDArray[np.bool_]) -> tuple[MarkingFit, ...]:
-    """Return how each marking in the picture was found."""
+    """Return the detection result of each marking in the image."""
     samples, fits = found.samples, []
     visible, residuals = found.seen.visible, found.adjusted.residuals
     for index in np.unique(samples.marking[visible]):

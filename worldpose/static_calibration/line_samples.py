@@ -1,4 +1,4 @@
-"""Samples of the template's markings as a camera has them: where, across what, how well known."""
+"""Projected samples of the template's markings: positions, normals, widths and derivatives."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from worldpose.static_calibration.parameters import by_step
 Floats = NDArray[np.float64]
 
 _STRIDE: Final = 0.1
-"""Along an arc, its curvature is told from [m]."""
+"""Step along an arc for finite differences of its curvature [m]."""
 _NARROWEST: Final = 0.5
-"""Paint that is narrower in the picture is not looked for [px]."""
+"""Minimum projected width of paint to search [px]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,10 +27,10 @@ class LineSamples:
     Attributes:
         points_world: (n, 3) [m], world.
         across_world: (n, 3) unit vectors on the surface, across the marking.
-        bend_world: (n, 3) how the marking turns, its second derivative along itself [1/m].
-        ends: (n, 2) indices of the template's points that a sample hangs on: the ends of its line,
+        bend_world: (n, 3) second derivative of the marking along itself [1/m].
+        ends: (n, 2) indices of the template's points that define a sample: the ends of its line,
             or its arc's center twice.
-        shares: (n, 2) how far it moves when these do [m/m].
+        shares: (n, 2) derivatives of the sample by these points [m/m].
         marking: (n,) indices into `names`, rising.
         names: the markings.
     """
@@ -50,7 +50,7 @@ class LineSamples:
         return np.stack([across[:, 1], -across[:, 0], np.zeros(len(across))], axis=-1)
 
     def beside(self, way: float) -> Floats:
-        """Return places (n, 3) [m], world, some way [m] along the marking from the samples."""
+        """Return places (n, 3) [m], world, at a distance [m] along the marking from samples."""
         return self.points_world + way * self.along_world + 0.5 * way**2 * self.bend_world
 
     def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> LineSamples:
@@ -67,18 +67,18 @@ class LineSamples:
 
 @dataclass(frozen=True, eq=False)
 class SeenLines:
-    """Samples in a picture.
+    """Marking samples projected into an image.
 
     Attributes:
         places: (n, 2) [px].
         normals: (n, 2) unit vectors across the projected marking.
         widths: (n,) of the paint across it [px].
         curvatures: (n,) of the projected marking, positive where it turns to its normal [1/px].
-        by_camera: (n, 12) how a place moves along its normal with a step of `PARAMETERS`.
-        by_paint: (n, 7) how it moves with what is not known of the paint, each one standard
-            deviation large: both ends along x, y, z, and a shift of the marking in the picture.
+        by_camera: (n, 12) derivatives of a place along its normal by a step of `PARAMETERS`.
+        by_paint: (n, 7) derivatives by the paint's unknowns, per standard deviation: both ends
+            along x, y, z, and a shift of the marking in the image.
         unknowns: (n, 7) numbers of these; markings that share a point share its error.
-        visible: (n,) whether it is in the picture and wide enough.
+        visible: (n,) whether the sample is in the image and its paint wide enough.
     """
 
     places: Floats
@@ -108,7 +108,7 @@ def sample_markings(pitch: PitchTemplate, spacing: float) -> LineSamples:
 
     Args:
         pitch: the template, with its crown.
-        spacing: largest distance between neighbours [m].
+        spacing: maximum distance between neighbours [m].
     """
     samples = pitch.sample_lines(spacing)
     points, marking = samples.points_world, samples.marking
@@ -143,14 +143,14 @@ def sample_markings(pitch: PitchTemplate, spacing: float) -> LineSamples:
 def see_lines(
     camera: Camera, samples: LineSamples, line_width: float, survey_error: float, shift: float
 ) -> SeenLines:
-    """Return samples as a camera has them.
+    """Return samples projected into a camera's image, with derivatives.
 
     Args:
         camera: a single camera.
         samples: of `sample_markings`.
         line_width: of the paint [m].
-        survey_error: of the points that markings hang on, each axis, standard deviation [m].
-        shift: of a whole marking in the picture, standard deviation [px].
+        survey_error: of the points that define markings, each axis, standard deviation [m].
+        shift: of a whole marking in the image, standard deviation [px].
     """
     points = samples.points_world
     projected = camera.project_with_jacobians(points)
@@ -170,7 +170,7 @@ def see_lines(
     by_point = survey_error * np.einsum("nij,ni->nj", projected.d_points, normals)
     moved = (samples.shares[:, :, None] * by_point[:, None]).reshape(len(points), 6)
     axes = (3 * samples.ends[:, :, None] + np.arange(3)).reshape(len(points), 6)
-    # Below zero, what is no point's.
+    # Numbers below zero belong to markings, not to points.
     own = -1 - samples.marking[:, None]
     return SeenLines(
         image,
@@ -185,7 +185,7 @@ def see_lines(
 
 
 def _curvatures(camera: Camera, samples: LineSamples, normals: Floats) -> Floats:
-    """Return how projected markings turn towards normals (n, 2) at the samples (n,) [1/px]."""
+    """Return curvatures (n,) of projected markings towards their normals (n, 2) [1/px]."""
     curvatures = np.zeros(len(normals))
     arcs = np.flatnonzero(samples.bend_world.any(axis=1))
     before, middle, after = (
@@ -198,19 +198,19 @@ def _curvatures(camera: Camera, samples: LineSamples, normals: Floats) -> Floats
 
 
 def thinned(seen: SeenLines, samples: LineSamples, spacing: float, most: int) -> NDArray[np.int64]:
-    """Return indices of visible samples that are about evenly spaced in the picture.
+    """Return indices of visible samples at about even spacing in the image.
 
     Args:
-        seen: the samples in the picture.
-        samples: the same in the world.
-        spacing: between neighbours [px], more where there would be too many.
-        most: how many at most, about.
+        seen: the samples in the image.
+        samples: the same samples in the world.
+        spacing: between neighbours [px], more if `most` requires it.
+        most: approximate maximum count.
     """
     index = np.flatnonzero(seen.visible)
     if not len(index):
         return index
     step = np.linalg.norm(np.diff(seen.places[index], axis=0), axis=-1)
-    # Between two markings, or the two parts of one that leaves the picture, a new count begins.
+    # The distance restarts between two markings, or two parts of one that leaves the image.
     step[np.diff(index) > 1] = 0.0
     way = np.concatenate([[0.0], np.cumsum(step)])
     bins = np.floor(way / max(spacing, way[-1] / most)).astype(np.int64)

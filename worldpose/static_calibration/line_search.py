@@ -1,4 +1,4 @@
-"""The search for painted lines: what is known well first, and closer and closer (C4)."""
+"""Coarse-to-fine search for painted lines, samples of small uncertainty first (C4)."""
 
 from __future__ import annotations
 
@@ -22,31 +22,31 @@ from worldpose.static_calibration.parameters import CameraEstimate, stepped
 Floats = NDArray[np.float64]
 
 _ROUNDS: Final = 8
-"""Of searching and fitting at most; one or two from ordinary clicks."""
+"""Maximum iterations of search and fit; one or two from ordinary clicks."""
 _COARSE_ERROR: Final = 1.0
-"""Of a bar that was found but not fitted yet [px]."""
+"""Standard deviation of a detected bar before its subpixel fit [px]."""
 _FEW: Final = 500
-"""Samples that are enough while bars are found to a pixel, about [1]."""
+"""Approximate number of samples in coarse iterations [1]."""
 _LEAST_REACH: Final = 1.5
-"""Bars are looked for this far beyond three standard deviations [px]."""
+"""Margin of the search beyond three standard deviations [px]."""
 _FINE: Final = 5.5
-"""Bars within this reach are measured exactly [px]."""
+"""Search width up to which bars are fitted to subpixel accuracy [px]."""
 _BEST: Final = 1.0 / 3.0
-"""Share of the samples that is looked for where all are known badly [1]."""
+"""Share of the samples to search where all have a large uncertainty [1]."""
 _MOSTLY: Final = 0.8
-"""Share of the samples that must be within it [1]."""
+"""Minimum share of the samples within this search width [1]."""
 _TURNS: Final = 4
-"""Times that exact bars are fitted to, each time from where the camera has come to."""
+"""Maximum fits to subpixel bars, each relinearized at the last camera."""
 _SETTLED: Final = 0.02
-"""Largest move of a sample in the last of them [px]."""
+"""Maximum sample displacement at which these fits stop [px]."""
 _NO_WEIGHT: Final = 1e-3
-"""Of a sample that the fit does not rest on [1]."""
+"""Weight up to which a sample is excluded from the result [1]."""
 _READING: Final = 0.05
-"""What a fitted bar is off by at least [px]."""
+"""Minimum standard deviation of a fitted bar [px]."""
 _COARSE_SCALES: Final = (np.inf, 12.0, 6.0, 4.0, 3.0, 3.0)
 _FINE_SCALES: Final = (12.0, 6.0)
-"""Scales of the loss while it tightens [standard deviations]: outliers lose their pull one by
-one, and the fit does not fall into the nearest minimum."""
+"""Decreasing scales of the loss [standard deviations]: outliers lose their influence one by one,
+which avoids the nearest local minimum."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A camera, samples, how it has them, the bars measured there, and the last fit."""
+    """A camera, its samples, their projections, the bars measured there, and the last fit."""
 
     camera: Camera
     samples: LineSamples
@@ -69,7 +69,7 @@ class Found:
 
 
 class LineSearch:
-    """One camera's start, picture and settings."""
+    """Line search in one image, from a start with a Gaussian prior."""
 
     def __init__(
         self,
@@ -86,23 +86,23 @@ class LineSearch:
         self.free = spread > 0.0
         covariance = start.covariance[np.ix_(self.free, self.free)]
         scale = spread[self.free]
-        # Scaled, since radians and pixels differ by a million in their squares.
+        # Scaled, since the squares of radians and pixels differ by a factor of a million.
         shape = covariance / np.outer(scale, scale)
         inverse: Floats = np.linalg.inv(shape + 1e-12 * np.eye(len(scale)))
         self.information = inverse / np.outer(scale, scale)
 
     def look(self, camera: Camera, samples: LineSamples) -> SeenLines:
-        """Return the samples as a camera has them."""
+        """Return the samples projected into a camera's image."""
         s = self.settings
         return see_lines(camera, samples, s.line_width, self.survey_error, s.line_shift)
 
     def clear(self, camera: Camera, samples: LineSamples, seen: SeenLines) -> NDArray[np.bool_]:
-        """Return which samples (n,) have grass on both sides in the picture."""
+        """Return a mask of the samples (n,) with grass on both sides in the image."""
         room, half = 0.5 * seen.widths + BESIDE, 0.5 * self.settings.line_width
         return clear(camera, self.whites, half, seen.places, room, samples.marking)
 
     def run(self, begin: CameraEstimate, samples: LineSamples) -> Found | None:
-        """Return the camera found by looking closer and closer; None where there are no lines."""
+        """Return the result of the coarse-to-fine search; None without lines."""
         camera, covariance = begin.camera, begin.covariance[np.ix_(self.free, self.free)]
         few = samples[np.arange(0, len(samples.marking), max(1, len(samples.marking) // _FEW))]
         found = None
@@ -132,7 +132,7 @@ class LineSearch:
         return found
 
     def reweighed(self, found: Found, used: NDArray[np.bool_], inflation: Floats) -> Found:
-        """Return the fit to some samples (n,), their variances multiplied (n,)."""
+        """Return the fit to the used samples (n,), with variances times `inflation` (n,)."""
         measured = Measured(
             np.where(used, found.measured.offsets, np.nan), found.measured.variances * inflation
         )
@@ -142,7 +142,7 @@ class LineSearch:
         return replace(found, camera=camera, measured=measured, adjusted=adjusted)
 
     def distance(self, camera: Camera) -> float:
-        """Return how far a camera is from the start [standard deviations]."""
+        """Return the Mahalanobis distance of a camera from the start."""
         gone = difference(self.start.camera, camera)[self.free]
         return float(np.sqrt(gone @ self.information @ gone))
 
@@ -153,7 +153,7 @@ class LineSearch:
         return np.asarray(0.5 * (whole + whole.T))
 
     def bars_of(self, found: Found) -> Bars:
-        """Return the bars that a fit rests on."""
+        """Return the bars that contribute to a fit."""
         seen, weights = found.seen, found.adjusted.weights
         used = weights > _NO_WEIGHT
         pixels = seen.places + found.measured.offsets[:, None] * seen.normals
@@ -174,7 +174,7 @@ class LineSearch:
         measured: Measured,
         fine: bool,
     ) -> Found:
-        """Return the fit to bars that stay where they were measured."""
+        """Return the converged fit to bars at fixed pixels."""
         bars = seen.places + measured.offsets[:, None] * seen.normals
         final = (self.settings.loss,) * 3
         scales: tuple[float, ...] = (*_FINE_SCALES, *final) if fine else _COARSE_SCALES
@@ -190,23 +190,23 @@ class LineSearch:
         return Found(camera, samples, seen, measured, adjusted)
 
     def _reach(self, seen: SeenLines, covariance: Floats) -> Floats:
-        """Return how far samples are looked for along their normals [px]."""
+        """Return the search widths (n,) of samples along their normals [px]."""
         rows = np.where(seen.visible[:, None], seen.by_camera[:, self.free], 0.0)
         own = np.where(seen.visible, (seen.by_paint**2).sum(-1), 0.0)
         variance = ((rows @ covariance) * rows).sum(-1) + own
         return np.asarray(3.0 * np.sqrt(variance) + _LEAST_REACH)
 
     def _measure(self, seen: SeenLines, reach: Floats, fine: bool) -> Measured:
-        """Return the bars that the samples are taken to be, exactly or to a pixel."""
+        """Return the bars matched to the samples, to a subpixel (`fine`) or to a pixel."""
         s, count = self.settings, len(reach)
-        # Where nothing is known well, the best known third begins.
+        # If all uncertainties are large, begin with the third of smallest uncertainty.
         limit = max(s.reach, float(np.quantile(reach[seen.visible], _BEST)))
         usable = seen.visible & (reach <= limit)
         offsets, strengths = np.empty((count, CANDIDATES)), np.empty((count, CANDIDATES))
         across = seen.places, seen.normals, seen.widths, seen.curvatures
         looked = np.where(usable, reach, -1.0)
         find_bars(self.grey, *across, looked, s.contrast, offsets, strengths)
-        # The likelier is the nearer, in standard deviations, and the stronger.
+        # A candidate's merit grows with its strength and falls with its Mahalanobis distance.
         away = 3.0 * offsets / reach[:, None]
         with np.errstate(divide="ignore"):
             merit = np.where(np.isnan(offsets), -np.inf, np.log(strengths) - 0.5 * away**2)
@@ -240,7 +240,7 @@ class LineSearch:
         return replace(adjusted, residuals=residuals, weights=weights)
 
     def _prior(self, camera: Camera) -> tuple[Floats, Floats]:
-        """Return information and expected step of the free parameters, at a camera."""
+        """Return information and mean of the prior on the free parameters' step from a camera."""
         gone = difference(self.start.camera, camera)
         chain = turned(gone)[np.ix_(self.free, self.free)]
         information: Floats = chain.T @ self.information @ chain
@@ -254,10 +254,10 @@ class LineSearch:
 
 
 def turned(gone: Floats) -> Floats:
-    """Return how a step that was made (12,) changes with a further one (12, 12)."""
+    """Return the derivative (12, 12) of a step (12,) by a further step after it."""
     chain = np.eye(len(gone))
     x, y, z = gone[3:6]
-    # A further turn also turns the way gone so far.
+    # A further rotation also rotates the translation so far.
     chain[3:6, :3] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return chain
 

@@ -1,4 +1,4 @@
-"""What to click next, and where."""
+"""Selection of the most informative points and markings to click next."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from worldpose.static_calibration.ground_error import surface_motion
 from worldpose.static_calibration.parameters import CameraEstimate, project_with_jacobian
 
 _NEARBY = 45.0
-"""How far from the clicked points a picture reaches that shows them [m]."""
+"""Maximum distance of proposed points from the mean of the given ones [m]."""
 _PLACES = 5.0
-"""Between the places of the pitch at which the gain is added up [m]."""
+"""Grid spacing of the summed gain over the pitch [m]."""
 _DRAWN = 5
-"""Pixels drawn along a marking that advice counts on [1]."""
+"""Assumed number of drawn pixels per marking [1]."""
 
 
 def most_helpful(
@@ -28,14 +28,14 @@ def most_helpful(
 ) -> tuple[str, ...]:
     """Return the points and markings whose clicks would lower the expected ground error most.
 
-    Greedy: each is the best one after those before it, of what the camera sees.
+    Greedy selection among the visible points and markings.
 
     Args:
-        estimate: the camera so far.
+        estimate: the current camera.
         pitch: the template.
-        clicked: names that are clicked or drawn already.
+        clicked: names that already have clicks.
         noise: of a click [px].
-        count: at most this many.
+        count: maximum number of names.
     """
     motion = _seen_motion(estimate, pitch)
     if not len(motion):
@@ -52,8 +52,8 @@ def most_helpful(
         best, gain, best_update = "", 0.0, np.zeros_like(covariance)
         for name, rows in candidates.items():
             through = covariance @ rows.T
-            # A camera that its clicks barely determine has variances beyond the reach of float64:
-            # the matrix is then singular.
+            # If clicks barely determine the camera, variances exceed the precision of float64: the
+            # matrix is then singular.
             inverse = np.linalg.pinv(np.eye(len(rows)) + rows @ through, hermitian=True)
             update = through @ inverse @ through.T
             if float((update * merit).sum()) > gain:
@@ -81,7 +81,7 @@ def off_the_line(
 
 
 def _seen_motion(estimate: CameraEstimate, pitch: PitchTemplate) -> NDArray[np.float64]:
-    """Return (n, 2, 12), how seen places on the pitch move with the camera's step [m]."""
+    """Return derivatives (n, 2, 12) of visible places on the pitch by the camera's step [m]."""
     x = np.arange(-0.5 * pitch.length, 0.5 * pitch.length + 1e-9, _PLACES)
     y = np.arange(-0.5 * pitch.width, 0.5 * pitch.width + 1e-9, _PLACES)
     along, across = (grid.ravel() for grid in np.meshgrid(x, y))
@@ -92,7 +92,7 @@ def _seen_motion(estimate: CameraEstimate, pitch: PitchTemplate) -> NDArray[np.f
 
 
 def _candidates(estimate: CameraEstimate, pitch: PitchTemplate) -> dict[str, NDArray[np.float64]]:
-    """Return, for what the camera sees, derivatives (k, 12) of its residuals by a step [px]."""
+    """Return residual derivatives (k, 12) by a step [px] of each visible point and marking."""
     names = tuple(pitch.points)
     pixels, by_step = project_with_jacobian(estimate.camera, pitch.positions(names))
     inside = _inside(estimate, pixels)

@@ -1,4 +1,4 @@
-"""The numbers that a static camera is solved for, and how pixels move with them."""
+"""Parameters of a static camera, and derivatives of pixels by them."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ PARAMETERS: Final = CAMERA_STEP
 
 @dataclass(frozen=True, eq=False)
 class CameraEstimate:
-    """A camera and how well it is known.
+    """A camera and its covariance.
 
     Attributes:
         camera: a single camera with square pixels.
-        covariance: (12, 12) of a step in the order of `PARAMETERS`; rows and columns of parameters
-            that were not solved for are zero.
+        covariance: (12, 12) of a step in the order of `PARAMETERS`; rows and columns of fixed
+            parameters are zero.
     """
 
     camera: Camera
@@ -66,11 +66,11 @@ def project_with_jacobian(
 
 
 def by_step(camera: Camera, seen: Projection) -> NDArray[np.float64]:
-    """Return derivatives (n, 2, 12) by a step out of those of a projection.
+    """Return derivatives (n, 2, 12) by a step, converted from those of a projection.
 
     Args:
         camera: a single camera with square pixels.
-        seen: what it has of n points.
+        seen: projection of n points.
     """
     by_focal = (seen.d_intrinsics[..., :2] * camera.focal).sum(axis=-1, keepdims=True)
     parts = (

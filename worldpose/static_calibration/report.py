@@ -1,4 +1,4 @@
-"""What a calibration says about itself: residuals, wrong clicks, and whether to trust it."""
+"""Calibration report: residuals, outliers, expected ground error and warnings."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from worldpose.static_calibration.parameters import CameraEstimate
 
 @dataclass(frozen=True, eq=False)
 class PointResidual:
-    """A clicked point against the camera.
+    """Residual of a clicked point.
 
     Attributes:
         name: of the template.
-        pixel: (2,) [px], where it was clicked.
+        pixel: (2,) [px], the click.
         residual: (2,) [px], projected minus clicked; NaN where the camera cannot image the point.
-        surprise: residual in standard deviations of what the other evidence predicts [1]; infinite
-            where the camera cannot image the point.
-        inlier: does the camera rest on it.
-        problem: why the camera does not rest on it; empty where it does.
+        surprise: Mahalanobis distance from the prediction by the other evidence [1]; infinite where
+            the camera cannot image the point.
+        inlier: whether the fit includes the click.
+        problem: reason for exclusion; empty for inliers.
     """
 
     name: str
@@ -36,14 +36,14 @@ class PointResidual:
 
 @dataclass(frozen=True)
 class MarkingResidual:
-    """A drawn marking against the camera.
+    """Residual of a drawn marking.
 
     Attributes:
         name: of the template.
-        pixels: how many were drawn [1].
+        pixels: number of drawn pixels [1].
         rms: of their distances to the projected marking [px].
         worst: largest distance [px].
-        inlier: does the camera rest on it.
+        inlier: whether the fit includes the marking.
     """
 
     name: str
@@ -55,27 +55,27 @@ class MarkingResidual:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationReport:
-    """How well a camera is known and why.
+    """Accuracy of a calibrated camera, its residuals and warnings.
 
     Attributes:
-        stage: the last one that went into the camera: `points` (stages 1 and 2), `lines` (3).
-        free: parameters that were solved for, of `PARAMETERS`.
-        decisions: what was chosen and the figures that decided.
-        points: residuals of all clicks, the most surprising first.
+        stage: last stage that contributes to the camera: `points` (stages 1 and 2), `lines` (3).
+        free: names of the estimated parameters, of `PARAMETERS`.
+        decisions: model choices and the metrics behind them.
+        points: residuals of all clicks, by falling Mahalanobis distance.
         drawn: residuals of drawn markings, the worst first.
-        wrong: names of clicks and drawn markings that the camera does not rest on, the most
-            surprising first.
-        noise_scale: factor on the stated noise that is taken [1]: 1 unless the residuals clearly
-            say another.
-        click_noise: standard deviation of the inlying clicks that their residuals say, each axis
-            [px]; NaN without degrees of freedom.
-        click_freedom: degrees of freedom that it rests on [1].
-        condition: of the information about the free parameters, each in its prior's spreads [1].
+        wrong: names of excluded clicks, by falling Mahalanobis distance, then of excluded drawn
+            markings.
+        noise_scale: estimated noise over the stated noise [1]: 1 unless the residuals clearly
+            contradict the stated noise.
+        click_noise: standard deviation of the inlying clicks, estimated from their residuals, each
+            axis [px]; NaN without degrees of freedom.
+        click_freedom: degrees of freedom of that estimate [1].
+        condition: condition number of the free parameters' correlation matrix [1].
         ground_error: the coverage map.
-        weak: must a person look at this camera.
+        weak: whether a person must review this camera.
         reasons: why it is weak.
         add_next: clicks that would lower the expected ground error most, the best first.
-        lines: what stage 3 found; None without a picture.
+        lines: result of stage 3; None without an image.
     """
 
     stage: str
@@ -97,11 +97,11 @@ class CalibrationReport:
 
 @dataclass(frozen=True, eq=False)
 class StaticCalibration:
-    """A static camera from its picture.
+    """Calibration result of one static camera.
 
     Attributes:
         estimate: camera and covariance.
-        report: residuals and trust.
+        report: residuals and warnings.
     """
 
     estimate: CameraEstimate

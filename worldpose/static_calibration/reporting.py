@@ -1,4 +1,4 @@
-"""The report of a calibration out of its fit."""
+"""Assembly of the calibration report from a fit."""
 
 from __future__ import annotations
 
@@ -29,10 +29,9 @@ _CANNOT_IMAGE: Final = {
     RayStatus.BEYOND_FOLD: "cannot be imaged: the point is outside the lens's field of view",
 }
 _SAME: Final = 0.01
-"""Difference from the stated noise that is worth no word [1]."""
+"""Difference from the stated noise too small to report [1]."""
 _TRUSTED: Final = 4.0
-"""Mean loss of an observation [1] to which a camera's residuals are not surprising: twice the
-stated noise."""
+"""Maximum mean loss per observation [1] without a warning: twice the stated noise."""
 
 
 def report_of(
@@ -45,17 +44,17 @@ def report_of(
     settings: StaticCalibrationSettings,
     stated: float,
 ) -> CalibrationReport:
-    """Return what there is to say about a camera.
+    """Return the report of a calibrated camera.
 
     Args:
-        estimate: the final one.
-        problem: what stage 2 fitted to.
+        estimate: the final camera.
+        problem: evidence, noise and prior of stage 2.
         fit: stage 2.
-        decisions: what was chosen so far.
-        lines: stage 3, where there was a picture.
+        decisions: decisions so far.
+        lines: stage 3; None without an image.
         pitch: the template.
-        settings: thresholds, and the noise of clicks that was found.
-        stated: noise of clicks that was stated [px].
+        settings: thresholds, and the estimated click noise.
+        stated: stated click noise [px].
     """
     scale = fit.noise_scale * settings.click_noise / stated
     evidence = problem.evidence
@@ -136,7 +135,7 @@ def report_of(
 
 
 def image_problems(camera: Camera, places: NDArray[np.float64]) -> tuple[str, ...]:
-    """Return why a camera cannot image places (n, 3) [m], world; empty for those that it can."""
+    """Return why a camera cannot image places (n, 3) [m], world; empty strings if it can."""
     status = camera.project_with_jacobians(places).status
     return tuple(_CANNOT_IMAGE.get(RayStatus(code), "") for code in status.tolist())
 
@@ -157,7 +156,7 @@ def _true_name(
     pitch: PitchTemplate,
     settings: StaticCalibrationSettings,
 ) -> str:
-    """Return which marking the pixels of a wrong one lie on, in words."""
+    """Return a sentence on the marking that the pixels of a misnamed marking lie on."""
     evidence = problem.evidence
     pixels = evidence.drawn_image[evidence.drawn_marking == index]
     every = np.zeros(len(pixels), dtype=np.int64)

@@ -24,12 +24,12 @@ PRIORS: Final = 9
 """Rows of the prior: focal, cx, cy, k1, k2, k3, height, distance, roll."""
 
 _LOST: Final = 1e3
-"""Residual [px] of what the camera does not see at all: farther off than any pixel."""
+"""Residual [px] of points that the camera cannot image: larger than any true residual."""
 _NEAR: Final = 0.5
-"""Least depth of a drawn marking's sample [m]."""
+"""Minimum depth of a drawn marking's sample [m]."""
 _REACH: Final = 1.5
-"""Radius, in half diagonals of the picture, to which distortion is followed for samples: beyond,
-polynomials may fold a marking back into the picture."""
+"""Radius, in half image diagonals, up to which samples are distorted: beyond, polynomials may fold
+a marking back into the image."""
 
 
 @compiled
@@ -38,9 +38,9 @@ def point_residuals(
 ) -> None:
     """Write pixel residuals (n, 2) of points and their derivatives (n, 2, 12) by a step [px].
 
-    Beyond the radius where the lens folds, the magnification of that radius holds on: an image
-    that goes on outwards. Folded back into the picture, a point under a wrong name would fit once
-    the lens is bent enough.
+    Beyond the radius where the lens folds, the magnification at that radius applies, so that image
+    radii keep growing. If points folded back into the image, a strong distortion would fit a point
+    under a wrong name.
     """
     n = len(world)
     fold = fold_squared(c[4], c[5], c[8])
@@ -79,8 +79,8 @@ def point_residuals(
             jacobian[i, k, 6] = image[0, i, k] - c[2 + k]
             jacobian[i, k, 7], jacobian[i, k, 8] = d[11], d[12]
             if s > fold:
-                # That the fold itself moves with the lens is left out: a step of which the cost
-                # does not fall is refused.
+                # The derivative of the fold radius is left out: the loop rejects steps that do
+                # not lower the cost.
                 plane = (image[0, i, k] - c[2 + k]) / magnification
                 for j in range(3):
                     jacobian[i, k, 9 + j] = plane * fold ** (1 + j)
@@ -99,16 +99,16 @@ def nearest_on_markings(
     place: Floats,
     normal: Floats,
 ) -> None:
-    """Write where each drawn pixel lies on its marking, and the unit normal from there.
+    """Write the nearest place on its marking of each drawn pixel, and the unit normal there.
 
     Args:
         c: (22,) camera.
-        reach: half the picture's diagonal [px].
+        reach: half the image diagonal [px].
         samples: (s, 3) [m], world.
         bounds: (m + 1,) of the markings' samples.
         pixels: (d, 2) [px].
         marking: (d,).
-        place: (d, 3) [m], world, written; NaN where the marking is not before the camera.
+        place: (d, 3) [m], world, written; NaN where the marking is not in front of the camera.
         normal: (d, 2), written: from the marking to the pixel, either sign.
     """
     cap = min((_REACH * reach / c[0]) ** 2, fold_squared(c[4], c[5], c[8]))
@@ -163,8 +163,8 @@ def drawn_residuals(
 ) -> None:
     """Write distances (d,) of drawn pixels to their projected markings, and derivatives (d, 12).
 
-    The place along the marking is eliminated: at the nearest point the distance does not change
-    with it, so that the derivative is the normal times that of the point's pixel.
+    The derivative ignores the place along the marking: at the nearest point the distance is
+    stationary in it, so that the derivative is the normal times that of the point's pixel.
     """
     n = len(pixels)
     place = np.empty((n, 3))
@@ -191,7 +191,7 @@ def prior_residuals(c: Floats, prior: Floats, residual: Floats, jacobian: Floats
         c: (22,) camera.
         prior: (19,) log focal, its spread; cx, cy, their spread; half diagonal [px]; spreads of
             k1, k2, k3; log height, its spread; log distance, its spread; spread of the roll; the
-            least height [m] that counts; spreads of k1, k2, k3 as coefficients; the middle of k1.
+            minimum height [m]; spreads of k1, k2, k3 as coefficients; the middle of k1.
         residual: (9,), written.
         jacobian: (9, 12), written.
     """
@@ -205,13 +205,13 @@ def prior_residuals(c: Floats, prior: Floats, residual: Floats, jacobian: Floats
     power = 1.0
     for k in range(3):
         power *= squared
-        # The corner's displacement: the same lens bends a long picture's corner less.
+        # The displacement of the image corner: it shrinks with the focal length.
         value = c[8] if k == 2 else c[4 + k]
         spread = np.hypot(prior[6 + k], prior[15 + k] * power)
         middle = prior[18] if k == 0 else 0.0
         residual[3 + k] = (value * power - middle) / spread
         jacobian[3 + k, 9 + k] = power / spread
-        # The focal length is in the displacement and in the spread.
+        # Displacement and spread both depend on the focal length.
         wide = (prior[15 + k] * power / spread) ** 2
         jacobian[3 + k, 6] = -2.0 * (k + 1.0) * (value * power / spread - residual[3 + k] * wide)
     # The center moves by -R^T d with the step's shift d, and not with its rotation.
@@ -219,7 +219,7 @@ def prior_residuals(c: Floats, prior: Floats, residual: Floats, jacobian: Floats
     y = -(c[10] * c[18] + c[13] * c[19] + c[16] * c[20])
     z = -(c[11] * c[18] + c[14] * c[19] + c[17] * c[20])
     high = max(z, prior[14])
-    # Below the least height the logarithm goes on as its tangent: no camera is underground, where
+    # Below the minimum height the tangent continues the logarithm: no camera is underground, where
     # mirrored names would put it.
     residual[6] = (np.log(high) + (z - high) / high - prior[9]) / prior[10]
     far = max(np.sqrt(x * x + y * y), 1.0)

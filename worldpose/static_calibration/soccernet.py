@@ -1,6 +1,6 @@
-"""Line annotations in SoccerNet's vocabulary as drawn markings.
+"""Conversion of SoccerNet's line annotations to drawn markings.
 
-Its "left" and "right" sides are those of the main camera's picture, "top" the far and "bottom" the
+Its "left" and "right" sides are those of the main camera's image, "top" the far and "bottom" the
 near side; a goal's posts are named as seen from the pitch.
 """
 
@@ -32,22 +32,22 @@ def _names() -> dict[str, str]:
 
 
 SOCCERNET_MARKINGS: Final = _names()
-"""Names of the pitch template by SoccerNet's."""
+"""Names of the pitch template by SoccerNet's names."""
 
 
 def soccernet_markings(
     lines: Mapping[str, Sequence[Sequence[float]]], image_size: tuple[int, int]
 ) -> ClickedMarkings:
-    """Return one picture's annotation as drawn markings; what has no name there is left out.
+    """Return one image's annotation as drawn markings, without unknown names.
 
     Args:
-        lines: points along each marking as shares of the picture's width and height [1].
+        lines: points along each marking as shares of the image's width and height [1].
         image_size: width, height [px].
     """
     width, height = image_size
     drawn = []
     for name, points in lines.items():
-        # Annotators drag ends past the border; what lies there was not seen.
+        # Annotators drag ends past the border, where nothing is visible.
         inside = [(x * width, y * height) for x, y in points if 0 <= x <= 1 and 0 <= y <= 1]
         if name in SOCCERNET_MARKINGS and inside:
             drawn.append(DrawnMarking(name=SOCCERNET_MARKINGS[name], xy=tuple(inside)))

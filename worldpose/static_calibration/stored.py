@@ -1,4 +1,4 @@
-"""A calibration as the arrays and attributes of `data_contracts.static_calibration`."""
+"""Conversion of a calibration to the arrays and attributes of the stored data contract."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from worldpose.static_calibration.report import StaticCalibration
 
 
 def calibration_arrays(calibration: StaticCalibration) -> dict[str, NDArray[Any]]:
-    """The stored arrays of a calibrated camera, by name.
+    """Return the stored arrays of a calibrated camera, by name.
 
-    A given camera has those of `camera_arrays` alone.
+    A given camera has only those of `camera_arrays`.
     """
     report = calibration.report
     surprise = np.array([p.surprise for p in report.points], dtype=np.float64)
@@ -33,18 +33,18 @@ def calibration_arrays(calibration: StaticCalibration) -> dict[str, NDArray[Any]
 
 
 def calibration_coordinates(calibration: StaticCalibration) -> dict[str, NDArray[Any]]:
-    """The stored coordinates: places of the expected ground error; a given camera has none."""
+    """Return the grid coordinates of the expected ground error; a given camera has none."""
     known = calibration.report.ground_error
     return {"ground_x": known.x, "ground_y": known.y}
 
 
 def given_attributes(camera_id: str) -> dict[str, Any]:
-    """The stored attributes of a given camera."""
+    """Return the stored attributes of a given camera."""
     return {"camera_id": camera_id, "origin": "given", **_no_evidence()}
 
 
 def left_out_attributes(camera_id: str, reason: str) -> dict[str, Any]:
-    """The stored attributes of a camera that cannot be calibrated; it has no arrays."""
+    """Return the stored attributes of a camera without calibration; it has no arrays."""
     return {"camera_id": camera_id, "origin": "none", **_no_evidence(), "reasons": [reason]}
 
 
@@ -54,7 +54,7 @@ def _no_evidence() -> dict[str, Any]:
 
 
 def calibration_attributes(camera_id: str, calibration: StaticCalibration) -> dict[str, Any]:
-    """The stored attributes of a calibrated camera."""
+    """Return the stored attributes of a calibrated camera."""
     report = calibration.report
     return {
         "camera_id": camera_id,

@@ -1,7 +1,7 @@
-"""Keeps results by what they were made from: whole or not at all, checked, never overwritten.
+"""Content-addressed store of results: written atomically, verified on read, never overwritten.
 
-Takes arrays that fit a layout of `data_contracts` and the recipe they were made by; gives them
-back as labelled arrays, with what runs used them and why a result is another than before.
+Input: arrays that match a layout of `data_contracts`, and the recipe that they were computed by.
+Output: labelled arrays, the runs that used them, and the reasons for differences between results.
 """
 
 from worldpose.store.comparison import compare_stores

@@ -1,4 +1,4 @@
-"""What the store asks of a disk or of object storage, and nothing more."""
+"""Interface of the store to a disk or to object storage."""
 
 from __future__ import annotations
 
@@ -25,43 +25,43 @@ class Entry:
 
 
 class Blobs(Protocol):
-    """Files by path below one root. Every method raises StoreError when the medium fails."""
+    """Files by path below one root. Every method raises StoreError if the medium fails."""
 
     @property
     def url(self) -> str:
-        """The root, as a user names it."""
+        """The root, in the user's notation."""
 
     def read(self, path: str) -> bytes | None:
-        """The content at `path`, None when nothing is there."""
+        """Return the content at `path`, None if there is none."""
 
     def exists(self, path: str) -> bool:
-        """Is something at `path`."""
+        """Return whether `path` exists."""
 
     def put_new(self, path: str, data: bytes) -> bool:
-        """Creates `path` whole and durable, or changes nothing and is False: it exists."""
+        """Create `path` whole and durable; return False without a change if it exists."""
 
     def put(self, path: str, data: bytes) -> None:
-        """Replaces the content at `path` in one step."""
+        """Replace the content at `path` atomically."""
 
     def delete(self, path: str) -> None:
-        """Removes the file at `path`; fine when there is none."""
+        """Remove the file at `path`, if it exists."""
 
     def delete_tree(self, prefix: str, first: str) -> None:
-        """Removes all below `prefix`; `first` goes first, so that no reader sees a half."""
+        """Remove all files below `prefix`; `first` goes first, so that no reader sees a part."""
 
     def entries(self, prefix: str) -> list[Entry]:
-        """All files below the folder `prefix`, sorted by path."""
+        """Return all files below the folder `prefix`, sorted by path."""
 
     def staging(self) -> Path:
-        """A new private local folder from which a tree can be published."""
+        """Create a private local folder for a tree to be published."""
 
     def staged(self) -> list[Entry]:
-        """What lies in this root's staging, with the time it was last written to."""
+        """Return the content of this root's staging, with the time of the last write."""
 
     def publish_tree(self, folder: Path, prefix: str, manifest_name: str, manifest: bytes) -> bool:
-        """Makes the files of the staged `folder` exist at `prefix`, with the manifest last.
+        """Publish the files of the staged `folder` at `prefix`, with the manifest last.
 
-        False when something is published there already; nothing is changed then.
+        Return False, without a change, if `prefix` is already published.
         """
 
 
@@ -77,12 +77,12 @@ _TODO = {
 
 @contextmanager
 def storage_errors(path: str) -> Iterator[None]:
-    """Turns the system's errors at `path` into a StoreError that says what to do."""
+    """Convert the system's errors at `path` to a StoreError that says what to do."""
     try:
         yield
     except OSError as error:
         todo = _TODO.get(error.errno or 0, "Mend that and run again")
-        # Of a copy or a rename, the second file is the one that could not be written.
+        # For a copy or a rename, the second file is the one that could not be written.
         named = error.filename2 or error.filename
         place = f" ({named})" if named is not None and str(named) != path else ""
         raise StoreError(

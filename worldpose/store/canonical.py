@@ -1,4 +1,4 @@
-"""One byte string for one value, so that equal things have equal digests."""
+"""Canonical byte string of a value, so that equal values have equal digests."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ _CONTAINERS: Final = (dict, list, tuple)
 
 
 def canonical_json(value: object) -> bytes:
-    """The JSON of `value`: sorted keys, no spaces, UTF-8, finite numbers only.
+    """Return the JSON of `value`: sorted keys, no spaces, UTF-8, finite numbers only.
 
     Raises:
-        InputError: the value holds something that JSON cannot say exactly: NaN, infinity, a key
-            that is not text, a half surrogate, an array.
+        InputError: the value contains something without an exact JSON form: NaN, infinity, a key
+            that is not text, a lone surrogate, an array.
     """
     try:
         text = json.dumps(
@@ -35,8 +35,8 @@ def canonical_json(value: object) -> bytes:
 
 
 def _refuse_other_keys(value: object) -> None:
-    # json.dumps turns a key 1 into "1" without a word, and two values would share a digest. It
-    # has refused a value that contains itself, so this comes to an end.
+    # json.dumps silently turns a key 1 into "1", and two values would share a digest. It has
+    # already refused a value that contains itself, so this recursion ends.
     containers = [value] if isinstance(value, _CONTAINERS) else []
     for container in containers:
         inner: Iterable[object] = container
@@ -49,5 +49,5 @@ def _refuse_other_keys(value: object) -> None:
 
 
 def digest(data: bytes) -> str:
-    """SHA-256 of `data` in lower-case hexadecimal."""
+    """Return the SHA-256 of `data` in lower-case hexadecimal."""
     return hashlib.sha256(data).hexdigest()

@@ -1,4 +1,4 @@
-"""Named places in the life of a result where a test may kill the process or fail the disk."""
+"""Named points in the publication of a result at which a test can inject faults."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ COMMIT_POINTS = (
     "before_run_record",
     "after_run_record",
 )
-"""In the order they are reached.
+"""In execution order.
 
 `before_write`, `after_write`: around the arrays in private staging. `before_publish`: all is hashed
-and nothing lies outside staging. `during_publish`: some data is durable, no manifest anywhere.
+and nothing is outside staging. `during_publish`: some data is durable, no manifest anywhere.
 `before_commit`, `after_commit`: around the one atomic step that makes the result exist, which is a
 rename in a folder and the manifest's creation in object storage. `before_run_record`,
 `after_run_record`: around the creation of the run's record.
@@ -27,15 +27,15 @@ _hook: Callable[[str], None] | None = None
 
 
 def install_fault_hook(hook: Callable[[str], None] | None) -> None:
-    """Calls `hook` with the name of every commit point reached from now on; None removes it.
+    """Call `hook` with the name of every commit point reached from now on; None removes it.
 
-    For fault tests only: nothing in the product installs one.
+    For fault tests only: no product code installs one.
     """
     global _hook
     _hook = hook
 
 
 def reached(point: str) -> None:
-    """Tells the installed hook, if any, that the process is at `point`."""
+    """Call the installed hook, if any, with the name of the current `point`."""
     if _hook is not None:
         _hook(point)

@@ -1,4 +1,4 @@
-"""Do two projects hold the same: the checker of the promise "same answer"."""
+"""Comparison of two projects: do their computations give the same answer."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ _PASSING = {
     "run": {"run_id", "parent", "executed", "reused", "started_at", "finished_at", "seconds"},
     "registration": {"folder", "files"},
 }
-"""What may differ between two honest runs: times, numbers, places, and who computed what when."""
+"""Allowed differences between two valid runs: times, numbers, places, and reused units."""
 
 
 def compare_stores(ours: Store, theirs: Store) -> list[str]:
-    """One line for each difference; empty when the projects hold the same, byte for byte.
+    """Return one line per difference; empty if the projects are equal, byte for byte.
 
     Compared are the registered matches, every result's files and manifest, and the latest run of
-    each match, which is the one that stands after interruptions. Left out are times, run numbers
-    and places, and which units a run computed or found there.
+    each match, which is the current one after interruptions. Ignored are times, run numbers and
+    places, and whether a run computed or reused a unit.
     """
     return [
         *_matches(ours, theirs),

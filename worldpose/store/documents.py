@@ -19,18 +19,18 @@ from worldpose.store.canonical import canonical_json, digest
 R = TypeVar("R", bound=Record)
 
 _FURTHER = "extra_forbidden"
-"""What pydantic calls a field that a record does not have."""
+"""pydantic's error type for an unknown field."""
 _SEAL: Final = re.compile(rb'\{"checksum":"([0-9a-f]{64})",')
-"""The start of a document none of whose keys sorts before `checksum`."""
+"""Start of a document with no key before `checksum`."""
 
 
 def checksum_of(record: Record) -> str:
-    """The digest that seals `record`: of all its fields but `checksum`."""
+    """Return the digest that seals `record`: of all its fields but `checksum`."""
     return digest(canonical_json(_fields(record)))
 
 
 def seal(record: Record) -> bytes:
-    """The document of `record`."""
+    """Return the document of `record`."""
     fields = _fields(record)
     return canonical_json({**fields, "checksum": digest(canonical_json(fields))}) + b"\n"
 
@@ -44,16 +44,16 @@ def unseal(kind: type[R], data: bytes, where: str) -> R:
         where: the document's path, for messages.
 
     Raises:
-        CorruptionError: the bytes are not the bytes that were sealed.
-        InputError: a whole document, of another contract version than this worldpose reads, or
-            with fields of a later version.
+        CorruptionError: the bytes differ from the sealed ones.
+        InputError: an intact document, but of an unsupported contract version, or with fields of a
+            later version.
     """
     content = _content_after_seal(data)
     if content is not None:
         try:
             return kind.model_validate_json(data if "checksum" in kind.model_fields else content)
         except ValidationError:
-            pass  # what follows says why
+            pass  # the checks below report the reason
     try:
         fields = json.loads(data)
         checksum = fields.pop("checksum")
@@ -87,10 +87,10 @@ def unseal(kind: type[R], data: bytes, where: str) -> R:
 
 
 def unseal_repairable(kind: type[R], data: bytes, where: str) -> R:
-    """As `unseal`, for a record that `worldpose verify --repair` sets aside when it is damaged.
+    """Unseal a record that `worldpose verify --repair` can set aside if it is damaged.
 
     Raises:
-        CorruptionError, InputError: see `unseal`; the former says what to do.
+        CorruptionError, InputError: see `unseal`; the former says how to repair.
     """
     try:
         return unseal(kind, data, where)
@@ -109,11 +109,11 @@ def read_checksum(data: bytes) -> str:
 def _content_after_seal(data: bytes) -> bytes | None:
     """Return the bytes that the checksum at the start of a document seals.
 
-    Reading JSON, writing it again and comparing takes ten times as long. Here the checksum is cut
-    out, and the rest has to be the bytes from which `seal` computed it.
+    Parsing JSON, writing it again and comparing takes ten times as long. Instead the checksum is
+    cut out, and the rest must be the bytes from which `seal` computed it.
 
     Returns:
-        None if another key comes before the checksum, or the rest does not fit the checksum.
+        None if another key comes before the checksum, or the rest does not match the checksum.
     """
     found = _SEAL.match(data)
     if found is None or not data.endswith(b"}\n"):

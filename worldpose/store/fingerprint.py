@@ -1,4 +1,4 @@
-"""The version of the code that computes a stage, read from its source without running it."""
+"""Version of the code that computes a stage, from its source, without executing it."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from worldpose.errors import StoreError
 from worldpose.store.canonical import digest
 
 FOLLOWED = ("tasks", "worldpose", "data_contracts")
-"""Packages whose imports decide a result."""
+"""Packages whose imports affect a result."""
 NOT_FOLLOWED = "worldpose.store"
-"""How results are kept decides none of their numbers; `STORE_FORMAT` decides their bytes."""
+"""The storage code does not affect numbers of results; `STORE_FORMAT` covers their bytes."""
 STORE_FORMAT = "1"
-"""Raised when the same arrays are written as other bytes."""
+"""Increased when the same arrays are written as other bytes."""
 NUMERIC_LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "av", "zarr", "numcodecs")
 
 PARSING_ATTEMPTS = 10
-"""Soon over where it is another trouble."""
+"""Sufficient for the thread race; other errors are raised soon."""
 
 _HOME = (Path(__file__).resolve().parents[2],)
 
 
 @functools.cache
 def code_version(root_module: str, roots: tuple[Path, ...] = _HOME) -> dict[str, str]:
-    """Digest of each source module that `root_module` computes with, by module name.
+    """Return the digest of each source module that `root_module` depends on, by module name.
 
-    Follows imports, those inside functions too, into `tasks`, `worldpose` (not its store) and
-    `data_contracts`. A package's `__init__` counts where an import takes a name from it, not
-    merely because a module inside it is imported. A data file beside a module counts where the
-    module names it. Comments, docstrings and formatting are left
-    out, so that editing them recomputes nothing. Only literal import statements are seen. Read
-    once per process: a process keeps the code it started with.
+    Follows imports, also inside functions, into `tasks`, `worldpose` (not its store) and
+    `data_contracts`. A package's `__init__` counts if an import takes a name from it, not merely
+    because a module inside it is imported. A data file next to a module counts if the module names
+    it. Comments, docstrings and formatting are ignored, so that editing them recomputes nothing.
+    Only literal import statements are detected. Computed once per process: a process keeps the code
+    that it started with.
 
     Args:
         root_module: the module to start from, such as `tasks.tracking`.
         roots: folders that hold the packages.
 
     Raises:
-        StoreError: a module's source is not found or cannot be parsed.
+        StoreError: a module's source is missing or cannot be parsed.
     """
     versions: dict[str, str] = {}
     seen = {root_module}
@@ -57,7 +57,7 @@ def code_version(root_module: str, roots: tuple[Path, ...] = _HOME) -> dict[str,
 
 @functools.cache
 def _read_module(name: str, roots: tuple[Path, ...]) -> tuple[dict[str, str], frozenset[str]]:
-    """Digests of one module and of the data files that it names, and the modules it imports."""
+    """Return digests of one module and of the data files that it names, and its imports."""
     path = _source(name, roots)
     if path is None:
         raise StoreError(f"no source of module {name} below {', '.join(map(str, roots))}")
@@ -74,7 +74,7 @@ def _read_module(name: str, roots: tuple[Path, ...]) -> tuple[dict[str, str], fr
 
 @functools.cache
 def libraries() -> dict[str, str]:
-    """Versions of what else decides a result's bytes: Python, numeric libraries, store format."""
+    """Return versions that affect a result's bytes: Python, numeric libraries, store format."""
     versions = {
         "python": f"{sys.version_info.major}.{sys.version_info.minor}",
         "store": STORE_FORMAT,
@@ -88,10 +88,10 @@ def libraries() -> dict[str, str]:
 
 
 def _parsed(source: bytes) -> ast.Module:
-    """The tree of a source, also where another thread parses at the same time.
+    """Parse a source, also while another thread parses.
 
-    Python 3.11 counts how deep it is for all threads together, and gives up where the count is off
-    in the end (python/cpython issue 106905).
+    Python 3.11 shares its recursion depth counter between threads, and raises an error if the count
+    is wrong at the end (python/cpython issue 106905).
     """
     for _ in range(PARSING_ATTEMPTS - 1):
         try:
@@ -116,7 +116,7 @@ def _source(name: str, roots: tuple[Path, ...]) -> Path | None:
 
 
 def _data(nodes: list[ast.AST], path: Path) -> Iterator[Path]:
-    """Files beside a module that a text in it names."""
+    """Yield files next to a module that a string in it names."""
     texts = {node.value for node in nodes if isinstance(node, ast.Constant)}
     yield from (
         file
@@ -141,12 +141,12 @@ def _imported(nodes: list[ast.AST], package: str, roots: tuple[Path, ...]) -> It
 
 
 def _without_text(tree: ast.Module) -> list[ast.AST]:
-    """All nodes of a tree, after text that stands alone as a statement is taken out of it.
+    """Return all nodes of a tree, after removing string statements from it.
 
-    Such are docstrings and field strings.
+    These are docstrings and field docstrings.
     """
     nodes: list[ast.AST] = [tree]
-    for node in nodes:  # it grows meanwhile
+    for node in nodes:  # the list grows during the loop
         for name, value in ast.iter_fields(node):
             if isinstance(value, ast.AST):
                 nodes.append(value)
@@ -160,7 +160,7 @@ def _without_text(tree: ast.Module) -> list[ast.AST]:
 
 
 def _is_text(node: object) -> bool:
-    """Whether this is a statement of nothing but text."""
+    """Return whether this is a statement that contains only a string."""
     if not isinstance(node, ast.Expr) or not isinstance(node.value, ast.Constant):
         return False
     return isinstance(node.value.value, str)

@@ -1,4 +1,4 @@
-"""A project in a local folder."""
+"""Project in a local folder."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from worldpose.store.commit_points import reached
 from worldpose.store.paths import STAGING, checked_path
 
 _WITHOUT_LINKS: Final = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
-"""What link() says on file systems that have no hard links."""
+"""Errors of link() on file systems without hard links."""
 _HERE: Final = -100
-"""AT_FDCWD: a relative path begins at the working folder."""
+"""AT_FDCWD: a relative path starts at the working folder."""
 _NO_REPLACE: Final = 1
 """RENAME_NOREPLACE of Linux."""
 
 
 @dataclass(frozen=True)
 class LocalBlobs:
-    """Files below `root`. What exists was written whole and reached the disk first."""
+    """Files below `root`. An existing file was written whole and synced to disk before."""
 
     root: Path
 
@@ -53,7 +53,7 @@ class LocalBlobs:
             return self._at(path).exists()
 
     def put_new(self, path: str, data: bytes) -> bool:
-        """See `Blobs`. A link, unlike a rename, fails where something exists."""
+        """See `Blobs`. A link, unlike a rename, fails if the target exists."""
         target = self._at(path)
         with storage_errors(str(target)), self._temporary(data) as temporary:
             _make_folder(target.parent)
@@ -77,7 +77,7 @@ class LocalBlobs:
             target.unlink(missing_ok=True)
 
     def delete_tree(self, prefix: str, first: str) -> None:
-        """See `Blobs`. One rename takes the whole tree away from readers."""
+        """See `Blobs`. One rename hides the whole tree from readers."""
         source = self._at(prefix)
         with storage_errors(str(source)):
             if source.parent != self.root / STAGING:
@@ -119,7 +119,7 @@ class LocalBlobs:
             return found
 
     def publish_tree(self, folder: Path, prefix: str, manifest_name: str, manifest: bytes) -> bool:
-        """See `Blobs`. All is durable, manifest last, before one rename makes it exist."""
+        """See `Blobs`. All files are durable, manifest last, before one rename publishes them."""
         target = self._at(prefix)
         with storage_errors(str(target)):
             _sync_tree(folder)
@@ -131,10 +131,10 @@ class LocalBlobs:
             try:
                 folder.rename(target)
             except OSError as error:
-                # Renaming onto a folder with something in it fails: written once, for good.
+                # Renaming onto a folder with content fails: a result is written only once.
                 if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
                     return False
-                # A network file system repeats a request whose reply was lost: the first one has
+                # A network file system repeats a request after a lost reply: the first request has
                 # moved our folder, and the second finds none.
                 if error.errno not in (errno.ENOENT, errno.ESTALE) or folder.exists():
                     raise
@@ -147,7 +147,7 @@ class LocalBlobs:
         return self.root / checked_path(path)
 
     def _entry(self, path: Path) -> Entry | None:
-        """None where somebody has removed it since it was listed."""
+        """Return the entry; None if it was removed since it was listed."""
         try:
             status = path.lstat()
         except (FileNotFoundError, NotADirectoryError):
@@ -177,21 +177,21 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _create_whole(temporary: Path, target: Path) -> bool:
-    """Give the whole, synced file `temporary` the name `target`; False where that is taken.
+    """Give the whole, synced file `temporary` the name `target`; return False if that exists.
 
-    Of many that try at once exactly one succeeds, and no reader ever sees a part of the file. A
-    hard link does that on most file systems. Where there are none (exFAT, many network shares), a
-    rename that never replaces does.
+    Of many concurrent attempts exactly one succeeds, and no reader ever sees a part of the file. A
+    hard link has this property on most file systems. Without hard links (exFAT, many network
+    shares), a rename that never replaces is used.
 
     Raises:
-        StoreError: the file system offers neither.
+        StoreError: the file system supports neither.
         OSError: it failed for another reason.
     """
     try:
         os.link(temporary, target)
     except OSError as error:
-        # A network file system repeats a request whose reply was lost, and the repeated one finds
-        # the link of the first. Nothing else knows the temporary name: two names mean success.
+        # A network file system repeats a request after a lost reply, and the repeated one finds the
+        # link of the first. Nothing else knows the temporary name: two names mean success.
         if temporary.stat().st_nlink == 2:
             return True
         if isinstance(error, FileExistsError):
@@ -203,7 +203,7 @@ def _create_whole(temporary: Path, target: Path) -> bool:
 
 
 def _rename_new(temporary: Path, target: Path, no_link: OSError) -> bool:
-    """Rename unless `target` exists; False where it does."""
+    """Rename unless `target` exists; return False if it does."""
     try:
         rename = ctypes.CDLL(None, use_errno=True).renameat2
     except AttributeError:  # not Linux
@@ -255,7 +255,7 @@ def _sync_tree(folder: Path) -> None:
 
 
 def _make_folder(path: Path) -> None:
-    """Makes `path` and its parents so that they outlast a power cut."""
+    """Create `path` and its parents so that they survive a power failure."""
     if path.is_dir():
         return
     _make_folder(path.parent)
@@ -264,11 +264,11 @@ def _make_folder(path: Path) -> None:
 
 
 def _entries_below(folder: str, path: str) -> Iterator[Entry]:
-    """Yield all files below a folder, without those that are removed meanwhile.
+    """Yield all files below a folder, without those removed during the scan.
 
     Args:
-        folder: where it is on the disk.
-        path: where it is below the root.
+        folder: path on the disk.
+        path: path below the root.
     """
     try:
         with os.scandir(folder) as found:

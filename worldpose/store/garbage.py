@@ -1,4 +1,4 @@
-"""What no kept run needs: found first, removed second."""
+"""Garbage collection of everything that no kept run needs: planned first, removed second."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from worldpose.store.store import Store
 
 @dataclass(frozen=True)
 class Garbage:
-    """One thing to remove."""
+    """One item to remove."""
 
     path: str
     """A result's group, a staging folder, a run record or a reservation."""
@@ -28,18 +28,17 @@ class Garbage:
 
 @dataclass(frozen=True)
 class GcPlan:
-    """What `collect` will remove, and why it leaves the rest of some matches alone."""
+    """Items that `collect` will remove, and the matches that it skips."""
 
     garbage: tuple[Garbage, ...]
     held: tuple[str, ...]
-    """One line for each match that is left alone, as a run may be at work or a record is damaged.
-    """
+    """One line for each skipped match, because a run may be in progress or a record is damaged."""
     runs: frozenset[str]
-    """The run records, reservations and pins that the plan knows of."""
+    """The run records, reservations and pins known to the plan."""
 
     @property
     def size(self) -> int:
-        """All that it frees [byte]."""
+        """Total size that it frees [byte]."""
         return sum(item.size for item in self.garbage)
 
 
@@ -50,26 +49,26 @@ def plan_gc(
     forget: Collection[str] = (),
     older_than: timedelta = timedelta(days=1),
 ) -> GcPlan:
-    """What can go: results that no kept run reaches, leftovers and reservations of dead runs.
+    """Find garbage: results that no kept run reaches, leftovers and reservations of dead runs.
 
-    A result is reached when a kept run's record names it or something made from it. A pinned run
-    is kept, however old. Results and leftovers are spared while young; results also while a run of
-    their match may be at work, which may be about to name them, and leftovers while any run may.
-    Reservations stay while they hold the highest number, so that no number is given twice unless
-    `forget` frees it. Nothing is removed by planning.
+    A result is reached if a kept run's record names it or a result computed from it. A pinned run
+    is kept, however old. Recent results and leftovers are kept; results are also kept while a run
+    of their match may be in progress, which may be about to name them, and leftovers while any run
+    may be. Reservations are kept while they hold the highest number, so that no number is reused
+    unless `forget` frees it. Planning removes nothing.
 
     Args:
         store: the project.
         keep_last: keep only this many of each match's newest run records; None keeps all.
-        forget: runs to drop, as `match/0003`; an unfinished one is taken to be dead, and a pinned
-            one has to be unpinned first.
-        older_than: the age below which results and leftovers are spared.
+        forget: runs to drop, as `match/0003`; an unfinished one counts as dead, and a pinned one
+            must be unpinned first.
+        older_than: the age below which results and leftovers are kept.
 
-    A match of which a run record, reservation, pin or manifest is damaged is left alone, as what
-    its runs reach is unknown.
+    A match with a damaged run record, reservation, pin or manifest is skipped, as the results that
+    its runs reach are unknown.
 
     Raises:
-        InputError: `forget` names a run that is not there or is pinned, or `keep_last` is below 1.
+        InputError: `forget` names a missing or pinned run, or `keep_last` is below 1.
     """
     known = _known(store)
     _check_arguments(store, keep_last, forget)
@@ -101,7 +100,7 @@ def plan_gc(
     garbage.extend(
         Garbage(entry.path, "staging of a dead writer", entry.size)
         for entry in store.blobs.staged()
-        if entry.modified <= before and not at_work  # staging does not tell whose it is
+        if entry.modified <= before and not at_work  # staging does not tell its match
     )
     held = tuple(
         f"{run.match_id} is left alone: run {run.run_id}, process {run.pid} on {run.host}, may "
@@ -113,14 +112,13 @@ def plan_gc(
 
 
 def collect(store: Store, plan: GcPlan) -> int:
-    """Removes what `plan` lists and returns the size that was freed [byte].
+    """Remove the items of `plan` and return the freed size [byte].
 
-    Records go before the results they name, manifests before their files: whatever interrupts
-    it, nothing that can be read is half, and the next plan finds the rest.
+    Records are removed before the results that they name, manifests before their files: after any
+    interruption, every readable result is whole, and the next plan finds the rest.
 
     Raises:
-        StoreError: a run has begun, ended or been pinned since the plan was made; nothing is
-            removed.
+        StoreError: a run was started, ended or pinned since the plan was made; nothing is removed.
     """
     if plan.runs != _known(store):
         raise StoreError(
@@ -136,19 +134,19 @@ def collect(store: Store, plan: GcPlan) -> int:
 
 
 def _matches_with_runs(paths: Iterable[str]) -> list[str]:
-    """Matches that files below `runs` belong to; a foreign file's folder is none."""
+    """Return the matches of files below `runs`, without folders of foreign files."""
     parts = (path.split("/") for path in paths)
     return sorted({each[1] for each in parts if len(each) == 3 and is_name(each[1])})
 
 
 def _known(store: Store) -> frozenset[str]:
-    """Everything that says which runs there are and which are kept."""
+    """Return all files that define which runs exist and which are kept."""
     folders = (store.blobs.entries(top) for top in ("runs", "pins"))
     return frozenset(entry.path for entries in folders for entry in entries)
 
 
 def _pinned(store: Store, match_id: str) -> dict[str, str]:
-    """Run to a name that keeps it."""
+    """Map each pinned run to one of its names."""
     return {pin.run_id: pin.name for pin in list_pins(store.blobs, match_id)}
 
 
@@ -182,7 +180,7 @@ def _check_arguments(store: Store, keep_last: int | None, forget: Collection[str
 def _sorted_out(
     store: Store, match_id: str, keep_last: int | None, forget: Collection[str]
 ) -> tuple[list[str], list[str]]:
-    """Run records to drop, and to keep."""
+    """Return run records to drop, and to keep."""
     finished, pinned = store.runs(match_id), _pinned(store, match_id)
     newest = finished if keep_last is None else finished[-keep_last:]
     kept = [
@@ -196,7 +194,7 @@ def _sorted_out(
 def _reservations(
     store: Store, match_id: str, known: Collection[str]
 ) -> Iterator[tuple[str, Reservation | None]]:
-    """Paths of a match's reservations; those that serve no end come with None."""
+    """Yield paths of a match's reservations; None marks those without a purpose."""
     finished = store.runs(match_id)
     for run_id in finished:
         path = reservation_path(match_id, run_id)
@@ -210,14 +208,14 @@ def _reservations(
 
 
 def _reach(store: Store, record: RunRecord, reached: set[ResultId]) -> None:
-    """Add to `reached` the results a run names, and all they were made from."""
+    """Add to `reached` the results that a run names, and all their inputs."""
     waiting = [ResultId.named(record.match_id, name, key) for name, key in record.results.items()]
     while waiting:
         result = waiting.pop()
         if result in reached:
             continue
         reached.add(result)
-        # An input of an older, forgotten run may be gone for good already.
+        # An input of an older, forgotten run may have been removed already.
         if store.has(result.match_id, result.stage, result.unit, result.key):
             recipe = store.manifest(result.match_id, result.stage, result.unit, result.key).recipe
             waiting.extend(

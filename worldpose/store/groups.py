@@ -26,10 +26,10 @@ from worldpose.store.layout_checks import (
 
 
 class _PrivateFolder(LocalStore):
-    """A folder with one writer, which creates files without the hard links that some disks lack."""
+    """Folder with one writer; creates files without hard links, which some file systems lack."""
 
     async def set_if_not_exists(self, key: str, value: Buffer) -> None:
-        """Write a file unless it is there; no other writer can come between."""
+        """Write a file unless it exists; there is no concurrent writer."""
         if not await self.exists(key):
             await self.set(key, value)
 
@@ -41,23 +41,23 @@ def write_group(
     coordinates: Arrays,
     attributes: Mapping[str, Any],
 ) -> int:
-    """Writes the group into `folder`; equal arrays and attributes give equal files.
+    """Write the group to `folder`; equal arrays and attributes give equal files.
 
-    Chunks are lz4 with a CRC-32C of the compressed bytes, so that any Zarr reader refuses a
-    changed chunk. Every chunk is written, an empty one too: a lost chunk is never a fill value.
+    Chunks are lz4 with a CRC-32C of the compressed bytes, so that any Zarr reader refuses a changed
+    chunk. Empty chunks are written, too: a lost chunk never becomes a fill value.
 
     Args:
         folder: an empty folder.
-        layout: what the arrays must be.
-        arrays: by name; those in `layout.optional` may be absent.
+        layout: required form of the arrays.
+        arrays: by name; those in `layout.optional` can be absent.
         coordinates: one-dimensional arrays by name.
-        attributes: what `layout.attributes` asks for.
+        attributes: the attributes that `layout.attributes` requires.
 
     Returns:
-        How many files that is.
+        The number of files.
 
     Raises:
-        InternalError: the arrays or attributes are not what the layout says.
+        InternalError: the arrays or attributes do not match the layout.
     """
     checked = checked_arrays(layout, arrays, coordinates)
     given = checked_attributes(layout, checked, attributes)
@@ -94,12 +94,12 @@ def write_group(
 
 
 def read_group(files: Store) -> xr.Dataset:
-    """The group in `files`, read when it is used: labelled, with units and conventions."""
+    """Open the group in `files`, read on access: labelled, with units and conventions."""
     stored: xr.Dataset = xr.open_zarr(
         files, zarr_format=3, consolidated=False, chunks=None, decode_cf=False
     )
     for variable in stored.variables.values():
-        # xarray and its plots know "units".
+        # xarray and its plots use "units".
         variable.attrs["units"] = variable.attrs.pop("unit")
     attributes = dict(stored.attrs)
     labels, given = attributes.pop("labels"), attributes.pop("attributes")
@@ -115,7 +115,7 @@ def read_group(files: Store) -> xr.Dataset:
 
 
 def _fill_value(array: ArrayLayout) -> float | int | bool:
-    """What a reader that knows no manifest sees in a lost chunk: missing, not a number."""
+    """Return the value of a lost chunk for a reader without the manifest: missing, not a number."""
     kind = np.dtype(array.dtype).kind
     if kind == "f":
         return 0.0 if array.missing == "0" else np.nan

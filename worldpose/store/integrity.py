@@ -1,4 +1,4 @@
-"""Finds every changed, lost or foreign byte of a project."""
+"""Verification of a project: finds every changed, lost or foreign byte."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ from worldpose.store.store import Store
 from worldpose.store.writer import content_of
 
 Progress = Callable[[int, int], None]
-"""Told how many bytes are checked, and how many there are."""
+"""Called with the number of verified bytes, and the total."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that is not as it was written."""
+    """A deviation from the published state."""
 
     path: str
     """Relative to the project."""
     problem: str
     result: ResultId | None = None
-    """The result it belongs to; None for records and stray files."""
+    """The result that it belongs to; None for records and stray files."""
     is_damaged_record: bool = False
-    """It is a run record, reservation, registration or pin that cannot be read as such."""
+    """It is a run record, reservation, registration or pin that is not readable as such."""
 
 
 def verify(
     store: Store, match_id: str | None = None, progress: Progress | None = None
 ) -> tuple[Finding, ...]:
-    """All damage in a project, or in one match of it; empty when all is as published.
+    """Return all damage in a project, or in one match of it; empty if all is as published.
 
     Reads everything: each result's files against its manifest, each manifest, run record, pin,
     journal entry, reservation and registration against its own checksum, and each run record's
     results.
     """
     below = "" if match_id is None else f"/{match_id}"
-    # Results last: a run at work publishes them before the record that names them.
+    # Results last: an active run publishes them before the record that names them.
     documents = [
         *(store.blobs.entries("matches") if match_id is None else []),
         *store.blobs.entries(f"runs{below}"),
@@ -80,11 +80,11 @@ def verify(
 def repair(
     store: Store, findings: Iterable[Finding]
 ) -> tuple[tuple[ResultId, ...], tuple[str, ...]]:
-    """Withdraws damaged results and sets damaged records aside; gives those, and paths of these.
+    """Withdraw damaged results and set damaged records aside; return results, and record paths.
 
-    The next run computes the withdrawn results, and only those, again. A record that is set aside
-    keeps its bytes under another name (`damaged_path`) beside its place, and a run its number.
-    Entries of the journal stay: what people said is restored from a copy, never dropped.
+    The next run recomputes only the withdrawn results. A record that is set aside keeps its bytes
+    under another name (`damaged_path`) in the same folder, and a run its number. Journal entries
+    stay: people's decisions are restored from a copy, never dropped.
     """
     findings = list(findings)
     results = sorted({finding.result for finding in findings if finding.result})
@@ -115,7 +115,7 @@ def _check_result(
     store: Store, result: ResultId, entries: Mapping[str, Entry]
 ) -> Iterator[Finding]:
     if result.manifest_path not in entries:
-        # Not published: what an interrupted writer left in object storage, and `gc` removes.
+        # Not published: left by an interrupted writer in object storage; `gc` removes it.
         return
     try:
         manifest = store.manifest(result.match_id, result.stage, result.unit, result.key)
@@ -143,7 +143,7 @@ def _check_document(
     is_record = False
     try:
         if path.endswith(DAMAGED) and parts[0] in ("matches", "runs", "pins"):
-            return  # set aside: nothing reads it
+            return  # set aside: it has no reader
         data = store.blobs.read(path)
         if data is None and parts[0] in ("runs", "pins"):
             return  # ended, forgotten or unpinned since it was listed
@@ -192,7 +192,7 @@ def _is_json(name: str) -> bool:
 
 
 def _check_chain(entries: list[JournalEntry]) -> Iterator[Finding]:
-    """Entries of a journal that build on one that is gone or damaged."""
+    """Yield journal entries whose predecessor is missing or damaged."""
     tip = None
     for entry in sorted(entries, key=lambda entry: entry.number):
         if entry.previous != tip:

@@ -1,4 +1,4 @@
-"""Do arrays keep what their layout promises."""
+"""Validation of arrays against their layout."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from worldpose.store.canonical import canonical_json
 Arrays = Mapping[str, NDArray[Any]]
 
 PART_CHUNKS = 16
-"""Chunks of an array that are in memory at once: enough for every core to compress one."""
+"""Chunks of an array in memory at once: enough for every core to compress one."""
 
 
 def checked_arrays(
     layout: GroupLayout, arrays: Arrays, coordinates: Arrays
 ) -> dict[str, NDArray[Any]]:
-    """All arrays by name in the layout's order, as they were given.
+    """Return all arrays by name in the layout's order, unchanged.
 
     Raises:
         InternalError: an array is unknown, absent, of another dtype or dimension, disagrees with
-            another in a dimension's size, or holds NaN or infinity where there must be none.
+            another in a dimension's size, or holds NaN or infinity against its layout.
     """
     _check_names(layout, "array", arrays, [array.name for array in layout.arrays])
     _check_names(layout, "coordinate", coordinates, [array.name for array in layout.coordinates])
@@ -53,9 +53,9 @@ def checked_arrays(
 
 
 def array_parts(array: ArrayLayout, shape: tuple[int, ...]) -> list[tuple[slice, ...]]:
-    """Where the parts of an array of `shape` lie: a few whole chunks each, all of it in turn.
+    """Return the slices of consecutive parts of an array of `shape`: a few whole chunks each.
 
-    An array may be longer than memory; what is done to it is done to a part at a time.
+    An array can be longer than memory, so it is processed one part at a time.
     """
     if 0 in shape:
         return []
@@ -71,9 +71,9 @@ def array_parts(array: ArrayLayout, shape: tuple[int, ...]) -> list[tuple[slice,
 
 
 def with_one_nan(values: NDArray[Any]) -> NDArray[Any]:
-    """The values with one bit pattern for every NaN.
+    """Return the values with one bit pattern for every NaN.
 
-    NaNs come with a sign and a payload that depend on the processor's path.
+    The sign and payload of NaNs depend on the processor's code path.
     """
     if values.dtype.kind != "f":
         return values
@@ -83,13 +83,14 @@ def with_one_nan(values: NDArray[Any]) -> NDArray[Any]:
 def checked_attributes(
     layout: GroupLayout, arrays: Arrays, attributes: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The group's attributes as plain JSON, in the layout's order.
+    """Return the group's attributes as plain JSON, in the layout's order.
 
-    An attribute named as a dimension labels it, so it must be a list of the dimension's size.
+    An attribute with the name of a dimension labels it, so it must be a list of the dimension's
+    size.
 
     Raises:
-        InternalError: an attribute is unknown, absent, not plain JSON, or labels a dimension
-            wrongly.
+        InternalError: an attribute is unknown, absent, not plain JSON, or a wrong label of a
+            dimension.
     """
     _check_names(layout, "attribute", attributes, list(layout.attributes))
     try:

@@ -1,4 +1,4 @@
-"""A project in S3-compatible object storage."""
+"""Project in S3-compatible object storage."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ except ImportError as error:
     ) from error
 
 UPLOADS = 8
-"""Objects of one result sent at a time; the result exists only after the last."""
+"""Concurrent uploads per result; the result exists only after the last."""
 
 
 @dataclass(frozen=True)
 class ObjectBlobs:
     """Objects below `prefix` of `bucket`.
 
-    The endpoint, the region and the credentials are the AWS_* variables that obstore reads.
+    obstore reads endpoint, region and credentials from AWS_* variables.
     """
 
     bucket: str
@@ -44,10 +44,10 @@ class ObjectBlobs:
 
     @classmethod
     def at(cls, url: str) -> ObjectBlobs:
-        """The root `s3://bucket/prefix`.
+        """Open the root `s3://bucket/prefix`.
 
         Raises:
-            InputError: no bucket.
+            InputError: there is no bucket in the URL.
         """
         bucket, _, prefix = url.removeprefix("s3://").strip("/").partition("/")
         if not bucket:
@@ -82,7 +82,7 @@ class ObjectBlobs:
             return True
 
     def put_new(self, path: str, data: bytes) -> bool:
-        """See `Blobs`. The service itself refuses a second creation (If-None-Match)."""
+        """See `Blobs`. The service refuses a second creation (If-None-Match)."""
         with self._errors(path):
             try:
                 obstore.put(self._s3, checked_path(path), data, mode="create", use_multipart=False)
@@ -113,11 +113,11 @@ class ObjectBlobs:
         return self._listed(checked_path(prefix))
 
     def all_entries(self) -> list[Entry]:
-        """All objects below the root, sorted by path; any program may have named them."""
+        """Return all objects below the root, sorted by path; any program can have named them."""
         return self._listed(None)
 
     def download(self, path: str, file: Path) -> None:
-        """Writes the object at `path` to a new file, piece by piece: it may be a video."""
+        """Write the object at `path` to a new file, piece by piece, since it can be a video."""
         file.parent.mkdir(parents=True, exist_ok=True)
         with file.open("xb") as content:
             for piece in self._pieces(path):
@@ -144,7 +144,7 @@ class ObjectBlobs:
             return Path(tempfile.mkdtemp(prefix="worldpose-"))
 
     def staged(self) -> list[Entry]:
-        """See `Blobs`. None: staging is on the writers' own machines."""
+        """See `Blobs`. Always empty: staging is on the writers' own machines."""
         return []
 
     def publish_tree(self, folder: Path, prefix: str, manifest_name: str, manifest: bytes) -> bool:
@@ -178,7 +178,7 @@ class ObjectBlobs:
             return S3Store(
                 self.bucket,
                 prefix=self.prefix or None,
-                # http is what local S3 servers speak; the default endpoint is https.
+                # Local S3 servers use http; the default endpoint is https.
                 client_options={"allow_http": True},
                 retry_config={"max_retries": 5, "retry_timeout": timedelta(seconds=30)},
             )

@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 
 class Run(Mapping[str, "xr.Dataset"]):
-    """The results of one run: `run["triangulation/clip"].joints`.
+    """Results of one run: `run["triangulation/clip"].joints`.
 
-    Each is opened when it is first asked for, and its values are read when they are used.
+    Each is opened on first access, and its values are read on access.
     """
 
     def __init__(self, store: Store, record: RunRecord, *, complete: bool = False) -> None:
         self.record = record
-        """What the run did: results, settings, figures, versions, times."""
+        """Record of the run: results, settings, metrics, versions, times."""
         self._store = store
         self._complete = complete
         self._opened: dict[str, xr.Dataset] = {}
@@ -58,7 +58,7 @@ class Run(Mapping[str, "xr.Dataset"]):
         return name in self.record.results
 
     def _require_all_arrays(self, name: str, stage: str, result: xr.Dataset) -> None:
-        from data_contracts.schemas import LAYOUTS  # late: it has every record there is
+        from data_contracts.schemas import LAYOUTS  # imported here: it imports every record class
 
         (layout,) = (each for each in LAYOUTS if each.stage == stage)
         written = {*(array.name for array in layout.arrays), *layout.attributes}
@@ -86,18 +86,18 @@ class Run(Mapping[str, "xr.Dataset"]):
 def open_run(
     project: str | os.PathLike[str], match: str, run: str = LATEST, *, complete: bool = False
 ) -> Run:
-    """The results of a match's run as labelled arrays (xarray), metres and pixels, world frame.
+    """Open a match run's results as labelled arrays (xarray), metres and pixels, world frame.
 
     Args:
         project: the project's folder or `s3://bucket/prefix`.
         match: the match's id.
         run: the run's number, such as `0003`, or `latest`.
-        complete: refuse, when it is opened, a result that an earlier version of worldpose made
-            without some array that this one writes.
+        complete: refuse, on opening, a result that an earlier version of worldpose computed without
+            some array of this version.
 
     Raises:
-        InputError: no such project, match or run.
-        CorruptionError: stored bytes are not the bytes that were published.
+        InputError: there is no such project, match or run.
+        CorruptionError: stored bytes differ from the published ones.
     """
     store = Store.open(project)
     return Run(store, store.run(match, run), complete=complete)

@@ -1,4 +1,4 @@
-"""Where everything lies in a project, relative to its root."""
+"""Paths in a project, relative to its root."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _KEY: TypeAdapter[str] = TypeAdapter(Key)
 
 @dataclass(frozen=True, order=True)
 class ResultId:
-    """Which result: match, stage, unit and key. Every part is safe as a folder's name."""
+    """Identifier of a result: match, stage, unit and key. Every part is safe as a folder's name."""
 
     match_id: str
     stage: str
@@ -43,19 +43,19 @@ class ResultId:
 
     @classmethod
     def of(cls, work: Work) -> ResultId:
-        """The result that `work` makes."""
+        """Return the result that `work` computes."""
         recipe = work.recipe
         return cls(recipe.match_id, recipe.stage, recipe.unit, work.key)
 
     @classmethod
     def named(cls, match_id: str, name: str, key: str) -> ResultId:
-        """The result of the unit `name`, such as `tracking/clip`."""
+        """Return the result of the unit `name`, such as `tracking/clip`."""
         stage, _, unit = name.partition("/")
         return cls(match_id, stage, unit, key)
 
     @classmethod
     def at(cls, path: str) -> ResultId | None:
-        """The result that the file at `path` belongs to, None when it is no result's."""
+        """Return the result that contains the file at `path`, None if there is none."""
         parts = path.split("/")
         if len(parts) < 6 or parts[0] != "results":
             return None
@@ -76,32 +76,32 @@ class ResultId:
 
     @property
     def manifest_path(self) -> str:
-        """The file that makes the result exist."""
+        """The file whose creation publishes the result."""
         return f"{self.path}/{MANIFEST}"
 
 
 def registration_path(match_id: str) -> str:
-    """Where a match's registration lies."""
+    """Return the path of a match's registration."""
     return f"matches/{checked_name(match_id)}.json"
 
 
 def record_path(match_id: str, run_id: str) -> str:
-    """Where the record of a finished run lies."""
+    """Return the path of a finished run's record."""
     return f"runs/{checked_name(match_id)}/{checked_name(run_id)}.json"
 
 
 def reservation_path(match_id: str, run_id: str) -> str:
-    """Where the reservation of a run's number lies until its record does."""
+    """Return the path of a run number's reservation, valid until there is a record."""
     return f"runs/{checked_name(match_id)}/{checked_name(run_id)}.open.json"
 
 
 def damaged_path(path: str) -> str:
-    """Where `repair` sets the damaged record at `path` aside; no reader looks there."""
+    """Return the path where `repair` sets the damaged record at `path` aside, without readers."""
     return f"{path}{DAMAGED}"
 
 
 def is_name(text: str) -> bool:
-    """Can `text` be the name of a match, stage, unit, run or pin."""
+    """Return whether `text` is valid as the name of a match, stage, unit, run or pin."""
     try:
         checked_name(text)
     except InputError:
@@ -110,12 +110,12 @@ def is_name(text: str) -> bool:
 
 
 def pin_path(match_id: str, name: str) -> str:
-    """Where a run's name lies."""
+    """Return the path of a pin."""
     return f"pins/{checked_name(match_id)}/{checked_name(name)}.json"
 
 
 def checked_name(name: str) -> str:
-    """`name`, when it is safe as a file's name.
+    """Return `name` after checking that it is safe as a file name.
 
     Raises:
         InputError: it is not.
@@ -132,7 +132,7 @@ def checked_name(name: str) -> str:
 
 
 def checked_path(path: str) -> str:
-    """`path`, when it stays inside the project on every file system and object store.
+    """Return `path` if it stays inside the project on every file system and object store.
 
     Raises:
         InputError: it is absolute or empty, or has `..`, `.`, an empty part, a NUL, a line break

@@ -1,4 +1,4 @@
-"""Names of runs that are kept, in their part of the project."""
+"""Pins: names of runs that garbage collection keeps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from worldpose.store.paths import is_name, pin_path
 
 
 def pin_run(blobs: Blobs, pin: Pin) -> Pin:
-    """Keeps a run under a name, for good; gives the pin that stands.
+    """Pin a run under a name; return the pin in force.
 
     Pinning the same run under the same name again changes nothing.
 
@@ -38,10 +38,10 @@ def pin_run(blobs: Blobs, pin: Pin) -> Pin:
 
 
 def unpin_run(blobs: Blobs, match_id: str, name: str) -> Pin:
-    """Takes a name back, so that its run may be forgotten; gives what it was.
+    """Remove a pin, so that its run can be forgotten; return it.
 
     Raises:
-        InputError: no such name.
+        InputError: there is no such name.
     """
     pin = read_pin(blobs, match_id, name)
     if pin is None:
@@ -57,14 +57,14 @@ def unpin_run(blobs: Blobs, match_id: str, name: str) -> Pin:
 
 
 def read_pin(blobs: Blobs, match_id: str, name: str) -> Pin | None:
-    """The pin of a name, None when no run has it."""
+    """Return the pin of a name, None if no run has it."""
     path = pin_path(match_id, name)
     data = blobs.read(path)
     return None if data is None else unseal_repairable(Pin, data, f"{blobs.url}/{path}")
 
 
 def list_pins(blobs: Blobs, match_id: str) -> tuple[Pin, ...]:
-    """All pins of a match, by name."""
+    """Return all pins of a match, sorted by name."""
     files = [entry.path.rpartition("/")[2] for entry in blobs.entries(f"pins/{match_id}")]
     names = [file.removesuffix(".json") for file in files if file.endswith(".json")]
     pins = (read_pin(blobs, match_id, name) for name in names if is_name(name))

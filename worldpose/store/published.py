@@ -1,4 +1,4 @@
-"""The files of a published result, checked against its manifest as they are read."""
+"""Files of a published result, verified against its manifest on read."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from worldpose.store.paths import ResultId
 
 
 def read_published(blobs: Blobs, result: ResultId, file: StoredFile) -> bytes:
-    """The bytes of one file, which are the bytes that were published.
+    """Return the bytes of one file after verifying that they are the published ones.
 
     Raises:
         CorruptionError: the file is missing or its bytes have changed.

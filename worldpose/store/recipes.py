@@ -1,4 +1,4 @@
-"""The key of a result, and why two keys differ."""
+"""Key of a result, and the differences between two recipes."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ KEY_LENGTH = 32
 
 
 def key_of(recipe: Recipe) -> str:
-    """The name of the result that `recipe` makes: the first 128 bits of the recipe's SHA-256."""
+    """Return the key of the result of `recipe`: the first 128 bits of the recipe's SHA-256."""
     return digest(canonical_json(dict(recipe)))[:KEY_LENGTH]
 
 
 def explain_difference(old: Recipe, new: Recipe) -> list[str]:
-    """One line for each thing that makes `new` another result than `old`; empty when equal.
+    """Return one line per difference between `old` and `new`; empty if equal.
 
     Lines read `setting gate.max_distance: 0.5 -> 0.7` or `module worldpose.tracking.tracker:
-    3f2a... -> 77b1...`; a side that lacks the thing reads `absent`.
+    3f2a... -> 77b1...`; a missing side reads `absent`.
     """
     lines = [
         *_changes("contract", {"": old.contract}, {"": new.contract}),
@@ -32,7 +32,7 @@ def explain_difference(old: Recipe, new: Recipe) -> list[str]:
         *_changes("module", old.code, new.code),
         *_changes("library", old.libraries, new.libraries),
     ]
-    # Digests that begin alike look the same when cut short; a difference is never silent.
+    # Digests with equal beginnings look equal when shortened; every difference must show.
     if not lines and key_of(old) != key_of(new):
         lines.append(f"recipe: {key_of(old)} -> {key_of(new)}")
     return lines
@@ -55,7 +55,7 @@ def _shown(values: Mapping[str, Any], name: str) -> str:
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Every leaf by its place: `camera.focal_px[0]`."""
+    """Return every leaf by its path: `camera.focal_px[0]`."""
     flat: dict[str, Any] = {}
     for name, value in values.items():
         if isinstance(value, Mapping) and value:

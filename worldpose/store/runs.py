@@ -1,4 +1,4 @@
-"""Numbers and records of runs, in their part of the project."""
+"""Numbers and records of runs in a project."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from worldpose.store.pins import read_pin
 LATEST = "latest"
 
 _FILE = re.compile(r"(\d+)(\.open)?\.json(\.damaged)?")
-"""Name of a run's record or reservation, in its place or set aside; other files are foreign."""
+"""Name of a run's record or reservation, in use or set aside; other files are foreign."""
 
 
 def may_be_at_work(reservation: Reservation) -> bool:
-    """May the run's process still be at work. True for any process on another machine."""
+    """Return whether the run's process may be active; True for a process on another machine."""
     if reservation.host != platform.node():
         return True
     try:
@@ -35,17 +35,17 @@ def may_be_at_work(reservation: Reservation) -> bool:
 
 
 def list_runs(blobs: Blobs, match_id: str) -> tuple[list[str], list[str]]:
-    """Ids of a match's finished runs, and of those reserved but not finished, in order."""
+    """Return ids of a match's finished runs, and of those reserved but not finished, in order."""
     finished, reserved, _ = _files(blobs, match_id)
     return sorted(finished, key=run_order), sorted(reserved - finished, key=run_order)
 
 
 def reserve_run(blobs: Blobs, match_id: str) -> str:
-    """A run number that no other run of the match has or gets: `0001`, `0002`, ..."""
+    """Reserve a run number that no other run of the match has or gets: `0001`, `0002`, ..."""
     number = 0
     while True:
         # A record that was set aside keeps its number: reviews may name the run. A number that
-        # could not be reserved, for whatever lies in its place, is not tried again.
+        # could not be reserved, for any reason, is not tried again.
         taken = set[str]().union(*_files(blobs, match_id))
         number = max([number, *(run_order(name)[0] for name in taken)]) + 1
         run_id = f"{number:04d}"
@@ -66,14 +66,14 @@ def reserve_run(blobs: Blobs, match_id: str) -> str:
 
 
 def read_reservation(blobs: Blobs, match_id: str, run_id: str) -> Reservation | None:
-    """The reservation of a run, None when it has none, or has it no more."""
+    """Return the reservation of a run, None if there is none, or none any more."""
     path = reservation_path(match_id, run_id)
     data = blobs.read(path)
     return None if data is None else unseal_repairable(Reservation, data, f"{blobs.url}/{path}")
 
 
 def read_record(blobs: Blobs, match_id: str, run_id: str = LATEST) -> RunRecord:
-    """The record of a finished run by its number or name; `latest` has the highest number.
+    """Read the record of a finished run by number or name; `latest` has the highest number.
 
     Raises:
         InputError: there is none.
@@ -96,10 +96,10 @@ def read_record(blobs: Blobs, match_id: str, run_id: str = LATEST) -> RunRecord:
 
 
 def write_record(blobs: Blobs, record: RunRecord) -> None:
-    """Writes a run's record, once for good, and drops its reservation.
+    """Write a run's record, only once, and drop its reservation.
 
     Raises:
-        StoreError: the run has another record already.
+        StoreError: the run already has another record.
     """
     path, data = record_path(record.match_id, record.run_id), seal(record)
     reached("before_run_record")
@@ -113,12 +113,12 @@ def write_record(blobs: Blobs, record: RunRecord) -> None:
 
 
 def is_run_file(name: str) -> bool:
-    """Is `name` that of a run's record or reservation."""
+    """Return whether `name` is the file name of a run's record or reservation."""
     return _FILE.fullmatch(name) is not None
 
 
 def _files(blobs: Blobs, match_id: str) -> tuple[set[str], set[str], set[str]]:
-    """Runs of a match that have a record, a reservation, or one of them set aside."""
+    """Return the runs of a match with a record, with a reservation, and with one set aside."""
     top = f"runs/{checked_name(match_id)}"
     finished: set[str] = set()
     reserved: set[str] = set()
@@ -133,5 +133,5 @@ def _files(blobs: Blobs, match_id: str) -> tuple[set[str], set[str], set[str]]:
 
 
 def run_order(run_id: str) -> tuple[int, str]:
-    """Sorts run ids by number."""
+    """Return a sort key that orders run ids by number."""
     return (int(run_id) if run_id.isascii() and run_id.isdigit() else 0, run_id)

@@ -1,4 +1,4 @@
-"""A project: results kept by what they were made from, whole or not at all, never overwritten."""
+"""Project: content-addressed results, written atomically and never overwritten."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ if TYPE_CHECKING:
 
 
 class Store:
-    """The results, runs and registered matches of one project.
+    """Results, runs and registered matches of one project.
 
     Results live at `results/<match>/<stage>/<unit>/<key>/`, each with a manifest written last.
-    Safe for any number of processes at once: nothing is locked and nothing is overwritten.
+    Safe for any number of concurrent processes: nothing is locked and nothing is overwritten.
     """
 
     def __init__(self, blobs: Blobs) -> None:
@@ -56,11 +56,11 @@ class Store:
 
     @classmethod
     def create(cls, url: str | os.PathLike[str]) -> Store:
-        """The project at `url`, made if it is not there.
+        """Open the project at `url`, or create it if it does not exist.
 
         Raises:
-            InputError: a project of another contract version is there.
-            StoreError: the place cannot be written to.
+            InputError: `url` has a project of another contract version.
+            StoreError: `url` is not writable.
         """
         blobs = open_blobs(os.fspath(url))
         blobs.put_new(PROJECT, seal(Project(store_format=STORE_FORMAT)))
@@ -68,10 +68,10 @@ class Store:
 
     @classmethod
     def open(cls, url: str | os.PathLike[str]) -> Store:
-        """The project at `url`.
+        """Open the project at `url`.
 
         Raises:
-            InputError: no project is there, or one of another contract version or store format.
+            InputError: there is no project, or one of another contract version or store format.
         """
         blobs = open_blobs(os.fspath(url))
         data = blobs.read(PROJECT)
@@ -95,46 +95,46 @@ class Store:
 
     @classmethod
     def open_or_new(cls, url: str | os.PathLike[str]) -> Store:
-        """The project at `url`; where there is none, the first `register` makes it.
+        """Open the project at `url`; if there is none, the first `register` creates it.
 
-        So input can be checked first, and a refused one leaves nothing behind.
+        Input can thus be validated first, and refused input leaves nothing behind.
 
         Raises:
-            InputError: a project of another contract version or store format is there.
+            InputError: `url` has a project of another contract version or store format.
         """
         blobs = open_blobs(os.fspath(url))
         return cls.open(url) if blobs.exists(PROJECT) else cls(blobs)
 
     def matches(self) -> tuple[str, ...]:
-        """Ids of the registered matches, sorted."""
+        """Return the ids of the registered matches, sorted."""
         files = (entry.path.split("/")[1:] for entry in self.blobs.entries("matches"))
         names = (
             parts[0].removesuffix(".json")
             for parts in files
             if len(parts) == 1 and parts[0].endswith(".json")
         )
-        return tuple(filter(is_name, names))  # macOS and others put files of their own on shares
+        return tuple(filter(is_name, names))  # macOS and others put their own files on shares
 
     def registration(self, match_id: str) -> Registration | None:
-        """What is known of a match; None when it is not registered."""
+        """Return the registration of a match; None if it is not registered."""
         path = registration_path(match_id)
         data = self.blobs.read(path)
         where = f"{self.url}/{path}"
         return None if data is None else unseal_repairable(Registration, data, where)
 
     def register(self, registration: Registration) -> None:
-        """Takes a match in, or replaces what is known of it."""
+        """Register a match, or replace its registration."""
         match_id = registration.spec.match_id
         self.blobs.put_new(PROJECT, seal(Project(store_format=STORE_FORMAT)))
         if self.registration(match_id) != registration:
             self.blobs.put(registration_path(match_id), seal(registration))
 
     def has(self, match_id: str, stage: str, unit: str, key: str) -> bool:
-        """Is this result published."""
+        """Return whether this result is published."""
         return self.blobs.exists(ResultId(match_id, stage, unit, key).manifest_path)
 
     def results(self, match_id: str | None = None) -> tuple[ResultId, ...]:
-        """All published results, of one match or of all, sorted."""
+        """Return all published results, of one match or of all, sorted."""
         top = "results" if match_id is None else f"results/{match_id}"
         found = ((entry.path, ResultId.at(entry.path)) for entry in self.blobs.entries(top))
         return tuple(
@@ -142,11 +142,11 @@ class Store:
         )
 
     def manifest(self, match_id: str, stage: str, unit: str, key: str) -> ResultManifest:
-        """The manifest of a published result.
+        """Return the manifest of a published result.
 
         Raises:
             StoreError: it is not published.
-            CorruptionError: its manifest is damaged, or is another result's.
+            CorruptionError: its manifest is damaged, or belongs to another result.
         """
         result = ResultId(match_id, stage, unit, key)
         where = f"{self.url}/{result.manifest_path}"
@@ -165,13 +165,13 @@ class Store:
 
     @contextmanager
     def publishing(self, work: Work) -> Iterator[ResultWriter]:
-        """A writer whose result is published when the block ends, and only then.
+        """Yield a writer whose result is published only when the block ends without an error.
 
         An error in the block leaves nothing behind; a killed process leaves only private staging.
-        Where the key is published already, the same content is fine and changes nothing.
+        If the key is already published, equal content changes nothing.
 
         Raises:
-            InputError: the work's key is not its recipe's.
+            InputError: the work's key does not match its recipe.
             NondeterminismError: the key is published with other content.
             StoreError: the disk is full or not writable; nothing is published.
         """
@@ -200,22 +200,23 @@ class Store:
     def open_result(
         self, match_id: str, stage: str, unit: str, key: str, verify: bool = False
     ) -> xr.Dataset:
-        """A published result as labelled arrays, with units and conventions in the attributes.
+        """Open a published result as labelled arrays, with units and conventions in the attributes.
 
-        Values are read when they are used, and every byte is checked against the manifest then.
+        Values are read on access, and every byte is then verified against the manifest.
 
         Args:
             match_id: the match.
             stage: the stage.
             unit: the unit of the stage.
             key: the result's key.
-            verify: check every file now.
+            verify: verify every file now.
 
         Raises:
             StoreError: the result is not published.
-            CorruptionError: a file is missing or changed (when it is read, unless `verify`).
+            CorruptionError: a file is missing or changed (on access, unless `verify`).
         """
-        # Late: status and resumed runs read manifests only, and Zarr takes most of a second.
+        # Imported here: status and resumed runs need only manifests, and Zarr takes most of a
+        # second.
         from worldpose.store.groups import read_group
         from worldpose.store.zarr_files import PublishedFiles
 
@@ -229,18 +230,18 @@ class Store:
         return data
 
     def withdraw(self, result: ResultId) -> None:
-        """Removes a result, manifest first, so that the next run computes it again."""
+        """Remove a result, manifest first, so that the next run recomputes it."""
         self.blobs.delete_tree(result.path, MANIFEST)
 
     def reserve_run(self, match_id: str) -> str:
-        """A run number that no other run of the match has or gets: `0001`, `0002`, ..."""
+        """Reserve a run number that no other run of the match has or gets: `0001`, `0002`, ..."""
         return reserve_run(self.blobs, match_id)
 
     def finish_run(self, record: RunRecord) -> None:
-        """Writes the record of a run, once for good.
+        """Write the record of a run, only once.
 
         Raises:
-            StoreError: a result it names is not published, or the run has another record.
+            StoreError: a named result is not published, or the run has another record.
         """
         results = [
             ResultId.named(record.match_id, name, key) for name, key in record.results.items()
@@ -258,17 +259,17 @@ class Store:
         write_record(self.blobs, record)
 
     def runs(self, match_id: str) -> tuple[str, ...]:
-        """Ids of the finished runs of a match, first to last."""
+        """Return the ids of the finished runs of a match, first to last."""
         return tuple(list_runs(self.blobs, match_id)[0])
 
     def unfinished_runs(self, match_id: str) -> tuple[Reservation, ...]:
-        """Runs of a match at work or killed at work, first to last."""
+        """Return active and killed runs of a match, first to last."""
         _, reserved = list_runs(self.blobs, match_id)
         found = (read_reservation(self.blobs, match_id, run_id) for run_id in reserved)
         return tuple(reservation for reservation in found if reservation)
 
     def run(self, match_id: str, run_id: str = LATEST) -> RunRecord:
-        """The record of a finished run by number or name; `latest` has the highest number.
+        """Return the record of a finished run by number or name; `latest` has the highest number.
 
         Raises:
             InputError: there is none.

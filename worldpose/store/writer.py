@@ -1,4 +1,4 @@
-"""One result on its way into the store."""
+"""Writer of one result before its publication."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from worldpose.store.layout_checks import Arrays
 
 
 class ResultWriter:
-    """Takes the arrays and figures of one result into private staging.
+    """Writes the arrays and metrics of one result to private staging.
 
     Attributes:
-        figures: quality figures by name, with the unit in the name; fill it before leaving
+        figures: quality metrics by name, with the unit in the name; fill it before leaving
             `Store.publishing`.
-        left_out: static cameras that no later stage may use, by id, with the reason; the stage
+        left_out: static cameras that later stages must not use, by id, with the reason; the stage
             must have `Stage.leaves_out`. See `flows.left_out`.
         warnings: sentences that the run prints at its end.
-        manifest: the published result's manifest; None until `Store.publishing` is left.
+        manifest: the published result's manifest; None until `Store.publishing` ends.
     """
 
     def __init__(self, work: Work, folder: Path) -> None:
@@ -49,13 +49,14 @@ class ResultWriter:
         coordinates: Arrays | None = None,
         attributes: Mapping[str, Any] | None = None,
     ) -> None:
-        """Writes the result's arrays, once; see `worldpose.store.groups.write_group`.
+        """Write the result's arrays, once; see `worldpose.store.groups.write_group`.
 
         Raises:
-            InternalError: they are not what the layout says.
+            InternalError: they do not match the layout.
             StoreError: the disk is full or not writable, or the result was written already.
         """
-        # Late: status and resumed runs read manifests only, and Zarr takes most of a second.
+        # Imported here: status and resumed runs need only manifests, and Zarr takes most of a
+        # second.
         from worldpose.store.groups import write_group
 
         name = self._work.recipe.name
@@ -74,11 +75,11 @@ class ResultWriter:
         reached("after_write")
 
     def sealed_manifest(self) -> ResultManifest:
-        """The manifest of what has been written.
+        """Return the manifest of the written files.
 
         Raises:
-            InternalError: a figure is not finite.
-            StoreError: nothing has been written, or not all of it is there.
+            InternalError: a metric is not finite.
+            StoreError: nothing was written, or files are missing.
         """
         name = self._work.recipe.name
         if not self._files:
@@ -113,7 +114,7 @@ class ResultWriter:
 
 
 def stored_files(folder: Path) -> tuple[StoredFile, ...]:
-    """Size and checksum of every file below `folder`, sorted by path."""
+    """Return size and checksum of every file below `folder`, sorted by path."""
     found = []
     for path in folder.rglob("*"):
         if path.is_file():
@@ -124,5 +125,5 @@ def stored_files(folder: Path) -> tuple[StoredFile, ...]:
 
 
 def content_of(files: tuple[StoredFile, ...]) -> str:
-    """The digest that two honest computations of one key agree in."""
+    """Return a digest that is equal for all valid computations of one key."""
     return digest(canonical_json([file.model_dump(mode="json") for file in files]))

@@ -1,4 +1,4 @@
-"""A published result as Zarr sees it."""
+"""Read-only Zarr store of a published result."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from worldpose.store.published import read_published
 
 
 class PublishedFiles(Store):
-    """A read-only Zarr store in which a lost or changed file is an error, never a fill value."""
+    """Read-only Zarr store that raises an error for a lost or changed file, never a fill value."""
 
     supports_writes = False
     supports_deletes = False
@@ -45,7 +45,7 @@ class PublishedFiles(Store):
     async def get(
         self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
-        """The file `key` or a range of it, None when the result has no such file."""
+        """Return the file `key` or a range of it, None if the result has no such file."""
         file = self._files.get(key)
         if file is None:
             return None
@@ -64,34 +64,34 @@ class PublishedFiles(Store):
         prototype: BufferPrototype,
         key_ranges: Iterable[tuple[str, ByteRequest | None]],
     ) -> list[Buffer | None]:
-        """Ranges of several files."""
+        """Return ranges of several files."""
         return [await self.get(key, prototype, part) for key, part in key_ranges]
 
     async def exists(self, key: str) -> bool:
-        """Does the manifest name the file `key`."""
+        """Return whether the manifest names the file `key`."""
         return key in self._files
 
     async def set(self, key: str, value: Buffer) -> None:
-        """Refused: a published result never changes."""
+        """Raise an error: a published result never changes."""
         self._check_writable()
 
     async def delete(self, key: str) -> None:
-        """Refused: a published result never changes."""
+        """Raise an error: a published result never changes."""
         self._check_writable()
 
     async def list(self) -> AsyncIterator[str]:
-        """Every file."""
+        """Yield every file."""
         for key in self._files:
             yield key
 
     async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
-        """Every file whose path begins with `prefix`."""
+        """Yield every file whose path starts with `prefix`."""
         for key in self._files:
             if key.startswith(prefix):
                 yield key
 
     async def list_dir(self, prefix: str) -> AsyncIterator[str]:
-        """Names of files and folders directly inside the folder `prefix`."""
+        """Yield names of files and folders directly inside the folder `prefix`."""
         base = f"{prefix.rstrip('/')}/" if prefix.strip("/") else ""
         inside = (key[len(base) :] for key in self._files if key.startswith(base))
         for name in dict.fromkeys(key.split("/")[0] for key in inside):

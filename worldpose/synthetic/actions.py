@@ -1,4 +1,4 @@
-"""Actions of people: motions at their time, blended into the gait."""
+"""Actions of people: timed motions, blended into the gait."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ Floats = NDArray[np.float64]
 CLEARANCE: Final = 0.05
 """Height of wrists and ankles on the ground above it [m]: half a hand, half a foot."""
 SOFTNESS: Final = 0.04
-"""Height over which a limb is held off the ground rather than stopped by it [m]."""
+"""Height over which the ground limits a limb gradually [m]."""
 STRADDLE: Final = 0.4
-"""How far from beneath the mid-hip a foot stays on the ground, ahead or behind [m]."""
+"""Maximum distance of a standing foot ahead of or behind the mid-hip [m]."""
 STEP_LIFT: Final = 0.07
-"""Of a foot that steps within an action [m]."""
+"""Lift of a foot that steps within an action [m]."""
 STEP_BACK: Final = 0.4
-"""Time in which a foot finds back into the gait [s]."""
+"""Time in which a foot returns to the gait [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Stage:
-    """Who acts where."""
+    """An action with the person's body and path and the ground."""
 
     body: Body
     way: GroundPath
@@ -50,7 +50,7 @@ class _Stage:
     action: Action
 
     def place(self, time: Floats) -> tuple[Floats, Floats]:
-        """Position (..., 2) [m] and heading (...) [rad] of the person at a time [s]."""
+        """Return position (..., 2) [m] and heading (...) [rad] of the person at a time [s]."""
         at = [np.interp(time, self.way.time, axis) for axis in self.way.position.T]
         return np.stack(at, axis=-1), np.interp(time, self.way.time, self.way.heading)
 
@@ -67,8 +67,8 @@ def act(
 
     Args:
         body: measures.
-        way: where the person goes.
-        action: what is done.
+        way: path of the person.
+        action: the action to blend in.
         times: (frames,) [s], ascending.
         ground: height of the ground [m] at x and y [m].
         pose: of the gait at these times; overwritten while the action lasts.
@@ -149,7 +149,7 @@ def _acted(stage: _Stage, times: Floats, gait: Pose) -> Pose:
 
 
 def _share(motion: Motion, since: Floats) -> Floats:
-    """How much of the pose is the motion's (frames,): rises and falls smoothly."""
+    """Return the motion's weight in the pose (frames,), which rises and falls smoothly."""
     rise, fall = motion.ease
     return _smooth(since / rise) * _smooth((motion.duration - since) / fall)
 
@@ -161,7 +161,7 @@ def _smooth(done: Floats) -> Floats:
 
 
 def _mirrored(channels: Floats) -> Floats:
-    """The same motion with the other side."""
+    """Return the motion mirrored left to right."""
     mirrored = channels.copy()
     for turn in (TURN, BEND, NOD):
         mirrored[:, turn] *= (1.0, -1.0, -1.0)
@@ -174,7 +174,7 @@ def _mirrored(channels: Floats) -> Floats:
 
 
 def _turned(angles: Floats, axes: Floats) -> Floats:
-    """Axes (frames, 3, 3), rows forward, left, up, after yaw, pitch and roll (frames, 3)."""
+    """Return axes (frames, 3, 3), rows forward, left, up, after yaw, pitch and roll (frames, 3)."""
     pitch, roll, yaw = angles.T
     one, zero = np.ones_like(pitch), np.zeros_like(pitch)
 
@@ -192,7 +192,7 @@ def _turned(angles: Floats, axes: Floats) -> Floats:
 
 
 def _orthonormal(axes: Floats) -> Floats:
-    """Nearest-by axes (frames, 3, 3) at right angles; up is kept."""
+    """Return close axes (frames, 3, 3) at right angles; up is kept."""
     up = unit(axes[:, 2])
     forward = axes[:, 0] - (axes[:, 0] * up).sum(-1, keepdims=True) * up
     forward = unit(forward)
@@ -200,7 +200,7 @@ def _orthonormal(axes: Floats) -> Floats:
 
 
 def _height(body: Body, motion: Motion, since: Floats) -> Floats:
-    """Height of the mid-hip above a standing ankle (frames,) [m]."""
+    """Return the height of the mid-hip above a standing ankle (frames,) [m]."""
     leg = body.leg
     time = np.array([height.time for height in motion.heights])
     above = np.array([height.legs * leg + height.metres for height in motion.heights])
@@ -221,9 +221,9 @@ def _stood(
     stances: tuple[Stance, ...],
     sign: float,
 ) -> tuple[Floats, Floats]:
-    """Ankle (frames, 3) of a foot that goes from stance to stance and back into the gait.
+    """Return the ankle (frames, 3) of a foot from stance to stance and back into the gait.
 
-    And where it points (frames,) [rad].
+    The second result is the foot's direction (frames,) [rad].
     """
     if not stances:
         return gait, course
@@ -237,7 +237,7 @@ def _stood(
         outward = sign * (0.8 * stage.body.hip_half_width + stance.outward)
         place = place + stance.ahead * forward[:2] + outward * left[:2]
         high = stage.ground(place[:1], place[1:]) + stage.body.ankle_height
-        # Who runs leaves a foothold before it is out of reach.
+        # A runner leaves a foothold before it is out of reach.
         pace = float(np.interp(under, stage.way.time, stage.way.speed))
         most = STRADDLE / max(pace, 1e-9)
         late = max(0.0, stance.under - most - stance.land)
@@ -253,7 +253,7 @@ def _stood(
 def _stepped(
     done: Floats, ankle: Floats, points: Floats, lift: Floats, place: Floats, course: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """A step from where an ankle is to a place; how far it is done goes from 0 to 1."""
+    """Return a step from an ankle's position to a place; `done` goes from 0 to 1."""
     moved, done = _smooth(done), np.clip(done, 0.0, 1.0)
     ankle = (1.0 - moved)[:, None] * ankle + moved[:, None] * place
     lift = np.maximum(lift, STEP_LIFT * np.sin(np.pi * done) ** 2)
@@ -261,7 +261,7 @@ def _stepped(
 
 
 def _off_ground(stage: _Stage, shoulders: Floats, arms: Floats) -> Floats:
-    """Arms (frames, 2, 2, 3) raised where an elbow or a wrist would be in the ground."""
+    """Return arms (frames, 2, 2, 3), raised where an elbow or a wrist would be below the ground."""
     arms, start = arms.copy(), shoulders
     for bone, length in enumerate((stage.body.upper_arm, stage.body.forearm)):
         floor = stage.ground(*np.moveaxis(start[..., :2], -1, 0)) + CLEARANCE
@@ -279,7 +279,7 @@ def _off_ground(stage: _Stage, shoulders: Floats, arms: Floats) -> Floats:
 
 
 def _at_least(value: Floats, least: Floats, softness: float) -> Floats:
-    """The greater of two, rounded where they are less than `softness` apart."""
+    """Return the greater of two, rounded where they are less than `softness` apart."""
     above = value - least
     near = (above + softness) ** 2 / (4.0 * softness)
     return least + np.where(above > softness, above, np.where(above < -softness, 0.0, near))

@@ -1,4 +1,4 @@
-"""The ball of a match: where it goes, and when somebody plays it."""
+"""Trajectory of a match's ball, and the touches of players."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ Floats = NDArray[np.float64]
 PASS_EVERY: Final = (2.0, 4.5)
 """Time between passes [s]."""
 PASS_LENGTH: Final = 12.0
-"""Of a pass per axis [m], standard deviation."""
+"""Standard deviation of a pass per axis [m]."""
 SHOT_RANGE: Final = 28.0
-"""From the goal within which shots are taken [m]."""
+"""Maximum distance from the goal for shots [m]."""
 SHOT_SPEED: Final = 24.0
 """Mean speed of a shot on its way [m/s]; instep kicks of trained players leave at 25 to 34 m/s."""
 GOAL_LINE: Final = 51.5
-"""Where shots are caught [m]: before the line of a pitch of 105 m."""
+"""Where the goalkeeper catches shots [m]: before the line of a pitch of 105 m."""
 HELD: Final = 2.0
-"""How long a goalkeeper keeps the ball [s]."""
+"""Time that a goalkeeper keeps the ball [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """Somebody plays the ball.
+    """A player's touch of the ball.
 
     Attributes:
         time: [s].
         place: (2,) [m].
-        target: (2,) where the ball goes from there [m].
-        kind: a kick on the ground; a header that two contest; a kick that an opponent slides
-            into; a shot; a save.
+        target: (2,) destination of the ball [m].
+        kind: a kick on the ground; a header that two contest; a kick that an opponent slides into;
+            a shot; a save.
     """
 
     time: float
@@ -47,11 +47,11 @@ class Touch:
 
 @dataclass(frozen=True, eq=False)
 class Ball:
-    """Way of the ball.
+    """Trajectory of the ball.
 
     Attributes:
         position: (samples, 2) [m], every `STEP`.
-        touches: in order of time.
+        touches: in temporal order.
     """
 
     position: Floats
@@ -64,7 +64,7 @@ def roll_ball(time: Floats, rates: ActionRates, rng: np.random.Generator) -> Bal
     Args:
         time: (samples,) [s], every `STEP`.
         rates: shares of headers, tackles and shots.
-        rng: draws the game.
+        rng: draws passes and touches.
     """
     place = rng.uniform(-1.0, 1.0, 2) * [30.0, 18.0]
     when, places, kinds = [float(time[0])], [place], ["pass"]
@@ -80,13 +80,13 @@ def roll_ball(time: Floats, rates: ActionRates, rng: np.random.Generator) -> Bal
             kinds += ["save", "pass"]
             place = goal
             continue
-        # Play drifts back to the middle third rather than stick to a corner.
+        # Play drifts back to the middle third instead of staying in a corner.
         place = np.clip(0.9 * place + way, [-46.0, -29.0], [46.0, 29.0])
         when.append(when[-1] + wait)
         places.append(place)
         high = chance < rates.headers
         kinds.append("header" if high else "tackle" if chance > 1.0 - rates.tackles else "pass")
-    # Rounded over a third of a second: nothing that people look at jumps.
+    # Smoothed over a third of a second: the target of people's gaze must not jump.
     raw = np.stack([np.interp(time, when, axis) for axis in np.array(places).T], axis=-1)
     half = round(0.35 / STEP)
     kernel = np.hanning(2 * half + 1)

@@ -1,4 +1,4 @@
-"""People's measures, of a figure of the open body."""
+"""Body measures of people, from the open body."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ class Body:
     """A person's constant measures [m]."""
 
     figure: Figure
-    """What they are measured on."""
+    """Source of the measures."""
     height: float
     thigh: float
     shank: float
     ankle_height: float
-    """Ankle above the sole."""
+    """Height of the ankle above the sole."""
     hip_half_width: float
     trunk: float
     """Mid-hip to mid-shoulder."""
@@ -34,12 +34,12 @@ class Body:
 
     @property
     def leg(self) -> float:
-        """Hip to ankle when stretched [m]."""
+        """Return the length from hip to ankle when stretched [m]."""
         return self.thigh + self.shank
 
 
 def draw_body(height: tuple[float, float], rng: np.random.Generator) -> Body:
-    """A person of random height [m] and build, with the open body's proportions."""
+    """Return a person of random height [m] and build, with the open body's proportions."""
     figure = draw_figure(height, rng)
     joints = figure.joints
     hips, shoulders = joints[1:3].mean(axis=0), joints[16:18].mean(axis=0)

@@ -15,9 +15,9 @@ from worldpose.synthetic.stadium import looking
 Floats = NDArray[np.float64]
 
 CALM: Final = 0.02
-"""Time step of the operator's hand [s]: that of a frame at 50 a second."""
+"""Time step of the operator's motion [s]: one frame at 50 per second."""
 WARM_UP: Final = 1.5
-"""How long he has followed before the first frame [s]."""
+"""Time for which the operator follows the action before the first frame [s]."""
 
 
 def film(
@@ -30,14 +30,14 @@ def film(
 ) -> Camera:
     """Return the broadcast camera of every frame, a batch (frames,), with one center (M1).
 
-    Pan and tilt follow a smoothed action through two equal first-order lags, as a damped head
-    does; the zoom goes between wide and close. Radial distortion grows with the focal length, as
-    in the released clips: k1 0.1 to 1, k2 0.6 to 4.3.
+    Pan and tilt follow a smoothed action through two equal first-order lags, like a damped head;
+    the zoom varies between wide and close. Radial distortion grows with the focal length, as in the
+    released clips: k1 0.1 to 1, k2 0.6 to 4.3.
 
     Args:
-        settings: place, zoom and habits.
+        settings: place, zoom and operator.
         times: (frames,) [s].
-        action: (samples, 2) [m], world; where the action is.
+        action: (samples, 2) [m], world; place of the action.
         action_times: (samples,) [s], from `WARM_UP` before the first frame to the last.
         image_size: width, height [px].
         rng: the camera's and the operator's own.
@@ -53,7 +53,7 @@ def film(
     aim = np.stack([np.interp(hand, action_times, axis) for axis in action.T], axis=-1)
     aim[:, 0] += settings.sway * _smooth(drift(hand.shape, 2.5, 1.0 / CALM, rng), 0.6)
     aim[:, 0] += settings.sweep * np.sin(2.0 * np.pi * (hand / 8.0 + rng.random()))
-    # The picture's middle stays within the pitch, nearer to the camera than the action's far side.
+    # The image centre stays within the pitch, nearer to the camera than the action's far side.
     aim = np.clip(0.9 * aim, [-40.0, -22.0], [40.0, 26.0])
     aim = _smooth(_smooth(aim, 0.5 * settings.lag), 0.5 * settings.lag)
     aim = np.stack([np.interp(times, hand, axis) for axis in aim.T], axis=-1)
@@ -83,7 +83,7 @@ def film(
 
 
 def _smooth(signal: Floats, time: float) -> Floats:
-    """A first-order lag along the first axis."""
+    """Return a first-order lag along the first axis."""
     smoothed = np.empty_like(signal)
     keep = float(np.exp(-CALM / time))
     smoothed[0] = signal[0]

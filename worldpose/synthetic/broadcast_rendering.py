@@ -1,8 +1,8 @@
-"""The broadcast camera's video: pictures cut out of one panorama, with people drawn over it.
+"""The broadcast camera's video: frames from one panorama, with people drawn over it.
 
-A camera that turns and zooms about a fixed center never sees more than one panorama from there:
-all that stands still is rendered once, finer than any frame, and every frame looks it up through
-its own lens. People are drawn frame by frame; they throw no shadows.
+A camera that turns and zooms about a fixed center always stays within one panorama from there: all
+static content is rendered once, finer than any frame, and every frame samples it through its own
+lens. People are drawn frame by frame; they cast no shadows.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 _CELL: Final = 4
-"""Between the places of a panorama's grid [px], as `paint_scene` takes it."""
+"""Spacing of a panorama's grid [px], for `paint_scene`."""
 _STRIP: Final = 512
 """Width of a panorama's strips [px]: their rays are straight lines within 4 px."""
 _GRID: Final = 8
-"""Between places where a frame's lens is inverted [px]: between them it errs by 0.005 px."""
+"""Grid spacing of a frame's lens inversion [px]: between the nodes its error is 0.005 px."""
 _MARGIN: Final = 0.01
-"""Around what the frames see [rad]."""
+"""Margin around the frames' field of view [rad]."""
 _FINER: Final = 1.15
-"""Pixels of the panorama for one of the frame, along each axis."""
+"""Pixels of the panorama per pixel of the frame, along each axis."""
 
 
 @dataclass(frozen=True, eq=False)
 class Panorama:
-    """All that stands still, on a cylinder about a vertical axis through the center.
+    """All static content, on a cylinder about a vertical axis through the center.
 
     Attributes:
         levels: (height, width, 3) RGB, each level half as fine as the one before.
-        scale: pixels a radian of the first.
+        scale: pixels per radian of the first.
         pan: of its left border, from the world's y axis towards x [rad].
         rise: tangent of the elevation at its upper border.
         center: (3,) [m], world.
@@ -58,12 +58,12 @@ class Panorama:
 
 
 def render_panorama(cameras: Camera, venue: Venue, *, lit: bool = False) -> Panorama:
-    """Return what a turning camera sees of pitch, boards and stands.
+    """Return a turning camera's panorama of pitch, boards and stands.
 
     Args:
         cameras: a batch (frames,) with one center.
         venue: the stadium.
-        lit: by its lights and through its fog; else in even light.
+        lit: with its lights and through its fog; else in even light.
 
     Raises:
         InputError: the cameras have different centers.
@@ -114,14 +114,14 @@ def render_broadcast(
     seed: int,
     settings: RenderingSettings | None = None,
 ) -> Iterator[Bytes]:
-    """Yield the pictures (height, width, 3) in RGB of a clip; the same arguments, the same bytes.
+    """Yield the images (height, width, 3) in RGB of a clip; the same arguments, the same bytes.
 
     Args:
         cameras: a batch (frames,) with one center.
-        pitch: what is painted.
-        people: (frames, persons, 17, 3) joints of COCO-17 [m], world; None = nobody.
-        seed: the stadium's look and the sensor's noise.
-        settings: the defaults if None; their light is not used.
+        pitch: the painted pitch.
+        people: (frames, persons, 17, 3) joints of COCO-17 [m], world; None = no people.
+        seed: of the stadium's look and the sensor's noise.
+        settings: the defaults if None; their light is ignored.
 
     Raises:
         InputError: the cameras have different centers.
@@ -132,7 +132,7 @@ def render_broadcast(
     goals, goal_colors = goal_capsules(pitch)
     noise = np.random.default_rng([seed, 3])
     width, height = (int(n) for n in cameras.image_size.reshape(-1, 2)[0])
-    # One field of noise, taken from another place for every frame.
+    # One field of noise, with another offset for every frame.
     field = settings.noise * noise.standard_normal((height + 256, width + 256), dtype=np.float32)
     for frame in range(len(cameras.focal)):
         camera = cameras[frame]
@@ -158,12 +158,12 @@ def render_broadcast(
 def film_broadcast(
     cameras: Camera, venue: Venue, moments: Iterable[Moment]
 ) -> Iterator[RenderedFrame]:
-    """Yield the frames of a clip, as `worldpose.synthetic.filming.render_frame` has them.
+    """Yield the frames of a clip, like `worldpose.synthetic.filming.render_frame`.
 
     Args:
         cameras: a batch (frames,) with one center.
         venue: the stadium.
-        moments: who and what is there in every frame.
+        moments: people and things in every frame.
 
     Raises:
         InputError: the cameras have different centers.
@@ -191,9 +191,9 @@ def _seen(cameras: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
 
 
 def _look_up(panorama: Panorama, camera: Camera, width: int, height: int) -> Bytes:
-    """Return what a camera sees of a panorama (height, width, 3)."""
+    """Return a camera's image of a panorama (height, width, 3)."""
     columns, rows = -(-width // _GRID) + 1, -(-height // _GRID) + 1
-    # Such that enlarging the grid puts its first entry on the first pixel.
+    # With this offset, enlarging the grid puts its first entry on the first pixel.
     u = np.arange(columns) * _GRID + 0.5 * (_GRID - 1.0)
     v = np.arange(rows) * _GRID + 0.5 * (_GRID - 1.0)
     u, v = np.concatenate([[u[0] - _GRID], u]), np.concatenate([[v[0] - _GRID], v])

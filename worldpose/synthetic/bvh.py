@@ -24,7 +24,7 @@ class Capture:
     """A captured motion.
 
     Attributes:
-        names: of the joints; the end of a last joint's bone is called "<joint>_end".
+        names: of the joints; the end of a terminal joint's bone is called "<joint>_end".
         parents: (joints,) index of each joint's parent, -1 for the root; parents come first.
         positions: (frames, joints, 3), in the file's axes and unit.
         frame_time: [s].
@@ -54,7 +54,7 @@ def read_bvh(path: Path) -> Capture:
     """Return the joint positions of a BVH file by forward kinematics.
 
     A joint's rotation is the product of its rotation channels in the file's order; position
-    channels replace its offset, as exporters mean them.
+    channels replace its offset, the convention of exporters.
 
     Args:
         path: text with a HIERARCHY and a MOTION part.
@@ -91,7 +91,7 @@ def read_bvh(path: Path) -> Capture:
 
 
 class _Reader:
-    """Words of a BVH file and the joints found so far."""
+    """Tokens of a BVH file and the joints read so far."""
 
     def __init__(self, path: Path, words: list[str]) -> None:
         self.path, self.words, self.place = path, words, 0
@@ -150,7 +150,7 @@ class _Reader:
 def _positions(
     offsets: Floats, parents: NDArray[np.int64], channels: list[tuple[str, ...]], rows: Floats
 ) -> Floats:
-    """Positions (frames, joints, 3) by forward kinematics."""
+    """Return positions (frames, joints, 3) by forward kinematics."""
     frames, first = len(rows), 0
     positions = np.empty((frames, len(parents), 3))
     turned = np.empty((frames, len(parents), 3, 3))
@@ -174,7 +174,7 @@ def _positions(
 
 
 def _about(axis: int, angle: Floats) -> Floats:
-    """Rotations (frames, 3, 3) about one axis [rad]."""
+    """Return rotations (frames, 3, 3) about one axis [rad]."""
     rotation = np.zeros((len(angle), 3, 3))
     one, other = (axis + 1) % 3, (axis + 2) % 3
     rotation[:, axis, axis] = 1.0

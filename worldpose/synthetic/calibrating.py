@@ -1,4 +1,4 @@
-"""Static cameras as calibration.toml gives them: the true ones, or some way off."""
+"""Static cameras of calibration.toml: the true ones, or with errors."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from worldpose.cameras import Camera, Rigid
 from worldpose.synthetic.settings import CalibrationErrors
 
 PIVOT: Final = 60.0
-"""Distance of the point that an error of the center leaves in its place in the picture [m]."""
+"""Distance of the point whose projection an error of the center leaves unchanged [m]."""
 
 
 def misjudge(
     cameras: dict[str, Camera], errors: CalibrationErrors, rng: np.random.Generator
 ) -> dict[str, Camera]:
-    """Return cameras that differ from the true ones as the settings say.
+    """Return the true cameras with the errors of the settings.
 
     Args:
         cameras: the true ones by id.

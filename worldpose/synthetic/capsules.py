@@ -1,4 +1,4 @@
-"""People and goals in a picture: shaded capsules along their limbs, and the shadows they throw."""
+"""People and goals in an image: shaded capsules along their limbs, and their shadows."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _GOAL_RADIUS = 0.06
 _TEAM = 11
 _KITS: Final = np.array(
     [
-        # shirt, shorts, socks of two teams, officials and goalkeepers
+        # Shirt, shorts, socks of two teams, officials and goalkeepers.
         [[0.80, 0.08, 0.10], [0.85, 0.85, 0.87], [0.80, 0.08, 0.10]],
         [[0.88, 0.89, 0.92], [0.08, 0.12, 0.35], [0.88, 0.89, 0.92]],
         [[0.08, 0.08, 0.09], [0.08, 0.08, 0.09], [0.08, 0.08, 0.09]],
@@ -27,7 +27,7 @@ _KITS: Final = np.array(
     ]
 )
 _LIMBS: Final = (
-    # from and to (COCO-17 joints, or shares of two), radii [m], part
+    # From and to (COCO-17 joints, or shares of two), radii [m], part.
     ((5, 5), (6, 6), 0.075, 0.075, _SHIRT),
     ((11, 11), (5, 5), 0.095, 0.08, _SHIRT),
     ((12, 12), (6, 6), 0.095, 0.08, _SHIRT),
@@ -108,10 +108,10 @@ def goal_capsules(pitch: PitchTemplate) -> tuple[Floats, Floats]:
 def draw_shadows(
     shade: Pictures, ground: Pictures, camera: Camera, limbs: Floats, light: Floats, bend: float
 ) -> None:
-    """Darken the ground where limbs keep a light off it.
+    """Darken the ground where limbs block a light.
 
     Args:
-        shade: (height, width) share of light that arrives, multiplied in place.
+        shade: (height, width) share of the light that arrives, multiplied in place.
         ground: (height, width, 2) x y of each pixel's place on the surface [m]; NaN off it.
         camera: a single camera.
         limbs: (things, limbs, 8) [m], world.
@@ -141,13 +141,13 @@ def draw_things(
     colors: list[Floats],
     brightness: list[float],
 ) -> None:
-    """Draw things over the picture, the far ones first.
+    """Draw things over the image, the far ones first.
 
     Args:
         picture: (height, width, 3), changed in place.
         camera: a single camera.
-        limbs: (limbs, 8) a thing [m], world.
-        colors: (limbs, 3) a thing.
+        limbs: (limbs, 8) per thing [m], world.
+        colors: (limbs, 3) per thing.
         brightness: of the light on each thing.
     """
     middles = np.array([_middle(thing) for thing in limbs]).reshape(-1, 3)
@@ -172,13 +172,13 @@ def _middle(thing: Floats) -> Floats:
 
 
 def _scale(camera: Camera, points: Floats) -> Floats:
-    """Return pixels a metre at points (n, 3)."""
+    """Return pixels per metre at points (n, 3)."""
     depth = camera.cam_from_world.apply(points)[:, 2]
     return np.asarray(camera.focal[0] / np.maximum(depth, 0.1))
 
 
 def _box(pixels: Floats, margin: Floats, shape: tuple[int, ...]) -> NDArray[np.int64] | None:
-    """Return left, top, right, bottom (exclusive) of what is drawn; None if outside."""
+    """Return left, top, right, bottom (exclusive) of a thing's pixels; None if outside."""
     known = np.isfinite(pixels).all(-1)
     if not known.any():
         return None
@@ -193,7 +193,7 @@ def _box(pixels: Floats, margin: Floats, shape: tuple[int, ...]) -> NDArray[np.i
 def _shadow(
     shade: Pictures, ground: Pictures, rows: Floats, box: NDArray[np.int64], share: float
 ) -> None:
-    """Take the light's share off pixels in a box within capsules (n, 6) on the ground."""
+    """Subtract the light's share from pixels in a box within capsules (n, 6) on the ground."""
     for v in range(box[1], box[3]):
         for u in range(box[0], box[2]):
             gx, gy = float(ground[v, u, 0]), float(ground[v, u, 1])
@@ -209,7 +209,7 @@ def _shadow(
                     along = min(max(((gx - r[0]) * ex + (gy - r[1]) * ey) / length2, 0.0), 1.0)
                 px, py = gx - r[0] - along * ex, gy - r[1] - along * ey
                 radius = (1.0 - along) * r[4] + along * r[5]
-                # A soft rim of 8 cm.
+                # Rim of 8 cm.
                 cover = (radius + 0.04 - np.sqrt(px * px + py * py)) / 0.08
                 most = max(most, min(cover, 1.0))
             shade[v, u] *= 1.0 - share * most
@@ -217,7 +217,7 @@ def _shadow(
 
 @compiled
 def _capsules(picture: Pictures, rows: Floats, colors: Floats) -> None:
-    """Draw capsules (n, 6) of ends and radii [px] in order, rounded by their shading."""
+    """Draw capsules (n, 6) of ends and radii [px] in order, with rounded shading."""
     height, width = picture.shape[0], picture.shape[1]
     for i in range(len(rows)):
         r = rows[i]

@@ -1,4 +1,4 @@
-"""The people of a film: who is in which team, dressed, shaped and posed."""
+"""The people of a film: team, clothes, shape and pose of each."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from worldpose.synthetic.props import Prop
 from worldpose.synthetic.settings import CrowdSettings
 
 BEHIND: Final = (2.5, 3.3)
-"""Where bystanders stand, behind the lines and before the boards [m]."""
+"""Distance of bystanders behind the lines and before the boards [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cast:
-    """People as they are dressed, before they are posed.
+    """Dressed people before they are posed.
 
     Attributes:
-        mannequin: what they are made of.
+        mannequin: common model of all people.
         shaped: (persons, vertices, 3) [m], clothed and unposed.
         pictures: (persons, 2, rows, columns, 3) RGB, kits from the front and the back.
     """
@@ -44,7 +44,7 @@ class Cast:
     pictures: NDArray[np.uint8]
 
     def posed(self, poses: BodyParameters) -> Surfaces:
-        """Return their surfaces in the poses (persons,) of a moment; NaN = missing."""
+        """Return their surfaces in the poses (persons,) at one time; NaN = missing."""
         return pose_people(self.mannequin, self.shaped, poses)
 
 
@@ -54,13 +54,13 @@ def dress_people(
     seed: int,
     patterns: tuple[Pattern, ...] = PATTERNS,
 ) -> Cast:
-    """Return a cast; everybody's looks depend on the seed and his number alone.
+    """Return a cast; a person's looks depend on the seed and the person's number alone.
 
     Args:
         betas: (persons, 10) of the open body.
         roles: of each.
         seed: draws kits and looks.
-        patterns: what shirts are drawn from.
+        patterns: shirt patterns to draw from.
     """
     mannequin = open_mannequin()
     kits = draw_kits(np.random.default_rng([seed, 5]), patterns)
@@ -80,7 +80,7 @@ def dress_people(
 
 
 def stand_by(pitch: PitchTemplate, count: int, seed: int) -> tuple[Prop, ...]:
-    """Return people who stand beside the pitch and watch."""
+    """Return bystanders who stand off the pitch and watch."""
     rng = np.random.default_rng([seed, 8])
     along, side = rng.uniform(-0.9, 0.9, count), rng.integers(4, size=count)
     behind = rng.uniform(*BEHIND, count)
@@ -108,11 +108,11 @@ def _stander(
     picture: NDArray[np.uint8],
     rng: np.random.Generator,
 ) -> Prop:
-    """One person with hanging arms who faces the middle of the pitch, and stands on the grass."""
+    """Return a person with hanging arms on the grass who faces the middle of the pitch."""
     mannequin = open_mannequin()
     course = np.arctan2(-place[1], -place[0]) + rng.normal(0.0, 0.5)
     upright = Rigid.from_rotvec(np.array([0.5 * np.pi, 0.0, 0.0]), np.zeros(3)).rotation
-    # The model faces -y once it is upright.
+    # The upright model faces -y.
     turned = Rigid.from_rotvec(np.array([0.0, 0.0, course + 0.5 * np.pi]), np.zeros(3)).rotation
     pose = np.zeros((23, 3))
     pose[15, 2], pose[16, 2] = -rng.uniform(1.0, 1.3), rng.uniform(1.0, 1.3)
@@ -131,7 +131,7 @@ def _stander(
 
 
 def roles_of(crowd: CrowdSettings, persons: int) -> list[Role]:
-    """Return who plays where, as `worldpose.synthetic.football` and `contests` have it."""
+    """Return everyone's role, in the order of `worldpose.synthetic.football` and `contests`."""
     roles: list[Role] = ["first" if person % 2 == 0 else "second" for person in range(persons)]
     if crowd.movement == "football":
         keepers: list[Role] = ["first keeper", "second keeper"]

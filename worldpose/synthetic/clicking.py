@@ -1,4 +1,4 @@
-"""Pitch points and lines as a person clicks them in one picture, mistakes included."""
+"""Pitch points and lines that a person clicks in one image, mistakes included."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ from worldpose.synthetic.settings import ClickSettings
 Floats = NDArray[np.float64]
 
 SPACING: Final = 0.25
-"""Between the points along a marking that are looked at [m]."""
+"""Distance between samples along a marking [m]."""
 BORDER: Final = 4.0
-"""Nobody clicks nearer to the picture's border [px]."""
+"""Minimum distance of clicks from the image border [px]."""
 SHORT: Final = 60.0
-"""Markings of which less is in the picture are not drawn [px]."""
+"""Markings with a shorter visible part are not drawn [px]."""
 FLAT: Final = 2.0
-"""Points that spread less than this across their common direction [m] are on one line. Where all
-but one are, no calibration can do; who clicks is asked for others."""
+"""Points that spread less than this across their common direction [m] are collinear. If all but one
+are, calibration is impossible, so the user must add others."""
 TRIES: Final = 50
-"""Choices of points after which those on one line are taken nevertheless."""
+"""Draws of points before collinear ones are accepted."""
 CONFUSED: Final = (
     ("near", "far"),
     ("front", "back"),
     ("penalty_area", "goal_area"),
     ("bottom", "top"),
 )
-"""Parts of names that people take for one another."""
+"""Parts of names that people confuse."""
 
 
 @dataclass(frozen=True, eq=False)
 class Clicks:
-    """What a person clicked in one camera's picture.
+    """Clicks of a person in one camera's image.
 
     Attributes:
         markings: annotations/static_calibration/<camera>.json.
-        wrong: by the name of every wrong click, the name of the point that it is on or, where that
-            is the same, was meant to be on.
-        clustered: all points were sought in one part of the picture.
+        wrong: by the name of every wrong click, the name of the point under it or, for the same
+            name, of the intended point.
+        clustered: all points come from one part of the image.
     """
 
     markings: ClickedMarkings
@@ -62,15 +62,15 @@ def click(
     mistaken: bool,
     rng: np.random.Generator,
 ) -> Clicks:
-    """Return what a person clicks who looks for named points, and for lines where these are few.
+    """Return a person's clicks on named points, and lines if points are few.
 
     Args:
         camera: the true one.
-        pitch: as it is painted.
-        people: joints (persons, 17, 3) [m], world, of those who hide what lies behind them.
-        settings: how many, how exactly.
-        clustered: all points come from one part of the picture.
-        mistaken: one point is named wrongly or far off, each in every second such camera.
+        pitch: the painted pitch.
+        people: joints (persons, 17, 3) [m], world, of possible occluders.
+        settings: number and accuracy of clicks.
+        clustered: all points come from one part of the image.
+        mistaken: one point has a wrong name or a gross error, each in every second such camera.
         rng: this camera's own.
     """
     names = list(pitch.points)
@@ -91,23 +91,23 @@ def click(
 
 
 def every(share: float, index: int, start: float) -> bool:
-    """Whether the item with this number is one of a share of all, evenly spaced from `start`."""
+    """Return whether the item with this number is in an even share of all, spaced from `start`."""
     return bool(np.floor((index + 1) * share + start) > np.floor(index * share + start))
 
 
 def _boxes(camera: Camera, people: Floats) -> Floats:
-    """Left, top, right, bottom [px] and depth [m] of people (persons, 5) before the camera."""
+    """Return left, top, right, bottom [px] and depth [m] of visible people (persons, 5)."""
     pixels = camera.project(people.reshape(-1, 3)).reshape(*people.shape[:2], 2)
     depth = camera.cam_from_world.apply(people.reshape(-1, 3))[:, 2].reshape(people.shape[:2])
     seen = np.isfinite(pixels).all(axis=(1, 2))
     low, high = pixels[seen].min(axis=1), pixels[seen].max(axis=1)
-    # Heads, feet and arms stand out of the joints by about a tenth of the height.
+    # Heads, feet and arms extend beyond the joints by about a tenth of the height.
     more = 0.1 * (high[:, 1:] - low[:, 1:])
     return np.concatenate([low - more, high + more, depth[seen].mean(axis=1)[:, None]], axis=1)
 
 
 def _visible(camera: Camera, places: Floats, pixels: Floats, boxes: Floats) -> NDArray[np.bool_]:
-    """Which points (n,) are in the picture with nobody before them."""
+    """Return which points (n,) are in the image and not occluded by a person."""
     depth = camera.cam_from_world.apply(places)[:, 2]
     inside = (pixels >= BORDER) & (pixels <= camera.image_size - 1.0 - BORDER)
     x, y = pixels[:, None, 0], pixels[:, None, 1]
@@ -125,13 +125,13 @@ def _chosen(
     clustered: bool,
     rng: np.random.Generator,
 ) -> NDArray[np.int64]:
-    """Indices of the points that are clicked, in no order."""
+    """Return indices of the points to click, in random order."""
     low, high = settings.clustered_points if clustered else settings.points
     count = int(rng.integers(low, high + 1))
     if clustered:
         inside = np.abs(x[there] - x[there][:, None] - 0.5 * settings.window * width)
         windows = [there[row] for row in inside <= 0.5 * settings.window * width]
-        # Where no part of the picture holds enough, people look farther.
+        # Where no part of the image holds enough, people look farther.
         firm = [window for window in windows if _firm(places[window])]
         rich = [window for window in firm if len(window) >= count] or firm or [there]
         there = rich[rng.integers(len(rich))]
@@ -145,7 +145,7 @@ def _chosen(
 
 
 def _firm(places: Floats) -> bool:
-    """Whether points (n, 3) [m] are off one line in plan, whichever of them is taken away."""
+    """Return whether points (n, 3) [m] are not collinear in plan, with any one of them removed."""
     if len(places) < 4:
         return False
     rest = np.array([np.delete(places[:, :2], one, axis=0) for one in range(len(places))])
@@ -160,7 +160,7 @@ def _mistaken(
     settings: ClickSettings,
     rng: np.random.Generator,
 ) -> tuple[dict[str, Floats], dict[str, str]]:
-    """The clicks with one of them wrong, and which."""
+    """Return the clicks with one of them wrong, and its name."""
     taken = list(clicked)
     victim = taken[rng.integers(len(taken))]
     others = [name for name in _mistakable(victim) if name in names and name not in clicked]
@@ -171,14 +171,14 @@ def _mistaken(
             named: victim
         }
     off = far * np.array([np.cos(angle), np.sin(angle)])
-    # Into the picture: who misses does not click beside it.
+    # Towards the inside: a slip does not leave the image.
     inward = np.where(clicked[victim] + off < BORDER, 1.0, np.sign(off))
     inward = np.where(clicked[victim] + off > camera.image_size - 1.0 - BORDER, -1.0, inward)
     return {**clicked, victim: clicked[victim] + inward * np.abs(off)}, {victim: victim}
 
 
 def _mistakable(name: str) -> list[str]:
-    """Names that differ from this one by one confused part."""
+    """Return the names that differ from this one by one confused part."""
     pairs = (*CONFUSED, *((other, one) for one, other in CONFUSED))
     return [name.replace(one, other) for one, other in pairs if one in name]
 
@@ -190,7 +190,7 @@ def _drawn(
     settings: ClickSettings,
     rng: np.random.Generator,
 ) -> tuple[DrawnMarking, ...]:
-    """Markings as drawn: points along what is seen of them, from one end to the other."""
+    """Return drawn markings: points along their visible parts, from one end to the other."""
     samples = pitch.sample_lines(SPACING)
     pixels = camera.project(samples.points_world)
     visible = _visible(camera, samples.points_world, pixels, _boxes(camera, people))
@@ -199,7 +199,7 @@ def _drawn(
         seen = pixels[visible & (samples.marking == marking)]
         if len(seen) < 2 or np.ptp(seen, axis=0).max() < SHORT:
             continue
-        # Clicked at about even steps, wherever a sample is near.
+        # Clicks are at about even steps, wherever a sample is near.
         steps = np.linspace(0.0, len(seen) - 1.0, settings.drawn_points).round().astype(int)
         points = seen[np.unique(steps)]
         points = _within(camera, points + settings.noise * rng.standard_normal(points.shape))
@@ -208,10 +208,10 @@ def _drawn(
 
 
 def _within(camera: Camera, pixels: Floats) -> Floats:
-    """Pixels (n, 2) as they are clicked: nobody clicks beside the picture."""
+    """Return pixels (n, 2) limited to the image, as clicks are."""
     return np.clip(pixels, 0.0, camera.image_size - 1.0)
 
 
 def _pixel(xy: Floats) -> tuple[float, float]:
-    """A click as annotation tools write it: to a hundredth of a pixel."""
+    """Return a click in annotation tools' precision, a hundredth of a pixel."""
     return round(float(xy[0]), 2), round(float(xy[1]), 2)

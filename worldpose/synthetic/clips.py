@@ -1,4 +1,4 @@
-"""Motion capture on a person of a scenario: bone directions of a clip on the person's own bones."""
+"""Retargeting of motion capture: bone directions of a clip on a person's own bones."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ NAMES: Final = {
     "right ankle": ("rFoot", "RightFoot", "RightAnkle"),
     "head": ("head_end", "head"),
 }
-"""Points of a clip by the names that conversions of the CMU database give them; capitals do not
-matter, the first that is there is taken. The first twelve are COCO's joints 5 to 16."""
+"""Points of a clip by their names in conversions of the CMU database; case does not matter, the
+first existing name is used. The first twelve are COCO's joints 5 to 16."""
 USUAL_LEG: Final = 0.82
-"""Thigh and shank together, by which the unit of a file is told [m]."""
+"""Length of thigh and shank together, which identifies the unit of a file [m]."""
 UNITS: Final = (1.0, 0.01, 0.0254, 0.001, 0.056444)
-"""Units that files come in [m]; the last is that of the CMU database."""
+"""Units of files [m]; the last is that of the CMU database."""
 ANKLE: Final = 0.08
 """Height of the ankles above the floor in their lowest frames [m]."""
 EASE: Final = 0.5
-"""Time at its end in which a clip gives way to standing [s]."""
+"""Time at the end of a clip in which it blends into standing [s]."""
 
 _BONES: Final = ((6, 5), (12, 11), (5, 7), (7, 9), (6, 8), (8, 10), (11, 13), (13, 15), (12, 14))
 """Pairs of joints: shoulders and hips from right to left, limbs outward ..."""
@@ -53,8 +53,8 @@ _LAST: Final = (14, 16)
 def read_clip(path: Path) -> Clip:
     """Return a file's motion in metres with z up, from the origin and facing along x.
 
-    Up is the axis along which shoulders are above hips, y or z; the unit is the one in which legs
-    are as long as legs are; the floor is where the ankles are lowest.
+    Up is the axis along which shoulders are above hips, y or z; the unit is the one with plausible
+    leg lengths; the floor is at the lowest ankles.
 
     Args:
         path: a BVH file, or an npz with `joints` (frames, joints, 3), `joint_names` and `fps`.
@@ -78,12 +78,12 @@ def read_clip(path: Path) -> Clip:
 
 
 def clip_path(clip: Clip, like: GroundPath, body: Body) -> GroundPath:
-    """Return the way of somebody who plays a clip from time 0 on, and then stands.
+    """Return the path of a person who plays a clip from time 0 on, and then stands.
 
     Args:
         clip: as read.
-        like: where the person is at time 0, and what times the way has.
-        body: whose legs the clip's are brought to.
+        like: place of the person at time 0, and times of the path.
+        body: target of the clip's leg length.
     """
     x, y, heading = (
         float(np.interp(0.0, like.time, axis)) for axis in (*like.position.T, like.heading)
@@ -108,14 +108,14 @@ def play_clip(
     ground: Callable[[Floats, Floats], Floats],
     gait: Floats,
 ) -> Floats:
-    """Joints (frames, 17, 3) [m], world: the clip's bone directions with the body's lengths.
+    """Return joints (frames, 17, 3) [m], world: the clip's bone directions with the body's lengths.
 
     Args:
         body: measures.
         clip: in its place.
         times: (frames,) [s].
         ground: height of the ground [m] at x and y [m].
-        gait: (frames, 17, 3) joints of who follows the clip's way, taken before and after it.
+        gait: (frames, 17, 3) joints of a person on the clip's path, used before and after it.
     """
     inside = np.clip(times, 0.0, clip.time[-1])
     flat = clip.points.reshape(len(clip.time), -1)
@@ -158,19 +158,19 @@ def play_clip(
 
 
 def _about_z(angle: float) -> Floats:
-    """Turns rows of points by minus the angle [rad]."""
+    """Return the matrix that turns rows of points by minus the angle [rad]."""
     cos, sin = np.cos(angle), np.sin(angle)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _leg(points: Floats) -> float:
-    """Length of the left leg in the first frame."""
+    """Return the length of the left leg in the first frame."""
     thigh, shank = points[0, 8] - points[0, 6], points[0, 10] - points[0, 8]
     return float(np.linalg.norm(thigh) + np.linalg.norm(shank))
 
 
 def _named(path: Path, capture: Capture) -> Floats:
-    """The clip's points (frames, 13, 3) in the order of `NAMES`."""
+    """Return the clip's points (frames, 13, 3) in the order of `NAMES`."""
     known = {name.lower(): number for number, name in enumerate(capture.names)}
     found = []
     for name, spellings in NAMES.items():

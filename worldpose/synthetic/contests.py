@@ -1,7 +1,7 @@
-"""Where people go who get in each other's way on purpose: at a corner kick, and running through.
+"""Paths of people in physical contact: at corner kicks, and running through each other.
 
-Everybody steers for a target within bounds of speed and acceleration; who would run into another
-passes in touch, and who is touched is pushed.
+Every person steers for a target within limits of speed and acceleration; a person on a collision
+course passes in contact, and contact pushes.
 """
 
 from __future__ import annotations
@@ -21,50 +21,49 @@ Floats = NDArray[np.float64]
 
 TOUCH: Final = 0.48
 """Distance between the middles of people whose bodies begin to touch [m]: chests and shoulders are
-0.25 to 0.5 m through, and arms are held out."""
+0.25 to 0.5 m thick, and arms are spread."""
 PUSH: Final = 60.0
-"""Acceleration at which two bodies would come out of one place [m/s^2]; who touches less is pushed
-less."""
+"""Acceleration that separates two coincident bodies [m/s^2]; less overlap pushes less."""
 FORESIGHT: Final = 0.6
-"""How far ahead people see that they will meet [s]."""
+"""Time ahead at which people see a collision [s]."""
 CLOSING: Final = 1.5
-"""Who comes nearer more slowly leans in instead [m/s]."""
+"""At lower closing speed people lean in instead of passing [m/s]."""
 DODGE: Final = 15.0
-"""Acceleration aside of two who would meet exactly [m/s^2]; who would pass in touch needs none."""
+"""Lateral acceleration on an exact collision course [m/s^2]; a pass in contact needs none."""
 BRAKE: Final = 6.0
-"""Rate at which bodies in touch lose speed relative to each other [1/s]: they hold and lean on
+"""Rate at which bodies in contact lose speed relative to each other [1/s]: they hold and lean on
 one another."""
 ACCELERATION: Final = 5.0
-"""Most by which people drive themselves on or brake [m/s^2]."""
+"""Maximum acceleration and braking by a person's own legs [m/s^2]."""
 SHOVED: Final = 20.0
-"""Most in all, pushed by others [m/s^2]: a body check takes 2 m/s in a tenth of a second."""
+"""Maximum in all, pushed by others [m/s^2]: a body check takes 2 m/s in a tenth of a second."""
 REACTION: Final = 0.25
-"""Time in which a wished change of velocity takes hold [s]."""
+"""Time constant of a wished change of velocity [s]."""
 KEEN: Final = 2.5
-"""Speed wished per metre to the target [1/s]."""
+"""Desired speed per metre to the target [1/s]."""
 TURN_TIME: Final = 0.15
-"""Time in which a body turns to where it moves or looks [s]."""
+"""Time constant of a body's turn to its direction of movement or gaze [s]."""
 TURN_RATE: Final = 6.0
-"""Most a body turns [rad/s]."""
+"""Maximum turn rate of a body [rad/s]."""
 FACING_SPEED: Final = 1.0
-"""Who is slower faces the ball and steps aside or back [m/s]."""
+"""Slower people face the ball and step aside or back [m/s]."""
 
 FIRST_BALL: Final = 1.8
-"""When the first ball comes down [s]."""
+"""Time at which the first ball comes down [s]."""
 BALL_EVERY: Final = 5.0
-"""Time to the next, should the clip be longer [s]."""
+"""Interval between balls in longer clips [s]."""
 PACKS: Final = 3
-"""Groups in which attackers wait for the ball, an arm's length apart."""
+"""Groups of attackers who wait for the ball, an arm's length apart."""
 FEINT_TIME: Final = (0.5, 1.3)
 """Time between an attacker's feints [s]."""
 FEINT: Final = 0.6
 """Length of a feint along each axis [m], standard deviation."""
 MARKED: Final = 0.35
-"""Distance at which a defender marks his attacker, towards the goal [m]: in touch."""
+"""Distance at which a defender marks an attacker, towards the goal [m]: in contact."""
 BESIDE: Final = 0.1
-"""Distance at which somebody wants to run beside another [m]; shoulders keep them farther."""
+"""Desired lateral distance of pairs of runners [m]; shoulders keep them farther apart."""
 JUMP_REACH: Final = 2.2
-"""Who is nearer to where the ball comes down jumps for it [m]."""
+"""People nearer to the falling ball jump for it [m]."""
 JUMP_TOP: Final = 0.9
 """Time from the crouch to the top of a jump [s]."""
 
@@ -76,10 +75,10 @@ from the sample's number, positions and velocities (people, 2)."""
 def take_corner(
     crowd: CrowdSettings, duration: float, rng: np.random.Generator
 ) -> list[GroundPath]:
-    """Return ways at corner kicks: pairs in touch, feints, a rush to the ball, jumps.
+    """Return paths at corner kicks: pairs in contact, feints, a rush to the ball, jumps.
 
-    The last person keeps the goal; of the others, every second one attacks and the next marks
-    him. The goal is at the end of the area that is farther from the halfway line.
+    The last person keeps the goal; of the others, every second one attacks and the next marks that
+    attacker. The goal is at the end of the area that is farther from the halfway line.
 
     Args:
         crowd: people, area and fastest speed.
@@ -139,7 +138,7 @@ def take_corner(
 def run_through(
     crowd: CrowdSettings, duration: float, rng: np.random.Generator
 ) -> list[GroundPath]:
-    """Return ways of people who run through the area's middle and back, half of them in pairs.
+    """Return paths of people who run through the area's middle and back, half of them in pairs.
 
     Args:
         crowd: people, area and speeds.
@@ -150,10 +149,10 @@ def run_through(
     count, center = crowd.people, np.array(crowd.area_center)
     reach = 0.5 * float(min(crowd.area_size))
     angle = 2.0 * np.pi * np.arange(count) / max(count, 1) + rng.uniform(-0.3, 0.3, count)
-    partners = np.arange(1, 2 * (count // 4), 2)  # each runs beside the one before
+    partners = np.arange(1, 2 * (count // 4), 2)  # each runs next to the previous person
     angle[partners] = angle[partners - 1] + 0.06
     speed = rng.uniform(0.5 * sum(crowd.speed), crowd.speed[1], count)
-    # Who wrestles for the way is slower.
+    # Pairs that fight for the path are slower.
     speed[partners - 1] = rng.uniform(crowd.speed[0], 0.5 * sum(crowd.speed), len(partners))
     miss = 0.35 * rng.standard_normal((count, 2))
     state = angle.copy()
@@ -164,7 +163,7 @@ def run_through(
         state[there] += np.pi + 0.5 * np.sin(7.0 * state[there])
         aside = _unit(np.stack([-velocity[:, 1], velocity[:, 0]], axis=-1))
         ahead[partners] = position[partners - 1] + BESIDE * aside[partners - 1]
-        ahead[partners] += velocity[partners - 1] / KEEN  # who keeps up aims ahead
+        ahead[partners] += velocity[partners - 1] / KEEN  # the follower aims ahead to keep up
         top = speed.copy()
         top[partners] = crowd.speed[1] + 1.0
         return ahead, top, center
@@ -179,7 +178,7 @@ def _times(duration: float) -> Floats:
 
 
 def _follow(time: Floats, start: Floats, wish: Wish) -> list[GroundPath]:
-    """Ways of people (n) from their starts (n, 2) [m] who go for what they wish and touch."""
+    """Return paths of people (n) from their starts (n, 2) [m] to their targets, with contact."""
     count = len(start)
     position, velocity = start.copy(), np.zeros((count, 2))
     heading = np.zeros(count)
@@ -226,7 +225,7 @@ def _follow(time: Floats, start: Floats, wish: Wish) -> list[GroundPath]:
 def _leaps(
     paths: list[GroundPath], balls: Floats, drops: Floats, rng: np.random.Generator
 ) -> list[tuple[Action, ...]]:
-    """Jumps of each person who is near when a ball comes down."""
+    """Return jumps of each person near a falling ball."""
     leaps = []
     for path in paths:
         own = []
@@ -242,7 +241,7 @@ def _leaps(
 def _jumps(
     time: Floats, count: int, every: tuple[float, float], rng: np.random.Generator
 ) -> Floats:
-    """Standard normal steps (samples, count, 2) that hold for a random time [s] each."""
+    """Return standard normal steps (samples, count, 2), constant for a random time [s] each."""
     steps = np.empty((len(time), count, 2))
     for person in range(count):
         ends = time[0] + np.cumsum(rng.uniform(*every, int((time[-1] - time[0]) / every[0]) + 2))

@@ -1,4 +1,4 @@
-"""People in motion: bodies, ways and gaits, evaluated at any camera's times."""
+"""People in motion: bodies, paths and gaits, evaluated at any camera's times."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from worldpose.synthetic.settings import Scenario
 Floats = NDArray[np.float64]
 
 CONTESTS: Final = {"corner": take_corner, "crossing": run_through}
-"""Movements in which people touch."""
+"""Movements in which people make contact."""
 
 
 @dataclass(frozen=True, eq=False)
 class Crowd:
-    """Everybody on the pitch.
+    """All people on the pitch.
 
     Attributes:
-        bodies: measures of each.
-        paths: ways of each.
-        action: (samples, 2) [m], world; what everybody, and the broadcast camera, follows.
+        bodies: measures of each person.
+        paths: path of each person.
+        action: (samples, 2) [m], world; the point that people and the broadcast camera follow.
         action_times: (samples,) [s].
     """
 
@@ -48,14 +48,14 @@ class Crowd:
     gaits: Sequence[np.random.SeedSequence]
 
     def joints(self, times: Floats) -> Floats:
-        """Joints (frames, persons, 17, 3) [m], world, at `times` [s]; always the same ones."""
+        """Return joints (frames, persons, 17, 3) [m], world, at `times` [s]; repeatable."""
         joints = np.empty((len(times), len(self.paths), 17, 3))
         for person in range(len(self.paths)):
             joints[:, person] = self._embodied(person, times).keypoints()
         return joints
 
     def poses(self, times: Floats) -> BodyParameters:
-        """The bodies (persons, frames) whose keypoints the joints are."""
+        """Return the bodies (persons, frames) whose keypoints the joints are."""
         shape = (len(self.paths), len(times))
         betas, orient, transl = np.empty((*shape, 10)), np.empty((*shape, 3)), np.empty((*shape, 3))
         angles = np.empty((*shape, BODY_POSE))
@@ -72,7 +72,7 @@ class Crowd:
 
     @property
     def heights(self) -> Floats:
-        """Body heights (persons,) [m]."""
+        """Return body heights (persons,) [m]."""
         return np.array([body.height for body in self.bodies])
 
 
@@ -86,10 +86,10 @@ def gather(
     """Return the people of a scenario.
 
     Args:
-        scenario: who, where and how long.
-        pitch: what they stand on.
-        seed: every person draws from a stream of their own; only football ties their ways.
-        driven: their ways, where tracking data gives them; there are as many people.
+        scenario: people, place and duration.
+        pitch: the ground under them.
+        seed: every person draws from a separate stream; only football couples the paths.
+        driven: paths from tracking data, one per person.
         clip: motion capture that the third person plays, the first who is no goalkeeper, or the
             last of fewer.
     """

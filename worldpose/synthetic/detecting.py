@@ -1,4 +1,4 @@
-"""What a detector makes of people whose pixels are known."""
+"""Detections of people with known pixels, with a detector's errors."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ MIRRORED: Final = np.array(
 )
 """The same joint on the other side."""
 MOSTLY_HIDDEN: Final = 0.7
-"""Share of hidden joints from which on a person is mostly hidden."""
+"""Share of hidden joints above which a person is mostly hidden."""
 DISPLACED: Final = (4.0, 10.0)
-"""How far displaced joints go, in standard deviations of their error."""
+"""Offset of displaced joints, in standard deviations of their error."""
 _SIDE: Final = np.array([("left" in name) - ("right" in name) for name in COCO17], dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
 class Habits:
-    """What one detector always gets wrong.
+    """Systematic errors of one detector.
 
     Attributes:
         joint_bias: (17, 3) forward, left, up [standard deviations], a mirror image of itself.
@@ -45,13 +45,14 @@ class Habits:
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """What a detector says of every body, in the bodies' order.
+    """Detections of every body, in the bodies' order.
 
     Attributes:
         keypoints: (frames, persons, 17, 2) [px]; NaN where not found.
         confidence: (frames, persons, 17); NaN where not found.
-        displaced: (frames, persons, 17), joints put far off.
-        merged_into: (frames, persons) int16, whose box holds this lost person too; -1 = none's.
+        displaced: (frames, persons, 17), joints with gross errors.
+        merged_into: (frames, persons) int16, the person whose box includes this lost one; -1 =
+            none.
     """
 
     keypoints: Floats
@@ -61,7 +62,7 @@ class Detections:
 
 
 def draw_habits(rng: np.random.Generator) -> Habits:
-    """A detector, drawn once a match: all cameras and people meet the same one."""
+    """Return a detector, drawn once per match for all cameras and people."""
     joint_bias = rng.standard_normal((17, 3))
     for joint, mirror in enumerate(MIRRORED):
         if _SIDE[joint] < 0.0:
@@ -71,13 +72,13 @@ def draw_habits(rng: np.random.Generator) -> Habits:
 
 
 def perceived_bias(joints: Floats, habits: Habits, noise: ObservationNoise, own: Floats) -> Floats:
-    """Offsets (frames, persons, 17, 3) [m], world, from joints to what is taken for them.
+    """Return offsets (frames, persons, 17, 3) [m], world, from joints to the detector's joints.
 
     Args:
         joints: (frames, persons, 17, 3) [m], world.
-        habits: the detector's.
+        habits: the detector's systematic errors.
         noise: spreads.
-        own: (persons, 17, 3) each person's own [standard deviations].
+        own: (persons, 17, 3) person-specific offsets [standard deviations].
     """
     front, left = facing(joints)
     up = np.broadcast_to([0.0, 0.0, 1.0], front.shape)
@@ -93,14 +94,14 @@ def detect(
     fps: float,
     rngs: list[np.random.Generator],
 ) -> Detections:
-    """Return what a detector reports.
+    """Return a detector's reports.
 
     Args:
-        sight: the truth in the picture.
+        sight: true keypoints and occlusions in the image.
         noise: rates and spreads.
-        habits: the detector's.
+        habits: the detector's systematic errors.
         fps: [1/s].
-        rngs: one a person; what one person draws never changes another's errors.
+        rngs: one per person; one person's draws never change another's errors.
     """
     shape = sight.hidden.shape
     keypoints, confidence = np.full((*shape, 2), np.nan), np.full(shape, np.nan)
@@ -171,7 +172,7 @@ def _detect_one(
 def _errors(
     pixels: Floats, spread: Floats, noise: ObservationNoise, fps: float, rng: np.random.Generator
 ) -> Floats:
-    """Errors of zero mean (frames, 17, 2) [px]: white, slow and by motion."""
+    """Return errors of zero mean (frames, 17, 2) [px]: white, slow and by motion."""
     white = rng.standard_normal(pixels.shape)
     slow = drift(pixels.shape, noise.slow_time, fps, rng)
     along = rng.standard_normal((*spread.shape, 1))
@@ -179,7 +180,7 @@ def _errors(
     error += (noise.slow * spread)[..., None] * slow
     if len(pixels) > 1 and noise.blur > 0.0:
         motion = np.gradient(pixels, axis=0) * fps
-        # At the border of the picture the motion is unknown; blur is the least there.
+        # At the image border the motion is unknown; blur is negligible there.
         error += noise.blur * np.where(np.isfinite(motion), motion, 0.0) * along
     return error
 
@@ -187,7 +188,7 @@ def _errors(
 def _bursts_by_size(
     share: float, time: float, small: Flags, fps: float, rng: np.random.Generator
 ) -> Flags:
-    """Bursts (frames,) that small people have from two sources."""
+    """Return bursts (frames,); small people have them from two sources."""
     both = bursts(share, time, (len(small), 2), fps, rng)
     on: Flags = both[:, 0] | (both[:, 1] & small)
     return on

@@ -1,4 +1,4 @@
-"""Who plays the ball and how: kicks, headers, tackles and saves, as the game calls for them."""
+"""Duels: players' kicks, headers, tackles and saves at the touches of the ball."""
 
 from __future__ import annotations
 
@@ -18,30 +18,31 @@ from worldpose.synthetic.tumbles import dive, fall, slide
 Floats = NDArray[np.float64]
 
 CALL: Final = 2.5
-"""Time before a touch at which somebody goes for it [s]."""
+"""Time before a touch at which a player goes for the ball [s]."""
 REACH: Final = 1.8
-"""Distance from which the ball is played [m]: who is farther away when the motion would begin
-leaves it."""
+"""Distance from which the ball is played [m]: a player who is farther away at the start of the
+motion leaves it."""
 KICK_SPEED: Final = 3.2
-"""Of a person who kicks [m/s]; kickers in motion capture run up at 3 to 3.5 m/s."""
+"""Speed of a kicker [m/s]; kickers in motion capture run up at 3 to 3.5 m/s."""
 JUMP_SPEED: Final = 1.8
-"""Of a person who jumps off both feet [m/s]."""
+"""Speed of a person who jumps off both feet [m/s]."""
 SLIDE_SPEED: Final = 5.5
-"""Of a person who slides in [m/s]."""
+"""Speed of a person who slides in [m/s]."""
 DIVE_SPEED: Final = 3.3
-"""Sideward, of a goalkeeper at take-off [m/s]; 3.9 +- 0.3 m/s were measured."""
+"""Sideward speed of a goalkeeper at take-off [m/s]; measurements give 3.9 +- 0.3 m/s."""
 DIVE_REACH: Final = (0.7, 3.5)
-"""Balls nearer than the first are caught standing, beyond the second are let in [m]."""
+"""A goalkeeper catches balls nearer than the first standing, and lets in balls beyond the second
+[m]."""
 SETTLE: Final = 0.35
-"""Before take-off, time in which nobody changes pace any more [s]."""
+"""Time before take-off with constant pace [s]."""
 
 AT_EASE, COASTING, STOPPING, PUSHING = range(4)
-"""How a person goes: as he wishes; as he did; to a stop; sideward, off a leg."""
+"""Modes of movement: free; constant velocity; to a stop; sideward, off a leg."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Call:
-    """Somebody is to do something at a touch."""
+    """A person's planned action at a touch."""
 
     person: int
     touch: Touch
@@ -51,11 +52,11 @@ class _Call:
 
 
 class Duels:
-    """The touches of a game and who has answered them; it changes as the game goes on.
+    """The touches of a game and the players' responses; updated during the game.
 
     Attributes:
-        mode: (samples, people), how everybody goes.
-        most: (samples, people), speed that nobody exceeds who is about to act [m/s].
+        mode: (samples, people), mode of movement.
+        most: (samples, people), speed limit before an action [m/s].
         push: (samples, people, 2), acceleration off a leg [m/s^2].
         actions: of each person.
     """
@@ -69,7 +70,7 @@ class Duels:
         rates: ActionRates,
         rng: np.random.Generator,
     ) -> None:
-        """Args are those of the game; players are the first people, of both teams in turn."""
+        """Take the game's arguments; players are the first people, of both teams in turn."""
         self._time, self._team, self._players = time, team, players
         self._rates, self._rng = rates, rng
         self._waiting, self._calls = list(touches), list[_Call]()
@@ -82,10 +83,10 @@ class Duels:
     def advance(
         self, sample: int, position: Floats, velocity: Floats, heading: Floats
     ) -> dict[int, tuple[Floats, float]]:
-        """Let people answer; targets [m] of those who go for the ball and when they must be there.
+        """Update responses; return targets [m] of people on the ball and times left [s].
 
         Args:
-            sample: number of it.
+            sample: its index.
             position: (people, 2) [m].
             velocity: (people, 2) [m/s].
             heading: (people,) [rad].
@@ -164,7 +165,7 @@ class Duels:
             course = call.touch.target - call.touch.place
             off = (np.arctan2(course[1], course[0]) - facing + np.pi) % (2.0 * np.pi) - np.pi
             turn = float(np.clip(off, -0.7, 0.7))
-            # Most kick with the right foot; a ball to the left of the body asks for the other.
+            # Most kick with the right foot; a ball to the left of the body needs the left one.
             left = bool(self._rng.random() < 0.2)
         self.actions[person].append(Action(begin, motion, left, turn))
         end = begin + motion.duration
@@ -185,7 +186,7 @@ class Duels:
         if motion.stops is not None:
             still = (begin + motion.stops, begin + motion.moves_again)
             self._set(self.mode, person, *still, STOPPING)
-            # Up again, nobody sprints off at once.
+            # After getting up, people do not sprint at once.
             self._set(self.most, person, still[1], end, 1.5)
 
     def _set(
@@ -196,12 +197,12 @@ class Duels:
 
 
 def overlapping(actions: list[Action], begin: float, end: float) -> bool:
-    """Whether anything is done between two times [s]."""
+    """Return whether an action overlaps an interval [s]."""
     return any(action.begin < end and action.end > begin for action in actions)
 
 
 def in_order(actions: list[Action]) -> tuple[Action, ...]:
-    """Actions by their beginning, each begun only when the one before is over."""
+    """Return actions by their start, without those that overlap an earlier one."""
     kept: list[Action] = []
     for action in sorted(actions, key=lambda action: action.begin):
         if not overlapping(kept, action.begin, action.end):

@@ -1,4 +1,4 @@
-"""False people: what a detector takes for somebody where nobody is."""
+"""False positives of a person detector."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from worldpose.synthetic.processes import bursts
 from worldpose.synthetic.settings import CrowdSettings, Scenario
 
 PHANTOMS: Final = 2
-"""Most false people at a time in one camera."""
+"""Maximum number of false positives at a time in one camera."""
 POSTURES: Final = 12.0
-"""Length of the walk that postures are taken from [s]."""
+"""Length of the walk that supplies postures [s]."""
 
 
 def draw_false_positives(
     scenario: Scenario, pitch: PitchTemplate, frames: int, rng: np.random.Generator
 ) -> Bodies:
-    """Return still human figures that come and go at random places on and around the area.
+    """Return still human figures that appear and vanish at random places on and around the area.
 
     Args:
-        scenario: area and the rates of false people.
-        pitch: what they stand on.
+        scenario: area and the rates of false positives.
+        pitch: the ground under them.
         frames: number of frames.
-        rng: this camera's own: cameras are deceived independently.
+        rng: this camera's own: false positives of cameras are independent.
     """
     noise, crowd = scenario.noise, scenario.crowd
     share = noise.false_people / PHANTOMS
     shape = (frames, PHANTOMS)
     on = bursts(share, noise.false_people_time, shape, scenario.fps, rng)
     body = draw_body(crowd.height, rng)
-    # Any moment of a walk serves as a posture; every appearance has its own.
+    # Any moment of a walk serves as a posture; every appearance draws another.
     path = wander(CrowdSettings(height=crowd.height), POSTURES, (), rng)
     appeared = on & ~np.concatenate([np.zeros_like(on[:1]), on[:-1]])
     times = rng.uniform(0.0, POSTURES, appeared.shape)
@@ -48,7 +48,7 @@ def draw_false_positives(
     )
     joints[..., :2] += place[:, :, None]
     joints[..., 2] += pitch.height(place[..., 0], place[..., 1])[..., None]
-    # A figure stays as it was when it appeared.
+    # A figure keeps the posture of its appearance.
     since = np.maximum.accumulate(np.where(appeared, np.arange(frames)[:, None], 0), axis=0)
     joints = np.take_along_axis(joints, since[..., None, None], axis=0)
     joints[~on] = np.nan

@@ -1,4 +1,4 @@
-"""What people of the simulation are made of: open bodies of drawn height and build."""
+"""Figures of the simulation: open bodies of random height and build."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ class Figure:
     toe: float
     """Length of the toes in front of their joint [m]."""
     heel: float
-    """How far the heel reaches behind the ankle [m]."""
+    """Distance of the heel behind the ankle [m]."""
 
 
 def draw_figure(height: tuple[float, float], rng: np.random.Generator) -> Figure:
     """Return a person of random height [m] within bounds and of random build.
 
-    Proportions are the open body's: its betas but the first are drawn, the first makes the height.
-    But for their build, players differ as the people do whom the open body was made from.
+    Proportions are the open body's: all betas but the first are random, the first sets the height.
+    Apart from their build, players vary as the people behind the open body do.
     """
     model, points, directions = _measured()
     betas = np.zeros(model.shapes)
@@ -71,7 +71,7 @@ def draw_figure(height: tuple[float, float], rng: np.random.Generator) -> Figure
 
 @functools.cache
 def _measured() -> tuple[BodyModel, Floats, Floats]:
-    """The open body; its head, big toe, heel, crown and sole (9, 3) [m], and these by betas."""
+    """Return the open body; head, big toe, heel, crown and sole (9, 3) [m], and these by betas."""
     model = load_open_body()
     named = [VERTEX_OF_POINT[name] for name in (*COCO17[:5], "left_big_toe", "left_heel")]
     upright = model.template[:, 1]

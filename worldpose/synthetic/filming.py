@@ -1,4 +1,4 @@
-"""Frames of static cameras: people in kits before a stadium."""
+"""Frames of static cameras: people in kits in front of a stadium."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class View:
     Attributes:
         venue: the stadium.
         camera: a single camera.
-        sharp: (height, width, 3) RGB, as light falls; without goals.
+        sharp: (height, width, 3) RGB, before the lens; without goals.
         blurred: the same through the lens.
         grain: noise of the sensor.
         props: the goals.
@@ -57,8 +57,8 @@ def open_view(
 
     Args:
         camera: a single camera.
-        pitch: what is painted.
-        seed: the stadium's look and the sensor's noise.
+        pitch: the painted pitch.
+        seed: of the stadium's look and the sensor's noise.
         settings: the defaults if None.
     """
     venue = build_venue(pitch, seed, settings or RenderingSettings())
@@ -85,15 +85,15 @@ def render_frame(
     frame: int = 0,
     props: Sequence[Prop] = (),
 ) -> RenderedFrame:
-    """Return one picture of people; the same arguments give the same bytes.
+    """Return one image of people; the same arguments give the same bytes.
 
     Args:
         view: a static camera.
         cast: the people.
-        opened: where they are when the shutter opens.
-        closed: where they are when it closes; None = nobody moves.
-        frame: gives every picture of a clip noise of its own.
-        props: things besides the goals.
+        opened: their surfaces when the shutter opens.
+        closed: their surfaces when it closes; None = no motion.
+        frame: seeds the noise of this image of a clip.
+        props: things in addition to the goals.
     """
     moment = Moment(cast, opened, closed or opened, [*view.props, *props])
     return expose(

@@ -1,4 +1,4 @@
-"""The videos of a scene, and where everybody is in them."""
+"""Videos of a scene, with the boxes and masks of all people."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Singles = NDArray[np.float32]
 Advance = Callable[[str, int, int], None]
 
 AT_ONCE: Final = 4
-"""Most cameras filmed at a time: each holds its empty stadium and its encoder's frames."""
+"""Maximum number of cameras filmed at a time: each holds its empty stadium and encoder frames."""
 
 
 def film_scene(
@@ -47,23 +47,23 @@ def film_scene(
 ) -> None:
     """Write the videos of all cameras into a match folder, frame by frame.
 
-    Besides videos/<camera>.mp4 and broadcast/<clip>.mp4, for every camera or clip:
+    In addition to videos/<camera>.mp4 and broadcast/<clip>.mp4, for every camera or clip:
 
-    - reference/boxes/<name>.npz: `boxes` (frames, persons, 4) left, top, right, bottom of
-      everybody's outline [px], hidden parts included; `visible` (frames, persons), the share of
-      it in the picture that nobody hides;
-    - with `stills`, stills/<camera>.png, its first frame as it was before encoding;
-    - with `masks`, reference/masks/<name>/<frame>.png, 8 bit: person + 1, 0 for nobody.
+    - reference/boxes/<name>.npz: `boxes` (frames, persons, 4) left, top, right, bottom of every
+      person's outline [px], occluded parts included; `visible` (frames, persons), the unoccluded
+      share of the outline's part in the image;
+    - with `stills`, stills/<camera>.png, its first frame before encoding;
+    - with `masks`, reference/masks/<name>/<frame>.png, 8 bit: person + 1, 0 for no person.
 
     Args:
-        scene: what happens.
-        scenario: its look, and its frames a second.
-        seed: the stadium, kits and noise.
+        scene: the scene to film.
+        scenario: its look, and its frame rate.
+        seed: of the stadium, kits and noise.
         folder: of the match.
         clip_id: names the broadcast camera's files.
-        stills: also write them.
-        masks: also write them.
-        advance: told the camera or clip, its frames done and all its frames.
+        stills: write stills, too.
+        masks: write masks, too.
+        advance: called with the camera or clip, its finished frames and its number of frames.
     """
     stage = _Stage(scene, scenario, seed)
     names = [*scene.cameras, *([] if scene.broadcast is None else [clip_id])]
@@ -90,12 +90,13 @@ def film_scene(
 
 
 class _Stage:
-    """A dressed scene before cameras."""
+    """A dressed scene ready for filming."""
 
     def __init__(self, scene: Scene, scenario: Scenario, seed: int) -> None:
         self.scene, self.scenario, self.seed = scene, scenario, seed
         self.pitch = PitchTemplate.from_spec(scenario.pitch)
-        # One more than there are: where people go while the last frame's shutter is open.
+        # One more than there are frames: positions of people while the last frame's shutter is
+        # open.
         self.times = np.arange(len(scene.truth.frames) + 1) / scenario.fps
         self.poses = scene.crowd.poses(self.times)
         roles = roles_of(scenario.crowd, len(scene.crowd.paths))
@@ -115,7 +116,7 @@ class _Stage:
 
     def broadcast(self) -> Iterator[RenderedFrame]:
         """Yield the frames of the broadcast camera."""
-        assert self.scene.broadcast is not None  # it is asked for where there is one
+        assert self.scene.broadcast is not None  # callers check this
         venue = build_venue(self.pitch, self.seed, self.scenario.look)
         standing = goals(self.pitch)
         moments = (
@@ -125,7 +126,7 @@ class _Stage:
         return film_broadcast(self.scene.broadcast, venue, moments)
 
     def _moments(self, late: float) -> Iterator[Moment]:
-        """Yield what is there in every frame of a camera whose clock is late [s]."""
+        """Yield the content of every frame of a camera with a clock offset [s]."""
         times = self.times + late
         poses = self.poses if late == 0.0 else self.scene.crowd.poses(times)
         share = self.scenario.look.shutter * self.scenario.fps
@@ -144,7 +145,7 @@ class _Stage:
 
 
 class _Kept:
-    """What is kept of a camera's frames besides the video."""
+    """Boxes, stills and masks kept from a camera's frames."""
 
     def __init__(
         self, still: Path | None, masks: Path | None, advance: Callable[[int], None]
@@ -156,7 +157,7 @@ class _Kept:
             masks.mkdir(parents=True)
 
     def watched(self, frames: Iterator[RenderedFrame]) -> Iterator[NDArray[np.uint8]]:
-        """Yield the pictures of frames."""
+        """Yield the images of frames."""
         for number, frame in enumerate(frames):
             self.boxes.append(frame.boxes.astype(np.float32))
             self.visible.append(frame.visible.astype(np.float32))

@@ -1,4 +1,4 @@
-"""Where footballers go: two teams and officials who follow a ball, with bounded accelerations."""
+"""Paths of footballers: two teams and officials who follow a ball, with bounded accelerations."""
 
 from __future__ import annotations
 
@@ -36,47 +36,47 @@ FORMATION: Final = np.array(
 )
 """Places of a 4-3-3 that attacks towards positive x, while the ball is at the centre spot [m]."""
 FOLLOW: Final = np.array([0.60, 0.45])
-"""Share of the ball's way along x and y that the formation goes with it [1]: teams stay compact."""
+"""Formation shift along x and y relative to the ball's displacement [1]: teams stay compact."""
 KEEPER_FOLLOW: Final = np.array([0.12, 0.12])
-"""The same for goalkeepers, who stay at home [1]."""
+"""The same for goalkeepers, who stay near their goal [1]."""
 ROAM: Final = 8.0
-"""How far players drift from their place in the formation [m], standard deviation per axis."""
+"""Drift of players from their place in the formation [m], standard deviation per axis."""
 ROAM_TIME: Final = 10.0
-"""Time in which they change their mind about it [s]."""
+"""Correlation time of that drift [s]."""
 PRESSING: Final = 2
 """Players of each team who go for the ball: one on it, one in support."""
 SPRINT_EVERY: Final = 45.0
 """Mean time between a player's sprints [s]."""
 SPRINT_TIME: Final = 2.5
-"""How long a sprint is meant to last [s]."""
+"""Planned duration of a sprint [s]."""
 TOP_SPEED: Final = (7.8, 9.2)
-"""Of players, who differ [m/s]."""
+"""Range over players [m/s]."""
 ACCELERATION: Final = 5.0
-"""Most at a standstill, falling to nothing at top speed; most in braking and turns [m/s^2]."""
+"""Maximum at a standstill, falling to zero at top speed; maximum in braking and turns [m/s^2]."""
 REACTION: Final = 0.5
-"""Time in which a wished change of velocity takes hold [s]."""
+"""Time constant of a wished change of velocity [s]."""
 JERK_TIME: Final = 0.12
-"""Time in which an acceleration builds up [s]."""
+"""Time constant of the acceleration [s]."""
 EAGERNESS: Final = 0.38
 """Speed wished per metre to the target [1/s]: 10 m away they jog, 20 m away they run hard."""
 NEAR_ENOUGH: Final = 2.0
-"""Who is that near his target stands [m], until it is `WORTH_GOING` away."""
+"""A player that near the target stands [m], until the target is `WORTH_GOING` away."""
 WORTH_GOING: Final = 5.0
 """[m]"""
 BODY_SPACE: Final = 1.3
-"""Distance under which players make way for each other [m]."""
+"""Distance below which players make way for each other [m]."""
 TURN_TIME: Final = 0.15
-"""Time in which a body turns to where it moves or looks [s]."""
+"""Time constant of a body's turn to its direction of movement or gaze [s]."""
 TURN_RATE: Final = 7.0
-"""Most a body turns [rad/s]."""
+"""Maximum turn rate of a body [rad/s]."""
 
 
 def play(
     crowd: CrowdSettings, duration: float, rng: np.random.Generator
 ) -> tuple[list[GroundPath], GroundPath]:
-    """Return the ways of all people, players by team and then officials, and the ball's.
+    """Return the paths of all people, players by team and then officials, and the path of the ball.
 
-    Everybody steers for a target that moves: players for their place in a formation that shifts
+    Every person steers for a target that moves: players for their place in a formation that shifts
     with the ball, the nearest of each team for the ball, a sprinter for open space, the referee
     for a place near play, assistants along the touch lines. Targets need not be smooth: people
     accelerate within human bounds (docs/synthetic.md).
@@ -152,9 +152,9 @@ def _targets(
     side: Floats,
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats]:
-    """Targets (samples, people, 2) [m], and how much more than usual each hurries there."""
+    """Return targets (samples, people, 2) [m], and by person a factor on the usual speed there."""
     samples = len(time)
-    # A thought a second, and none of the jitter of a random walk between.
+    # One knot per second, without the jitter of a random walk in between.
     knots = np.arange(time[0], time[-1] + 2.0)
     roam = ROAM * drift((len(knots), people, 2), ROAM_TIME, 1.0, rng)
     roam = interp1d(knots, roam, axis=0)(time)
@@ -177,7 +177,7 @@ def _targets(
         elif person == players:
             targets[:, person] = 0.9 * ball + [-4.0, 7.0] + 0.4 * roam[:, person]
         else:
-            # An assistant keeps level with the last defender of his half.
+            # An assistant keeps level with the last defender of the assistant's half.
             half = 1.0 if (person - players) % 2 else -1.0
             line = half * np.clip(25.0 + half * FOLLOW[0] * ball[:, 0], 0.0, 50.0)
             targets[:, person] = np.stack([line, np.full(samples, half * 35.2)], axis=-1)
@@ -187,12 +187,12 @@ def _targets(
 
 @dataclass(frozen=True, eq=False)
 class _Wishes:
-    """How everybody (people,) would go.
+    """Desired motion of every person (people,).
 
     Attributes:
-        hurry: how much more than usual they hurry to their target [1].
-        haste: speed at which they would be there in time [m/s]; NaN = as they like.
-        most: speed that they keep to [m/s].
+        hurry: factor on the usual speed to the target [1].
+        haste: speed that reaches the target in time [m/s]; NaN = free choice.
+        most: speed limit [m/s].
         mode: at ease, coasting, stopping or pushing off.
         off_leg: (people, 2), acceleration of those who push off [m/s^2].
     """
@@ -213,7 +213,7 @@ def _steer(
     wishes: _Wishes,
     top: Floats,
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Velocity, acceleration and who is on the move, one step later."""
+    """Return velocity, acceleration and a mask of people on the move, one step later."""
     far = np.linalg.norm(way, axis=-1)
     called = ~np.isnan(wishes.haste)
     moving = (far > np.where(moving, NEAR_ENOUGH, WORTH_GOING)) | called
@@ -226,7 +226,7 @@ def _steer(
     wished = wished + 5.0 * (apart * (near / np.maximum(gap, 1e-9))[..., None]).sum(axis=1)
     wished = np.where((wishes.mode == STOPPING)[:, None], 0.0, wished)
     change = (wished - velocity) / REACTION
-    # What drives on falls with speed, what brakes or turns does not.
+    # The limit of driving forces falls with speed, the limit of braking and turning does not.
     speed = np.linalg.norm(velocity, axis=-1)
     ahead = velocity / np.maximum(speed, 1e-9)[:, None]
     drive = (change * ahead).sum(-1)
@@ -237,7 +237,7 @@ def _steer(
     change = np.where((wishes.mode == COASTING)[:, None], 0.0, change)
     push = push + (change - push) * STEP / JERK_TIME
     push = np.where((wishes.mode == PUSHING)[:, None], wishes.off_leg, push)
-    # A leg that pushed somebody off the ground pushes no more.
+    # A leg that pushed a person off the ground pushes no more.
     thrown = (wishes.mode == COASTING) & (np.linalg.norm(push, axis=-1) > ACCELERATION)
     push = np.where(thrown[:, None], 0.0, push)
     return velocity + push * STEP, push, moving

@@ -1,4 +1,4 @@
-"""People who stand, walk, run and act: 17 joints from a path over the ground.
+"""Gait: 17 joints of people who stand, walk, run and act, from a path over the ground.
 
 A kinematic model: planted feet follow the path's footholds, knees follow by two-bone inverse
 kinematics, arms swing against the legs. Bones between joints keep their lengths exactly.
@@ -26,20 +26,20 @@ RIGID_BONES: Final = (
     *((5, 7), (7, 9), (6, 8), (8, 10), (5, 6), (11, 12), (11, 13), (13, 15), (12, 14), (14, 16)),
     *((0, 1), (0, 2), (1, 3), (2, 4)),
 )
-"""Pairs of joints whose distance never changes in a person; the spine twists and the head turns."""
+"""Pairs of joints at constant distance in a person; the spine twists and the head turns."""
 
 STRIDES: Final = (
     (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.0, 9.0),
     (0.91, 1.0, 1.10, 1.26, 1.36, 1.43, 1.53, 1.68, 1.85, 2.2),
 )
-"""Speeds [m/s] and strides a second at them: walkers up to 2 m/s, runners beyond."""
+"""Speeds [m/s] and strides per second at them: walkers up to 2 m/s, runners beyond."""
 STANDING_SPEED: Final = 0.25
-"""Who is slower than this for `STANDING_TIME` stands [m/s]."""
+"""A person slower than this for `STANDING_TIME` stands [m/s]."""
 STANDING_TIME: Final = 0.3
 """[s]"""
 TURNING_ARM: Final = 0.5
-"""Turning by 1 rad/s asks for as many steps as walking this much a second [m]; who turns by less
-than half that does it with the hips."""
+"""Turning by 1 rad/s needs as many steps as walking at this many metres per second [m]; a turn of
+less than half of that uses the hips alone."""
 
 
 def walk(
@@ -49,7 +49,7 @@ def walk(
     ground: Ground,
     rng: np.random.Generator,
 ) -> Floats:
-    """Joints (frames, 17, 3) [m], world, of a person who follows a path; see `tread`."""
+    """Return joints (frames, 17, 3) [m], world, of a person who follows a path; see `tread`."""
     return tread(body, path, times, ground, rng)[0]
 
 
@@ -60,23 +60,23 @@ def tread(
     ground: Ground,
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats]:
-    """Joints (frames, 17, 3) [m], world, of a person who follows a path, and where the feet point.
+    """Return joints (frames, 17, 3) [m], world, and feet directions of a person on a path.
 
-    Feet point (frames, 2) [rad], left and right, from the x axis towards y, as the path did where
-    they were set down. Actions of the path are blended in.
+    Feet point (frames, 2) [rad], left and right, from the x axis towards y, along the path at the
+    time of their placement. Actions of the path are blended in.
 
     Args:
         body: measures.
         path: covers `times` and a stride before and after.
         times: (frames,) [s].
-        ground: what feet stand on.
-        rng: draws where in the stride the path begins and how the head turns.
+        ground: height of the ground under the feet.
+        rng: draws the stride phase at the start of the path and the turns of the head.
     """
     cycle = stride_cycle(path, rng.random())
     swing = 2.0 * np.pi * np.interp(times, path.time, cycle)
     speed, heading = (np.interp(times, path.time, x) for x in (path.speed, path.heading))
     run = _running(speed)
-    # Who hardly moves hardly swings.
+    # Slow people hardly swing their arms.
     pace = np.minimum(speed, 1.0)
     sway = pace * np.sin(swing)
 
@@ -122,15 +122,15 @@ def tread(
 
 
 def stride_cycle(path: GroundPath, phase: float) -> Floats:
-    """Strides made (samples,): whole when the left foot is in mid-stance, half when the right is.
+    """Return strides made (samples,): whole at mid-stance of the left foot, half at the right's.
 
-    Strides get longer and faster with speed: 0.9 a second at 1 m/s, 1.4 at 4 m/s, 2.2 at 9 m/s.
+    Strides get longer and faster with speed: 0.9 per second at 1 m/s, 1.4 at 4 m/s, 2.2 at 9 m/s.
     Sources are in docs/synthetic.md.
-    Who stands rests a quarter of the way between the two, where both feet are on the ground.
+    A standing person rests a quarter of the way between the two, with both feet on the ground.
 
     Args:
         path: of a person.
-        phase: stride at the path's beginning [1], for a person who never stands.
+        phase: stride at the start of the path [1], for a person who never stands.
     """
     pace = _pace(path)
     rate = np.where(pace < 1.0, 0.91 * np.sqrt(pace), np.interp(pace, *STRIDES))
@@ -148,7 +148,7 @@ def stride_cycle(path: GroundPath, phase: float) -> Floats:
         made[begin:end] = here
         natural = cycle[end - 1 : following + 1] - cycle[end - 1]
         if following < len(cycle):
-            # Whole steps lead from one rest to the next; a pace aside takes one or two.
+            # Whole steps lead from one rest to the next; a shift sideways takes one or two.
             moved = float(np.linalg.norm(path.position[following] - path.position[end - 1]))
             steps = max(round(2.0 * natural[-1]), min(2, int(np.ceil(moved / 0.2 - 0.25))))
             natural = natural * (0.5 * steps / natural[-1])
@@ -158,13 +158,13 @@ def stride_cycle(path: GroundPath, phase: float) -> Floats:
 
 
 def _pace(path: GroundPath) -> Floats:
-    """Speed that steps answer to (samples,) [m/s]: turning on the spot takes steps too."""
+    """Return the speed that determines steps (samples,) [m/s], turning on the spot included."""
     turning = TURNING_ARM * np.abs(np.gradient(path.heading, path.time))
     return np.maximum(path.speed, np.minimum(turning, 1.0))
 
 
 def _rests(path: GroundPath, pace: Floats) -> list[tuple[int, int]]:
-    """Stretches of samples, first and behind the last, in which a person stands."""
+    """Return the intervals of samples, first and behind the last, in which a person stands."""
     slow = np.concatenate([[False], pace < STANDING_SPEED, [False]])
     begins, ends = np.flatnonzero(~slow[:-1] & slow[1:]), np.flatnonzero(slow[:-1] & ~slow[1:])
     long = path.time[np.minimum(ends, len(path.time) - 1)] - path.time[begins] >= STANDING_TIME
@@ -172,12 +172,12 @@ def _rests(path: GroundPath, pace: Floats) -> list[tuple[int, int]]:
 
 
 def _running(speed: Floats) -> Floats:
-    """How much of a run it is: 0 at a walk of 1 m/s, 1 at 4 m/s, at most 1.5."""
+    """Return the running share: 0 at a walk of 1 m/s, 1 at 4 m/s, at most 1.5."""
     return np.clip((speed - 1.0) / 3.0, 0.0, 1.5)
 
 
 def _arm(angle: Floats, forward: Floats, outward: Floats) -> Floats:
-    """Unit vectors from hanging down, raised forward by `angle` [rad] and a little outward."""
+    """Return unit vectors from hanging, raised forward by `angle` [rad] and a little outward."""
     down = np.array([0.0, 0.0, -1.0])
     vector = np.cos(angle)[:, None] * down + np.sin(angle)[:, None] * forward + outward
     return unit(vector)
@@ -191,9 +191,9 @@ def _ankles(
     ground: Ground,
     sign: float,
 ) -> tuple[Floats, Floats]:
-    """Ankles (frames, 3) and where the feet point (frames,) [rad].
+    """Return ankles (frames, 3) and the directions of the feet (frames,) [rad].
 
-    Planted around whole cycles, in between carried to the next foothold.
+    An ankle is planted around whole cycles, and moves to the next foothold in between.
     """
     now = np.interp(times, path.time, cycle)
     before = np.floor(now)

@@ -1,4 +1,4 @@
-"""The scene without people in a picture: each pixel carried back to what it sees."""
+"""Image of the scene without people: each pixel cast back to the surface that it sees."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ Floats = NDArray[np.float64]
 Pictures = NDArray[np.float32]
 
 _CELL: Final = 4
-"""Between places where the lens is inverted [px]: between them straight lines are off by
-k1 / focal length of a pixel, a few ten-thousandths."""
+"""Grid spacing of the lens inversion [px]: between the nodes, straight lines have errors of k1 /
+focal length of a pixel, a few ten-thousandths."""
 
 
 def plane_grid(camera: Camera, width: int, height: int) -> Floats:
@@ -70,7 +70,7 @@ def paint_scene(
         table: (64, 64) random numbers of the grass.
         scene: length and width of the pitch, its bend, contrast of stripes, paint.
         half: (2,) half the distances between the boards [m].
-        look: which stadium.
+        look: seed of the stadium's look.
         color: (height, width, 3), written.
         ground: (height, width, 2), written.
         distance: (height, width) from the camera [m], written; infinite in the sky.
@@ -98,8 +98,8 @@ def paint_scene(
                 place[3 + 2 * k] = s * ey + ds * dy
             place[6], place[7] = dx / sink, dy / sink
             inside = min(half[0] - abs(place[0]), half[1] - abs(place[1]))
-            # A board hides the ground behind it as far as the ray is below its top; pixels that
-            # see only ground need no more.
+            # A board hides the ground behind it as far as the ray is below its top; pixels that see
+            # only ground skip the scenery.
             clear = (BOARD_HEIGHT + 0.3) * (abs(dx) + abs(dy)) / abs(dz) + 1.0
             if inside > clear:
                 ground[v, u, 0], ground[v, u, 1] = place[0], place[1]
@@ -146,7 +146,7 @@ def _turf(paint: Floats, table: Floats, place: Floats, scene: Floats, color: Pic
     color[2] = bright * (0.205 - 0.006 * yellow)
     cover = scene[4] * paint_cover(paint, place)
     if cover > 0.0:
-        # Grass shows through where paint is worn.
+        # Grass shows through worn paint.
         cover *= min(0.88 + 0.06 * wear(table, place), 0.97)
         white = 0.9 + 0.03 * (bright - 1.0)
         color[0] += cover * (white - color[0])

@@ -1,4 +1,4 @@
-"""When people who stand do what, and when a goalkeeper is ready."""
+"""Actions of standing people, and readiness of a goalkeeper."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from worldpose.synthetic.standing import hands_on_hips, look_around, ready, shif
 Floats = NDArray[np.float64]
 
 STANDING_SPEED: Final = 0.25
-"""Who is slower stands [m/s]."""
+"""Slower people stand [m/s]."""
 SHORTEST: Final = 1.6
-"""Shortest rest in which people do something [s]."""
+"""Minimum duration of a rest with actions [s]."""
 LONGEST: Final = (3.0, 6.0)
-"""What they do takes at most between these [s]."""
+"""Range of the maximum duration of an action [s]."""
 ALERT: Final = 35.0
-"""Ball's distance to the goal at which a goalkeeper gets ready [m]."""
+"""Distance of the ball from the goal at which a goalkeeper gets ready [m]."""
 
 
 def stand_about(path: GroundPath, rates: ActionRates, rng: np.random.Generator) -> GroundPath:
-    """Return the path with what a person does who stands: shift weight, look, hands on hips."""
+    """Return the path with actions while the person stands: shift weight, look, hands on hips."""
     motions = (shift_weight, look_around, hands_on_hips)
     actions = list(path.actions)
     for begin, end in _rests(path):
@@ -40,7 +40,7 @@ def stand_about(path: GroundPath, rates: ActionRates, rng: np.random.Generator) 
 
 
 def keep_ready(path: GroundPath, goal: Floats, ball: Floats) -> GroundPath:
-    """Return a goalkeeper's path on which he is ready while he stands and the ball is near.
+    """Return a goalkeeper's path, with readiness during rests while the ball is near.
 
     Args:
         path: of the goalkeeper.
@@ -56,7 +56,7 @@ def keep_ready(path: GroundPath, goal: Floats, ball: Floats) -> GroundPath:
 
 
 def _rests(path: GroundPath, also: NDArray[np.bool_] | None = None) -> list[tuple[float, float]]:
-    """Begins and ends [s] of stretches in which a person stands and does nothing else."""
+    """Return start and end [s] of intervals in which a person stands without other actions."""
     still = path.speed < STANDING_SPEED
     turning = np.abs(np.gradient(path.heading, path.time))
     still &= turning < 0.5 * STANDING_SPEED

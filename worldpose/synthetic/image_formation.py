@@ -1,4 +1,4 @@
-"""One exposure: people and things drawn over a scene, then lens and sensor."""
+"""Image formation of one exposure: people and things drawn over a scene, then lens and sensor."""
 
 from __future__ import annotations
 
@@ -26,28 +26,28 @@ Singles = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
 AMBIENT: Final = 0.58
-"""Of the light on an upright surface, what comes from all around [1]."""
+"""Ambient light on an upright surface [1]."""
 FROM_ABOVE: Final = 0.12
-"""How much more of it falls on a surface that faces up [1]."""
+"""Additional ambient light on a surface that faces up [1]."""
 DIRECT: Final = 1.3
-"""What a light gives a surface that faces it, for the share of light its shadow takes [1]."""
+"""Light on a surface that faces a light source, per share of light that its shadow takes [1]."""
 _MARGIN: Final = 3
-"""Around what people change [px]: as far as blur reaches."""
+"""Margin around pixels that people change [px]: the extent of the blur."""
 _SPARE: Final = 64
-"""Rows and columns that noise has more than a picture, to begin elsewhere in every frame [px]."""
+"""Additional rows and columns of noise, for another offset in every frame [px]."""
 
 
 @dataclass(frozen=True, eq=False)
 class RenderedFrame:
-    """A picture and what is where in it.
+    """An image with its pixel labels.
 
     Attributes:
         picture: (height, width, 3) RGB.
-        person_ids: (height, width) the person that fills most of a pixel, -1 for nobody.
-        boxes: (persons, 4) left, top, right, bottom of everybody's whole outline [px], also
-            where it leaves the picture; NaN for who is missing or behind the camera.
-        visible: (persons,) share of the outline's part in the picture that nobody hides [1];
-            0 for who is not in it.
+        person_ids: (height, width) the person that fills most of a pixel, -1 for none.
+        boxes: (persons, 4) left, top, right, bottom of every person's whole outline [px], also
+            outside the image; NaN for a person who is missing or behind the camera.
+        visible: (persons,) unoccluded share of the outline's part in the image [1]; 0 for a person
+            outside the image.
     """
 
     picture: Bytes
@@ -58,13 +58,13 @@ class RenderedFrame:
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """People, and things besides them, while the shutter is open.
+    """People and other things while the shutter is open.
 
     Attributes:
         cast: the people.
-        opened: where they are when the shutter opens.
-        closed: where they are when it closes.
-        props: things that stay where they are.
+        opened: their surfaces when the shutter opens.
+        closed: their surfaces when it closes.
+        props: static things.
     """
 
     cast: Cast
@@ -90,7 +90,7 @@ def expose(
     venue: Venue, camera: Camera, sharp: Bytes, blurred: Bytes, grain: NDArray[np.int8],
     moment: Moment, frame: int,
 ) -> RenderedFrame:  # fmt: skip
-    """Return the picture of people before a scene.
+    """Return the image of people before a scene.
 
     Args:
         venue: the stadium.
@@ -98,8 +98,8 @@ def expose(
         sharp: (height, width, 3) the scene without them; changed in place.
         blurred: the same through the lens; changed in place.
         grain: of `sensor_grain`.
-        moment: who and what is there.
-        frame: gives every picture noise of its own.
+        moment: people and things in the scene.
+        frame: seeds the noise of this image.
     """
     height, width = sharp.shape[:2]
     cast = moment.cast
@@ -148,7 +148,7 @@ def expose(
 def _outlined(
     venue: Venue, camera: Camera, moment: Moment, width: int, height: int
 ) -> tuple[list[_Drawn], list[Box | None], Floats]:
-    """All surfaces, people first; the part of the picture each is in; people's boxes (n, 4)."""
+    """Return all surfaces, people first; the image region of each; people's boxes (n, 4)."""
     cast = moment.cast
     opened = outline_surfaces(camera, moment.opened.vertices)
     closed = opened
@@ -180,7 +180,7 @@ def _span(opened: Outlines, closed: Outlines, person: int, width: int, height: i
 
 
 def _lit(venue: Venue, surfaces: Surfaces) -> Singles:
-    """Return the light (persons, vertices) on surfaces, 1 = as their colours are."""
+    """Return the light (persons, vertices) on surfaces, 1 = their own colour."""
     normals, vertices = surfaces.normals, surfaces.vertices
     light = np.float32(AMBIENT) + np.float32(FROM_ABOVE) * normals[..., 2]
     for way in venue.lights:
@@ -204,17 +204,17 @@ def _haze(venue: Venue, outline: Singles) -> Singles:
 
 
 def clusters(spans: Sequence[Box | None]) -> list[tuple[Box, list[int]]]:
-    """Return parts of a picture that share no pixel, each with the numbers of what is in it.
+    """Return image regions that share no pixel, each with the indices of the things in it.
 
     Args:
-        spans: left, top, right, bottom of each thing; None for what is not in the picture.
+        spans: left, top, right, bottom of each thing; None for a thing outside the image.
     """
     parts: list[tuple[Box, list[int]]] = []
     for number, span in enumerate(spans):
         if span is None:
             continue
         box, members = span, [number]
-        # A part that grows may reach others that it did not.
+        # A region that grows may reach others that it did not reach before.
         while touching := [each for each in parts if _overlap(each[0], box)]:
             parts = [each for each in parts if each not in touching]
             for other, others in touching:
@@ -230,7 +230,7 @@ def _overlap(a: Box, b: Box) -> bool:
 
 
 def through_lens(light: Singles, settings: RenderingSettings) -> Singles:
-    """Return a picture blurred by the lens."""
+    """Return an image blurred by the lens."""
     if settings.blur == 0.0:
         return light
     return np.asarray(cv2.GaussianBlur(light, (0, 0), settings.blur), dtype=np.float32)
@@ -252,7 +252,7 @@ def sensor_grain(venue: Venue, camera: Camera) -> NDArray[np.int8]:
 
 
 def _refocus(settings: RenderingSettings, sharp: Bytes, blurred: Bytes, box: Box) -> None:
-    """Write into `blurred` what the lens makes of `sharp` around a box."""
+    """Write `sharp` blurred by the lens into `blurred` around a box."""
     height, width = sharp.shape[:2]
     left, top = max(box[0] - _MARGIN, 0), max(box[1] - _MARGIN, 0)
     right, bottom = min(box[2] + _MARGIN, width), min(box[3] + _MARGIN, height)
@@ -267,7 +267,7 @@ def _refocus(settings: RenderingSettings, sharp: Bytes, blurred: Bytes, box: Box
 
 @compiled
 def _add_grain(picture: Bytes, grain: NDArray[np.int8]) -> None:
-    """Add noise (height, 3 width) to a picture (height, width, 3), in place."""
+    """Add noise (height, 3 width) to an image (height, width, 3), in place."""
     for v in range(picture.shape[0]):
         row, noise = picture[v].reshape(-1), grain[v]
         for u in range(len(row)):

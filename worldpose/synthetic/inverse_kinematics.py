@@ -1,7 +1,7 @@
 """Bodies for skeletons: analytic inverse kinematics from 17 joints to the open body's angles.
 
-Every frame is solved by itself, in closed form and continuously: no turn depends on a sign or an
-angle that jumps as limbs pass through straight. So a body at a time is the same whoever asks.
+Every frame is solved independently, in closed form and continuously: no rotation depends on a sign
+or an angle that jumps as limbs pass through straight. So a body depends on its time alone.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ Floats = NDArray[np.float64]
 Ground = Callable[[Floats, Floats], Floats]
 
 BIAS: Final = 0.1
-"""How much a limb's natural bend has a say in its plane, next to the sine of the bend it has [1]:
-nearly straight limbs keep their twist."""
+"""Weight of a limb's natural bend in its plane, relative to the sine of its actual bend [1]: nearly
+straight limbs keep their twist."""
 POINTED: Final = np.radians(10.0)
-"""How far the toes of a foot in the air point down from square with the shank [rad]."""
+"""Angle by which toes of a foot in the air point down from square with the shank [rad]."""
 TREADING: Final = (0.25, 0.6)
-"""Upward part of the shank's direction [1]: below the first a foot does not mind the ground, as of
-somebody who lies; above the second it treads on it."""
+"""Upward part of the shank's direction [1]: below the first a foot ignores the ground, as of a
+lying person; above the second the foot is flat on it."""
 LEVELLED: Final = 0.15
-"""An ankle that much higher than one that stands does not roll the foot level any more [m]."""
+"""An ankle higher than a standing one by this much no longer levels the foot's roll [m]."""
 
 _X, _Z = np.eye(3)[[0, 2]]
 _UP = np.array([0.0, 0.0, 1.0])
@@ -38,16 +38,16 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, eq=False)
 class Embodied:
-    """A figure in motion."""
+    """A body in motion."""
 
     figure: Figure
     rotations: Floats
-    """(frames, 24, 3, 3), of every joint, world from model."""
+    """(frames, 24, 3, 3), rotation of every joint, world from model."""
     pelvis: Floats
     """(frames, 3) [m], world: the model's first joint."""
 
     def joints(self) -> Floats:
-        """The model's joints (frames, 24, 3) [m], world."""
+        """Return the model's joints (frames, 24, 3) [m], world."""
         rest, parents = self.figure.joints, self.figure.model.parents
         joints = np.empty((len(self.pelvis), len(rest), 3))
         joints[:, 0] = self.pelvis
@@ -57,10 +57,10 @@ class Embodied:
         return joints
 
     def keypoints(self) -> Floats:
-        """The body's COCO-17 keypoints (frames, 17, 3) [m], world.
+        """Return the body's COCO-17 keypoints (frames, 17, 3) [m], world.
 
-        The same as `worldpose.body.fold_keypoints` of `parameters`: of the 17 points only those of
-        the face are on the surface, and nothing but the head moves them.
+        Equal to `worldpose.body.fold_keypoints` of `parameters`: of the 17 points only those of the
+        face are on the surface, and only the head moves them.
         """
         joints = self.joints()
         keypoints = np.empty((len(joints), 17, 3))
@@ -71,7 +71,7 @@ class Embodied:
         return keypoints
 
     def parameters(self) -> BodyParameters:
-        """Shape, angles and place of the body, a batch (frames,)."""
+        """Return shape, angles and place of the body, a batch (frames,)."""
         parents = self.figure.model.parents[1:]
         local = self.rotations.copy()
         local[:, 1:] = self.rotations[:, parents].swapaxes(-1, -2) @ self.rotations[:, 1:]
@@ -87,19 +87,19 @@ class Embodied:
 def embody(
     figure: Figure, joints: Floats, ground: Ground, courses: Floats | None = None
 ) -> Embodied:
-    """Return the body that moves as a skeleton does.
+    """Return the body that follows the motion of a skeleton.
 
-    Hips stand where the skeleton's do, and ankles where its ankles are, as far as the legs reach;
-    knees and arms have its planes and directions. What 17 joints leave open is filled in as people
-    move: the spine bends and twists evenly, the neck turns half as far as the head, hands go on
-    as forearms do, feet are flat where they stand and keep out of the ground where they do not.
+    Hips match the skeleton's, and ankles match its ankles, as far as the legs reach; knees and arms
+    have its planes and directions. Typical human motion completes the parameters that 17 joints
+    leave open: the spine bends and twists evenly, the neck turns half as far as the head, hands
+    continue forearms, feet are flat where they stand and stay above the ground elsewhere.
 
     Args:
         figure: the person.
         joints: (frames, 17, 3) [m], world, COCO-17, of bones about as long as the figure's.
         ground: height of the ground at x and y [m], world.
-        courses: (frames, 2) [rad] from the x axis towards y, where left and right foot point when
-            they tread, within what a hip can turn; where the knees point without.
+        courses: (frames, 2) [rad] from the x axis towards y, direction of left and right foot when
+            they tread, within what a hip can turn; without, the knees' direction.
     """
     rest = figure.joints
     turns = np.empty((len(joints), len(rest), 3, 3))
@@ -135,9 +135,9 @@ def embody(
 
 
 def _elbow(figure: Figure, side: int, chest: Floats, upper: Floats, fore: Floats) -> Floats:
-    """The axis (frames, 3) about which an elbow bends.
+    """Return the axis (frames, 3) about which an elbow bends.
 
-    An arm without a bend of its own has that of the unposed arm, brought along the shortest way.
+    A straight arm takes the axis of the unposed arm, rotated along the shortest way.
     """
     straight = chest @ _unit(figure.joints[18 + side] - figure.joints[16 + side])
     ahead, both = chest @ _Z, straight + upper
@@ -149,7 +149,7 @@ def _elbow(figure: Figure, side: int, chest: Floats, upper: Floats, fore: Floats
 def _leg(
     figure: Figure, side: int, hip: Floats, joints: Floats, forward: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Thigh and shank (frames, 3) [m] whose ends are hip and ankle, and the knee's axis."""
+    """Return thigh and shank (frames, 3) [m] from hip to ankle, and the knee's axis."""
     bones = figure.joints[[4 + side, 7 + side]] - figure.joints[[1 + side, 4 + side]]
     upper, lower = np.linalg.norm(bones, axis=-1)
     along = joints[:, 15 + side] - hip
@@ -167,14 +167,14 @@ def _leg(
 def _foot(
     figure: Figure, turned: Floats, shank: Floats, clear: Floats, course: Floats | None
 ) -> tuple[Floats, Floats]:
-    """Turns of foot and toes (frames, 3, 3).
+    """Return rotations of foot and toes (frames, 3, 3).
 
     Args:
         figure: the person.
-        turned: (frames, 3, 3), of the shank.
+        turned: (frames, 3, 3), rotation of the shank.
         shank: (frames, 3) [m].
-        clear: (frames,) [m], how much higher the ankle is than that of a flat foot.
-        course: (frames,) [rad], where it points when it treads.
+        clear: (frames,) [m], height of the ankle above that of a flat foot.
+        course: (frames,) [rad], direction of the foot when it treads.
     """
     down = _unit(shank)
     hanging = np.cos(POINTED) * (turned @ _Z) + np.sin(POINTED) * down
@@ -198,10 +198,10 @@ def _foot(
 
 
 def _swung(ahead: Floats, course: Floats, share: Floats) -> Floats:
-    """Level directions (frames, 3) turned by a share of the way to a course.
+    """Return horizontal directions (frames, 3) turned by a share of the way to a course.
 
-    Up to half a right angle it is the whole way but for 2 degrees, 67 degrees at most, and nothing
-    towards a course straight behind: who turns about pivots on the foot.
+    Up to half a right angle the turn is complete but for 2 degrees; it is 67 degrees at most, and
+    zero towards a course straight behind: a person who turns about pivots on the foot.
     """
     sine = np.sin(course) * ahead[:, 0] - np.cos(course) * ahead[:, 1]
     angle = share * (sine + sine**3 / 6.0)
@@ -209,7 +209,7 @@ def _swung(ahead: Floats, course: Floats, share: Floats) -> Floats:
 
 
 def _held(value: Floats, below: Floats, above: Floats | float) -> Floats:
-    """Values softly kept between -below and above."""
+    """Return values softly limited to between -below and above."""
     room = np.maximum(np.where(value < 0.0, below, above), 1e-6)
     with np.errstate(invalid="ignore"):
         held: Floats = np.where(np.isinf(room), value, room * np.tanh(value / room))
@@ -217,30 +217,30 @@ def _held(value: Floats, below: Floats, above: Floats | float) -> Floats:
 
 
 def _smooth(value: Floats) -> Floats:
-    """From 0 to 1 while the value goes from 0 to 1, without a kink."""
+    """Return a smooth step from 0 to 1 while the value goes from 0 to 1."""
     within = np.clip(value, 0.0, 1.0)
     return within**2 * (3.0 - 2.0 * within)
 
 
 def _face(head: Floats) -> tuple[Floats, Floats]:
-    """From right to left ear, and from the ears to eyes and nose (..., 3)."""
+    """Return the vectors from right to left ear, and from the ears to eyes and nose (..., 3)."""
     nose, *eyes, left, right = (head[..., k, :] for k in range(5))
     return left - right, nose + sum(eyes) - 1.5 * (left + right)
 
 
 def _between(first: Floats, second: Floats, share: float) -> Floats:
-    """Turns (frames, 3, 3) on the way from the first to the second, less than half a turn away."""
+    """Return rotations (frames, 3, 3) between first and second, less than half a turn apart."""
     mixed = (1.0 - share) * first + share * second
     return _frame(mixed[..., 0], mixed[..., 1])
 
 
 def _turned(bone: Floats, side: Floats, to_bone: Floats, to_side: Floats) -> Floats:
-    """Turns (frames, 3, 3) of one direction to others, and of a second one to that side of them."""
+    """Return rotations (frames, 3, 3) of one direction to others, and a second to that side."""
     return _frame(to_bone, to_side) @ _frame(bone, side).T
 
 
 def _frame(first: Floats, second: Floats) -> Floats:
-    """Orthonormal columns (..., 3, 3): along the first, then towards the second."""
+    """Return orthonormal columns (..., 3, 3): along the first, then towards the second."""
     along = _unit(first)
     third = _unit(_cross(along, second))
     return np.stack([along, _cross(third, along), third], axis=-1)

@@ -1,4 +1,4 @@
-"""Key frames of the broadcast camera as a person picks and clicks them."""
+"""Key frames of the broadcast camera, with simulated clicks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from worldpose.synthetic.clicking import Clicks, click
 from worldpose.synthetic.settings import ClickSettings
 
 REACH: Final = 0.1
-"""How far from its even place a key frame is looked for, of the clip's length [1]."""
+"""Search range for a key frame around its even place, as a share of the clip's length [1]."""
 LOOKS: Final = 5
 """Frames that a person compares for one key frame [1]."""
 
@@ -27,14 +27,14 @@ def click_key_frames(
     count: int,
     rng: np.random.Generator,
 ) -> KeyFrames:
-    """Return what a person clicks in frames spread over a clip, each where there is most to click.
+    """Return clicks in frames spread over a clip, each at a local maximum of clickable markings.
 
     Args:
         cameras: the true ones, a batch (frames,).
-        pitch: as it is painted.
-        people: joints (frames, persons, 17, 3) [m], world, of those who hide what lies behind them.
-        settings: how exactly; lines and arcs are always drawn.
-        count: of key frames.
+        pitch: the painted pitch.
+        people: joints (frames, persons, 17, 3) [m], world, of possible occluders.
+        settings: accuracy; lines and arcs are always drawn.
+        count: number of key frames.
         rng: of the clicks.
     """
     frames = len(people)
@@ -65,5 +65,5 @@ def click_key_frames(
 
 
 def _content(clicks: Clicks) -> int:
-    """How much a frame tells: points twice, for they have two coordinates."""
+    """Return a frame's information: points count twice, because they have two coordinates."""
     return 2 * len(clicks.markings.points) + len(clicks.markings.drawn)

@@ -1,4 +1,4 @@
-"""What people wear and look like: pictures of kits, skin and hair, front and back in the T-pose."""
+"""Textures of people: kits, skin and hair, front and back in the T-pose."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _HAIR: Final = np.array(
 
 @dataclass(frozen=True, eq=False)
 class Kit:
-    """What the people of one role wear; colours (3,) RGB in [0, 1]."""
+    """Clothes of the people of one role; colours (3,) RGB in [0, 1]."""
 
     shirt: Floats
     second: Floats
@@ -71,7 +71,7 @@ class Kit:
 def draw_kits(
     rng: np.random.Generator, patterns: tuple[Pattern, ...] = PATTERNS
 ) -> dict[Role, Kit]:
-    """Return the kits of a match: two teams that can be told apart, keepers and officials."""
+    """Return the kits of a match: two distinguishable teams, keepers and officials."""
     first = _team_kit(rng, patterns, None)
     second = _team_kit(rng, patterns, first)
     order = rng.permutation(len(_BRIGHT))
@@ -119,10 +119,10 @@ def _jittered(color: Floats, rng: np.random.Generator) -> Floats:
 
 
 def paint_person(kit: Kit, number: int | None, rng: np.random.Generator) -> Bytes:
-    """Return the pictures (2, SIZE, SIZE, 3) of one person's front and back, in the T-pose.
+    """Return the textures (2, SIZE, SIZE, 3) of one person's front and back, in the T-pose.
 
     Args:
-        kit: what he wears.
+        kit: the person's clothes.
         number: on shirt and shorts.
         rng: draws skin, hair, boots and the folds of the cloth.
     """
@@ -172,7 +172,7 @@ def _paint_head(
     bearded: bool,
     front: bool,
 ) -> None:
-    """Paint face and hair; a tenth of the people have none."""
+    """Paint face and hair; a tenth of the people are bald."""
     covered = y > 0.435
     if front:
         face = ((x / 0.074) ** 2 + ((y - 0.49) / 0.092) ** 2) < 1.0
@@ -192,7 +192,7 @@ def _paint_head(
 
 
 def _patterned(kit: Kit, x: Floats, y: Floats) -> Floats:
-    """The shirt's colours (SIZE, SIZE, 3) without number and folds."""
+    """Return the shirt's colours (SIZE, SIZE, 3) without number and folds."""
     ahead = np.abs(x) < 0.20
     chosen = {
         "plain": np.zeros(x.shape, dtype=bool),
@@ -227,7 +227,7 @@ def _print_number(cloth: Floats, kit: Kit, number: int, *, back: bool) -> None:
 
 
 def _folds(rng: np.random.Generator) -> Floats:
-    """How bright creased cloth is (SIZE, SIZE), about 1."""
+    """Return the brightness of creased cloth (SIZE, SIZE), about 1."""
     grain = rng.standard_normal((SIZE, SIZE))
     broad = cv2.GaussianBlur(grain, (0, 0), 5.0)
     creases = cv2.GaussianBlur(grain, (0, 0), 1.5)

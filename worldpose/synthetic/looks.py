@@ -1,4 +1,4 @@
-"""How pictures of a scenario look: light, weather, kits, lens and sensor."""
+"""Look of a scenario's images: light, weather, kits, lens and sensor."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ PATTERNS: Final[tuple[Pattern, ...]] = (
 
 
 class RenderingSettings(Record):
-    """How a picture looks."""
+    """Look of an image."""
 
     stripes: float = Field(default=0.16, ge=0, le=1)
-    """Brightness of a mown stripe against its neighbour [1]; 0.1 to 0.2 in broadcast pictures."""
+    """Brightness of a mown stripe against its neighbour [1]; 0.1 to 0.2 in broadcast images."""
     paint: float = Field(default=1.0, ge=0, le=1)
     """Share of the grass that fresh paint hides [1]; 0 = no markings."""
     light: Literal["sun", "floodlights"] = "sun"
-    """One hard shadow a person, or four faint ones."""
+    """One hard shadow per person, or four faint ones."""
     stand_shadow: float = Field(default=0.45, ge=0, le=1)
-    """Share of the light that the shadow of a stand keeps off a part of the pitch [1], if the
-    sun shines; 0 = no such shadow."""
+    """Share of the light that a stand blocks on a part of the pitch [1], if the sun shines; 0 = no
+    such shadow."""
     fog: float = Field(default=0.0, ge=0, le=100)
     """Extinction [1/m]; at 0.01 a third of the contrast is left at 100 m."""
     exposure: float = Field(default=1.0, gt=0, le=100)
-    """Brightness of all [1]."""
+    """Brightness of the whole image [1]."""
     patterns: tuple[Pattern, ...] = PATTERNS
-    """What shirts are drawn from."""
+    """Shirt patterns to draw from."""
     bystanders: int = Field(default=0, ge=0, le=100)
     """People who stand 2.5 to 3.3 m behind the lines and do not play [1]: ball boys, stewards,
-    photographers. The truth knows nothing of them."""
+    photographers. The ground truth does not include them."""
     shutter: float = Field(default=0.004, ge=0, le=1)
-    """How long it is open in every frame [s]: 1/250 s, usual for sport by day."""
+    """Exposure time of every frame [s]: 1/250 s, usual for sport by day."""
     blur: float = Field(default=0.7, ge=0, le=100)
     """Standard deviation of the lens's and the codec's blur [px]; a sharp broadcast lens."""
     noise: float = Field(default=2.0, ge=0, le=1000)

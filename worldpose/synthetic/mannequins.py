@@ -1,4 +1,4 @@
-"""The open body as a renderer draws it: fewer vertices, loose clothes, places in kits' pictures."""
+"""The open body for rendering: fewer vertices, loose clothes, texture coordinates in kits."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 CELL: Final = 0.03
-"""Vertices of the body this close become one [m]: half a pixel to four at 38 to 150 px."""
+"""Cell size of the vertex clustering [m]: half a pixel to four at 38 to 150 px."""
 HAND: Final = 0.76
-"""Beyond that x of the T-pose are fingers, which become one mitten [m]."""
+"""Fingers are beyond that x of the T-pose; they become one mitten [m]."""
 TEXEL: Final = 0.0125
-"""Of the pictures of a kit [m]: a pixel of a person of 150 px."""
+"""Texel of a kit's textures [m]: a pixel of a person of 150 px."""
 LEFT, TOP, SIZE = -0.96, 0.68, 154
-"""Border of the pictures of a kit [m] and how many texels they have along each axis."""
+"""Border of a kit's textures [m] and number of texels along each axis."""
 WAIST, HEM, SLEEVE = -0.16, -0.53, 0.42
-"""Where shirt, shorts and sleeves end in the T-pose: y, y, and x of both arms [m]."""
+"""Ends of shirt, shorts and sleeves in the T-pose: y, y, and x of both arms [m]."""
 KNEE, BOOT, HAIRLINE = -0.70, -1.10, 0.575
 """Upper ends of socks and boots, lower end of the hair in front, y [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mannequin:
-    """What all people have in common before they are shaped and posed."""
+    """Common parts of all people, before shape and pose."""
 
     body: BodyModel
-    """Whose vertices these are, a part of them."""
+    """The body from which a part of the vertices is kept."""
     kept: NDArray[np.int64]
-    """(vertices,) which of the body's vertices."""
+    """(vertices,) indices of the kept vertices of the body."""
     clothed: Floats
-    """(vertices, 3) [m], the mean body in T-pose with what clothes and hair stand off the skin."""
+    """(vertices, 3) [m], the mean body in T-pose with the thickness of clothes and hair."""
     outward: Singles
     """(vertices, 3) unit normals of the same."""
     correctives: Singles
@@ -46,18 +46,18 @@ class Mannequin:
     bones: NDArray[np.int64]
     """(vertices, 4) joints that move each vertex."""
     shares: Singles
-    """(vertices, 4) of these joints, with sum 1."""
+    """(vertices, 4) skinning weights of these joints, with sum 1."""
     faces: NDArray[np.int32]
     """(triangles, 3), counter-clockwise seen from outside."""
     backs: NDArray[np.bool_]
     """(triangles,) whether a triangle faces backwards in the T-pose."""
     texels: Singles
-    """(vertices, 2) column and row in the pictures of a kit."""
+    """(vertices, 2) column and row in a kit's textures."""
 
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """People's clothed surfaces at a moment; those of missing people are NaN."""
+    """People's clothed surfaces at one time; those of missing people are NaN."""
 
     vertices: Singles
     """(persons, vertices, 3) [m], world."""
@@ -65,7 +65,7 @@ class Surfaces:
     """(persons, vertices, 3), unit."""
 
     def toward(self, other: Surfaces, share: float) -> Surfaces:
-        """Return where they are that share of the way to others, as they face now."""
+        """Return positions interpolated by a share towards others, with the present normals."""
         way = np.float32(share) * (other.vertices - self.vertices)
         return Surfaces(self.vertices + way, self.normals)
 
@@ -108,7 +108,7 @@ def pose_people(mannequin: Mannequin, shaped: Singles, poses: BodyParameters) ->
     """Return posed surfaces.
 
     Args:
-        mannequin: what they are made of.
+        mannequin: common model of the people.
         shaped: (persons, vertices, 3) of `shape_people`.
         poses: of the same people, a batch (persons,); NaN = missing.
     """
@@ -144,9 +144,9 @@ def _normals(vertices: Floats, faces: NDArray[np.int64]) -> Floats:
 def _clustered(
     vertices: Floats, faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return which vertices stay and the faces between them: one a cell, nearest to its mean.
+    """Return the kept vertices and the faces between them: one per cell, nearest to its mean.
 
-    No cell reaches across the middle of the body, so legs stay apart.
+    No cell crosses the middle of the body, so legs stay apart.
     """
     size = np.where(np.abs(vertices[:, :1]) > HAND, 2.0 * CELL, CELL)
     key = np.concatenate([np.floor(vertices / size), size], axis=1)
@@ -163,7 +163,7 @@ def _clustered(
 
 
 def _cloth(template: Floats, outward: Floats) -> Floats:
-    """How far clothes and hair stand off the skin (vertices,) [m]."""
+    """Return the thickness of clothes and hair over the skin (vertices,) [m]."""
     x, y, z = np.abs(template[:, 0]), template[:, 1], template[:, 2]
     off = np.zeros(len(template))
     trunk = (y > WAIST - 0.02) & (y < 0.32) & (x < SLEEVE)
@@ -172,7 +172,7 @@ def _cloth(template: Floats, outward: Floats) -> Floats:
     off[trunk & (x < 0.2)] += 0.012 * np.clip((0.1 - y[trunk & (x < 0.2)]) / 0.2, 0.0, 1.0)
     legs = (y <= WAIST - 0.02) & (y > HEM)
     off[legs] = 0.018 + 0.03 * (WAIST - y[legs]) / (WAIST - HEM)
-    # Inside the thighs there is no room.
+    # Clothes are thin at the inside of the thighs.
     off[legs] *= np.clip(0.5 + outward[legs, 0] * np.sign(template[legs, 0]), 0.2, 1.0)
     off[(y < KNEE) & (y > BOOT)] = 0.006
     off[y <= BOOT] = 0.008

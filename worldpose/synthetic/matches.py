@@ -1,4 +1,4 @@
-"""Synthetic match folders: what a user would bring in, with the truth beside it."""
+"""Synthetic match folders: the inputs that a user would supply, and the ground truth."""
 
 from __future__ import annotations
 
@@ -50,48 +50,48 @@ def simulate_match(
     masks: bool = False,
     advance: Advance | None = None,
 ) -> MatchSpec:
-    """Write a synthetic match folder with its truth; the same arguments give the same bytes.
+    """Write a synthetic match folder with its ground truth; the same arguments give the same bytes.
 
-    Besides what a match folder to be calibrated has (match.yaml, pitch.json, detections/,
-    annotations/, stills/) it holds, under reference/:
+    In addition to the files of a match folder to be calibrated (match.yaml, pitch.json,
+    detections/, annotations/, stills/) it holds, under reference/:
 
     - joints.npz (`worldpose.formats.write_joints`);
-    - poses/clip.npz, the bodies that these joints are keypoints of, as the WorldPose release has
-      them: betas (N, 10), global_orient (N, T, 3), body_pose (N, T, 69), transl (N, T, 3) in single
-      precision, and the name of the `body_model`;
+    - poses/clip.npz, the bodies that these joints are keypoints of, in the WorldPose release's
+      format: betas (N, 10), global_orient (N, T, 3), body_pose (N, T, 69), transl (N, T, 3) in
+      single precision, and the name of the `body_model`;
     - calibration.toml and cameras/<camera>.npz (`worldpose.formats.write_static_camera`) and, with
-      a row a frame, cameras/clip.npz of the broadcast camera;
-    - pitch.json as it is painted;
+      one row per frame, cameras/clip.npz of the broadcast camera;
+    - pitch.json of the painted pitch;
     - clicks.json: of every static camera, `wrong` clicks (`Clicks.wrong`), and whether they are
-      `clustered` in one part of the picture;
+      `clustered` in one part of the image;
     - identities/<camera or clip>.npz: `frame` (frames,) int64, `person` (frames, detections) int16,
-      the index into the joints file's `person_ids` of every detection, -1 for false people and
-      padding, and `displaced` (frames, detections, 17) uint8, keypoints put far off;
-    - clocks.json: frames that each static camera lies behind its stated clock.
+      the index into the joints file's `person_ids` of every detection, -1 for false positives and
+      padding, and `displaced` (frames, detections, 17) uint8, keypoints with gross errors;
+    - clocks.json: offset of each static camera behind its stated clock, in frames.
 
     Args:
-        scenario: what happens.
+        scenario: the scenario to simulate.
         seed: from 0.
-        out: absent or an empty folder; written whole or not at all.
+        out: absent or an empty folder; the write is atomic.
         duration: [s], instead of the scenario's.
         cameras: number of static cameras, instead of the scenario's.
         players: number of people, instead of the scenario's.
         trajectories: tracking data (`read_trajectories`) that drives the people instead; the clip
             ends with it.
-        calibrated: give the true static cameras, as calibration.toml; else there is such a file
-            only where the scenario misjudges cameras.
-        stills: add one picture of every static camera, about a second each.
-        video: add the broadcast camera's video, about 0.1 s a frame, clicked key frames, and
-            bodies that a method of one picture sees in it (`estimates/`), where the scenario has
-            key frames.
-        render: film all cameras (`worldpose.synthetic.footage.film_scene`), and give no detections:
-            there is nothing but pixels to work from. Stills are first frames.
-        masks: add who is where in every pixel of what is filmed.
-        advance: told of the filming's progress.
+        calibrated: write the true static cameras as calibration.toml; without, the folder has such
+            a file only if the scenario has calibration errors.
+        stills: add one image of every static camera, about a second each.
+        video: if the scenario has key frames, add the broadcast camera's video, about 0.1 s per
+            frame, annotated key frames, and bodies from a simulated monocular method
+            (`estimates/`).
+        render: film all cameras (`worldpose.synthetic.footage.film_scene`), and write no
+            detections, so that pixels are the only input. Stills are first frames.
+        masks: add person masks of all filmed frames.
+        advance: receives the filming's progress.
         mocap: motion capture (`worldpose.synthetic.clips.read_clip`) that one person plays.
 
     Returns:
-        The match's match.yaml. Its id names scenario, seed and what differs from the scenario.
+        The match's match.yaml. Its id names scenario, seed and overrides of the scenario.
 
     Raises:
         InputError: `out` holds files, or the trajectories or the capture cannot be used.
@@ -176,10 +176,10 @@ def simulate_match(
 
 
 def _stills(scenario: Scenario, scene: Scene, seed: int) -> dict[str, NDArray[np.uint8]]:
-    """One picture of every static camera."""
+    """Return one image of every static camera."""
     painted = PitchTemplate.from_spec(scenario.pitch)
     people, drawn = scene.truth.joints[0], scene.cameras
-    with ThreadPoolExecutor() as pool:  # the renderer's kernels let other threads run
+    with ThreadPoolExecutor() as pool:  # the renderer's kernels release the GIL
         rendered = pool.map(
             lambda camera: render_pitch(camera, painted, people, seed, scenario.look),
             drawn.values(),
@@ -188,7 +188,7 @@ def _stills(scenario: Scenario, scene: Scene, seed: int) -> dict[str, NDArray[np
 
 
 def _key_frames(scenario: Scenario, scene: Scene, seed: int) -> dict[str, KeyFrames]:
-    """What was clicked in the broadcast camera's video, where the scenario has any."""
+    """Return the annotated key frames of the broadcast camera's video, if the scenario has any."""
     if scene.broadcast is None or not scenario.key_frames:
         return {}
     painted = PitchTemplate.from_spec(scenario.pitch)
@@ -202,7 +202,7 @@ def _key_frames(scenario: Scenario, scene: Scene, seed: int) -> dict[str, KeyFra
 def _write_broadcast(
     folder: Path, scenario: Scenario, camera: Camera, scene: Scene, seed: int
 ) -> None:
-    """Write the broadcast camera's video, and the bodies that were estimated from it."""
+    """Write the broadcast camera's video, and the bodies estimated from it."""
     file = folder / "broadcast" / f"{CLIP_ID}.mp4"
     file.parent.mkdir()
     painted = PitchTemplate.from_spec(scenario.pitch)
@@ -215,13 +215,13 @@ def _write_broadcast(
 def write_references(
     folder: Path, scenario: Scenario, scene: Scene, *, detected: bool = True
 ) -> None:
-    """Write the truth of a scene: joints, cameras, clocks, pitch and who every detection is.
+    """Write the ground truth of a scene: joints, cameras, clocks, pitch and detections' persons.
 
     Args:
         folder: reference/ of the match.
-        scenario: what it is a scene of.
-        scene: the truth.
-        detected: whether the match has the scene's detections.
+        scenario: of the scene.
+        scene: the ground truth.
+        detected: whether the match includes the scene's detections.
     """
     write_joints(folder / "joints.npz", scene.truth)
     write_poses(folder / "poses" / f"{CLIP_ID}.npz", scene.poses, OPEN_BODY)

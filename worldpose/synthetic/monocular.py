@@ -1,4 +1,4 @@
-"""What a method of one picture makes of people: turns with errors, depth and size by guess (S4)."""
+"""Simulated monocular body estimates: rotations with errors, guessed depth and size (S4)."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ Floats = NDArray[np.float64]
 
 
 class MonocularErrors(Record):
-    """How such methods err; together 80 mm of mean joint distance after alignment (PA-MPJPE)."""
+    """Errors of such methods; together 80 mm of mean joint distance after alignment (PA-MPJPE)."""
 
     turn: float = Field(default=0.135, ge=0, le=100)
-    """Of every joint's turn, standard deviation about each axis [rad]."""
+    """Error of every joint's rotation, standard deviation about each axis [rad]."""
     facing: float = Field(default=0.2, ge=0, le=100)
-    """Of the pelvis' turn, about each axis [rad]."""
+    """Error of the pelvis' rotation, about each axis [rad]."""
     time: float = Field(default=0.4, gt=0, le=100)
-    """Time in which errors forget themselves by a factor e [s]: pictures hardly change."""
+    """Time constant of the errors' correlation [s]: images hardly change."""
     white: float = Field(default=0.3, ge=0, le=1)
-    """Share of the errors' variance that is new in every frame [1]."""
+    """Share of the errors' variance that is independent per frame [1]."""
     size: float = Field(default=0.1, ge=0, le=10)
-    """Of the scale in the crop, relative [1]: children look like adults far away."""
+    """Error of the scale in the crop, relative [1]: children look like adults far away."""
     place: float = Field(default=0.03, ge=0, le=10)
-    """Of a box's middle, along each axis of the picture [box side]."""
+    """Error of a box's centre, along each image axis [box side]."""
     missed: float = Field(default=0.1, ge=0, lt=1)
-    """Share of bodies in the picture that are not found [1]."""
+    """Share of bodies in the image that are not found [1]."""
 
 
 def estimate_bodies(
@@ -44,13 +44,13 @@ def estimate_bodies(
     errors: MonocularErrors,
     rng: np.random.Generator,
 ) -> dict[str, NDArray[np.generic]]:
-    """Return estimates of a clip's bodies as 4DHumans writes them, a row for each that it finds.
+    """Return estimates of a clip's bodies in 4DHumans' format, a row for each found body.
 
     Arrays: `frame`, `global_orient` (rows, 1, 3, 3) relative to a camera that looks at the crop's
-    middle, `body_pose` (rows, 23, 3, 3), `betas` (rows, shapes) of nobody in particular,
+    middle, `body_pose` (rows, 23, 3, 3), `betas` (rows, shapes) without person-specific shape,
     `pred_cam` (rows, 3), the crop's weak perspective: scale and offset [1], `box_center` (rows, 2)
-    [px], `box_size` (rows,) [px], `img_size` (rows, 2) [px]. Rows of a frame are in no order of
-    persons.
+    [px], `box_size` (rows,) [px], `img_size` (rows, 2) [px]. The order of a frame's rows does not
+    identify persons.
 
     Args:
         model: the bodies'.
@@ -58,7 +58,7 @@ def estimate_bodies(
         camera: batch (frames,).
         fps: [1/s].
         errors: of the method.
-        rng: draws the same numbers whoever is in the picture.
+        rng: draws the same numbers for any people in the image.
     """
     frames, persons = bodies.batch_shape
     given = np.concatenate([bodies.global_orient, bodies.body_pose], axis=-1)
@@ -88,7 +88,7 @@ def estimate_bodies(
     ray = np.concatenate([seen_at, np.ones((len(frame), 1))], axis=-1)
     to_crop = _facing(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
     found[:, 0] = to_crop @ camera.cam_from_world.rotation[frame] @ found[:, 0]
-    # An adult of 1.7 m fills so much of a crop: scale 2 / (1.7 m) is a crop as high as he is.
+    # Scale 2 / (1.7 m) is a crop as high as an adult of 1.7 m.
     scale = 2.0 * size[frame, person] / (1.2 * 1.7)
     offset = (image[frame, person, 0] - center[frame, person]) / (0.5 * side[frame, person, None])
     pelvis = model.joint_template[0, :2] * [1.0, -1.0]
@@ -107,7 +107,7 @@ def estimate_bodies(
 def write_estimates(
     path: Path, poses: BodyParameters, camera: Camera, fps: float, seed: int
 ) -> None:
-    """Write what `estimate_bodies` makes of a scene's open bodies.
+    """Write the results of `estimate_bodies` for a scene's open bodies.
 
     Args:
         path: the npz file.
@@ -124,7 +124,7 @@ def write_estimates(
 
 
 def _facing(ahead: Floats) -> Floats:
-    """The least turns (n, 3, 3) from directions (n, 3) to straight ahead."""
+    """Return the smallest rotations (n, 3, 3) from directions (n, 3) to straight ahead."""
     across = np.cross(ahead, [0.0, 0.0, 1.0])
     sine = np.linalg.norm(across, axis=-1, keepdims=True)
     angle = np.arctan2(sine, ahead[:, 2:])

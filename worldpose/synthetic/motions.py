@@ -1,4 +1,4 @@
-"""Motions of a body that are no gait, as key poses in time.
+"""Motions of a body other than gait, as key poses in time.
 
 Angles are those of sports biomechanics: hips and shoulders flex forward and abduct outward, knees
 and elbows flex; zero is standing upright with arms hanging.
@@ -26,7 +26,7 @@ class Arm(NamedTuple):
     abduction: float = 9.0
     elbow: float = 22.0
     inward: float = 0.0
-    """How far the elbow bends inward instead of forward."""
+    """Angle by which the elbow bends inward instead of forward."""
 
 
 class Leg(NamedTuple):
@@ -36,7 +36,7 @@ class Leg(NamedTuple):
     abduction: float = 0.0
     knee: float = 24.0
     inward: float = 0.0
-    """How far the knee's hinge turns the shank inward instead of backward."""
+    """Angle by which the knee's hinge turns the shank inward instead of backward."""
 
 
 class Height(NamedTuple):
@@ -54,20 +54,20 @@ class Height(NamedTuple):
 
 
 class Stance(NamedTuple):
-    """A foot that stands somewhere."""
+    """Standing phase of a foot at one place."""
 
     lift: float
-    """When it leaves for there [s] from the beginning."""
+    """Departure for that place [s] from the beginning."""
     land: float
-    """When it arrives [s]."""
+    """Arrival [s]."""
     leave: float
-    """When it leaves [s]."""
+    """Departure from it [s]."""
     under: float
-    """It stands where the person is then [s]."""
+    """Time that defines the person's position as the foot's place [s]."""
     ahead: float = 0.0
-    """And that much ahead [m]."""
+    """Offset of the foot ahead of it [m]."""
     outward: float = 0.0
-    """And that much outward [m]."""
+    """Offset of the foot outward [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +83,8 @@ class Motion:
         stances: of the acting foot and of the other one; before and after both walk.
         ease: time of blending in and out [s].
         flight: when the body is in the air [s]; None = never.
-        blow: when it comes to the point: the kick, the head at the ball, the tackle [s].
-        stops: when the person begins to come to rest [s]; None = keeps going.
+        blow: time of the decisive contact: the kick, the head at the ball, the tackle [s].
+        stops: when the person begins to come to rest [s]; None = does not stop.
         moves_again: when the person is up again [s].
     """
 
@@ -103,13 +103,13 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Action:
-    """What a person does at some time, besides going somewhere.
+    """A person's action at some time, in addition to moving somewhere.
 
     Attributes:
         begin: [s].
         motion: of the body.
         left: whether the left side acts.
-        turn: where it is aimed, from where the person faces, to the left [rad].
+        turn: direction of its aim, relative to the heading, to the left [rad].
     """
 
     begin: float
@@ -119,20 +119,20 @@ class Action:
 
     @property
     def end(self) -> float:
-        """When it is over [s]."""
+        """Return the end time [s]."""
         return self.begin + self.motion.duration
 
 
 TURN: Final = slice(0, 3)
 """Channels: pitch forward, roll to the left, yaw to the left of the pelvis [rad]."""
 BEND: Final = slice(3, 6)
-"""The same of the chest, seen from the pelvis [rad]."""
+"""The same angles of the chest, relative to the pelvis [rad]."""
 NOD: Final = slice(6, 9)
-"""The same of the head, seen from the heading [rad]."""
+"""The same angles of the head, relative to the heading [rad]."""
 AWAY: Final = slice(9, 11)
-"""Of the mid-hip, forward and to the left [m]."""
+"""Displacement of the mid-hip, forward and to the left [m]."""
 FREE: Final = slice(11, 13)
-"""How little feet are on the ground: 0 = where they stand or walk, 1 = where the leg is held."""
+"""Freedom of the feet: 0 = the foot stands or walks, 1 = the leg's pose determines it."""
 ARMS: Final = slice(13, 25)
 """(2, 2, 3): side; upper arm, forearm; forward, outward, up in the chest's axes."""
 LEGS: Final = slice(25, 43)
@@ -149,7 +149,7 @@ def key(
     arms: Sequence[Arm] = (Arm(), Arm()),
     legs: Sequence[Leg] = (Leg(), Leg()),
 ) -> Floats:
-    """Channels (43,) of a key pose; angles in degrees, the acting side first."""
+    """Return channels (43,) of a key pose; angles in degrees, the acting side first."""
     angles = np.radians([*turn, *bend, *nod])
     return np.concatenate(
         [
@@ -162,12 +162,12 @@ def key(
 
 
 def motion_of(keys: Sequence[tuple[float, Floats]]) -> tuple[Floats, Floats]:
-    """Times (keys,) and channels (keys, 43) of key poses in order."""
+    """Return times (keys,) and channels (keys, 43) of key poses in order."""
     return np.array([time for time, _ in keys]), np.array([channels for _, channels in keys])
 
 
 def _limb(flexion: float, abduction: float, inward: float) -> tuple[Floats, Floats]:
-    """Along a limb, and where its end would go if it flexed, or turned inward, on."""
+    """Return a limb's direction, and its end's direction under further flexion or inward turn."""
     (sin, out, turned), (cos, level, straight) = (
         f(np.radians([flexion, abduction, inward])) for f in (np.sin, np.cos)
     )

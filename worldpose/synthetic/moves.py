@@ -1,4 +1,4 @@
-"""What footballers do upright: jumps and kicks."""
+"""Motions of upright footballers: jumps and kicks."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import numpy as np
 from worldpose.synthetic.motions import GRAVITY, Arm, Height, Leg, Motion, Stance, key, motion_of
 
 STANDING: Final = 0.945
-"""Height of the mid-hip of who stands, in leg lengths [1]."""
+"""Mid-hip height of a standing person, in leg lengths [1]."""
 REST: Final = key()
 """Standing upright."""
 
 
 def jump(rise: float, *, hurdle: bool = False) -> Motion:
-    """A header off both feet: crouch, take-off, free flight, landing; the left foot leaves last.
+    """Return a header off both feet: crouch, take-off, flight, landing; the left foot leaves last.
 
     Args:
         rise: of the mid-hip in flight [m]; footballers reach 0.35 to 0.45 with a countermovement
             (docs/synthetic.md).
-        hurdle: knees come up and the head stays down, as over somebody who slides.
+        hurdle: knees come up and the head stays down, as over a sliding player.
     """
     climb = float(np.sqrt(2.0 * GRAVITY * rise))
     off = 0.62
@@ -104,7 +104,7 @@ def jump(rise: float, *, hurdle: bool = False) -> Motion:
 
 
 def kick(power: float) -> Motion:
-    """A kick with the left foot: plant, back swing, hip before knee, follow-through.
+    """Return a kick with the left foot: plant, back swing, hip before knee, follow-through.
 
     Args:
         power: 0.4 is a pass, 1 a shot with the instep [1].
@@ -115,7 +115,7 @@ def kick(power: float) -> Motion:
     def swing(
         hip: float, knee: float, out: float, yaw: float, roll: float, pitch: float, arms: float
     ) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-        """Arms go from 0, spread back, to 1, across."""
+        """Return a key; arms go from 0, spread back, to 1, across."""
         return key(
             turn=(p * pitch, p * roll, p * yaw),
             bend=(4.0, -0.3 * p * roll, -1.2 * p * yaw),

@@ -1,4 +1,4 @@
-"""Where bodies are in a camera's pictures, and who hides whom."""
+"""Projections of bodies into a camera's images, and occlusions between them."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ TRUNK: Final = (5, 6, 11, 12)
 
 @dataclass(frozen=True, eq=False)
 class Bodies:
-    """People, or false ones, in front of a camera.
+    """People, or false positives, in front of a camera.
 
     Attributes:
         joints: (frames, persons, 17, 3) [m], world; NaN where absent.
         heights: (persons,) [m].
-        bias: (frames, persons, 17, 3) [m], world: from a joint to what a detector takes for it;
-            None = nothing.
+        bias: (frames, persons, 17, 3) [m], world: from a joint to the detector's joint; None =
+            zero.
     """
 
     joints: Floats
@@ -34,10 +34,10 @@ class Bodies:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """Where bodies are in a picture and what hides them.
+    """Projections of bodies into an image, and their occlusions.
 
     Attributes:
-        keypoints: (frames, persons, 17, 2) [px]; NaN outside the picture.
+        keypoints: (frames, persons, 17, 2) [px]; NaN outside the image.
         bias: (frames, persons, 17, 2) [px], of `Bodies.bias`; 0 without.
         hider: (frames, persons, 17) int16, the nearest of the persons before a joint, -1 = none.
         size: (frames, persons) height of a standing person there [px].
@@ -53,22 +53,22 @@ class Sight:
 
     @property
     def hidden(self) -> Flags:
-        """Joints behind a nearer person (frames, persons, 17)."""
+        """Return the joints behind a nearer person (frames, persons, 17)."""
         hidden: Flags = self.hider >= 0
         return hidden
 
     @property
     def seen(self) -> Flags:
-        """Joints in the picture that nothing hides (frames, persons, 17)."""
+        """Return the joints in the image that are not occluded (frames, persons, 17)."""
         seen: Flags = np.isfinite(self.keypoints[..., 0]) & ~self.hidden
         return seen
 
 
 def see(camera: Camera, bodies: Bodies) -> Sight:
-    """Return the exact pixels of bodies, and which joints a nearer body hides.
+    """Return the exact pixels of bodies, and the occlusions of joints by nearer bodies.
 
-    A nearer body hides what lies in its box: from its highest to its lowest joint, as wide as its
-    shoulders and hips with a third on either side.
+    A nearer body hides the contents of its box: from its highest to its lowest joint, as wide as
+    its shoulders and hips with a third on either side.
 
     Args:
         camera: a single camera, or one for every frame.
@@ -94,7 +94,7 @@ def see(camera: Camera, bodies: Bodies) -> Sight:
 
 
 def facing(joints: Floats) -> tuple[Floats, Floats]:
-    """Level unit vectors (..., 3) to the front and to the left of bodies (..., 17, 3)."""
+    """Return horizontal unit vectors (..., 3) to the front and left of bodies (..., 17, 3)."""
     left = joints[..., (5, 11), :].sum(axis=-2) - joints[..., (6, 12), :].sum(axis=-2)
     left[..., 2] = 0.0
     left /= np.linalg.norm(left, axis=-1, keepdims=True)
@@ -116,7 +116,7 @@ def _hiders(pixels: Floats, depth: Floats) -> NDArray[np.int16]:
     reach_low, reach_high = pixels.min(axis=2), pixels.max(axis=2)
     for person in range(pixels.shape[1]):
         one_low, one_high = low[:, person, None], high[:, person, None]
-        # Only the few whose extents meet are looked at joint by joint.
+        # Only the few bodies with overlapping extents need the test joint by joint.
         meets = np.all((reach_high >= one_low) & (reach_low <= one_high), axis=-1)
         frame, other = np.nonzero(meets & (depth[:, person, None] < depth))
         joints, before = pixels[frame, other], depth[frame, person, None]

@@ -1,4 +1,4 @@
-"""Jumps and falls of people who wander, and what they do to their pace."""
+"""Jumps and falls of wandering people, and their effect on the pace."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from worldpose.synthetic.tumbles import fall
 Floats = NDArray[np.float64]
 
 SETTLE: Final = 0.35
-"""Before take-off, time in which nobody changes pace any more [s]."""
+"""Time before take-off with constant pace [s]."""
 JUMP_SPEED: Final = 2.5
-"""Who is faster does not jump off both feet [m/s]."""
+"""Faster people do not jump off both feet [m/s]."""
 BRAKE: Final = 4.0
-"""Rate at which somebody who fell comes to rest [m/s^2]."""
+"""Deceleration of a fallen person [m/s^2]."""
 RECOVERY: Final = 1.5
-"""Time in which the wished pace comes back [s]."""
+"""Time in which the desired pace returns [s]."""
 
 
 def draw_actions(
     time: Floats, speed: Floats, rates: ActionRates, rng: np.random.Generator
 ) -> tuple[Action, ...]:
-    """Return jumps and falls of somebody who wanders, none before another is over.
+    """Return jumps and falls of a wandering person, without overlap in time.
 
     Args:
         time: (samples,) [s].
         speed: (samples,) [m/s], which `steadied` changes to suit.
-        rates: how often.
+        rates: frequencies of actions.
         rng: draws them.
     """
     minutes = (time[-1] - time[0]) / 60.0
@@ -52,9 +52,9 @@ def draw_actions(
 def steadied(
     time: Floats, speed: Floats, actions: tuple[Action, ...]
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return speeds (samples,) [m/s] that suit the actions, and when nobody may be turned.
+    """Return speeds (samples,) [m/s] that suit the actions, and when turns are blocked.
 
-    In flight, and just before, speed is constant; who fell comes to rest until he is up again.
+    Speed is constant in flight and just before; a fallen person rests until up again.
     """
     speed, steady = speed.copy(), np.zeros(len(speed), dtype=bool)
     step = float(time[1] - time[0])

@@ -1,4 +1,4 @@
-"""Where shadows fall on the grass, as a camera has them."""
+"""Outlines of shadows on the grass, in the image of a camera."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Singles = NDArray[np.float32]
 
 
 def outline_shadows(venue: Venue, camera: Camera, vertices: Singles, light: Floats) -> Outlines:
-    """Return outlines of the shadows that surfaces throw on the grass.
+    """Return outlines of the shadows that surfaces cast on the grass.
 
-    A vertex has no shadow beyond the boards, or where the stand keeps this light off anyway; it
-    keeps none off that comes straight down.
+    A vertex casts no shadow beyond the boards, or where the stand's shadow already covers the
+    grass; the stand does not block light that comes straight down.
 
     Args:
         venue: the stadium.
@@ -36,13 +36,13 @@ def outline_shadows(venue: Venue, camera: Camera, vertices: Singles, light: Floa
 
 @compiled
 def _throw(vertices: Singles, light: Floats, ground: Floats, fallen: Singles) -> None:
-    """Write where light through vertices meets the grass; NaN where nothing is darkened.
+    """Write the grass points in the shadows of vertices; NaN where none is darkened.
 
     Args:
         vertices: (persons, vertices, 3) [m], world.
         light: (4,), its direction down first.
         ground: the bend of the surface, half the distances between the boards along x and y, the
-            side of the stand that throws a shadow, and where this begins.
+            side of the stand that casts a shadow, and the start of that shadow.
         fallen: (persons, vertices, 3), written.
     """
     for p in range(vertices.shape[0]):

@@ -1,4 +1,4 @@
-"""Where people go: smooth paths over a part of the pitch."""
+"""Paths of people: smooth curves over a part of the pitch."""
 
 from __future__ import annotations
 
@@ -19,27 +19,26 @@ STEP: Final = 0.01
 MARGIN: Final = 2.0
 """Path before the first and after the last frame [s]: more than one stride of the slowest walk."""
 LATERAL_ACCELERATION: Final = 4.0
-"""Most a runner leans into a turn [m/s^2]: a turn of 4 m radius at 4 m/s."""
+"""Maximum lateral acceleration of a runner [m/s^2]: a turn of 4 m radius at 4 m/s."""
 TURN_RATE: Final = 2.0
-"""Most a walker turns [rad/s]."""
+"""Maximum turn rate of a walker [rad/s]."""
 TURN_LAG: Final = 0.25
-"""Time in which a change of turn rate takes hold [s]: about one step."""
+"""Time constant of a change of turn rate [s]: about one step."""
 TURNING_SPEED: Final = 0.5
-"""Who is slower turns less, and who stands not at all [m/s]."""
+"""Slower people turn less; standing people do not turn [m/s]."""
 LOOK_AHEAD: Final = 1.2
-"""How far ahead people see borders and other people coming [s]."""
+"""Time ahead at which people see borders and other people [s]."""
 BODY_WIDTH: Final = 0.7
 """Distance between the middles of two people who touch shoulder to shoulder [m]."""
 SHOVE: Final = 9.0
-"""Speed at which somebody would be pushed out of another's middle [m/s]; who touches less is
-pushed less."""
+"""Speed that pushes a person out of another's middle [m/s]; smaller overlap pushes less."""
 START_SPACE: Final = 2.5
-"""Least distance between people at the start of their paths [m], where there is room."""
+"""Minimum distance between people at the start of their paths [m], where there is room."""
 
 
 @dataclass(frozen=True)
 class GroundPath:
-    """A person's way over the ground, sampled every `STEP`."""
+    """A person's path over the ground, sampled every `STEP`."""
 
     time: NDArray[np.float64]
     """(samples,) [s], from -MARGIN on; 0 is the first frame."""
@@ -50,7 +49,7 @@ class GroundPath:
     speed: NDArray[np.float64]
     """(samples,) [m/s]."""
     actions: tuple[Action, ...] = ()
-    """What the person does besides, in order of their beginning."""
+    """Actions of the person, in order of their start."""
     clip: Clip | None = None
     """Motion capture that the person plays from time 0 on, instead of a gait."""
 
@@ -58,13 +57,13 @@ class GroundPath:
 def wander(
     crowd: CrowdSettings, duration: float, others: Sequence[GroundPath], rng: np.random.Generator
 ) -> GroundPath:
-    """A smooth path with changing speed and turns that stays near the area.
+    """Return a smooth path with changing speed and turns that stays near the area.
 
     Args:
         crowd: area and speeds.
         duration: time covered besides the margins [s].
-        others: paths to keep clear of; they do not react, so that adding a person changes nobody
-            before.
+        others: paths to keep clear of; they do not react, so that an additional person changes no
+            earlier path.
         rng: this person's own.
     """
     samples = round((duration + 2.0 * MARGIN) / STEP) + 1
@@ -97,7 +96,7 @@ def wander(
         limit = min(TURN_RATE, LATERAL_ACCELERATION / max(speed[i], 0.1))
         limit *= min(1.0, speed[i] / TURNING_SPEED)
         turn += (float(np.clip(wish, -limit, limit)) - turn) * STEP / TURN_LAG
-        # In the air, and on the ground, nobody turns.
+        # People in the air or on the ground do not turn.
         turn *= 0.92 if steady[i] else 1.0
         here = here + velocity * STEP
         angle = angle + turn * STEP
@@ -105,7 +104,7 @@ def wander(
 
 
 def _shove(apart: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Velocity (2,) [m/s] that bodies (others, 2) [m] away give to somebody who touches them."""
+    """Return the velocity (2,) [m/s] of a person in contact with bodies (others, 2) [m] away."""
     gap = np.linalg.norm(apart, axis=-1, keepdims=True)
     push = SHOVE * np.clip(1.0 - gap / BODY_WIDTH, 0.0, 1.0)
     velocity: NDArray[np.float64] = (push * apart / np.maximum(gap, 1e-9)).sum(axis=0)
@@ -115,7 +114,7 @@ def _shove(apart: NDArray[np.float64]) -> NDArray[np.float64]:
 def _slow_wave(
     time: NDArray[np.float64], periods: tuple[float, float], rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Two sines of unlike period [s], together within -1 and 1."""
+    """Return the sum of two sines of different period [s], within -1 and 1."""
     first = rng.uniform(*periods)
     angle = 2.0 * np.pi * (time[:, None] / (first, 0.6 * first) + rng.random(2))
     wave: NDArray[np.float64] = np.sin(angle) @ np.array([0.65, 0.35])
@@ -129,7 +128,7 @@ def _velocity(path: GroundPath) -> NDArray[np.float64]:
 
 
 def _turn_back(ahead: NDArray[np.float64], half: NDArray[np.float64], heading: float) -> float:
-    """Turn rate [rad/s] towards the middle when the place ahead, seen from it, is outside."""
+    """Return the turn rate [rad/s] towards the middle if the place ahead of it is outside."""
     outside = float(np.max(np.abs(ahead) / half)) - 1.0
     if outside <= 0.0:
         return 0.0
@@ -141,13 +140,13 @@ def _turn_back(ahead: NDArray[np.float64], half: NDArray[np.float64], heading: f
 def _turn_aside(
     offsets: NDArray[np.float64], motions: NDArray[np.float64], heading: float, space: float
 ) -> float:
-    """Turn rate [rad/s] away from those who would come too near; relative positions and motions."""
+    """Return the turn rate [rad/s] away from people on a close course, from relative motions."""
     if not len(offsets) or space == 0.0:
         return 0.0
     approach = -(offsets * motions).sum(-1) / np.maximum((motions**2).sum(-1), 1e-9)
     nearest = offsets + motions * np.clip(approach, 0.0, LOOK_AHEAD)[:, None]
     urgency = np.clip(1.0 - np.linalg.norm(nearest, axis=-1) / space, 0.0, 1.0)
     leftward = np.array([-np.sin(heading), np.cos(heading)])
-    # Those who pass exactly through are passed on one side, rather than met undecided.
+    # On an exact collision course, pass on one side rather than meet undecided.
     away = np.where(nearest @ leftward > 0.0, -1.0, 1.0)
     return float(2.0 * TURN_RATE * (urgency * away).sum())

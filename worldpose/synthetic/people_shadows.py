@@ -1,4 +1,4 @@
-"""Shadows that people and things throw on the grass."""
+"""Shadows of people and things on the grass."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ Bytes = NDArray[np.uint8]
 Faces = NDArray[np.int32]
 
 SKY: Final = np.array([0.0, 0.0, -1.0, 0.2])
-"""What comes from all around, as a light straight from above: dims the grass at the feet."""
+"""Ambient light, as a light straight from above: dims the grass at the feet."""
 SOFT: Final = 0.9
 """Standard deviation of a shadow's rim [px]: some centimetres."""
 _MARGIN: Final = 3
-"""Around a shadow, as far as its rim reaches [px]."""
+"""Margin around a shadow, the extent of its rim [px]."""
 
 
 def shade_ground(
     venue: Venue, camera: Camera, picture: Bytes, things: Sequence[tuple[Faces, Singles]]
 ) -> list[Box]:
-    """Darken the grass where something keeps light off it, and return the boxes that changed.
+    """Darken the grass in shadows, and return the boxes that changed.
 
     Args:
         venue: the stadium and its lights.
         camera: a single camera.
         picture: (height, width, 3), changed in place.
-        things: faces (triangles, 3) and vertices (things, vertices, 3) [m], world, of what throws
-            shadows.
+        things: faces (triangles, 3) and vertices (things, vertices, 3) [m], world, of objects that
+            cast shadows.
     """
     height, width = picture.shape[:2]
     mask = np.zeros((height, width), dtype=np.uint8)
@@ -69,7 +69,7 @@ def shade_ground(
 
 @compiled
 def _darken(picture: Bytes, dark: Bytes) -> None:
-    """Take a share (height, width) [1/255] off a picture, and forget it."""
+    """Subtract a share (height, width) [1/255] from an image, and reset the share to zero."""
     for v in range(picture.shape[0]):
         for u in range(picture.shape[1]):
             left = 255 - int(dark[v, u])

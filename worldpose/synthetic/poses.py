@@ -1,4 +1,4 @@
-"""Poses of people: what moves freely, and the 17 joints that follow from it."""
+"""Poses of people: free parameters, and the 17 joints that follow from them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A person's pose in every frame, world; vectors of directions have length one.
+    """A person's pose per frame, world; direction vectors have length one.
 
     Attributes:
         pelvis: (frames, 3) mid-hip [m].
@@ -23,9 +23,9 @@ class Pose:
         shoulders_left: (frames, 3) from mid-shoulder to the left shoulder.
         head: (frames, 3, 3), rows: forward, left, up of the head.
         arms: (frames, 2, 2, 3): left and right; upper arm and forearm.
-        ankles: (frames, 2, 3) where ankles would be [m]; a leg goes as far as it reaches.
-        knees: (frames, 2, 3) where knees point, of any length.
-        feet: (frames, 2) where feet point that stand, from the x axis towards y [rad].
+        ankles: (frames, 2, 3) desired ankles [m]; a leg extends at most to its reach.
+        knees: (frames, 2, 3) directions of the knees, of any length.
+        feet: (frames, 2) directions of standing feet, from the x axis towards y [rad].
     """
 
     pelvis: Floats
@@ -40,7 +40,7 @@ class Pose:
 
 
 def pose_joints(body: Body, pose: Pose) -> Floats:
-    """Joints (frames, 17, 3) [m], world; distances between them are the body's own."""
+    """Return joints (frames, 17, 3) [m], world; distances between them are the body's own."""
     joints = np.empty((len(pose.pelvis), 17, 3))
     neck = pose.pelvis + body.trunk * pose.trunk
     joints[:, :5] = neck[:, None] + body.head @ pose.head
@@ -58,24 +58,24 @@ def pose_joints(body: Body, pose: Pose) -> Floats:
 
 
 def unit(vectors: Floats) -> Floats:
-    """Vectors (..., 3) of length one in the same direction."""
+    """Return vectors (..., 3) of length one in the same direction."""
     of_length_one: Floats = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
     return of_length_one
 
 
 def level_axes(heading: Floats) -> tuple[Floats, Floats]:
-    """Unit vectors (frames, 3) forward and to the left, level."""
+    """Return horizontal unit vectors (frames, 3) forward and to the left."""
     zero = np.zeros_like(heading)
     forward = np.stack([np.cos(heading), np.sin(heading), zero], axis=-1)
     return forward, np.stack([-np.sin(heading), np.cos(heading), zero], axis=-1)
 
 
 def _leg(body: Body, hip: Floats, ankle: Floats, forward: Floats) -> tuple[Floats, Floats]:
-    """Knee and ankle (frames, 3); an ankle out of reach is drawn to the hip: the heel rises."""
+    """Return knee and ankle (frames, 3); an ankle out of reach moves to the hip: the heel rises."""
     along = ankle - hip
     far = np.linalg.norm(along, axis=-1, keepdims=True)
     along = along / far
-    # Reach ends softly and short of a straight leg, whose knee would snap.
+    # Reach ends smoothly and short of a straight leg, whose knee would snap.
     free, spare = 0.965 * body.leg, 0.03 * body.leg
     beyond = np.maximum(far - free, 0.0)
     reach = np.minimum(far, free) + spare * (1.0 - np.exp(-beyond / spare))

@@ -1,4 +1,4 @@
-"""Random processes in time: what drifts and what comes in bursts."""
+"""Random processes in time: drift and bursts."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 def drift(
     shape: tuple[int, ...], time: float, fps: float, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """A stationary first-order autoregressive process of unit variance along the first axis.
+    """Return a stationary first-order autoregressive process of unit variance along the first axis.
 
     Args:
         shape: (frames, ...).
@@ -29,11 +29,11 @@ def drift(
 def bursts(
     share: float, time: float, shape: tuple[int, ...], fps: float, rng: np.random.Generator
 ) -> NDArray[np.bool_]:
-    """A stationary on-off process along the first axis: on for a given share of the frames.
+    """Return a stationary on-off process along the first axis: on for a given share of the frames.
 
     Args:
         share: of frames that are on, below 1.
-        time: mean length of a stretch that is on [s]; at least a frame.
+        time: mean length of an interval that is on [s]; at least one frame.
         shape: (frames, ...).
         fps: [1/s].
         rng: draws `shape` uniform numbers.

@@ -1,4 +1,4 @@
-"""Things in a picture besides people: goals with their nets, and the ball."""
+"""Objects in an image other than people: goals with their nets, and the ball."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ BALL: Final = 0.11
 _THREAD: Final = 0.007
 """Radius of a net's threads, thicker than real ones, which cameras hardly see [m]."""
 _MESH: Final = 0.24
-"""Between threads [m]."""
+"""Distance between threads [m]."""
 _PROFILE: Final = np.array([[0.0, 2.44], [1.1, 2.36], [2.0, 0.0]])
-"""Of the net seen from the side: depth behind the goal line and height [m]."""
+"""Profile of the net from the side: depth behind the goal line and height [m]."""
 _PIECE: Final = 0.8
 """Longest piece of a thread [m]: long slanting triangles cost time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prop:
-    """A thing that has one surface.
+    """An object with one surface.
 
     Attributes:
         faces: (triangles, 3), counter-clockwise seen from outside.
-        backs: (triangles,) which of the two pictures has their colours.
+        backs: (triangles,) which of the two images has their colours.
         texels: (vertices, 2) column and row there.
         picture: (2, rows, columns, 3) RGB.
-        surfaces: where it is, a batch of 1.
-        shadow: whether it throws one.
+        surfaces: its position, a batch of 1.
+        shadow: whether it casts a shadow.
     """
 
     faces: NDArray[np.int32]
@@ -69,7 +69,7 @@ def goals(pitch: PitchTemplate) -> tuple[Prop, ...]:
 
 
 def _threads(near: Floats, far: Floats, outward: float) -> list[tuple[Floats, Floats]]:
-    """Pieces of the threads of a net between two posts' feet."""
+    """Return the pieces of the threads of a net between two posts' feet."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(_PROFILE, axis=0), axis=1))])
     steps = np.linspace(0.0, along[-1], round(along[-1] / _MESH) + 1)
     depth, height = (np.interp(steps, along, axis) for axis in _PROFILE.T)
@@ -103,7 +103,7 @@ def _threads(near: Floats, far: Floats, outward: float) -> list[tuple[Floats, Fl
 def _tubes(
     lines: list[tuple[Floats, Floats]], radius: float, corners: int, level: int, *, shadow: bool
 ) -> Prop:
-    """One prop of tubes along lines, of one grey level."""
+    """Return one prop of tubes along lines, of one grey level."""
     ends = np.array(lines)
     way = ends[:, 1] - ends[:, 0]
     way /= np.linalg.norm(way, axis=1, keepdims=True)
@@ -126,7 +126,7 @@ def _tubes(
 
 
 def ball() -> Prop:
-    """Return the ball, its middle at the origin."""
+    """Return the ball, centred at the origin."""
     points = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
     faces = np.array(
         [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]

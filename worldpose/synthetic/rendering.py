@@ -1,7 +1,7 @@
-"""Pictures of the synthetic stadium: the pitch, its surroundings and people, as a camera has them.
+"""Images of the synthetic stadium: the pitch, its surroundings and people, seen by a camera.
 
-What stage 3 of static calibration must survive: mown stripes, worn and distorted lines, boards
-full of edges, people on the lines, their shadows and that of a stand.
+Stage 3 of static calibration must cope with mown stripes, worn and distorted lines, boards full of
+edges, people on the lines, their shadows and that of a stand.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ def render_pitch(
     *,
     frame: int = 0,
 ) -> NDArray[np.uint8]:
-    """Return one picture (height, width, 3) in RGB; the same arguments give the same bytes.
+    """Return one image (height, width, 3) in RGB; the same arguments give the same bytes.
 
     Painted lines are `LINE_WIDTH` wide with the template's lines in their middle.
 
     Args:
         camera: a single camera.
-        pitch: what is painted; the surface follows its crown.
-        people: (persons, 17, 3) joints of COCO-17 [m], world; None = nobody.
-        seed: the stadium's look, the same for all its cameras, and the sensor's noise.
+        pitch: the painted pitch; the surface follows its crown.
+        people: (persons, 17, 3) joints of COCO-17 [m], world; None = no people.
+        seed: of the stadium's look, the same for all its cameras, and of the sensor's noise.
         settings: the defaults if None.
-        frame: gives every picture of a clip noise of its own.
+        frame: seeds the noise of this image of a clip.
 
     Raises:
         InputError: a batch of cameras, or people of another shape.
@@ -51,7 +51,7 @@ def render_pitch(
     settings = settings or RenderingSettings()
     _check(camera, people)
     venue = build_venue(pitch, seed, settings)
-    # What the stadium looks like must not depend on who is in it.
+    # The stadium's look must not depend on the people in it.
     kits = np.random.default_rng([seed, 2])
     limbs, colors = person_capsules(np.empty((0, 17, 3)) if people is None else people, kits)
     goals, goal_colors = goal_capsules(pitch)
@@ -81,7 +81,7 @@ def _check(camera: Camera, people: NDArray[np.float64] | None) -> None:
 def _developed(
     color: Pictures, camera: Camera, settings: RenderingSettings, seed: int, frame: int
 ) -> NDArray[np.uint8]:
-    """Return what lens and sensor make of the light (height, width, 3)."""
+    """Return the light (height, width, 3) after lens and sensor."""
     seen = np.asarray(255.0 * settings.exposure * color, dtype=np.float32)
     if settings.blur > 0.0:
         seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), settings.blur), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Detections as a camera reports them: shuffled, boxed, scored, with frames lost."""
+"""Detections as a camera reports them: shuffled, with boxes and scores, and with lost frames."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from worldpose.synthetic.detecting import Detections
 from worldpose.synthetic.occlusion import Flags, Floats
 
 ROOM: Final = 0.06
-"""Of a box around the keypoints, for head, hands and feet [person height]."""
+"""Margin of a box around the keypoints, for head, hands and feet [person height]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """A camera's detections and who they are.
+    """A camera's detections and their persons.
 
     Attributes:
-        observations: what the factory gets.
+        observations: input of the factory.
         person: (frames, detections) int16, the body of every detection, -1 for padding.
-        displaced: (frames, detections, 17), joints put far off.
+        displaced: (frames, detections, 17), joints with gross errors.
     """
 
     observations: Observations
@@ -38,14 +38,14 @@ def report(
     dropped: Flags,
     rng: np.random.Generator,
 ) -> Report:
-    """Return detections in an order that tells nothing, and which body each one is.
+    """Return detections in shuffled order, and the body of each.
 
     Args:
         first_frame: number of the first frame.
-        detections: of all bodies, false ones among them.
-        size: (frames, bodies) [px]; gives the boxes room.
+        detections: of all bodies, including false positives.
+        size: (frames, bodies) [px]; scales the margins of boxes.
         dropped: (frames,), frames without any detection.
-        rng: shuffles every frame anew.
+        rng: shuffles every frame independently.
     """
     found = np.isfinite(detections.confidence).any(-1) & ~dropped[:, None]
     boxes = _boxes(detections, size, found)
@@ -55,7 +55,7 @@ def report(
     keypoints = np.take_along_axis(detections.keypoints, order[..., None, None], axis=1)
     confidence = np.take_along_axis(detections.confidence, order[..., None], axis=1)
     displaced = np.take_along_axis(detections.displaced, order[..., None], axis=1)
-    # Padding has neither box nor score: a detection without keypoints never gets that far.
+    # Padding has neither box nor score: reports omit detections without keypoints.
     keypoints[~found], confidence[~found] = np.nan, np.nan
     boxes = np.take_along_axis(boxes, order[..., None], axis=1)
     joints = np.maximum(np.isfinite(confidence).sum(-1), 1)
@@ -72,14 +72,14 @@ def report(
 
 
 def _boxes(detections: Detections, size: Floats, found: Flags) -> Floats:
-    """Boxes (frames, bodies, 4) [px]; a merged one holds the lost person's size too."""
+    """Return boxes (frames, bodies, 4) [px]; a merged one includes the lost person's width."""
     room = ROOM * size[..., None]
     missing = np.isnan(detections.keypoints)
     low = np.where(missing, np.inf, detections.keypoints).min(axis=2) - room
     high = np.where(missing, -np.inf, detections.keypoints).max(axis=2) + room
     frame, lost = np.nonzero(detections.merged_into >= 0)
     into = detections.merged_into[frame, lost].astype(np.intp)
-    # Most of the lost one is behind: half his width shows on the far side.
+    # Most of the lost person is hidden: half the person's width shows on the far side.
     half = 0.2 * size[frame, lost]
     side = np.where(lost % 2 == 0, 1.0, -1.0)
     low[frame, into, 0] -= np.where(side < 0.0, half, 0.0)

@@ -1,4 +1,4 @@
-"""Scenarios: what happens, where, who films it and how well people are found."""
+"""Scenarios: people, place, cameras and detector quality of each synthetic match."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from worldpose.synthetic.settings import (
 )
 
 _QUARTER: Final = (
-    # where in the quarter x > 0, y > 0 a camera stands, what it looks at, its focal length
+    # Of a camera in the quarter x > 0, y > 0: position, aim, focal length.
     Seat(place=(13.0, 60.0, 22.0), aim=(19.2, 11.4), focal=2254.0),
     Seat(place=(76.0, 14.0, 19.0), aim=(41.2, -16.0), focal=2228.0),
     Seat(place=(38.0, 57.0, 16.0), aim=(33.5, 17.7), focal=2096.0),
@@ -53,7 +53,7 @@ CORNER_SEATS: Final = (
     Seat(place=(13.0, 60.0, 22.0), aim=(39.8, 28.7), focal=4100.0),
     Seat(place=(66.0, -48.0, 26.0), aim=(43.0, -27.0), focal=3300.0),
 )
-"""Six of these stands, with lenses so long that one or two corners of markings are in a picture."""
+"""Six of these stands, with lenses so long that an image shows one or two corners of markings."""
 
 _TINY: Final = Scenario(
     name="tiny",
@@ -125,7 +125,7 @@ SCENARIOS: Final = {
             rig=_SPRAWL,
             broadcast=BroadcastSettings(),
             noise=_TRIAL,
-            # A line is 7 px wide here: its edge, taken for its middle, is 3.5 px off.
+            # A line is 7 px wide here: a click on its edge instead of its middle is 3.5 px off.
             clicks=ClickSettings(clustered=1.0, clustered_points=(5, 5), noise=3.0),
         ),
         Scenario(
@@ -180,7 +180,7 @@ SCENARIOS: Final = {
             duration=1.0,
             crowd=CrowdSettings(people=4, area_center=(44.0, 24.0), area_size=(14.0, 14.0)),
             rig=RigSettings(cameras=6, seats=CORNER_SEATS, seat_spread=0.3),
-            # Among one or two points a wrong one cannot be told.
+            # A wrong point among one or two cannot be detected.
             clicks=ClickSettings(wrong=0.0),
         ),
         Scenario(

@@ -1,4 +1,4 @@
-"""A whole synthetic scene: people, cameras, detections and the truth behind them."""
+"""A complete synthetic scene: people, cameras, detections and ground truth."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ Seed = np.random.SeedSequence
 
 @dataclass(frozen=True, eq=False)
 class Identities:
-    """Who every detection of one camera is.
+    """Person of each detection of one camera.
 
     Attributes:
         person: (frames, detections) int16 index into the truth's `person_ids`; -1 for false
-            people and padding.
-        displaced: (frames, detections, 17) bool, keypoints put far off on purpose.
+            positives and padding.
+        displaced: (frames, detections, 17) bool, keypoints with deliberate gross errors.
     """
 
     person: NDArray[np.int16]
@@ -54,14 +54,14 @@ class Identities:
 
 @dataclass(frozen=True, eq=False)
 class StaticViews:
-    """What the detectors of static cameras found in every frame, as tracking takes it.
+    """Detections of static cameras per frame, the input of tracking.
 
     Attributes:
         keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where there is none.
-        confidence: (frames, cameras, detections, 17); NaN likewise.
+        confidence: (frames, cameras, detections, 17); NaN where there is none.
         person: (frames, cameras, detections) index into the truth's `person_ids`; -1 for false
-            people and padding.
-        displaced: (frames, cameras, detections, 17) bool, keypoints put far off on purpose.
+            positives and padding.
+        displaced: (frames, cameras, detections, 17) bool, keypoints with deliberate gross errors.
     """
 
     keypoints: NDArray[np.float64]
@@ -70,7 +70,7 @@ class StaticViews:
     displaced: NDArray[np.bool_]
 
     def index(self, persons: int) -> NDArray[np.int16]:
-        """Return the place of everybody's detection (frames, cameras, persons); -1 = not seen."""
+        """Return each person's detection index (frames, cameras, persons); -1 = not found."""
         index = np.full((*self.person.shape[:2], persons), -1, np.int16)
         frame, camera, place = np.nonzero(self.person >= 0)
         index[frame, camera, self.person[frame, camera, place]] = place
@@ -79,21 +79,21 @@ class StaticViews:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What happened, and what detectors made of it.
+    """Ground truth of a match, and its detections.
 
     Attributes:
-        truth: `views` counts the static cameras that have the joint in their picture with nobody
-            before it.
+        truth: `views` counts the static cameras that have the joint in their image without an
+            occluding person.
         crowd: the people, at any time.
         poses: the bodies (persons, frames) whose keypoints the truth's joints are.
         cameras: the true static cameras by id, in the order of the rig.
-        given: the same as calibration.toml has them.
+        given: the same with the errors of calibration.toml.
         broadcast: the moving camera, a batch (frames,); None without.
-        observations: by id of a static camera, and of the clip for the broadcast camera.
+        observations: by id of a static camera, or of the clip for the broadcast camera.
         identities: by the same ids.
-        clocks: frames that a static camera lies behind its stated clock, by id [frame].
-        clicks: what a person clicked in the first frame of every static camera, by id.
-        surveyed: the pitch as pitch.json has it; the scenario has it as it is painted.
+        clocks: offset of a static camera behind its stated clock, by id [frame].
+        clicks: a person's clicks in the first frame of every static camera, by id.
+        surveyed: the pitch of pitch.json; the scenario has the painted one.
     """
 
     truth: JointTracks
@@ -127,7 +127,7 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class _World:
-    """What all cameras look at, and with whose eyes."""
+    """Subject of all cameras, with the detector's systematic errors."""
 
     scenario: Scenario
     crowd: Crowd
@@ -153,16 +153,16 @@ def simulate_scene(
 ) -> Scene:
     """Return a scene; the same scenario and seed give the same numbers.
 
-    Every person and every camera draws from a stream of its own: a further camera changes nothing
-    that was there; a further person, where each wanders for himself, only whom it hides and the
-    order of detections.
+    Every person and every camera draws from a separate stream: an additional camera changes no
+    existing number; an additional person, if people wander independently, changes only occlusions
+    and the order of detections.
 
     Args:
         scenario: everything but the seed.
         seed: from 0.
         clip_id: names the broadcast camera's detections.
-        driven: ways of the people, instead of the scenario's movement.
-        clip: motion capture that one of them plays.
+        driven: paths of the people, instead of the scenario's movement.
+        clip: motion capture for one of them.
     """
     people_seed, rig_seed, habit_seed, broadcast_seed, error_seed, survey_seed, click_seed = Seed(
         seed
@@ -228,7 +228,7 @@ def simulate_scene(
 
 
 def _reported(world: _World, camera: Camera, sight: Sight, seeds: list[Seed]) -> Report:
-    """What a camera's detector says of people and of nobody; `seeds` are four."""
+    """Return a camera's detections, false positives included; `seeds` are four."""
     order, deception, errors, loss = seeds
     scenario, noise = world.scenario, world.scenario.noise
     frames, persons = sight.size.shape

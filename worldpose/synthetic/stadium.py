@@ -1,4 +1,4 @@
-"""Where the static cameras stand: in a stadium's seats, or in a ring off the pitch."""
+"""Poses of the static cameras: in a stadium's seats, or in a ring off the pitch."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from worldpose.cameras import Camera, Rigid
 from worldpose.synthetic.settings import RigSettings
 
 STANDARD_PERSON: Final = 1.8
-"""Body height that `RigSettings.person_height` speaks of [m]."""
+"""Body height for `RigSettings.person_height` [m]."""
 
 GOLDEN: Final = (np.sqrt(5.0) - 1.0) / 2.0
-"""Steps of this share of a turn spread any number of cameras, and one more moves none of them."""
+"""Steps of this share of a turn spread any number of cameras, and an additional one moves none."""
 
 
 def place_camera(
@@ -25,18 +25,18 @@ def place_camera(
     pitch: PitchSpec,
     rng: np.random.Generator,
 ) -> Camera:
-    """The static camera with this number.
+    """Return the static camera with this number.
 
-    It has its seat's place, aim and focal length, a little off; without a seat, it stands in a
-    ring around the target behind where the pitch ends. It leans by a fraction of a degree, has its
-    principal point a few pixels off the middle and the mild barrel distortion (k1, k2) of a stadium
+    It has its seat's place, aim and focal length with small random offsets; without a seat, it is
+    in a ring around the target beyond the pitch border. It has a roll of a fraction of a degree, a
+    principal point a few pixels off the centre and the mild barrel distortion (k1, k2) of a stadium
     lens (C5).
 
     Args:
-        rig: seats, distances, heights and picture.
+        rig: seats, distances, heights and image size.
         index: number from 0.
-        target: (3,) [m], world; what the ring looks at.
-        pitch: no camera of the ring stands on it.
+        target: (3,) [m], world; aim of the ring.
+        pitch: off which the ring's cameras stand.
         rng: this camera's own.
     """
     if index < len(rig.seats):
@@ -65,7 +65,7 @@ def _in_the_ring(
     pitch: PitchSpec,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Center and aim (3,) [m], world, and focal length [px]."""
+    """Return center and aim (3,) [m], world, and focal length [px]."""
     azimuth = 2.0 * np.pi * (index * GOLDEN + rng.uniform(-0.02, 0.02)) - 0.5 * np.pi
     way = np.array([np.cos(azimuth), np.sin(azimuth)])
     border = 0.5 * np.array([pitch.length, pitch.width])
@@ -79,7 +79,7 @@ def _in_the_ring(
 
 
 def looking(center: NDArray[np.float64], aim: NDArray[np.float64], roll: float) -> Rigid:
-    """The pose of a camera at `center` that sees `aim` in its middle, rolled by an angle [rad]."""
+    """Return the pose of a camera at `center` that looks at `aim`, rolled by an angle [rad]."""
     forward = (aim - center) / np.linalg.norm(aim - center)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)

@@ -1,4 +1,4 @@
-"""What people do who stand about: shift their weight, rest hands on hips, look around, wait."""
+"""Motions of standing people: shift weight, rest hands on hips, look around, wait."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Floats = NDArray[np.float64]
 
 
 def shift_weight(duration: float) -> Motion:
-    """Weight on the left leg, then on the right one."""
+    """Return a shift of weight to the left leg, then to the right one."""
 
     def over(side: float) -> Floats:
         return key(
@@ -27,7 +27,7 @@ def shift_weight(duration: float) -> Motion:
 
 
 def hands_on_hips(duration: float) -> Motion:
-    """Both hands on the hips, looking about."""
+    """Return a rest with both hands on the hips, looking around."""
     arms = (Arm(-22.0, 46.0, 98.0, 76.0), Arm(-20.0, 44.0, 98.0, 76.0))
 
     def looking(yaw: float, aside: float) -> Floats:
@@ -38,7 +38,7 @@ def hands_on_hips(duration: float) -> Motion:
 
 
 def look_around(duration: float) -> Motion:
-    """The head, and after it the chest, from side to side."""
+    """Return turns of the head, followed by the chest, from side to side."""
 
     def looking(yaw: float) -> Floats:
         return key(bend=(3.0, 0.0, 0.25 * yaw), nod=(2.0, 0.0, yaw))
@@ -47,7 +47,7 @@ def look_around(duration: float) -> Motion:
 
 
 def ready(duration: float) -> Motion:
-    """A goalkeeper who waits for a shot: knees bent by 62 degrees, trunk leaning, hands up."""
+    """Return a goalkeeper's ready stance: knees bent by 62 degrees, trunk leaning, hands up."""
     waiting = [
         key(
             turn=(27.0, 0.0, 0.0),

@@ -1,4 +1,4 @@
-"""What stands round the pitch in a picture: advertising boards, a track, stands with a crowd."""
+"""Surroundings of the pitch in an image: advertising boards, a track, stands with a crowd."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _SEAT = 0.52
 
 @compiled
 def _hash(i: int, j: int, k: int) -> float:
-    """Return a number in [0, 1) that looks random and depends on three numbers."""
+    """Return a pseudorandom number in [0, 1) that depends on three numbers."""
     value = (i * 73856093) ^ (j * 19349663) ^ (k * 83492791)
     value = (value ^ (value >> 13)) * 1274126177 & 0xFFFFFFFF
     value = (value ^ (value >> 16)) * 668265263 & 0xFFFFFFFF
@@ -64,10 +64,10 @@ def _board(along: float, up: float, side: int, look: int) -> tuple[float, float,
 
 @compiled
 def _crowd(along: float, z: float, side: int, look: int) -> tuple[float, float, float]:
-    """Return the colour at a place of a stand: somebody seated, or an empty seat.
+    """Return the colour at a place of a stand: a seated spectator or an empty seat.
 
-    Head, hair and shoulders in some jacket, a part of each block in the colours of one club: what
-    a detector of people finds and a filter must drop.
+    Head, hair and shoulders in some jacket, a part of each block in the colours of one club: a
+    person detector finds them and a filter must drop them.
     """
     row, seat = int(z / _ROW), int(along / _SEAT)
     x, up = along - (seat + 0.5) * _SEAT, z - row * _ROW
@@ -101,16 +101,16 @@ def _crowd(along: float, z: float, side: int, look: int) -> tuple[float, float, 
 def scenery(
     o: Floats, dx: float, dy: float, dz: float, half: Floats, bend: float, look: int
 ) -> tuple[float, float, float, float]:
-    """Return the colour where a ray ends, and the distance in steps; grass gives (-1, 0, 0).
+    """Return the colour at a ray's end, and the distance in steps; grass gives (-1, 0, 0).
 
     Args:
-        o: (3,) where the ray begins [m], world.
+        o: (3,) origin of the ray [m], world.
         dx: direction along x.
         dy: direction along y.
         dz: direction upwards.
         half: (2,) half the distances between the boards along x and y [m].
         bend: the surface is z = -bend y^2.
-        look: which stadium.
+        look: seed of the stadium's look.
     """
     nearest = surface_hit(o, dx, dy, dz, bend)
     x, y = o[0] + nearest * dx, o[1] + nearest * dy
@@ -148,7 +148,7 @@ def scenery(
         if 0.0 < steps < nearest:
             z = o[2] + steps * dz
             along = o[1] + steps * dy if axis == 0 else o[0] + steps * dx
-            # Where two stands meet, the higher one is what is there.
+            # Where two stands meet, the higher one is visible.
             other = abs(along) - half[1 - axis] - _STAND_SETBACK
             if 0.0 < z < _STAND_TOP and z >= _STAND_SLOPE * other:
                 nearest = steps

@@ -1,4 +1,4 @@
-"""The pitch as a survey gives it."""
+"""Survey of the pitch, with measurement errors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from worldpose.pitch import PitchTemplate
 
 
 def survey(painted: PitchSpec, error: float, rng: np.random.Generator) -> PitchSpec:
-    """Return the pitch with all its points as they were measured, to a millimetre.
+    """Return the pitch with all its points as measured, to a millimetre.
 
     Args:
         painted: the true pitch.

@@ -1,4 +1,4 @@
-"""Ways of people from tracking data: npz in, smooth paths out."""
+"""Paths of people from tracking data: npz in, smooth paths out."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from worldpose.synthetic.paths import MARGIN, STEP, GroundPath
 Floats = NDArray[np.float64]
 
 SMOOTHING: Final = 0.15
-"""Standard deviation of the smoothing in time [s]: tracking jitters by decimetres between
-samples, a runner's path does not."""
+"""Standard deviation of the smoothing in time [s]: tracking jitters by decimetres between samples,
+a runner's path does not."""
 COAST: Final = 0.7
 """Time in which people come to a stop before and after the data [s]."""
 FACING_SPEED: Final = 0.6
-"""Who is slower keeps the way he faced [m/s]."""
+"""Slower people keep their heading [m/s]."""
 
 
 def read_trajectories(
     path: Path, duration: float, *, most: int | None = None
 ) -> tuple[list[GroundPath], float]:
-    """Return paths of the people in a tracking file, and how long they last [s].
+    """Return paths of the people in a tracking file, and their duration [s].
 
     The file is an npz without pickled objects: `xy` (T, N, 2) [m], world axes with the centre
-    spot as origin, NaN where somebody is absent; `time` (T,) [s] or `fps`; optionally `segment`
-    (T,), a number for each stretch without gaps. The longest stretch is used, and who is there all
-    along.
+    spot as origin, NaN where a person is absent; `time` (T,) [s] or `fps`; optionally `segment`
+    (T,), a number for each chunk without gaps. The longest chunk is used, with the people who are
+    present in all of it.
 
     Args:
         path: the file.
-        duration: longest clip [s], from the stretch's beginning.
-        most: keep that many people at most, in file order.
+        duration: maximum duration of the clip [s], from the chunk's beginning.
+        most: maximum number of people, in file order.
 
     Raises:
-        InputError: unreadable, wrong shapes, or nobody there for a fifth of a second.
+        InputError: unreadable, wrong shapes, or no person present for a fifth of a second.
     """
     xy, time, segment = _read(path)
     edges = np.flatnonzero((np.diff(segment) != 0) | (np.diff(time) <= 0.0)) + 1
@@ -116,7 +116,7 @@ def _path(clock: Floats, xy: Floats) -> GroundPath:
 
 
 def _velocity(clock: Floats, xy: Floats, end: int) -> Floats:
-    """Velocity (2,) [m/s] over the half second at one end."""
+    """Return the velocity (2,) [m/s] over the half second at one end."""
     near = np.abs(clock - clock[end]) <= max(0.5, clock[3] - clock[0])
     slope: Floats = np.polyfit(clock[near], xy[near], 1)[0]
     return slope

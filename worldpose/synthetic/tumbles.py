@@ -1,4 +1,4 @@
-"""What footballers do on the ground: falls, slide tackles and goalkeepers' dives."""
+"""Motions of footballers on the ground: falls, slide tackles and goalkeepers' dives."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from worldpose.synthetic.moves import REST, STANDING
 
 
 def fall() -> Motion:
-    """Stumble, fall forward onto the hands, lie, kneel and get up over the right foot."""
+    """Return a stumble and forward fall onto the hands, then lying, kneeling and getting up."""
     prone_arms = (Arm(168.0, 55.0, 75.0, 90.0), Arm(165.0, 60.0, 80.0, 90.0))
     reaching = (Arm(95.0, 20.0, 30.0), Arm(105.0, 15.0, 25.0))
     prone = key(
@@ -117,7 +117,7 @@ def fall() -> Motion:
 
 
 def slide() -> Motion:
-    """A slide tackle with the left leg ahead, and getting up over both feet."""
+    """Return a slide tackle with the left leg ahead, and getting up over both feet."""
     low = key(
         turn=(-42.0, -6.0, 8.0),
         bend=(14.0, 4.0, -6.0),
@@ -190,13 +190,13 @@ def slide() -> Motion:
 
 
 def dive(climb: float) -> Motion:
-    """A goalkeeper's dive to the left off the right foot, landing on the side, and getting up.
+    """Return a goalkeeper's dive to the left off the right foot, side landing, and getting up.
 
     Args:
         climb: of the mid-hip at take-off [m/s]: 1 for a low ball, 2.5 for a high one.
     """
     off, high, low = 0.52, 0.80, 0.2
-    # Of a leg of 0.87 m; with others the same flight ends centimetres higher or lower.
+    # For a leg of 0.87 m; with others the same flight ends centimetres higher or lower.
     drop = (high - low) * 0.87
     flight = (climb + float(np.sqrt(climb**2 + 2.0 * GRAVITY * drop))) / GRAVITY
     land = off + flight

@@ -1,7 +1,7 @@
-"""The pitch in a picture: mown grass and painted markings, each pixel from its place in the world.
+"""Image of the pitch: mown grass and painted markings, each pixel from its place in the world.
 
-A pixel is carried back to the crowned surface, and the share of it that paint covers follows from
-the distance to each marking over the pixel's footprint there: exact for straight edges.
+A pixel is cast back to the crowned surface, and its painted share follows from the distance to each
+marking over the pixel's footprint there: exact for straight edges.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from worldpose.pitch import PitchTemplate
 Floats = NDArray[np.float64]
 
 LINE_WIDTH: Final = 0.12
-"""Of the painted markings, all of it on both sides of the template's line [m] (Law 1)."""
+"""Width of the painted markings, centred on the template's line [m] (Law 1)."""
 SPOT_RADIUS: Final = 0.11
-"""Of the painted centre and penalty marks [m]."""
+"""Radius of the painted centre and penalty marks [m]."""
 _SPOTS: Final = ("center_mark", "penalty_mark_left", "penalty_mark_right")
 _STRIPE: Final = 5.5
-"""Width of a mown stripe: as far as the penalty area is deep, three of them [m]."""
+"""Width of a mown stripe: a third of the penalty area's depth [m]."""
 
 _LINE, _ARC, _SPOT = 0.0, 1.0, 2.0
 _HALF = 0.5 * LINE_WIDTH
 
 
 def paint_rows(pitch: PitchTemplate) -> Floats:
-    """Return what is painted, a row (8,) each for `paint_cover`.
+    """Return the painted markings, a row (8,) each for `paint_cover`.
 
     Kind, then for a line x y of its start, its direction, length, and both ends' heights above the
     crown; for an arc center x y, radius, start angle, span, height; for a spot x y, radius, and
@@ -61,7 +61,7 @@ def _arc_row(arc: ArcSpec, center: tuple[float, float, float]) -> tuple[float, .
 
 @compiled
 def surface_hit(o: Floats, dx: float, dy: float, dz: float, bend: float) -> float:
-    """Return how many steps (dx, dy, dz) from `o` the surface z = -bend y^2 is; inf if never."""
+    """Return the steps (dx, dy, dz) from `o` to the surface z = -bend y^2; inf if none."""
     a = bend * dy * dy
     b = dz + 2.0 * bend * o[1] * dy
     c = o[2] + bend * o[1] * o[1]
@@ -74,7 +74,7 @@ def surface_hit(o: Floats, dx: float, dy: float, dz: float, bend: float) -> floa
 
 @compiled
 def _below(t: float, wide: float, narrow: float) -> float:
-    """Return which share of a pixel lies below t, in the middle of widths |du|, |dv| of a ramp."""
+    """Return the share of a pixel below t, in the middle of widths |du|, |dv| of a ramp."""
     sum_half, diff_half = 0.5 * (wide + narrow), 0.5 * (wide - narrow)
     if t <= -sum_half:
         return 0.0
@@ -89,7 +89,7 @@ def _below(t: float, wide: float, narrow: float) -> float:
 
 @compiled
 def _share(t: float, du: float, dv: float, low: float, high: float) -> float:
-    """Return which share of a pixel has low < t < high, t changing by du and dv a pixel."""
+    """Return the share of a pixel with low < t < high, where t changes by du and dv per pixel."""
     a, b = abs(du), abs(dv)
     wide, narrow = max(a, b, 1e-9), max(min(a, b), 1e-9)
     return _below(high - t, wide, narrow) - _below(low - t, wide, narrow)
@@ -97,7 +97,7 @@ def _share(t: float, du: float, dv: float, low: float, high: float) -> float:
 
 @compiled
 def paint_cover(paint: Floats, place: Floats) -> float:
-    """Return which share of a pixel is painted.
+    """Return the painted share of a pixel.
 
     Args:
         paint: (n, 8) of `paint_rows`.
@@ -156,7 +156,7 @@ def paint_cover(paint: Floats, place: Floats) -> float:
 
 @compiled
 def texture(table: Floats, x: float, y: float) -> float:
-    """Return a smooth pattern at (x, y), one cell of the (64, 64) table a unit, repeating."""
+    """Return a smooth periodic pattern at (x, y), one cell of the (64, 64) table per unit."""
     ix, iy = int(np.floor(x)), int(np.floor(y))
     fx, fy = x - ix, y - iy
     fx, fy = fx * fx * (3.0 - 2.0 * fx), fy * fy * (3.0 - 2.0 * fy)
@@ -170,7 +170,7 @@ def texture(table: Floats, x: float, y: float) -> float:
 def grass(
     table: Floats, place: Floats, length: float, width: float, stripes: float
 ) -> tuple[float, float]:
-    """Return how bright the grass is (1 on average), and how yellow.
+    """Return brightness (1 on average) and yellowness of the grass.
 
     Args:
         table: (64, 64) of numbers about 0 with spread 1.
@@ -181,7 +181,7 @@ def grass(
     """
     x, y = place[0], place[1]
     size = abs(place[2]) + abs(place[3]) + abs(place[4]) + abs(place[5])
-    # A triangle wave made steep: 0.15 m of half-turned grass between stripes, or a pixel.
+    # A steep triangle wave: 0.15 m of half-turned grass between stripes, or a pixel.
     phase = ((x + 0.5 * length) / _STRIPE + 0.5) % 2.0
     ramp = (0.5 - abs(phase - 1.0)) * 2.0 * _STRIPE / max(0.3, size)
     bright = 1.0 + 0.5 * stripes * min(max(ramp, -1.0), 1.0)
@@ -197,7 +197,7 @@ def grass(
 
 @compiled
 def wear(table: Floats, place: Floats) -> float:
-    """Return how worn paint is at a place: about 0 with spread of about a half."""
+    """Return the wear of paint at a place: about 0 with spread of about a half."""
     x, y = place[0], place[1]
     fine = texture(table, x / 0.9, y / 0.9 + 9.0)
     return 0.5 * fine + 0.5 * texture(table, x / 4.0, y / 4.0)

@@ -1,4 +1,4 @@
-"""A stadium as pictures show it: how it looks, which light falls on it."""
+"""A stadium as rendered: its look and its lights."""
 
 from __future__ import annotations
 
@@ -28,48 +28,48 @@ SKY_COLOR: Final = np.array([0.66, 0.74, 0.84])
 
 @dataclass(frozen=True, eq=False)
 class Venue:
-    """A stadium: the same pitch, seed and settings make the same one for all cameras."""
+    """A stadium: the same pitch, seed and settings give the same one for all cameras."""
 
     pitch: PitchTemplate
     seed: int
     settings: RenderingSettings
     look: int
-    """Which boards and crowd."""
+    """Seed of boards and crowd."""
     table: Floats
     """(64, 64) random numbers of the grass."""
     side: float
-    """Of the stand that throws a shadow, -1 or 1 along y."""
+    """Side of the stand that casts a shadow, -1 or 1 along y."""
     edge: float
-    """How far from the long axis its shadow begins [m]."""
+    """Distance of the shadow's edge from the long axis [m]."""
     lights: tuple[Floats, ...]
     """(4,) each: direction down from the light, z = -1, and its share of all light."""
 
     @property
     def bend(self) -> float:
-        """The surface is z = -bend y^2 [1/m]."""
+        """Return the surface's coefficient in z = -bend y^2 [1/m]."""
         return self.pitch.crown / (0.5 * self.pitch.width) ** 2
 
     @property
     def half(self) -> Floats:
-        """Half the distances between the boards (2,) [m]."""
+        """Return half the distances between the boards (2,) [m]."""
         return 0.5 * np.array([self.pitch.length, self.pitch.width]) + BOARD_SETBACK
 
     @property
     def shade(self) -> float:
-        """Share of the light that the stand's shadow keeps off [1]."""
+        """Return the share of the light that the stand blocks in its shadow [1]."""
         return self.settings.stand_shadow if self.settings.light == "sun" else 0.0
 
     def in_shadow(self, y: Pictures) -> Pictures:
-        """Return how much of the stand's shadow is at places y on the ground [1]; 0 for NaN.
+        """Return the share of the stand's shadow at places y on the ground [1]; 0 for NaN.
 
-        It begins softly, over the 0.5 m that the sun's size gives.
+        Its edge is soft, over the 0.5 m that the sun's size gives.
         """
         past = np.float32(self.side) * y - np.float32(self.edge)
         dark = np.clip(past / np.float32(0.5) + np.float32(0.5), 0.0, 1.0)
         return np.where(np.isnan(dark), np.float32(0.0), dark)
 
     def fogged(self, color: Pictures, distance: Pictures) -> None:
-        """Put fog before colours (..., 3) at distances (...) [m]; in place."""
+        """Add fog to colours (..., 3) at distances (...) [m]; in place."""
         if self.settings.fog > 0.0:
             clear = np.exp(np.float32(-self.settings.fog) * distance)[..., None]
             color *= clear
@@ -90,7 +90,7 @@ def build_venue(pitch: PitchTemplate, seed: int, settings: RenderingSettings) ->
 
 def _lights(kind: str, turn: float, side: float) -> tuple[Floats, ...]:
     if kind == "sun":
-        # From behind the stand whose shadow lies on the pitch.
+        # From behind the stand whose shadow is on the pitch.
         across = np.clip(np.sin(turn), -0.8, 0.8)
         return (np.array([1.3 * across, -1.3 * side * np.sqrt(1.0 - across**2), -1.0, 0.5]),)
     corners = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
@@ -99,7 +99,7 @@ def _lights(kind: str, turn: float, side: float) -> tuple[Floats, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Emptiness:
-    """What a camera sees of grass and surroundings.
+    """A camera's image of grass and surroundings, without people.
 
     Attributes:
         color: (height, width, 3) RGB, 1 = white.
@@ -115,14 +115,14 @@ class Emptiness:
 def paint_venue(
     venue: Venue, grid: Floats, center: Floats, world_from_cam: Floats, size: tuple[int, int]
 ) -> Emptiness:
-    """Return what is seen through rays, under even light.
+    """Return the scene along rays, under even light.
 
     Args:
         venue: the stadium.
         grid: (rows, columns, 2) of `plane_grid`.
-        center: (3,) where rays begin [m], world.
+        center: (3,) origin of the rays [m], world.
         world_from_cam: (3, 3).
-        size: width and height of the picture [px].
+        size: width and height of the image [px].
     """
     width, height = size
     pitch, settings = venue.pitch, venue.settings
@@ -148,12 +148,12 @@ def paint_venue(
 
 
 def paint_empty(venue: Venue, camera: Camera, throwing: Sequence[Floats] = ()) -> Emptiness:
-    """Return what a camera sees of grass and surroundings, with shadows on the grass.
+    """Return a camera's image of grass and surroundings, with shadows on the grass.
 
     Args:
         venue: the stadium.
         camera: a single camera.
-        throwing: (things, limbs, 8) capsules that throw shadows besides the stand [m], world.
+        throwing: (things, limbs, 8) capsules that cast shadows in addition to the stand [m], world.
     """
     width, height = (int(n) for n in camera.image_size)
     seen = paint_venue(
@@ -176,7 +176,7 @@ def paint_empty(venue: Venue, camera: Camera, throwing: Sequence[Floats] = ()) -
 def draw_capsules(
     venue: Venue, camera: Camera, color: Pictures, things: list[Floats], colors: list[Floats]
 ) -> None:
-    """Draw things made of capsules over a picture.
+    """Draw things made of capsules over an image.
 
     Args:
         venue: the stadium.

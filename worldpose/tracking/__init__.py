@@ -1,7 +1,7 @@
-"""Tracking: which detection of every camera is which person, frame after frame (T1, T2).
+"""Multi-view tracking: association of every camera's detections with people, over time (T1, T2).
 
-Inputs: cameras and the people each of them detected. Outputs: the detection of every person in
-every frame and camera, quick joints [m], and a summary of each track.
+Inputs: cameras and the detections of each. Outputs: the detection of every person in every frame
+and camera, quick joints [m], and a summary of each track.
 """
 
 from worldpose.tracking.diagnosis import NoPeople, diagnose_no_people

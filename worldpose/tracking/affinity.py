@@ -24,20 +24,19 @@ def ray_affinity(
 
     Args:
         joints: (persons, joints, 3) [m], world; NaN where unknown.
-        centers: (cameras, 3) [m], world, where the rays begin.
+        centers: (cameras, 3) [m], world, origins of the rays.
         directions: (cameras, detections, joints, 3) unit rays, world.
-        weights: (cameras, detections, joints), 0 or less where not seen; else their size says
-            nothing.
-        gates: (cameras, persons) [m], distances beyond which an affinity is not needed.
-        min_joints: least joints known on both sides.
+        weights: (cameras, detections, joints), 0 or less where not seen; only the sign counts.
+        gates: (cameras, persons) [m], distances beyond which no affinity is computed.
+        min_joints: least number of joints known on both sides.
 
     Returns:
         (cameras, persons, detections) [-m]; minus infinity with too few joints in common or
         beyond the gate.
 
     Note:
-        T1: the plain mean over the joints known on both sides. A pair is given up as soon as the
-        joints seen so far put its mean beyond the gate, however near the others are.
+        T1: the plain mean over the joints known on both sides. Computation of a pair stops as soon
+        as the joints so far put its mean beyond the gate, whatever the distance of the others.
     """
     cameras, detections, joint_count, _ = directions.shape
     persons = joints.shape[0]
@@ -80,7 +79,7 @@ def distance(
 ) -> float:
     """Return the distance [m] of a point to a ray; NaN where either is missing.
 
-    A point behind the camera is as far as the camera.
+    For a point behind the camera, the distance to the camera counts.
     """
     x, y, z = x - center[0], y - center[1], z - center[2]
     along = max(0.0, x * direction[0] + y * direction[1] + z * direction[2])
@@ -98,8 +97,8 @@ def match_greedily(affinity: NDArray[np.float64]) -> NDArray[np.int64]:
         affinity: (cameras, persons, detections); minus infinity = no match.
 
     Returns:
-        (cameras, persons) place among the detections, each used once; -1 = none. Of equal pairs
-        the first person's, then the first detection's is taken.
+        (cameras, persons) index of the detection, each used once; -1 = none. Of equal pairs the
+        first person's, then the first detection's wins.
     """
     cameras, persons, detections = affinity.shape
     index = np.full((cameras, persons), -1)
@@ -119,11 +118,11 @@ def match_greedily(affinity: NDArray[np.float64]) -> NDArray[np.int64]:
 def nearest_detections(
     affinity: NDArray[np.float64], unmatched: float
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return everybody's best detection (cameras, persons), and the cameras where two share one.
+    """Return each person's best detection (cameras, persons), and the cameras where two share one.
 
     Args:
         affinity: (cameras, persons, detections); minus infinity = no match.
-        unmatched: affinity of having no detection.
+        unmatched: affinity of a person without detection.
     """
     cameras, persons, detections = affinity.shape
     index, shared = np.full((cameras, persons), -1), np.zeros(cameras, np.bool_)
@@ -142,15 +141,15 @@ def nearest_detections(
 
 
 def match_optimally(affinity: NDArray[np.float64], unmatched: float) -> NDArray[np.int64]:
-    """Return each person's detection in every camera, so that the sum of affinities is largest.
+    """Return each person's detection in every camera, with the largest sum of affinities.
 
     Args:
         affinity: (cameras, persons, detections); minus infinity = no match.
-        unmatched: affinity of having no detection.
+        unmatched: affinity of a person without detection.
 
     Returns:
-        (cameras, persons) place among the detections, each used once; -1 = none (Hungarian
-        method, where the best detections of two people are the same).
+        (cameras, persons) index of the detection, each used once; -1 = none (Hungarian method, if
+        the best detections of two people are the same).
     """
     index, shared = nearest_detections(affinity, unmatched)
     for c in np.flatnonzero(shared):

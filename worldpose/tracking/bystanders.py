@@ -1,7 +1,7 @@
-"""Bystanders: people who are never on the pitch or near it (D2, in space).
+"""Removal of bystanders: people who are never on the pitch or near it (D2, in 3D).
 
-A single camera knows a far foot to a metre, and given 2D poses may be anybody's. Where a track has
-its place from several cameras, it is known to centimetres who waits behind the lines.
+A single camera locates a distant foot to a metre, and given 2D poses may show any person. Several
+cameras locate a track to centimetres, and so tell people waiting behind the lines from players.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from worldpose.tracking.person import Person
 def without_bystanders(
     people: list[Person], pitch_size: tuple[float, float] | None, margin: float
 ) -> list[Person]:
-    """Return the people without those who are farther outside all the time.
+    """Return the people without those who are always farther outside than `margin`.
 
     Args:
         people: tracks of a clip.
         pitch_size: length along x and width along y of the pitch around the origin [m]; None keeps
-            everybody.
-        margin: how far outside of the lines may still be a player [m].
+            all.
+        margin: largest distance of a player outside of the lines [m].
     """
     if pitch_size is None:
         return people
@@ -30,7 +30,7 @@ def without_bystanders(
 
 
 def _nearest(person: Person, half: NDArray[np.float64]) -> float:
-    """The least distance outside of the lines [m]; 0 for who was on the pitch, or nowhere."""
+    """Return the least distance outside of the lines [m]; 0 on the pitch or without position."""
     places = np.array([sighting.joints[:, :2] for sighting in person.sightings.values()])
     places = places[np.isfinite(places[..., 0]).any(axis=1)]
     outside = np.maximum(np.abs(np.nanmean(places, axis=1)) - half, 0.0)

@@ -1,7 +1,7 @@
-"""How near to a tracked person a camera's detection must be, learned from those that were matched.
+"""Gates on the distance of a camera's detections to tracked people, learned from matches.
 
-A fixed gate that suits badly calibrated cameras lets a person whom a camera misses take the
-detection of a neighbour. Matched detections tell each camera's usual distance.
+If a camera misses a person, a fixed gate wide enough for badly calibrated cameras would admit a
+neighbour's detection. The distances of matched detections give each camera's gate.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 MEMORY: Final = 300
-"""Matched detections of a camera from which its usual distance is taken."""
+"""Most matched detections of a camera that its median distance uses."""
 ENOUGH: Final = 10
-"""Fewer than these tell nothing."""
+"""Least number of matches for a median."""
 RAY_NOISE: Final = (0.03, 0.05, 0.13)
 """Standard deviation of the distance between two rays of one joint: least, while unknown, and
 greatest [m]. MVOR's median is 0.05 m, Shelf's 0.02 m."""
 
 
 class CameraGates:
-    """Distances of each camera's detections to the people with whom they were matched.
+    """Distances of each camera's detections to the people that they were matched with.
 
     Attributes:
-        usual: (cameras,) medians [m]; infinite where too few are known.
+        usual: (cameras,) medians [m]; infinite with too few matches.
         usual_pair: median distance of the rays of two detections that are each other's nearest
-            [m]; infinite where too few are known.
+            [m]; infinite with too few.
     """
 
     def __init__(self, cameras: int) -> None:
@@ -37,14 +37,14 @@ class CameraGates:
         self._known: list[deque[float]] = [deque(maxlen=MEMORY) for _ in range(cameras)]
 
     def learn(self, distance: NDArray[np.float64]) -> None:
-        """Take in the ray distances (cameras, persons) [m] of a frame's matches; NaN = none."""
+        """Add the ray distances (cameras, persons) [m] of a frame's matches; NaN = none."""
         for camera, known in enumerate(self._known):
             known.extend(distance[camera][np.isfinite(distance[camera])].tolist())
             if len(known) >= ENOUGH:
                 self.usual[camera] = np.median(known)
 
     def learn_pairs(self, distance: NDArray[np.float64]) -> None:
-        """Take in ray distances (pairs,) [m] of detections that are each other's nearest."""
+        """Add ray distances (pairs,) [m] of detections that are each other's nearest."""
         self._pairs.extend(distance.tolist())
         if len(self._pairs) >= ENOUGH:
             self.usual_pair = float(np.median(self._pairs))

@@ -1,4 +1,4 @@
-"""Arrays of a clip that are read a stretch of frames at a time."""
+"""Arrays of a clip that are read in chunks of frames."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 
 class ClipArray(Protocol):
-    """What slices like an array along frames, its first dimension; NumPy's arrays do."""
+    """An array that can be sliced along frames, its first dimension; NumPy's arrays can."""
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Frames first."""
+        """Shape, with frames first."""
 
     def __getitem__(self, frames: slice, /) -> NDArray[Any]:
-        """The values of a stretch of frames."""
+        """Return the values of a chunk of frames."""

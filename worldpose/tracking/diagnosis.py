@@ -1,7 +1,7 @@
-"""Why a clip's detections became no people: measured on the detections and the cameras.
+"""Diagnosis of a clip without tracked people, from its detections and cameras.
 
-Where cameras agree on their people (`pair_agreement`), what differs from the settings is the
-reason; where they do not, their clocks, places and poses are.
+If cameras agree on their people (`pair_agreement`), a quantity outside the limits of the settings
+is the cause; if not, clock offsets, camera positions or poses are.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.visibility import CameraSight
 
 WINDOW: Final = 400
-"""Most frames that are looked at."""
+"""Most frames that the diagnosis uses."""
 SAME_PLACE: Final = 1e-3
-"""Cameras nearer to each other than this are at one place [m]."""
+"""Cameras nearer to each other than this are at one position [m]."""
 UNITS: Final = {1000.0: "millimetres", 100.0: "centimetres", 39.37: "inches", 3.281: "feet"}
-"""Units that translations come in by mistake, by what they make of a metre."""
+"""Units that translations have by mistake, by their number per metre."""
 
 
 @dataclass(frozen=True)
 class NoPeople:
-    """Why tracking found no person.
+    """Cause of an empty tracking result.
 
     Attributes:
-        cause: one word for it.
+        cause: one word.
         message: the reason with its numbers, and what to do, in full sentences.
         evidence: the numbers by name.
     """
@@ -57,7 +57,7 @@ def diagnose_no_people(
     ground: bool,
     births: int = 0,
 ) -> NoPeople:
-    """Return why tracking found no person in a clip.
+    """Return the reason why tracking found no person in a clip.
 
     Args:
         cameras: batch (cameras,).
@@ -65,9 +65,9 @@ def diagnose_no_people(
         keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
         confidence: (frames, cameras, detections, 17); 0, less or NaN where not found.
         fps: frames per second [1/s].
-        settings: with which tracking found none.
+        settings: of the tracking run.
         ground: whether people stand on z = 0.
-        births: tracks that were started and dropped again.
+        births: tracks that began and were dropped again.
     """
     usable = _usable(keypoints, confidence, settings.min_joints)
     present = np.asarray(usable.any(axis=-1))
@@ -108,7 +108,7 @@ def diagnose_no_people(
         return _limit(cameras, camera_ids, agreeing, settings, ground, births)
     matched = [each for each in meetings if len(each.angle)]
     if matched and max(np.median(each.angle) for each in matched) < settings.min_angle:
-        # Cameras at nearly one place share few people where each looks elsewhere.
+        # Cameras at nearly one position share few people if they look in different directions.
         return _limit(cameras, camera_ids, matched, settings, ground, births)
     found = _other_clock(cameras, camera_ids, rays, meetings, fps, settings)
     if found is not None:
@@ -135,7 +135,7 @@ def diagnose_no_people(
 def _all_pairs_have_rivals(
     cameras: Camera, rays: NDArray[np.float64], ground: bool, settings: TrackingSettings
 ) -> bool:
-    """Return whether two cameras' detections make people, but always in several likely ways."""
+    """Return whether two cameras' detections form people, but always in several likely ways."""
     sight, gates, some = CameraSight(cameras), CameraGates(len(cameras.focal)), False
     for frame in np.unique(np.linspace(0, len(rays) - 1, SAMPLES).astype(int)):
         weights = np.isfinite(rays[frame, ..., 0]).astype(np.float64)
@@ -149,7 +149,7 @@ def _all_pairs_have_rivals(
 
 
 def _usable(keypoints: ClipArray, confidence: ClipArray, least: int) -> NDArray[np.bool_]:
-    """Return which detections (frames, cameras, detections) have joints enough."""
+    """Return which detections (frames, cameras, detections) have enough joints."""
     rows = [
         np.count_nonzero(
             (confidence[start : start + WINDOW] > 0.0)
@@ -169,7 +169,7 @@ def _too_little(
     confidence: ClipArray,
     settings: TrackingSettings,
 ) -> NoPeople | None:
-    """Return why detections cannot be compared at all, if so.
+    """Return the reason if detections cannot be compared at all, else None.
 
     Args:
         present: (frames, cameras), whether a camera has a usable detection in a frame.
@@ -219,7 +219,7 @@ def _too_little(
 
 
 def _window(present: NDArray[np.bool_]) -> slice:
-    """Return up to `WINDOW` frames around the middle of those that two cameras see."""
+    """Return up to `WINDOW` frames around the middle of those in which two cameras see people."""
     both = np.flatnonzero(np.count_nonzero(present, axis=1) >= 2)
     start = max(0, int(both[len(both) // 2]) - WINDOW // 2)
     return slice(start, min(len(present), start + WINDOW))
@@ -245,7 +245,7 @@ def _limit(
     ground: bool,
     births: int,
 ) -> NoPeople:
-    """Return which limit refuses people whom two cameras share.
+    """Return the limit that rejects people seen by two cameras.
 
     Args:
         cameras: batch (cameras,).
@@ -253,7 +253,7 @@ def _limit(
         agreeing: pairs with matches, the best first.
         settings: of tracking.
         ground: whether people stand on z = 0.
-        births: tracks that were started and dropped again.
+        births: tracks that began and were dropped again.
     """
     best = agreeing[0]
     a, b = (names[n] for n in best.cameras)
@@ -345,7 +345,7 @@ def _other_clock(
     fps: float,
     settings: TrackingSettings,
 ) -> NoPeople | None:
-    """Return the offset at which two cameras agree that do not as they are, if there is one."""
+    """Return the clock offset at which two cameras agree that otherwise do not, or None."""
     reach = min(len(rays) // 2, round(4.0 * fps))
     found: list[tuple[float, int, Meeting]] = []
     busiest = sorted(meetings, key=lambda each: each.possible, reverse=True)[:3]
@@ -357,7 +357,7 @@ def _other_clock(
     if not found:
         return None
     top = max(share for share, _, _ in found)
-    # A person who stands still agrees at many offsets; the middle of the best ones is told.
+    # A person who stands still agrees at many offsets: report the middle of the best ones.
     near = sorted(shift for share, shift, _ in found if share >= 0.95 * top)
     shift = near[len(near) // 2]
     share, _, then = next(each for each in found if each[1] == shift)
@@ -375,7 +375,7 @@ def _other_clock(
 def _overlap(
     cameras: Camera, rays: NDArray[np.float64], ground: bool, settings: TrackingSettings
 ) -> bool:
-    """Return whether people of one camera may be in the image of another."""
+    """Return whether people seen by one camera may be in the image of another."""
     centers, size = cameras.center, cameras.image_size
     middle = 0.5 * sum(settings.body_heights)
     for a in range(len(centers)):

@@ -1,4 +1,4 @@
-"""Where a clip's detections cannot tell who is who, and what a run says about it."""
+"""Ambiguous identities in a clip, and the warning of a run about them."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from data_contracts.tracking import Join
 from worldpose.tracking.person import Person
 
 UNDECIDED_SHARE: Final = 0.2
-"""Undecided joins per person [1] up to which a run does not warn: somebody leaves the view and
-comes back in most clips, and an undecided join leaves two tracks, which mixes no one up."""
+"""Undecided joins per person [1] up to which a run does not warn: in most clips a person leaves the
+view and comes back, and an undecided join leaves two tracks, which mixes up no identities."""
 NAMED: Final = 3
-"""Doubts that the warning names one by one."""
+"""Most doubts that the warning names one by one."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class Takeover:
     """A frame in which a track may have passed from one person to another.
 
     A camera lost `person` and then matched a detection that could as well be that of `other`, who
-    had one in this camera until then and is not placed by two cameras again. Where both are on one
-    ray, as cameras at eye level see them, no camera tells which of the two it shows.
+    had one in this camera until then and is not located by two cameras again. If both are on one
+    ray, as seen from eye level, no camera tells which of the two the detection shows.
     """
 
     frame: int
@@ -39,12 +39,12 @@ def find_takeovers(
     index: NDArray[np.int64],
     affinity: NDArray[np.float64],
 ) -> list[Takeover]:
-    """Return who, after a gap, took a detection that another person lost in this frame.
+    """Return people who, after a gap, took a detection that another person lost in this frame.
 
-    Whether the other is placed again is not known yet.
+    Whether the other person is located again is not known yet.
 
     Args:
-        people: n who are followed, before they take in this frame.
+        people: n followed people, before this frame's update.
         frame: number of the frame.
         index: (cameras, n) matched detections; -1 = none.
         affinity: (cameras, n, detections); minus infinity beyond the gates.
@@ -65,11 +65,11 @@ def find_takeovers(
 def lasting_takeovers(
     takeovers: Iterable[Takeover], lasting: Sequence[Person], chains: Sequence[Sequence[Person]]
 ) -> tuple[Takeover, ...]:
-    """Return takeovers of people who are real and were not placed again, by their final numbers.
+    """Return takeovers after which a real person was never located again, by final numbers.
 
     Args:
         takeovers: by numbers of tracks.
-        lasting: tracks that were seen for long enough.
+        lasting: tracks with enough evidence.
         chains: each final person's tracks.
     """
     tracks = {person.number: person for person in lasting}
@@ -91,12 +91,12 @@ def describe_doubts(
     takeovers: Sequence[Takeover],
     joins: Sequence[Join],
 ) -> str | None:
-    """Return a sentence about the places where identities are in doubt; None where few are.
+    """Return a warning about ambiguous identities; None if there are few.
 
     Args:
         frames: (frames,) numbers of the clip's frames.
-        people: persons found.
-        takeovers: by places of frames in the clip.
+        people: number of people.
+        takeovers: by indices of frames in the clip.
         joins: of the clip, decided or not.
     """
     parts = []

@@ -21,10 +21,10 @@ def footprints(
     directions: NDArray[np.float64],
     ground: tuple[float, float],
 ) -> NDArray[np.float64]:
-    """Return where on the ground each detection's person stands (n, 3): x, y and doubt [m].
+    """Return the ground position of each detection's person (n, 3): x, y and uncertainty [m].
 
-    The mean ray is cut at the height of a body's middle; the doubt is how far it travels through
-    the heights which that may have.
+    The mean ray is cut at the height of a body's centre; the uncertainty is the length of its
+    ground track within the possible heights of the centre.
 
     Args:
         centers: (n, 3) [m], world, of each detection's camera.
@@ -65,15 +65,15 @@ def pair_distances(
         centers: (n, 3) [m], world, of each detection's camera.
         directions: (n, joints, 3) unit rays, world; NaN where not seen.
         camera: (n,) index of each detection's camera.
-        places: (n, 3) [m], footprints; two farther apart than their doubts are two people.
-        min_joints: least joints seen by both.
+        places: (n, 3) [m], footprints; two farther apart than their uncertainties are two people.
+        min_joints: least number of joints seen by both.
         min_sine: least mean sine of the angle between the rays.
-        gate: distance beyond which a pair is of no interest [m].
+        gate: distance beyond which a pair is rejected [m].
 
     Returns:
-        (n, n) [m], upper triangle; infinite where two detections cannot start a group: same
-        camera, other places on the ground, too few joints in common, beyond the gate, or rays so
-        parallel that they meet everywhere.
+        (n, n) [m], upper triangle; infinite where two detections cannot start a group: same camera,
+        other positions on the ground, too few joints in common, beyond the gate, or nearly parallel
+        rays.
     """
     n, joint_count, _ = directions.shape
     distances = np.full((n, n), np.inf)
@@ -112,15 +112,15 @@ def associate(
     ground: bool,
     settings: TrackingSettings,
 ) -> list[Sighting]:
-    """Return the people that detections of at least `birth_views` cameras agree on.
+    """Return the people in agreeing detections of at least `birth_views` cameras.
 
     The two nearest detections start a group; every other camera adds the detection nearest to
-    where they meet. A group of too few views, or of impossible size, is no person.
+    their intersection. A group of too few views, or of impossible size, is no person.
 
     Args:
         centers: (cameras, 3) [m], world.
-        directions: (cameras, detections, 17, 3) unit rays, world; NaN where not seen or taken.
-        weights: (cameras, detections, 17), of the squared angle; 0 where not seen or taken.
+        directions: (cameras, detections, 17, 3) unit rays, world; NaN where not seen or matched.
+        weights: (cameras, detections, 17), of the squared angle; 0 where not seen or matched.
         ground: whether people stand on z = 0.
         settings: gates and least views.
 
@@ -165,7 +165,7 @@ def associate(
 
 
 def is_person(joints: NDArray[np.float64], ground: bool, settings: TrackingSettings) -> bool:
-    """Return whether joints (17, 3) [m] have the size of a person, and stand where people do."""
+    """Return whether joints (17, 3) [m] have a person's size, and a person's height if `ground`."""
     known = np.isfinite(joints[:, 2])
     if not plausible(joints, settings.size_range):
         return False
@@ -182,7 +182,7 @@ def _grown(
 ) -> Sighting:
     """Return the group around a seed of two detections (cameras,).
 
-    Two rounds, the first at the wider gate: two views alone leave the place uncertain.
+    Two passes, the first at the wider gate: two views alone leave the position uncertain.
     """
     unknown = np.full((1, directions.shape[2], 3), np.nan)
     sine = math.sin(settings.min_angle)

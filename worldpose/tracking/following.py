@@ -1,4 +1,4 @@
-"""People followed from frame to frame: matching, births, losses, merges (T1, T2)."""
+"""Frame-by-frame tracking: matching, births, losses, merges (T1, T2)."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from worldpose.tracking.sightings import Sighting
 from worldpose.tracking.visibility import CameraSight
 
 MIN_AREA = 25.0
-"""Least ground on which strangers may appear [m^2]: a room."""
+"""Least ground area on which strangers may appear [m^2]: a room."""
 MAX_DEVIATION = 3.0
-"""Standard deviations by which the rays of two views of one person miss each other at most."""
+"""Largest distance of the rays of two views of one person, in standard deviations."""
 LEARN_EVERY = 5
-"""Frames of these in which cameras tell what they show of people who are known."""
+"""Interval between frames in which visibility statistics use known people."""
 
 
 class Follower:
-    """The people of a clip, frame by frame.
+    """Tracker state of a clip, updated frame by frame.
 
     Attributes:
-        active: who is being followed.
-        lost: whom nobody saw for a while; only in causal mode, where they may come back.
-        ended: whose track is over.
-        joins: causal decisions about who came back.
+        active: people being tracked.
+        lost: people unseen for a while; only in causal mode, where they may come back.
+        ended: people whose track is over.
+        joins: causal decisions about people who came back.
         takeovers: frames in which a track may have passed to another person.
-        merged: tracks that turned out to be on another's person.
-        detections: detections with enough joints to be matched.
+        merged: number of tracks that duplicated another's person.
+        detections: number of detections with enough joints to be matched.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Follower:
 
     @property
     def area(self) -> float:
-        """The ground on which people were seen so far [m^2]."""
+        """Ground area on which people were seen so far [m^2]."""
         return max(MIN_AREA, float(np.prod(self.high - self.low)) if self.born else 0.0)
 
     @property
@@ -79,7 +79,7 @@ class Follower:
     def step(
         self, frame: int, directions: NDArray[np.float64], weights: NDArray[np.float64]
     ) -> None:
-        """Take in one frame's rays (cameras, detections, 17, 3) and weights."""
+        """Update with one frame's rays (cameras, detections, 17, 3) and weights."""
         usable = np.count_nonzero(weights > 0.0, axis=-1) >= self.settings.min_joints
         self.detections += int(np.count_nonzero(usable))
         for person in self.active:
@@ -126,7 +126,7 @@ class Follower:
         directions: NDArray[np.float64],
         weights: NDArray[np.float64],
     ) -> None:
-        """Take in what cameras show of people who are known, now and then."""
+        """Update visibility statistics with new groups, and every few frames with known people."""
         seen = [(joints[n], index[:, n] >= 0) for n in np.flatnonzero(known).tolist()]
         seen = seen if frame % LEARN_EVERY == 0 else []
         seen += [(group.joints, group.index >= 0) for group in groups]
@@ -146,7 +146,7 @@ class Follower:
     def _match(
         self, frame: int, directions: NDArray[np.float64], weights: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-        """Match the people known so far.
+        """Match the known people.
 
         Returns:
             detections (cameras, persons), their distances [m], and joints (persons, 17, 3) [m].
@@ -199,10 +199,10 @@ class Follower:
         directions: NDArray[np.float64],
         affinity: NDArray[np.float64],
     ) -> None:
-        """Undo, in `index`, matches of two views whose rays miss each other.
+        """Remove, from `index`, matches of two views whose rays are too far apart.
 
-        Where a third view is lost, a neighbour's detection within the gate would carry the person
-        away. Of the two, the one nearer to the predicted place stays.
+        If a third view is lost, a neighbour's detection within the gate would drag the track away.
+        Of the two, the one nearer to the prediction stays.
         """
         for n in np.flatnonzero(np.count_nonzero(index >= 0, axis=0) == 2).tolist():
             a, b = np.flatnonzero(index[:, n] >= 0)
@@ -215,10 +215,10 @@ class Follower:
                 index[a if affinity[a, n, i] < affinity[b, n, j] else b, n] = -1
 
     def _evidence(self, sighting: Sighting, pairs: Pairs | None) -> float:
-        """Return what a sighting says for a person [1].
+        """Return the evidence of a sighting for a person [1].
 
-        Two views count in full where the odds are clear, not at all where the detections more
-        likely belong to others, and in part else.
+        Two views count in full if the odds are clear, not at all if the detections more likely
+        belong to others, and in part otherwise.
         """
         settings = self.settings
         views = np.count_nonzero(sighting.index >= 0)
@@ -232,10 +232,10 @@ class Follower:
         return 1.0 if pairs.odds[pair] >= settings.pair_odds else settings.pair_evidence
 
     def _add(self, frame: int, groups: list[Sighting], pairs: Pairs | None) -> None:
-        """Give associated groups to lost people within reach, else start new people."""
+        """Assign associated groups to lost people within reach, else start new people."""
         seen = [person for person in self.active if person.last_fixed == frame]
-        # A group on a person in view, or on another group, comes from that person's second
-        # detections.
+        # A group at a person in view, or at another group, consists of duplicate detections of that
+        # person.
         taken, new = [person.pose for person in seen], list[Sighting]()
         for group in groups:
             beside = separations(group.joints[None], np.array(taken)) if taken else np.array(np.inf)
@@ -262,7 +262,7 @@ class Follower:
         self.joins += [replace(join, after=numbers[join.after]) for join in found]
 
     def _found_again(self, frame: int, groups: list[Sighting]) -> list[Candidate]:
-        """Return which of the groups (`after`) are lost people, as far as the past can tell."""
+        """Return which of the groups (`after`) are lost people, judged from the past alone."""
         before = [self.end_of(person)[1] for person in self.lost]
         now = np.array([frame])
         after = [
@@ -273,7 +273,7 @@ class Follower:
         return decide(before, after, costs, self.settings)
 
     def end_of(self, person: Person) -> tuple[End, End]:
-        """Return how a person's track begins and stops."""
+        """Return the start and the end of a person's track."""
         fixed = [
             (frame, sighting.joints)
             for frame, sighting in person.sightings.items()
@@ -284,7 +284,7 @@ class Follower:
         return ends_of(person.number, frames, joints, self.fps, self.settings)
 
     def _merge(self, frame: int) -> None:
-        """End people who have been where another is for `merge_time`."""
+        """End people whose track has coincided with another's for `merge_time`."""
         seen = [person for person in self.active if person.last_fixed == frame]
         seen.sort(key=lambda person: (-person.fixed, person.number))
         apart = _apart([person.pose for person in seen], seen)
@@ -303,7 +303,7 @@ class Follower:
         self.near_since = near
 
     def _end(self, frame: int) -> None:
-        """Lose people unseen for too long; ghosts have little patience."""
+        """End or lose people unseen for too long; unconfirmed ones have a shorter limit."""
         settings = self.settings
         for person in list(self.active):
             patience = settings.max_coast if self._confirmed(person) else settings.min_track
@@ -329,7 +329,7 @@ def ray_distance(
 
 
 def _without(weights: NDArray[np.float64], index: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return weights (cameras, detections, 17), 0 for detections (cameras, n) that are taken."""
+    """Return weights (cameras, detections, 17), 0 for matched detections (cameras, n)."""
     left = weights.copy()
     camera, person = np.nonzero(index >= 0)
     left[camera, index[camera, person]] = 0.0

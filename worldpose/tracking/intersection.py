@@ -1,4 +1,4 @@
-"""The tracker's own quick 3D joints: where the rays of matched detections meet."""
+"""Quick 3D joints of the tracker, from the rays of matched detections."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from worldpose.tracking.affinity import distance
 
 ITERATIONS = 5
 CONVERGED = 1e-3
-"""Length of a step that ends the iteration [m]: a tenth of what the rays can tell."""
+"""Length of a step that ends the iteration [m]: a tenth of the rays' accuracy."""
 FEW_RAYS = 1e-9
-"""Determinant, of a system whose diagonal is about 1, that counts as singular [1]."""
+"""Determinant of a system with a diagonal of about 1 that counts as singular [1]."""
 
 Point = tuple[float, float, float]
 
@@ -32,19 +32,19 @@ def intersect_people(
     """Return the joints of people from the rays of their detections.
 
     The point nearest to the rays, each weighted by `weights` over its squared length, under a
-    Geman-McClure loss: a view that shows someone else has little say.
+    Geman-McClure loss: a view that shows another person has little influence.
 
     Args:
         centers: (cameras, 3) [m], world.
         directions: (cameras, detections, joints, 3) unit rays, world; NaN where not seen.
         weights: (cameras, detections, joints), of the squared angle; 0 where not seen.
-        index: (cameras, persons) place among the detections; -1 = not seen.
-        near: (persons, joints, 3) [m], expected places; NaN where there is no expectation.
-        gate: distance [m] beyond which a ray does not carry the joint.
-        min_sine: least sine of an angle between two carrying rays.
+        index: (cameras, persons) index of the detection; -1 = not seen.
+        near: (persons, joints, 3) [m], predicted positions; NaN without prediction.
+        gate: distance [m] beyond which a ray is an outlier.
+        min_sine: least sine of the angle between two inlier rays.
 
     Returns:
-        (persons, joints, 3) [m], world; NaN where fewer than two rays agree.
+        (persons, joints, 3) [m], world; NaN with fewer than two inlier rays.
     """
     cameras, _, joint_count, _ = directions.shape
     persons = index.shape[1]

@@ -1,4 +1,4 @@
-"""Which fragment of a track goes on as which other, by motion and size, and how sure that is."""
+"""Joins of track fragments by motion and size, with their odds."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from worldpose.tracking.limbs import limb_lengths
 from worldpose.tracking.settings import TrackingSettings
 
 TORSO = (5, 6, 11, 12)
-"""Shoulders and hips, whose mean is the place of a body."""
+"""Shoulders and hips, whose mean is the position of a body."""
 PLACE_NOISE = 0.1
-"""Standard deviation of a place from few frames [m]."""
+"""Standard deviation of a position from few frames [m]."""
 VELOCITY_NOISE = 0.5
 """Standard deviation of a velocity from few frames [m/s]."""
 TOP_SPEED = 9.5
-"""Nobody runs faster [m/s]."""
+"""Highest speed of a person [m/s]."""
 GROSS_SHARE = 0.1
 """Share of a track's limb lengths that are gross errors [1]."""
 GROSS_LIMB = 0.3
-"""Standard deviation of such lengths [m]."""
+"""Standard deviation of these gross errors [m]."""
 
 
 @dataclass(frozen=True)
 class End:
-    """A track where it begins or stops.
+    """Start or end of a track.
 
     Attributes:
         number: of the track.
         frame: first or last frame.
         place: (2,) [m], on the ground.
-        velocity: (2,) [m/s]; NaN where not known.
-        limbs: (11,) lengths [m], over the whole track; NaN where not known.
+        velocity: (2,) [m/s]; NaN where unknown.
+        limbs: (11,) lengths [m], over the whole track; NaN where unknown.
         limb_variance: (11,) of those lengths [m^2].
     """
 
@@ -49,15 +49,15 @@ class End:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A place in a clip where one track may go on as another.
+    """A possible join of two tracks, the later one as continuation of the earlier.
 
     Attributes:
-        before: number of the track that stops.
+        before: number of the track that ends.
         after: number of the track that begins.
         last_frame: of the first.
         first_frame: of the second.
         cost: minus the logarithm of the odds that they are one person rather than two strangers.
-        margin: by how much every other way of joining the tracks is worse [nat].
+        margin: additional cost of the best alternative without this join [nat].
         decided: whether they were joined.
     """
 
@@ -77,11 +77,11 @@ def ends_of(
     fps: float,
     settings: TrackingSettings,
 ) -> tuple[End, End]:
-    """Return how a track begins and how it stops.
+    """Return the start and the end of a track.
 
     Args:
         number: of the track.
-        frames: (n,) frames whose rays determined the place.
+        frames: (n,) frames whose rays determined the position.
         joints: (n, 17, 3) [m], world; NaN where not determined.
         fps: frames per second [1/s].
         settings: times.
@@ -102,7 +102,7 @@ def ends_of(
 
 
 def _mean_known(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean place (n, 2) of the points known among (n, points, 3); NaN without any."""
+    """Return the mean position (n, 2) of the known points among (n, points, 3); NaN without any."""
     known: NDArray[np.bool_] = np.isfinite(points[..., :1])
     total = np.where(known, points[..., :2], 0.0).sum(axis=1)
     with np.errstate(invalid="ignore"):
@@ -116,19 +116,19 @@ def join_costs(
     area: float,
     settings: TrackingSettings,
 ) -> NDArray[np.float64]:
-    """Return the cost of every track that stops going on as every track that begins.
+    """Return the cost of joining every track that ends to every track that begins.
 
-    Between two sightings a person's velocity wanders at random: the place where the second track
-    begins is expected at the mean of both velocities, or at the first's where the second's is not
-    known yet, and the doubt grows with the gap. A stranger may appear anywhere on the area, at
-    any speed and of any size.
+    Between two sightings a person's velocity is a random walk: the expected start of the second
+    track follows from the mean of both velocities, or from the first's if the second's is unknown,
+    and its uncertainty grows with the gap. A stranger may appear anywhere on the area, at any speed
+    and of any size.
 
     Args:
-        before: n tracks that stop.
+        before: n tracks that end.
         after: m tracks that begin.
         fps: frames per second [1/s].
         area: ground on which people move [m^2].
-        settings: how people move and differ.
+        settings: statistics of people's motion and size.
 
     Returns:
         (n, m) [nat], minus the log odds of one person; infinite where impossible.
@@ -172,7 +172,7 @@ def _cost(old: End, new: End, gap: float, area: float, settings: TrackingSetting
     own = settings.limb_noise**2 + old.limb_variance[known] + new.limb_variance[known]
     other = own + 2.0 * settings.limb_spread**2
     evidence = _log_limb(difference[known], other) - _log_limb(difference[known], own)
-    # Limbs of one person err and differ together: their mean is worth two of them.
+    # Limb errors and differences of one person are correlated: their mean is worth two limbs.
     return cost + (2.0 * float(evidence.mean()) if known.any() else 0.0)
 
 
@@ -181,7 +181,7 @@ def _log_limb(
 ) -> NDArray[np.float64]:
     """Return the log density of differences of lengths (n,) [m], some of which are gross errors.
 
-    An elbow that two views place at another person's arm makes a limb a metre longer.
+    If two views place an elbow at another person's arm, a limb becomes a metre longer.
     """
     wide = variance + GROSS_LIMB**2
     usual = math.log1p(-GROSS_SHARE) - 0.5 * (difference**2 / variance + np.log(variance))
@@ -190,7 +190,7 @@ def _log_limb(
 
 
 def _log_normal(offset: NDArray[np.float64], variance: float) -> float:
-    """Return the logarithm of the density of a normal distribution in the plane."""
+    """Return the log density of a normal distribution in the plane."""
     return -0.5 * float(offset @ offset) / variance - math.log(2.0 * math.pi * variance)
 
 
@@ -200,13 +200,13 @@ def decide(
     costs: NDArray[np.float64],
     settings: TrackingSettings,
 ) -> list[Candidate]:
-    """Return the joins of the likeliest way to go on, each with its margin, cheapest first.
+    """Return the joins of the likeliest assignment, each with its margin, cheapest first.
 
-    A join is decided when its odds against every other way are at least `join_odds`; the others
-    are for a person to decide.
+    A join is decided if its odds against every alternative are at least `join_odds`; a person
+    reviews the others.
 
     Args:
-        before: n tracks that stop.
+        before: n tracks that end.
         after: m tracks that begin.
         costs: (n, m) [nat].
         settings: odds that decide.
@@ -233,7 +233,7 @@ def decide(
 
 
 def _cheapest(gain: NDArray[np.float64]) -> tuple[list[tuple[int, int]], float]:
-    """Return the pairs of the cheapest matching and its cost; no pair costs nothing."""
+    """Return the pairs of the cheapest assignment and its cost; an unpaired track costs nothing."""
     row, column = linear_sum_assignment(gain)
     used = gain[row, column] < 0.0
     pairs = list(zip(row[used].tolist(), column[used].tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""Limbs: how long they are in an adult, and in the person of a track."""
+"""Limb lengths of adults, and of the person of a track."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ LIMBS = np.array(
         (14, 16),
     ]
 )
-"""Pairs of COCO-17 joints whose distances tell a person's size."""
+"""Pairs of COCO-17 joints whose distances measure a person's size."""
 LIMB_LENGTHS = np.array([0.36, 0.30, 0.30, 0.25, 0.25, 0.51, 0.51, 0.42, 0.42, 0.42, 0.42])
 """Their lengths in an adult of 1.75 m [m]: Drillis and Contini's segment ratios, with the torso
 and shoulders measured between joint centres."""
 ERROR_TIME = 0.3
-"""Time in which a detector's errors are forgotten [s]: frames nearer to each other say the same."""
+"""Correlation time of a detector's errors [s]: frames nearer to each other add no information."""
 
 
 def plausible(joints: NDArray[np.float64], size_range: tuple[float, float]) -> bool:
@@ -54,7 +54,7 @@ def limb_lengths(
         known = every[np.isfinite(every)]
         if len(known):
             median[limb] = np.median(known)
-            # 5 cm for a single frame, and what the frames themselves show.
+            # 5 cm for a single frame, else the scatter between frames if larger.
             spread = max(0.05, 1.4826 * float(np.median(np.abs(known - median[limb]))))
             variance[limb] = spread**2 / max(1.0, len(known) / (ERROR_TIME * fps))
     return median, variance

@@ -1,8 +1,8 @@
-"""Whether two cameras agree on their people: their detections compared without any unit.
+"""Agreement of two cameras on their people, independent of the unit of length.
 
-Two detections of one person, in two cameras that are right, lie on each other's epipolar lines.
-That is measured as an angle relative to the person's apparent size, so it needs no unit of length,
-no smallest angle between rays, and no gate.
+In two correctly calibrated cameras, two detections of one person lie on each other's epipolar
+lines. The residual is an angle relative to the person's apparent size, so it needs no unit of
+length, no smallest angle between rays, and no gate.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from worldpose.cameras import Camera
 from worldpose.tracking.limbs import LIMB_LENGTHS, LIMBS
 
 SAMPLES: Final = 24
-"""Frames of these in which detections are compared."""
+"""Most frames in which detections are compared."""
 TOLERANCE: Final = 0.15
 """Largest mean epipolar angle of two detections of one person, in spreads of a body's joints [1]:
 7 cm on an adult, whose joints spread 0.5 m."""
 AGREE: Final = 0.5
 """Share of detections with a partner from which two cameras agree [1]."""
 FEW: Final = 4
-"""Fewer matches than these tell nothing."""
+"""Least number of matches for a conclusion."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class Meeting:
     """Matches of the detections of two cameras.
 
     Attributes:
-        cameras: places of the two.
-        possible: matches that there could be.
+        cameras: indices of the two.
+        possible: largest possible number of matches.
         angle: (matches,) angle between the lines of the rays of one joint, up to a right one [rad].
-        distance: (matches,) by how far those rays miss each other [m].
+        distance: (matches,) distance between those rays [m].
         size: (matches,) limb lengths relative to an adult's [1]; NaN where unknown.
         height: (matches,) mean height of the joints over z = 0 [m].
         depth: (matches,) distance from the first camera [m].
@@ -52,7 +52,7 @@ class Meeting:
 
     @property
     def share(self) -> float:
-        """Matches among those that there could be [1]."""
+        """Share of matches among the possible ones [1]."""
         return len(self.angle) / max(self.possible, 1)
 
     @property
@@ -69,9 +69,9 @@ def match_pair(
     Args:
         cameras: batch (cameras,).
         rays: (frames, cameras, detections, 17, 3) unit rays [world]; NaN where not seen.
-        pair: places of the two cameras.
-        shift: frames by which the second camera is taken later.
-        least: joints that both detections must show.
+        pair: indices of the two cameras.
+        shift: frames by which the second camera's detections are later.
+        least: least number of joints in both detections.
     """
     a, b = pair
     seen = np.asarray(np.isfinite(rays[..., 0]).any(axis=(-1, -2)))
@@ -102,7 +102,7 @@ def _matches(
         p: (n, 17, 3) unit rays of its detections.
         other: (3,) [m], of the second camera.
         q: (m, 17, 3) unit rays of its detections.
-        least: joints that both must show.
+        least: least number of joints in both.
     """
     baseline = other - origin
     length = float(np.linalg.norm(baseline))

@@ -1,9 +1,9 @@
-"""Evidence for people whom exactly two cameras show: the odds that both show one person.
+"""Evidence for new people in exactly two cameras: the odds that both show one person.
 
 Two rays nearly meet wherever two cameras look at people of one height, so a small distance between
 rays is not enough. The odds of a pair weigh its rays' distance, the size and proportions of the
-skeleton that they determine, cameras that should see a person there and have no detection, and
-every other pair that one of the two detections could form instead.
+triangulated skeleton, cameras that should see a person there and have no detection, and all other
+pairs that could contain one of the two detections.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ SIZE_SPREAD: Final = 0.15
 LIMB_SCATTER: Final = 0.2
 """Standard deviation of the logarithms of limb lengths of one person in one frame [1]."""
 SAME_PLACE: Final = 0.3
-"""Two skeletons whose joints are nearer than this on average are one body [m]."""
+"""Two skeletons with a smaller mean joint distance are one body [m]."""
 NO_PARTNER: Final = -6.3
-"""Score of having no partner [nat]."""
+"""Score of a detection without partner [nat]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """All pairs that the free detections of a frame could form.
+    """All possible pairs of a frame's free detections.
 
     Attributes:
-        cameras: (pairs, 2) places of the two cameras, the first before the second.
-        detections: (pairs, 2) places among their detections.
-        joints: (pairs, 17, 3) [m], world, where their rays meet.
+        cameras: (pairs, 2) indices of the two cameras, the first before the second.
+        detections: (pairs, 2) indices of their detections.
+        joints: (pairs, 17, 3) [m], world, from the intersection of their rays.
         distance: (pairs,) mean distance of their rays [m].
         odds: (pairs,) odds against all other explanations of the two detections [1].
-        unique: (pairs,) whether it is likelier than all rival pairs together.
+        unique: (pairs,) whether the pair is likelier than all its rivals together.
     """
 
     cameras: NDArray[np.int64]
@@ -55,7 +55,7 @@ class Pairs:
     unique: NDArray[np.bool_]
 
     def find(self, index: NDArray[np.int64]) -> int | None:
-        """Return which pair two detections (cameras,) are, -1 = not seen; None if they are none."""
+        """Return the number of the pair of two detections (cameras,), -1 = none; None if absent."""
         cameras = np.flatnonzero(index >= 0)
         same = (self.cameras == cameras) & (self.detections == index[cameras])
         found = np.flatnonzero(same.all(axis=1))
@@ -78,8 +78,8 @@ def judge_pairs(
         directions: (cameras, detections, 17, 3) unit rays, world; NaN where not seen.
         weights: (cameras, detections, 17), of the squared angle; 0 where not seen, or where other
             views explain the detection.
-        sight: what the cameras see.
-        gates: how far detections of people pass from each other; learns it.
+        sight: visibility statistics of the cameras.
+        gates: distances between rays of one person; updated here.
         ground: whether people stand on z = 0.
         settings: gates and accepted sizes.
         everything: the weights of all detections, explained or not.
@@ -140,8 +140,8 @@ def group_pairs(
 
     Args:
         pairs: of a frame.
-        weights: (cameras, detections, 17); 0 for detections that are taken.
-        settings: least joints.
+        weights: (cameras, detections, 17); 0 for matched detections.
+        settings: least number of joints.
 
     Note:
         Each detection joins one pair at most.
@@ -174,7 +174,7 @@ def _mutual(
 
 
 def _body_score(joints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how well limbs (n, 17, 3) [m] have an adult's size and proportions (n,) [nat]."""
+    """Return log likelihoods (n,) [nat] of the size and proportions of joints (n, 17, 3) [m]."""
     limbs = np.linalg.norm(joints[:, LIMBS[:, 0]] - joints[:, LIMBS[:, 1]], axis=-1)
     size = np.log(limbs / LIMB_LENGTHS)
     middle = np.nanmedian(size, axis=1)
@@ -190,8 +190,8 @@ def _rivals(
 ) -> NDArray[np.float64]:
     """Return the summed likelihood (pairs,) of each pair's rivals.
 
-    A pair that shares a detection and has its body elsewhere is a rival; one that has it at the
-    same place is a second detection of that body.
+    A rival shares a detection and has its body elsewhere; a pair with a shared detection and the
+    body at the same position is a duplicate detection of that body.
     """
     shared = (first[:, None] == first) | (second[:, None] == second)
     shared |= (first[:, None] == second) | (second[:, None] == first)

@@ -1,4 +1,4 @@
-"""One person on the way through a clip: pose, motion, and what was seen of it so far."""
+"""State of one track through a clip: pose, motion, and sightings so far."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from worldpose.tracking.sightings import Sighting, Sightings
 
 @dataclass(eq=False)
 class Person:
-    """The state of one track, changed frame by frame.
+    """The state of one track, updated frame by frame.
 
     Attributes:
         number: order of birth.
         pose: (17, 3) [m], world, at the current frame; NaN for joints never determined.
-        last_fixed: last frame whose rays determined the place.
+        last_fixed: last frame whose rays determined the position.
         velocity: (3,) [m/s], of the whole body.
         sightings: by frame.
-        misfit: mean ray distance of late [m]: large where a body falls or jumps.
-        fixed: number of frames whose rays determined the place.
-        evidence: the same with frames of fewer views than a birth takes counted as parts [1].
+        misfit: recent mean ray distance [m]: large where a body falls or jumps.
+        fixed: number of frames whose rays determined the position.
+        evidence: the same, with frames of fewer views than a birth needs counted in part [1].
         shown_from: first frame with the evidence of a birth; -1 = none so far.
     """
 
@@ -40,7 +40,7 @@ class Person:
     shown_from: int = -1
 
     def advance(self, frame: int, fps: float, settings: TrackingSettings) -> None:
-        """Move the pose on to `frame`, one frame later."""
+        """Predict the pose at `frame`, one frame later."""
         if settings.predict_motion:
             self.pose = self.pose + self.velocity / fps
             if self.last_fixed < frame - 1:
@@ -54,7 +54,7 @@ class Person:
         settings: TrackingSettings,
         evidence: float = 1.0,
     ) -> None:
-        """Take over what was seen in `frame`; joints not determined follow the others."""
+        """Update with the sighting in `frame`; undetermined joints follow the others."""
         self.sightings[frame] = sighting
         gain = 1.0 - math.exp(-1.0 / (fps * settings.velocity_time))
         self.misfit += gain * (float(np.nanmean(sighting.ray_distance)) - self.misfit)
@@ -73,15 +73,15 @@ class Person:
             self.shown_from = frame
 
     def uncertainty(self, frame: int, fps: float, settings: TrackingSettings) -> float:
-        """Return the standard deviation of the predicted place at `frame` [m]: it grows unseen."""
+        """Return the standard deviation of the predicted position at `frame` [m]."""
         unseen = (frame - self.last_fixed) / fps
         wander = settings.agility * math.sqrt(unseen**3 / 3.0)
-        # A velocity is known after a few frames; before, a person may run.
+        # The velocity estimate needs a few frames; before, a person may be running.
         known = 1.0 - math.exp(-self.fixed / (fps * settings.velocity_time))
         return math.hypot(wander, (1.0 - known) * settings.mean_speed * unseen)
 
     def absorb(self, other: Person, since: int) -> None:
-        """Take over the other's sightings from frame `since` on: they show this person."""
+        """Move the other's sightings from frame `since` on to this person."""
         for frame in [frame for frame in other.sightings if frame >= since]:
             theirs = other.sightings.pop(frame)
             own = self.sightings.get(frame)
@@ -94,7 +94,7 @@ class Person:
 def _moved(
     pose: NDArray[np.float64], joints: NDArray[np.float64], move: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], bool]:
-    """Return the pose with known joints replaced and others moved along, the shift, any known."""
+    """Return the pose with known joints replaced and others shifted, the shift, and any known."""
     both, known = np.empty((len(pose), 3)), False
     count = 0
     for joint in range(len(pose)):

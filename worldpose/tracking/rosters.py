@@ -1,4 +1,4 @@
-"""How many people there can be: the roster's limit on tracks."""
+"""Limit on the number of simultaneous tracks, from the roster."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TEAM = 11
 
 
 def alive(people: list[Person]) -> dict[int, list[Person]]:
-    """Return who has a sighting between birth and last fix, by the frame of every birth."""
+    """Return the people between birth and last fix, by the frame of every birth."""
     births = sorted({min(person.sightings) for person in people})
     return {
         frame: [person for person in people if min(person.sightings) <= frame <= person.last_fixed]
@@ -22,11 +22,11 @@ def alive(people: list[Person]) -> dict[int, list[Person]]:
 
 
 def within_limit(people: list[Person], limit: int | None) -> list[Person]:
-    """Return the people without those who are too many at once: whoever has the least evidence.
+    """Return the people without those beyond the limit at any time, who have the least evidence.
 
     Args:
         people: tracks of a clip.
-        limit: how many there can be at once; None = any number.
+        limit: most people at once; None = any number.
     """
     if limit is None:
         return people
@@ -42,10 +42,10 @@ def within_limit(people: list[Person], limit: int | None) -> list[Person]:
 
 
 def people_allowed(roster: Sequence[PlayerSpec]) -> int | None:
-    """Return how many people a match with this roster can have on the pitch at once.
+    """Return the most people on the pitch at once in a match with this roster.
 
-    Eleven of each of two teams and the officials; None where the roster has less than that, for
-    then it may leave out anybody.
+    Eleven of each of two teams and the officials; None for a smaller roster, which may leave out
+    people.
     """
     teams = Counter(person.team for person in roster if person.role != "official")
     officials = sum(person.role == "official" for person in roster)

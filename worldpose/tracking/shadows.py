@@ -1,7 +1,7 @@
-"""Shadows: tracks that follow somebody about in a few of the cameras that see him.
+"""Removal of shadows: false tracks that follow a person, in a few of the cameras that see it.
 
-Where a detector takes halves of two people for a third, in two cameras at once, rays may meet. A
-person so near to another is seen by most of the cameras that see him; a shadow is not.
+If a detector reports halves of two people as a third, in two cameras at once, rays may meet. A real
+person so near to another is seen by most of the cameras that see the other; a shadow is not.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from worldpose.tracking.person import Person
 
 VIEWS: Final = 0.4
-"""A shadow is seen by at most this share of the cameras that see the other [1]."""
+"""Largest share of the cameras that see the other person that a shadow is seen by [1]."""
 LASTING: Final = 0.7
-"""Share of its frames in which a shadow has somebody so near [1]."""
+"""Least share of its frames in which a shadow has another person so near [1]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A track in the frames that determine its place.
+    """A track in the frames that determine its position.
 
     Attributes:
         frame: (frames,) rising.
@@ -36,7 +36,7 @@ class Seen:
 
 
 def without_shadows(people: list[Person], distance: float) -> list[Person]:
-    """Return the people without those who are nearly always beside somebody far better seen.
+    """Return the people without those nearly always close to a person seen by far more cameras.
 
     Args:
         people: tracks of a clip.
@@ -53,11 +53,11 @@ def without_shadows(people: list[Person], distance: float) -> list[Person]:
 
 
 def are_shadow(chain: list[Seen], others: list[Seen], distance: float) -> bool:
-    """Tell whether tracks of one person are nearly always beside somebody far better seen.
+    """Return whether a person is nearly always close to a person seen by far more cameras.
 
     Args:
         chain: the person's tracks.
-        others: everybody else's.
+        others: the tracks of all other people.
         distance: between bodies, below which one may be the other's shadow [m].
     """
     beside = np.concatenate([_beside(track, others, distance) for track in chain])
@@ -65,7 +65,7 @@ def are_shadow(chain: list[Seen], others: list[Seen], distance: float) -> bool:
 
 
 def _beside(track: Seen, others: list[Seen], distance: float) -> NDArray[np.bool_]:
-    """In which of its frames (frames,) a track has somebody far better seen so near."""
+    """Return the frames (frames,) in which a person seen by far more cameras is so near."""
     beside = np.zeros(len(track.frame), dtype=np.bool_)
     for other in others:
         _, mine, theirs = np.intersect1d(
@@ -77,13 +77,13 @@ def _beside(track: Seen, others: list[Seen], distance: float) -> NDArray[np.bool
         known = np.isfinite(apart[..., 0])
         total = np.where(known[..., None], apart, 0.0).sum(axis=1)
         count = known.sum(axis=1)
-        # Of bodies, not of joints: a shadow's joints are another's, or between two people's.
+        # Of bodies, not of joints: a shadow's joints are another person's, or mix two people's.
         beside[mine] |= np.linalg.norm(total, axis=1) < distance * count
     return beside
 
 
 def seen_of(person: Person) -> Seen:
-    """Return a track in the frames that determine its place."""
+    """Return a track in the frames that determine its position."""
     frames = sorted(person.sightings)
     sightings = [person.sightings[frame] for frame in frames]
     joints = np.array([each.joints for each in sightings])

@@ -1,4 +1,4 @@
-"""What was seen of a person, frame after frame, in as many bytes as results take."""
+"""Compact storage of a person's detections and joints per frame."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 BLOCK: Final = 16
-"""Frames stored together: most ghosts need one block, and arrays' headers weigh little."""
+"""Frames stored together: most ghosts need one block, and array headers cost little."""
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """Detections of different views, in one frame, that are one person.
+    """Detections of one person in different views of one frame.
 
     Attributes:
-        index: (cameras,) place among the detections; -1 = not seen.
-        ray_distance: (cameras,) mean distance of the detection's rays to the person [m]; NaN =
-            not seen.
+        index: (cameras,) index of the detection; -1 = not seen.
+        ray_distance: (cameras,) mean distance of the detection's rays to the person [m]; NaN = not
+            seen.
         joints: (17, 3) [m], world; NaN where the rays do not determine them.
     """
 
@@ -29,7 +29,7 @@ class Sighting:
     joints: NDArray[np.float64]
 
     def filled_from(self, other: Sighting) -> Sighting:
-        """Return this with the other's detections in the cameras where this has none."""
+        """Return this with the other's detections in cameras without one of its own."""
         own = self.index >= 0
         return Sighting(
             np.where(own, self.index, other.index),
@@ -42,7 +42,7 @@ Block = tuple[NDArray[np.int16], NDArray[np.float32], NDArray[np.float32]]
 
 
 class Sightings(MutableMapping[int, Sighting]):
-    """Sightings by frame, in the order in which they came; kept as int16 and float32."""
+    """Sightings by frame, in order of insertion; stored as int16 and float32."""
 
     def __init__(self) -> None:
         self._place: dict[int, int] = {}

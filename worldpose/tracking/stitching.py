@@ -1,4 +1,4 @@
-"""The tracks of a whole clip joined into people, by what comes before and after every gap."""
+"""Tracks of a whole clip joined into people across gaps."""
 
 from __future__ import annotations
 

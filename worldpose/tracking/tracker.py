@@ -1,4 +1,4 @@
-"""The tracker: follows people through a clip, joins what belongs together, says who is who."""
+"""The tracker: follows people through a clip, joins their tracks, assigns identities."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from worldpose.tracking.whole_people import join_people
 
 JOINTS = len(COCO17)
 BLOCK = 64
-"""Frames read and turned into rays at a time: bounds the memory, not the result."""
+"""Frames read and converted to rays at a time: bounds memory, not the result."""
 
 
 class TrackingReport(Record):
-    """How tracking went."""
+    """Summary of a tracking run."""
 
     people: int
     """People found [1]."""
     births: int
-    """Tracks started [1]."""
+    """Tracks begun [1]."""
     dropped: int
-    """Of these, dropped: too short, shadows, bystanders, more than the roster allows [1]."""
+    """Of these, dropped: too short, shadows, bystanders, or beyond the roster's limit [1]."""
     merged: int
-    """Of these, ended because another was on the same person [1]."""
+    """Of these, ended as duplicates of another track [1]."""
     joined: int
-    """Tracks that go on an earlier person's [1]."""
+    """Tracks that continue an earlier person's [1]."""
     undecided: int
     """Joins left to review [1]."""
     takeovers: int
@@ -49,28 +49,27 @@ class TrackingReport(Record):
     detections: int
     """Detections with enough joints to be matched [1]."""
     unmatched_share: float | None
-    """Share of them that is no tracked person; None without any."""
+    """Share of them that belong to no tracked person; None without any."""
     mean_ray_distance_m: float | None
     """Mean of `ray_distance` [m]; None without a match."""
 
 
 @dataclass(frozen=True)
 class Tracking:
-    """Which detection is which person.
+    """Detections assigned to people.
 
     Attributes:
         person: (persons,) int32 ids from 0, in the order of first appearance.
-        detection_index: (frames, cameras, persons) int16, place among the detections of this
-            frame and camera; -1 = not seen.
+        detection_index: (frames, cameras, persons) int16, index among the detections of this frame
+            and camera; -1 = not seen.
         ray_distance: (frames, cameras, persons) float32, mean distance of the detection's rays to
             the person when matched [m]; NaN = not seen.
         joints: (frames, persons, 17, 3) float32 quick joints [m], world; NaN where fewer than two
             views determine one.
-        tracks: one summary a person.
-        joins: where one track went on as another or may have: the undecided first, then the
-            dearest.
+        tracks: one summary per person.
+        joins: decided and possible joins of tracks: the undecided first, then by falling cost.
         takeovers: frames in which a track may have passed to another person.
-        report: figures for the whole clip.
+        report: metrics of the whole clip.
     """
 
     person: NDArray[np.int32]
@@ -94,25 +93,26 @@ def track_people(
     pitch_size: tuple[float, float] | None = None,
     people: int | None = None,
 ) -> Tracking:
-    """Return which detection of every camera is which person, over a clip.
+    """Return the person of every camera's detections, over a clip.
 
-    Every frame, known people take detections by ray distance, confirmed people before new ones
-    (T1); detections left over are associated across views and start people (T2). Who is unseen
-    for longer than a moment ends; afterwards the tracks of the whole clip are joined by motion and
-    size where the odds are clear. In causal mode that is decided when somebody appears.
+    In every frame, known people take detections by ray distance, confirmed people before new ones
+    (T1); remaining detections are associated across views and start people (T2). A track ends when
+    its person is unseen for longer than a moment; afterwards the tracks of the whole clip are
+    joined by motion and size if the odds are clear. In causal mode that happens when a person
+    appears.
 
     Args:
         cameras: batch (cameras,).
         keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found. Read in blocks
             of frames.
-        confidence: (frames, cameras, detections, 17) in (0, 1]; NaN, 0 or less leaves a keypoint
-            out.
+        confidence: (frames, cameras, detections, 17) in (0, 1]; NaN, 0 or less excludes a
+            keypoint.
         fps: frames per second [1/s].
         settings: gates, least views and times.
         progress: called with frames done and frames in all.
         pitch_size: length and width of the pitch around the origin [m], on which people stand at
             z = 0; None = they may be anywhere.
-        people: how many there can be at once; None = any number.
+        people: most people at once; None = any number.
 
     Raises:
         InputError: the shapes do not fit together.
@@ -136,7 +136,7 @@ def track_people(
         directions = cameras.unproject(image.reshape(*image.shape[:2], -1, 2)).directions
         directions = directions.reshape(*image.shape[:-1], 3)
         seen = np.isfinite(directions[..., 0]) & (weights > 0.0)
-        # Angles are known to a pixel over the focal length.
+        # The accuracy of an angle is a pixel over the focal length.
         weights *= (cameras.focal**2).mean(axis=-1)[:, None, None]
         weights[~seen] = 0.0
         directions = np.where(seen[..., None], directions, np.nan)
@@ -150,7 +150,7 @@ def track_people(
 
 
 def _result(follower: Follower, frames: int, pitch_size: tuple[float, float] | None) -> Tracking:
-    """Return the people who lasted, over `frames` frames."""
+    """Return the people with enough evidence, over `frames` frames."""
     causal = follower.settings.causal
     everyone = follower.everyone()
     if causal:
@@ -168,7 +168,7 @@ def _result(follower: Follower, frames: int, pitch_size: tuple[float, float] | N
     tracks = []
     for n, chain in enumerate(chains):
         for person in chain:
-            # What single views matched after the last fix may be anyone.
+            # Matches in single views after the last fix may show any person.
             first, last = (person.shown_from, frames) if causal else (0, person.last_fixed)
             for frame, sighting in person.sightings.items():
                 if first <= frame <= last:
@@ -213,7 +213,7 @@ def _summary(person: int, index: NDArray[np.int16]) -> Track:
 def _joins(
     candidates: list[Candidate], chains: list[list[Person]], everyone: list[Person]
 ) -> tuple[Join, ...]:
-    """Return the joins in terms of final people; those of dropped tracks are left out."""
+    """Return the joins in terms of final people, without those of dropped tracks."""
     final = {person.number: n for n, chain in enumerate(chains) for person in chain}
     joins = [
         Join(

@@ -1,4 +1,4 @@
-"""Which cameras should see a person at a place, and how often they miss one."""
+"""Expected visibility of people in cameras, and the rate at which cameras miss them."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from worldpose.cameras import Camera
 from worldpose.compiled import compiled
 
 SEEN_JOINTS: Final = 4
-"""Keypoints on a body's image from which a camera sees something there [1]."""
+"""Keypoints on a body's image from which on a camera has a detection there [1]."""
 BODY_WIDTH: Final = 0.2
-"""A ray that passes this near to a joint is on the body [m]."""
+"""A ray that passes a joint within this distance is on the body [m]."""
 INSIDE: Final = 0.8
 """Share of a body's joints in the image from which a camera should see it [1]."""
 
 
 FARTHER: Final = 1.25
-"""A camera should see people that are this many times as far away as others whom it showed [1]."""
+"""Range of a camera over the largest distance of people it has shown [1]."""
 
 
 class CameraSight:
-    """What cameras should see, and what they miss of it, learned from people who are known.
+    """Expected visibility and misses of cameras, learned from known people.
 
     Attributes:
         centers: (cameras, 3) [m], world.
-        reach: (cameras,) greatest distance of a person whom the camera showed [m].
-        shown: (cameras,) people whom the camera should have shown [1].
-        missed: (cameras,) of these, people where it has no detection [1].
+        reach: (cameras,) greatest distance of a person that the camera showed [m].
+        shown: (cameras,) number of people that the camera should have shown [1].
+        missed: (cameras,) of these, people without a detection [1].
     """
 
     def __init__(self, cameras: Camera) -> None:
@@ -43,8 +43,8 @@ class CameraSight:
     def should_see(self, joints: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which cameras (cameras, n) should see bodies (n, 17, 3) [m].
 
-        Most joints are in the image, and the camera has shown people as far away. NaN joints do
-        not count.
+        Most joints must be in the image, and the camera must have shown people at a similar
+        distance. NaN joints do not count.
         """
         n, joint_count, _ = joints.shape
         image = self._cameras.project(joints.reshape(-1, 3)).reshape(-1, n, joint_count, 2)
@@ -55,7 +55,7 @@ class CameraSight:
         return np.asarray((inside >= INSIDE * known) & (known > 0) & self._in_reach(joints))
 
     def _in_reach(self, joints: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return whether bodies (n, 17, 3) are about as near to cameras (cameras, n) as others."""
+        """Return whether bodies (n, 17, 3) are within each camera's range (cameras, n)."""
         away = np.linalg.norm(np.nanmean(joints, axis=1) - self.centers[:, None], axis=-1)
         return np.asarray(away <= FARTHER * self.reach[:, None])
 
@@ -66,7 +66,7 @@ class CameraSight:
         weights: NDArray[np.float64],
         seen: NDArray[np.bool_],
     ) -> None:
-        """Take in known people of a frame.
+        """Update with the known people of a frame.
 
         Args:
             joints: (n, 17, 3) [m], world; NaN where unknown, not all of one person.
@@ -92,14 +92,14 @@ class CameraSight:
     ) -> NDArray[np.float64]:
         """Return the log probability (n,) that cameras miss bodies which they should see.
 
-        A camera that cannot see the place says nothing, and neither does one that has a
-        detection there: it may hide the body.
+        A camera that cannot see the position adds nothing, and neither does one with a detection
+        there, which may occlude the body.
 
         Args:
             joints: (n, 17, 3) [m], world.
             directions: (cameras, detections, 17, 3) unit rays, world; NaN where not seen.
             weights: (cameras, detections, 17); 0 where not seen.
-            own: (cameras, n) cameras whose detection it is.
+            own: (cameras, n) cameras whose detections the body is from.
         """
         if not len(joints):
             return np.zeros(0)

@@ -1,8 +1,8 @@
-"""Who of a clip's tracks are people: judged as whole people, not as the stretches they are seen in.
+"""Selection of real people among a clip's tracks, judged by whole people rather than fragments.
 
-A track ends after a moment unseen, so one person is usually several. A stretch of a player may be
-like a bystander's, where he fetches the ball, or like a shadow, where few cameras see him in a
-duel; the rest of him tells that he is neither.
+A track ends after a moment unseen, so one person usually has several. A fragment of a player may
+look like a bystander, while fetching the ball, or like a shadow, if few cameras see the player in a
+duel; the player's other tracks show neither.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ def join_people(
 ) -> tuple[list[Candidate], Chains]:
     """Return the joins of a clip's tracks and the people, without shadows and bystanders.
 
-    Tracks that are neither by themselves are sure. Another stays if it is joined to one of these,
-    the chain as a whole is no shadow, and no join of sure tracks is torn for it.
+    Tracks that are neither by themselves are accepted. Another track stays if it is joined to an
+    accepted one, the chain as a whole is no shadow, and no join of accepted tracks breaks for it.
 
     Args:
-        tracks: of the whole clip, ghosts left out.
-        follower: who made them.
-        pitch_size: length and width of the pitch around the origin [m]; None = nobody is a
-            bystander.
+        tracks: of the whole clip, without ghosts.
+        follower: that made them.
+        pitch_size: length and width of the pitch around the origin [m]; None = there are no
+            bystanders.
 
     Returns:
         joins: of the tracks that stay.
@@ -46,7 +46,7 @@ def join_people(
     pairs = [(join.before, join.after) for join in joins if join.decided]
     left = tracks
     while True:
-        # Who goes changes who is joined: until all that is joined may stay.
+        # Removal of tracks changes the joins: repeat until all joined tracks may stay.
         joins, chains = join_tracks(left, follower)
         whole = _whole(chains, sure, pairs, settings.shadow_distance)
         kept = within_limit(whole, follower.people)
@@ -58,12 +58,12 @@ def join_people(
 def _whole(
     chains: Chains, sure: list[Person], pairs: list[tuple[int, int]], distance: float
 ) -> list[Person]:
-    """Return the sure tracks, and the others of the chains that stand as a whole.
+    """Return the accepted tracks, and the others of the chains that pass as a whole.
 
     Args:
         chains: of all tracks.
-        sure: tracks that stay in any case.
-        pairs: numbers of sure tracks that are joined where there are no others.
+        sure: accepted tracks, which always stay.
+        pairs: numbers of accepted tracks that are joined in the absence of others.
         distance: of shadows [m].
     """
     place = {track.number: n for n, chain in enumerate(chains) for track in chain}

@@ -1,7 +1,7 @@
-"""Training: the embedded nets learn from labelled pictures, rendered or reviewed (D5).
+"""Training of the embedded nets on labelled frames, rendered or reviewed (D5).
 
 Input: COCO keypoints data sets. Output: safetensors weights that `worldpose.detection.bundled`
-takes, and figures (AP50, PCK) before and after. Needs torch where nets are named.
+takes, and metrics (AP50, PCK) before and after. Only the training of nets needs torch.
 """
 
 from worldpose.training.average_precision import average_precision

@@ -1,4 +1,4 @@
-"""Other looks of the same picture: light, colours, fog, lens and codec."""
+"""Image augmentation: light, colours, fog, lens and codec."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ Levels = NDArray[np.float32]
 
 
 class AugmentationSettings(Record):
-    """How often, and how far, training pictures differ from those on disk."""
+    """Frequency and strength of augmentations."""
 
     strength: float = 1.0
-    """Of changes of light and colour [1]; 0 = none."""
+    """Strength of changes of light and colour [1]; 0 = none."""
     recoloured: float = 0.3
-    """Share of pictures whose colour channels change places [1]: kits and skins of any colour."""
+    """Share of images with permuted colour channels [1]: kits and skins of any colour."""
     grey: float = 0.04
     """Share without colour [1]."""
     fog: float = 0.15
-    """Share seen through haze [1]."""
+    """Share with haze [1]."""
     soft: float = 0.35
     """Share blurred or shrunk and enlarged again [1]."""
     coded: float = 0.2
-    """Share that went through a codec [1]."""
+    """Share compressed by a codec [1]."""
     grain: float = 0.5
-    """Share with a sensor's noise [1]."""
+    """Share with sensor noise [1]."""
 
 
 def augment(
     picture: NDArray[np.uint8], settings: AugmentationSettings, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Return the picture (height, width, 3) as another camera, light or kit would show it."""
+    """Return the image (height, width, 3) as another camera, light or kit would show it."""
     mixing, offset = _colours(picture[::8, ::8].mean(), settings, rng)
     levels: Levels = np.asarray(
         cv2.transform(picture.astype(np.float32), np.column_stack([mixing, offset])), np.float32
@@ -54,7 +54,7 @@ def augment(
 def _colours(
     middle: float, settings: AugmentationSettings, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What light, camera and air make of colours: a matrix (3, 3) and levels to add (3,)."""
+    """Return the colour transform of light, camera and air: matrix (3, 3) and offset (3,)."""
     strength = settings.strength
     mixing = np.eye(3)
     if rng.random() < settings.recoloured:

@@ -1,4 +1,4 @@
-"""How well boxes are found: average precision at one overlap (COCO's AP50)."""
+"""Average precision of boxes at one overlap (COCO's AP50)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from worldpose.training.labels import LabelledPicture
 Floats = NDArray[np.float64]
 
 OVERLAP: Final = 0.5
-"""Least intersection over union of a found box with the true one [1]."""
+"""Least intersection over union of a true positive [1]."""
 
 
 def average_precision(
@@ -23,17 +23,17 @@ def average_precision(
     labels: Sequence[LabelledPicture],
     heights: tuple[float, float] = (0.0, np.inf),
 ) -> float:
-    """Return the area under the curve of precision over recall [1]; NaN if nobody is asked for.
+    """Return the area under the curve of precision over recall [1]; NaN without wanted people.
 
-    As COCO has it: the best boxes choose first, each the person it overlaps most; people who are
-    ignored or of other heights, and boxes on them, count neither as right nor as wrong, nor do
-    boxes of other heights that are on nobody. Precision is made to fall with recall, and
-    integrated at every step of it instead of at COCO's 101 places.
+    As in COCO: the best boxes choose first, each the person it overlaps most. People who are
+    ignored or of other heights, and boxes on them, count neither as true nor as false positives;
+    nor do boxes of other heights that match no person. Precision is made to fall with recall, and
+    integrated at every step of recall instead of at COCO's 101 points.
 
     Args:
-        found: of each picture.
-        labels: the truth of the same pictures.
-        heights: of the people asked for, first included, last not [px].
+        found: detections in each image.
+        labels: the truth of the same images.
+        heights: range of wanted people, lower bound included, upper not [px].
     """
     scores, right = [], []
     asked = 0
@@ -58,7 +58,7 @@ def average_precision(
 
 
 def _judged(boxes: Floats, true: Floats, wanted: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Say of boxes, best first: 1 on a person asked for, 0 on nobody, -1 on one to be ignored."""
+    """Return per box, best first: 1 true positive, 0 false positive, -1 on an ignored person."""
     verdict = np.zeros(len(boxes), dtype=np.int64)
     if not len(true):
         return verdict

@@ -1,4 +1,4 @@
-"""How much boxes overlap, as something to learn by."""
+"""Intersection over union of boxes, differentiable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A net made better at what reviewed labels show, or left as it was (D5)."""
+"""Fine-tuning of a net on reviewed labels, adopted only if it scores better (D5)."""
 
 from __future__ import annotations
 
@@ -30,27 +30,27 @@ from worldpose.training.settings import FineTuningSettings
 Pictures = Sequence[LabelledPicture]
 
 FIGURES: dict[NetKind, str] = {"people": "ap50", "keypoints": "pck"}
-"""What each net is judged by: boxes at an overlap of a half, keypoints within 0.2 torsos."""
+"""Metric of each net: AP50 of boxes, share of keypoints within 0.2 torsos."""
 MILD = AugmentationSettings(
     strength=0.4, recoloured=0.1, grey=0.0, fog=0.0, soft=0.1, coded=0.1, grain=0.3
 )
-"""Looks of the pictures that nets are fine-tuned on: these show the footage that a version is for,
-and the air, light and kits of others are not asked for."""
+"""Augmentation for fine-tuning, mild: the labelled frames already show the footage that a version
+is for, so air, light and kits of other footage are not needed."""
 BLOCKS = 20
-"""Runs of consecutive pictures that stay together: neighbours in a video are almost the same."""
+"""Blocks of consecutive frames that stay together: neighbours in a video are almost the same."""
 
 
 @dataclass(frozen=True, eq=False)
 class FineTuned:
-    """What fine-tuning came to.
+    """Result of fine-tuning.
 
     Attributes:
-        learned: pictures learned from.
-        held_out: pictures that the figures are of.
-        before: figure of the weights that training began from [1].
-        after: figure of those that it ended with [1].
+        learned: frames in the training set.
+        held_out: frames in the test set.
+        before: metric of the initial weights [1].
+        after: metric of the final weights [1].
         steps: done.
-        better: by more than the gain asked for.
+        better: whether the metric rose by at least the required gain.
     """
 
     learned: Pictures
@@ -70,18 +70,18 @@ def fine_tune(
     start: Path | None = None,
     progress: Callable[[str], None] = lambda line: None,
 ) -> FineTuned:
-    """Return what training on labels made of a net; its weights are written in any case.
+    """Fine-tune a net on labels and return its metrics; the weights are written in any case.
 
     Args:
         kind: which net.
-        pictures: with reviewed labels, in the order they were taken.
-        weights: the file to write; a checkpoint beside it lets a killed training go on.
+        pictures: with reviewed labels, in the order of recording.
+        weights: the file to write; with the checkpoint next to it a killed training resumes.
         settings: the defaults if None.
-        start: weights to begin from; the shipped ones if None.
-        progress: takes a line at every check.
+        start: initial weights; the shipped ones if None.
+        progress: receives a line at every check.
 
     Raises:
-        InputError: too few pictures, nobody in some part of them, or weights of another net.
+        InputError: too few frames, a subset without people, or weights of another net.
     """
     settings = settings or FineTuningSettings()
     learned, checked, held_out = split(pictures, settings)
@@ -118,10 +118,10 @@ def fine_tune(
 def split(
     pictures: Pictures, settings: FineTuningSettings
 ) -> tuple[list[LabelledPicture], list[LabelledPicture], list[LabelledPicture]]:
-    """Return pictures to learn from, to choose by, and to be judged by.
+    """Return the frames for training, for validation, and for the test.
 
     Raises:
-        InputError: a part without anybody.
+        InputError: a subset without people.
     """
     count = min(BLOCKS, len(pictures))
     blocks = np.array_split(np.arange(len(pictures)), max(count, 1))

@@ -1,4 +1,4 @@
-"""How well keypoints are placed (PCK), and whether their confidence is what it says."""
+"""Accuracy of keypoints (PCK) and calibration of their confidence."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 SHARE: Final = 0.2
-"""Of the torso, within which a keypoint is correct [1]."""
+"""Share of the torso within which a keypoint is correct [1]."""
 
 
 def torso_sizes(keypoints: Floats) -> Floats:
@@ -38,12 +38,12 @@ def correct_keypoints(found: Floats, true: Floats, share: float = SHARE) -> Floa
 
 
 def calibration_error(confidence: Floats, right: NDArray[np.bool_], classes: int = 10) -> float:
-    """Return the mean gap between confidence and share of right ones [1], over equal classes.
+    """Return the mean gap between confidence and share of correct ones [1], over equal bins.
 
     Args:
         confidence: (keypoints,) in (0, 1].
         right: (keypoints,)
-        classes: of confidence, with equally many keypoints each.
+        classes: bins of confidence, with equally many keypoints each.
     """
     order = np.argsort(confidence, kind="stable")
     parts = np.array_split(order, min(classes, len(order)))

@@ -1,4 +1,4 @@
-"""What the keypoint net learns from: crops of people, and how far its maps are from the truth."""
+"""Crops of people as training batches of the keypoint net, and its loss."""
 
 from __future__ import annotations
 
@@ -34,66 +34,66 @@ MIRRORED: Final = np.array(
 )
 """The same joint on the other side."""
 SPREAD: Final = 2.0
-"""Standard deviation of the target about a joint [px of the crop]."""
+"""Standard deviation of the target around a joint [px of the crop]."""
 HIDDEN: Final = 0.4
-"""Weight of a joint that cannot be seen [1]: where it is can be told only by the rest."""
+"""Weight of an occluded joint [1]: only the rest of the body tells its position."""
 BOXES: Final = 2.0
-"""Weight of the box beside that of the joints [1]."""
+"""Weight of the box loss, relative to that of the joints [1]."""
 MOST: Final = 24
-"""People that a crop's box may be of, the nearest."""
+"""Most people per crop that its box is compared with, the nearest."""
 HALF: Final = 0.5 * (np.array(CROP) - 1.0)
-"""The middle of a crop [px of the crop]."""
+"""The centre of a crop [px of the crop]."""
 RIGHT: Final = 0.05
-"""A keypoint is right within this share of the box's longer side [1], a fifth of a torso."""
+"""A keypoint is correct within this share of the box's longer side [1], a fifth of a torso."""
 
 
 class KeypointCrops(Record):
     """Crops cut around people."""
 
     crops: int = 16
-    """In a batch."""
+    """Crops per batch."""
     height: tuple[float, float] = (34.0, 260.0)
-    """People outside of these heights are left out or, above, shown as small [px]."""
+    """Least height of people shown smaller [px]; no code uses the upper limit."""
     shift: float = 0.08
-    """Most that a box is off, as a share of its sides [1]: detectors err."""
+    """Largest shift of a box, as a share of its sides [1]: detectors err."""
     scale: float = 0.18
-    """Most that a box is too large or too small [1]."""
+    """Largest relative error of a box's size [1]."""
     astray: float = 0.3
-    """Share of boxes that are off by up to three times as much, and wrong in size by twice [1]."""
+    """Share of boxes with up to three times the shift and twice the error of size [1]."""
     elsewhere: float = 0.12
-    """Share of crops put beside people, where a detector may see what is nobody [1]."""
+    """Share of crops next to people, where a detector may report a false positive [1]."""
     turned: float = 0.5
-    """Share of crops that are turned [1]; of the others the box is learned."""
+    """Share of rotated crops [1]; the box is learned from the others."""
     turn: float = 0.45
-    """Most that a crop is turned [rad]."""
+    """Largest rotation of a crop [rad]."""
     smaller: float = 0.35
     """Share of people shown as if they were farther away, down to the least height [1]."""
     hidden: float = 0.25
-    """Share of crops with a part of another person before them [1]."""
+    """Share of crops with a part of another person pasted over the person [1]."""
     untold: float = 0.4
-    """Share of crops of which is not said where others stand [1]: at first nobody knows."""
+    """Share of crops without the boxes of neighbours [1]: they are unknown in the first pass."""
     overlooked: float = 0.12
-    """Share of others who are not told of all the same [1]."""
+    """Share of neighbours left out nevertheless [1]."""
     misplaced: float = 0.06
-    """Most that a side of another's box is off, as a share of the box's [1]."""
+    """Largest shift of a side of a neighbour's box, as a share of the box's [1]."""
     imagined: float = 0.1
-    """Share of crops with somebody told of who is not there [1]."""
+    """Share of crops with the box of a neighbour that is not there [1]."""
     looks: AugmentationSettings = AugmentationSettings()
 
 
 @dataclass(frozen=True, eq=False)
 class KeypointBatch:
-    """Crops and what the net should say of them.
+    """Crops and the targets of the net.
 
     Attributes:
         crops: (crops, height, width, 3) bytes.
-        surroundings: (crops, 3, rows, columns) who is asked for and who is about.
+        surroundings: (crops, 3, rows, columns) maps of the target box and its neighbours.
         keypoints: (crops, 17, 2) [px of the crop]; NaN where not labelled.
-        visible: (crops, 17): 2 seen, 1 hidden, 0 not labelled.
-        tolerance: (crops,) error up to which a keypoint is right [px of the crop].
-        boxes: (crops, 4) of the person [px of the crop]; NaN in a turned crop and beside people.
-        people: (crops, most_people, 4) of everybody [px of the crop]; NaN in a turned crop and
-            where there is nobody more.
+        visible: (crops, 17): 2 visible, 1 occluded, 0 not labelled.
+        tolerance: (crops,) error up to which a keypoint is correct [px of the crop].
+        boxes: (crops, 4) of the person [px of the crop]; NaN in a rotated crop and off people.
+        people: (crops, most_people, 4) of all people [px of the crop]; NaN in a rotated crop and
+            after the last person.
         ignored: (crops, most_people)
     """
 
@@ -110,7 +110,7 @@ class KeypointBatch:
 def people_of(
     pictures: Sequence[LabelledPicture], least: float = 0.0
 ) -> list[tuple[LabelledPicture, int]]:
-    """Return everybody who is labelled, with at least two joints, and at least so tall [px]."""
+    """Return all labelled people with at least two joints and at least `least` tall [px]."""
     return [
         (picture, index)
         for picture in pictures
@@ -130,10 +130,10 @@ def keypoint_batch(
     """Return a batch; the same generator gives the same one.
 
     Args:
-        people: to draw from, each as often, as of `people_of`.
-        cache: reads their pictures.
-        settings: number and looks of the crops.
-        rng: draws people, errors of boxes and looks.
+        people: drawn with equal probability, from `people_of`.
+        cache: reads their images.
+        settings: number and augmentation of the crops.
+        rng: draws people, errors of boxes and augmentations.
     """
     count = settings.crops
     crops = np.empty((count, CROP[1], CROP[0], 3), dtype=np.uint8)
@@ -197,11 +197,11 @@ def _told(
     settings: KeypointCrops,
     rng: np.random.Generator,
 ) -> Floats:
-    """Boxes of others (people, 4) that the net is told of, as a detector might have them [px]."""
+    """Return boxes of neighbours (people, 4) for the net, as a detector might give them [px]."""
     untold = rng.random() < settings.untold
     boxes = np.delete(labelled.boxes, [person] if person >= 0 else [], axis=0)
     ignored = np.delete(labelled.ignored, [person] if person >= 0 else [])
-    # Who is hardly to be seen is found now and then.
+    # Detectors find barely visible people now and then.
     missing = np.where(ignored, 0.5, settings.overlooked)
     sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
     boxes = boxes + settings.misplaced * rng.uniform(-1, 1, boxes.shape) * sides
@@ -213,13 +213,13 @@ def _told(
 
 
 def boxes_in_crop(boxes: Floats, mapping: Floats) -> Floats:
-    """Boxes of a picture (people, 4) in the pixels of an upright crop, mirrored or not."""
+    """Return boxes of a frame (people, 4) in the pixels of an upright crop, mirrored or not."""
     corners = (boxes.reshape(-1, 2, 2) - mapping[:, 2]) @ np.linalg.inv(mapping[:, :2]).T
     return np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1)
 
 
 def _seen(picture: NDArray[np.uint8], mapping: Floats, scale: float) -> NDArray[np.uint8]:
-    """A crop as it is with so many picture px a crop px: from farther away there are fewer."""
+    """Return a crop at `scale` frame px per crop px: a person farther away covers fewer px."""
     coarse = float(np.sqrt(abs(np.linalg.det(mapping[:, :2])))) / scale
     if coarse <= 1.0:
         return cut(picture, mapping, CROP)
@@ -242,7 +242,7 @@ def _cover(
     visible: NDArray[np.int8],
     rng: np.random.Generator,
 ) -> None:
-    """Put a part of another crop before the person, in place; what it covers is hidden."""
+    """Put a part of another crop over the person, in place; joints under it become occluded."""
     width, height = int(rng.integers(12, 44)), int(rng.integers(16, 72))
     x, y = int(rng.integers(0, CROP[0] - width)), int(rng.integers(0, CROP[1] - height))
     left, top = (CROP[0] - width) // 2, (CROP[1] - height) // 2
@@ -252,11 +252,11 @@ def _cover(
 
 
 def keypoint_loss(net: KeypointNet, batch: KeypointBatch) -> Tensor:
-    """Return how far the net's maps and its sureness are from the batch's truth.
+    """Return the loss of the net's maps and confidences against the batch's truth.
 
-    Places by the cross-entropy of each map against a narrow bump, sureness by the cross-entropy of
-    whether the place that the map says is right; the box by generalised intersection over union
-    (Rezatofighi, 2019), its fit by the cross-entropy of what it shares with anybody's.
+    Positions: cross-entropy of each map against a narrow Gaussian. Confidence: cross-entropy of
+    whether the map's position is correct. Box: generalised intersection over union (Rezatofighi,
+    2019). Fit: cross-entropy of the box's largest overlap with any person's box.
     """
     device = next(net.parameters()).device
     keypoints, visible, tolerance = (
@@ -274,7 +274,7 @@ def keypoint_loss(net: KeypointNet, batch: KeypointBatch) -> Tensor:
     down = torch.exp(-0.5 * ((y - at[..., 1:]) / SPREAD) ** 2)
     bump = (down[..., :, None] * across[..., None, :]).flatten(2)
     mass = bump.sum(dim=-1)
-    # Joints outside of the crop leave no bump: there is no place to learn.
+    # Joints outside of the crop leave no peak: there is no position to learn.
     inside = labelled & (mass > 4.0)
     entropy = torch.logsumexp(maps.flatten(2), -1)
     entropy = entropy - (bump * maps.flatten(2)).sum(-1) / mass.clamp(min=1e-6)
@@ -292,7 +292,7 @@ def keypoint_loss(net: KeypointNet, batch: KeypointBatch) -> Tensor:
 
 
 def box_loss(batch: KeypointBatch, said: Tensor, fit: Tensor) -> Tensor:
-    """How far boxes are from the batch's, and their fit from what they share with anybody's.
+    """Return the loss of boxes, and of their fit, the expected overlap with any person's box.
 
     Args:
         batch: the truth.

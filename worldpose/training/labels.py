@@ -1,4 +1,4 @@
-"""Pictures with labelled people, as COCO keypoints data sets on disk."""
+"""Frames with labelled people, as COCO keypoints data sets on disk."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 
 class _Given(BaseModel):
-    """Part of a data set that others wrote: what is not needed is passed over."""
+    """Part of a foreign data set; unknown keys are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
@@ -43,15 +43,15 @@ class _Dataset(_Given):
 
 @dataclass(frozen=True, eq=False)
 class LabelledPicture:
-    """One picture and the people in it.
+    """One image and the people in it.
 
     Attributes:
-        path: of the picture.
+        path: of the image.
         boxes: (people, 4) x0, y0, x1, y1 [px]; (0, 0) is the centre of the top-left pixel.
         keypoints: (people, 17, 2) COCO-17 [px]; NaN where not labelled.
-        visible: (people, 17) int8: 2 seen, 1 hidden or outside of the picture, 0 not labelled.
-        ignored: (people,) people too hidden or too small to be asked for, or groups: to find them
-            is neither right nor wrong.
+        visible: (people, 17) int8: 2 visible, 1 occluded or outside of the image, 0 not labelled.
+        ignored: (people,) people too occluded or too small, or groups: detections of them count
+            neither as true nor as false positives.
     """
 
     path: Path
@@ -62,17 +62,17 @@ class LabelledPicture:
 
 
 def read_labels(annotations: Path, pictures: Path | None = None) -> list[LabelledPicture]:
-    """Return the pictures of a COCO keypoints data set, in the order of their ids.
+    """Return the images of a COCO keypoints data set, in the order of their ids.
 
-    `iscrowd` 1 marks people to be ignored. Boxes are taken as x, y, width, height in the pixels of
-    the keypoints, which begin at the centre of the top-left pixel.
+    `iscrowd` 1 marks ignored people. Boxes are x, y, width, height in the pixels of the keypoints,
+    which begin at the centre of the top-left pixel.
 
     Args:
         annotations: the JSON file.
-        pictures: the folder that file names are in; the folder of the JSON file if None.
+        pictures: the folder of the images; the folder of the JSON file if None.
 
     Raises:
-        InputError: the file is none of COCO keypoints, or a picture lies outside of the folder.
+        InputError: the file is no COCO keypoints data set, or an image lies outside of the folder.
     """
     folder = annotations.parent if pictures is None else pictures
 
@@ -108,12 +108,12 @@ def read_labels(annotations: Path, pictures: Path | None = None) -> list[Labelle
 def write_labels(
     annotations: Path, pictures: Sequence[LabelledPicture], size: tuple[int, int]
 ) -> None:
-    """Write a COCO keypoints data set; pictures are named relative to the file's folder.
+    """Write a COCO keypoints data set; image names are relative to the file's folder.
 
     Args:
         annotations: the JSON file.
         pictures: within its folder.
-        size: width, height of the pictures [px].
+        size: width, height of the images [px].
     """
     images: list[dict[str, Any]] = []
     people: list[dict[str, Any]] = []

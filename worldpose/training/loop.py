@@ -1,9 +1,9 @@
-"""Training of a net: seeded, checkpointed, resumable, stopped early; the best weights are kept.
+"""Training of a net: seeded, checkpointed, resumable, with early stopping at the best weights.
 
-What is checked and kept is the running mean of the weights (Polyak), which is better at any step
-than the weights of the step itself. The batch of a step is drawn from the seed and the step's
-number alone. So a training that was killed and goes on from its checkpoint gives the weights of an
-undisturbed one.
+Checks evaluate and keep the running mean of the weights (Polyak averaging), which is better at any
+step than the weights of the step. The seed and the step's number alone determine the batch of a
+step. So a training that was killed and resumes from its checkpoint gives the weights of an
+uninterrupted one.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ Batch = TypeVar("Batch")
 Tensors = dict[str, Tensor]
 
 WARM_UP: Final = 0.04
-"""Share of the steps in which the rate rises to its full value [1]."""
+"""Share of the steps in which the learning rate rises to its full value [1]."""
 LAST_RATE: Final = 0.02
-"""Share of the full rate that is left at the end [1]."""
+"""Share of the full rate at the end [1]."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """What a training had come to.
+    """Result of a check during training.
 
     Attributes:
         step: steps done.
-        loss: mean since the check before.
-        figure: of the net against held-out pictures; higher is better.
+        loss: mean since the previous check.
+        figure: metric of the net on held-out frames; higher is better.
     """
 
     step: int
@@ -52,7 +52,7 @@ class Check:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """All that a training goes on from."""
+    """State from which a training resumes."""
 
     mean: Tensors
     step: int = 0
@@ -63,13 +63,13 @@ class _State:
 
 @dataclass(frozen=True, eq=False)
 class Training(Generic[Net, Batch]):
-    """A net and what it is trained on.
+    """A net, its batches, loss and metric.
 
     Attributes:
         net: changed in place.
         batch: draws a batch.
         loss: of the net on a batch.
-        figure: of the net on what is held out; higher is better.
+        figure: metric of the net on held-out frames; higher is better.
         settings: rate, steps and seed.
     """
 
@@ -85,14 +85,14 @@ def train(
     checkpoint: Path | None = None,
     progress: Callable[[str], None] = lambda line: None,
 ) -> tuple[Check, ...]:
-    """Return what the checks found; the net then has the weights of the best of them.
+    """Train a net and return its checks; the net then has the weights of the best one.
 
-    The net is also checked before the first step: training that makes it worse changes nothing.
+    A check also runs before the first step: training that makes the net worse changes nothing.
 
     Args:
-        training: what is trained, and how.
-        checkpoint: written at every check; a training whose file is there goes on from it.
-        progress: takes a line at every check.
+        training: net, batches, loss, metric and settings.
+        checkpoint: written at every check; if the file exists, training resumes from it.
+        progress: receives a line at every check.
 
     Raises:
         InputError: the checkpoint is of another training.
@@ -146,7 +146,7 @@ def _step(training: Training[Net, Batch], optimizer: torch.optim.Optimizer, step
 
 
 def _checked(training: Training[Net, Batch], state: _State) -> _State:
-    """The state after one more check."""
+    """Return the state after one more check."""
     mean = copy.deepcopy(training.net).eval()
     mean.load_state_dict(state.mean)
     figure = training.figure(mean)
@@ -167,7 +167,7 @@ def _settled(state: _State, settings: TrainingSettings) -> bool:
 
 @torch.no_grad()
 def _blend(mean: Tensors, now: Tensors, kept: float) -> None:
-    """Move a mean towards what is now, in place; whole numbers are taken as they are."""
+    """Move a running mean towards the current weights, in place; integers are copied."""
     for name, value in now.items():
         if value.is_floating_point():
             mean[name].lerp_(value, 1.0 - kept)
@@ -186,7 +186,7 @@ def _write(
     state: _State,
     settings: TrainingSettings,
 ) -> None:
-    """Write a checkpoint, whole or not at all."""
+    """Write a checkpoint atomically."""
     tensors = {f"net.{name}": value for name, value in _copied(net.state_dict()).items()}
     tensors |= {f"mean.{name}": value for name, value in state.mean.items()}
     tensors |= {f"best.{name}": value for name, value in _copied(state.best).items()}
@@ -205,7 +205,7 @@ def _write(
 def _read(
     path: Path, net: nn.Module, optimizer: torch.optim.Optimizer, settings: TrainingSettings
 ) -> _State:
-    """The state of a checkpoint, and its weights and moments in place.
+    """Restore weights and moments of a checkpoint in place, and return its state.
 
     Raises:
         InputError: the file is no checkpoint, or that of another training.

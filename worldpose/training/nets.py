@@ -28,7 +28,7 @@ Pictures = Sequence[LabelledPicture]
 Progress = Callable[[str], None]
 
 LEAST_HEIGHT: Final = 34.0
-"""Nobody smaller is learned from or scored by the keypoint net [px]: his limbs are 2 px wide."""
+"""Shortest person for training and scoring of the keypoint net [px]: limbs are 2 px wide."""
 
 
 def people_figure(net: PeopleNet, pictures: Pictures, cache: PictureCache) -> float:
@@ -38,7 +38,7 @@ def people_figure(net: PeopleNet, pictures: Pictures, cache: PictureCache) -> fl
 
 
 def keypoint_figure(net: KeypointNet, pictures: Pictures, cache: PictureCache) -> float:
-    """Return the share of seen keypoints [1] that a pose estimator puts within 0.2 torsos."""
+    """Return the share of visible keypoints [1] that a pose estimator puts within 0.2 torsos."""
     estimator = EmbeddedPose(copy.deepcopy(net))
     return score_keypoints(estimator, pictures, cache, (LEAST_HEIGHT, float("inf"))).pck
 

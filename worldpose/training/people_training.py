@@ -1,4 +1,4 @@
-"""What the people net learns from: windows of pictures, and how far its maps are from the truth."""
+"""Windows of frames as training batches of the people net, and its loss."""
 
 from __future__ import annotations
 
@@ -24,38 +24,38 @@ from worldpose.training.pictures import PictureCache
 Floats = NDArray[np.float64]
 
 SPREAD: Final = 0.12
-"""Standard deviation of the target about a middle, as a share of the box's sides [1]."""
+"""Standard deviation of the target around a centre, as a share of the box's sides [1]."""
 NEAR: Final = 0.5
-"""Cells with a target from this on learn the box's sides [1]."""
+"""Cells with a target from this value on learn the box's sides [1]."""
 BOXES: Final = 4.0
-"""Weight of the boxes beside that of the middles [1]: people are found sooner than their sides."""
+"""Weight of the box loss, relative to that of the centres [1]: centres are learned sooner."""
 LEAST_SEEN: Final = 0.3
-"""Share of a box within a window from which on the person is asked for [1]."""
+"""Share of a box within a window from which on the person is a target [1]."""
 
 
 class PeopleWindows(Record):
-    """Windows cut from pictures."""
+    """Windows cut from frames."""
 
     windows: int = 4
-    """In a batch."""
+    """Windows per batch."""
     side: int = 256
     """Width and height of a window [px], a multiple of 32."""
     height: tuple[float, float] = (28.0, 160.0)
-    """Shortest and tallest people that windows are scaled to [px]."""
+    """Shortest and tallest people after scaling [px]."""
     aimed: float = 0.75
-    """Share of windows put around somebody [1]; the others lie anywhere."""
+    """Share of windows around a person [1]; the others lie anywhere."""
     looks: AugmentationSettings = AugmentationSettings()
 
 
 @dataclass(frozen=True, eq=False)
 class PeopleBatch:
-    """Windows and what the net should say of them.
+    """Windows and the targets of the net.
 
     Attributes:
         pictures: (windows, side, side, 3) bytes.
-        target: (windows, rows, columns) in [0, 1]; 1 at the cell of a middle.
-        weight: (windows, rows, columns), 0 where ignored people are.
-        boxes: (windows, 4, rows, columns) [px] of whom a cell belongs to.
+        target: (windows, rows, columns) in [0, 1]; 1 at the cell of a centre.
+        weight: (windows, rows, columns), 0 on ignored people.
+        boxes: (windows, 4, rows, columns) [px] of the person that a cell belongs to.
     """
 
     pictures: NDArray[np.uint8]
@@ -73,10 +73,10 @@ def people_batch(
     """Return a batch; the same generator gives the same one.
 
     Args:
-        pictures: to draw from, each as often.
+        pictures: drawn with equal probability.
         cache: reads them.
-        settings: number, size and looks of the windows.
-        rng: draws pictures, places, scales and looks.
+        settings: number, size and augmentation of the windows.
+        rng: draws images, positions, scales and augmentations.
     """
     side, cells = settings.side, settings.side // STRIDE
     seen = np.empty((settings.windows, side, side, 3), dtype=np.uint8)
@@ -100,7 +100,7 @@ def _window(
     settings: PeopleWindows,
     rng: np.random.Generator,
 ) -> Floats:
-    """Middle x, y [px] and picture px a window px of a random window."""
+    """Return centre x, y [px] and image px per window px of a random window."""
     tall = np.exp(rng.uniform(*np.log(settings.height)))
     wanted = np.flatnonzero(~labelled.ignored)
     sides = labelled.boxes[:, 2:] - labelled.boxes[:, :2]
@@ -119,7 +119,7 @@ def _window(
 def boxes_in_window(
     labelled: LabelledPicture, shape: tuple[int, ...], mapping: Floats, side: int
 ) -> tuple[Floats, Floats]:
-    """Boxes of people to be found in a window (n, 4), and of those to be ignored (m, 4) [px]."""
+    """Return boxes of target people in a window (n, 4), and of ignored ones (m, 4) [px]."""
     inverse = np.linalg.inv(mapping[:, :2])
     corners = (labelled.boxes.reshape(-1, 2, 2) - mapping[:, 2]) @ inverse.T
     limits = (np.array([[0.0, 0.0], [shape[1], shape[0]]]) - 0.5 - mapping[:, 2]) @ inverse.T
@@ -143,7 +143,7 @@ def draw_targets(
     weight: NDArray[np.float32],
     sides: NDArray[np.float32],
 ) -> None:
-    """Fill in one window's target, weight and boxes, in place."""
+    """Write one window's target, weight and boxes, in place."""
     middles = np.arange(target.shape[0]) * STRIDE + 0.5 * (STRIDE - 1)
     for x0, y0, x1, y1 in ignored:
         rows, columns = (middles >= y0) & (middles <= y1), (middles >= x0) & (middles <= x1)
@@ -163,10 +163,10 @@ def draw_targets(
 
 
 def people_loss(net: PeopleNet, batch: PeopleBatch) -> Tensor:
-    """Return how far the net's maps are from the batch's truth.
+    """Return the loss of the net's maps against the batch's truth.
 
-    Middles by a penalty-reduced focal loss (Zhou, Objects as Points, 2019), boxes by generalised
-    intersection over union (Rezatofighi, 2019) at the cells about a middle.
+    Centres: penalty-reduced focal loss (Zhou, Objects as Points, 2019). Boxes: generalised
+    intersection over union (Rezatofighi, 2019) at the cells around a centre.
     """
     device = next(net.parameters()).device
     target, weight, boxes = (

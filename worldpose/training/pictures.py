@@ -1,4 +1,4 @@
-"""Pictures read once and kept while there is room."""
+"""Images read once and cached in bounded memory."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from worldpose.errors import InputError
 
 
 def read_picture(path: Path) -> NDArray[np.uint8]:
-    """Return a picture (height, width, 3) in RGB.
+    """Return an image (height, width, 3) in RGB.
 
     Raises:
-        InputError: there is no picture.
+        InputError: the file is no readable image.
     """
     data = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if data is None:
@@ -30,10 +30,10 @@ def read_picture(path: Path) -> NDArray[np.uint8]:
 
 
 class PictureCache:
-    """Pictures by path; those not asked for longest make room.
+    """Images by path, in a cache that evicts the least recently used.
 
     Args:
-        most: bytes kept.
+        most: largest size of the cache [byte].
     """
 
     def __init__(self, most: int = 3 << 30) -> None:

@@ -1,4 +1,4 @@
-"""Labels that detectors propose for chosen frames, for people to correct (D3-D4)."""
+"""Label proposals of detectors for chosen frames, for people to correct (D3-D4)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from worldpose.detection.interfaces import Picture
 from worldpose.training.labels import LabelledPicture, write_labels
 
 SEEN: Final = 0.5
-"""Keypoints from this confidence on are proposed as seen, others as hidden [1]."""
+"""Keypoints from this confidence on are proposed as visible, others as occluded [1]."""
 
 
 def propose_labels(
@@ -27,18 +27,17 @@ def propose_labels(
     folder: Path,
     settings: DetectionSettings | None = None,
 ) -> list[LabelledPicture]:
-    """Return what detectors say of frames, after writing it as a COCO data set.
+    """Write detections in frames as a COCO data set and return them.
 
-    The folder then holds pictures/<name>.png and labels.json, which any editor of COCO keypoints
-    takes and `read_labels` reads again. It is written whole or not at all: a failure leaves nothing
-    that would stand in the way of trying again.
+    The folder then holds pictures/<name>.png and labels.json, for any editor of COCO keypoints and
+    for `read_labels`. The write is atomic: a failure leaves nothing that prevents a retry.
 
     Args:
-        frames: name and picture of each, in the order they were taken, all of one size.
+        frames: name and image of each, in the order of recording, all of one size.
         detectors: an ensemble; its boxes of one person become one.
-        pose: finds the keypoints.
+        pose: estimator of the keypoints.
         folder: absent or empty.
-        settings: what is sure enough to be proposed; the defaults if None.
+        settings: thresholds of proposals; the defaults if None.
     """
     place = folder.resolve()
     place.parent.mkdir(parents=True, exist_ok=True)
@@ -60,12 +59,12 @@ def _write(
     (folder / "pictures").mkdir(parents=True)
     proposed, size = [], (0, 0)
     for name, picture in frames:
-        people = fuse([each.detect([picture])[0] for each in detectors], settings.overlap)
-        sure = people.scores >= settings.sure
+        people = fuse([each.detect([picture])[0] for each in detectors], settings.nms_iou)
+        sure = people.scores >= settings.high_score_threshold
         kept = People(people.boxes[sure], people.scores[sure])
         poses = pose.estimate(picture, kept.boxes)
         kept = seen_closer(kept, poses)
-        found = poses.confidence >= settings.least_keypoint
+        found = poses.confidence >= settings.min_keypoint_confidence
         path = folder / "pictures" / f"{name}.png"
         cv2.imwrite(str(path), picture[..., ::-1])
         visible = np.where(poses.confidence >= SEEN, 2, 1) * found

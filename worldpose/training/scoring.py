@@ -1,4 +1,4 @@
-"""Figures of the embedded nets on labelled pictures."""
+"""Metrics of the embedded nets on labelled frames."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from worldpose.detection.boxes import overlaps
 from worldpose.detection.interfaces import Detector, People, Picture, PoseEstimator
+from worldpose.detection.oks_nms import told_apart
 from worldpose.detection.posed import find_poses
-from worldpose.detection.same_pose import told_apart
 from worldpose.detection.settings import DetectionSettings
 from worldpose.training.average_precision import average_precision
 from worldpose.training.keypoint_accuracy import calibration_error, correct_keypoints
@@ -25,14 +25,14 @@ HEIGHTS = ((34.0, 46.0), (52.0, 70.0), (70.0, 160.0))
 
 @dataclass(frozen=True)
 class KeypointFigures:
-    """How well keypoints are placed in given boxes.
+    """Accuracy of keypoints in given boxes.
 
     Attributes:
-        people: how many.
-        pck: share of seen keypoints within a fifth of the torso [1].
-        hidden_pck: the same of hidden ones in the picture [1]; NaN without.
-        median_error: of seen keypoints, as a share of the longer side of the box [1].
-        calibration: mean gap between confidence and share of right keypoints [1].
+        people: number of people.
+        pck: share of visible keypoints within a fifth of the torso [1].
+        hidden_pck: the same of occluded ones within the image [1]; NaN without.
+        median_error: of visible keypoints, as a share of the longer side of the box [1].
+        calibration: mean gap between confidence and share of correct keypoints [1].
     """
 
     people: int
@@ -49,7 +49,7 @@ def found_people(
     estimator: PoseEstimator | None = None,
     settings: DetectionSettings | None = None,
 ) -> list[People]:
-    """Return the people of each picture; with an estimator as they are stored by settings."""
+    """Return the people in each image; with an estimator, as the stage stores them."""
     found = [detector.detect([cache[picture.path]])[0] for picture in pictures]
     if estimator is None:
         return found
@@ -64,7 +64,7 @@ def score_people(
     pictures: Sequence[LabelledPicture],
     heights: Sequence[tuple[float, float]] = HEIGHTS,
 ) -> tuple[float, ...]:
-    """Return AP50 of all people found, and of those in each class of heights [px]."""
+    """Return AP50 of all detections, and in each class of heights [px]."""
     classes = [(0.0, np.inf), *heights]
     return tuple(average_precision(found, pictures, each) for each in classes)
 
@@ -75,16 +75,16 @@ def stored(
     estimator: PoseEstimator,
     settings: DetectionSettings | None = None,
 ) -> People:
-    """Return the people of a picture as the stage stores them, the crowd included."""
+    """Return the people in an image as the stage stores them, the crowd included."""
     chosen = settings or DetectionSettings()
-    kept = people.scores >= chosen.doubtful
+    kept = people.scores >= chosen.low_score_threshold
     people = People(people.boxes[kept], people.scores[kept])
     people, poses = find_poses(estimator, picture, people, chosen)
-    return told_apart(people, poses, chosen.least_keypoint, chosen.same_pose)[0]
+    return told_apart(people, poses, chosen.min_keypoint_confidence, chosen.oks_nms)[0]
 
 
 def apart(pictures: Sequence[LabelledPicture], share: float = 0.3) -> list[LabelledPicture]:
-    """Return the pictures with everybody ignored whose box has more in common with another's.
+    """Return the images with people ignored whose box overlaps another's more than `share`.
 
     Args:
         pictures: with the truth.
@@ -105,7 +105,7 @@ def score_keypoints(
     cache: PictureCache,
     heights: tuple[float, float] = (0.0, np.inf),
 ) -> KeypointFigures:
-    """Return figures of the people of some heights [px], each in the true box."""
+    """Return metrics of the people of some heights [px], each in the true box."""
     correct, visible, error, confidence, right = [], [], [], [], []
     for picture in pictures:
         tall = picture.boxes[:, 3] - picture.boxes[:, 1]

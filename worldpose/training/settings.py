@@ -1,4 +1,4 @@
-"""How nets are trained, and fine-tuned on reviewed labels."""
+"""Settings of training and of fine-tuning on reviewed labels."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from data_contracts.records import Record
 
 
 class TrainingSettings(Record):
-    """How a net is trained."""
+    """Settings of the training of a net."""
 
     steps: int = Field(default=1500, ge=1, le=1_000_000)
-    """Batches."""
+    """Number of batches."""
     planned: int | None = Field(default=None, ge=1, le=1_000_000)
     """Batches over which the rate rises and falls; `steps` if None. A training may end earlier."""
     rate: float = Field(default=1e-3, ge=1e-12, le=0.1)
@@ -21,37 +21,37 @@ class TrainingSettings(Record):
     memory: float = Field(default=0.998, ge=0, lt=1)
     """Share of the running mean of the weights that a step keeps [1]; less at first."""
     clip: float = Field(default=5.0, ge=1e-6, le=1000)
-    """Longest gradient [1]."""
+    """Largest norm of the gradient [1]."""
     check_every: int = Field(default=250, ge=1, le=100_000)
-    """Steps between checks against held-out pictures, each with a checkpoint."""
+    """Steps between checks on held-out frames, each with a checkpoint."""
     patience: int = Field(default=6, ge=1, le=1000)
-    """Checks without a better one after which training stops."""
+    """Checks without improvement after which training stops."""
     seed: int = Field(default=0, ge=0, le=2_147_483_647)
     bfloat16: bool = False
-    """Compute in bfloat16 where that is safe: twice as fast on processors that know it."""
+    """Compute in bfloat16 where that is safe: twice as fast on processors that support it."""
 
 
 class Refinement(TrainingSettings):
-    """How a trained net is trained on."""
+    """Settings of the further training of a trained net."""
 
     steps: int = Field(default=1500, ge=1, le=1_000_000)
-    """Batches."""
+    """Number of batches."""
     rate: float = Field(default=1e-3, ge=1e-12, le=0.1)
-    """Highest learning rate of AdamW [1]: two thirds of that which the nets began with."""
+    """Highest learning rate of AdamW [1]: two thirds of the rate of the nets' initial training."""
     check_every: int = Field(default=250, ge=1, le=100_000)
-    """Steps between checks against held-out pictures, each with a checkpoint: a check takes as long
-    as dozens of steps."""
+    """Steps between checks on held-out frames, each with a checkpoint: a check takes as long as
+    dozens of steps."""
 
 
 class FineTuningSettings(Record):
-    """How a net is fine-tuned."""
+    """Settings of the fine-tuning of a net."""
 
     checked: float = Field(default=0.15, gt=0, lt=0.5)
-    """Share of pictures that choose the best weights [1]."""
+    """Share of frames that choose the best weights [1]."""
     held_out: float = Field(default=0.25, gt=0, lt=0.5)
-    """Share of pictures that the figures are of [1]; nothing is learned or chosen by them."""
+    """Share of frames in the test set [1], which neither trains the net nor chooses its weights."""
     gain: float = Field(default=0.005, ge=0, le=1)
-    """What a version must be better by on the held-out pictures to be adopted [1]: less can be
-    luck."""
+    """Least gain of the metric on the held-out frames for a version to be adopted [1]: less can be
+    chance."""
     training: Refinement = Refinement()
     """Steps, rate and seed."""

@@ -1,7 +1,7 @@
-"""Triangulation: where every joint of every tracked person is, and how sure that is (T3, T4).
+"""Triangulation: 3D joints of all tracked persons, with covariance (T3, T4).
 
-Inputs: cameras, detected keypoints, and which detection is which person. Outputs: joints [m] of
-every frame and of whole tracks, with covariance and agreeing views; by how much clocks are late.
+Inputs: cameras, detected keypoints, and the detection of each person in each view. Outputs: joints
+[m] per frame and of whole tracks, with covariance and inlier views; clock offsets of the cameras.
 """
 
 from worldpose.triangulation.chunking import (

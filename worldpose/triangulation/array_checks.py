@@ -1,4 +1,4 @@
-"""Arrays of one clip belong together."""
+"""Checks that the arrays of one clip have matching shapes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def check_arrays(
     detection_index: NDArray[np.int16],
     camera_covariance: NDArray[np.float64] | None,
 ) -> None:
-    """Raise InputError unless the arrays belong together."""
+    """Raise InputError unless the arrays have matching shapes and valid indices."""
     if (
         confidence.ndim != 4
         or keypoints.shape != (*confidence.shape, 2)

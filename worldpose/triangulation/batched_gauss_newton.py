@@ -1,10 +1,10 @@
-"""Least squares on reprojection for 64 joints at a time, one vector lane a joint.
+"""Batched Gauss-Newton on reprojection errors: 64 joints at a time, one SIMD lane per joint.
 
-A tile is one flat row of numbers for each camera: `ROWS` rows of `LANES` lanes. A lane's
-observation is linearised at itself: with X = (x, y, z, 1) and depth p X, its error is
-(a X, b X) / (p X) [px]. The state of a tile is one flat array of `STATE` rows.
+A tile is one flat array per camera: `ROWS` rows of `LANES` numbers. Each observation is linearised
+at its own pixel: with X = (x, y, z, 1) and depth p X, its error is (a X, b X) / (p X) [px]. The
+state of a tile is one flat array of `STATE` rows.
 
-Loops run over lanes with constant bounds and offsets within one flat array, without branches:
+Loops run over `LANES` with constant bounds and offsets within one flat array, without branches:
 compilers then need no proof that rows do not overlap and use vector instructions.
 """
 
@@ -20,46 +20,46 @@ from worldpose.compiled import compiled
 Floats = NDArray[np.float64]
 
 LANES: Final = 64
-"""Joints a tile: 16 cameras of 64 lanes fit the second cache of a processor core."""
+"""Joints per tile: 16 cameras x 64 joints fit the L2 cache of a processor core."""
 
 # Rows of an observation.
 A: Final = 0
 B: Final = 4 * LANES
 SCALE: Final = 8 * LANES
-"""Square pixels for an area of one at depth one."""
+"""Image area of a unit area at depth one [px^2]."""
 PRECISION: Final = 9 * LANES
-"""Inverse of the factor on the image noise's variance; 0 = no observation."""
+"""Inverse of the factor on the image noise variance; 0 = no observation."""
 EXTRA: Final = 10 * LANES
-"""Variance besides the image noise [px^2]."""
+"""Variance in addition to the image noise [px^2]."""
 USED: Final = 11 * LANES
-"""1 = agrees or is taken to, 0 = left out."""
+"""1 = inlier or assumed to be one, 0 = left out."""
 SQUARED: Final = 12 * LANES
-"""Squared error in units of its variance, written by `accumulate`; infinite behind the camera."""
+"""Squared error over its variance, written by `accumulate`; infinite behind the camera."""
 LEVERAGE: Final = 13 * LANES
-"""Share of the observation in its own prediction, of two, written by `weigh`."""
+"""Leverage of the observation, at most 2, written by `weigh`."""
 ROWS: Final = 14
 
 # Rows of a state.
 POINT: Final = 0
 SHARPNESS: Final = 3 * LANES
-"""One over the scale of the Geman-McClure loss in units of variance; 0 = least squares."""
+"""Inverse scale of the Geman-McClure loss in units of variance; 0 = least squares."""
 MATRIX: Final = 4 * LANES
 """Sums of xx xy xz yy yz zz."""
 RIGHT: Final = 10 * LANES
 STEP: Final = 13 * LANES
 """Squared length of the last step [m^2]."""
 SEEN: Final = 14 * LANES
-"""Views there are, written by `survey`."""
+"""Number of views, written by `survey`."""
 INSIDE: Final = 15 * LANES
-"""Views within the limit."""
+"""Number of views within the limit."""
 WORST: Final = 16 * LANES
 """Largest finite squared error."""
 CHANGED: Final = 17 * LANES
-"""Views that changed sides, written by `select`."""
+"""Number of views whose inlier state changed, written by `select`."""
 STATE: Final = 18
 
 SINGULAR: Final = 1e-14
-"""Determinant over product of the diagonal below which rounding decides the answer [1]."""
+"""Determinant over product of the diagonal below which rounding dominates the result [1]."""
 
 
 @compiled
@@ -95,7 +95,7 @@ def accumulate(tile: Floats, depth: Floats, noise: tuple[float, float], state: F
     Args:
         tile: one camera's rows; writes `SQUARED`.
         depth: (4,), p of the camera.
-        noise: standard deviation of the image noise [px], and of its part in metres [m].
+        noise: standard deviation of the image noise [px], and of its part at the joint [m].
         state: points and sharpness of the loss; writes the sums.
     """
     p, q, r, s = depth[0], depth[1], depth[2], depth[3]
@@ -180,7 +180,7 @@ def start(tiles: Floats, state: Floats) -> None:
 
 @compiled
 def step(tiles: Floats, depths: Floats, noise: tuple[float, float], state: Floats) -> None:
-    """Take one Gauss-Newton step; errors and the inverted matrix are those before it."""
+    """Take one Gauss-Newton step; errors and the inverted matrix refer to the state before it."""
     clear(state)
     for camera in range(len(tiles)):
         accumulate(tiles[camera], depths[camera], noise, state)
@@ -189,7 +189,7 @@ def step(tiles: Floats, depths: Floats, noise: tuple[float, float], state: Float
 
 @compiled
 def weigh(tile: Floats, depth: Floats, noise: tuple[float, float], state: Floats) -> None:
-    """Write how far one camera's observations determine the points; the matrix is inverted."""
+    """Write the leverage of one camera's observations; the matrix is already inverted."""
     pixel, metric = noise[0] ** 2, noise[1] ** 2
     for j in range(LANES):
         x, y, z = state[POINT + j], state[POINT + LANES + j], state[POINT + 2 * LANES + j]
@@ -213,7 +213,7 @@ def weigh(tile: Floats, depth: Floats, noise: tuple[float, float], state: Floats
 
 @compiled
 def survey(tiles: Floats, limit: float, state: Floats) -> None:
-    """Write how many views there are, how many are within the limit, and the worst error."""
+    """Write the number of views, the number of views within the limit, and the largest error."""
     state[SEEN : SEEN + 3 * LANES] = 0.0
     for camera in range(len(tiles)):
         _survey_view(tiles[camera], limit, state)
@@ -231,7 +231,7 @@ def _survey_view(tile: Floats, limit: float, state: Floats) -> None:
 
 @compiled
 def select(tiles: Floats, limit: float, state: Floats) -> None:
-    """Use the views within the limit; write how many of them were not used or no longer are."""
+    """Mark the views within the limit as used; write the number of views that changed."""
     state[CHANGED : CHANGED + LANES] = 0.0
     for camera in range(len(tiles)):
         _select_view(tiles[camera], limit, state)
@@ -248,7 +248,7 @@ def _select_view(tile: Floats, limit: float, state: Floats) -> None:
 
 @compiled
 def largest(state: Floats, row: int) -> float:
-    """Return the largest number of a row of a state, NaN aside."""
+    """Return the largest number of a row of a state, ignoring NaN."""
     value = 0.0
     for j in range(LANES):
         value = state[row + j] if state[row + j] > value else value
@@ -259,7 +259,7 @@ def largest(state: Floats, row: int) -> float:
 def measure(tiles: Floats, depths: Floats, centers: Floats, state: Floats, rays: Floats) -> None:
     """Write the sum of squared pixel errors of the used views, their number and spread.
 
-    They go to the first three rows of sums: `MATRIX`, and the two after it; the spread is the
+    The results go to the first three rows of sums, `MATRIX` and the two after it; the spread is the
     largest squared sine of an angle between two rays.
     """
     sums, views, widest = MATRIX, MATRIX + LANES, MATRIX + 2 * LANES
@@ -281,7 +281,7 @@ def measure(tiles: Floats, depths: Floats, centers: Floats, state: Floats, rays:
             state[views + j] += used
             x, y, z = x - cx, y - cy, z - cz
             length = 1.0 / np.sqrt(x * x + y * y + z * z)
-            # A ray of NaN makes no angle.
+            # A NaN ray contributes no angle.
             length = length if used > 0.0 else np.nan
             ray[j], ray[LANES + j], ray[2 * LANES + j] = x * length, y * length, z * length
     for camera in range(len(tiles)):

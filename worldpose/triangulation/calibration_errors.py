@@ -1,4 +1,4 @@
-"""How far calibration is expected to misplace each person in each picture."""
+"""Image displacement of each person that calibration errors are expected to cause."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ RADIAL = [0, 1, 4]
 
 @dataclass(frozen=True, eq=False)
 class StatedErrors:
-    """Variance of people's places in pictures that calibration causes.
+    """Variance of people's image positions caused by calibration errors.
 
     Attributes:
-        variance: (frames, cameras, persons) per axis [px^2]; 0 where the person is not known.
-        scale: (frames, cameras, persons) pixels a metre there [px/m]; 0 where not known.
+        variance: (frames, cameras, persons) per axis [px^2]; 0 where the position is unknown.
+        scale: (frames, cameras, persons) image scale there [px/m]; 0 where unknown.
     """
 
     variance: Floats
     scale: Floats
 
     def misplaced(self, factor: float) -> tuple[Histogram, ...]:
-        """Return what the variance times `factor` is at people [m], by camera."""
+        """Return the standard deviation at people [m], variance times `factor`, by camera."""
         there = self.variance > 0.0
         variance = np.where(there, self.variance, 0.0) / np.where(there, self.scale, 1.0) ** 2
         root = np.sqrt(factor * variance)
@@ -43,12 +43,12 @@ def stated_errors(
     settings: TriangulationSettings,
     camera_covariance: Floats | None,
 ) -> StatedErrors:
-    """Return the variance of each person's place in each picture.
+    """Return the variance of each person's position in each image.
 
     Args:
         cameras: batch (cameras,).
-        joints: (frames, persons, joints, 3) [m], world; people are taken at their mean.
-        settings: `calibration_error` stands in for a covariance.
+        joints: (frames, persons, joints, 3) [m], world; their mean is the person's position.
+        settings: `calibration_error` replaces a missing covariance.
         camera_covariance: (cameras, 12, 12) of steps in the order of `PARAMETERS`, or None.
     """
     found = np.isfinite(joints[..., 0])
@@ -60,7 +60,7 @@ def stated_errors(
     variance, scale = np.zeros(shape), np.zeros(shape)
     for camera in range(shape[1]):
         depth = places @ pose.rotation[camera, 2] + pose.translation[camera, 2]
-        # Nobody is before a missing camera.
+        # A missing camera sees no person.
         before = known & (depth > 0.0) & bool(np.isfinite(cameras.focal[camera]).all())
         size = np.sqrt(cameras.focal[camera].prod()) / np.where(before, depth, 1.0)
         scale[:, camera] = np.where(before, size, 0.0)

@@ -1,7 +1,7 @@
-"""A clip of any length: learned about from samples, then reconstructed a stretch at a time.
+"""Chunked reconstruction of a clip of any length, with models learned from sample frames.
 
-Joints of a frame need no other frame. Smoothed ones need those around them, so each stretch is
-smoothed together with a margin of its neighbours.
+Triangulation of a frame needs no other frame. Smoothing needs neighbouring frames, so each chunk is
+smoothed together with a margin on either side.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from worldpose.triangulation.smoothing import Smoothing, smooth_joints
 Floats = NDArray[np.float64]
 
 PART: Final = 512
-"""Frames a stretch: some hundred megabytes with 25 people before 16 cameras."""
+"""Frames per chunk: some hundred megabytes with 25 people in 16 cameras."""
 MARGIN: Final = 2.0
-"""Time on either side that smoothing looks at [s]: what lies farther away moves a joint by less
-than the steps at which its iteration ends, across gaps too."""
+"""Margin on either side for smoothing [s]: frames farther away move a joint by less than the step
+that ends the iteration, across gaps too."""
 
 
 @dataclass(frozen=True, eq=False)
 class ClipModel:
-    """What samples of a clip tell about all of it.
+    """Noise model and clock offsets of a clip, estimated from sample frames.
 
     Attributes:
-        clocks: by how much cameras are late.
-        detector: how the detector and the calibration err.
-        motion: how people usually move.
+        clocks: clock offsets of the cameras.
+        detector: error model of detector and calibration.
+        motion: motion prior of smoothing.
     """
 
     clocks: CameraClocks
@@ -57,11 +57,11 @@ class ClipModel:
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
-    """A stretch of a clip.
+    """Joints of one chunk of frames.
 
     Attributes:
-        frames: which of the clip's.
-        triangulation: every frame by itself.
+        frames: its frames in the clip.
+        triangulation: each frame on its own.
         smoothing: as part of whole tracks.
     """
 
@@ -72,13 +72,13 @@ class Chunk:
 
 @dataclass(frozen=True, eq=False)
 class ClipDetections:
-    """What cameras saw of tracked people, a stretch of frames at a time.
+    """Detections of tracked people, loaded one chunk of frames at a time.
 
     Attributes:
         keypoints: (frames, cameras, detections, 17, 2) [px].
         confidence: (frames, cameras, detections, 17).
         detection_index: (frames, cameras, persons).
-        late: (cameras,) [frame] by how much to correct the clocks; None = not at all.
+        late: (cameras,) [frame], clock offsets to correct; None = no correction.
     """
 
     keypoints: ClipArray
@@ -88,7 +88,7 @@ class ClipDetections:
 
     @property
     def frames(self) -> int:
-        """How many there are."""
+        """Number of frames."""
         return self.confidence.shape[0]
 
     def between(self, first: int, last: int) -> Moved:
@@ -104,13 +104,13 @@ class ClipDetections:
         return arrays[0][inner], arrays[1][inner], arrays[2][inner]
 
     def at(self, frames: NDArray[np.int64]) -> Moved:
-        """Return the same of single frames."""
+        """Return keypoints, confidence and index of single frames."""
         each = [self.between(frame, frame + 1) for frame in frames.tolist()]
         keypoints, confidence, index = zip(*each, strict=True)
         return np.concatenate(keypoints), np.concatenate(confidence), np.concatenate(index)
 
     def seen(self, views: int) -> NDArray[np.bool_]:
-        """Return whether so many cameras saw a person (frames, persons)."""
+        """Return whether at least `views` cameras saw each person (frames, persons)."""
         parts = [
             (self.detection_index[start : start + PART] >= 0).sum(axis=1) >= views
             for start in range(0, max(1, self.frames), PART)
@@ -125,7 +125,7 @@ def learn_clip(
     settings: TriangulationSettings,
     camera_covariance: Floats | None = None,
 ) -> tuple[ClipModel, ClipDetections]:
-    """Return what samples of a clip tell, and its detections by corrected clocks where asked for.
+    """Return the clip's model, and its detections with clocks corrected if the settings say so.
 
     Args:
         cameras: batch (cameras,).
@@ -167,9 +167,9 @@ def reconstruct_chunks(
     camera_covariance: Floats | None = None,
     length: int = PART,
 ) -> Iterator[Chunk]:
-    """Yield a clip's joints, a stretch of `length` frames at a time.
+    """Yield a clip's joints, one chunk of `length` frames at a time.
 
-    Triangulated joints are those that the whole clip at once gives; smoothed ones to 0.1 mm.
+    Triangulated joints equal those of the whole clip at once, smoothed joints to within 0.1 mm.
 
     Args:
         cameras: batch (cameras,).
@@ -178,10 +178,10 @@ def reconstruct_chunks(
         fps: frames per second [1/s].
         settings: of the stage.
         camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
-        length: frames a stretch; made to hold the margin and whole tiles of the solver.
+        length: frames per chunk; rounded up to the margin and whole tiles of the solver.
     """
     frames, margin = detections.frames, round(MARGIN * fps)
-    # Joints of a tile take their steps together: with the same tiles they are the same bits.
+    # Joints of a tile share their number of steps: equal tiles give bit-identical joints.
     length = LANES * -(-max(1, length, margin) // LANES)
     parts = [
         slice(first, min(first + length, frames)) for first in range(0, max(1, frames), length)
@@ -209,7 +209,7 @@ def reconstruct_chunks(
 def _around(
     before: Triangulation | None, here: Triangulation, after: Triangulation | None, margin: int
 ) -> Triangulation:
-    """Return what smoothing needs of a stretch and of the frames on either side of it."""
+    """Return the triangulation of a chunk with `margin` frames on either side."""
 
     def joined(name: str) -> NDArray[Any]:
         parts = [getattr(before, name)[-margin:]] if before is not None and margin else []

@@ -1,7 +1,7 @@
-"""Clocks of the cameras: by how many frames each is late, seen in how people's rays miss.
+"""Clock offsets of the cameras, estimated from reprojection residuals of moving people.
 
-A camera that is late by d frames shows in its frame t what happened at t + d: its rays miss a
-person by the person's way in d frames.
+Frame t of a camera with clock offset d shows the time t + d: its rays miss a person by the person's
+motion in d frames.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ Floats = NDArray[np.float64]
 Moved = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.int16]]
 
 GATES: Final = (10.0, 10.0, 5.0, 3.5, 3.5, 3.5, 3.5)
-"""Deviations accepted in each round: clocks three frames apart put a runner's rays half a metre
+"""Deviations accepted in each pass: clocks three frames apart put a runner's rays half a metre
 apart."""
 SETTLED: Final = 0.005
-"""Change that ends the rounds [frame]."""
+"""Change that ends the passes [frame]."""
 SAMPLE: Final = 3000
-"""Person-frames looked at."""
+"""Person-frames in the sample."""
 WINDOW: Final = 1.0
-"""Length of a stretch of frames, whose errors count as one [s]."""
+"""Length of an interval [s]; errors within an interval count as one."""
 VELOCITY_TIME: Final = 0.06
-"""Half the time over which velocity is taken [s]."""
+"""Half the time over which velocity is computed [s]."""
 ALIKE: Final = 0.025
-"""Share of a detector's error that all people before a camera have in common along their way [1]:
-it takes bodies seen from one side for shifted, and no number of people averages that away.
-Simulated matches and penalty boxes showed 0.027 and 0.021."""
+"""Share of a detector's error along the motion that all people in a camera have in common [1]: the
+detector shifts bodies seen from one side, and no number of people averages that out. Simulated
+matches and penalty boxes showed 0.027 and 0.021."""
 UNKNOWN: Final = 10.0
-"""Standard deviation of an offset of which nothing is known [frame]."""
+"""Standard deviation of an undetermined offset [frame]."""
 
 
 class ClockReport(Record):
-    """The same as figures, a value a camera."""
+    """Clock offsets as metrics, one value per camera."""
 
     clock_late_frames: tuple[float | None, ...]
     """None where too little moves."""
@@ -53,13 +53,13 @@ class ClockReport(Record):
 
 @dataclass(frozen=True, eq=False)
 class CameraClocks:
-    """By how much cameras are late.
+    """Clock offsets of the cameras.
 
     Attributes:
         late: (cameras,) [frame]: frame t shows the time t + late of the cameras' mean clock; NaN
             where `determined` is false.
         standard_error: (cameras,) [frame]; several frames without motion.
-        determined: (cameras,) bool, known to better than the settings' `clock_error`.
+        determined: (cameras,) bool, standard error below the settings' `clock_error`.
     """
 
     late: Floats
@@ -68,7 +68,7 @@ class CameraClocks:
 
     @property
     def report(self) -> ClockReport:
-        """The figures of the clocks."""
+        """The metrics of the clock offsets."""
         late = zip(self.late.tolist(), self.determined.tolist(), strict=True)
         return ClockReport(
             clock_late_frames=tuple(value if known else None for value, known in late),
@@ -84,11 +84,11 @@ def estimate_clocks(
     fps: float,
     settings: TriangulationSettings,
 ) -> CameraClocks:
-    """Return by how much each camera's frames are late against the cameras' mean.
+    """Return the clock offset of each camera relative to the cameras' mean.
 
-    Round by round people are triangulated, each camera's misses are regressed on the people's
-    velocity in its picture, with the people free to follow, and its observations are moved in time
-    by what was found. At the end no miss goes with velocity, so that its noise does not matter.
+    Each pass triangulates people, regresses each camera's residuals on the people's image velocity,
+    with the joints free to follow, and shifts the camera's observations in time by the estimate. At
+    convergence no residual correlates with velocity, so noise of the velocity has no effect.
 
     Args:
         cameras: batch (cameras,).
@@ -96,7 +96,7 @@ def estimate_clocks(
         confidence: (frames, cameras, detections, 17).
         detection_index: (frames, cameras, persons).
         fps: frames per second [1/s].
-        settings: noise, and the standard error up to which a clock counts as known.
+        settings: noise, and the standard error below which an offset is determined.
     """
     rig = Rig.of(cameras)
     count = len(rig.cameras)
@@ -110,14 +110,15 @@ def estimate_clocks(
         sums = [_regression(rig, *each, fps, loose) for each in arrays]
         information = np.concatenate([each.information for each in sums])
         score = np.concatenate([each.score for each in sums])
-        # A common offset moves people along their way and shows in no miss.
+        # A common offset moves people along their path and changes no residual.
         inverse = np.linalg.inv(information.sum(axis=0) + np.eye(count) / UNKNOWN**2)
         step = inverse @ score.sum(axis=0)
-        # Cameras that tell nothing are no part of the mean.
+        # Cameras without information are not part of the mean.
         telling = np.diagonal(information.sum(axis=0)) > 1.0 / UNKNOWN**2
         centered = inverse - telling @ inverse / max(1, telling.sum())
-        # Stretches of a person are independent, frames are not: what their scores scatter by.
-        # Each has pulled the solution its way: what it would miss the others' by (jackknife).
+        # Intervals of a person are independent, frames are not: the error is the scatter of
+        # interval scores. Each interval has influenced the solution, hence the division
+        # (jackknife).
         own = np.diagonal(information, axis1=1, axis2=2)
         share = np.minimum(own / np.maximum(own.sum(axis=0), 1e-12), 0.5)
         left = ((score - information @ step) / (1.0 - share)) @ centered.T
@@ -141,9 +142,9 @@ def moved_in_time(
     detection_index: NDArray[np.int16],
     late: Floats,
 ) -> Moved:
-    """Return the observations as cameras with the right clock would have made them.
+    """Return the observations shifted to the common clock.
 
-    Between two frames a keypoint is taken to move straight; it is missing unless both have it.
+    Keypoints are interpolated linearly between two frames and are missing unless both have them.
 
     Args:
         keypoints: (frames, cameras, detections, joints, 2) [px].
@@ -152,8 +153,8 @@ def moved_in_time(
         late: (cameras,) [frame]; NaN or 0 leaves a camera as it is.
 
     Returns:
-        The same three by person: keypoints (frames, cameras, persons, joints, 2), confidence, and
-        an index that says so.
+        The same three arrays by person: keypoints (frames, cameras, persons, joints, 2),
+        confidence, and the matching index.
     """
     frames, _, persons = detection_index.shape
     at = np.maximum(detection_index, 0).astype(np.int64)[..., None]
@@ -181,7 +182,7 @@ def moved_in_time(
 
 
 def _stretches(shape: tuple[int, ...], length: int) -> list[slice]:
-    """Return stretches of frames spread over the clip, with enough people together."""
+    """Return intervals of frames spread over the clip, with enough person-frames in total."""
     frames, _, persons = shape
     starts = np.arange(0, max(1, frames - length + 1), length)
     wanted = max(1, SAMPLE // max(1, length * persons))
@@ -191,15 +192,15 @@ def _stretches(shape: tuple[int, ...], length: int) -> list[slice]:
 
 @dataclass(frozen=True, eq=False)
 class _Sums:
-    """What a stretch says of the clocks.
+    """Normal equations of the clock offsets from one interval.
 
     Attributes:
         information: (persons, cameras, cameras) [1/frame^2].
-        score: (persons, cameras) [1/frame]; the sum's solution is to be added to `late`.
-        along: (cameras,) of weight times way times pixels a metre [1/(frame m)]: the score that a
-            shift of people along their way brings.
-        misses: (cameras,) of weighted squared misses [1].
-        scale: (cameras,) of weight times squared pixels a metre [1/m^2].
+        score: (persons, cameras) [1/frame]; `late` grows by the solution of the sum.
+        along: (cameras,) of weight x image motion x image scale [1/(frame m)]: the score of a shift
+            of people along their path.
+        misses: (cameras,) of weighted squared residuals [1].
+        scale: (cameras,) of weight x squared image scale [1/m^2].
     """
 
     information: Floats
@@ -210,7 +211,7 @@ class _Sums:
 
 
 def _common_score(sums: list[_Sums]) -> Floats:
-    """Return the score (cameras,) of people shifted along their way by a camera's usual miss."""
+    """Return the score (cameras,) of people shifted along their path by a typical residual."""
     along = np.sum([each.along for each in sums], axis=0)
     misses = np.sum([each.misses for each in sums], axis=0)
     scale = np.sum([each.scale for each in sums], axis=0)
@@ -227,7 +228,7 @@ def _regression(
     fps: float,
     settings: TriangulationSettings,
 ) -> _Sums:
-    """Return what the misses of a stretch of frames say of the clocks."""
+    """Return the normal equations from the residuals of an interval of frames."""
     pixels, weights, index = moved_in_time(keypoints, confidence, detection_index, late)
     precision = NoiseModel.stated(weights.shape[-1]).precision(weights)
     joints = solve(rig, pixels, precision, index, no_shift(), settings).joints
@@ -239,7 +240,7 @@ def _regression(
     at, velocity = at[known], velocity[known]
     person = np.nonzero(known)[1]
     persons, count = index.shape[2], len(rig.cameras)
-    # By the point: matrix (n, 3, 3) and right side; by the clock, and by both.
+    # Point block: matrix (n, 3, 3) and right side; mixed block; clock block.
     matrix, right = np.zeros((len(at), 3, 3)), np.zeros((len(at), 3))
     mixed = np.zeros((count, len(at), 3))
     information, score = np.zeros((persons, count, count)), np.zeros((persons, count))

@@ -1,7 +1,7 @@
-"""How far what a detector takes for joints is from the joints, from people's proportions (T3).
+"""Bias of detected joints that all views share, estimated from body proportions (T3).
 
-All views of a joint share that error, so no residual shows it. But it makes bones longer or
-shorter, of everybody and for the whole clip, while the proportions of people are known.
+No residual shows that bias. But it makes bones of all persons longer or shorter for the whole clip,
+while human proportions are known.
 """
 
 from __future__ import annotations
@@ -31,21 +31,22 @@ BY_JOINT: Final = np.array(
 )
 """Common bias of each joint relative to the average one (17,) [1].
 
-Errors against the labels of real people (Shelf, frames 300 to 510, five cameras), root mean
-square per axis: shoulders 27 mm, elbows 30, wrists 31, hips 43, knees 23, ankles 23. Against
-markers hips and knees are 30 to 50 mm off, ankles 1 to 15 (Needham et al., Scientific Reports 11,
-2021). No such measurement of the face is at hand."""
+Errors against the labels of real people (Shelf, frames 300 to 510, five cameras), root mean square
+per axis: shoulders 27 mm, elbows 30, wrists 31, hips 43, knees 23, ankles 23. Against markers hips
+and knees are 30 to 50 mm off, ankles 1 to 15 (Needham et al., Scientific Reports 11, 2021). No such
+measurement of the face is available."""
 
 
 @dataclass(frozen=True)
 class Proportion:
-    """A length that no pose changes much.
+    """Body length that hardly depends on the pose.
 
     Attributes:
         ends: one or two pairs of ends; an end is the mean of its joints.
         share: of stature [1].
-        spread: standard deviation, relative, of what is published for the share [1].
-        offsets: the length's variance when each joint's is 1 per axis, mirrored left to right [1].
+        spread: relative standard deviation of published values of the share [1].
+        offsets: variance of the length for joint biases of variance 1 per axis, mirrored left to
+            right [1].
     """
 
     ends: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
@@ -63,7 +64,7 @@ def _limb(upper: str, lower: str, share: float) -> Proportion:
 
 def _breadth(name: str, share: float, spread: float) -> Proportion:
     left, right = COCO17.index(f"left_{name}"), COCO17.index(f"right_{name}")
-    # Both ends go outward together.
+    # Both ends move outward together.
     return Proportion((((left,), (right,)),), share, spread, 4.0 * float(BY_JOINT[left]) ** 2)
 
 
@@ -77,28 +78,28 @@ PROPORTIONS: Final = (
     Proportion((((5, 6), (11, 12)),), 0.294, 0.05, float((BY_JOINT[[5, 11]] ** 2).sum())),
 )
 """Limbs and trunk between joint centres of men after P. de Leva, Journal of Biomechanics 29, 1996;
-breadths between the centres of shoulders and hips are published less alike."""
+published breadths between the centres of shoulders and hips agree less."""
 STATURE: Final = (1.72, 0.12)
-"""Of the people of a clip, mean and standard deviation [m]: men, women or children."""
+"""Stature of people, mean and standard deviation per clip [m]: men, women or children."""
 PERSONAL: Final = 0.035
 """Standard deviation of a person's proportion relative to the mean [1] (Drillis, Contini 1966)."""
 PRIOR_DEGREES_OF_FREEDOM: Final = 8.0
-"""Of the inverse chi-square prior of the bias's variance [1]. Proportions that fit by chance barely
-lower the estimate, proportions that do not fit raise it."""
+"""Degrees of freedom of the inverse chi-square prior of the bias variance [1]. Proportions that fit
+by chance barely lower the estimate, proportions that do not fit raise it."""
 MIN_FRAMES: Final = 5
 """Frames needed to estimate the length of a person's bone."""
 
 
 def learn_common_bias(joints: Floats, covariance: Floats, usual: float) -> float:
-    """Return the common bias per axis of an average joint that a clip's people make probable [m].
+    """Return the estimated common bias per axis of an average joint [m].
 
-    Lengths are the medians over people of medians over frames, less what noise adds to them. Common
-    bias is normal; its size is the root of the posterior mean of its variance.
+    Lengths are medians over people of medians over frames, minus the contribution of noise. The
+    bias is normal; the result is the root of the posterior mean of its variance.
 
     Args:
         joints: (frames, persons, 17, 3) [m].
         covariance: (frames, persons, 17, 3, 3) [m^2], of `joints` without common bias.
-        usual: what is expected of detectors per axis [m].
+        usual: expected bias of detectors per axis [m].
     """
     if usual <= 0.0:
         return 0.0
@@ -125,7 +126,7 @@ def learn_common_bias(joints: Floats, covariance: Floats, usual: float) -> float
 
 
 def _length(joints: Floats, covariance: Floats, what: Proportion) -> tuple[float, float, int]:
-    """Length [m], its variance by noise [m^2] and of how many people; zeros where nobody has it."""
+    """Return a length [m], its noise variance [m^2] and the number of people; zeros without any."""
     squares, traces = [], []
     for ends in what.ends:
         first, second = (joints[:, :, list(end)].mean(axis=2) for end in ends)

@@ -1,6 +1,6 @@
-"""Which views of a joint agree, and the point that suits them best, for 64 joints at a time.
+"""Inlier views of each joint and their least-squares point, for 64 joints at a time.
 
-Tiles, states and their rows are those of `lanes`.
+Tiles, states and their rows are those of `batched_gauss_newton`.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ MAX_STEPS: Final = 8
 CONVERGED: Final = 1e-6
 """Length of a step that ends the iteration [m]."""
 MAX_REVISIONS: Final = 5
-"""Corrections of the set of agreeing views; it settles after one or two."""
+"""Updates of the inlier set; it settles after one or two."""
 SHRINK: Final = 0.1
-"""Of the loss's scale from step to step [1]."""
+"""Factor on the scale of the loss from step to step [1]."""
 
 
 @compiled
@@ -52,21 +52,21 @@ def consensus(
     limit: float,
     state: Floats,
 ) -> None:
-    """Write the least-squares points of the views that agree, NaN where there are none.
+    """Write the least-squares points of the inlier views, NaN where there are none.
 
-    All views are tried together; where they do not agree, a Geman-McClure loss whose scale shrinks
-    from the worst error to `limit` finds a majority (graduated non-convexity, Blake and Zisserman
-    1987); where there is none, the two views that the others contradict least decide.
+    The first attempt uses all views. If they disagree, a Geman-McClure loss whose scale shrinks
+    from the largest error to `limit` finds a majority (graduated non-convexity, Blake and Zisserman
+    1987). Without a majority, the pair of views with the smallest error over all views decides.
 
     Args:
         tiles: (cameras, ROWS x LANES); writes `USED`.
         depths: (cameras, 4).
         noise: [px], [m].
-        limit: largest squared error that agrees, in variances.
+        limit: largest squared error of an inlier [variances].
         state: written: points, and the inverse matrices there.
     """
     for tile in tiles:
-        # All there are are used.
+        # Start with all available views.
         tile[SQUARED : SQUARED + LANES] = 0.0
     select(tiles, limit, state)
     state[SHARPNESS : SHARPNESS + LANES] = 0.0
@@ -97,9 +97,9 @@ def consensus(
 def _graduate(
     tiles: Floats, depths: Floats, noise: tuple[float, float], limit: float, state: Floats
 ) -> bool:
-    """Move lanes whose views do not agree to where a majority does; is there such a lane?
+    """Move joints with disagreeing views to a majority's point; return whether there are any.
 
-    The scale of their loss stays at `limit`; that of the others is infinite.
+    Their loss scale ends at `limit`; the loss scale of all other joints is infinite.
     """
     survey(tiles, limit, state)
     most = 0.0
@@ -117,7 +117,7 @@ def _graduate(
         most *= SHRINK
         for j in range(LANES):
             state[SHARPNESS + j] = min(1.0 / limit, state[SHARPNESS + j] / SHRINK)
-    # Errors are those before a step: one more shows where the last one led.
+    # Errors refer to the state before a step: one more step updates them.
     step(tiles, depths, noise, state)
     return True
 

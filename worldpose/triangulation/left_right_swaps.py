@@ -1,4 +1,4 @@
-"""Left and right exchanged: detections that fit the other views when their sides are swapped."""
+"""Left-right swaps: detections that fit the other views only with left and right swapped."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ PAIRS: Final = np.array(
         for name in names
     ]
 )
-"""(pairs, 2) left and right joints, part after part."""
+"""(pairs, 2) left and right joints, part by part."""
 PART_OF: Final = np.repeat(
     np.arange(len(EXCHANGED_PARTS)), [len(names) for names in EXCHANGED_PARTS.values()]
 )
-"""(pairs,) the part that each belongs to."""
+"""(pairs,) part of each pair."""
 WHOLE: Final = 2.0 * math.log(50.0)
-"""Twice the logarithm of the odds, before looking, against a body whose sides are exchanged:
-detectors take one back in fifty for a front. Half or one and a half times as much changes mean
-errors by 0.1 %."""
+"""Twice the logarithm of the prior odds against a left-right swap of the whole body: detectors
+mistake one back in fifty for a front. Half or one and a half times as much changes mean errors by
+0.1 %."""
 PART: Final = 2.0 * math.log(150.0)
-"""The same of one part alone."""
+"""The same for a single part."""
 
 
 def find_swaps(
@@ -48,21 +48,21 @@ def find_swaps(
     limit: float,
     found: Solution,
 ) -> Flags:
-    """Return which parts of whom have left and right exchanged (frames, cameras, persons, parts).
+    """Return the left-right swaps of body parts (frames, cameras, persons, parts).
 
-    The detection as it is and with its sides exchanged, the whole body or parts of it, are
-    compared by how far they are from where all views together put the joints, under a loss that
-    ends at `limit`. Only detections are looked at of which that rejected two keypoints or more.
+    Each detection is compared, as it is and with the whole body or parts of it swapped, by the
+    distances to the joints from all views, under a loss truncated at `limit`. Only detections with
+    at least two outlier keypoints are tested.
 
     Args:
         rig: the cameras.
         keypoints: (frames, cameras, detections, joints, 2) [px].
         precision: (frames, cameras, detections, joints), 0 or NaN = no observation.
-        index: (frames, cameras, persons), place among the detections; -1 = not seen.
+        index: (frames, cameras, persons), index of the detection; -1 = not seen.
         shift: (frames, cameras, persons, 3) as in `solve`.
         noise: [px], [m].
-        limit: largest squared error that agrees, in variances.
-        found: the joints from the detections as they are.
+        limit: largest squared error of an inlier [variances].
+        found: the joints from the unchanged detections.
     """
     exchanged = np.zeros((*index.shape, len(EXCHANGED_PARTS)), np.bool_)
     if precision.shape[-1] == len(COCO17):
@@ -80,7 +80,7 @@ def undo_swaps(
     index: NDArray[np.integer],
     exchanged: Flags,
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Return keypoints and confidence with the sides of exchanged parts put right.
+    """Return keypoints and confidence with left-right swaps undone.
 
     Args:
         keypoints: (frames, cameras, detections, 17, 2) [px]; not changed.
@@ -94,7 +94,7 @@ def undo_swaps(
 def unswap(
     seen: NDArray[np.floating], index: NDArray[np.integer], exchanged: Flags
 ) -> NDArray[np.floating]:
-    """Return what was seen of joints with the sides of exchanged parts put right.
+    """Return values of detected joints with left-right swaps undone.
 
     Args:
         seen: (frames, cameras, detections, 17, ...); not changed.
@@ -129,7 +129,7 @@ def _find(
     part_of: NDArray[np.int64],
     exchanged: Flags,
 ) -> None:
-    """Write the last argument."""
+    """Write `exchanged`."""
     frames, count, persons = index.shape
     joint_count = precision.shape[3]
     image, base, doubt = np.empty((2, 2)), np.empty(2), np.empty(2)

@@ -1,7 +1,7 @@
-"""Limbs that change their length: ends that the wrong two views have placed (T3).
+"""Repair of joints triangulated from a wrong pair of views, based on limb lengths (T3).
 
-Where one of three views is wrong, any two may agree about as well. The pair that leaves the
-person's limbs as long as they are is the right one.
+If one of three views is wrong, any two may agree about equally well. The correct pair preserves the
+person's limb lengths.
 """
 
 from __future__ import annotations
@@ -33,26 +33,26 @@ LIMBS: Final = tuple(
 )
 """Upper and lower ends, left before right."""
 SURE: Final = 3
-"""Agreeing views that tell how long a limb is; with no more an end may be placed by chance."""
+"""Inlier views that both ends of a measured limb need; an end with no more may be accidental."""
 FEWEST: Final = 5
-"""Frames that tell how long a limb is."""
+"""Minimum frames to measure the length of a limb."""
 SLACK: Final = 0.03
-"""Standard deviation of a limb's length from frame to frame [m]: what is labelled as a hip from
-behind is another point than from the side."""
+"""Standard deviation of a limb's length from frame to frame [m]: the label of a hip means another
+point from behind than from the side."""
 STRANGE: Final = 4.0
-"""Square of a length's deviation from which on other pairs are tried [variances]."""
+"""Squared deviation of a length from which other pairs are tried [variances]."""
 RARE: Final = 6.6
-"""The same, from which on an end that two views alone carry is missing: one honest in a hundred."""
+"""The same, from which an end with only two views is dropped: one correct end in a hundred."""
 
 
 def limb_lengths(found: Solution) -> Floats:
-    """Return how long everybody's limbs are (persons, limbs) [m]; NaN where nothing tells.
+    """Return the limb lengths of all persons (persons, limbs) [m]; NaN where unknown.
 
-    A length is the median over the frames in which three views agree on both ends; over all
-    frames where those are too few. A limb whose length is hardly ever the same tells nothing.
+    A length is the median over the frames with three inlier views of both ends, or over all frames
+    if those are too few. The length is unknown if it varies too much.
 
     Args:
-        found: joints of frames all over a clip.
+        found: joints of frames sampled over the clip.
     """
     persons, joints = found.joints.shape[1:3]
     lengths = np.full((persons, len(LIMBS)), np.nan)
@@ -83,19 +83,18 @@ def repair_limb_lengths(
     found: Solution,
     lengths: Floats,
 ) -> None:
-    """Place anew, in place, ends that few views carry of limbs whose length is strange.
+    """Re-triangulate, in place, ends with few inlier views of limbs of wrong length.
 
-    Of all pairs of views those decide, for the two limbs of an arm or leg together, which the
-    other views and the limbs' lengths contradict least. Where even that leaves a limb of another
-    length, its end is missing.
+    For the two limbs of an arm or leg together, the pairs of views with the smallest residuals of
+    all views and limb lengths decide. If the limb still has a wrong length, its end is missing.
 
     Args:
         rig: the cameras.
         keypoints: (frames, cameras, detections, joints, 2) [px].
         precision: (frames, cameras, detections, joints), as in `solve`.
-        index: (frames, cameras, persons), place among the detections; -1 = not seen.
+        index: (frames, cameras, persons), index of the detection; -1 = not seen.
         shift: (frames, cameras, persons, 3), as in `solve`.
-        settings: noise, agreement and least views.
+        settings: noise, inlier limit and minimum views.
         found: joints from the same arrays; changed.
         lengths: (persons, limbs) of `limb_lengths`.
     """
@@ -130,13 +129,13 @@ def repair_limb_lengths(
 
 @dataclass(frozen=True, eq=False)
 class _Choices:
-    """Where an end may be.
+    """Candidate positions of a limb's end.
 
     Attributes:
         points: (choices, 3) [m], world.
         covariance: (choices, 3, 3) [m^2].
-        cost: (choices,) by which its views contradict each.
-        tried: what is known of each; None of an end that stays.
+        cost: (choices,) of the residuals of all views.
+        tried: the solution of each; None for an end that stays.
     """
 
     points: Floats
@@ -152,13 +151,13 @@ def _choices(
     found: Solution,
     end: tuple[int, int, int],
 ) -> _Choices:
-    """Return where pairs of views, and those that agree with them, put an end.
+    """Return the positions of an end from pairs of views and their inliers.
 
     Args:
         rig: the cameras.
         observed: pixels (cameras, 2), precision (cameras,), 0 = not seen, and shift of one person;
-            an end that nobody sees stays.
-        settings: noise, agreement and least views.
+            an end without observations stays.
+        settings: noise, inlier limit and minimum views.
         found: joints.
         end: frame, person, joint.
     """
@@ -182,7 +181,7 @@ def _choices(
     limit = settings.max_deviation**2
     _, misfit = placed(used)
     tried, misfit = placed(misfit <= limit)
-    # To leave out a view that is hardly known costs less.
+    # Rejecting a view of low precision costs less.
     some = np.where(weights > 0.0, weights, 1.0)
     most = np.maximum(limit + 2.0 * np.log(some / weights.max()), 0.0)
     cost = np.where(misfit <= limit, np.minimum(misfit, most), most)
@@ -198,13 +197,13 @@ def _choose(
     found: Solution,
     chain: tuple[int, int, int, int],
 ) -> None:
-    """Place the two ends of an arm or a leg, in place.
+    """Set the two ends of an arm or a leg to their best candidates, in place.
 
     Args:
-        root: where it begins (3,) and covariance (3, 3).
-        choices: of its middle and its end.
-        long: (2,) its limbs [m].
-        limit: largest squared deviation of a length that is right [variances].
+        root: position (3,) and covariance (3, 3) of its first joint.
+        choices: candidates for its middle and its end.
+        long: (2,) lengths of its limbs [m].
+        limit: largest squared deviation of a correct length [variances].
         found: joints; changed.
         chain: frame, person, middle and end.
     """
@@ -250,7 +249,7 @@ def _deviation(
     other_covariance: Floats,
     long: Floats | float,
 ) -> tuple[Floats, Floats]:
-    """How far limbs are from their lengths, and how sure that is.
+    """Return deviations of limbs from their lengths, and their variances.
 
     Args:
         upper: (..., 3) one end [m], world.
@@ -260,8 +259,8 @@ def _deviation(
         long: length [m].
 
     Returns:
-        Squares (...) [variances] and logarithms of variances over the least one (...); both 0
-        where nothing tells.
+        Squares (...) [variances] and logarithms of variances over the least one (...); both 0 where
+        unknown.
     """
     limb = lower - upper
     now = np.linalg.norm(limb, axis=-1)
@@ -283,7 +282,7 @@ def _misfit(
     noise: tuple[float, float],
     points: Floats,
 ) -> Floats:
-    """Squared errors of views (points, cameras) [variances]; 0 of who does not see the joint."""
+    """Return squared errors of views (points, cameras) [variances]; 0 without an observation."""
     at = np.broadcast_to(points, (len(weights), *points.shape))
     image = np.empty((*at.shape[:-1], 2))
     projection.project(rig.cameras, np.ascontiguousarray(at), image)

@@ -1,4 +1,4 @@
-"""Pictures of a person moved so that the rays of his mid-hip meet (T4)."""
+"""Image shift of each person that makes the rays of the mid-hip meet (T4)."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def midhip_shift(
     index: NDArray[np.integer],
     settings: TriangulationSettings,
 ) -> Floats:
-    """Return the error of the mid-hip in each picture of a person, and a zero.
+    """Return the mid-hip residual of each person in each image, and a zero.
 
-    With it subtracted, projection less observation is that of the paper's second stage, both
-    relative to the mid-hip. A picture without both hips, or a person without a mid-hip, is left
-    where it is.
+    With the shift subtracted, reprojection residuals are those of the paper's second stage,
+    relative to the mid-hip. The shift is 0 in an image without both hips, and for a person without
+    a mid-hip.
 
     Args:
         rig: the cameras.

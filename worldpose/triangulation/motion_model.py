@@ -1,4 +1,4 @@
-"""How people's joints usually accelerate, and for how long a detector repeats its errors."""
+"""Typical accelerations of joints, and the correlation time of detector errors."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from worldpose.triangulation.track_solver import held_out_cost, prepare, solve_s
 Floats = NDArray[np.float64]
 
 ACCELERATIONS: Final = (3.0, 6.0, 12.0, 25.0, 50.0, 100.0, 200.0)
-"""What is tried [m/s^2]: from a stroller's trunk to a kicking foot."""
+"""Candidates [m/s^2]: from a stroller's trunk to a kicking foot."""
 USUAL: Final = 25.0
-"""Taken where nothing can be learned [m/s^2]."""
+"""Default without data [m/s^2]."""
 WINDOWS: Final = 12
-"""Stretches of tracks that are looked at."""
+"""Intervals of tracks in the sample."""
 WINDOW: Final = 2.0
-"""Their length [s]."""
+"""Length of an interval [s]."""
 REPEAT: Final = 0.2
-"""Time over which errors may repeat themselves [s]: that over which smoothing averages."""
+"""Time over which errors may be correlated [s]: the averaging time of smoothing."""
 
 
 @dataclass(frozen=True, eq=False)
 class MotionModel:
-    """What smoothing takes for usual.
+    """Motion prior of smoothing.
 
     Attributes:
         acceleration: (joints,) standard deviation per axis [m/s^2].
@@ -49,20 +49,20 @@ def learn_motion(
     fps: float,
     settings: TriangulationSettings,
 ) -> MotionModel:
-    """Return the accelerations under which some cameras best foretell the others.
+    """Return the accelerations that predict held-out cameras best.
 
-    Joints are smoothed from every other camera and compared with what the cameras left out saw.
-    That punishes too much smoothing as well as too little, and errors that a detector repeats from
-    frame to frame do not pass for motion, for another camera has others. Left and right share one
-    value.
+    Joints are smoothed from every other camera and compared with the observations of the held-out
+    cameras. This penalizes too much smoothing as well as too little. Errors that a detector repeats
+    from frame to frame differ between cameras, so they do not count as motion. Left and right share
+    one value.
 
     Args:
         rig: the cameras.
-        stretches: of one person each, pixels (17, cameras, frames, 2) and precision as in
+        stretches: intervals of one person each: pixels (17, cameras, frames, 2) and precision as in
             `person_observations`, and triangulated joints (frames, 17, 3) [m].
-        joints: how many there are of a person.
+        joints: number of joints per person.
         fps: frames per second [1/s].
-        settings: noise and agreement.
+        settings: noise and inlier limit.
     """
     names = [name.split("_")[-1] for name in COCO17]
     limit, noise = settings.max_deviation**2, settings.noise
@@ -98,10 +98,10 @@ def learn_motion(
 
 
 def choose_stretches(there: NDArray[np.bool_], fps: float) -> list[tuple[int, slice]]:
-    """Return people and stretches of frames to learn from, spread over the clip.
+    """Return persons and intervals of frames to learn from, spread over the clip.
 
     Args:
-        there: (frames, persons), can the person be triangulated.
+        there: (frames, persons), whether the person can be triangulated.
         fps: frames per second [1/s].
     """
     frames, persons = there.shape
@@ -124,7 +124,7 @@ def _whitened(
     noise: tuple[float, float],
     limit: float,
 ) -> Floats:
-    """Return errors (cameras, frames, 2) in standard deviations; NaN where a view disagrees."""
+    """Return errors (cameras, frames, 2) in standard deviations; NaN for outlier views."""
     image = np.empty(pixels.shape)
     at = np.ascontiguousarray(np.broadcast_to(points, (*image.shape[:2], 3)))
     projection.project(rig.cameras, at, image)

@@ -1,4 +1,4 @@
-"""How much a clip's detector errs, by joint and by confidence, from how its views disagree."""
+"""Detector noise by joint and by confidence, learned from residuals between views of a clip."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from worldpose.triangulation.observations import Rig, gather, linearize
 Floats = NDArray[np.float64]
 
 BINS: Final = 8
-"""Classes of confidence with equally many observations."""
+"""Confidence classes with equally many observations."""
 ROUNDS: Final = 4
-"""Weights, agreement and spreads settle after three."""
+"""Iterations; weights, inliers and variances settle after three."""
 PRIOR: Final = 60.0
-"""Degrees of freedom for which the stated noise counts: few observations change little."""
+"""Degrees of freedom of the stated noise as a prior: few observations change little."""
 LEAST: Final = 0.01
-"""Smallest factor on a variance: views that agree perfectly do not make certain."""
+"""Smallest factor on a variance: perfect agreement of views does not imply certainty."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class NoiseModel:
 
     Attributes:
         joint: (joints,) factor on the variance of each joint.
-        confidence: (knots,) rising confidences.
+        confidence: (knots,) ascending confidences.
         precision_at: (knots,) inverse of the factor on the variance there; linear between them.
     """
 
@@ -52,16 +52,16 @@ class NoiseModel:
 
     @classmethod
     def stated(cls, joints: int) -> NoiseModel:
-        """Return the model of the settings: variance as one over confidence."""
+        """Return the model of the settings: variance proportional to the inverse confidence."""
         return cls(np.ones(joints), np.array([0.0, 1.0]), np.array([0.0, 1.0]))
 
     @property
     def factor(self) -> float:
-        """Median over joints of a confident keypoint's noise over the stated one [1]."""
+        """Median over joints of a confident keypoint's noise over the stated noise [1]."""
         return float(np.median(np.sqrt(self.joint / self.precision_at[-1])))
 
     def precision(self, confidence: NDArray[np.floating]) -> Floats:
-        """Return one over the factor (..., joints); 0 where there is no observation."""
+        """Return the inverse of the factor (..., joints); 0 without an observation."""
         precision = np.empty(confidence.shape)
         rows = np.ascontiguousarray(confidence).reshape(-1, len(self.joint))
         out = precision.reshape(-1, len(self.joint))
@@ -78,10 +78,10 @@ def learn_noise(
     noise: tuple[float, float],
     limit: float,
 ) -> NoiseModel:
-    """Return the noise that the residuals of a sample of frames show.
+    """Return the noise model learned from the residuals of a sample of frames.
 
-    A residual is smaller than the error behind it, for the point follows its observations: sums of
-    squares are divided by degrees of freedom, two an observation less its leverage.
+    A residual is smaller than the error that causes it, because the point follows its observations:
+    sums of squares are divided by degrees of freedom, two per observation minus its leverage.
     """
     count, joints = index.shape[1], confidence.shape[-1]
     model = NoiseModel.stated(joints)
@@ -118,14 +118,14 @@ def learn_noise(
         factor = np.maximum(factor * _ratio(by_bin, len(factor), *expected), LEAST)
         expected = (excess / factor[by_bin] / joint[by_joint], freedom[used])
         joint = joint * _ratio(by_joint, joints, *expected)
-        # Less confident is not surer: rising factors are pooled.
+        # The factor must not rise with confidence: take the running minimum.
         factor = np.minimum.accumulate(factor)
         model = NoiseModel(joint, model.confidence, 1.0 / factor)
     return model
 
 
 def _ratio(group: NDArray[np.int64], groups: int, squares: Floats, freedom: Floats) -> Floats:
-    """Variance over the assumed one, (groups,), drawn towards that of all together."""
+    """Return variance over assumed variance, (groups,), shrunk towards the overall ratio."""
     overall = (squares.sum() + PRIOR) / (freedom.sum() + PRIOR)
     total = np.bincount(group, squares, groups) + PRIOR * overall
     ratio: Floats = total / (np.bincount(group, freedom, groups) + PRIOR)
@@ -146,9 +146,9 @@ def _residuals(
     known: Floats,
     freedom: Floats,
 ) -> None:
-    """Write (points, cameras): squared errors, further variance, degrees of freedom.
+    """Write (points, cameras): squared errors, additional variance, degrees of freedom.
 
-    The first two in units of the stated variance; 0 where a view does not take part.
+    The first two are in units of the stated variance; all are 0 where a view is not used.
     """
     tiles, state = np.empty((len(cameras), ROWS * LANES)), np.empty(STATE * LANES)
     total = len(squares)
@@ -186,7 +186,7 @@ def _precision(
     values: Floats,
     out: Floats,
 ) -> None:
-    """Write (rows, joints) the value between knots, constant beyond them, times the weight."""
+    """Write (rows, joints): the interpolated value, constant beyond the knots, times the weight."""
     last = len(knots) - 1
     for row in range(len(confidence)):
         for joint in range(len(weight)):

@@ -25,14 +25,14 @@ from worldpose.triangulation.batched_gauss_newton import (
 Floats = NDArray[np.float64]
 
 NEWTON_STEPS: Final = 2
-"""Steps that invert most lenses to rounding; the others are inverted one by one."""
+"""Newton steps that invert most lens models to rounding; the others are inverted one by one."""
 MISFIT: Final = 1e-13
 """Largest accepted misfit of an inverse on the plane z = 1."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Cameras as the kernels read them.
+    """Cameras in the memory layout of the kernels.
 
     Attributes:
         cameras: (cameras, 22) as in `worldpose.cameras.projection`.
@@ -58,7 +58,7 @@ class Rig:
         )
         rows = np.concatenate(parts, axis=-1)
         depths = np.concatenate([pose.rotation[:, 2], pose.translation[:, 2:]], axis=-1)
-        # Nought times NaN is NaN: what counts for nothing needs a depth all the same.
+        # 0 x NaN is NaN: a camera of weight 0 needs a finite depth nevertheless.
         missing = ~np.isfinite(rows[:, :-1]).all(axis=-1)
         depths[missing] = [0.0, 0.0, 0.0, 1.0]
         return cls(rows, depths, np.ascontiguousarray(cameras.center))
@@ -74,8 +74,8 @@ def person_observations(
     Args:
         arrays: keypoints (frames, cameras, detections, joints, 2), precision (the same without
             the last), index (frames, cameras, persons), offsets (frames, cameras, persons, 2).
-        person: which.
-        frames: when.
+        person: index of the person.
+        frames: frames to include.
     """
     keypoints, precision = arrays[0][frames], arrays[1][frames]
     index, offsets = arrays[2][frames], arrays[3][frames]
@@ -101,14 +101,14 @@ def gather(
     cameras: Floats,
     tiles: Floats,
 ) -> None:
-    """Write pixels, precision and further variance of 64 joints.
+    """Write pixels, precision and additional variance of 64 joints.
 
     Args:
         keypoints: (frames, cameras, detections, joints, 2) [px].
         precision: (frames, cameras, detections, joints), 0 or NaN = no observation.
-        index: (frames, cameras, persons), place among the detections; -1 = not seen.
-        shift: (frames, cameras, persons, 3), subtracted from pixels [px], and variance [px^2];
-            or of no frames for none.
+        index: (frames, cameras, persons), index of the detection; -1 = not seen.
+        shift: (frames, cameras, persons, 3), subtracted from pixels [px], and variance [px^2]; no
+            frames = no shift.
         first: the first joint, counted over frames, persons, joints.
         cameras: (cameras, 22).
         tiles: (cameras, ROWS x LANES); pixels go to the first rows of `A` and `B`.
@@ -121,7 +121,7 @@ def gather(
         tile[PRECISION : PRECISION + 2 * LANES] = 0.0
         j = 0
         while j < last:
-            # A run of one person's joints.
+            # Consecutive joints of one person.
             joint, which = (first + j) % joints, (first + j) // joints
             run = min(joints - joint, last - j)
             frame, person = which // persons, which % persons
@@ -152,7 +152,7 @@ def gather(
 def linearize(tile: Floats, c: Floats) -> None:
     """Turn one camera's pixels into equations.
 
-    No observation where the lens has no inverse, and none of a missing camera.
+    Observations are dropped where the lens model has no inverse, and for a missing camera.
     """
     if not projection.is_finite(c):
         tile[:] = 0.0
@@ -172,7 +172,7 @@ def linearize(tile: Floats, c: Floats) -> None:
         fx, fy, dxx, dxy, dyy = distort(x, y, c[4], c[5], c[6], c[7], c[8])
         misfit = max(abs(fx - xd), abs(fy - yd))
         inside = misfit <= MISFIT and x * x + y * y < c[21] * c[21]
-        # Lanes that need another way are marked here.
+        # Mark the joints that need the scalar inverse.
         tile[SQUARED + j] = 0.0 if inside else 1.0
         tile[A + LANES + j], tile[B + LANES + j] = x, y
         tile[A + 2 * LANES + j], tile[A + 3 * LANES + j], tile[B + 2 * LANES + j] = dxx, dxy, dyy

@@ -1,7 +1,7 @@
-"""By how much a camera sees a person beside where all cameras together put him (T4).
+"""Image offset of each person in each camera, caused by calibration errors (T4).
 
-A camera's calibration error moves all joints of a person by about the same vector in its picture:
-people are small. That vector is unknown and normal; its variance is that of calibration.
+A camera's calibration error moves all joints of a person by about the same vector in the image,
+because people are small. The vector is unknown and normal; its variance is that of calibration.
 """
 
 from __future__ import annotations
@@ -37,20 +37,21 @@ Floats = NDArray[np.float64]
 
 
 ROUNDS: Final = 6
-"""Updates of the cameras' variances; the last changes them by a few percent."""
+"""Updates of the variance factor; the last changes it by a few percent."""
 DAMPING: Final = 4.0
-"""Degrees of freedom for which the variance before an update counts."""
+"""Weight of the factor before an update, in degrees of freedom."""
 LEAST: Final = 1e-3
-"""Smallest factor on it."""
+"""Smallest variance factor."""
 
 
 @dataclass(frozen=True, eq=False)
 class Offsets:
-    """Offsets of people in the pictures.
+    """Offsets of people in the images.
 
     Attributes:
         shift: (frames, cameras, persons, 3), the offsets [px] and a zero.
-        covariance: (frames, persons, joints, 3, 3) [m^2] that they add to the joints'.
+        covariance: (frames, persons, joints, 3, 3) [m^2], their contribution to the joints'
+            covariance.
     """
 
     shift: Floats
@@ -66,10 +67,10 @@ def learn_factor(
     first: Solution,
     stated: Floats,
 ) -> float:
-    """Return the factor on the stated variance that a sample of frames makes most probable.
+    """Return the most probable factor on the stated variance for a sample of frames.
 
-    It is the same for all cameras: each camera's own error is drawn once, and cannot tell how
-    large it might have been. Arguments are those of `estimate_offsets`.
+    All cameras share the factor: a camera's own error is a single draw, which does not determine
+    its variance. Arguments are those of `estimate_offsets`.
     """
     factor, known = 1.0, first.inliers.any(axis=-1) & (stated > 0.0)
     scale = np.where(known, stated, 1.0)
@@ -96,11 +97,11 @@ def estimate_offsets(
     first: Solution,
     variance: Floats,
 ) -> Offsets:
-    """Return the most probable offsets with the joints free to follow.
+    """Return the most probable offsets, estimated together with the joints.
 
-    T4 of the paper takes the mid-hip's error in each picture for the offset, which adds the
-    detector's error of the hips to every joint. All joints together know it better, and where the
-    cameras agree anyhow nothing is shifted.
+    T4 of the paper uses the mid-hip residual in each image as the offset, which adds the detector's
+    hip error to every joint. All joints together determine the offset more accurately, and cameras
+    that agree get none.
 
     Args:
         rig: the cameras.
@@ -109,7 +110,7 @@ def estimate_offsets(
         index: (frames, cameras, persons).
         noise: [px], [m].
         first: the joints without offsets.
-        variance: (frames, cameras, persons) per axis that calibration has [px^2].
+        variance: (frames, cameras, persons) calibration variance per axis [px^2].
     """
     offsets, unknown = np.zeros((*variance.shape, 2)), np.zeros(variance.shape)
     further = np.zeros((*first.joints.shape, 3))
@@ -135,10 +136,10 @@ def _body_offsets(
     variance: Floats,
     further: Floats,
 ) -> None:
-    """Write the most probable offsets of people in the pictures, with the joints free to follow.
+    """Write the most probable offsets of people in the images, estimated with the joints.
 
-    All joints of a person in one picture are off by the same vector, normal with variance `prior`.
-    The joints are eliminated (Schur complement), which leaves two unknowns a camera.
+    All joints of a person in one image share the same offset, normal with variance `prior`. The
+    joints are eliminated (Schur complement), which leaves two unknowns per camera.
 
     Args:
         keypoints: (frames, cameras, detections, joints, 2) [px].
@@ -152,8 +153,8 @@ def _body_offsets(
         prior: (frames, cameras, persons) [px^2].
         offsets: (frames, cameras, persons, 2) [px], written.
         variance: (frames, cameras, persons) [px^2] per axis, of the offsets, written.
-        further: (frames, persons, joints, 3, 3) [m^2], what the offsets' uncertainty adds to
-            the joints' covariance, written; of no frames to leave it out.
+        further: (frames, persons, joints, 3, 3) [m^2], contribution of the offsets to the joints'
+            covariance, written; no frames = not wanted.
     """
     frames, count, persons = index.shape
     joint_count = precision.shape[3]

@@ -1,4 +1,4 @@
-"""The whole stage: clocks, joints of every frame, joints of every track."""
+"""Reconstruction stage: clock offsets, joints of every frame, joints of every track."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from worldpose.triangulation.smoothing import Smoothing
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What the stage finds in a clip.
+    """Joints and clock offsets of one clip.
 
     Attributes:
-        triangulation: every frame by itself.
+        triangulation: each frame on its own.
         smoothing: whole tracks.
-        clocks: by how much cameras are late; taken into account when the settings ask for it.
+        clocks: clock offsets; corrected if the settings say so.
     """
 
     triangulation: Triangulation
@@ -40,20 +40,20 @@ def reconstruct_joints(
     settings: TriangulationSettings,
     camera_covariance: NDArray[np.float64] | None = None,
 ) -> Reconstruction:
-    """Return a clip's joints, triangulated and smoothed, and its cameras' clocks.
+    """Return a clip's triangulated and smoothed joints, and its cameras' clock offsets.
 
     Args:
         cameras: batch (cameras,).
         keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
         confidence: (frames, cameras, detections, 17) in (0, 1]; NaN, 0 or less leaves a keypoint
             out.
-        detection_index: (frames, cameras, persons), place among the detections; -1 = not seen.
+        detection_index: (frames, cameras, persons), index of the detection; -1 = not seen.
         fps: frames per second [1/s].
         settings: of the stage.
         camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
 
     Raises:
-        InputError: the shapes do not fit together.
+        InputError: the shapes do not match.
     """
     check_arrays(cameras, keypoints, confidence, detection_index, camera_covariance)
     detections = ClipDetections(keypoints, confidence, detection_index)

@@ -1,4 +1,4 @@
-"""Figures of a clip, added up over its parts."""
+"""Metrics of one clip, summed over its chunks."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ Floats = NDArray[np.float64]
 
 LEAST: Final = 1e-7
 WIDTH: Final = 0.005
-"""Of a class, relative: as exact as a median is given."""
+"""Relative width of a histogram bin: the accuracy of the median."""
 CLASSES: Final = 5000
-"""From `LEAST` to 7000."""
+"""Bins from `LEAST` to 7000."""
 
 
 class TriangulationReport(Record):
-    """How well the views of a clip agree."""
+    """Agreement between the views of one clip."""
 
     joints: int
     """Joints found [1]."""
     undetermined: int
-    """Joints that some camera saw and that are missing all the same [1]."""
+    """Joints that are missing although a camera saw them [1]."""
     observations: int
     """Keypoints of tracked people [1]."""
     rejected_share: tuple[float | None, ...]
-    """Share of each camera's keypoints, among joints found, that disagree; None without any."""
+    """Share of outliers among each camera's keypoints of joints found; None without any."""
     exchanged_share: tuple[float | None, ...]
-    """Share of each camera's views of people whose left and right, of a part at least, were
-    exchanged and put right; None without any."""
+    """Share of each camera's views of people with a corrected left-right swap of at least one part;
+    None without any."""
     mean_views: float | None
-    """Mean number of agreeing views of the joints found."""
+    """Mean number of inlier views of the joints found."""
     reprojection_error_px: float | None
     """Median over joints [px]."""
     standard_deviation_m: float | None
@@ -43,38 +43,38 @@ class TriangulationReport(Record):
     noise_factor: float
     """Median over joints of the learned noise of a confident keypoint over the stated one [1]."""
     misplacement_m: tuple[float | None, ...]
-    """By how much each camera misplaces people, root mean square per axis at the median person
-    [m]; None where it sees nobody or offsets are off."""
+    """Displacement of people by each camera's calibration, root mean square per axis at the median
+    person [m]; None without people or with offsets disabled."""
 
 
 class SmoothingReport(Record):
-    """What smoothing did to a clip."""
+    """Effect of smoothing on the joints of one clip."""
 
     filled: int
     """Joints filled in [1]."""
     filled_share: float | None
-    """Share of them in all joints; None without any."""
+    """Share of filled joints in all joints; None without any."""
     acceleration_m_s2: float
-    """Median over joints of the acceleration that was taken for usual [m/s^2]."""
+    """Median over joints of the prior's acceleration [m/s^2]."""
     repeated: float
-    """Frames of observations whose errors count as one [1]: they are alike for a while."""
+    """Frames of observations whose errors count as one [1]: errors are correlated in time."""
     moved_m: float | None
     """Median distance between smoothed and triangulated joints [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Histogram:
-    """Numbers from 0 counted in classes half a percent wide, so that parts of a clip add up.
+    """Histogram of non-negative numbers with bins half a percent wide; chunks of a clip add up.
 
     Attributes:
-        counts: (CLASSES,) int64; what is below `LEAST` is in the first.
+        counts: (CLASSES,) int64; the first includes numbers below `LEAST`.
     """
 
     counts: NDArray[np.int64]
 
     @classmethod
     def of(cls, values: NDArray[np.floating]) -> Self:
-        """Return the counts of values of any shape, without NaN."""
+        """Return the histogram of values of any shape, without NaN."""
         place = np.log(np.maximum(values, LEAST) / LEAST) / math.log1p(WIDTH)
         place = np.clip(place, 0, CLASSES - 1).astype(np.int64)
         return cls(np.bincount(place.ravel(), minlength=CLASSES))
@@ -84,7 +84,7 @@ class Histogram:
 
     @property
     def median(self) -> float | None:
-        """The middle of the median's class; None of nothing, 0 below `LEAST`."""
+        """Middle of the median's bin; None without values, 0 below `LEAST`."""
         below = self.counts.cumsum()
         if not below[-1]:
             return None
@@ -94,20 +94,20 @@ class Histogram:
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """What a report of triangulation is made of.
+    """Counts and histograms behind a triangulation report.
 
     Attributes:
         found: joints.
-        undetermined: joints seen and not found.
+        undetermined: joints seen but not found.
         seen: observations.
-        views: agreeing views, over all joints.
+        views: inlier views, summed over all joints.
         used: (cameras,) observations of joints found.
-        agreed: (cameras,) of these, agreeing.
+        agreed: (cameras,) of these, inliers.
         people: (cameras,) views of people.
-        exchanged: (cameras,) of these, put right.
+        exchanged: (cameras,) of these, with a corrected left-right swap.
         error: reprojection errors [px].
         deviation: roots of traces [m].
-        misplaced: misplacements that calibration makes probable, by camera [m].
+        misplaced: expected displacements by calibration errors, by camera [m].
     """
 
     found: int
@@ -138,7 +138,7 @@ class Agreement:
         )
 
     def report(self, noise_factor: float) -> TriangulationReport:
-        """Return the figures."""
+        """Return the metrics."""
         return TriangulationReport(
             joints=self.found,
             undetermined=self.undetermined,
@@ -155,7 +155,7 @@ class Agreement:
 
 @dataclass(frozen=True, eq=False)
 class Changes:
-    """What a report of smoothing is made of.
+    """Counts and distances behind a smoothing report.
 
     Attributes:
         there: joints after smoothing.
@@ -173,7 +173,7 @@ class Changes:
         )
 
     def report(self, acceleration: Floats, repeated: float) -> SmoothingReport:
-        """Return the figures under a motion model."""
+        """Return the metrics for a motion model."""
         return SmoothingReport(
             filled=self.filled,
             filled_share=self.filled / self.there if self.there else None,
@@ -184,6 +184,6 @@ class Changes:
 
 
 def _shares(part: NDArray[np.int64], whole: NDArray[np.int64]) -> tuple[float | None, ...]:
-    """Return part over whole; None of nothing."""
+    """Return part over whole; None where the whole is 0."""
     each = zip(part.tolist(), whole.tolist(), strict=True)
     return tuple(some / number if number else None for some, number in each)

@@ -27,20 +27,20 @@ Floats = NDArray[np.float64]
 
 
 SAMPLE: Final = 6000
-"""Joints that a clip's detector and calibration are judged by: a class of confidence then has
-thousands of observations."""
+"""Joints in the sample for detector and calibration errors: a confidence class then has thousands
+of observations."""
 
 
 @dataclass(frozen=True, eq=False)
 class DetectorModel:
-    """What a clip shows of its detector and its calibration.
+    """Error model of a clip's detector and calibration.
 
     Attributes:
-        noise: what the detector's errors are taken to be in each pass: without calibration's
-            share, with it, and without the offsets.
-        factor: on the variance that calibration is stated to have.
-        lengths: (persons, limbs) [m] of everybody's limbs; NaN where nothing tells.
-        common_bias: (joints,) per axis, of what all views err in common [m].
+        noise: noise model of each pass: without calibration's share, with it, and without the
+            offsets.
+        factor: on the stated variance of calibration.
+        lengths: (persons, limbs) [m], limb lengths; NaN where unknown.
+        common_bias: (joints,) per axis, error that all views share [m].
     """
 
     noise: tuple[NoiseModel, ...]
@@ -55,27 +55,27 @@ class DetectorModel:
 
 @dataclass(frozen=True)
 class Triangulation:
-    """Joints in the world, and how sure they are.
+    """3D joints with covariance.
 
     Attributes:
         joints: (frames, persons, 17, 3) [m], world; NaN where not determined.
-        covariance: (frames, persons, 17, 3, 3) [m^2], of `joints`: the noise that the residuals
-            show, calibration, and the bias that all views share.
-        views: (frames, persons, 17) uint8, agreeing cameras; 0 where not determined.
-        spread: (frames, persons, 17) float32 [rad], widest angle between agreeing rays, at most a
-            right one; NaN where not determined.
+        covariance: (frames, persons, 17, 3, 3) [m^2], of `joints`: noise from the residuals,
+            calibration, and the bias that all views share.
+        views: (frames, persons, 17) uint8, inlier cameras; 0 where not determined.
+        spread: (frames, persons, 17) float32 [rad], widest angle between inlier rays, at most a
+            right angle; NaN where not determined.
         reprojection_error: (frames, persons, 17) float32 [px], root mean square length over the
-            agreeing cameras, offsets taken off.
-        inliers: (frames, cameras, persons, 17) bool, does this camera agree.
-        exchanged: (frames, cameras, persons, 3) bool, which `EXCHANGED_PARTS` of the detection had
-            left and right exchanged: it was put right.
-        offsets: (frames, cameras, persons, 2) [px], by how much the camera sees the person beside
-            where all cameras put him; 0 where unknown.
+            inlier cameras, offsets subtracted.
+        inliers: (frames, cameras, persons, 17) bool, whether this camera is an inlier.
+        exchanged: (frames, cameras, persons, 3) bool, left-right swaps of the detection's
+            `EXCHANGED_PARTS`, already corrected.
+        offsets: (frames, cameras, persons, 2) [px], offset of the person in the image from the
+            reprojection of all cameras' joints; 0 where unknown.
         calibration_covariance: (frames, persons, 17, 3, 3) [m^2], the part of `covariance` that
-            observations of more frames do not lessen: offsets and the common bias.
-        common_bias: (17,) per axis, of what all views err in common [m]; in `covariance`.
-        noise: what the detector's errors were taken to be.
-        agreement: what `report` is made of.
+            more frames do not reduce: offsets and the common bias.
+        common_bias: (17,) per axis, error that all views share [m]; included in `covariance`.
+        noise: noise model of the detector.
+        agreement: counts and histograms behind `report`.
     """
 
     joints: Floats
@@ -93,7 +93,7 @@ class Triangulation:
 
     @property
     def report(self) -> TriangulationReport:
-        """The figures of these frames."""
+        """The metrics of these frames."""
         return self.agreement.report(self.noise.factor)
 
 
@@ -106,30 +106,30 @@ def triangulate_joints(
     camera_covariance: Floats | None = None,
     model: DetectorModel | None = None,
 ) -> Triangulation:
-    """Return every joint of every tracked person where the views that agree put it.
+    """Return every joint of every tracked person, triangulated from its inlier views.
 
-    Each joint is the weighted least-squares point on reprojection over the cameras that agree
-    (`consensus`). Nothing is filled in, and no frame has a say in another's joints but by the
-    model, which is learned from frames all over the clip.
+    Each joint is the weighted least-squares point on reprojection over the inlier cameras
+    (`consensus`). Nothing is filled in. Frames influence each other only through the model, which
+    is learned from frames all over the clip.
 
     Args:
         cameras: batch (cameras,).
         keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
         confidence: (frames, cameras, detections, 17) in (0, 1]; NaN, 0 or less leaves a keypoint
             out.
-        detection_index: (frames, cameras, persons), place among the detections; -1 = not seen.
-        settings: noise, agreement and least views.
+        detection_index: (frames, cameras, persons), index of the detection; -1 = not seen.
+        settings: noise, inlier limit and minimum views.
         camera_covariance: (cameras, 12, 12) of steps in the order of
             `static_calibration.parameters.PARAMETERS`; None = not known.
-        model: what `learn_detector` found in the clip that these frames are of; None = these
-            frames are the clip.
+        model: result of `learn_detector` for the clip of these frames; None = these frames are the
+            clip.
 
     Raises:
-        InputError: the shapes do not fit together.
+        InputError: the shapes do not match.
 
     Note:
         T3, T4. Residuals are pixels to first order in their length: the lens is linearised at the
-        observation, exact enough for any residual that can agree.
+        observation, accurate enough for any inlier residual.
     """
     check_arrays(cameras, keypoints, confidence, detection_index, camera_covariance)
     arrays = (keypoints, confidence, detection_index)
@@ -177,14 +177,14 @@ def learn_detector(
     settings: TriangulationSettings,
     camera_covariance: Floats | None = None,
 ) -> DetectorModel:
-    """Return what a sample of a clip's frames shows; arguments as in `triangulate_joints`."""
+    """Return the error model from sample frames; arguments as in `triangulate_joints`."""
     arrays = (keypoints, confidence, detection_index)
     return _passes(cameras, arrays, settings, camera_covariance, None).model
 
 
 @dataclass(frozen=True, eq=False)
 class _Passes:
-    """The last solution and what led to it."""
+    """Last solution with intermediate results."""
 
     solution: Solution
     exchanged: NDArray[np.bool_]
@@ -201,7 +201,7 @@ def _passes(
     camera_covariance: Floats | None,
     known: DetectorModel | None,
 ) -> _Passes:
-    """Solve, and solve again with what that tells of calibration and of offsets."""
+    """Solve, and solve again with the learned calibration variance and offsets."""
     keypoints, confidence, index = arrays
     rig, limit = Rig.of(cameras), settings.max_deviation**2
     models: list[NoiseModel] = []
@@ -235,7 +235,7 @@ def _passes(
     factor = 1.0 if known is None else known.factor
     if calibration is not None:
         stated = stated_errors(cameras, solution.joints, settings, calibration)
-        # What calibration explains is not the detector's noise, nor a reason to reject a view.
+        # Calibration errors are not detector noise, nor a reason to reject a view.
         shift = np.zeros((*stated.variance.shape, 3))
         shift[..., 2] = stated.variance
         solution = solved(shift)
@@ -263,7 +263,7 @@ def _passes(
 
 
 def _agreement(passes: _Passes, covariance: Floats, index: NDArray[np.int16]) -> Agreement:
-    """Return how well the views of some frames agree."""
+    """Return the agreement between the views of some frames."""
     solution = passes.solution
     views, seen = solution.views, solution.seen
     found = views > 0
@@ -285,5 +285,5 @@ def _agreement(passes: _Passes, covariance: Floats, index: NDArray[np.int16]) ->
 
 
 def _by_camera(there: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return how many are true of (frames, cameras, ...), by camera."""
+    """Return the number of true entries of (frames, cameras, ...), by camera."""
     return np.array([np.count_nonzero(there[:, c]) for c in range(there.shape[1])], np.int64)

@@ -10,54 +10,55 @@ from data_contracts.records import Record
 
 
 class TriangulationSettings(Record):
-    """What counts as noise, as agreement and as enough views.
+    """Noise, inlier limit and minimum views of triangulation.
 
-    A keypoint is expected to err by sqrt(pixel_noise^2 + (pixels per metre at the joint x
-    joint_noise)^2) [px] per axis, so that one setting serves people of 60 and of 600 pixels; times
-    factors for its joint and its confidence.
+    The expected error of a keypoint is sqrt(pixel_noise^2 + (pixels per metre at the joint x
+    joint_noise)^2) [px] per axis, times factors for its joint and its confidence. So one setting
+    serves people of 60 and of 600 pixels.
     """
 
     pixel_noise: float = Field(default=1.5, ge=1e-6, le=1000)
     """Standard deviation per image axis that does not depend on distance [px]: the grid
     of a detector."""
     joint_noise: float = Field(default=0.04, ge=0, le=10)
-    """Standard deviation per axis that scales with the person [m]: what a human labels as a hip
-    spreads by 2 to 3 % of body height (COCO's keypoint sigmas)."""
+    """Standard deviation per axis that scales with the person [m]: human labels of a hip spread by
+    2 to 3 % of body height (COCO's keypoint sigmas)."""
     learn_noise: bool = True
-    """Learn the factors from how the clip's views disagree; False takes the noise as stated and
-    its variance as one over the confidence."""
+    """Learn the factors from residuals between the clip's views; False uses the stated noise, with
+    a variance proportional to the inverse confidence."""
     common_bias: float = Field(default=0.024, ge=0, le=1)
-    """Usual standard deviation per axis of what all views of a joint err in common [m]: a
+    """Usual standard deviation per axis of the error that all views of a joint share [m]: a
     detector's labels mean another point than the joint's centre. No residual shows it; it is added
-    to the covariance. With `learn_noise` every joint has a factor (`common_bias.BY_JOINT`), and
-    the proportions of a clip's people say how far its detector goes. Joints of real people are 27
-    mm per axis from hand-made labels (Shelf), of which the views' own noise is 10."""
+    to the covariance. With `learn_noise` every joint has a factor (`common_bias.BY_JOINT`), and the
+    proportions of a clip's people determine the size of the bias. Joints of real people are 27 mm
+    per axis from hand-made labels (Shelf); 10 of these are noise of the views."""
     max_deviation: float = Field(default=3.5, ge=1e-6, le=1e6)
-    """Observations farther than this from the joint, in standard deviations, are rejected [1]:
-    0.2 % of honest ones (chi-square, two degrees of freedom)."""
+    """Observations farther than this from the joint, in standard deviations, are rejected [1]: 0.2
+    % of correct ones (chi-square, two degrees of freedom)."""
     min_views: int = Field(default=2, ge=2, le=1000)
-    """Least cameras that must agree [1]; a joint with fewer is missing."""
+    """Minimum inlier cameras [1]; a joint with fewer is missing."""
     min_angle: float = Field(default=0.1, ge=1e-6, le=10)
-    """Least angle between the most different agreeing rays [rad]: below it a pixel moves the
-    joint ten times as far along the rays as across them."""
+    """Minimum of the widest angle between inlier rays [rad]: below it a pixel moves the joint ten
+    times as far along the rays as across them."""
     undo_swaps: bool = True
-    """Put right detections whose left and right the other views show to be exchanged."""
+    """Correct left-right swaps that contradict the other views."""
     repair_limb_lengths: bool = True
-    """Where few views carry the end of a limb of strange length, choose those that keep its length,
-    or leave it out."""
+    """For a limb of wrong length whose end has few inlier views, choose the views that keep its
+    length, or drop the end."""
     offsets: Literal["none", "midhip", "body"] = "body"
-    """How calibration errors are kept from a person's pose (T4): "none" takes the cameras as
-    exact; "midhip" moves every picture of a person so that the mid-hips meet, as the paper does;
-    "body" moves it by what all joints together make probable."""
+    """How calibration errors are kept from a person's pose (T4): "none" treats the cameras as
+    exact; "midhip" shifts every image of a person so that the mid-hips meet, as the paper does;
+    "body" shifts it by the most probable offset of all joints together."""
     calibration_error: float = Field(default=0.03, ge=1e-6, le=10)
-    """Where "body" starts to learn how far cameras misplace people [m], when they come without
-    covariance: what careful calibration from pitch markings leaves in the middle of the pitch."""
+    """Initial displacement of people by calibration errors [m], from which "body" learns if cameras
+    have no covariance: the residual error of careful calibration from pitch markings in the middle
+    of the pitch."""
     max_gap: float = Field(default=0.5, ge=0, le=100)
     """Longest time without a triangulated joint that smoothing fills [s]: a stride."""
     clock_error: float = Field(default=0.05, ge=1e-6, le=10)
-    """A camera's clock counts as known when its offset's standard error is below this [frame]."""
+    """A camera's clock offset is determined if its standard error is below this [frame]."""
     correct_clocks: bool = False
-    """Shift every camera's observations in time by the offset that the tracks show."""
+    """Shift every camera's observations in time by the clock offset estimated from tracks."""
 
     @property
     def noise(self) -> tuple[float, float]:

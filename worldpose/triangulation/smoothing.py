@@ -1,4 +1,4 @@
-"""Whole tracks: joints that fit all their observations and do not jerk, with short gaps filled."""
+"""Smoothed joints of whole tracks, with short gaps filled."""
 
 from __future__ import annotations
 
@@ -21,15 +21,14 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Smoothing:
-    """Joints of whole tracks.
+    """Smoothed joints of whole tracks.
 
     Attributes:
         joints: (frames, persons, 17, 3) [m], world; NaN outside tracks and in long gaps.
         covariance: (frames, persons, 17, 3, 3) [m^2], growing into gaps.
-        filled: (frames, persons, 17) bool, not triangulated in this frame but between two that
-            are.
-        motion: what was taken for usual motion.
-        changes: what `report` is made of.
+        filled: (frames, persons, 17) bool, interpolated between two triangulated frames.
+        motion: motion prior.
+        changes: counts and distances behind `report`.
     """
 
     joints: Floats
@@ -40,7 +39,7 @@ class Smoothing:
 
     @property
     def report(self) -> SmoothingReport:
-        """The figures of these frames."""
+        """The metrics of these frames."""
         return self.changes.report(self.motion.acceleration, self.motion.repeated)
 
 
@@ -57,19 +56,19 @@ def smooth_joints(
 ) -> Smoothing:
     """Return joints that fit the observations of their whole track with little acceleration.
 
-    It is the observations that are fitted, not the triangulated joints: a view that alone saw a
-    joint still says where it is not. How much acceleration is usual is learned (`learn_motion`).
+    The fit uses the observations, not the triangulated joints: even a single view constrains a
+    joint. The prior on acceleration is learned (`learn_motion`).
 
     Args:
         cameras: batch (cameras,).
         keypoints: (frames, cameras, detections, 17, 2) [px].
         confidence: (frames, cameras, detections, 17).
         detection_index: (frames, cameras, persons).
-        raw: of the same arrays; its noise, offsets and exchanges are used.
+        raw: triangulation of the same arrays; its noise, offsets and left-right swaps are used.
         fps: frames per second [1/s].
         settings: noise and the longest gap.
-        motion: what is usual in the clip that these frames are of; None = they are the clip.
-        core: frames to return; the others only lend them support.
+        motion: motion prior of the clip of these frames; None = these frames are the clip.
+        core: frames to return; the others only support them.
     """
     rig = Rig.of(cameras)
     keypoints, confidence = undo_swaps(keypoints, confidence, detection_index, raw.exchanged)
@@ -96,7 +95,7 @@ def smooth_joints(
                     *(pixels[joint, :, part], weights[joint, :, part], given[part], rig),
                     *(settings.noise, limit, float(penalty[joint])),
                 )
-                # One wild observation must not take a whole track with it.
+                # One gross error must not spoil a whole track.
                 good = np.isfinite(x).all() and np.isfinite(c).all()
                 joints[part, person, joint] = x if good else given[part]
                 covariance[part, person, joint] = (
@@ -113,7 +112,7 @@ def smooth_joints(
 
 
 def segments(there: NDArray[np.bool_], gap: int) -> list[slice]:
-    """Return the stretches of frames that begin and end with a joint and have no longer gap."""
+    """Return the intervals that begin and end with a joint and have no gap above `gap` frames."""
     frames = np.flatnonzero(there)
     if not len(frames):
         return []
@@ -124,7 +123,7 @@ def segments(there: NDArray[np.bool_], gap: int) -> list[slice]:
 
 
 def _nearest(matrices: Floats, given: Floats) -> Floats:
-    """Return the matrices (frames, 3, 3), those of frames without a joint from the one before."""
+    """Return the matrices (frames, 3, 3); a frame without a joint takes the last one before."""
     known = np.isfinite(given[:, 0])
     last = np.maximum.accumulate(np.where(known, np.arange(len(given)), 0))
     return matrices[last]

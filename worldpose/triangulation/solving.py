@@ -1,4 +1,4 @@
-"""Every joint of a clip from the observations that agree."""
+"""Triangulation of every joint of a clip from its inlier observations."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Joints with what is known about them; the arrays are those of `Triangulation`.
+    """Joints with covariance and inliers; the arrays are those of `Triangulation`.
 
     Attributes:
-        seen: (frames, cameras, persons, joints) bool, is there an observation.
+        seen: (frames, cameras, persons, joints) bool, whether there is an observation.
     """
 
     joints: Floats
@@ -44,7 +44,7 @@ class Solution:
 
 
 def no_shift() -> Floats:
-    """Return the shift that leaves every observation where it is."""
+    """Return the empty shift, which moves no observation."""
     return np.zeros((0, 0, 0, 3))
 
 
@@ -56,17 +56,17 @@ def solve(
     shift: Floats,
     settings: TriangulationSettings,
 ) -> Solution:
-    """Return the joints of a clip, covariance from `precision` and the stated noise.
+    """Return the joints of one clip, with covariance from `precision` and the stated noise.
 
     Args:
         rig: the cameras.
         keypoints: (frames, cameras, detections, joints, 2) [px].
         precision: (frames, cameras, detections, joints), inverse of the factor on the stated
             variance; 0 or NaN = no observation.
-        index: (frames, cameras, persons), place among the detections; -1 = not seen.
-        shift: (frames, cameras, persons, 3), subtracted from pixels [px], and further variance
+        index: (frames, cameras, persons), index of the detection; -1 = not seen.
+        shift: (frames, cameras, persons, 3), subtracted from pixels [px], and additional variance
             [px^2]; `no_shift()` for none.
-        settings: noise, agreement and least views.
+        settings: noise, inlier limit and minimum views.
     """
     frames, count, persons = index.shape
     shape = (frames, persons, precision.shape[-1])
@@ -112,7 +112,7 @@ def _solve_all(
     inliers: NDArray[np.bool_],
     seen: NDArray[np.bool_],
 ) -> None:
-    """Solve tile after tile and write the last eight arguments."""
+    """Solve tile by tile and write `joints` and all arguments after it."""
     frames, count, persons = index.shape
     joint_count = precision.shape[3]
     tiles, rays = np.empty((count, ROWS * LANES)), np.empty((count, 3 * LANES))

@@ -1,8 +1,8 @@
-"""One joint over time: reprojection of all its observations and little acceleration.
+"""Least squares of one joint over time: reprojection errors and a penalty on acceleration.
 
-The unknowns x, y, z of frame after frame make a symmetric matrix whose entries lie within six
-places of the diagonal: a frame's own 3x3 block, and an acceleration ties each coordinate to those
-of two frames before.
+The unknowns x, y, z of all frames form a symmetric matrix whose entries lie within six places of
+the diagonal: a frame's own 3x3 block, and an acceleration ties each coordinate to those of two
+frames before.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ def solve_segment(
         pixels: (cameras, frames, 2) [px].
         weights: (cameras, frames), inverse of the factor on the stated variance; 0 or NaN = no
             observation.
-        given: (frames, 3) [m] a start, whose first and last frame are not NaN.
+        given: (frames, 3) [m], initial points; the first and last frame are not NaN.
         rig: the cameras.
         noise: [px], [m].
-        limit: scale of the Geman-McClure loss that observations count by [variances].
+        limit: scale of the Geman-McClure loss of observations [variances].
         penalty: on squared second differences [1/m^2].
     """
     frames = np.arange(len(given))
@@ -70,7 +70,7 @@ def solve_segment(
 
 
 def prepare(pixels: Floats, weights: Floats, cameras: Floats) -> Floats:
-    """Return tiles of one joint's observations, a lane a frame; all are used."""
+    """Return tiles of one joint's observations, one lane per frame; all are used."""
     count, frames = weights.shape
     tiles = np.empty((-(-frames // LANES), count, ROWS * LANES))
     index = np.zeros((1, count, 1), np.int64)
@@ -101,9 +101,9 @@ def _solve(
     points: Floats,
     covariance: Floats,
 ) -> None:
-    """Move the points of a track to where its observations and little acceleration want them.
+    """Minimize reprojection errors and the acceleration penalty over the points of a track.
 
-    Observations count by a Geman-McClure loss of scale `limit`.
+    Observations have a Geman-McClure loss of scale `limit`.
 
     Args:
         tiles: of `prepare`.
@@ -111,7 +111,7 @@ def _solve(
         noise: [px], [m].
         limit: [variances].
         penalty: on squared second differences [1/m^2].
-        points: (frames, 3) [m], a start; written.
+        points: (frames, 3) [m], initial values; written.
         covariance: (frames, 3, 3) [m^2], written.
     """
     frames = len(points)
@@ -159,7 +159,7 @@ def held_out_cost(
 
 @compiled
 def _place(points: Floats, part: int, state: Floats) -> None:
-    """Put the points of one tile into its state."""
+    """Copy the points of one tile into its state."""
     for j in range(LANES):
         t = min(part * LANES + j, len(points) - 1)
         for axis in range(3):

@@ -1,6 +1,6 @@
-"""Video: frames by their exact number, and clips written from pictures (PyAV).
+"""Video input by exact frame number, and video output from images (PyAV).
 
-Input: a video file, a folder of images, or pictures. Output: pictures by number and their times,
+Input: a video file, a folder of images, or images. Output: images by frame number and their times,
 or a file.
 """
 

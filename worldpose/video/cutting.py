@@ -1,4 +1,4 @@
-"""A stretch of a video as a file of its own, pictures untouched."""
+"""Extraction of a part of a video into its own file, without re-encoding."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from worldpose.video.frame_index import FrameIndex, index_frames
 
 
 def cut_video(path: Path, start: int, stop: int, out: Path, index: FrameIndex | None = None) -> int:
-    """Write some pictures of a video without coding them anew.
+    """Write a range of frames of a video without re-encoding.
 
-    Decoding begins at key frames: some pictures before the first one wanted come along, and some
-    behind the last one may, from which others are predicted.
+    Decoding begins at key frames: the file also holds some frames before the first one wanted, and
+    perhaps some after the last one, from which others are predicted.
 
     Args:
         path: the video.
-        start: number of the first picture.
+        start: number of the first frame.
         stop: one past the last.
         out: the file to write, of the same kind.
-        index: of the video, where it is known; else it is made.
+        index: of the video, if known; else it is computed.
 
     Returns:
-        The number that picture `start` has in the new file.
+        The number of frame `start` in the new file.
 
     Raises:
-        InputError: no video, or it has no such pictures.
+        InputError: no video, or it has no such frames.
     """
     index = index_frames(path) if index is None else index
     if not 0 <= start < stop <= len(index):

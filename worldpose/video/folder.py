@@ -1,4 +1,4 @@
-"""Folders of numbered images, read as videos are."""
+"""Folders of numbered images, with the interface of videos."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from worldpose.video.reading import VideoReader
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg")
 _DIGITS: Final = 18
-"""Longest number of an image [digits]: 64 bits hold no longer one."""
+"""Most digits of an image's number: 64 bits hold no longer one."""
 
 
 class ImageFolder:
-    """Images whose names end in their number; the lowest is frame 0, and a gap is a missing one."""
+    """Images whose names end in their number; the lowest is frame 0, a gap a missing frame."""
 
     def __init__(self, folder: Path, index: FrameIndex | None = None) -> None:
         """Open a folder.
 
         Args:
             folder: holds the images.
-            index: of them, where it is known; else it is made.
+            index: of the images, if known; else it is computed.
 
         Raises:
             InputError: no images, or names without a number or with the same one.
@@ -53,28 +53,28 @@ class ImageFolder:
         return len(self._files)
 
     def close(self) -> None:
-        """Nothing stays open."""
+        """Do nothing: no file stays open."""
 
     def frame(self, number: int) -> NDArray[np.uint8]:
-        """Return one picture (height, width, 3) RGB.
+        """Return one image (height, width, 3) RGB.
 
         Raises:
-            InputError: it is no picture.
+            InputError: the file is no image.
         """
         return next(self.frames(number, number + 1))[1]
 
     def frames(
         self, start: int = 0, stop: int | None = None, *, grey: bool = False
     ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield picture numbers from `start` up to before `stop`, each with its picture.
+        """Yield image numbers from `start` up to before `stop`, each with its image.
 
         Args:
-            start: first picture, in the order of the numbers.
+            start: first image, in the order of the numbers.
             stop: one past the last; all if None.
             grey: (height, width) instead of RGB.
 
         Raises:
-            InputError: one is no picture.
+            InputError: a file is no image.
         """
         for number, picture in self.readable(start, stop, grey=grey):
             if picture is None:
@@ -89,10 +89,10 @@ class ImageFolder:
     def readable(
         self, start: int = 0, stop: int | None = None, *, grey: bool = False
     ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
-        """Yield picture numbers from `start` up to before `stop`; None where one is no picture.
+        """Yield image numbers from `start` up to before `stop` and images; None if unreadable.
 
         Args:
-            start: first picture, in the order of the numbers.
+            start: first image, in the order of the numbers.
             stop: one past the last; all if None.
             grey: (height, width) instead of RGB.
         """
@@ -101,7 +101,7 @@ class ImageFolder:
 
 
 def numbered_images(folder: Path) -> list[tuple[int, Path]]:
-    """The images of a folder by the number that their names end in.
+    """Return the images of a folder by the number at the end of their names.
 
     Raises:
         InputError: no images, or names without a number or with the same one.
@@ -132,7 +132,7 @@ def numbered_images(folder: Path) -> list[tuple[int, Path]]:
 
 
 def index_images(folder: Path) -> FrameIndex:
-    """Return the index of a folder of images; the first one is read for its size.
+    """Return the index of a folder of images; the size comes from the first one.
 
     Raises:
         InputError: no images, or names without a number or with the same one.
@@ -148,7 +148,7 @@ def index_images(folder: Path) -> FrameIndex:
 
 
 def index_video(path: Path) -> FrameIndex:
-    """The index of a video file or of a folder of images.
+    """Return the index of a video file or of a folder of images.
 
     Raises:
         InputError: neither.
@@ -157,10 +157,10 @@ def index_video(path: Path) -> FrameIndex:
 
 
 def open_video(path: Path, index: FrameIndex | None = None) -> VideoReader | ImageFolder:
-    """A video file or a folder of images, to be read by picture number."""
+    """Open a video file or a folder of images, to be read by frame number."""
     return ImageFolder(path, index) if path.is_dir() else VideoReader(path, index)
 
 
 def _read(file: Path, *, grey: bool) -> NDArray[np.uint8] | None:
-    """An image as it is to be shown, RGB or grey; None where the file is no image."""
+    """Return an image as displayed, RGB or grey; None if the file is no image."""
     return decode_image(np.fromfile(file, dtype=np.uint8), grey=grey)

@@ -1,4 +1,4 @@
-"""Which picture of a video is frame n: the time stamps of all its pictures in order."""
+"""Time stamps of all frames of a video in display order."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from numpy.typing import NDArray
 from worldpose.errors import InputError
 
 MOST_FRAMES: Final = 10_000_000
-"""Frames of a video's clock, two days at 60 frames/s: one odd number would fill the memory."""
+"""Most frames of a video's clock, two days at 60 frames/s: one wrong stamp would fill memory."""
 RATE_SLACK: Final = 0.1
-"""Share of a clock's frames that a video may lack or double before it is one of another rate."""
+"""Share of missing or duplicate frames from which a video's rate differs from its clock's."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameIndex:
-    """The pictures of a video, in the order in which they are shown.
+    """The frames of a video, in display order.
 
-    A picture's number counts pictures as shown, whatever the file says of its rate: containers
-    round times, begin later than zero, and store pictures in the order of decoding.
+    A frame's number counts frames in display order, whatever rate the file states: containers round
+    times, begin later than zero, and store frames in decoding order.
 
     Attributes:
         stamps: (pictures,) presentation time stamps, rising, in units of `time_base`.
         key: (pictures,) whether decoding can begin there.
-        time_base: seconds a unit; None where stamps are frame numbers, as in a folder of images.
-        size: width, height of the pictures as shown, after any turn [px].
+        time_base: seconds per unit; None where stamps are frame numbers, as in a folder of images.
+        size: width, height of the frames as displayed, after rotation [px].
     """
 
     stamps: NDArray[np.int64]
@@ -45,13 +45,13 @@ class FrameIndex:
 
     @property
     def times(self) -> NDArray[np.float64]:
-        """When each picture is shown, from the first one on (pictures,) [s]; NaN without times."""
+        """Return the display times of frames since the first (pictures,) [s]; NaN if unknown."""
         unit = np.nan if self.time_base is None else float(self.time_base)
         return np.asarray((self.stamps - self.stamps[0]) * unit)
 
     @property
     def fps(self) -> float:
-        """Frames a second, from the median time between neighbours; NaN where it is not known."""
+        """Return frames per second, from the median step between frames; NaN if unknown."""
         if len(self) < 2 or self.time_base is None:
             return float("nan")
         # The median of the single steps is rounded to the time base; the whole length is not.
@@ -60,17 +60,18 @@ class FrameIndex:
         return float(1.0 / (step[usual].mean() * float(self.time_base)))
 
     def on_clock(self, fps: float, where: str) -> NDArray[np.int64]:
-        """The picture of each frame of a camera's clock (frames,); -1 where the video lacks it.
+        """Return the number of the video frame for each clock frame (frames,); -1 if missing.
 
-        Frame n is shown n / fps after the first picture. A picture that a recorder dropped leaves
-        its frame empty and shifts none behind it; of two pictures for a frame the nearer counts.
+        Frame n is shown n / fps after the first one. A frame that a recorder dropped leaves its
+        clock frame empty and shifts no later one; of two video frames for one clock frame the
+        nearer counts.
 
         Args:
-            fps: frames a second of the clock.
+            fps: frames per second of the clock.
             where: the video, for messages.
 
         Raises:
-            InputError: the video has another rate, or pictures beyond belief.
+            InputError: the video has another rate, or implausibly many frames.
         """
         if self.time_base is None:
             exact = (self.stamps - self.stamps[0]).astype(np.float64)
@@ -85,7 +86,7 @@ class FrameIndex:
             )
         slot = np.rint(exact).astype(np.int64)
         late = np.abs(exact - slot)
-        # By frame, and within a frame the nearest last, so that it is what stays.
+        # By clock frame, then by falling distance, so that the nearest one stays.
         order = np.lexsort((-late, slot))
         picture = np.full(slot[-1] + 1, -1, dtype=np.int64)
         picture[slot[order]] = order
@@ -102,10 +103,10 @@ class FrameIndex:
 
 
 def index_frames(path: Path) -> FrameIndex:
-    """Return the index of a file's first video stream, from its packets: one picture is decoded.
+    """Return the index of a file's first video stream, from its packets: it decodes one frame.
 
     Raises:
-        InputError: no video, or pictures without time stamps.
+        InputError: no video, or frames without time stamps.
     """
     try:
         with av.open(str(path)) as container:
@@ -131,7 +132,7 @@ def index_frames(path: Path) -> FrameIndex:
 
 
 def _packets(container: InputContainer, stream: VideoStream) -> list[av.Packet[VideoStream]]:
-    """All packets of a stream; a file that was cut off ends where it was cut."""
+    """Return all packets of a stream; a truncated file ends where it was cut."""
     found: list[av.Packet[VideoStream]] = []
     try:
         found.extend(container.demux(stream))
@@ -142,7 +143,7 @@ def _packets(container: InputContainer, stream: VideoStream) -> list[av.Packet[V
 
 
 def _shown_size(container: InputContainer, stream: VideoStream) -> tuple[int, int]:
-    """Width and height as shown: a camera held upright stores lying pictures and a turn."""
+    """Return width and height as displayed: an upright camera stores rotated frames."""
     for picture in container.decode(stream):
         if picture.rotation % 180:
             return picture.height, picture.width

@@ -1,4 +1,4 @@
-"""PNG and JPEG images in memory; what their header declares is checked before they are decoded."""
+"""Decoding of PNG and JPEG images in memory, after a check of the size in their header."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 HEADER_BYTES: Final = 1 << 20
-"""Of a file, in which its image's size must stand [byte]; a camera's notes may come before it."""
+"""First bytes of a file that must hold its image's size [byte]; camera metadata may precede it."""
 MAX_PIXELS: Final = 200_000_000
-"""A larger image is none of a camera; a few hundred bytes can declare one of gigabytes."""
+"""No camera takes larger images; a few hundred bytes can declare gigabytes."""
 
 
 def decode_image(content: NDArray[np.uint8], *, grey: bool = False) -> NDArray[np.uint8] | None:
@@ -22,7 +22,7 @@ def decode_image(content: NDArray[np.uint8], *, grey: bool = False) -> NDArray[n
         grey: without colour.
 
     Returns:
-        None where the bytes are no whole image, or declare more than `MAX_PIXELS`.
+        None if the bytes are no whole image, or declare more than `MAX_PIXELS`.
     """
     import cv2  # late: it takes a fifth of a second, and few commands open an image
 
@@ -37,7 +37,7 @@ def decode_image(content: NDArray[np.uint8], *, grey: bool = False) -> NDArray[n
 
 
 def declared_size(content: NDArray[np.uint8]) -> tuple[int, int] | None:
-    """Width and height [px] that the header of a PNG or JPEG file declares; None for no such."""
+    """Return width and height [px] in the header of a PNG or JPEG file; None for other files."""
     header = content[:HEADER_BYTES].tobytes()
     if header[:8] == b"\x89PNG\r\n\x1a\n" and header[12:16] == b"IHDR" and len(header) >= 24:
         width, height = struct.unpack(">II", header[16:24])

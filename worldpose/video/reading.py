@@ -1,4 +1,4 @@
-"""Pictures of a video by frame number."""
+"""Frames of a video by number."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from worldpose.video.frame_index import FrameIndex, index_frames
 
 
 class VideoReader:
-    """A video file whose frames are read by number, forwards without seeking."""
+    """A video file with access to frames by number, forwards without seeking."""
 
     def __init__(self, path: Path, index: FrameIndex | None = None) -> None:
         """Open a file.
 
         Args:
             path: the video.
-            index: of it, where it is known; else it is made.
+            index: of the video, if known; else it is computed.
 
         Raises:
             InputError: no video.
@@ -53,7 +53,7 @@ class VideoReader:
         self._container.close()
 
     def frame(self, number: int) -> NDArray[np.uint8]:
-        """Return one picture (height, width, 3) RGB.
+        """Return one frame (height, width, 3) RGB.
 
         Raises:
             InputError: there is no such frame, or it cannot be decoded.
@@ -65,12 +65,12 @@ class VideoReader:
     def frames(
         self, start: int = 0, stop: int | None = None, *, grey: bool = False
     ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield frame numbers from `start` up to before `stop`, each with its picture.
+        """Yield frame numbers from `start` up to before `stop`, each with its image.
 
         Args:
             start: first frame.
             stop: one past the last; the end of the video if None.
-            grey: luma (height, width) as it is stored, in half the time, instead of RGB.
+            grey: luma (height, width) as stored, in half the time, instead of RGB.
 
         Raises:
             InputError: there are no such frames, or one cannot be decoded.
@@ -88,15 +88,16 @@ class VideoReader:
         grey: bool = False,
         width: int | None = None,
     ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
-        """Yield the same, with None for each picture that cannot be decoded or comes damaged.
+        """Yield frames as `frames` does, with None for each damaged or undecodable one.
 
-        So are those after a damaged one up to the next key frame: they may be predicted from it.
+        Frames after a damaged one up to the next key frame are None too: they may be predicted from
+        it.
 
         Args:
             start: first frame.
             stop: one past the last; the end of the video if None.
             grey: luma instead of RGB.
-            width: RGB pictures are made this wide, before they are turned [px]; None = as they are.
+            width: RGB images get this width, before rotation [px]; None = unscaled.
 
         Raises:
             InputError: there are no such frames.
@@ -128,13 +129,13 @@ class VideoReader:
             yield number, None
 
     def _next_key(self, number: int) -> int:
-        """The first picture after a damaged one that is not predicted from it."""
+        """Return the first frame after a damaged one that is not predicted from it."""
         keys = np.flatnonzero(self.index.key)
         after = int(np.searchsorted(keys, number, side="right"))
         return int(keys[after]) if after < len(keys) else len(self)
 
     def _shown_from(self, start: int) -> Iterator[av.VideoFrame]:
-        """Pictures as shown, from the last one before `start` at which decoding can begin."""
+        """Yield displayed frames, from the last one up to `start` at which decoding can begin."""
         before = np.flatnonzero(self.index.key[: start + 1])
         begin = int(before[-1]) if len(before) else 0
         self._container.seek(
@@ -144,14 +145,14 @@ class VideoReader:
         while True:
             try:
                 packet = next(packets, None)
-            except av.error.FFmpegError:  # the file ends here, cut off
+            except av.error.FFmpegError:  # the file is truncated here
                 packet = None
             if packet is None:
                 return
             try:
                 shown = packet.decode()
             except av.error.FFmpegError:
-                continue  # what it held is missing; what follows the next key frame is not
+                continue  # its frames are missing; those after the next key frame are not
             for picture in shown:
                 assert isinstance(picture, av.VideoFrame)  # of a video stream
                 yield picture
@@ -166,9 +167,9 @@ class VideoReader:
 
 
 def _pixels(picture: av.VideoFrame, grey: bool, width: int | None) -> NDArray[np.uint8]:
-    """Return the picture as it is to be shown: RGB, or luma alone."""
+    """Return the frame as displayed: RGB, or luma alone."""
     pixels = _stored_pixels(picture, grey, width)
-    quarters = round(picture.rotation / 90.0) % 4  # counterclockwise, as NumPy turns
+    quarters = round(picture.rotation / 90.0) % 4  # counterclockwise, as in np.rot90
     return pixels if quarters == 0 else np.ascontiguousarray(np.rot90(pixels, quarters))
 
 

@@ -1,4 +1,4 @@
-"""Some pictures of a video, without decoding all between them."""
+"""Selected frames of a video, without decoding all between them."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from worldpose.video.folder import ImageFolder
 from worldpose.video.reading import VideoReader
 
 WORTH: Final = 8
-"""Pictures that a jump to a key frame must save: beginning anew costs about as many."""
+"""Frames that a jump to a key frame must save: a restart costs about as many."""
 
 
 def some_pictures(
     video: VideoReader | ImageFolder, numbers: NDArray[np.integer]
 ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
-    """Yield the asked for pictures in order; None where one cannot be decoded.
+    """Yield selected frames in order; None where one cannot be decoded.
 
     Args:
-        video: they are of.
+        video: their source.
         numbers: (pictures,) rising.
     """
     for group in jumps(numbers, video.index.key):
@@ -32,10 +32,10 @@ def some_pictures(
 
 
 def jumps(numbers: NDArray[np.integer], key: NDArray[np.bool_]) -> list[NDArray[np.integer]]:
-    """Return groups of pictures, each to be decoded in one go.
+    """Return groups of frames, each decoded in one pass.
 
     Args:
-        numbers: (pictures,) asked for, rising.
+        numbers: (pictures,) selected, rising.
         key: (all pictures,) whether decoding can begin there.
     """
     if not len(numbers):

@@ -1,4 +1,4 @@
-"""Video files from pictures."""
+"""Video files from images."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from worldpose.errors import InputError
 def write_video(
     path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float, *, quality: int = 20
 ) -> int:
-    """Write a file of pictures and return how many; the same pictures give the same bytes.
+    """Write images to a file and return their number; the same images give the same bytes.
 
-    H.264 with a key frame a second where the installed FFmpeg can write it, else MPEG-4 part 2.
+    H.264 with a key frame per second if the installed FFmpeg can write it, else MPEG-4 part 2.
 
     Args:
-        path: .mp4, written as pictures come.
+        path: .mp4, written image by image.
         pictures: (height, width, 3) RGB, or (height, width) grey, all of one even size.
-        fps: frames a second.
+        fps: frames per second.
         quality: 0 is without loss, 51 the worst (H.264's constant rate factor).
 
     Raises:
-        InputError: no picture, or one of another or an odd size.
+        InputError: no image, or one of another or an odd size.
     """
     rate = Fraction(fps).limit_denominator(1001)
     codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"
@@ -38,7 +38,7 @@ def write_video(
         stream = container.add_stream(codec, rate=rate)
         assert isinstance(stream, VideoStream)  # both codecs are of video
         stream.pix_fmt = "yuv420p"
-        # One thread: more make the bytes depend on the machine.
+        # One thread: with more, the bytes depend on the machine.
         stream.codec_context.thread_count = 1
         stream.gop_size = max(1, round(fps))
         if codec == "libx264":

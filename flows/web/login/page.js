@@ -3,7 +3,7 @@ const form = document.getElementById("login");
 const message = document.getElementById("message");
 const field = (name) => document.getElementById(name);
 
-// The token stands behind the #: browsers keep that to themselves.
+// The token is in the URL fragment, which browsers do not send.
 const given = new URLSearchParams(location.hash.slice(1)).get("token");
 if (given) {
   field("token").value = given;

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_glimpses import broadcast, crowd
+from test_monocular_poses import broadcast, crowd
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body_fitting import BodyFittingSettings, fit_bodies

@@ -29,7 +29,7 @@ def followed(found, **settings):
 
 
 def test_two_people_who_cross_keep_their_tracks():
-    tracker = BoxTracker(sure=0.4, patience=25)
+    tracker = BoxTracker(high_score_threshold=0.4, track_buffer_frames=25)
     ids = []
     for frame in range(40):
         boxes = np.array([walker(frame, 100, 4, 60), walker(frame, 260, -4, 80)])
@@ -38,7 +38,7 @@ def test_two_people_who_cross_keep_their_tracks():
 
 
 def test_a_doubtful_box_continues_a_track_and_begins_none():
-    tracker = BoxTracker(sure=0.4, patience=25)
+    tracker = BoxTracker(high_score_threshold=0.4, track_buffer_frames=25)
     lone = np.array([900.0, 200, 924, 260])
     assert tracker.follow(np.array([walker(0), lone]), np.array([0.9, 0.2])).tolist() == [0, -1]
     assert tracker.follow(np.array([walker(1), lone]), np.array([0.2, 0.2])).tolist() == [0, -1]
@@ -46,7 +46,7 @@ def test_a_doubtful_box_continues_a_track_and_begins_none():
 
 def test_a_track_is_given_up_after_the_patience_and_not_before():
     for missed, expected in ((5, 0), (6, 1)):
-        tracker = BoxTracker(sure=0.4, patience=5)
+        tracker = BoxTracker(high_score_threshold=0.4, track_buffer_frames=5)
         tracker.follow(np.array([walker(0, speed=0)]), np.array([0.9]))
         for _ in range(missed):
             tracker.follow(np.empty((0, 4)), np.empty(0))
@@ -57,7 +57,7 @@ def test_a_track_is_given_up_after_the_patience_and_not_before():
 def test_a_gap_is_filled_evenly_and_a_longer_one_is_not():
     for gap, filled in ((4, 4), (6, 0)):
         seen = [people() if 10 <= n < 10 + gap else people([*walker(n), 0.9]) for n in range(30)]
-        frames, follower = followed(seen, bridge=5)
+        frames, follower = followed(seen, max_gap_frames=5)
         assert [number for number, _ in frames] == list(range(30))
         counts = [len(one.scores) for _, one in frames]
         assert counts.count(1) == 30 - gap + filled
@@ -86,7 +86,7 @@ def test_looks_at_every_third_frame_give_boxes_in_all_of_them(batch):
         return [people([*walker(number), 0.9]) for number in numbers]
 
     frames = [(n, None if n == 5 else np.full((4, 4, 3), n, dtype=np.uint8)) for n in range(21)]
-    follower = Follower(DetectionSettings(stride=3, bridge=0))
+    follower = Follower(DetectionSettings(stride=3, max_gap_frames=0))
     found = list(follower.follow(looked_at(iter(frames), look, 3, batch)))
     assert looked == [0, 3, 6, 9, 12, 15, 18, 20]  # and the last, so that boxes reach the end
     assert [number for number, _, _ in found] == list(range(21))

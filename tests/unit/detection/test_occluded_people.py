@@ -8,8 +8,8 @@ from worldpose.detection import DetectionSettings, People, PeopleFinder, Place, 
 from worldpose.detection.boxes import overlaps
 from worldpose.detection.bundled import embedded_pose
 from worldpose.detection.bundled_looks import Look
+from worldpose.detection.flip_test import Mirrored
 from worldpose.detection.interfaces import LooksBeside
-from worldpose.detection.mirrored import Mirrored
 from worldpose.detection.occluded_people import find_occluded_people
 
 FRONT = np.array([100.0, 50.0, 140.0, 150.0])
@@ -107,7 +107,7 @@ def people_of(settings, place=None):
 
 
 def test_they_are_kept_as_people_of_the_picture():
-    assert people_of(DetectionSettings(beside=True)) == (2, 2)
+    assert people_of(DetectionSettings(find_occluded=True)) == (2, 2)
     assert people_of(DetectionSettings()) == (1, 0)
 
 
@@ -115,7 +115,7 @@ def test_a_bystander_whom_a_player_hides_is_crowd(monkeypatch):
     monkeypatch.setattr(
         "worldpose.detection.people.on_pitch", lambda boxes, *_: boxes[:, 0] <= FRONT[0]
     )
-    assert people_of(DetectionSettings(beside=True), Place(None, None)) == (1, 2)
+    assert people_of(DetectionSettings(find_occluded=True), Place(None, None)) == (1, 2)
 
 
 def test_the_embedded_net_looks_beside_and_means_of_two_looks_do_not():

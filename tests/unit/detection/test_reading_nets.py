@@ -5,7 +5,7 @@ import pytest
 
 from worldpose.detection import DetectionSettings, Poses, load_detectors, weights_of
 from worldpose.detection.crops import crop_frames, cut_crops, in_picture
-from worldpose.detection.mirrored import SIDES, Mirrored
+from worldpose.detection.flip_test import SIDES, Mirrored
 from worldpose.detection.onnx_detectors import _corners, _grid, _multipose
 from worldpose.detection.onnx_pose import _read, from_heat_maps
 from worldpose.errors import InputError

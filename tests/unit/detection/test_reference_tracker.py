@@ -36,7 +36,7 @@ def test_tracks_are_those_of_the_reference():
     trackers = pytest.importorskip("trackers")
     import supervision
 
-    own = BoxTracker(sure=0.4, patience=25)
+    own = BoxTracker(high_score_threshold=0.4, track_buffer_frames=25)
     other = trackers.ByteTrackTracker(
         lost_track_buffer=25,
         frame_rate=30.0,

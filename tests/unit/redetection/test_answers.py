@@ -71,7 +71,7 @@ def test_how_far_it_may_be_off_goes_with_how_well_the_body_is_known():
 
 def test_an_answer_that_the_net_doubts_is_nothing():
     bodies = expected((0.0, 0.0))
-    doubted = answer(bodies, 0, confidence=SETTINGS.least_confidence - 0.01)
+    doubted = answer(bodies, 0, confidence=SETTINGS.min_confidence - 0.01)
     assert kinds(judge(bodies, doubted, seek(bodies, 0))) == ["unsure"]
     assert kinds(judge(bodies, Answers.none(1), seek(bodies, 0))) == ["unsure"]
 

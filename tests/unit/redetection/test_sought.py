@@ -48,7 +48,7 @@ def test_who_is_hidden_is_not_looked_for_and_counted():
 def test_nobody_is_looked_for_off_the_pitch():
     pitch = Place(camera(), PitchTemplate.from_spec(PitchSpec(length=105.0, width=68.0)))
     bodies = expected((0.0, 0.0), (3.0, 37.0))  # the second 3 m behind the touch line
-    low = RedetectionSettings(least_height_px=20.0)
+    low = RedetectionSettings(min_height_px=20.0)
     nobody = np.zeros((1, 2), dtype=bool)
     assert whom_to_seek(bodies, nobody, SIZE, low).person.tolist() == [0, 1]
     found = whom_to_seek(bodies, nobody, SIZE, low, place=pitch, margin=2.5)

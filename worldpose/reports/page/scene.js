@@ -1,4 +1,4 @@
-// People, markings and cameras of one clip in space: turned by dragging, played like a film.
+// Interactive 3D view of one clip's people, markings and cameras: drag to rotate, with playback.
 "use strict";
 
 function showScene(holder) {
@@ -17,11 +17,11 @@ function showScene(holder) {
   const broadcast = scene.broadcast ? numbers(scene.broadcast, Float32Array) : null;
   const { frames, persons, unit, bones, colors, ids } = scene;
   const MISSING = -32768;
-  // Numbers of a broadcast camera in one frame: rotation, translation, focal length, width, height.
+  // Values of a broadcast camera per frame: rotation, translation, focal length, width, height.
   const CAMERA = 15;
   const stride = persons * 17 * 3;
 
-  // The place looked at, turn about the vertical, height above the ground, and distance.
+  // Target point, rotation about the vertical, tilt above the ground, and distance.
   const home = { at: scene.middle, turn: -0.5, tilt: 0.42, far: scene.reach };
   let view = { ...home, at: [...home.at] };
   let through = false;
@@ -74,7 +74,7 @@ function showScene(holder) {
     pen.stroke();
   }
 
-  // A joint between two frames, so that few frames still play smoothly.
+  // A joint interpolated between two frames, for smooth playback of few frames.
   function joint(person, number) {
     const before = Math.floor(time);
     const share = time - before;
@@ -129,7 +129,7 @@ function showScene(holder) {
     const [focal, wide, high] = [broadcast[k + 12], broadcast[k + 13], broadcast[k + 14]];
     const center = world([0, 0, 0]);
     pen.strokeStyle = "rgba(255, 213, 74, .75)";
-    // Where the corners of the picture meet the ground.
+    // Intersections of the image corners with the ground.
     const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([a, b]) => {
       const ahead = world([(a * wide) / 2 / focal, (b * high) / 2 / focal, 1]);
       const down = center[2] - ahead[2];

@@ -1,8 +1,8 @@
-"""The second world: match folders that differ from the others in all that can be learned.
+"""The second simulator: match folders that share no model with the first.
 
-Inputs: a `ForeignScenario`, a seed, and recordings where there are some.
-Outputs: a match folder with its truth. Nothing here is shared with the first simulator: no motion,
-no noise, no camera placement; estimators are measured on it and never chosen by it.
+Inputs: a `ForeignScenario`, a seed, and recordings if there are any.
+Outputs: a match folder with its ground truth. Nothing here is shared with the first simulator: no
+motion, no noise, no camera placement; estimators are measured on it and never tuned on it.
 """
 
 from worldpose.synthetic.foreign.matches import simulate_foreign_match

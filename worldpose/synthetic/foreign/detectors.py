@@ -1,8 +1,8 @@
-"""Detectors: what they take for joints, how they err, and how little their confidence says.
+"""Detectors of the second simulator: joint definitions, errors, and uninformative confidence.
 
-An error has parts that no other simulation here has: definitions tied to limbs, bias with the
-first and third harmonic of the side that is seen and with the camera's height, resonant noise that
-runs along limbs, heavy tails, and grids of heatmaps.
+An error has components that the first simulator lacks: definitions tied to limbs, bias with the
+first and third harmonic of the azimuth and with the camera's elevation, resonant noise along limbs,
+heavy tails, and grids of heatmaps.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _PARENT: Final = (5, 0, 0, 1, 2, 6, 5, 5, 6, 7, 8, 12, 11, 11, 12, 13, 14)
-"""The joint from which a limb leads to each joint."""
+"""Parent joint of the limb that leads to each joint."""
 _OTHER: Final = (0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15)
-"""The same joint of the other side."""
+"""The same joint on the other side."""
 _EASE: Final = np.array(
     [0.5, 0.45, 0.45, 0.6, 0.6, 0.9, 0.9, 1.0, 1.0, 1.25, 1.25, 1.3, 1.3, 1.05, 1.05, 1.15, 1.15]
 )
 """Error of each joint relative to the average one [1]."""
 _PARTS: Final = ((1, 2, 3, 4), (5, 6, 7, 8, 9, 10), (11, 12, 13, 14, 15, 16))
-"""Joints that are taken for those of the other side together."""
+"""Joints that are swapped left to right together."""
 
 _STICKMAN: Final = (
     np.array(
@@ -44,12 +44,12 @@ _STICKMAN: Final = (
     .reshape(2, 17)
     .T
 )
-"""Across and down, of a figure one high that faces the camera."""
+"""Across and down, of a figure of height one that faces the camera."""
 
 
 @dataclass(frozen=True, eq=False)
 class Detector:
-    """A profile with what was drawn for one match.
+    """A profile with the values drawn for one match.
 
     Attributes:
         profile: rates and spreads.
@@ -70,9 +70,9 @@ class Report:
     """A camera's detections and the person of each.
 
     Attributes:
-        observations: what the factory gets.
-        person: (frames, detections) int16, -1 for false people and padding.
-        displaced: (frames, detections, 17), joints that strayed.
+        observations: input of the factory.
+        person: (frames, detections) int16, -1 for false positives and padding.
+        displaced: (frames, detections, 17), joints with gross errors.
     """
 
     observations: Observations
@@ -94,18 +94,18 @@ def draw_detector(profile: DetectorProfile, rng: np.random.Generator) -> Detecto
 
 
 def defined_joints(joints: Floats, detector: Detector, personal: Floats) -> Floats:
-    """Return what the detector takes for joints (frames, persons, 17, 3) [m], world.
+    """Return the joints as the detector defines them (frames, persons, 17, 3) [m], world.
 
     Args:
         joints: anatomical ones (frames, persons, 17, 3) [m], world.
         detector: definitions.
-        personal: (persons, 17, 3) each person's own, in units of the profile's.
+        personal: (persons, 17, 3) each person's own offsets, in units of the profile's.
     """
     _, left = facing(joints)
     along = joints - joints[:, :, _PARENT]
     along = along / np.linalg.norm(along, axis=-1, keepdims=True)
     side = left[:, :, None] - (left[:, :, None] * along).sum(-1, keepdims=True) * along
-    # An arm stretched out sideways has no left of its own.
+    # An arm stretched out sideways has no left direction of its own.
     side = side / np.maximum(np.linalg.norm(side, axis=-1, keepdims=True), 0.2)
     offset = detector.definition + detector.profile.personal * personal
     moved = joints + offset[..., :1] * along + offset[..., 1:2] * side
@@ -126,12 +126,12 @@ def detect_people(
     lost: float,
     rng: np.random.Generator,
 ) -> Report:
-    """Return what a detector reports in a camera's images.
+    """Return the detections in a camera's images.
 
     Args:
         detector: of the match.
-        view: what there is to see.
-        defined: pixels (frames, persons, 17, 2) of what the detector takes for joints [px].
+        view: people in the camera's images.
+        defined: pixels (frames, persons, 17, 2) of the joints as the detector defines them [px].
         image_size: width and height [px].
         fps: [1/s].
         lost: share of frames that the camera lost [1].
@@ -183,7 +183,7 @@ def detect_people(
 def _draw_errors(
     profile: DetectorProfile, frames: int, persons: int, fps: float, rng: np.random.Generator
 ) -> Floats:
-    """Errors (frames, persons, 17, 2) of unit size: resonant, sudden, and shared along limbs."""
+    """Return unit errors (frames, persons, 17, 2): resonant, sudden, and shared along limbs."""
     shape = (persons, 17, 2)
     lead = round(2.0 * fps)
     driven = rng.standard_normal((frames + lead, *shape))
@@ -205,7 +205,7 @@ def _draw_errors(
 
 
 def _bias(detector: Detector, view: View, size: Floats) -> Floats:
-    """Bias (frames, persons, 17, 2) [px] by the side that is seen and the camera's height."""
+    """Return the bias (frames, persons, 17, 2) [px] by azimuth and elevation of the camera."""
     azimuth = view.azimuth
     waves = [np.cos(azimuth), np.sin(azimuth), np.cos(3.0 * azimuth), np.sin(3.0 * azimuth)]
     bias = np.einsum("fpw,jaw->fpja", np.stack(waves, axis=-1), detector.view_bias)
@@ -216,10 +216,10 @@ def _bias(detector: Detector, view: View, size: Floats) -> Floats:
 def _misplace_joints(
     profile: DetectorProfile, keypoints: Floats, view: View, fps: float, rng: np.random.Generator
 ) -> tuple[Floats, Flags]:
-    """Keypoints some of which are far off for a while, and which these are."""
+    """Return keypoints with gross errors in bursts, and their flags."""
     shape = keypoints.shape[:3]
     away = _draw_bursts(profile.strayed, 0.12, shape, fps, rng)
-    # A joint behind another person is taken from that person more often.
+    # A joint behind another person more often gets that person's position.
     away |= (view.hider >= 0) & _draw_bursts(6.0 * profile.strayed, 0.15, shape, fps, rng)
     frame, person, joint = np.nonzero(away)
     kind = rng.integers(3, size=len(frame))
@@ -245,7 +245,7 @@ def _misplace_joints(
 def _swap_sides(
     profile: DetectorProfile, keypoints: Floats, view: View, fps: float, rng: np.random.Generator
 ) -> Floats:
-    """Keypoints with the sides of parts exchanged in bursts, more often from behind."""
+    """Return keypoints with left-right swaps of parts in bursts, more often from behind."""
     swapped = keypoints.copy()
     for part in (*_PARTS, tuple(range(17))):
         on = _draw_bursts(0.5 * profile.swapped, 0.2, view.size.shape, fps, rng)
@@ -269,7 +269,7 @@ def _merge_people(
     fps: float,
     rng: np.random.Generator,
 ) -> tuple[Floats, Flags, Flags]:
-    """Two people who overlap become one: half of the joints of each."""
+    """Merge two people who overlap: half of the joints of each."""
     frames, persons = found.shape
     keypoints, there, found = keypoints.copy(), there.copy(), found.copy()
     merging = _draw_bursts(profile.merged, 0.3, (frames, persons), fps, rng)
@@ -289,7 +289,7 @@ def _merge_people(
 def _draw_confidence(
     profile: DetectorProfile, known: Floats, hidden: Flags, rng: np.random.Generator
 ) -> Floats:
-    """Confidence (frames, persons, 17); biases, straying and swaps do not lower it."""
+    """Return confidence (frames, persons, 17); biases, gross errors and swaps do not lower it."""
     luck = rng.standard_normal(known.shape)
     honest = 1.0 / (1.0 + (known / 0.06) ** 2) * np.where(hidden, 0.6, 1.0) + 0.06 * luck
     if profile.confidence == "honest":
@@ -308,7 +308,7 @@ def _draw_false_positives(
     frames: int,
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats]:
-    """Keypoints (frames, false, 17, 2) of false positives, and their confidence."""
+    """Return keypoints (frames, false, 17, 2) of false positives, and their confidence."""
     ghosts = int(rng.poisson(profile.ghosts))
     flashes = rng.poisson(profile.flashes, frames)
     count = ghosts + int(flashes.max(initial=0))
@@ -339,7 +339,7 @@ def _list_detections(
     displaced: Flags,
     rng: np.random.Generator,
 ) -> Report:
-    """Detections in an order that says nothing, with boxes and scores."""
+    """Return detections in random order, with boxes and scores."""
     found: Flags = np.asarray(np.isfinite(confidence).any(axis=-1))
     order = np.argsort(np.where(found, rng.random(found.shape), np.inf), axis=1)
     order = order[:, : int(found.sum(axis=1).max(initial=0))]
@@ -369,7 +369,7 @@ def _list_detections(
 def _draw_bursts(
     share: float, length: float, shape: tuple[int, ...], fps: float, rng: np.random.Generator
 ) -> Flags:
-    """Flags that are on for a share of the first dimension, for a mean time [s] at once."""
+    """Return flags set for a share of the first dimension, in bursts of a mean duration [s]."""
     stop = min(1.0, 1.0 / max(length * fps, 1.0))
     begin = min(1.0, stop * share / max(1.0 - share, 1e-9))
     luck = rng.random(shape)

@@ -1,4 +1,4 @@
-"""Posture of walking and running people: joint angles of published gait curves, gestures, looks.
+"""Posture of walking and running people: joint angles of published gait curves, gestures, gaze.
 
 Hip and knee angles over the gait cycle are those of walking in D. A. Winter, The biomechanics and
 motor control of human gait, 1991, and of running in T. F. Novacheck, The biomechanics of running,
@@ -36,24 +36,24 @@ _RUN: Final = np.array(
     ],
     dtype=np.float64,
 ).T
-"""Running, likewise."""
+"""Running: share of the cycle from the foot's strike [%], hip flexion, knee flexion [deg]."""
 _NEUTRAL: Final = (4.0, 6.0)
 """Hip and knee flexion of a standing person [deg]."""
 _RUNNING_FROM: Final = (1.9, 2.6)
 """Speeds between which a walk becomes a run [m/s]."""
 _HOLD: Final = (0.04, 0.42, 0.24)
-"""When the ankle rests: from this share of the cycle to these, walking and running [1]."""
+"""Rest of the ankle: from this share of the cycle to these, walking and running [1]."""
 _FLIGHT: Final = 0.05
-"""How far a runner's pelvis rises and falls, peak to peak [share of the leg]."""
+"""Rise and fall of a runner's pelvis, peak to peak [share of the leg]."""
 _ROLL: Final = 0.5
-"""How far the hips go over a resting ankle at most; then the heel rises [share of the leg]."""
+"""Maximum distance of the hips past a resting ankle; then the heel rises [share of the leg]."""
 _STILL: Final = 0.05
 """A slower person keeps both feet down [m/s]."""
 
 
 @dataclass(frozen=True)
 class Manner:
-    """How one person carries himself.
+    """Style of one person's posture and gait.
 
     Attributes:
         lean: of the trunk, forward [rad].
@@ -76,11 +76,11 @@ class Manner:
 
 @dataclass(frozen=True)
 class Gesture:
-    """Something a person does besides walking, from nothing to its height and back.
+    """An action besides walking, which rises from zero to its peak and falls back.
 
     Attributes:
-        kind: what.
-        time: of its height [s].
+        kind: one of `GESTURES`.
+        time: of its peak [s].
         length: from begin to end [s].
         strength: 1 = fully.
         side: the arm, 0 left, 1 right.
@@ -114,7 +114,7 @@ def draw_manner(rng: np.random.Generator) -> Manner:
 def draw_gestures(
     rate: float, begin: float, end: float, rng: np.random.Generator
 ) -> tuple[Gesture, ...]:
-    """Return gestures between two times [s], `rate` of them a minute."""
+    """Return gestures between two times [s], `rate` per minute."""
     drawn = []
     for _ in range(rng.poisson(rate * (end - begin) / 60.0)):
         direction = rng.normal([0.8, 0.0, 0.3])
@@ -149,8 +149,8 @@ def walk_posture(
         heading: (frames,) direction that the body faces [rad].
         leg: its length [m].
         manner: the person's.
-        gestures: what the person does besides.
-        rng: draws the first step and the looks.
+        gestures: the person's gestures.
+        rng: draws the first step and the gaze.
     """
     step = times[1] - times[0]
     velocity = np.gradient(root, step, axis=0)
@@ -218,7 +218,7 @@ def walk_posture(
 
 
 def _stride_rate(pace: Floats, leg: float, run: Floats) -> Floats:
-    """Strides a second: walking by Grieve, running rising evenly with speed."""
+    """Return strides per second: walking by Grieve, running linear in speed."""
     stature = leg / 0.49
     walking = 64.8 / 60.0 * np.maximum(pace / stature, 0.0) ** 0.57
     running = 1.15 + 0.09 * pace
@@ -226,7 +226,7 @@ def _stride_rate(pace: Floats, leg: float, run: Floats) -> Floats:
 
 
 def _stride_size(pace: Floats, rate: Floats, leg: float, run: Floats) -> Floats:
-    """How far legs swing relative to the curves (frames,) [1], so that feet keep up."""
+    """Return the leg swing relative to the curves (frames,) [1], such that feet match the speed."""
     sizes = []
     for curve, end in ((_WALK, _HOLD[1]), (_RUN, _HOLD[2])):
         part = np.array([_HOLD[0], end])
@@ -238,7 +238,7 @@ def _stride_size(pace: Floats, rate: Floats, leg: float, run: Floats) -> Floats:
 
 
 def _angles(part: Floats, size: Floats, bend: Floats, run: Floats) -> Floats:
-    """Hip and knee flexion (frames, 2) [rad]; walking backwards mirrors the swing of the hips."""
+    """Return hip and knee flexion (frames, 2) [rad]; walking backwards mirrors the hips' swing."""
     both = (1.0 - run)[:, None] * _curve(_WALK, part) + run[:, None] * _curve(_RUN, part)
     mean = (1.0 - run)[:, None] * _WALK[:, 1:].mean(0) + run[:, None] * _RUN[:, 1:].mean(0)
     share = np.minimum(bend, 1.0)[:, None]
@@ -249,7 +249,7 @@ def _angles(part: Floats, size: Floats, bend: Floats, run: Floats) -> Floats:
 
 
 def _curve(table: Floats, part: Floats) -> Floats:
-    """Hip and knee flexion (..., 2) [deg] at shares of the cycle: a Fourier series of the table."""
+    """Return hip and knee flexion (..., 2) [deg] over the cycle, by the table's Fourier series."""
     share, values = table[:, 0] / 100.0, table[:, 1:]
     orders = np.arange(1, 6)
 
@@ -263,18 +263,18 @@ def _curve(table: Floats, part: Floats) -> Floats:
 
 
 def _sagittal(angle: Floats, outward: Floats) -> Floats:
-    """Directions (frames, 2, 3) from hanging down, swung forward, and outward for both sides."""
+    """Return directions (frames, 2, 3) from hanging, swung forward, and outward on both sides."""
     out = np.broadcast_to(outward, angle.shape)
     return _unit(np.stack([np.sin(angle), np.tan(out), -np.cos(angle)], axis=-1))
 
 
 def _lateral_axis(angle: Floats) -> Floats:
-    """From the right to the left of what is turned by an angle [rad] (frames, 3)."""
+    """Return the right-to-left axis of a part turned by an angle [rad] (frames, 3)."""
     return np.stack([-np.sin(angle), np.cos(angle), 0.0 * angle], axis=-1)
 
 
 def _random_course(times: Floats, period: float, rng: np.random.Generator) -> Floats:
-    """A smooth random course (frames,) of unit size, of three waves; period [s]."""
+    """Return a smooth random signal (frames,) of unit size, of three waves; period [s]."""
     waves = [
         np.sin(2.0 * np.pi * (times / (period * rng.uniform(0.6, 2.2)) + rng.random()))
         for _ in range(3)
@@ -283,7 +283,7 @@ def _random_course(times: Floats, period: float, rng: np.random.Generator) -> Fl
 
 
 def _add_gesture(posture: Posture, gesture: Gesture, times: Floats) -> Posture:
-    """The posture with a gesture blended in."""
+    """Return the posture with a gesture blended in."""
     near = np.clip(2.0 * np.abs(times - gesture.time) / gesture.length, 0.0, 1.0)
     on = gesture.strength * 0.5 * (1.0 + np.cos(np.pi * near))
     arms, hands = posture.upper_arm.copy(), posture.forearm.copy()
@@ -323,7 +323,7 @@ def _add_gesture(posture: Posture, gesture: Gesture, times: Floats) -> Posture:
 
 
 def _blend(vectors: Floats, goal: Floats, share: Floats) -> Floats:
-    """Unit vectors turned towards a goal by a share (frames,) of the trajectory."""
+    """Return unit vectors turned towards a goal by a share (frames,) of the way."""
     mixed = (1.0 - share)[:, None] * vectors + share[:, None] * goal / np.linalg.norm(goal)
     return _unit(mixed)
 

@@ -1,4 +1,4 @@
-"""Match folders of the second world, with their truth."""
+"""Match folders of the second simulator, with their ground truth."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ def simulate_foreign_match(
     recordings: Path | None = None,
     calibrated: bool = False,
 ) -> MatchSpec:
-    """Write a match folder of the second world; the same arguments give the same bytes.
+    """Write a match folder of the second simulator; the same arguments give the same bytes.
 
     Under reference/ are joints.npz, cameras/<camera>.npz, calibration.toml, identities/,
-    pitch.json, clocks.json and clicks.json as of other simulated matches, and
+    pitch.json, clocks.json and clicks.json as in other simulated matches, and
 
-    - defined_joints.npz: what the detector takes for joints, as a joints file;
+    - defined_joints.npz: joints as the detector defines them, as a joints file;
     - world.json: motion and bones of every person, detector, lenses and mountings.
 
     Args:
         scenario: ranges.
         seed: from 0.
-        out: absent or an empty folder; written whole or not at all.
+        out: absent or an empty folder; the write is atomic.
         duration: [s], instead of the scenario's.
         cameras: number of them, instead of the scenario's.
         people: number of them, instead of the scenario's.
         recordings: folder with npz files of motion capture and tracking data (`read_recordings`).
-        calibrated: cameras are given exactly.
+        calibrated: write the exact cameras.
 
     Returns:
         The match's match.yaml.
@@ -102,7 +102,7 @@ def simulate_foreign_match(
 
 
 def _number_frames(observations: Observations, offset: int) -> Observations:
-    """The same with the camera's own frame numbers."""
+    """Return the observations with the camera's own frame numbers."""
     return Observations(frame=observations.frame + offset, **observations.arrays())
 
 

@@ -12,37 +12,38 @@ class DetectorProfile(Record):
 
     name: str
     definition: float = 0.025
-    """From the anatomical joint to what is taken for it, along each axis of its limb [m]; the same
-    for all people and cameras."""
+    """From the anatomical joint to the detector's, along each axis of its limb [m]; the same for
+    all people and cameras."""
     personal: float = 0.006
-    """The same, of each person's own [m]."""
+    """The same, for each person [m]."""
     low_hips: float = 0.0
-    """What is taken for hips lies this much below the joints' centres [m]."""
+    """Offset of the detector's hips below the joints' centres [m]."""
     wide_hips: float = 0.0
-    """And this much farther outward [m]."""
+    """Offset of the detector's hips outward [m]."""
     view_bias: float = 0.007
-    """Bias by the side that is seen, each of two harmonics [person height]."""
+    """Bias by azimuth, each of two harmonics [person height]."""
     height_bias: float = 0.012
     """Bias along the image's vertical by the sine of the camera's elevation [person height]."""
     noise: float = 0.017
-    """Of a person 100 px tall [person height]; relative to their height it falls with the 0.3rd
-    power of it."""
+    """Noise on a person 100 px tall [person height]; it is proportional to the -0.3rd power of the
+    height in the image."""
     floor: float = 0.5
-    """Least noise [px]."""
+    """Minimum noise [px]."""
     resonance: tuple[float, float] = (0.08, 0.45)
-    """Period in which a joint's error swings, shortest and longest [s]."""
+    """Period of a joint's oscillating error, minimum and maximum [s]."""
     tail: float = 3.5
     """Degrees of freedom of the sudden part (Student's t) [1]."""
     sudden: float = 0.5
-    """Share of the variance that is new in every frame [1]."""
+    """Share of the variance that is independent per frame [1]."""
     limbs: float = 0.45
-    """How much of its parent's error a joint has too [1]."""
+    """Share of its parent's error in a joint's error [1]."""
     grid: float = 0.0
-    """Spacing of the grid of places that are reported [person height]; 0 = none."""
+    """Spacing of the grid of reported positions [person height]; 0 = none."""
     swapped: float = 0.015
-    """Share of person-frames in which one part's sides are exchanged; twice from behind [1]."""
+    """Share of person-frames with a left-right swap of one part; twice from behind [1]."""
     strayed: float = 0.01
-    """Share of joints far off for a while [1]: on another person, the other side, the limb."""
+    """Share of joints with temporary gross errors [1]: on another person, the other side, the
+    limb."""
     joint_missed: float = 0.02
     """Share of visible joints left out [1]."""
     hidden_kept: float = 0.5
@@ -50,18 +51,18 @@ class DetectorProfile(Record):
     person_missed: float = 0.02
     """Share of person-frames without a detection [1]."""
     smallest: float = 24.0
-    """Half of the people of this height in the image are found [px]."""
+    """Height at which half of the people in the image are found [px]."""
     merged: float = 0.4
-    """Share of overlaps in which two people become one [1]."""
+    """Share of overlaps in which two people merge into one detection [1]."""
     ghosts: float = 0.4
-    """Lasting false people in a camera, mean number [1]: a bush, a poster."""
+    """Persistent false positives in a camera, mean number [1]: a bush, a poster."""
     flashes: float = 0.03
-    """False people of a single frame, mean number [1]."""
+    """False positives of a single frame, mean number [1]."""
     duplicates: float = 0.006
     """Share of people reported twice [1]."""
     confidence: Literal["honest", "blind", "sure", "meek"] = "honest"
-    """`honest` falls with the error, `blind` knows nothing of it, `sure` is high whatever happens,
-    `meek` is honest in a small range."""
+    """`honest` falls with the error, `blind` is independent of it, `sure` is always high, `meek` is
+    honest in a small range."""
 
 
 PROFILES: Final = {

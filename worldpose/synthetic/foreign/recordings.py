@@ -1,8 +1,8 @@
-"""Recordings that people replay: motion capture and tracking data, from a folder of npz files.
+"""Recordings to replay: motion capture and tracking data, from a folder of npz files.
 
 A motion capture file has `joints` (frames, joints, 3) [m], z up, `joint_names` and `fps`; tracking
 data have `xy` (frames, players, 2) [m], `time` or `fps`, and optionally `segment`. Other files are
-left alone.
+ignored.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ JOINTS: Final = {
     **{f"{side}_knee": (f"{side[0]}Shin", f"{side.title()}Leg") for side in ("left", "right")},
     **{f"{side}_ankle": (f"{side[0]}Foot", f"{side.title()}Foot") for side in ("left", "right")},
 }
-"""Names of a skeleton's joints in conversions of the CMU database, by what they are here."""
+"""Names of a skeleton's joints in conversions of the CMU database, by the names used here."""
 PLANTED: Final = (0.55, 0.06)
 """An ankle slower than this [m/s] and at most this far above its lowest place [m] is planted."""
 TEMPO: Final = (0.8, 1.15)
-"""How much faster than it was recorded a motion is played [1]."""
+"""Playback speed relative to the recording [1]."""
 _JUMP: Final = 15.0
-"""A joint this fast at the beginning [m/s] comes from a calibration pose, which is left out."""
+"""A joint this fast at the beginning [m/s] comes from a calibration pose, which is dropped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class Motion:
 
     Attributes:
         name: of the file.
-        fps: frames in a second [1/s].
+        fps: frame rate [1/s].
         joints: by the names of `JOINTS` (frames, 3) [m], z up.
     """
 
@@ -60,13 +60,13 @@ class Motion:
 
     @property
     def frames(self) -> int:
-        """How many frames there are."""
+        """Number of frames."""
         return len(self.joints["neck"])
 
 
 @dataclass(frozen=True, eq=False)
 class Tracking:
-    """A stretch of tracking data without gaps.
+    """A chunk of tracking data without gaps.
 
     Attributes:
         name: of the file.
@@ -83,7 +83,7 @@ class Tracking:
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """What a folder of recordings holds."""
+    """Contents of a folder of recordings."""
 
     motions: tuple[Motion, ...] = ()
     tracks: tuple[Tracking, ...] = ()
@@ -93,7 +93,7 @@ def read_recordings(folder: Path) -> Recordings:
     """Return the motions and tracking data in a folder and the folders in it, by file name.
 
     Raises:
-        InputError: there is no such folder, a file cannot be read, or none has what is sought.
+        InputError: there is no such folder, a file cannot be read, or none has recordings.
     """
     if not folder.is_dir():
         raise InputError(
@@ -197,15 +197,15 @@ def play_motion(
 ) -> tuple[Trajectory, Posture]:
     """Return the trajectory and posture of a person who replays a motion.
 
-    Directions of bones are those of the recording; the length of the legs scales trajectory and
-    height. The part, its direction, its tempo and whether left and right are exchanged are drawn;
-    at the ends of the recording it is played backwards.
+    Bone directions are those of the recording; the length of the legs scales trajectory and height.
+    Part, direction, tempo and left-right mirroring are random; at the ends of the recording the
+    playback reverses.
 
     Args:
         motion: the recording.
         skeleton: the person's bones.
         times: (frames,) [s], evenly spaced; the clip begins at 0.
-        place: (2,) where the person is in the middle of `times` [m].
+        place: (2,) position of the person in the middle of `times` [m].
         rng: draws part, direction, tempo and side.
     """
     tempo, mirrored = float(rng.uniform(*TEMPO)), bool(rng.random() < 0.5)
@@ -215,7 +215,7 @@ def play_motion(
     moment = begin + tempo * times
     moment = np.abs((moment + length) % (2.0 * length) - length)
     clock = np.arange(motion.frames) / motion.fps
-    # Jitter of the capture is no motion.
+    # Remove the capture's jitter.
     smooth = {
         name: gaussian_filter1d(joints, 0.02 * motion.fps, axis=0, mode="nearest")
         for name, joints in motion.joints.items()
@@ -236,7 +236,7 @@ def play_motion(
     cos, sin = np.cos(course), np.sin(course)
 
     def turned(vectors: Floats) -> Floats:
-        """Into forward, left, up, and to unit length."""
+        """Return vectors in forward, left, up, of unit length."""
         x, y = vectors[..., 0], vectors[..., 1]
         local = np.stack([cos * x + sin * y, cos * y - sin * x, vectors[..., 2]], axis=-1)
         return np.asarray(local / np.linalg.norm(local, axis=-1, keepdims=True))

@@ -18,7 +18,7 @@ SIZES: Final = (
     *((1280, 720), (1920, 1080), (1920, 1080), (2704, 1520), (3840, 2160), (1440, 1080)),
     *((1080, 1920),),
 )
-"""Width and height [px]; phones stand upright."""
+"""Width and height [px]; phones film in portrait format."""
 LENSES: Final = {
     "rectilinear": 0.37,
     "barrel": 0.27,
@@ -26,10 +26,10 @@ LENSES: Final = {
     "fisheye": 0.135,
     "beyond": 0.135,
 }
-"""Share of each kind [1]. `fisheye`: nearly equidistant; `beyond`: a barrel with a swirl that the
-five coefficients of the lens model cannot have."""
+"""Share of each kind [1]. `fisheye`: nearly equidistant; `beyond`: barrel distortion with a swirl
+that the five coefficients of the lens model cannot represent."""
 _BEYOND: Final = 0.9
-"""Largest displacement by that swirl, at the corner of a image 1920 px wide [px]."""
+"""Maximum displacement by that swirl, at the corner of an image 1920 px wide [px]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +37,11 @@ class RigCamera:
     """A static camera.
 
     Attributes:
-        camera: as OpenCV's five coefficients describe it.
+        camera: with OpenCV's five coefficients.
         lens: its kind.
-        mounting: where it stands, in words.
-        beyond: size [px], order and phase [rad] of what the five coefficients lack; zero size for
-            most.
+        mounting: its position, in words.
+        beyond: amplitude [px], order and phase [rad] of the distortion beyond the five
+            coefficients; zero amplitude for most.
     """
 
     camera: Camera
@@ -50,7 +50,7 @@ class RigCamera:
     beyond: tuple[float, int, float] = (0.0, 3, 0.0)
 
     def project(self, points: Floats) -> Floats:
-        """Return the pixels (..., 2) of world points (..., 3) [m]; NaN without an image."""
+        """Return the pixels (..., 2) of world points (..., 3) [m]; NaN where undefined."""
         pixels = self.camera.project(points.reshape(-1, 3)).reshape(*points.shape[:-1], 2)
         size, order, phase = self.beyond
         if size == 0.0:
@@ -77,10 +77,10 @@ def draw_rig(
     """Return cameras that look at the action.
 
     Args:
-        count: how many.
-        layout: where they stand.
+        count: number of cameras.
+        layout: their arrangement.
         field: length and width of the pitch, or of the space that a lab's people move in [m].
-        action: (places, 3) [m], where heads, hips and feet will be; cameras aim among them.
+        action: (places, 3) [m], positions of heads, hips and feet; cameras aim among them.
         rng: draws everything.
     """
     rig: list[RigCamera] = []
@@ -110,7 +110,7 @@ def _draw_camera(
     aim = share * action.mean(axis=0) + (1.0 - share) * aim
     size = SIZES[rng.integers(len(SIZES))]
     lens = str(rng.choice(list(LENSES), p=list(LENSES.values())))
-    # Wide enough for a share of the action, as whoever mounts a camera turns its zoom.
+    # Choose the zoom for a share of the action, as a camera operator does.
     forward = (aim - place) / np.linalg.norm(aim - place)
     towards = action - place
     towards = towards / np.linalg.norm(towards, axis=-1, keepdims=True)
@@ -146,7 +146,7 @@ def _draw_place(
     field: tuple[float, float],
     rng: np.random.Generator,
 ) -> tuple[Floats, str]:
-    """A camera's centre (3,) [m] and where that is, in words."""
+    """Return a camera's centre (3,) [m] and its position in words."""
     half = 0.5 * np.array(field)
     share = (index + rng.uniform(0.2, 0.8)) / count
     if layout == "hall":
@@ -184,7 +184,7 @@ def _draw_place(
 
 
 def _draw_distortion(lens: str, half: float, rng: np.random.Generator) -> Floats:
-    """k1 k2 p1 p2 k3 of a lens of this kind that sees `half` [rad] to either side."""
+    """Return k1 k2 p1 p2 k3 of a lens of this kind that sees `half` [rad] to either side."""
     # The corner of a 16:9 image is 15 % farther out than its side.
     reach = np.tan(min(1.2 * half, np.radians(62.0)))
     tangential = 2e-4 * rng.standard_normal(2)
@@ -208,7 +208,7 @@ def _draw_distortion(lens: str, half: float, rng: np.random.Generator) -> Floats
 
 
 def _look_at(center: Floats, aim: Floats, roll: float) -> Rigid:
-    """The pose of a camera that sees a point in the middle of its image."""
+    """Return the pose of a camera with a point in the middle of its image."""
     z = (aim - center) / np.linalg.norm(aim - center)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)

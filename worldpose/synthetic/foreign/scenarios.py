@@ -1,4 +1,4 @@
-"""The second world's scenarios: ranges from which every match is drawn."""
+"""Scenarios of the second simulator: parameter ranges of its matches."""
 
 from __future__ import annotations
 
@@ -14,38 +14,38 @@ Range = tuple[float, float]
 
 
 class ForeignScenario(Record):
-    """A kind of match of the second world; a seed draws everything within it."""
+    """A kind of match of the second simulator; a seed draws all its parameters."""
 
     name: Name
     about: str
-    """One sentence for people who choose."""
+    """One sentence for a user who chooses."""
     duration: float = Field(default=4.0, gt=0)
     """[s]"""
     cameras: tuple[int, int]
-    """Fewest and most [1]."""
+    """Minimum and maximum [1]."""
     people: tuple[int, int]
-    """Fewest and most [1]."""
+    """Minimum and maximum [1]."""
     pitch: float = Field(default=1.0, ge=0, le=1)
     """Share of matches on a pitch [1]; the others are in a hall without markings."""
     given: float = Field(default=0.0, ge=0, le=1)
     """Share of matches on a pitch whose cameras are given, with small errors [1]; in a hall they
     always are."""
     layouts: tuple[Layout, ...] = ("bowl", "one-side", "low", "goals", "mixed")
-    """Where cameras stand on a pitch."""
+    """Camera layouts on a pitch."""
     roles: tuple[Role, ...] = ("roam", "duel", "stand", "sprint", "cross")
-    """What people do, drawn for each who replays no recording."""
+    """Roles, drawn for each person who replays no recording."""
     area: Range = (0.5, 0.9)
-    """Part of the pitch's length and width that people use, least and most [1]."""
+    """Part of the pitch's length and width that people use, minimum and maximum [1]."""
     hall: Range = (3.0, 8.0)
-    """Side of the space that people in a hall use, least and most [m]."""
+    """Side of the space that people in a hall use, minimum and maximum [m]."""
     rates: tuple[float, ...] = (23.976, 25.0, 29.97, 30.0, 50.0, 59.94, 60.0)
     """Frame rates to draw from [1/s]."""
     kinds: tuple[float, float, float] = (0.6, 0.33, 0.07)
     """Shares of men, women and children [1]."""
     gestures: float = Field(default=5.0, ge=0)
-    """Of each person, a minute [1/min]."""
+    """Of each person [1/min]."""
     unsynchronised: float = Field(default=0.5, ge=0, le=1)
-    """Share of matches whose cameras expose up to half a frame before or after the clock [1]."""
+    """Share of matches in which cameras expose up to half a frame before or after the clock [1]."""
 
 
 FOREIGN_SCENARIOS: Final = {

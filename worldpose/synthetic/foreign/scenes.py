@@ -1,4 +1,4 @@
-"""A match of the second world in memory: people, rig, detections and statements."""
+"""A match of the second simulator in memory: people, rig, detections and user inputs."""
 
 from __future__ import annotations
 
@@ -49,15 +49,15 @@ from worldpose.synthetic.foreign.visibility import view_people
 Floats = NDArray[np.float64]
 
 MOTION_RATE: Final = 100.0
-"""Least rate at which motion is computed [1/s], a multiple of the frame rate."""
+"""Minimum rate of the motion's computation [1/s], a multiple of the frame rate."""
 REPLAYED: Final = 0.3
-"""Share of people who replay motion capture where there is some [1]."""
+"""Share of people who replay motion capture if there is any [1]."""
 TRACKED: Final = 0.75
-"""Share of matches on a pitch whose people follow tracking data where there is some [1]."""
+"""Share of matches on a pitch whose people follow tracking data if there is any [1]."""
 _OFFSETS: Final = ((0, 1), (0, 1), (-40, 41), (0, 90000))
 """Ranges of a camera's frame number at the match's first frame, one of which is drawn [frame]."""
 ENOUGH_POINTS: Final = 6
-"""A camera to be clicked is mounted so that it sees that many named points [1]."""
+"""Minimum number of named points in the image of a camera to be calibrated from clicks [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class Person:
     Attributes:
         skeleton: the bones.
         joints: (samples, 17, 3) [m], world, at `ForeignScene.times`.
-        motion: where it is from.
+        motion: its origin.
     """
 
     skeleton: Skeleton
@@ -77,22 +77,22 @@ class Person:
 
 @dataclass(frozen=True, eq=False)
 class ForeignScene:
-    """A match of the second world in memory.
+    """A match of the second simulator in memory.
 
     Attributes:
-        fps: frames in a second [1/s].
+        fps: frame rate [1/s].
         truth: anatomical joints; `views` counts the cameras that see the joint.
-        defined: what the detector takes for joints.
+        defined: joints as the detector defines them.
         people: bones, motion and joints of each person.
         cameras: by id.
-        given: cameras as calibration.toml has them, by id; empty where they are to be clicked.
+        given: cameras of calibration.toml, by id; empty if they are to be clicked.
         clicked: by id of a camera without calibration.
-        misnamed: by camera, by wrong name, the name of the point that is there.
+        misnamed: by camera, by wrong name, the name of the point under it.
         reports: detections, by camera.
         offsets: of the cameras' frame numbers, as stated [frame].
-        late: frames that a camera exposes later than stated, by id [frame].
+        late: clock offset of a camera's exposure, by id [frame].
         pitch: None in a hall.
-        record: everything else that was drawn, for world.json.
+        record: all other drawn values, for world.json.
     """
 
     fps: float
@@ -120,7 +120,7 @@ def simulate_foreign_scene(
     recordings: Recordings | None = None,
     calibrated: bool = False,
 ) -> ForeignScene:
-    """Return a match of the second world; the same arguments give the same numbers.
+    """Return a match of the second simulator; the same arguments give the same numbers.
 
     Args:
         scenario: ranges.
@@ -129,7 +129,7 @@ def simulate_foreign_scene(
         cameras: number of them, instead of the scenario's.
         people: number of them, instead of the scenario's.
         recordings: motion capture and tracking data to replay; None = all motion is computed.
-        calibrated: cameras are given exactly.
+        calibrated: return the exact cameras.
     """
     streams = np.random.SeedSequence([seed, *scenario.name.encode()]).spawn(6)
     rng = np.random.default_rng(streams[0])
@@ -166,7 +166,7 @@ def simulate_foreign_scene(
     on_frames = lead + multiple * np.arange(frames)
     joints = np.stack([person.joints[on_frames] for person in persons], axis=1)
 
-    # Heads, hips and feet now and then.
+    # Heads, hips and feet at intervals.
     action = joints[:: max(1, frames // 15)][:, :, [0, 11, 15]].reshape(-1, 3)
     rng = np.random.default_rng(streams[2])
     space = (
@@ -262,7 +262,7 @@ def _draw_people(
     recordings: Recordings | None,
     stream: np.random.SeedSequence,
 ) -> list[Person]:
-    """People with their motion: replayed, tracked, or by social forces."""
+    """Return people with their motion: replayed, tracked, or by social forces."""
     common, *own = stream.spawn(1 + count)
     rng = np.random.default_rng(common)
     rngs = [np.random.default_rng(one) for one in own]
@@ -311,7 +311,7 @@ def _draw_people(
 def _draw_tracking(
     recordings: Recordings | None, times: Floats, rng: np.random.Generator
 ) -> Tracking | None:
-    """Tracking data long enough for the clip, in most matches where there are some."""
+    """Return tracking data long enough for the clip, in most matches if there is any."""
     if recordings is None:
         return None
     needed = times[-1] - LEAD
@@ -329,7 +329,7 @@ def _remount_cameras(
     action: Floats,
     rng: np.random.Generator,
 ) -> list[RigCamera]:
-    """The rig, with new cameras for those that see too few markings."""
+    """Return the rig, with new cameras for those that see too few markings."""
     mounted = []
     for camera in rig:
         for _ in range(12):
@@ -341,5 +341,5 @@ def _remount_cameras(
 
 
 def _flat_ground(x: Floats, y: Floats) -> Floats:
-    """The ground of a hall."""
+    """Return the ground of a hall."""
     return np.asarray(0.0 * x + 0.0 * y)

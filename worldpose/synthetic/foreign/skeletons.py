@@ -3,7 +3,7 @@
 Segment lengths are shares of stature after P. de Leva, Adjustments to Zatsiorsky-Seluyanov's
 segment inertia parameters, Journal of Biomechanics 29, 1996 (men of 1.741 m, women of 1.735 m), and
 R. Drillis, R. Contini, Body segment parameters, 1966; face and neck after the means of the ANSUR
-survey of 1988. No body model takes part.
+survey of 1988. No body model is involved.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ SHARES: Final[dict[Kind, dict[str, float]]] = {
         **{"drop": 0.055, "neck": 0.058, "head": 0.93},
     },
 }
-"""Bones as shares of stature [1]; `drop`, how far the shoulders' centres lie below the neck along
+"""Bones as shares of stature [1]; `drop`, distance of the shoulders' centres below the neck along
 the trunk; `head`, the size of the face relative to a man's."""
 SPREAD: Final = 0.035
 """Standard deviation of a person's share relative to the mean [1]."""
@@ -58,9 +58,9 @@ FACE: Final = np.array(
 ).T
 """Nose, eyes and ears [m] forward, left and up of the middle between the ears."""
 NECK_FORWARD: Final = 0.6
-"""How far the ears lie before the neck's base, as a share of how far they lie above it [1]."""
+"""Ratio of the ears' distance before the neck's base to their height above it [1]."""
 SETTLING: Final = 0.08
-"""Standard deviation in time with which the pelvis is lowered to what the legs reach [s]."""
+"""Standard deviation of the smoothing in time of the pelvis' drop into the legs' reach [s]."""
 
 
 @dataclass(frozen=True)
@@ -68,12 +68,12 @@ class Skeleton:
     """One person's bones.
 
     Attributes:
-        kind: whose proportions they vary.
+        kind: kind of person, which gives the mean proportions.
         stature: [m].
         thigh, shank, upper_arm, forearm: left and right [m].
         ankle: height of the ankle's centre above the sole [m].
         trunk: from the middle of the hips to the base of the neck [m].
-        hips, shoulders: between the joints' centres [m].
+        hips, shoulders: distance between the joints' centres [m].
         drop: from the neck's base down to the line of the shoulders [m].
         neck: from the neck's base up to the ears [m].
         head: size of the face relative to `FACE` [1].
@@ -110,12 +110,12 @@ class Posture:
     Attributes:
         hips, shoulders: from right to left.
         trunk: from the middle of the hips to the neck's base.
-        head_up, gaze: the head's axis, and where the face points.
+        head_up, gaze: axis of the head, and direction of the face.
         upper_arm, forearm, thigh, shank: (frames, 2, 3), left and right, towards the end of the
             limb.
         height: (frames,) of the middle of the hips above the ankles' level on the ground, as a
             share of the leg's length [1].
-        planted: (frames, 2), left and right: the ankle stays where it is.
+        planted: (frames, 2), left and right: the ankle does not move.
     """
 
     hips: Floats
@@ -173,18 +173,18 @@ def place_joints(
 ) -> Floats:
     """Return anatomical joints (frames, 17, 3) [m], world, in COCO-17 order.
 
-    Bone lengths are exact. Planted ankles are held in place as in L. Kovar, J. Schreiner,
-    M. Gleicher, Footskate cleanup for motion capture editing, 2002: the limb's own course is
-    shifted while a foot is planted, the shift fades over to the next in between, the pelvis sinks
-    where the legs do not reach, and knees follow from thigh and shank.
+    Bone lengths are exact. Planted ankles are fixed as in L. Kovar, J. Schreiner, M. Gleicher,
+    Footskate cleanup for motion capture editing, 2002: the limb's own trajectory is shifted while a
+    foot is planted, the shift fades over to the next in between, the pelvis sinks where the legs do
+    not reach, and knees follow from thigh and shank.
 
     Args:
         skeleton: the person's bones.
         posture: directions relative to the heading.
         root: (frames, 2) middle of the hips in plan [m], world.
         heading: (frames,) from the x axis towards y [rad].
-        fps: frames in a second [1/s].
-        ground: what feet stand on.
+        fps: frame rate [1/s].
+        ground: height of the ground under the feet.
     """
     frames = len(root)
     turn = _heading_rotations(heading)
@@ -232,7 +232,7 @@ def place_joints(
 
 
 def _heading_rotations(heading: Floats) -> Floats:
-    """Rotations (frames, 3, 3) from forward, left, up to the world."""
+    """Return rotations (frames, 3, 3) from forward, left, up to the world."""
     cos, sin = np.cos(heading), np.sin(heading)
     zero, one = np.zeros_like(cos), np.ones_like(cos)
     return np.stack(
@@ -246,7 +246,7 @@ def _heading_rotations(heading: Floats) -> Floats:
 
 
 def _hold_ankle(course: Floats, planted: Flags, ankle: float, ground: Ground) -> Floats:
-    """An ankle's course (frames, 3) with its planted stretches brought to rest on the ground."""
+    """Return an ankle's trajectory (frames, 3), at rest on the ground while it is planted."""
     frames = len(course)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], planted, [False]]).astype(np.int8)))
     shift = np.zeros((frames, 3))
@@ -271,7 +271,7 @@ def _hold_ankle(course: Floats, planted: Flags, ankle: float, ground: Ground) ->
 def _pelvis_drop(
     hips: Floats, ankles: Floats, planted: Flags, lengths: Floats, fps: float
 ) -> Floats:
-    """How far the pelvis must sink (frames,) [m] for planted ankles to be within reach."""
+    """Return the pelvis' drop (frames,) [m] that puts planted ankles within reach."""
     reach = 0.998 * lengths.sum(axis=0)
     away = np.linalg.norm((ankles - hips)[..., :2], axis=-1)
     highest = ankles[..., 2] + np.sqrt(np.maximum(reach**2 - away**2, 0.0))
@@ -285,7 +285,7 @@ def _pelvis_drop(
 def _solve_knees(
     hips: Floats, ankles: Floats, pole: Floats, lengths: Floats
 ) -> tuple[Floats, Floats]:
-    """Knees and reachable ankles (frames, 2, 3): the knee bends towards the pole."""
+    """Return knees and reachable ankles (frames, 2, 3): the knee bends towards the pole."""
     thigh, shank = lengths[0][:, None], lengths[1][:, None]
     line = ankles - hips
     far = np.linalg.norm(line, axis=-1, keepdims=True)

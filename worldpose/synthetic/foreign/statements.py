@@ -1,4 +1,4 @@
-"""What people state about a match: clicks in images, cameras from elsewhere, the pitch."""
+"""User inputs of a match: clicks in images, cameras from another calibration, the pitch."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from worldpose.synthetic.foreign.rigs import RigCamera
 Floats = NDArray[np.float64]
 
 PAINTING: Final = 0.015
-"""How far painted points lie off the Laws of the Game, standard deviation along each axis [m]."""
+"""Error of painted points against the Laws of the Game, standard deviation along each axis [m]."""
 SURVEY: Final = 0.005
 """Of a surveyed point, along each axis [m]."""
 TAPE: Final = 0.02
 """Of a length measured by tape [m]."""
 CLICK: Final = (0.3, 1.1)
-"""Spread of one person's clicks in a image of 1920 px, least and most [px]."""
+"""Spread of one person's clicks in an image of 1920 px, minimum and maximum [px]."""
 CLICK_TAIL: Final = 4.0
 """Degrees of freedom of clicks (Student's t) [1]."""
 MISNAMED: Final = 0.04
 """Share of cameras with a click under a wrong name [1]."""
 FEW: Final = 9
-"""Where fewer points are in a image, lines and arcs are drawn too [1]."""
+"""If an image shows fewer points, lines and arcs are drawn, too [1]."""
 _CONFUSED: Final = (("left", "right"), ("near", "far"), ("front", "back"))
 _MARGIN: Final = 6.0
 
 
 @dataclass(frozen=True, eq=False)
 class Pitch:
-    """A pitch as it is, and as it is stated.
+    """True and stated positions of a pitch.
 
     Attributes:
-        painted: with every named point where it really is.
+        painted: with the true position of every named point.
         stated: pitch.json.
-        how: where the statement comes from.
+        how: origin of the statement.
     """
 
     painted: PitchSpec
@@ -83,7 +83,7 @@ def _points(places: dict[str, Floats]) -> dict[str, tuple[float, float, float]]:
 
 
 def visible_points(camera: RigCamera, pitch: PitchTemplate) -> list[str]:
-    """Return the named points of the pitch that are in a camera's image."""
+    """Return the named points of the pitch inside a camera's image."""
     names = list(pitch.points)
     pixels = camera.project(pitch.positions(names))
     inside = _is_inside(camera, pixels)
@@ -93,11 +93,11 @@ def visible_points(camera: RigCamera, pitch: PitchTemplate) -> list[str]:
 def click_points(
     camera: RigCamera, pitch: PitchTemplate, rng: np.random.Generator
 ) -> tuple[ClickedMarkings, dict[str, str]]:
-    """Return what a person clicks, and by wrong name the name of the point that is there.
+    """Return a person's clicks, and by wrong name the name of the point under it.
 
     Args:
         camera: the true one.
-        pitch: as it is painted.
+        pitch: the painted pitch.
         rng: this camera's own.
     """
     spread = rng.uniform(*CLICK) * np.sqrt(camera.camera.image_size[0] / 1920.0)
@@ -146,7 +146,7 @@ def _round_click(camera: RigCamera, xy: Floats) -> tuple[float, float]:
 
 
 def measure_camera(camera: Camera, accuracy: float, rng: np.random.Generator) -> Camera:
-    """Return a camera as another calibration found it.
+    """Return a camera with the errors of another calibration.
 
     Args:
         camera: the true one.

@@ -1,7 +1,7 @@
 """Trajectories of people over the ground: social forces, or tracking data of real players.
 
 People without tracking data follow D. Helbing, P. Molnar, Social force model for pedestrian
-dynamics, Physical Review E 51, 1995: everyone relaxes to the velocity that leads to a goal, and
+dynamics, Physical Review E 51, 1995: each person relaxes to the velocity that leads to a goal, and
 other people push them away.
 """
 
@@ -19,19 +19,19 @@ Floats = NDArray[np.float64]
 Role = Literal["roam", "duel", "cross", "stand", "sprint"]
 
 LEAD: Final = 2.0
-"""Time before the first frame and behind the last in which people already move [s]."""
+"""Time before the first frame and after the last in which people already move [s]."""
 TRACK_SMOOTHING: Final = 0.3
 """Standard deviation in time of the smoothing of tracking data [s]."""
 FASTEST: Final = 9.0
 """[m/s]"""
 _RELAXATION: Final = 0.45
-"""Time in which a person takes on a wanted velocity [s]."""
+"""Time constant of a person's velocity [s]."""
 _PUSH: Final = (12.0, 0.25)
-"""Of another person who touches: acceleration [m/s^2], and the distance over which it fades [m]."""
+"""Repulsion by a person in contact: acceleration [m/s^2], and its decay distance [m]."""
 _HARDEST: Final = (6.0, 25.0)
-"""Largest acceleration by legs, and by others [m/s^2]."""
+"""Maximum acceleration by legs, and by others [m/s^2]."""
 _BODY: Final = 0.42
-"""Distance of the middles of two people who touch [m]."""
+"""Distance between the middles of two people in contact [m]."""
 _SPEEDS: Final[dict[Role, tuple[float, float]]] = {
     "roam": (0.6, 4.5),
     "duel": (0.8, 5.0),
@@ -39,7 +39,7 @@ _SPEEDS: Final[dict[Role, tuple[float, float]]] = {
     "stand": (0.3, 1.2),
     "sprint": (4.5, 8.5),
 }
-"""Slowest and fastest wanted speed of a role [m/s]."""
+"""Minimum and maximum desired speed of a role [m/s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +49,8 @@ class Trajectory:
     Attributes:
         times: (samples,) [s], evenly spaced.
         root: (samples, 2) middle of the hips [m], world.
-        heading: (samples,) direction that the body faces [rad], continuous.
-        source: where it is from, for the reference.
+        heading: (samples,) direction of the body [rad], continuous.
+        source: origin, for the reference.
     """
 
     times: Floats
@@ -65,7 +65,7 @@ def follow_tracks(
     """Return the trajectory of a tracked player.
 
     Args:
-        times: (samples,) wanted [s].
+        times: (samples,) desired [s].
         clock: (rows,) of the tracking data [s].
         xy: (rows, 2) [m].
         scale: (2,) of this pitch to the pitch of the data [1].
@@ -109,10 +109,10 @@ def wander(
 
     Args:
         times: (samples,) [s], evenly spaced.
-        roles: one a person; duels are with the person before in the list.
+        roles: one per person; duels are with the previous person in the list.
         center: (2,) of the area [m].
         size: (2,) of the area [m].
-        obstacles: people whose trajectories are known; the others avoid them.
+        obstacles: people with fixed trajectories; the others avoid them.
         rng: draws places, goals and speeds.
     """
     if not roles:
@@ -172,7 +172,7 @@ def wander(
 def _draw_places(
     count: int, center: Floats, size: Floats, taken: list[Floats], rng: np.random.Generator
 ) -> Floats:
-    """Places (count, 2) in an area, apart from each other where there is room."""
+    """Return places (count, 2) in an area, apart from each other where there is room."""
     places: list[Floats] = []
     for _ in range(count):
         drawn = center + size * rng.uniform(-0.48, 0.48, (30, 2))
@@ -196,7 +196,7 @@ def _draw_goal(
 
 
 def _repulsion(place: Floats, others: Floats) -> Floats:
-    """Accelerations (persons, 2) [m/s^2] by which people push each other apart."""
+    """Return accelerations (persons, 2) [m/s^2] by which people repel each other."""
     everyone = np.concatenate([place, others])
     apart = place[:, None] - everyone
     far = np.linalg.norm(apart, axis=-1)
@@ -206,7 +206,7 @@ def _repulsion(place: Floats, others: Floats) -> Floats:
 
 
 def _limit_length(vectors: Floats, most: float) -> Floats:
-    """Vectors (persons, 2) that are no longer than `most`."""
+    """Return vectors (persons, 2) of length at most `most`."""
     size = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors * np.minimum(1.0, most / np.maximum(size, 1e-9)))
 
@@ -214,7 +214,7 @@ def _limit_length(vectors: Floats, most: float) -> Floats:
 def _headings(
     velocity: Floats, step: float, towards: Floats | None, rng: np.random.Generator | None = None
 ) -> Floats:
-    """Heading (samples,) [rad]: direction of motion, or of `towards` while slow."""
+    """Return the heading (samples,) [rad]: direction of motion, or of `towards` while slow."""
     speed = np.linalg.norm(velocity, axis=-1)
     begin = 0.0 if rng is None else float(rng.uniform(-np.pi, np.pi))
     aim = velocity + 1e-9

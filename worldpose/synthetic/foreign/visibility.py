@@ -1,4 +1,4 @@
-"""What of people each camera can see: limbs as capsules that hide what is behind them."""
+"""Visibility of people in each camera: limbs as capsules that occlude points behind them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CAPSULES: Final = (
     *((5, 7, 0.028), (6, 8, 0.028), (7, 9, 0.024), (8, 10, 0.024)),
     *((11, 13, 0.045), (12, 14, 0.045), (13, 15, 0.03), (14, 16, 0.03), (3, 4, 0.055)),
 )
-"""Joints between which a body part lies, and its half width [stature]."""
+"""Joint pairs of body parts, and their half widths [stature]."""
 _TRUNK: Final = (5, 6, 11, 12)
 
 
@@ -29,12 +29,12 @@ class View:
     Attributes:
         pixels: (frames, persons, 17, 2) [px]; NaN behind the camera.
         inside: (frames, persons, 17) in the image and not behind a pillar.
-        hider: (frames, persons, 17) int16, the person before a joint, -1 for none.
+        hider: (frames, persons, 17) int16, the person in front of a joint, -1 for none.
         behind_self: (frames, persons, 17) behind the person's own trunk.
         size: (frames, persons) height of a standing person there [px].
-        azimuth, elevation: (frames, persons) where the camera is, seen from the body [rad]: 0 in
-            front, growing to the left; 0 level, growing upwards.
-        scale: (frames, persons) pixels a metre has there [px/m].
+        azimuth, elevation: (frames, persons) direction of the camera, seen from the body [rad]: 0
+            in front, growing to the left; 0 level, growing upwards.
+        scale: (frames, persons) pixels per metre there [px/m].
     """
 
     pixels: Floats
@@ -48,20 +48,20 @@ class View:
 
     @property
     def seen(self) -> Flags:
-        """Joints (frames, persons, 17) that no other person and no border hides."""
+        """Return the joints (frames, persons, 17) in the image that no other person occludes."""
         return np.asarray(self.inside & (self.hider < 0))
 
 
 def view_people(
     camera: RigCamera, joints: Floats, statures: Floats, pillar: tuple[float, float] | None
 ) -> View:
-    """Return where people are in the image and what hides them.
+    """Return positions of people in the image and their occlusions.
 
     Args:
         camera: true camera.
         joints: (frames, persons, 17, 3) [m], world.
         statures: (persons,) [m].
-        pillar: left and right border of a strip that something hides [px], or None.
+        pillar: left and right border of an occluded strip [px], or None.
     """
     pixels = camera.project(joints)
     inside = camera.sees(pixels)
@@ -87,7 +87,7 @@ def view_people(
 
 
 def facing(joints: Floats) -> tuple[Floats, Floats]:
-    """Level unit vectors (..., 3) forward and to the left of bodies (..., 17, 3)."""
+    """Return horizontal unit vectors (..., 3) forward and to the left of bodies (..., 17, 3)."""
     across = joints[..., 5, :] - joints[..., 6, :] + joints[..., 11, :] - joints[..., 12, :]
     across = across * [1.0, 1.0, 0.0]
     left = across / np.linalg.norm(across, axis=-1, keepdims=True)
@@ -120,7 +120,7 @@ def _find_hiders(pixels: Floats, depth: Floats, size: Floats) -> NDArray[np.int1
 
 
 def _is_covered(points: Floats, body: Floats, size: Floats) -> Flags:
-    """Which points (rows, joints, 2) a body (rows, 17, 2) of a size (rows,) [px] covers."""
+    """Return which points (rows, joints, 2) a body (rows, 17, 2) of a size (rows,) [px] covers."""
     covered = np.zeros(points.shape[:2], np.bool_)
     for one, two, width in CAPSULES:
         begin, line = body[:, [one]], body[:, [two]] - body[:, [one]]
@@ -134,7 +134,7 @@ def _is_covered(points: Floats, body: Floats, size: Floats) -> Flags:
 def _is_behind_trunk(
     camera: RigCamera, joints: Floats, pixels: Floats, depth: Floats, size: Floats
 ) -> Flags:
-    """Joints (frames, persons, 17) more than a trunk's half depth behind the own trunk."""
+    """Return joints (frames, persons, 17) over half a trunk's depth behind the own trunk."""
     frames, persons = depth.shape
     own = camera.camera.cam_from_world.apply(joints.reshape(-1, 3))[:, 2].reshape(pixels.shape[:3])
     behind = own > depth[..., None] + 0.09

@@ -1,4 +1,4 @@
-"""Poses that are too much alike to be of two people."""
+"""Suppression of poses by object keypoint similarity (OKS)."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from worldpose.detection.interfaces import People, Poses
 Floats = NDArray[np.float64]
 
 DOUBT: Final = 0.5
-"""Share of its score that a box loses which has a better one's pose [1]."""
+"""Share of its score that a box with the pose of a better box loses [1]."""
 
 
 def likeness(keypoints: Floats, area: Floats) -> Floats:
-    """COCO's object keypoint similarity of every pair of poses (people, people) [1].
+    """Return COCO's object keypoint similarity of every pair of poses (people, people) [1].
 
     Args:
         keypoints: (people, 17, 2) [px]; NaN where not found.
@@ -36,16 +36,16 @@ def likeness(keypoints: Floats, area: Floats) -> Floats:
 def told_apart(
     people: People, poses: Poses, least_keypoint: float, same_pose: float
 ) -> tuple[People, Poses]:
-    """Return who has a pose, and one of his own; of two boxes with one pose the better stays.
+    """Return the people that have a pose different from that of every better box.
 
-    The more a pose is like that of a better box, the lower its score falls (soft suppression,
-    Bodla, 2017): who stands behind somebody is kept, who is somebody seen twice comes last.
+    The more a pose resembles that of a better box, the lower its score falls (soft suppression,
+    Bodla, 2017): a person behind another stays, a duplicate ranks last.
 
     Args:
-        people: with the boxes that are kept.
+        people: with their boxes.
         poses: of each.
         least_keypoint: a keypoint below this confidence was not found [1].
-        same_pose: likeness of poses above which two boxes are of one person [1].
+        same_pose: similarity of poses above which two boxes are of one person [1].
     """
     with np.errstate(invalid="ignore"):
         found = (poses.confidence >= least_keypoint) & np.isfinite(poses.keypoints).all(axis=2)

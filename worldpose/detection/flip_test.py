@@ -1,4 +1,4 @@
-"""Poses looked at twice, as they are and in the mirror: errors of one side cancel."""
+"""Flip test: mean of the poses of an image and of its mirror image, which cancels side bias."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from numpy.typing import NDArray
 from worldpose.detection.interfaces import Picture, PoseEstimator, Poses
 
 SIDES: Final = (0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15)
-"""The joint of COCO-17 that each joint is in the mirror."""
+"""The COCO-17 joint that each joint becomes in the mirror image."""
 
 
 class Mirrored:
-    """An estimator whose poses are the mean of what it sees in a picture and in its mirror image.
+    """An estimator whose poses are the mean over an image and its mirror image.
 
-    Means are weighted by confidence; a keypoint that only one of the two shows is taken from it.
+    Means are weighted by confidence; a keypoint that only one of the two shows comes from that one.
     """
 
     def __init__(self, estimator: PoseEstimator) -> None:
         self._estimator = estimator
 
     def estimate(self, picture: Picture, boxes: NDArray[np.float64]) -> Poses:
-        """The pose of each box."""
+        """Return the pose in each box."""
         last = picture.shape[1] - 1
         seen = self._estimator.estimate(picture, boxes)
         mirror = self._estimator.estimate(
@@ -45,5 +45,5 @@ class Mirrored:
 
 
 def _turned(boxes: NDArray[np.float64], last: int) -> NDArray[np.float64]:
-    """Boxes (people, 4) in the mirror of a picture whose last column is `last` [px]."""
+    """Return boxes (people, 4) in the mirror image of a frame whose last column is `last` [px]."""
     return np.asarray(boxes[:, [2, 1, 0, 3]] * [-1.0, 1.0, -1.0, 1.0] + [last, 0.0, last, 0.0])
