@@ -195,7 +195,7 @@ def _machines(
             ask_for = stack.enter_context(kept_complete(cluster))
             request = replace(request, dask=cluster.scheduler_address, security=cluster.security)
         else:
-            _require_scheduler(request.dask)
+            _require_scheduler(request.dask, request.security)
         # Imported here: it takes seconds, while server and workers start.
         import flows.match  # noqa: F401
 
@@ -246,12 +246,14 @@ def _without_heartbeats() -> AbstractContextManager[Any]:
     return temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None})
 
 
-def _require_scheduler(address: str) -> None:
+def _require_scheduler(address: str, security: Security | None) -> None:
     from distributed import Client
 
+    client = {} if security is None else {"security": security}
+
     try:
-        Client(address, timeout=DASK_SECONDS, set_as_default=False).close()
-    except (OSError, ValueError) as error:
+        Client(address, timeout=DASK_SECONDS, set_as_default=False, **client).close()
+    except (OSError, ValueError, TypeError) as error:  # TypeError: tls:// without a certificate
         raise InputError(
             f"--dask {address}",
             expected="a running Dask scheduler, as tcp://host:port",

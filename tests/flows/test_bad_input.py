@@ -201,6 +201,7 @@ def test_a_match_folder_that_is_gone_hides_neither_results_nor_other_matches(mat
     ("arguments", "environment", "told"),
     [
         (["--dask", "tcp://127.0.0.1:9"], {}, "expected a running Dask scheduler"),
+        (["--dask", "tls://127.0.0.1:9"], {}, "expected a running Dask scheduler"),
         ([], {"PREFECT_API_URL": "http://127.0.0.1:9/api"}, "expected a running Prefect server"),
     ],
 )

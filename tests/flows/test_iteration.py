@@ -246,3 +246,15 @@ def test_iterations_are_runs_that_a_second_call_finds_finished(server, tiny, tmp
     assert (again["run"], again["executed"]) == (answer["run"], 0)
     assert again["kept"] == answer["kept"]
     assert worldpose(*asked, "--until", "tracking").code == 2
+
+
+def test_the_command_runs_two_iterations_on_the_workers_of_one_run(tmp_path):
+    short = tmp_path / "match"
+    succeed("simulate", "--scenario", "tiny", "--duration", 0.3, "--no-stills", "--out", short)
+    project = tmp_path / "project"
+    answer = succeed("run", short, "--project", project, "--iterations", 2, "--json")
+    assert answer.json["failed"] == 0
+    assert answer.err.count("starting Prefect and Dask") == 1
+    store = Store.open(str(project))
+    (match,) = store.matches()
+    assert [store.run(match, run).iteration for run in store.runs(match)] == [1, 2]
