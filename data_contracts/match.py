@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from functools import cached_property
-from typing import Any, Final, Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -21,9 +21,6 @@ from data_contracts.records import (
     PersonId,
     Record,
 )
-
-MAX_UNIT_LENGTH: Final = 63
-"""A result of one camera in one clip is named by both ids with a dot between them."""
 
 
 class CameraSpec(Record):
@@ -92,12 +89,6 @@ class MatchSpec(Record):
         twice = sorted({name for name in ids if ids.count(name) > 1})
         if twice:
             raise ValueError(f"ids of cameras and clips must differ; used twice: {twice}")
-        longest = max(len(camera.id) for camera in self.cameras), max(len(c.id) for c in self.clips)
-        if sum(longest) > MAX_UNIT_LENGTH:
-            raise ValueError(
-                f"ids of a camera and a clip must have at most {MAX_UNIT_LENGTH} characters "
-                f"together; the longest have {longest[0]} and {longest[1]}"
-            )
         broadcast = {camera.id for camera in self.cameras if camera.kind == "broadcast"}
         for clip in self.clips:
             if clip.broadcast is not None and clip.broadcast not in broadcast:

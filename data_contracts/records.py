@@ -10,7 +10,10 @@ CONTRACT_VERSION: Final[Literal[1]] = 1
 """Version of all contracts in this package; readers refuse any other (docs/conventions.md)."""
 
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
-"""An id that is safe as a file and object name: cameras, clips, matches, units."""
+"""An id that is safe as a file and object name: cameras, clips, matches."""
+
+UnitName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,128}$")]
+"""A unit of a stage: an id, or the ids of a camera and a clip with a dot between them."""
 
 Digest = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 """SHA-256 in lower-case hexadecimal."""

@@ -10,7 +10,7 @@ from typing import Literal
 
 from pydantic import JsonValue
 
-from data_contracts.records import CONTRACT_VERSION, Amount, Key, Name, Record
+from data_contracts.records import CONTRACT_VERSION, Amount, Key, Name, Record, UnitName
 
 
 class Recipe(Record):
@@ -19,7 +19,7 @@ class Recipe(Record):
     contract: Literal[1] = CONTRACT_VERSION
     match_id: Name
     stage: Name
-    unit: Name
+    unit: UnitName
     sources: dict[str, JsonValue]
     """What the match folder gives: digests of files, and values such as the frame rate."""
     inputs: dict[str, Key]

@@ -250,10 +250,11 @@ def _require_scheduler(address: str, security: Security | None) -> None:
     from distributed import Client
 
     client = {} if security is None else {"security": security}
-
     try:
         Client(address, timeout=DASK_SECONDS, set_as_default=False, **client).close()
-    except (OSError, ValueError, TypeError) as error:  # TypeError: tls:// without a certificate
+    except (OSError, ValueError, TypeError) as error:
+        if isinstance(error, TypeError) and not address.startswith("tls://"):
+            raise  # of TLS, distributed says so that no certificate is configured
         raise InputError(
             f"--dask {address}",
             expected="a running Dask scheduler, as tcp://host:port",

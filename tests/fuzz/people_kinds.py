@@ -884,7 +884,7 @@ kinds(
     "ids",
     {
         "camera_id_with_dots": "cam.1.left",
-        "camera_id_of_58_letters": "c" * 58,
+        "camera_id_of_64_letters": "c" * 64,
         "camera_id_with_capitals": "Cam_One-2",
         "camera_id_of_digits": "0001",
         "camera_id_of_truth": "true",
@@ -896,7 +896,6 @@ kinds(
 kinds(
     "ids",
     {
-        "camera_id_of_64_letters": "c" * 64,
         "camera_id_of_65_letters": "c" * 65,
         "camera_id_with_umlaut": "kamera-süd",
         "camera_id_of_emoji": "cam\U0001f600",

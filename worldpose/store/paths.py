@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from pydantic import TypeAdapter, ValidationError
 
-from data_contracts.records import Key, Name
+from data_contracts.records import Key, Name, UnitName
 from data_contracts.work import Work
 from worldpose.errors import InputError
 
@@ -16,6 +16,7 @@ STAGING = "staging"
 DAMAGED = ".damaged"
 
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
+_UNIT: TypeAdapter[str] = TypeAdapter(UnitName)
 _KEY: TypeAdapter[str] = TypeAdapter(Key)
 
 
@@ -29,8 +30,12 @@ class ResultId:
     key: str
 
     def __post_init__(self) -> None:
-        for name in (self.match_id, self.stage, self.unit):
+        for name in (self.match_id, self.stage):
             checked_name(name)
+        try:
+            _UNIT.validate_python(self.unit)
+        except ValidationError as error:
+            raise _bad_name("unit of a result", "1 to 129", self.unit) from error
         try:
             _KEY.validate_python(self.key)
         except ValidationError as error:
@@ -123,12 +128,16 @@ def checked_name(name: str) -> str:
     try:
         return _NAME.validate_python(name)
     except ValidationError as error:
-        raise InputError(
-            "name of a match, stage, unit or run",
-            expected="1 to 64 letters, digits, '.', '_' or '-', the first a letter or digit",
-            found=repr(name),
-            todo="Rename it.",
-        ) from error
+        raise _bad_name("name of a match, stage or run", "1 to 64", name) from error
+
+
+def _bad_name(where: str, length: str, name: str) -> InputError:
+    return InputError(
+        where,
+        expected=f"{length} letters, digits, '.', '_' or '-', the first a letter or digit",
+        found=repr(name),
+        todo="Rename it.",
+    )
 
 
 def checked_path(path: str) -> str:

@@ -79,7 +79,6 @@ FIRST = "match.yaml: cameras[0]"
             "used twice: ['cam2']",
             "named",
         ),
-        (match(cameras=[camera(id=64 * "c")]), "match.yaml", "agree", "at most 63", "named"),
         ([1], "match.yaml", "a mapping", "a list of 1", "Correct"),
         (None, "match.yaml", "a mapping", "None", "Correct"),
     ],

@@ -296,7 +296,17 @@ def test_results_are_listed_by_match(store: Store) -> None:
     assert len(store.results()) == 3
 
 
-@pytest.mark.parametrize("name", ["..", "a/b", "", "/etc", "a\0b", "a\n", "x" * 65, "é"])
+def test_a_unit_holds_the_ids_of_a_camera_and_a_clip_of_64_letters_each(tmp_path: Path) -> None:
+    store = Store.create(tmp_path / "project")
+    publish(store, sample_recipe("c" * 64 + "." + "d" * 64))
+    assert [len(result.unit) for result in store.results("final")] == [129]
+    with pytest.raises(InputError):
+        store.has("c" * 65, "tracking", "clip", "0" * 32)
+    with pytest.raises(InputError):
+        store.registration("c" * 65)
+
+
+@pytest.mark.parametrize("name", ["..", "a/b", "", "/etc", "a\0b", "a\n", "x" * 130, "é"])
 def test_name_that_could_leave_the_project_is_refused(tmp_path: Path, name: str) -> None:
     store = Store.create(tmp_path / "project")
     with pytest.raises(InputError):
