@@ -20,11 +20,11 @@ from scipy.stats import chi2
 from static_accuracy import SHARES, ground_errors
 
 from worldpose.bundle_adjustment import Clicks, Clip, adjust_cameras
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
+from worldpose.simulation import SCENARIOS, Scenario, Scene, simulate_scene
+from worldpose.simulation.rendering import render_pitch
 from worldpose.static_calibration import StaticCalibration, calibrate, project_with_jacobian
-from worldpose.synthetic import SCENARIOS, Scenario, Scene, simulate_scene
-from worldpose.synthetic.rendering import render_pitch
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 

@@ -33,12 +33,12 @@ from worldpose.body_fitting import (
     sight_people,
 )
 from worldpose.body_fitting.monocular import monocular_of
-from worldpose.cameras import Camera
 from worldpose.evaluation import evaluate_joints
 from worldpose.formats import JointTracks
+from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-from worldpose.synthetic import SCENARIOS, Scene, simulate_scene
-from worldpose.synthetic.monocular import MonocularErrors, estimate_bodies
+from worldpose.simulation import SCENARIOS, Scene, simulate_scene
+from worldpose.simulation.monocular import MonocularErrors, estimate_bodies
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, reconstruct_joints, unswap
 

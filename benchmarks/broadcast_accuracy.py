@@ -33,8 +33,8 @@ from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE
 from worldpose.broadcast_calibration.normal_equations import point_row
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
 from worldpose.broadcast_calibration.weights import roughness
-from worldpose.cameras import Rigid
 from worldpose.formats import read_camera, read_joints
+from worldpose.geometry import Rigid
 from worldpose.ingest import MatchFolder, read_match, read_unit
 from worldpose.pitch import PitchTemplate
 from worldpose.video import VideoReader

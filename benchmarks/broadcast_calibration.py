@@ -29,8 +29,8 @@ from worldpose.broadcast_calibration.settings import BroadcastPrior
 from worldpose.broadcast_calibration.smoothness import second_differences
 from worldpose.broadcast_calibration.solving import Problem, equations_at, solve
 from worldpose.pitch import PitchTemplate
-from worldpose.synthetic.broadcast import film
-from worldpose.synthetic.settings import BroadcastSettings
+from worldpose.simulation.broadcast import film
+from worldpose.simulation.settings import BroadcastSettings
 
 Floats = NDArray[np.float64]
 SMOOTH = np.array([np.inf, np.inf, np.inf, 1e-4, 1e-3, 1e-2, 1e-2])

@@ -34,14 +34,14 @@ from worldpose.broadcast_calibration.solving import Problem, solve
 from worldpose.broadcast_calibration.uncertainty import uncertainty_of
 from worldpose.broadcast_calibration.weights import lasting_of, smoothness_of
 from worldpose.pitch import PitchTemplate
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import simulate_scene
 from worldpose.static_calibration.line_samples import (
     LineSamples,
     sample_markings,
     see_lines,
     thinned,
 )
-from worldpose.synthetic.scenarios import SCENARIOS
-from worldpose.synthetic.scene import simulate_scene
 
 Floats = NDArray[np.float64]
 NOISE = 0.15

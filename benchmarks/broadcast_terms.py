@@ -31,7 +31,7 @@ from worldpose.formats import JointTracks, read_joints
 from worldpose.ingest import read_match
 from worldpose.pitch import PitchTemplate
 from worldpose.reports.broadcast import before_after_picture, largest_pose_changes
-from worldpose.synthetic import SCENARIOS, simulate_match
+from worldpose.simulation import SCENARIOS, simulate_match
 from worldpose.video import VideoReader
 
 STILL = {"smooth": False, "flow_weight": 0.0}

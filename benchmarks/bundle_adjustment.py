@@ -31,9 +31,9 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 
 from worldpose.bundle_adjustment import Problem, SolverSettings, solve
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
+from worldpose.simulation.stadium import looking
 from worldpose.static_calibration import PARAMETERS, stepped
-from worldpose.synthetic.stadium import looking
 
 Solution = tuple[Camera, np.ndarray]
 Run = Callable[[], Solution]

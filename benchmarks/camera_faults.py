@@ -3,8 +3,8 @@
     python benchmarks/camera_faults.py [--rigs 60] [--seed 0] [--data FOLDER]
 
 Half of the rigs have one fault each, of each kind in turn; the other half have none. Rigs, people
-and detector are drawn here and share no code with `worldpose.synthetic`: 4 to 18 cameras at heights
-of 2 to 35 m, focal lengths from wide to long, people on recorded players' paths (FOLDER, or
+and detector are drawn here and share no code with `worldpose.simulation`: 4 to 18 cameras at
+heights of 2 to 35 m, focal lengths from wide to long, people on recorded players' paths (FOLDER, or
 WORLDPOSE_TEST_DATA) or on random ones, as stick models or motion capture, and a detector with a
 bias, heavy tails, misses, false positives and an uninformative confidence.
 """
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.camera_consistency import ConsistencySettings, check_consistency
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 
 KINDS = ("flipped", "mirrored", "focal", "lens", "clock", "frame_rate", "swapped", "duplicate")
 FLIPPED_JOINTS = [0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15]

@@ -19,7 +19,7 @@ from functools import partial
 import cv2
 import numpy as np
 
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 
 CAMERA = Camera(
     focal=np.array([3200.0, 3200.0]),

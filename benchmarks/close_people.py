@@ -1,9 +1,9 @@
 """Clips of people who pass close to each other in a room, seen by few cameras, with ground truth.
 
-For measuring identity switches of tracking. It shares no code with `worldpose.synthetic`: skeleton,
-motion, cameras and detector errors are its own. The detector makes the errors that swap identities:
-it misses a person behind another, merges both into one detection, reports joints of the person in
-front, and errs over many frames in the same direction.
+For measuring identity switches of tracking. It shares no code with `worldpose.simulation`:
+skeleton, motion, cameras and detector errors are its own. The detector makes the errors that swap
+identities: it misses a person behind another, merges both into one detection, reports joints of the
+person in front, and errs over many frames in the same direction.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 
 FPS = 25.0
 IMAGE = np.array([1032.0, 776.0])

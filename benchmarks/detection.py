@@ -24,13 +24,13 @@ from worldpose.detection import People
 from worldpose.detection.bundled import embedded_detector, embedded_pose
 from worldpose.detection.interfaces import Picture
 from worldpose.pitch import PitchTemplate
-from worldpose.synthetic import SCENARIOS
-from worldpose.synthetic.casting import dress_people, roles_of
-from worldpose.synthetic.crowd import gather
-from worldpose.synthetic.filming import open_view, render_frame
-from worldpose.synthetic.looks import RenderingSettings
-from worldpose.synthetic.settings import RigSettings
-from worldpose.synthetic.stadium import place_camera
+from worldpose.simulation import SCENARIOS
+from worldpose.simulation.casting import dress_people, roles_of
+from worldpose.simulation.crowd import gather
+from worldpose.simulation.filming import open_view, render_frame
+from worldpose.simulation.looks import RenderingSettings
+from worldpose.simulation.settings import RigSettings
+from worldpose.simulation.stadium import place_camera
 from worldpose.video import open_video, write_video
 
 Result = TypeVar("Result")

@@ -16,7 +16,6 @@ import numpy as np
 
 from worldpose.body import find_body
 from worldpose.body_fitting import BodyFittingSettings, find_sightings, fit_bodies
-from worldpose.cameras import Camera
 from worldpose.filtering import (
     FilteringSettings,
     Suspects,
@@ -26,10 +25,11 @@ from worldpose.filtering import (
     perceived_joints,
     view_bodies,
 )
+from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-from worldpose.synthetic.scenarios import SCENARIOS
-from worldpose.synthetic.scene import simulate_scene
-from worldpose.synthetic.settings import Scenario
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import simulate_scene
+from worldpose.simulation.settings import Scenario
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, reconstruct_joints, unswap
 

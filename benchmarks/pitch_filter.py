@@ -20,18 +20,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
 from worldpose.detection import DetectionSettings, PeopleFinder, Place
 from worldpose.detection.boxes import overlaps
 from worldpose.detection.bundled import embedded_detector, embedded_pose
 from worldpose.detection.interfaces import Picture
+from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-from worldpose.synthetic import SCENARIOS
-from worldpose.synthetic.casting import dress_people, roles_of, stand_by
-from worldpose.synthetic.filming import open_view, render_frame
-from worldpose.synthetic.image_formation import RenderedFrame
-from worldpose.synthetic.scene import simulate_scene
-from worldpose.synthetic.settings import Scenario
+from worldpose.simulation import SCENARIOS
+from worldpose.simulation.casting import dress_people, roles_of, stand_by
+from worldpose.simulation.filming import open_view, render_frame
+from worldpose.simulation.image_formation import RenderedFrame
+from worldpose.simulation.scene import simulate_scene
+from worldpose.simulation.settings import Scenario
 
 Floats = NDArray[np.float64]
 

@@ -23,8 +23,8 @@ import cv2
 import numpy as np
 
 from data_contracts.pitch import PitchSpec
-from worldpose.cameras import Camera
 from worldpose.errors import InputError
+from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import (
     CameraPrior,

@@ -47,9 +47,9 @@ from worldpose.evaluation.matching import joint_distances, match_people
 from worldpose.evaluation.regions import JOINT_GROUPS, region_counts
 from worldpose.formats import JointTracks, read_joints
 from worldpose.ingest import read_match
+from worldpose.simulation import SCENARIOS, simulate_match
+from worldpose.simulation.foreign import FOREIGN_SCENARIOS, simulate_foreign_match
 from worldpose.store import Store, open_run
-from worldpose.synthetic import SCENARIOS, simulate_match
-from worldpose.synthetic.foreign import FOREIGN_SCENARIOS, simulate_foreign_match
 
 MIX = (
     *("foreign-match", "foreign-lab", "foreign-mixed", "foreign-two", "foreign-match"),

@@ -22,13 +22,13 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from data_contracts.static_calibration import ClickedMarkings
-from worldpose.cameras import Camera
 from worldpose.errors import InputError
 from worldpose.evaluation.cameras import surface_points
+from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
+from worldpose.simulation import SCENARIOS, simulate_scene
+from worldpose.simulation.rendering import render_pitch
 from worldpose.static_calibration import CameraEstimate, StaticCalibration, calibrate
-from worldpose.synthetic import SCENARIOS, simulate_scene
-from worldpose.synthetic.rendering import render_pitch
 
 Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]

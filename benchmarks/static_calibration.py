@@ -24,8 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 from worldpose.pitch import PitchTemplate
+from worldpose.simulation.rendering import render_pitch
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.stadium import place_camera
 from worldpose.static_calibration.line_refinement import refine_on_lines
 from worldpose.static_calibration.line_search import LineSearch
 from worldpose.static_calibration.parameters import (
@@ -33,9 +36,6 @@ from worldpose.static_calibration.parameters import (
     project_with_jacobian,
     stepped,
 )
-from worldpose.synthetic.rendering import render_pitch
-from worldpose.synthetic.scenarios import SCENARIOS
-from worldpose.synthetic.stadium import place_camera
 
 PITCH = PitchTemplate.standard()
 SPREAD = np.array([1e-3, 1e-3, 1e-3, 0.1, 0.1, 0.1, 2e-3, 4.0, 4.0, 0.01, 0.01, 0.0])

@@ -30,9 +30,9 @@ from flows.planning import PlannedUnit, plan_run
 from flows.registering import register
 from flows.stages import refitting
 from worldpose.formats import read_joints, write_archive
+from worldpose.simulation import SCENARIOS
+from worldpose.simulation.matches import simulate_match
 from worldpose.store import Store, key_of
-from worldpose.synthetic import SCENARIOS
-from worldpose.synthetic.matches import simulate_match
 
 Floats = NDArray[np.float64]
 SCENARIO, PEOPLE = SCENARIOS["tiny-broadcast"], 12

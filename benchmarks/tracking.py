@@ -18,7 +18,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.tracking.affinity import match_greedily, match_optimally, ray_affinity
 from worldpose.tracking.epipolar import associate

@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from worldpose.cameras import Camera
 from worldpose.evaluation import evaluate_joints
 from worldpose.formats import JointTracks
-from worldpose.synthetic import SCENARIOS, Scenario, Scene, read_trajectories, simulate_scene
+from worldpose.geometry import Camera
+from worldpose.simulation import SCENARIOS, Scenario, Scene, read_trajectories, simulate_scene
 from worldpose.tracking import TrackingSettings, track_people
 
 CLIPS = ["match:501:60", "corner-kick:501", "corner-kick:502", "crossing:501", "crossing:502"]

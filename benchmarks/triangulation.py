@@ -19,7 +19,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
 CAMERAS, PEOPLE, JOINTS = 16, 22, 17

@@ -15,11 +15,11 @@ import argparse
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
 from worldpose.evaluation import evaluate_joints
 from worldpose.formats import JointTracks
-from worldpose.synthetic import SCENARIOS, CalibrationErrors, Scene, simulate_scene
-from worldpose.synthetic.calibrating import misjudge
+from worldpose.geometry import Camera
+from worldpose.simulation import SCENARIOS, CalibrationErrors, Scene, simulate_scene
+from worldpose.simulation.calibrating import misjudge
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 

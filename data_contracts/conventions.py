@@ -1,6 +1,6 @@
 """Frames, axes, units and joint names: the one record that ships with every result.
 
-tests/unit/cameras proves the image half of it against OpenCV.
+tests/unit/geometry proves the image half of it against OpenCV.
 """
 
 from __future__ import annotations

@@ -18,19 +18,19 @@ from worldpose.bundle_adjustment import (
     adjust_cameras,
     marking_errors,
 )
-from worldpose.cameras import Camera
 from worldpose.errors import InputError
 from worldpose.evaluation import evaluate_cameras, evaluate_joints
 from worldpose.formats import JointTracks
+from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import Scene, simulate_scene
+from worldpose.simulation.settings import ClickSettings
 from worldpose.static_calibration import (
     StaticCalibration,
     StaticCalibrationSettings,
     calibrate,
 )
-from worldpose.synthetic.scenarios import SCENARIOS
-from worldpose.synthetic.scene import Scene, simulate_scene
-from worldpose.synthetic.settings import ClickSettings
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 

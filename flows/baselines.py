@@ -12,12 +12,12 @@ from data_contracts.evaluation import MethodScore
 from flows.evaluation import cameras_of, reference_side
 from worldpose.baselines import MethodResult, find_method, resampled
 from worldpose.body import OPEN_BODY, find_body
-from worldpose.cameras import Camera
 from worldpose.errors import UsageError
 from worldpose.evaluation import EvaluationSettings, evaluate_joints
 from worldpose.evaluation.method_table import meaningful
 from worldpose.formats import JointTracks
 from worldpose.formats.camera_file import RELEASE_SIZE
+from worldpose.geometry import Camera
 
 
 def score_methods(

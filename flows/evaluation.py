@@ -16,7 +16,6 @@ from flows.release import (
     joint_tracks,
     static_cameras,
 )
-from worldpose.cameras import Camera
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation import CameraScore, PersonScore, evaluate_cameras, evaluate_joints
 from worldpose.evaluation.marker_files import (
@@ -28,6 +27,7 @@ from worldpose.evaluation.marker_files import (
 )
 from worldpose.evaluation.marker_reference import ReferenceAlignment, lay_over
 from worldpose.formats import JointTracks, read_camera, read_joints
+from worldpose.geometry import Camera
 from worldpose.ingest import MatchFolder, read_match
 from worldpose.pitch import PitchTemplate
 from worldpose.store import Store, open_run

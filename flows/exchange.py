@@ -16,7 +16,7 @@ from flows.detections import detections_now
 from flows.reports.match_pictures import frame_picture
 from flows.stage import Match
 from worldpose.errors import UsageError
-from worldpose.exchange import (
+from worldpose.formats.annotations import (
     AnnotatedPerson,
     AnnotatedPicture,
     Changes,
@@ -25,9 +25,9 @@ from worldpose.exchange import (
     read_annotations,
     write_annotations,
 )
-from worldpose.exchange.changes import picture_name
-from worldpose.exchange.formats import suffix_of
-from worldpose.exchange.pictures import SEEN
+from worldpose.formats.annotations.changes import picture_name
+from worldpose.formats.annotations.formats import suffix_of
+from worldpose.formats.annotations.pictures import SEEN
 from worldpose.ingest import Observations
 from worldpose.review.detections import DETECTION_EDITS
 from worldpose.store import Store

@@ -20,8 +20,6 @@ from flows.release import (
     static_cameras,
 )
 from worldpose.body import BodyModel, BodyParameters, find_body
-from worldpose.cameras import Camera
-from worldpose.cameras.stored import camera_from_arrays
 from worldpose.errors import WorldposeError
 from worldpose.formats import coco_dataset, write_coco, write_joints
 from worldpose.formats.baseline_inputs import (
@@ -41,6 +39,8 @@ from worldpose.formats.challenge import (
 )
 from worldpose.formats.motion_capture import stretches, write_markers, write_motion
 from worldpose.formats.pose_file import write_poses
+from worldpose.geometry import Camera
+from worldpose.geometry.stored import camera_from_arrays
 from worldpose.ingest import read_match
 from worldpose.pitch import PitchTemplate
 from worldpose.store import Run

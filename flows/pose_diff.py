@@ -12,7 +12,7 @@ from data_contracts.run import RunRecord
 from flows.pairing import BodiesOfBoth, bodies_of_both
 from flows.registering import find_registration
 from flows.release import static_cameras
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.store import Run, Store
 
 JOINTS: Final = 9

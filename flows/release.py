@@ -9,10 +9,10 @@ import numpy as np
 from data_contracts.match import MatchSpec
 from data_contracts.run import RunRecord
 from worldpose.body import BodyParameters, find_body
-from worldpose.cameras import Camera
-from worldpose.cameras.stored import camera_from_arrays
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.formats import JointTracks
+from worldpose.geometry import Camera
+from worldpose.geometry.stored import camera_from_arrays
 from worldpose.reports.body_rendering import BodyTracks
 from worldpose.store import Run
 

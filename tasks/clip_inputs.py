@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from data_contracts.redetection import again_of
 from data_contracts.work import Work
 from tasks.unit import open_input
-from worldpose.cameras import Camera
-from worldpose.cameras.stored import camera_from_arrays
+from worldpose.geometry import Camera
+from worldpose.geometry.stored import camera_from_arrays
 from worldpose.store import Store
 from worldpose.tracking.clip_arrays import ClipArray
 

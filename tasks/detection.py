@@ -17,7 +17,6 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.work import Work
 from tasks.spool import Spool, spooling
 from tasks.unit import open_input, require_registered, unit_task
-from worldpose.cameras.stored import camera_from_arrays
 from worldpose.detection import (
     DetectionSettings,
     PeopleFinder,
@@ -28,6 +27,7 @@ from worldpose.detection import (
 )
 from worldpose.detection.interfaces import Picture
 from worldpose.errors import InputError
+from worldpose.geometry.stored import camera_from_arrays
 from worldpose.ingest import Observations
 from worldpose.ingest.footage import stretches
 from worldpose.pitch import PitchTemplate

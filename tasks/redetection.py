@@ -19,8 +19,6 @@ from tasks.clip_inputs import ADJUSTED
 from tasks.detection import footage_index, require_weights
 from tasks.triangulation import settings_before
 from tasks.unit import open_input, require_registered, unit_task
-from worldpose.cameras import Camera
-from worldpose.cameras.stored import camera_from_arrays
 from worldpose.detection import DetectionSettings, Place, load_pose
 from worldpose.detection.interfaces import Picture
 from worldpose.filtering import (
@@ -35,6 +33,8 @@ from worldpose.filtering import (
     view_bodies,
     watch_motion,
 )
+from worldpose.geometry import Camera
+from worldpose.geometry.stored import camera_from_arrays
 from worldpose.pitch import PitchTemplate
 from worldpose.redetection import (
     Answers,

@@ -25,8 +25,8 @@ from worldpose.body_fitting import (
     recognise_people,
     sight_people,
 )
-from worldpose.cameras import Camera
-from worldpose.cameras.stored import camera_from_arrays
+from worldpose.geometry import Camera
+from worldpose.geometry.stored import camera_from_arrays
 from worldpose.store import Store
 
 Floats = NDArray[np.float64]

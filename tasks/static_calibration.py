@@ -19,9 +19,9 @@ from data_contracts.static_calibration import (
 )
 from data_contracts.work import Work
 from tasks.unit import require_registered, unit_task
-from worldpose.cameras import Camera
-from worldpose.cameras.stored import camera_arrays
 from worldpose.errors import InputError
+from worldpose.geometry import Camera
+from worldpose.geometry.stored import camera_arrays
 from worldpose.ingest.stills import read_still
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import (

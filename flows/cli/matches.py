@@ -71,8 +71,8 @@ def simulate(
 
     Example: worldpose simulate --scenario tiny --seed 1 --out matches/tiny
     """
-    from worldpose.synthetic import SCENARIOS, simulate_match
-    from worldpose.synthetic.foreign import FOREIGN_SCENARIOS, simulate_foreign_match
+    from worldpose.simulation import SCENARIOS, simulate_match
+    from worldpose.simulation.foreign import FOREIGN_SCENARIOS, simulate_foreign_match
 
     about = {name: each.about for name, each in (SCENARIOS | FOREIGN_SCENARIOS).items()}
     if scenario == "list":

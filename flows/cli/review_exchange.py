@@ -12,7 +12,7 @@ from flows.cli.review_text import correction_json, in_words
 from flows.registering import open_match
 from flows.stage import Match
 from worldpose.errors import UsageError
-from worldpose.exchange import FORMATS, Format
+from worldpose.formats.annotations import FORMATS, Format
 from worldpose.store import Store
 
 MatchId = Annotated[str, typer.Argument(metavar="MATCH", help="Id of a registered match.")]
@@ -109,7 +109,7 @@ def convert_annotations(
 
     Example: worldpose review convert annotations.xml --out labels.json
     """
-    from worldpose.exchange import read_annotations, write_annotations
+    from worldpose.formats.annotations import read_annotations, write_annotations
 
     chosen = _format(form)
     if out.exists():

@@ -20,8 +20,8 @@ from flows.reports.flow import flow_pictures
 from flows.stage import Match
 from flows.stages.detection import seen_in_broadcast
 from worldpose.broadcast_calibration import camera_before
-from worldpose.cameras.stored import camera_from_arrays
 from worldpose.formats import JointTracks, whole_file
+from worldpose.geometry.stored import camera_from_arrays
 from worldpose.ingest import unit_frames
 from worldpose.reports import Picture
 from worldpose.reports.broadcast import (

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from data_contracts.match import MatchSpec
 from flows.stage import Match
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.ingest.stills import read_still
 from worldpose.reports import CameraSummary, Picture
 from worldpose.reports.static_cameras import (

@@ -19,7 +19,7 @@ from flows.release import (
 from flows.reports.broadcast import write_broadcast_videos
 from flows.reports.match_pictures import frame_pictures
 from flows.stage import Match
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.reports.overlay_video import overlay_frames
 from worldpose.store import Run, Store
 from worldpose.video import write_video

@@ -16,8 +16,8 @@ from flows.reports.cameras import still_of
 from flows.reports.match_pictures import frame_picture
 from flows.stage import Match
 from flows.stages.redetection import seen_in
-from worldpose.cameras import Camera
 from worldpose.formats import JointTracks
+from worldpose.geometry import Camera
 from worldpose.reports import Picture, Scene
 from worldpose.reports.bodies import bodies_picture
 from worldpose.reports.body_rendering import BodyTracks

@@ -11,7 +11,7 @@ from flows.stages.detection import seen_in_broadcast
 from worldpose.broadcast_calibration import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.optical_flow import follow
 from worldpose.broadcast_calibration.turning import modified_z_scores
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.ingest import unit_frames
 from worldpose.reports import Picture
 from worldpose.reports.broadcast import flow_picture

@@ -16,8 +16,8 @@ from flows.identities import identities_now
 from flows.release import static_cameras
 from flows.stage import Match
 from flows.web.app_context import Desk
-from worldpose.cameras import Camera
 from worldpose.errors import InputError
+from worldpose.geometry import Camera
 from worldpose.review.other_views import check_views, epipolar_curves
 from worldpose.store import open_run
 

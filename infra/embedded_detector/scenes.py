@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.pitch import PitchSpec
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-from worldpose.synthetic.casting import dress_people, roles_of
-from worldpose.synthetic.crowd import Crowd, gather
-from worldpose.synthetic.filming import RenderedFrame, open_view, render_frame
-from worldpose.synthetic.kits import PATTERNS
-from worldpose.synthetic.settings import CrowdSettings, RigSettings, Scenario
-from worldpose.synthetic.stadium import place_camera
-from worldpose.synthetic.venues import RenderingSettings
+from worldpose.simulation.casting import dress_people, roles_of
+from worldpose.simulation.crowd import Crowd, gather
+from worldpose.simulation.filming import RenderedFrame, open_view, render_frame
+from worldpose.simulation.kits import PATTERNS
+from worldpose.simulation.settings import CrowdSettings, RigSettings, Scenario
+from worldpose.simulation.stadium import place_camera
+from worldpose.simulation.venues import RenderingSettings
 from worldpose.training import LabelledPicture, read_labels, write_labels
 
 HIDDEN = 0.3

@@ -17,8 +17,8 @@ import numpy as np
 from worldpose.body_fitting.pose_space import COORDINATES, GATHER, SIZE
 from worldpose.formats import write_archive
 from worldpose.pitch import PitchTemplate
-from worldpose.synthetic import SCENARIOS
-from worldpose.synthetic.crowd import gather
+from worldpose.simulation import SCENARIOS
+from worldpose.simulation.crowd import gather
 
 CLIPS = (
     ("match", 24.0, 9001),

@@ -22,17 +22,16 @@ FORBIDDEN = {
 ORDER_IN_WORLDPOSE = (
     "errors",
     "compiled",
-    "cameras",
+    "geometry",
     "pickles",
     "body",
     "pitch",
     "video",
     "store",
     "ingest",
-    "formats",
     "static_calibration",
     "review",
-    "exchange",
+    "formats",
     "detection",
     "training",
     "tracking",
@@ -47,7 +46,7 @@ ORDER_IN_WORLDPOSE = (
     "baselines",
     "dataset",
     "reports",
-    "synthetic",
+    "simulation",
 )
 """Order inside worldpose/: a package or module may import those before it, never one after it."""
 
@@ -107,11 +106,11 @@ def test_packages_of_worldpose_import_earlier_ones_only():
 
 
 def test_an_import_of_a_later_package_is_seen(tmp_path):
-    package = tmp_path / "worldpose" / "cameras"
+    package = tmp_path / "worldpose" / "geometry"
     package.mkdir(parents=True)
-    (package / "lens.py").write_text("from worldpose.synthetic.noise import x\n")
+    (package / "lens.py").write_text("from worldpose.simulation.noise import x\n")
     assert later_imports(ORDER_IN_WORLDPOSE, tmp_path) == [
-        "worldpose/cameras/lens.py imports worldpose.synthetic.noise"
+        "worldpose/geometry/lens.py imports worldpose.simulation.noise"
     ]
 
 

@@ -24,7 +24,7 @@ from checker import problems_of
 from machines import Machines
 from recoveries import Fault, by_kind, reason_in, summary_of
 
-from worldpose.synthetic import SCENARIOS, simulate_match
+from worldpose.simulation import SCENARIOS, simulate_match
 
 WORLDPOSE = [sys.executable, "-c", "from flows.cli import main; main()"]
 SMALL = {"duration": 0.2, "cameras": 3, "players": 2}

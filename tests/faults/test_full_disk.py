@@ -12,7 +12,7 @@ from flows import prefect_database
 from flows.cluster_errors import require_room
 from flows.prefect_database import begin_database
 from worldpose.errors import MemoryLimitError, StoreError, require_memory
-from worldpose.synthetic import SCENARIOS, simulate_match
+from worldpose.simulation import SCENARIOS, simulate_match
 
 
 @pytest.fixture

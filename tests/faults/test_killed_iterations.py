@@ -23,9 +23,9 @@ from flows.registering import open_match, register
 from flows.review import correct
 from flows.running import RunRequest
 from flows.settings import selected_stages
+from worldpose.simulation import SCENARIOS, simulate_match
 from worldpose.store import Store
 from worldpose.store.commit_points import install_fault_hook
-from worldpose.synthetic import SCENARIOS, simulate_match
 
 pytestmark = pytest.mark.faults
 

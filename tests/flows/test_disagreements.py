@@ -7,9 +7,9 @@ import xarray as xr
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.reports.disagreements import worst_views
-from worldpose.cameras import Camera
 from worldpose.formats import JointTracks
-from worldpose.synthetic.stadium import looking
+from worldpose.geometry import Camera
+from worldpose.simulation.stadium import looking
 
 FRAMES = np.arange(20, 24)
 

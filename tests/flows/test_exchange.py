@@ -13,7 +13,7 @@ from flows.edit_conflicts import StaleEditError
 from flows.exchange import export_people, import_people
 from flows.registering import open_match
 from worldpose.errors import InputError, UsageError
-from worldpose.exchange import FORMATS, read_annotations, write_annotations
+from worldpose.formats.annotations import FORMATS, read_annotations, write_annotations
 from worldpose.store import Store
 
 PLACES = [("cam00", 3), ("cam01", 4)]

@@ -9,9 +9,9 @@ from command_line import TINY, succeed, worldpose
 
 from worldpose.dataset.origins import read_origins
 from worldpose.errors import InputError
+from worldpose.simulation.bvh import read_bvh
 from worldpose.store import Store, list_pins
 from worldpose.store.garbage import plan_gc
-from worldpose.synthetic.bvh import read_bvh
 
 pytestmark = pytest.mark.usefixtures("server")
 

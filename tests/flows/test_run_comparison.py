@@ -7,7 +7,7 @@ from data_contracts.run import RunRecord
 from flows import comparison, pose_diff
 from flows.comparison import compare_runs, count_marks
 from flows.pairing import BodiesOfBoth, pair_people
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 
 
 def record(figures):

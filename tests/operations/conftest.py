@@ -16,7 +16,7 @@ from threading import Thread
 import pytest
 from service import Served
 
-from worldpose.synthetic import SCENARIOS, simulate_match
+from worldpose.simulation import SCENARIOS, simulate_match
 
 
 @pytest.fixture(scope="session")

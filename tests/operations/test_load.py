@@ -14,8 +14,8 @@ from command_line import WORLDPOSE, succeed
 from flows.method import METHOD
 from flows.planning import plan_run
 from flows.registering import register
+from worldpose.simulation import SCENARIOS, simulate_match
 from worldpose.store import Store
-from worldpose.synthetic import SCENARIOS, simulate_match
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600), pytest.mark.usefixtures("server")]
 

@@ -10,8 +10,8 @@ from stand_ins import publish_stand_in
 
 from flows.planning import plan_run
 from flows.registering import register
+from worldpose.simulation import SCENARIOS, simulate_match
 from worldpose.store import Store
-from worldpose.synthetic import SCENARIOS, simulate_match
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 

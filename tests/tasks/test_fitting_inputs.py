@@ -12,9 +12,9 @@ from tasks.clip_inputs import ClipInputs
 from worldpose.body_fitting.monocular import MonocularEstimates
 from worldpose.body_fitting.moving_view import sight_people
 from worldpose.body_fitting.pose_space import GATHER
-from worldpose.cameras import Camera, Rigid
-from worldpose.cameras.stored import camera_arrays
-from worldpose.synthetic.stadium import looking
+from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.stored import camera_arrays
+from worldpose.simulation.stadium import looking
 
 LEGS = [COCO17.index(f"{side}_{name}") for name in ("knee", "ankle") for side in ("left", "right")]
 

@@ -17,9 +17,9 @@ from tasks.ingest import ingest
 from tasks.static_calibration import static_calibration
 from tasks.triangulation import camera_errors
 from tasks.unit import unit_task
-from worldpose.cameras.stored import camera_from_arrays
 from worldpose.errors import CorruptionError, InputError, StoreError, WorldposeError
 from worldpose.formats import read_camera
+from worldpose.geometry.stored import camera_from_arrays
 from worldpose.ingest.stills import write_still
 from worldpose.store import Store, explain_difference, key_of
 

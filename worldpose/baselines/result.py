@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17
 from worldpose.body import OPEN_BODY, BodyModel, BodyParameters, fold_keypoints
-from worldpose.cameras import Rigid
 from worldpose.errors import InputError
 from worldpose.formats import JointTracks
+from worldpose.geometry import Rigid
 
 Floats = NDArray[np.float64]
 World = Literal["shared", "own", "camera"]

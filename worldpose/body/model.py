@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from worldpose.body.articulation import Articulation, articulate
 from worldpose.body.parameters import BODY_POSE, BodyParameters
-from worldpose.cameras.rigid import Rigid
 from worldpose.errors import InputError
+from worldpose.geometry.rigid import Rigid
 
 JOINTS: Final = 24
 SMPL_VERTICES: Final = 6890

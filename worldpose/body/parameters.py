@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras.rigid import Index, checked, common_batch, leading
+from worldpose.geometry.rigid import Index, checked, common_batch, leading
 
 BODY_POSE = 69
 """Length of `body_pose`: three angles for each of the 23 joints below the pelvis."""

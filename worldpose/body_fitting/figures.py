@@ -12,7 +12,7 @@ from worldpose.body_fitting.bones import BONES
 from worldpose.body_fitting.feet import ANKLES
 from worldpose.body_fitting.fitting import BodyFit
 from worldpose.body_fitting.shared_bias import body_axes
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 
 Floats = NDArray[np.float64]
 

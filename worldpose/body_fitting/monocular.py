@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.body.model import JOINTS
-from worldpose.cameras import Rigid
 from worldpose.errors import InputError
+from worldpose.geometry import Rigid
 from worldpose.ingest.npz_files import read_npz
 from worldpose.ingest.text_files import require_file
 

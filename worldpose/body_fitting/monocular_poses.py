@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from worldpose.body_fitting.monocular import MonocularEstimates
 from worldpose.body_fitting.pose_space import GATHER
 from worldpose.body_fitting.starting import bridged
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 
 Floats = NDArray[np.float64]
 

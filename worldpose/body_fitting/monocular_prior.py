@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from worldpose.body_fitting.monocular_poses import MonocularPoses
 from worldpose.body_fitting.pose_space import SIZE
-from worldpose.cameras import Rigid
+from worldpose.geometry import Rigid
 
 Floats = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from worldpose.body_fitting.ray_constraints import Sightings, lines_of_sight
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 
 Floats = NDArray[np.float64]
 

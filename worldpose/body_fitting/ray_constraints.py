@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.body_fitting.starting import bridged
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 
 Floats = NDArray[np.float64]
 

@@ -21,8 +21,8 @@ from worldpose.body_fitting.pose_space import PosePrior
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shared_bias import body_axes
 from worldpose.body_fitting.starting import bridged, start_poses
-from worldpose.cameras import Rigid
 from worldpose.errors import DegenerateError
+from worldpose.geometry import Rigid
 
 Floats = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from worldpose.body import BodyModel
 from worldpose.body_fitting.pose_space import SIZE, PosePrior
-from worldpose.cameras import Rigid
+from worldpose.geometry import Rigid
 
 Floats = NDArray[np.float64]
 

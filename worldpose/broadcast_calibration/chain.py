@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from worldpose.broadcast_calibration.moving_camera import MovingCamera, joined
 from worldpose.broadcast_calibration.optical_flow import Followed
 from worldpose.broadcast_calibration.turning import modified_z_scores, turn
-from worldpose.cameras import Rigid
+from worldpose.geometry import Rigid
 
 Floats = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 
 Floats = NDArray[np.float64]
 

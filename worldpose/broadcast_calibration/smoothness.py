@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
-from worldpose.cameras import Rigid
+from worldpose.geometry import Rigid
 
 Floats = NDArray[np.float64]
 

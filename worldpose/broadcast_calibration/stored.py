@@ -12,8 +12,8 @@ from data_contracts.broadcast_calibration import FRAME_STATUS
 from worldpose.broadcast_calibration.calibrating import BroadcastCalibration
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
-from worldpose.cameras import Camera
-from worldpose.cameras.stored import camera_from_arrays
+from worldpose.geometry import Camera
+from worldpose.geometry.stored import camera_from_arrays
 
 
 def broadcast_arrays(calibration: BroadcastCalibration) -> dict[str, NDArray[Any]]:

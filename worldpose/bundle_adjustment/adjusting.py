@@ -32,7 +32,7 @@ from worldpose.bundle_adjustment.noise import measured_noise
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.bundle_adjustment.solving import Adjusted, solve
 from worldpose.bundle_adjustment.survey import survey_response, with_shared_errors
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.static_calibration import PARAMETERS, project_with_jacobian
 
 _STRANGER: Final = "refused: it shows other people than the other cameras do under the same ids"

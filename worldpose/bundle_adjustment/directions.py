@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.static_calibration import PARAMETERS, project_with_jacobian
 
 _DISTANCE: Final = 60.0

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 
 Floats = NDArray[np.float64]
 

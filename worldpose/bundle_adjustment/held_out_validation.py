@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from worldpose.bundle_adjustment.clip import Clip, keypoints_of, predict
 from worldpose.bundle_adjustment.gauge import Similarity, align_points
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.triangulation import triangulate_joints
 
 _PARTS: Final = 4

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from worldpose.bundle_adjustment.building import KeypointNoise
 from worldpose.bundle_adjustment.clip import Observed
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 
 _MEDIAN: Final = 2.0 * np.log(2.0)
 """Median squared length of a standard Gaussian in two dimensions [1]."""

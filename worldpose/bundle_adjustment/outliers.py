@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from worldpose.bundle_adjustment.building import KeypointNoise
 from worldpose.bundle_adjustment.clip import Clicks, Clip, keypoints_of, predict
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.static_calibration import image_problems, project_with_jacobian
 from worldpose.triangulation import triangulate_joints
 

@@ -13,9 +13,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras.distortion import distort
-from worldpose.cameras.projection import project_point
 from worldpose.compiled import compiled
+from worldpose.geometry.distortion import distort
+from worldpose.geometry.projection import project_point
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -19,8 +19,8 @@ from worldpose.bundle_adjustment.schur_complement import (
     eliminate,
     substitute,
 )
-from worldpose.cameras import Camera
 from worldpose.errors import InputError, InternalError
+from worldpose.geometry import Camera
 from worldpose.static_calibration import stepped
 
 Floats = NDArray[np.float64]

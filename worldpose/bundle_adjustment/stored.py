@@ -12,8 +12,8 @@ from worldpose.bundle_adjustment.clip import Clip
 from worldpose.bundle_adjustment.directions import weak_direction
 from worldpose.bundle_adjustment.outliers import keypoint_outliers, review_clicks
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
-from worldpose.cameras import Camera
-from worldpose.cameras.stored import camera_arrays
+from worldpose.geometry import Camera
+from worldpose.geometry.stored import camera_arrays
 
 
 def adjustment_arrays(

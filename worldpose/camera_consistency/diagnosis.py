@@ -21,8 +21,8 @@ from worldpose.camera_consistency.hypotheses import (
     turned,
 )
 from worldpose.camera_consistency.settings import ConsistencySettings
-from worldpose.cameras import Camera
 from worldpose.errors import InputError
+from worldpose.geometry import Camera
 from worldpose.static_calibration.parameters import project_with_jacobian
 from worldpose.tracking.clip_arrays import ClipArray
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from data_contracts.conventions import COCO17
 from data_contracts.release import Finding, ReleaseManifest
 from worldpose.body import BODY25, CHALLENGE15, BodyModel, BodyParameters, fold_keypoints
-from worldpose.cameras import Rigid
 from worldpose.dataset.contents import PointSource, ShippedClip, View, absent_rows
 from worldpose.errors import InputError
 from worldpose.formats.archives import wrong
@@ -21,6 +20,7 @@ from worldpose.formats.camera_rows import read_camera_rows
 from worldpose.formats.challenge import read_challenge, read_submission, submission_clips
 from worldpose.formats.joints_file import read_joints
 from worldpose.formats.pose_file import read_poses
+from worldpose.geometry import Rigid
 
 Floats = NDArray[np.float64]
 

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.release import Finding
-from worldpose.cameras import Camera
 from worldpose.dataset.contents import PointSource, View
 from worldpose.dataset.faults import Fault, camera_faults, frame_faults, point_faults
 from worldpose.dataset.settings import CheckSettings
 from worldpose.formats.camera_rows import CameraRows
+from worldpose.geometry import Camera
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -9,7 +9,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
 from worldpose.detection.boxes import areas, fuse, suppress
 from worldpose.detection.crowd import on_pitch
 from worldpose.detection.followed import Follower, looked_at
@@ -18,6 +17,7 @@ from worldpose.detection.oks_nms import told_apart
 from worldpose.detection.posed import find_poses
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.views import Tiled
+from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 
 STRETCH: Final = 64

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldpose.cameras.rigid import checked
+from worldpose.geometry.rigid import checked
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 
 
 def joint_boxes(joints: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from data_contracts.evaluation import CameraErrors, CameraEvaluation
 from data_contracts.records import Record
-from worldpose.cameras import Camera, Rays
 from worldpose.errors import InputError
 from worldpose.evaluation.settings import CameraErrorSettings
+from worldpose.geometry import Camera, Rays
 from worldpose.pitch import PitchTemplate
 
 

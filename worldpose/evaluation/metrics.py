@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from data_contracts.evaluation import Evaluation
 from data_contracts.records import Record
-from worldpose.cameras import Camera
 from worldpose.evaluation.identity import identity_scores
 from worldpose.evaluation.limbs import correct_limbs, limb_ends
 from worldpose.evaluation.matching import joint_distances, match_people, taken
@@ -23,6 +22,7 @@ from worldpose.evaluation.trajectories import (
     path_lengths,
 )
 from worldpose.formats import JointTracks
+from worldpose.geometry import Camera
 
 
 class PersonScore(Record):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
 from worldpose.errors import InputError
 from worldpose.evaluation.boxes import box_overlaps, joint_boxes
 from worldpose.evaluation.matching import (
@@ -16,6 +15,7 @@ from worldpose.evaluation.matching import (
 )
 from worldpose.evaluation.registration import register_world
 from worldpose.evaluation.settings import EvaluationSettings
+from worldpose.geometry import Camera
 
 
 def match_tracks(

@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
 from worldpose.filtering.residuals import Places, Residuals
+from worldpose.geometry import Camera
 from worldpose.static_calibration.parameters import by_step
 
 Floats = NDArray[np.float64]

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.body_fitting.shared_bias import body_axes
-from worldpose.cameras import Camera
 from worldpose.filtering.residuals import Residuals
+from worldpose.geometry import Camera
 
 Floats = NDArray[np.float64]
 

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.release import BaselineSettings
-from worldpose.cameras import Camera
 from worldpose.errors import InputError
 from worldpose.formats.archives import write_archive
 from worldpose.formats.files import whole_file
+from worldpose.geometry import Camera
 
 Y_DOWN: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Rotation of world points to axes with y down, the ground orientation of SLAHMR."""

@@ -8,9 +8,9 @@ from typing import Final
 import numpy as np
 
 from data_contracts.cameras import CameraCalibration
-from worldpose.cameras import Camera, Rigid
-from worldpose.cameras.rigid import nearest_rotation
 from worldpose.formats.archives import Member, read_archive, write_archive, wrong
+from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.rigid import nearest_rotation
 
 MEMBERS: Final = {
     "K": Member(("rows", 3, 3), "float"),

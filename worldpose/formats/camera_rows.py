@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera, Rigid
 from worldpose.formats.archives import Member, read_archive
+from worldpose.geometry import Camera, Rigid
 
 MEMBERS: Final = {
     "K": Member(("rows", 3, 3), "float"),

@@ -16,10 +16,10 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from worldpose.body import BODY25, CHALLENGE15, BodyModel, BodyParameters, fold_keypoints
-from worldpose.cameras import Camera
 from worldpose.errors import InputError
 from worldpose.formats.archives import Member, read_archive, write_archive, wrong
 from worldpose.formats.files import whole_file
+from worldpose.geometry import Camera
 
 Floats = NDArray[np.float64]
 

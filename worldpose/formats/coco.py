@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17, COCO17_BONES
-from worldpose.cameras import Camera
 from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry import Camera
 
 DECIMALS = 2
 """Of all pixel values: a hundredth of a pixel is far below any detector's error."""

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17
 from worldpose.body import SKELETONS, BodyModel, BodyParameters
-from worldpose.cameras import Rigid
 from worldpose.errors import InputError
 from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry import Rigid
 
 Y_UP: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Rotation of world points to the axes of OpenSim and of animation tools: x stays, y is up."""

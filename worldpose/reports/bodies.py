@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from data_contracts.pitch import PitchSpec
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.reports.body_rendering import paint_bodies, zoomed
 from worldpose.reports.drawing import INK, draw_label, markings, person_color, png, style
 

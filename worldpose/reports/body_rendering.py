@@ -11,9 +11,9 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from worldpose.body import BodyModel, BodyParameters
-from worldpose.cameras import Camera
-from worldpose.cameras.outlines import outline_surfaces
-from worldpose.cameras.rasters import NOBODY, Samples, draw_triangles, resolve
+from worldpose.geometry import Camera
+from worldpose.geometry.outlines import outline_surfaces
+from worldpose.geometry.rasters import NOBODY, Samples, draw_triangles, resolve
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

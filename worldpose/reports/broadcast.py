@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from data_contracts.pitch import PitchSpec
-from worldpose.cameras import Camera
 from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry import Camera
 from worldpose.reports.drawing import (
     INK,
     PALETTE,

@@ -11,8 +11,8 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from data_contracts.pitch import PitchSpec
-from worldpose.cameras import Camera
 from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry import Camera
 from worldpose.reports.drawing import (
     GRASS,
     HIPS,

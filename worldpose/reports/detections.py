@@ -11,7 +11,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from data_contracts.pitch import PitchSpec
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.reports.bodies import crowded_part
 from worldpose.reports.drawing import (
     GRASS,

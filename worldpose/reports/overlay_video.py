@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
-from worldpose.cameras import Camera
 from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry import Camera
 from worldpose.reports.body_rendering import BodyTracks, paint_bodies, zoomed
 from worldpose.reports.drawing import TEMPLATE, markings, person_color
 

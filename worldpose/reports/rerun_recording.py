@@ -11,10 +11,10 @@ from matplotlib.colors import to_rgb
 
 from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
-from worldpose.cameras import Camera
 from worldpose.errors import UsageError
 from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry import Camera
 from worldpose.reports.drawing import markings, person_color
 
 NAME: Final = "worldpose"

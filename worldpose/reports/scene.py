@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
-from worldpose.cameras import Camera
 from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry import Camera
 
 UNIT: Final = 0.005
 """Resolution of joint coordinates [m]: 164 m to either side fit into 16 bits."""

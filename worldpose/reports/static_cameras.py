@@ -13,7 +13,7 @@ from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
 
 from data_contracts.pitch import PitchSpec
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.reports.drawing import (
     GRASS,
     HALO,

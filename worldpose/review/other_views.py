@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldpose.cameras import Camera, Rays, intersect_rays
+from worldpose.geometry import Camera, Rays, intersect_rays
 
 Floats = NDArray[np.float64]
 

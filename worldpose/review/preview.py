@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.static_calibration import ClickedMarkings
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import (
     CalibrationReport,

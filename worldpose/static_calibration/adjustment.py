@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 from worldpose.static_calibration.descent import descend
 from worldpose.static_calibration.evidence import Evidence, crowding
 from worldpose.static_calibration.parameters import PARAMETERS
@@ -86,7 +86,7 @@ class Fits:
     """Fitted cameras, their costs and information matrices.
 
     Attributes:
-        rows: (b, 22) cameras, see `worldpose.cameras.projection`.
+        rows: (b, 22) cameras, see `worldpose.geometry.projection`.
         cost: (b,) half the sum of squared, loss-weighted residuals and priors.
         information: (b, 12, 12) inverse covariance of a step from the evidence and the prior.
         evidence_information: (b, 12, 12) contribution of the evidence alone.

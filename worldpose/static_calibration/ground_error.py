@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.parameters import CameraEstimate, project_with_jacobian
 

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.static_calibration.adjustment import Problem, row_of
 from worldpose.static_calibration.curvature_correction import weighted
 from worldpose.static_calibration.line_profiles import Bars

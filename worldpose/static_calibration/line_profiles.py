@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.static_calibration.line_samples import LineSamples
 from worldpose.static_calibration.parameters import project_with_jacobian
 

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.bar_fits import fit_bars
 from worldpose.static_calibration.clearance import clear, whites_of

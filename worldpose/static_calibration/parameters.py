@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from data_contracts.static_calibration import CAMERA_STEP
-from worldpose.cameras import Camera, Projection
+from worldpose.geometry import Camera, Projection
 
 PARAMETERS: Final = CAMERA_STEP
 """Steps of a camera: rotation about its center [rad] and shift [m] in its own axes

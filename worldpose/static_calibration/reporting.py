@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera, RayStatus
+from worldpose.geometry import Camera, RayStatus
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.adjustment import Problem, row_of
 from worldpose.static_calibration.click_outliers import Screened, residual_rows

@@ -1,6 +1,6 @@
 """Compiled residuals of clicks, drawn points and priors, with derivatives.
 
-A camera is the row of 22 numbers of `worldpose.cameras.projection`; a step has the order of
+A camera is the row of 22 numbers of `worldpose.geometry.projection`; a step has the order of
 `PARAMETERS`. Residuals are in standard deviations.
 """
 
@@ -11,9 +11,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras.distortion import fold_squared
-from worldpose.cameras.projection import project_with_jacobians
 from worldpose.compiled import compiled
+from worldpose.geometry.distortion import fold_squared
+from worldpose.geometry.projection import project_with_jacobians
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras.stored import camera_arrays
+from worldpose.geometry.stored import camera_arrays
 from worldpose.static_calibration.report import StaticCalibration
 
 

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.tracking.camera_gates import CameraGates
 from worldpose.tracking.clip_arrays import ClipArray
 from worldpose.tracking.pair_agreement import SAMPLES, Meeting, match_pair

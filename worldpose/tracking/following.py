@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.tracking.affinity import match_greedily, match_optimally, ray_affinity
 from worldpose.tracking.camera_gates import CameraGates
 from worldpose.tracking.doubts import Takeover, find_takeovers

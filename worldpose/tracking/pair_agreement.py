@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.tracking.limbs import LIMB_LENGTHS, LIMBS
 
 SAMPLES: Final = 24

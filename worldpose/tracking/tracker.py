@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from data_contracts.conventions import COCO17
 from data_contracts.records import Record
 from data_contracts.tracking import Join, Track
-from worldpose.cameras import Camera
 from worldpose.errors import InputError
+from worldpose.geometry import Camera
 from worldpose.tracking.clip_arrays import ClipArray
 from worldpose.tracking.doubts import Takeover, lasting_takeovers
 from worldpose.tracking.following import Follower

@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
 from worldpose.compiled import compiled
+from worldpose.geometry import Camera
 
 SEEN_JOINTS: Final = 4
 """Keypoints on a body's image from which on a camera has a detection there [1]."""

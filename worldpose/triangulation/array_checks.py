@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
 from worldpose.errors import InputError
+from worldpose.geometry import Camera
 
 
 def check_arrays(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.triangulation.reports import Histogram
 from worldpose.triangulation.settings import TriangulationSettings
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.tracking.clip_arrays import ClipArray
 from worldpose.triangulation.batched_gauss_newton import LANES
 from worldpose.triangulation.clocks import CameraClocks, Moved, estimate_clocks, moved_in_time

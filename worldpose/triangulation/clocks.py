@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.records import Record
-from worldpose.cameras import Camera, projection
+from worldpose.geometry import Camera, projection
 from worldpose.tracking.clip_arrays import ClipArray
 from worldpose.triangulation.noise_model import NoiseModel
 from worldpose.triangulation.observations import Rig

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17
 from data_contracts.triangulation import EXCHANGED_PARTS
-from worldpose.cameras.projection import project_point
 from worldpose.compiled import compiled
+from worldpose.geometry.projection import project_point
 from worldpose.triangulation.observations import Rig
 from worldpose.triangulation.solving import Solution
 

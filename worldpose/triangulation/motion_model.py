@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17
-from worldpose.cameras import projection
+from worldpose.geometry import projection
 from worldpose.triangulation.observations import Rig
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.track_solver import held_out_cost, prepare, solve_segment

@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera, fold_radius, projection
-from worldpose.cameras.distortion import distort
 from worldpose.compiled import compiled
+from worldpose.geometry import Camera, fold_radius, projection
+from worldpose.geometry.distortion import distort
 from worldpose.triangulation.batched_gauss_newton import (
     EXTRA,
     LANES,
@@ -35,7 +35,7 @@ class Rig:
     """Cameras in the memory layout of the kernels.
 
     Attributes:
-        cameras: (cameras, 22) as in `worldpose.cameras.projection`.
+        cameras: (cameras, 22) as in `worldpose.geometry.projection`.
         depths: (cameras, 4), depth of (x, y, z, 1) [m]; 1 where a camera is missing.
         centers: (cameras, 3) [m], world.
     """

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.triangulation.array_checks import check_arrays
 from worldpose.triangulation.chunking import ClipDetections, learn_clip, reconstruct_chunks
 from worldpose.triangulation.clocks import CameraClocks

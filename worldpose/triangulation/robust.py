@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.triangulation import EXCHANGED_PARTS
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.triangulation.array_checks import check_arrays
 from worldpose.triangulation.calibration_errors import stated_errors
 from worldpose.triangulation.common_bias import BY_JOINT, learn_common_bias

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.triangulation.left_right_swaps import undo_swaps
 from worldpose.triangulation.motion_model import MotionModel, choose_stretches, learn_motion
 from worldpose.triangulation.observations import Rig, person_observations

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from data_contracts.conventions import COCO17
 from worldpose.body import BodyParameters, fold_keypoints, load_open_body
-from worldpose.cameras import Camera, Rigid
 from worldpose.evaluation.boxes import joint_boxes
 from worldpose.formats import JointTracks
+from worldpose.geometry import Camera, Rigid
 
 FRAMES, PEOPLE, WALK = 16, 2, 8.0
 FIRST = 40

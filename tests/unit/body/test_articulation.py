@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from worldpose.body.articulation import articulate
-from worldpose.cameras.rigid import Rigid
+from worldpose.geometry.rigid import Rigid
 
 CHAIN = np.array([-1, 0, 1])
 REST = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0]])

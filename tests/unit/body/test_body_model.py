@@ -5,8 +5,8 @@ import pytest
 
 from worldpose.body import BodyParameters
 from worldpose.body.skeletons import JOINT_NAMES
-from worldpose.cameras.rigid import Rigid
 from worldpose.errors import InputError
+from worldpose.geometry.rigid import Rigid
 
 # The file is in single precision, and the regressors' rows sum to 1 only that well.
 SINGLE = 1e-6

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from worldpose.body_fitting.monocular import read_monocular
-from worldpose.cameras import Rigid
 from worldpose.errors import InputError
+from worldpose.geometry import Rigid
 
 VECTORS = np.random.default_rng(0).normal(0.0, 0.4, (3, 24, 3))
 MATRICES = Rigid.from_rotvec(VECTORS, np.zeros(3)).rotation

@@ -8,8 +8,8 @@ from worldpose.body import BodyParameters
 from worldpose.body_fitting.monocular import MonocularEstimates, monocular_of
 from worldpose.body_fitting.monocular_poses import place_monocular_poses
 from worldpose.body_fitting.pose_space import GATHER
-from worldpose.cameras import Camera, Rigid
-from worldpose.synthetic.monocular import MonocularErrors, estimate_bodies
+from worldpose.geometry import Camera, Rigid
+from worldpose.simulation.monocular import MonocularErrors, estimate_bodies
 
 EXACT = MonocularErrors(turn=0.0, facing=0.0, size=0.0, place=0.0, missed=0.0)
 

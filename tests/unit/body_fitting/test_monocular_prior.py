@@ -17,7 +17,7 @@ from worldpose.body_fitting.monocular_prior import (
     left_jacobian,
 )
 from worldpose.body_fitting.pose_space import GATHER
-from worldpose.cameras import Rigid
+from worldpose.geometry import Rigid
 
 RNG = np.random.default_rng(2)
 

@@ -5,11 +5,11 @@ import pytest
 
 from worldpose.broadcast_calibration import MovingCamera, People, calibrate_broadcast
 from worldpose.pitch import PitchTemplate
-from worldpose.synthetic.broadcast_rendering import render_broadcast
-from worldpose.synthetic.key_frames import click_key_frames
-from worldpose.synthetic.scenarios import SCENARIOS
-from worldpose.synthetic.scene import simulate_scene
-from worldpose.synthetic.settings import ClickSettings
+from worldpose.simulation.broadcast_rendering import render_broadcast
+from worldpose.simulation.key_frames import click_key_frames
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import simulate_scene
+from worldpose.simulation.settings import ClickSettings
 
 
 def played(name, duration, seed):

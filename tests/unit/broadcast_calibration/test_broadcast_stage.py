@@ -18,10 +18,10 @@ from flows.stages.broadcast_pooling import STAGE as POOLING
 from tasks.broadcast_calibration import broadcast_calibration
 from tasks.broadcast_pooling import broadcast_pooling
 from tasks.ingest import ingest
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.ingest import Observations, write_match
+from worldpose.simulation.broadcast_rendering import render_broadcast
 from worldpose.store import Store
-from worldpose.synthetic.broadcast_rendering import render_broadcast
 from worldpose.video import write_video
 
 FIRST, COUNT, OFFSET = 7, 10, 4.4

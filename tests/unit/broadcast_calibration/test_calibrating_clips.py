@@ -22,8 +22,8 @@ from worldpose.broadcast_calibration import (
     moving_from_arrays,
 )
 from worldpose.errors import InputError
-from worldpose.synthetic.broadcast_rendering import render_broadcast
-from worldpose.synthetic.rendering import RenderingSettings
+from worldpose.simulation.broadcast_rendering import render_broadcast
+from worldpose.simulation.rendering import RenderingSettings
 
 FRAMES, FPS = 16, 25.0
 LOOK = RenderingSettings(light="floodlights", stand_shadow=0.0)

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from worldpose.broadcast_calibration.programme import find_shots, grass_and_people
-from worldpose.cameras import Camera, Rigid
 from worldpose.errors import InputError
+from worldpose.geometry import Camera, Rigid
 from worldpose.pitch import PitchTemplate
-from worldpose.synthetic.broadcast_rendering import render_broadcast
-from worldpose.synthetic.stadium import looking
+from worldpose.simulation.broadcast_rendering import render_broadcast
+from worldpose.simulation.stadium import looking
 from worldpose.video import VideoReader, index_frames, write_video
 from worldpose.video.cutting import cut_video
 

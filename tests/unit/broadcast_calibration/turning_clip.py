@@ -5,7 +5,7 @@ import numpy as np
 from worldpose.broadcast_calibration.evidence import MARKING, FlowEvidence, PointEvidence
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.pitch import PitchTemplate
-from worldpose.synthetic.stadium import looking
+from worldpose.simulation.stadium import looking
 
 PITCH = PitchTemplate.standard()
 SIZE = (960, 540)

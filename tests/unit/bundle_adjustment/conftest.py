@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from worldpose.bundle_adjustment import Clicks, Clip, Problem
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
+from worldpose.simulation.stadium import looking
 from worldpose.static_calibration import PARAMETERS, stepped
-from worldpose.synthetic.stadium import looking
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
 

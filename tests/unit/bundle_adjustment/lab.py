@@ -1,6 +1,6 @@
 """A laboratory of its own: few given cameras around people who cross, no pitch, biased keypoints.
 
-Nothing of it is taken from `worldpose.synthetic`: another skeleton, another way to walk, another
+Nothing of it is taken from `worldpose.simulation`: another skeleton, another way to walk, another
 detector and another rig.
 """
 
@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from worldpose.bundle_adjustment import Clicks, Clip
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 from worldpose.static_calibration import stepped
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 

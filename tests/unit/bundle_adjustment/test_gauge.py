@@ -10,7 +10,7 @@ from worldpose.bundle_adjustment.gauge import (
     relative_covariance,
     similarity_steps,
 )
-from worldpose.cameras import Rigid
+from worldpose.geometry import Rigid
 from worldpose.static_calibration import project_with_jacobian, stepped
 
 ORIGIN = np.array([0.3, -0.2, 1.0])

@@ -11,7 +11,7 @@ from worldpose.bundle_adjustment import (
     marking_errors,
     weak_direction,
 )
-from worldpose.cameras.stored import camera_from_arrays
+from worldpose.geometry.stored import camera_from_arrays
 from worldpose.store.layout_checks import checked_arrays, checked_attributes
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from worldpose.camera_consistency import ConsistencySettings, check_consistency
 from worldpose.camera_consistency.hypotheses import LEFT_RIGHT
-from worldpose.cameras import Camera, Rigid
 from worldpose.errors import InputError
+from worldpose.geometry import Camera, Rigid
 
 SETTINGS = ConsistencySettings(sample_frames=18)
 PITCH = (105.0, 68.0)

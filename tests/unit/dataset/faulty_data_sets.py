@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from worldpose.cameras import Camera, Rigid
 from worldpose.dataset.check import CheckSettings, check_clip
 from worldpose.dataset.reading import clips_in, read_clip
+from worldpose.geometry import Camera, Rigid
 
 FRAMES, PERSONS, FPS = 40, 6, 50.0
 Y_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])

@@ -16,13 +16,13 @@ from flows.checking import check
 from flows.cli.app import app
 from flows.statistics import count
 from worldpose.body import BodyParameters
-from worldpose.cameras import Camera, Rigid
 from worldpose.dataset.manifest import frame_rate_of, read_frame_rates, write_frame_rates
 from worldpose.dataset.statistics import clip_statistics, data_set_statistics
 from worldpose.errors import InputError, UsageError
 from worldpose.formats import JointTracks, write_joints, write_moving_camera
 from worldpose.formats.challenge import write_submission
 from worldpose.formats.pose_file import write_poses
+from worldpose.geometry import Camera, Rigid
 from worldpose.reports.data_set import bin_edges, statistics_picture
 
 

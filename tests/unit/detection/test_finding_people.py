@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from worldpose.cameras import Camera
 from worldpose.detection import DetectionSettings, People, PeopleFinder, Place, Poses
 from worldpose.detection.crowd import on_pitch
 from worldpose.detection.oks_nms import likeness, told_apart
+from worldpose.geometry import Camera
 from worldpose.ingest.given_cameras import given_camera
 from worldpose.pitch import PitchTemplate
 

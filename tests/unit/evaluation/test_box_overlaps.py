@@ -1,7 +1,7 @@
 import numpy as np
 
-from worldpose.cameras import Camera, Rigid
 from worldpose.evaluation.boxes import box_overlaps, joint_boxes
+from worldpose.geometry import Camera, Rigid
 
 DOWN_Z = Camera(
     focal=np.array([100.0, 100.0]),

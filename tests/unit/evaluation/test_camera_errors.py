@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from data_contracts.pitch import PitchSpec
-from worldpose.cameras import Camera, Rigid
 from worldpose.errors import InputError
 from worldpose.evaluation import CameraErrorSettings, evaluate_cameras
 from worldpose.evaluation.cameras import camera_samples, surface_points
+from worldpose.geometry import Camera, Rigid
 from worldpose.pitch import PitchTemplate
 
 FLAT = PitchTemplate.from_spec(PitchSpec(crown=0.0))

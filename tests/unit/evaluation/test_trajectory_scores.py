@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from people_samples import crowd, e4, person, score, tracks
 
-from worldpose.cameras import Camera, Rigid
 from worldpose.errors import InputError
 from worldpose.evaluation import evaluate_joints
 from worldpose.evaluation.trajectories import path_lengths
 from worldpose.formats import JointTracks
+from worldpose.geometry import Camera, Rigid
 
 # Sums of a few thousand rounded distances, after a decomposition of 3 x 3 matrices: 1e-8 mm is
 # some thousand roundings of the metres they are made of.

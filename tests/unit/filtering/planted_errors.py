@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldpose.cameras import Camera
 from worldpose.filtering import Suspects, perceived_joints, view_bodies
-from worldpose.synthetic.scenarios import SCENARIOS
-from worldpose.synthetic.scene import simulate_scene
+from worldpose.geometry import Camera
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import simulate_scene
 
 SPREAD = 0.015
 """Of the bodies' joints [m]: what fitting leaves of people whom several cameras see."""

@@ -7,7 +7,6 @@ import pytest
 from planted_errors import plant
 
 from data_contracts.conventions import COCO17
-from worldpose.cameras import Rigid
 from worldpose.filtering import FilteringSettings, judge_detections, learn_from
 from worldpose.filtering.clock_offsets import ClockEquations
 from worldpose.filtering.residuals import Residuals
@@ -17,7 +16,8 @@ from worldpose.filtering.systematic_errors import (
     watch_motion,
 )
 from worldpose.filtering.view_bias import TERMS, ViewBias, find_azimuths, learn_view_bias
-from worldpose.synthetic.occlusion import facing
+from worldpose.geometry import Rigid
+from worldpose.simulation.occlusion import facing
 
 ROWS = 3000
 

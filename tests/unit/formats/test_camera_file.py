@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 
 from data_contracts.cameras import CameraCalibration
-from worldpose.cameras import Camera
 from worldpose.errors import InputError
 from worldpose.formats import read_camera, write_archive, write_static_camera
+from worldpose.geometry import Camera
 
 CALIBRATION = CameraCalibration(
     id="north",

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from worldpose.body import BODY25, CHALLENGE15, BodyParameters, fold_keypoints, load_open_body
-from worldpose.cameras import Camera, Rigid
 from worldpose.errors import InputError
 from worldpose.formats.camera_rows import read_camera_rows
 from worldpose.formats.challenge import (
@@ -21,6 +20,7 @@ from worldpose.formats.challenge import (
     write_pitch_points,
     write_submission,
 )
+from worldpose.geometry import Camera, Rigid
 
 FRAMES = 3
 K1 = 0.2

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from data_contracts.conventions import COCO17
-from worldpose.cameras import Camera, Rigid
 from worldpose.formats import JointTracks, coco_dataset, write_coco
+from worldpose.geometry import Camera, Rigid
 
 
 @pytest.fixture

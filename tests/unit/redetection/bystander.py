@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from worldpose.cameras import Camera, Rigid
 from worldpose.filtering import BodyViews, Spread, view_bodies
+from worldpose.geometry import Camera, Rigid
 from worldpose.redetection import Expected
 
 FOCAL, SIZE = 1000.0, (1000, 600)

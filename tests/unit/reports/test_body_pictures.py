@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from worldpose.body import BodyParameters, load_open_body
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 from worldpose.reports.bodies import bodies_picture, crowded_part
 from worldpose.reports.body_rendering import paint_bodies, zoomed
 

@@ -7,8 +7,8 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from worldpose.cameras import Camera, Rigid
 from worldpose.formats import JointTracks
+from worldpose.geometry import Camera, Rigid
 from worldpose.reports.broadcast import (
     angles_of,
     before_after_picture,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from data_contracts.pitch import PitchSpec
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 from worldpose.reports.detections import LEFT_OUT, USED, detections_picture
 from worldpose.reports.drawing import PALETTE, markings
 from worldpose.reports.static_cameras import (

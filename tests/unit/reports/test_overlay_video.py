@@ -5,11 +5,11 @@ import numpy as np
 from data_contracts.conventions import COCO17
 from data_contracts.pitch import PitchSpec
 from worldpose.body import BodyParameters, fold_keypoints, load_open_body
-from worldpose.cameras import Camera
 from worldpose.formats import JointTracks
+from worldpose.geometry import Camera
 from worldpose.reports.body_rendering import BodyTracks
 from worldpose.reports.overlay_video import overlay_frames
-from worldpose.synthetic.stadium import looking
+from worldpose.simulation.stadium import looking
 
 SIZE = (322, 182)
 

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from data_contracts.pitch import PitchSpec
-from worldpose.cameras import Camera, Rigid
 from worldpose.formats import JointTracks
+from worldpose.geometry import Camera, Rigid
 from worldpose.reports.clips import paths_picture
 from worldpose.reports.drawing import PALETTE
 

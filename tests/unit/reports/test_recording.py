@@ -9,9 +9,9 @@ import pytest
 
 from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
-from worldpose.cameras import Camera, Rigid
 from worldpose.errors import UsageError
 from worldpose.formats import JointTracks
+from worldpose.geometry import Camera, Rigid
 from worldpose.reports.rerun_recording import write_recording
 
 

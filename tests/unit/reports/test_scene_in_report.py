@@ -7,8 +7,8 @@ import re
 import numpy as np
 import pytest
 
-from worldpose.cameras import Camera, Rigid
 from worldpose.formats import JointTracks
+from worldpose.geometry import Camera, Rigid
 from worldpose.reports import Scene
 from worldpose.reports.scene import MISSING, NUMBERS, UNIT, scene_html
 

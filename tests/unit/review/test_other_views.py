@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 from worldpose.review.other_views import check_views, epipolar_curves
 
 SIZE = np.array([1920, 1080])

@@ -7,13 +7,13 @@ from scipy.stats import chi2
 
 from data_contracts.pitch import PitchSpec
 from worldpose.pitch import PitchTemplate
+from worldpose.simulation.clicking import click
+from worldpose.simulation.rendering import render_pitch
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.settings import ClickSettings
+from worldpose.simulation.stadium import place_camera
+from worldpose.simulation.surveying import survey
 from worldpose.static_calibration import StaticCalibrationSettings, calibrate
-from worldpose.synthetic.clicking import click
-from worldpose.synthetic.rendering import render_pitch
-from worldpose.synthetic.scenarios import SCENARIOS
-from worldpose.synthetic.settings import ClickSettings
-from worldpose.synthetic.stadium import place_camera
-from worldpose.synthetic.surveying import survey
 
 SPREAD_OUT = ClickSettings()
 FEW = ClickSettings(clustered=1.0, clustered_points=(5, 7))

@@ -4,8 +4,8 @@ import clicking_people as people
 import numpy as np
 import pytest
 
+from worldpose.simulation.rendering import render_pitch
 from worldpose.static_calibration import StaticCalibrationSettings, calibrate
-from worldpose.synthetic.rendering import render_pitch
 
 PITCH, SIZE = people.PITCH, people.SIZE
 EXACT = StaticCalibrationSettings(survey_error=0.0)

@@ -6,11 +6,11 @@ from hypothesis import strategies as st
 
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
+from worldpose.simulation.stadium import looking
 from worldpose.static_calibration.evidence import gather
 from worldpose.static_calibration.homography import camera_of, homographies, plane_from_image
-from worldpose.synthetic.stadium import looking
 
 SIZE = people.SIZE
 MIDDLE = np.array([959.5, 539.5])

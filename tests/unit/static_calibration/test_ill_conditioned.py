@@ -5,6 +5,9 @@ import numpy as np
 import pytest
 
 from data_contracts.pitch import PitchSpec
+from worldpose.simulation.rendering import render_pitch
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.stadium import place_camera
 from worldpose.static_calibration import StaticCalibrationSettings, calibrate
 from worldpose.static_calibration.adjustment import problem_of, row_of
 from worldpose.static_calibration.evidence import gather
@@ -12,9 +15,6 @@ from worldpose.static_calibration.ill_conditioned import ClicksAndBars, fit_and_
 from worldpose.static_calibration.line_profiles import Bars
 from worldpose.static_calibration.line_samples import sample_markings, see_lines
 from worldpose.static_calibration.parameters import stepped
-from worldpose.synthetic.rendering import render_pitch
-from worldpose.synthetic.scenarios import SCENARIOS
-from worldpose.synthetic.stadium import place_camera
 
 SETTINGS = StaticCalibrationSettings()
 

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from data_contracts.pitch import PitchSpec
-from worldpose.cameras import Camera
 from worldpose.errors import InputError
+from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
+from worldpose.simulation.rendering import RenderingSettings, render_pitch
+from worldpose.simulation.stadium import looking
 from worldpose.static_calibration.clearance import clear, whites_of
 from worldpose.static_calibration.edges import brightness
 from worldpose.static_calibration.line_adjustment import adjust
@@ -18,8 +20,6 @@ from worldpose.static_calibration.line_samples import sample_markings, see_lines
 from worldpose.static_calibration.line_search import LineSearch, difference
 from worldpose.static_calibration.line_settings import LineRefinementSettings
 from worldpose.static_calibration.parameters import CameraEstimate, stepped
-from worldpose.synthetic.rendering import RenderingSettings, render_pitch
-from worldpose.synthetic.stadium import looking
 
 PITCH = PitchTemplate.standard()
 EXACT = 0.0

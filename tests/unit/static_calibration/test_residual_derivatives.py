@@ -4,7 +4,7 @@ import clicking_people as people
 import numpy as np
 import pytest
 
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.static_calibration import stepped
 from worldpose.static_calibration.adjustment import problem_of, row_of
 from worldpose.static_calibration.descent import step_row

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 
 SKELETON = np.array(
     [

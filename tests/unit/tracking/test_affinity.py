@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldpose.cameras import Rays, distance_to_rays
+from worldpose.geometry import Rays, distance_to_rays
 from worldpose.tracking.affinity import match_greedily, match_optimally, ray_affinity
 
 ORIGIN = np.zeros((1, 3))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worldpose.cameras import Rigid
+from worldpose.geometry import Rigid
 from worldpose.tracking import TrackingSettings, diagnose_no_people, track_people
 
 FPS = 25.0

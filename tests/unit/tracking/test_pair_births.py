@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 from worldpose.tracking import TrackingSettings, diagnose_no_people, track_people
 from worldpose.tracking.camera_gates import CameraGates
 from worldpose.tracking.following import Follower

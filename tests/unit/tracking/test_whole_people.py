@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.tracking.following import Follower
 from worldpose.tracking.person import Person

@@ -3,7 +3,7 @@
 import numpy as np
 
 from data_contracts.conventions import COCO17
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 
 FPS = 50.0
 MIRRORED = [

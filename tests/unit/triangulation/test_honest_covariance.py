@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
+from worldpose.simulation import SCENARIOS, simulate_scene
 from worldpose.static_calibration.parameters import stepped
-from worldpose.synthetic import SCENARIOS, simulate_scene
 from worldpose.triangulation import TriangulationSettings, estimate_clocks, triangulate_joints
 
 # Standard deviations of steps in the order of PARAMETERS; together some 9 cm at a player.

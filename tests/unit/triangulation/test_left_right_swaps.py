@@ -4,7 +4,7 @@ from running_samples import FPS, MIRRORED, detections, runner
 
 from data_contracts.conventions import COCO17
 from data_contracts.triangulation import EXCHANGED_PARTS
-from worldpose.cameras import Camera, Rigid
+from worldpose.geometry import Camera, Rigid
 from worldpose.triangulation import (
     TriangulationSettings,
     reconstruct_joints,

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from running_samples import detections, runner
 
-from worldpose.cameras import Camera
+from worldpose.geometry import Camera
 from worldpose.static_calibration.parameters import project_with_jacobian, stepped
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 from worldpose.triangulation.calibration_errors import stated_errors

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from worldpose.cameras import Camera
 from worldpose.errors import InputError
+from worldpose.geometry import Camera
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
 SETTINGS = TriangulationSettings()

@@ -1,0 +1,183 @@
+import cv2
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from worldpose.errors import InputError
+from worldpose.geometry import Camera, RayStatus, Rigid, fold_radius
+
+
+def plane_camera(k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0) -> Camera:
+    """A camera whose pixels are the distorted coordinates on the plane z = 1."""
+    return Camera(
+        focal=np.ones(2),
+        principal_point=np.zeros(2),
+        distortion=np.array([k1, k2, p1, p2, k3]),
+        cam_from_world=Rigid.identity(),
+        image_size=np.array([2, 2]),
+    )
+
+
+def on_plane(points) -> np.ndarray:
+    return np.concatenate([points, np.ones((len(points), 1))], axis=1)
+
+
+def spokes(radii, count=12) -> np.ndarray:
+    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    directions = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return (np.asarray(radii)[:, None, None] * directions).reshape(-1, 2)
+
+
+@pytest.mark.parametrize(
+    ("k1", "k2", "k3", "squared"),
+    [
+        (0.0, 0.0, 0.0, np.inf),
+        (0.3, 0.2, 0.1, np.inf),
+        (-1 / 3, 0.0, 0.0, 1.0),  # 1 - s
+        (0.0, -1 / 5, 0.0, 1.0),  # 1 - s^2
+        (0.0, 0.0, -1 / 7, 1.0),  # 1 - s^3
+        (-2.5 / 3, 1 / 5, 0.0, 0.5),  # (1 - 2 s)(1 - s / 2)
+        (-3 / 3, 2.75 / 5, -0.75 / 7, 2 / 3),  # (1 - 3 s / 2)(1 - s / 2)(1 - s)
+        (2 / 3, -3 / 5, 0.0, 1.0),  # (1 - s)(1 + 3 s): rises first
+        (-1.0 / 3, 1.0 / 5, 0.0, np.inf),  # 1 - s + s^2 > 0 everywhere
+        (-1.0, 5.0, 0.0, np.inf),  # barrel near the centre, never folding
+        (-1.0 / 3, 1.0 / 5, -1.0 / 7, 1.0),  # (1 - s)(1 + s^2)
+        (0.0, -1e-12 / 5, 0.0, 1e6),  # 1 - 1e-12 s^2
+    ],
+)
+def test_fold_is_the_first_zero_of_the_slope(k1, k2, k3, squared):
+    # A root of a polynomial with rounded coefficients: well conditioned in all these cases.
+    np.testing.assert_allclose(fold_radius([k1, k2, 0.0, 0.0, k3]), np.sqrt(squared), rtol=1e-12)
+
+
+def test_fold_is_found_for_batches():
+    batch = np.zeros((2, 3, 5))
+    batch[1, 2, 0] = -1 / 3
+    radii = fold_radius(batch)
+    assert radii.shape == (2, 3)
+    assert np.isinf(radii).sum() == 5
+    np.testing.assert_allclose(radii[1, 2], 1.0, rtol=1e-14)
+
+
+def test_missing_lens_has_no_known_fold():
+    assert np.isnan(fold_radius([0.1, np.nan, 0.0, 0.0, 0.0]))
+
+
+def test_fold_refuses_four_coefficients():
+    with pytest.raises(InputError, match=r"\(\.\.\., 5\), found shape \(4,\)"):
+        fold_radius(np.zeros(4))
+
+
+@example(0.0, -1.0, 2e-311)
+@given(*3 * [st.floats(-5.0, 5.0)])
+def test_radius_rises_up_to_the_fold_and_no_further(k1, k2, k3):
+    fold = float(fold_radius([k1, k2, 0.0, 0.0, k3]))
+    s = np.linspace(0.0, min(fold, 10.0), 1000)[:-1] ** 2
+    slope = 1.0 + s * (3.0 * k1 + s * (5.0 * k2 + s * 7.0 * k3))
+    # Rounding of terms up to 35 s^3.
+    rounding = 1e-15 * (1.0 + s * (15.0 + s * (25.0 + 35.0 * s)))
+    assert np.all(slope > -rounding)
+    if np.isfinite(fold):
+        s = fold * fold
+        slope = 1.0 + s * (3.0 * k1 + s * (5.0 * k2 + s * 7.0 * k3))
+        assert abs(slope) <= 1e-14 * (1.0 + s * (15.0 + s * (25.0 + 35.0 * s)))
+
+
+def test_points_at_and_beyond_the_fold_have_no_image():
+    camera = plane_camera(k1=-1 / 3)  # folds at 1, where the image radius is 2 / 3
+    points = on_plane([[0.999, 0.0], [1.001, 0.0], [0.0, 1.5], [-5.0, 0.0]])
+    found = camera.project_with_jacobians(points)
+    assert found.status.tolist() == [RayStatus.OK] + 3 * [RayStatus.BEYOND_FOLD]
+    assert np.isfinite(camera.project(points)).all(axis=-1).tolist() == [True, False, False, False]
+
+
+def test_pixels_beyond_the_folded_image_have_no_ray():
+    rays = plane_camera(k1=-1 / 3).unproject([[0.666, 0.0], [0.0, 0.667], [3.0, 4.0]])
+    assert rays.status.tolist() == [RayStatus.OK] + 2 * [RayStatus.BEYOND_FOLD]
+    assert np.isnan(rays.directions[1:]).all()
+
+
+def test_inverse_of_a_hand_made_barrel():
+    # h(1/2) = 1/2 (1 - 1/12) = 11/24 for k1 = -1/3.
+    found = plane_camera(k1=-1 / 3).normalize([[11 / 24, 0.0], [0.0, -11 / 24]])
+    np.testing.assert_allclose(found, [[0.5, 0.0], [0.0, -0.5]], atol=1e-15)
+
+
+def test_centre_of_the_lens_stays_in_place():
+    found = plane_camera(k1=0.9, k2=-1.0, k3=2.0).normalize([[0.0, 0.0]])
+    np.testing.assert_array_equal(found, [[0.0, 0.0]])
+
+
+@pytest.mark.parametrize("k", [(-0.4, 0.0, 0.0), (-0.3, 0.1, -0.05), (0.2, -1.0, 0.0)])
+def test_inverse_holds_up_to_the_brink_of_the_fold(k):
+    k1, k2, k3 = k
+    camera = plane_camera(k1=k1, k2=k2, k3=k3)
+    fold = float(fold_radius([k1, k2, 0.0, 0.0, k3]))
+    # At 1e-7 before the fold the image is 1e-14 short of its limit; at 1e-8 that is rounding.
+    points = spokes(fold * (1.0 - np.logspace(-1, -7, 7)))
+    image = camera.project(on_plane(points))
+    rays = camera.unproject(image)
+    assert rays.valid.all()
+    back = camera.project(rays.directions)
+    # The image returns to rounding even where the point itself is ill determined.
+    np.testing.assert_allclose(back, image, atol=1e-15)
+
+
+@example(-0.5, 3e-306, 0.0, 0.0, 0.0)
+@given(
+    st.floats(-0.5, 1.0),
+    st.floats(-1.1, 4.3),
+    st.floats(-0.01, 0.01),
+    st.floats(-0.01, 0.01),
+    st.floats(-1.0, 1.0),
+)
+def test_distortion_and_inverse_agree_with_opencv(k1, k2, p1, p2, k3):
+    camera = plane_camera(k1, k2, p1, p2, k3)
+    fold = float(fold_radius(camera.distortion))
+    # Tangential terms of 0.01 shift the fold by a few percent; 0.8 of the radial one is inside.
+    points = spokes(min(0.8 * fold, 0.6) * np.linspace(0.0, 1.0, 7))
+    image = camera.project(on_plane(points))
+    expected = cv2.projectPoints(
+        on_plane(points), np.zeros(3), np.zeros(3), np.eye(3), np.array(camera.distortion)
+    )[0]
+    np.testing.assert_allclose(image, expected.reshape(-1, 2), atol=1e-15)
+    # At 0.8 of the fold the slope is at least 0.1: rounding of 1e-16 grows tenfold.
+    np.testing.assert_allclose(camera.normalize(image), points, atol=1e-14)
+
+
+def test_tangential_terms_bend_the_fold():
+    # x' = x + 6 p2 x^2 / 2 on the axis: with p2 = -1/6 the slope 1 - x vanishes at x = 1,
+    # though the radial part never folds.
+    camera = plane_camera(p2=-1 / 6)
+    found = camera.project_with_jacobians(on_plane([[0.99, 0.0], [1.01, 0.0]]))
+    assert found.status.tolist() == [RayStatus.OK, RayStatus.BEYOND_FOLD]
+    # The image ends at x' = 1 - 1/2.
+    rays = camera.unproject([[0.4999, 0.0], [0.51, 0.0], [1.2, 0.0]])
+    assert rays.status.tolist() == [RayStatus.OK, RayStatus.BEYOND_FOLD, RayStatus.BEYOND_FOLD]
+
+
+def test_pixel_outside_the_radial_image_can_lie_inside_the_tangential_one():
+    # Along -x, p2 = -0.05 pushes the image outwards past the radial limit of 2 / 3.
+    camera = plane_camera(k1=-1 / 3, p2=-0.05)
+    image = camera.project(on_plane([[-0.9, 0.0]]))
+    assert image[0, 0] < -2 / 3
+    np.testing.assert_allclose(camera.normalize(image), [[-0.9, 0.0]], atol=1e-13)
+    assert camera.unproject([[-1.5, 0.0]]).status.tolist() == [RayStatus.BEYOND_FOLD]
+
+
+def test_radial_fold_bounds_the_inverse_with_tangential_terms_too():
+    # Along +x, p2 = 0.05 carries the image on past the radial fold at 1: the image of 1.1.
+    camera = plane_camera(k1=-1 / 3, p2=0.05)
+    beyond = 1.1 * (1.0 - 1.21 / 3.0) + 3.0 * 0.05 * 1.21
+    assert np.isnan(camera.project([[1.1, 0.0, 1.0]])).all()
+    assert camera.unproject([[beyond, 0.0]]).status.tolist() == [RayStatus.BEYOND_FOLD]
+
+
+def test_missing_pixels_and_cameras_are_missing():
+    rays = plane_camera(k1=0.1).unproject([[np.nan, 0.0], [0.0, np.inf], [0.0, 0.0]])
+    assert rays.status.tolist() == [RayStatus.MISSING, RayStatus.MISSING, RayStatus.OK]
+    absent = plane_camera(k1=np.nan)
+    assert absent.unproject([[0.0, 0.0]]).status.tolist() == [RayStatus.MISSING]
+    assert absent.project_with_jacobians([[0.0, 0.0, 1.0]]).status.tolist() == [RayStatus.MISSING]
+    assert np.isnan(absent.project([[0.0, 0.0, 1.0]])).all()

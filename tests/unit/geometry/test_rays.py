@@ -1,0 +1,211 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from worldpose.errors import InputError
+from worldpose.geometry import (
+    Rays,
+    RayStatus,
+    distance_to_rays,
+    intersect_rays,
+    ray_to_ray_distance,
+)
+
+coordinates = st.floats(-100.0, 100.0)
+points3 = st.tuples(coordinates, coordinates, coordinates).map(np.array)
+
+
+def rays_through(origins, targets) -> Rays:
+    origins, targets = np.broadcast_arrays(np.asarray(origins, float), np.asarray(targets, float))
+    offset = targets - origins
+    directions = offset / np.linalg.norm(offset, axis=-1, keepdims=True)
+    return Rays(origins, directions, np.zeros(directions.shape[:-1], np.uint8))
+
+
+def without(rays: Rays, *index) -> Rays:
+    directions, status = rays.directions.copy(), rays.status.copy()
+    directions[index], status[index] = np.nan, RayStatus.BEYOND_FOLD
+    return Rays(rays.origins, directions, status)
+
+
+def random_rays(rng: np.random.Generator, *shape: int) -> Rays:
+    return rays_through(rng.uniform(-50, 50, (*shape, 3)), rng.uniform(-50, 50, (*shape, 3)))
+
+
+def test_distance_to_a_ray_along_x_is_the_3_4_5_triangle():
+    ray = rays_through([0.0, 0.0, 0.0], [1.0, 0.0, 0.0])
+    assert distance_to_rays([7.0, 3.0, 4.0], ray) == 5.0
+
+
+def test_point_behind_the_camera_is_as_far_as_the_camera():
+    ray = rays_through([0.0, 0.0, 0.0], [1.0, 0.0, 0.0])
+    assert distance_to_rays([-12.0, 3.0, 4.0], ray) == 13.0
+
+
+def test_missing_point_or_ray_has_no_distance():
+    rays = without(rays_through(np.zeros((2, 3)), [1.0, 0.0, 0.0]), 1)
+    distance = distance_to_rays([[np.nan, 0.0, 0.0], [1.0, 1.0, 1.0]], rays)
+    assert np.isnan(distance).all()
+    assert np.isnan(ray_to_ray_distance(rays[:1], rays[1:])).all()
+
+
+def test_crossing_rays_touch_and_skew_rays_keep_their_gap():
+    a = rays_through([-5.0, 0.0, 0.0], [5.0, 0.0, 0.0])
+    b = rays_through([[0.0, -5.0, 0.0], [0.0, -5.0, 2.0]], [[0.0, 5.0, 0.0], [0.0, 5.0, 2.0]])
+    np.testing.assert_allclose(ray_to_ray_distance(a, b), [0.0, 2.0], atol=1e-15)
+
+
+def test_rays_that_would_cross_behind_a_camera_do_not_touch():
+    a = rays_through([3.0, 0.0, 0.0], [4.0, 0.0, 0.0])
+    b = rays_through([0.0, 4.0, 0.0], [0.0, 3.0, 0.0])
+    # The lines cross at the origin, behind a; nearest are a's camera and the origin on b.
+    assert ray_to_ray_distance(a, b) == 3.0
+
+
+@pytest.mark.parametrize(
+    ("origin", "target", "distance"),
+    [
+        ([7.0, 3.0, 4.0], [8.0, 3.0, 4.0], 5.0),  # side by side
+        ([-7.0, 3.0, 4.0], [-6.0, 3.0, 4.0], 5.0),  # side by side, beginning behind
+        ([7.0, 3.0, 4.0], [6.0, 3.0, 4.0], 5.0),  # face to face, passing
+        ([-12.0, 3.0, 4.0], [-13.0, 3.0, 4.0], 13.0),  # back to back
+        ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 0.0),  # the same ray
+    ],
+)
+@pytest.mark.parametrize("turn", [0.0, 1e-15, 1e-12, 1e-9])
+def test_parallel_and_nearly_parallel_rays(origin, target, distance, turn):
+    a = rays_through([0.0, 0.0, 0.0], [1.0, turn, 0.0])
+    b = rays_through(origin, target)
+    # An angle of 1e-9 over the 13 m here changes the distance by 13e-9 m.
+    np.testing.assert_allclose(ray_to_ray_distance(a, b), distance, atol=2e-8)
+
+
+@given(points3, points3, points3, points3)
+def test_ray_distance_is_the_least_over_all_pairs_of_points(o1, t1, o2, t2):
+    if np.linalg.norm(t1 - o1) < 1e-3 or np.linalg.norm(t2 - o2) < 1e-3:
+        return
+    a, b = rays_through(o1, t1), rays_through(o2, t2)
+    found = float(ray_to_ray_distance(a, b))
+    assert found == pytest.approx(float(ray_to_ray_distance(b, a)), abs=1e-6)
+    along = np.concatenate([[0.0], np.logspace(-2, 5, 400)])
+    on_a = a.origins + along[:, None] * a.directions
+    least = distance_to_rays(on_a, b).min()
+    # No sample is nearer than the answer; 1e-6 m covers rounding of nearly parallel rays.
+    assert found <= least + 1e-6
+    # Samples 4 percent apart miss the nearest point by up to 2 percent of its distance along a.
+    nearest = along[distance_to_rays(on_a, b).argmin()]
+    assert least <= found + 0.05 * nearest + 0.02
+
+
+def test_rays_through_one_point_meet_there():
+    rng = np.random.default_rng(1)
+    target = rng.uniform(-50, 50, (10, 1, 3))
+    rays = rays_through(rng.uniform(-100, 100, (10, 4, 3)), target)
+    points, normal = intersect_rays(rays)
+    # Four directions at random: conditioning below 100, rounding of 100 m.
+    np.testing.assert_allclose(points, target[:, 0], atol=1e-11)
+    assert normal.shape == (10, 3, 3)
+
+
+def test_two_skew_rays_meet_halfway_and_weights_pull():
+    rays = rays_through([[-5.0, 0.0, 0.0], [0.0, -5.0, 4.0]], [[5.0, 0.0, 0.0], [0.0, 5.0, 4.0]])
+    np.testing.assert_allclose(intersect_rays(rays)[0], [0.0, 0.0, 2.0], atol=1e-14)
+    # Weights 3 to 1 on squared distances: a quarter of the way.
+    np.testing.assert_allclose(intersect_rays(rays, [3.0, 1.0])[0], [0.0, 0.0, 1.0], atol=1e-14)
+
+
+def test_normal_matrix_of_rays_along_x_and_y():
+    rays = rays_through([[-5.0, 0.0, 0.0], [0.0, -5.0, 0.0]], [0.0, 0.0, 0.0])
+    # x is seen by the second ray, y by the first, z by both.
+    np.testing.assert_allclose(
+        intersect_rays(rays, [1.0, 10.0])[1], np.diag([10.0, 1.0, 11.0]), atol=1e-14
+    )
+
+
+def test_point_is_where_the_weighted_squares_are_least():
+    rng = np.random.default_rng(2)
+    rays, weights = random_rays(rng, 6, 5), rng.uniform(0.1, 2.0, (6, 5))
+    point, normal = intersect_rays(rays, weights)
+
+    def squares(at: np.ndarray) -> np.ndarray:
+        offset = at[:, None] - rays.origins
+        along = np.einsum("...i,...i->...", offset, rays.directions)
+        off_line = offset - along[..., None] * rays.directions
+        return (weights * np.square(off_line).sum(-1)).sum(-1)
+
+    for axis in np.eye(3):
+        # The cost is quadratic: half its second difference is the normal matrix's diagonal, and
+        # its slope vanishes. Values near 1e4 round at 1e-12.
+        plus, minus = squares(point + axis), squares(point - axis)
+        np.testing.assert_allclose(plus, minus, atol=1e-9)
+        second = 0.5 * (plus + minus) - squares(point)
+        np.testing.assert_allclose(second, np.einsum("i,...ij,j->...", axis, normal, axis),
+                                   atol=1e-9)  # fmt: skip
+
+
+@pytest.mark.parametrize("weights", [None, [1.0, 1.0, 0.0], [1.0, 1.0, np.nan]])
+def test_missing_and_weightless_rays_are_left_out(weights):
+    rays = rays_through(
+        [[-5.0, 0.0, 0.0], [0.0, -5.0, 0.0], [9.0, 9.0, 9.0]],
+        [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 2.0, 3.0]],
+    )
+    rays = without(rays, 2) if weights is None else rays
+    point, normal = intersect_rays(rays, weights)
+    np.testing.assert_allclose(point, np.zeros(3), atol=1e-14)
+    np.testing.assert_allclose(normal, np.diag([1.0, 1.0, 2.0]), atol=1e-14)
+
+
+def test_fewer_than_two_rays_determine_no_point():
+    rays = random_rays(np.random.default_rng(3), 3, 2)
+    rays = without(without(rays, 0), 1, 1)
+    points, _ = intersect_rays(rays)
+    assert np.isnan(points).all(axis=-1).tolist() == [True, True, False]
+    assert np.isnan(intersect_rays(random_rays(np.random.default_rng(3), 1, 0))[0]).all()
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-12, 1e-7])
+def test_parallel_rays_determine_no_point(turn):
+    origins = [[0.0, 0.0, 0.0], [0.0, 5.0, 0.0], [0.0, 0.0, 3.0]]
+    targets = [[10.0, 10.0 * turn, 0.0], [10.0, 5.0, 0.0], [10.0, 0.0, 3.0]]
+    assert np.isnan(intersect_rays(rays_through(origins, targets))[0]).all()
+
+
+def test_cameras_ten_metres_apart_meet_a_kilometre_away():
+    target = np.array([1000.0, 0.0, 0.0])
+    rays = rays_through([[0.0, -5.0, 0.0], [0.0, 5.0, 0.0]], target)
+    # An angle of 0.01 rad: rounding of 1e-13 m over 0.01^2.
+    np.testing.assert_allclose(intersect_rays(rays)[0], target, atol=1e-8)
+
+
+def test_large_world_coordinates_keep_their_digits():
+    shift = np.array([500_000.0, 4_000_000.0, 100.0])  # a survey grid
+    origins = shift + np.array([[0.0, -5.0, 0.0], [0.0, 5.0, 0.0]])
+    target = shift + np.array([1000.0, 0.0, 0.0])
+    # As ten metres apart without the shift; solving in grid coordinates would lose 1e-5 m.
+    np.testing.assert_allclose(intersect_rays(rays_through(origins, target))[0], target, rtol=0.0,
+                               atol=1e-8)  # fmt: skip
+
+
+def test_rays_broadcast_and_index():
+    rays = Rays(np.zeros(3), random_rays(np.random.default_rng(0), 4, 5).directions, np.uint8(0))
+    assert rays.origins.shape == (4, 5, 3)
+    assert rays.status.shape == (4, 5)
+    assert rays[1].directions.shape == (5, 3)
+    assert rays[:, 2].directions.shape == (4, 3)
+    assert rays[..., 2].directions.shape == (4, 3)
+    assert rays[:, None].directions.shape == (4, 1, 5, 3)
+    assert distance_to_rays(np.zeros((7, 1, 1, 3)), rays).shape == (7, 4, 5)
+    assert ray_to_ray_distance(rays[:, None], rays[None]).shape == (4, 4, 5)
+    with pytest.raises(IndexError):
+        _ = rays[1, 2, 0]
+
+
+def test_negative_weights_and_wrong_shapes_are_refused():
+    rays = random_rays(np.random.default_rng(0), 2)
+    with pytest.raises(InputError, match="no negative weight, found -1"):
+        intersect_rays(rays, [1.0, -1.0])
+    with pytest.raises(InputError, match=r"\(\.\.\., 3\), found shape \(2,\)"):
+        distance_to_rays([0.0, 1.0], rays)
+    with pytest.raises(InputError, match="broadcast"):
+        Rays(np.zeros((2, 3)), np.zeros((4, 3)), np.zeros(4, np.uint8))

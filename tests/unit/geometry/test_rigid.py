@@ -1,0 +1,147 @@
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from worldpose.errors import InputError
+from worldpose.geometry import Rigid
+from worldpose.geometry.rigid import nearest_rotation
+
+# Matrix products of unit-size numbers: a few roundings of 1.1e-16 each.
+ROUNDING = 1e-14
+
+coordinates = st.floats(-100.0, 100.0)
+vectors = st.tuples(coordinates, coordinates, coordinates).map(np.array)
+angles = st.floats(-1.0, 1.0)
+rotvecs = st.tuples(angles, angles, angles).map(np.array)
+
+
+def quarter_turn_about_z() -> Rigid:
+    return Rigid.from_rotvec([0.0, 0.0, np.pi / 2], [10.0, 0.0, 0.0])
+
+
+def test_quarter_turn_about_z_takes_x_to_y():
+    moved = quarter_turn_about_z().apply([[1.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
+    np.testing.assert_allclose(moved, [[10.0, 1.0, 0.0], [10.0, 0.0, 2.0]], atol=ROUNDING)
+
+
+def test_composition_applies_the_right_transform_first():
+    turn, shift = quarter_turn_about_z(), Rigid(np.eye(3), [1.0, 0.0, 0.0])
+    # Shift x = 1 to 2, turn it to y = 2, then add 10 to x.
+    np.testing.assert_allclose(
+        (turn @ shift).apply([[1.0, 0.0, 0.0]]), [[10.0, 2.0, 0.0]], atol=ROUNDING
+    )
+
+
+def test_identity_moves_nothing():
+    points = np.arange(6.0).reshape(2, 3)
+    np.testing.assert_array_equal(Rigid.identity().apply(points), points)
+
+
+@given(rotvecs, vectors, rotvecs, vectors, vectors)
+def test_composition_inverse_and_application_agree(r1, t1, r2, t2, point):
+    c_from_b, b_from_a = Rigid.from_rotvec(r1, t1), Rigid.from_rotvec(r2, t2)
+    through = c_from_b.apply(b_from_a.apply(point[None]))
+    # Coordinates reach 500 m: 500 times the unit rounding of a few products.
+    np.testing.assert_allclose((c_from_b @ b_from_a).apply(point[None]), through, atol=1e-12)
+    np.testing.assert_allclose(
+        (c_from_b @ b_from_a).inverse().apply(through), point[None], atol=1e-12
+    )
+
+
+@given(rotvecs)
+def test_rotation_vector_equals_opencv_and_comes_back(rotvec):
+    transform = Rigid.from_rotvec(rotvec, np.zeros(3))
+    np.testing.assert_allclose(transform.rotation, cv2.Rodrigues(rotvec)[0], atol=ROUNDING)
+    # Angles stay below sqrt(3) < pi, where the vector is unique.
+    np.testing.assert_allclose(transform.rotvec, rotvec, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("axis", [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.6, 0.0, 0.8]])
+@pytest.mark.parametrize("below", [0.0, 1e-12, 1e-7, 1e-3])
+def test_rotation_vector_survives_half_turns(axis, below):
+    transform = Rigid.from_rotvec((np.pi - below) * np.array(axis), np.zeros(3))
+    again = Rigid.from_rotvec(transform.rotvec, np.zeros(3))
+    np.testing.assert_allclose(again.rotation, transform.rotation, atol=ROUNDING)
+    # sin(angle / 2) comes out within rounding of 1, and its slope there is what limits the angle.
+    np.testing.assert_allclose(np.linalg.norm(transform.rotvec), np.pi - below, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-300, 1e-12, 1e-8, 1e-5])
+def test_tiny_rotations_keep_their_digits(size):
+    rotvec = size * np.array([1.0, -2.0, 3.0])
+    found = Rigid.from_rotvec(rotvec, np.zeros(3)).rotvec
+    # The matrix holds the sine itself, so the relative precision is that of float64.
+    np.testing.assert_allclose(found, rotvec, rtol=ROUNDING, atol=0.0)
+
+
+def test_missing_rotation_stays_missing():
+    missing = Rigid.from_rotvec(np.full(3, np.nan), np.zeros(3))
+    assert np.isnan(missing.rotvec).all()
+    assert np.isnan(missing.apply([[1.0, 2.0, 3.0]])).all()
+
+
+def test_tangent_update_rotates_before_it_translates():
+    start = Rigid(np.eye(3), [1.0, 0.0, 0.0])
+    # x = 1 in frame b turns to y = 1, then moves 5 along z.
+    moved = start.updated([0.0, 0.0, np.pi / 2, 0.0, 0.0, 5.0]).apply([[0.0, 0.0, 0.0]])
+    np.testing.assert_allclose(moved, [[0.0, 1.0, 5.0]], atol=ROUNDING)
+
+
+@given(rotvecs, vectors, vectors)
+def test_tangent_update_has_the_documented_derivative(rotvec, translation, point):
+    transform = Rigid.from_rotvec(rotvec, translation)
+    x, y, z = transform.apply(point[None])[0]
+    expected = np.hstack([[[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]], np.eye(3)])
+    h = 1e-6
+    steps = h * np.eye(6)
+    found = (
+        transform.updated(steps).apply(point[None]) - transform.updated(-steps).apply(point[None])
+    )[:, 0].T / (2.0 * h)
+    # Central differences at 300 m: 300 h^2 / 6 from the third derivative, and rounding of
+    # 300 * 1e-16 * a few / h.
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_batches_broadcast_and_index():
+    batch = Rigid.from_rotvec(np.zeros((4, 1, 3)), np.arange(6.0).reshape(2, 3))
+    assert batch.batch_shape == (4, 2)
+    assert batch.apply(np.zeros((5, 3))).shape == (4, 2, 5, 3)
+    assert batch[1].batch_shape == (2,)
+    np.testing.assert_array_equal(batch[3, 1].translation, [3.0, 4.0, 5.0])
+    assert batch[..., 0].batch_shape == (4,)
+    assert batch[:, np.array([True, False])].batch_shape == (4, 1)
+    assert (batch @ batch.inverse()).batch_shape == (4, 2)
+    assert batch.updated(np.zeros(6)).batch_shape == (4, 2)
+
+
+def test_single_transform_has_no_items():
+    with pytest.raises(IndexError):
+        _ = Rigid.identity()[0]
+
+
+@pytest.mark.parametrize(
+    ("make", "expected", "found"),
+    [
+        (lambda: Rigid(np.eye(4), np.zeros(3)), r"\(\.\.\., 3, 3\)", r"\(4, 4\)"),
+        (lambda: Rigid(np.eye(3), np.zeros((3, 1))), r"\(\.\.\., 3\)", r"\(3, 1\)"),
+        (lambda: Rigid(np.zeros((2, 3, 3)), np.zeros((4, 3))), "broadcast", r"\(2,\) and \(4,\)"),
+        (lambda: Rigid.identity().apply(np.zeros(3)), r"\(\.\.\., n, 3\)", r"\(3,\)"),
+        (lambda: Rigid.identity().updated(np.zeros(3)), r"\(\.\.\., 6\)", r"\(3,\)"),
+        (lambda: Rigid.from_rotvec(np.eye(4), np.zeros(3)), r"\(\.\.\., 3\)", r"\(4, 4\)"),
+    ],
+)
+def test_wrong_shapes_are_refused_with_both_shapes(make, expected, found):
+    with pytest.raises(InputError, match=expected + ".*" + found):
+        make()
+
+
+def test_exact_rotation_is_kept_bit_for_bit():
+    rotation = Rigid.from_rotvec([0.3, -2.0, 0.9], np.zeros(3)).rotation
+    np.testing.assert_array_equal(nearest_rotation("here", rotation), rotation)
+
+
+def test_missing_rotation_is_refused():
+    with pytest.raises(InputError, match="here: expected an orthonormal matrix"):
+        nearest_rotation("here", np.full((3, 3), np.nan))

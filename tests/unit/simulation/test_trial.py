@@ -1,0 +1,55 @@
+from statistics import mean
+
+import numpy as np
+import pytest
+
+from worldpose.evaluation import evaluate_joints
+from worldpose.formats import JointTracks
+from worldpose.geometry import Camera
+from worldpose.pitch import PitchTemplate
+from worldpose.simulation import SCENARIOS, simulate_scene
+from worldpose.static_calibration import StaticCalibrationSettings, calibrate
+from worldpose.tracking import TrackingSettings, track_people
+from worldpose.triangulation import TriangulationSettings, triangulate_joints
+
+
+def reconstructed(scene, cameras, fps):
+    """Scores of tracked and plainly triangulated joints: cameras are taken as exact."""
+    seen = scene.static_views()
+    keypoints, confidence = seen.keypoints, seen.confidence
+    tracks = track_people(cameras, keypoints, confidence, fps, TrackingSettings())
+    index = tracks.detection_index
+    plain = TriangulationSettings(learn_noise=False, offsets="none")
+    joints = triangulate_joints(cameras, keypoints, confidence, index, plain)
+    prediction = JointTracks(scene.truth.frames, np.asarray(tracks.person), joints.joints)
+    scores, _ = evaluate_joints(prediction, scene.truth, fps=fps)
+    return scores
+
+
+def from_clicks(scene):
+    """The static cameras by the plain calibration: clicks, without the lines in the pictures."""
+    pitch = PitchTemplate.from_spec(scene.surveyed)
+    plain = StaticCalibrationSettings(lines=False)
+    return Camera.stack(
+        [
+            calibrate(pitch, clicks.markings, (1920, 1080), settings=plain).estimate.camera
+            for clicks in scene.clicks.values()
+        ]
+    )
+
+
+@pytest.mark.slow
+def test_the_trial_starts_where_the_papers_does_and_true_cameras_show_what_can_be_gained():
+    scenario = SCENARIOS["penalty-box"].model_copy(update={"broadcast": None})
+    true, plain = [], []
+    for seed in range(1, 11):
+        scene = simulate_scene(scenario, seed)
+        exact = Camera.stack(list(scene.cameras.values()))
+        true.append(reconstructed(scene, exact, scenario.fps))
+        plain.append(reconstructed(scene, from_clicks(scene), scenario.fps))
+    # The paper has 83.5 / 70.8 mm from its base calibration; the detector's own part, left with
+    # true cameras, is pinned at 62 to 72 mm (docs/synthetic.md).
+    assert 62.0 < mean(each.g_mpjpe_mm for each in true) < 72.0
+    assert 54.0 < mean(each.pa_mpjpe_mm for each in true) < 66.0
+    assert 80.0 < mean(each.g_mpjpe_mm for each in plain) < 90.0
+    assert 65.0 < mean(each.pa_mpjpe_mm for each in plain) < 78.0

@@ -1,0 +1,96 @@
+"""Annotation formats by name, and their files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final, Literal, NamedTuple, TypeAlias, get_args
+
+from pydantic import ValidationError
+
+from worldpose.errors import InputError
+from worldpose.formats.annotations.coco import coco_bytes, read_coco
+from worldpose.formats.annotations.cvat import cvat_bytes, read_cvat
+from worldpose.formats.annotations.label_studio import label_studio_bytes, read_label_studio
+from worldpose.formats.annotations.pictures import AnnotatedPicture, ContentError
+
+Format: TypeAlias = Literal["coco", "cvat", "label-studio"]
+FORMATS: Final[tuple[Format, ...]] = get_args(Format)
+MOST: Final = 1 << 28
+"""Maximum file size [bytes], about that of a hundred thousand people."""
+
+
+class _Codec(NamedTuple):
+    name: str
+    suffix: str
+    encode: Callable[[Sequence[AnnotatedPicture]], bytes]
+    decode: Callable[[bytes], list[AnnotatedPicture]]
+
+
+_CODECS: Final[dict[Format, _Codec]] = {
+    "coco": _Codec("COCO keypoints JSON", ".json", coco_bytes, read_coco),
+    "cvat": _Codec("CVAT for images XML 1.1", ".xml", cvat_bytes, read_cvat),
+    "label-studio": _Codec("Label Studio JSON", ".json", label_studio_bytes, read_label_studio),
+}
+
+
+def suffix_of(form: Format) -> str:
+    """Return the file name suffix of a format."""
+    return _CODECS[form].suffix
+
+
+def format_of(content: bytes) -> Format:
+    """Detect the format of a file from its first characters: XML, a list of tasks, or an object."""
+    begin = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1]
+    return "cvat" if begin == b"<" else "label-studio" if begin == b"[" else "coco"
+
+
+def write_annotations(
+    path: Path, pictures: Sequence[AnnotatedPicture], form: Format = "coco"
+) -> None:
+    """Write annotated images in a format.
+
+    Args:
+        path: the file; overwritten.
+        pictures: with unique names.
+        form: the format.
+    """
+    path.write_bytes(_CODECS[form].encode(pictures))
+
+
+def read_annotations(path: Path, form: Format | None = None) -> list[AnnotatedPicture]:
+    """Return the images of a file, in its order.
+
+    Args:
+        path: the file.
+        form: its format; None = detect from its content.
+
+    Raises:
+        InputError: the content is invalid; nothing is read.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MOST:
+            raise ContentError(f"{size} bytes, more than {MOST}")
+        content = path.read_bytes()
+        form = form or format_of(content)
+        pictures = _CODECS[form].decode(content)
+        if len({picture.name for picture in pictures}) < len(pictures):
+            raise ContentError("two pictures of one name")
+        return pictures
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        raise _refusal(path, form, f"{place}: {first['msg']}" if place else first["msg"]) from None
+    except (OSError, ContentError) as error:
+        raise _refusal(path, form, str(error)) from error
+
+
+def _refusal(path: Path, form: Format | None, found: str) -> InputError:
+    known = " or ".join(codec.name for codec in _CODECS.values())
+    return InputError(
+        str(path),
+        expected=known if form is None else _CODECS[form].name,
+        found=found,
+        todo="Export it again from the annotator; docs/review.md says how.",
+    )

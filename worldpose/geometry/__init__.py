@@ -1,0 +1,28 @@
+"""Camera models: projection of world points to pixels, and unprojection of pixels to rays.
+
+Inputs: calibrations, world points [m] or pixels. Outputs: pixels with Jacobians, rays, distances.
+"""
+
+from worldpose.geometry.distortion import fold_radius
+from worldpose.geometry.pinhole import Camera, Projection
+from worldpose.geometry.rays import (
+    Rays,
+    RayStatus,
+    distance_to_rays,
+    intersect_rays,
+    ray_to_ray_distance,
+)
+from worldpose.geometry.rigid import Rigid, nearest_rotation
+
+__all__ = [
+    "Camera",
+    "Projection",
+    "RayStatus",
+    "Rays",
+    "Rigid",
+    "distance_to_rays",
+    "fold_radius",
+    "intersect_rays",
+    "nearest_rotation",
+    "ray_to_ray_distance",
+]

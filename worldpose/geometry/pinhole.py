@@ -1,0 +1,304 @@
+"""Pinhole cameras with lens distortion: projection with Jacobians, and unprojection to rays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from data_contracts.cameras import CameraCalibration, Vector3
+from worldpose.errors import InputError
+from worldpose.geometry import projection
+from worldpose.geometry.distortion import fold_radius
+from worldpose.geometry.rays import Rays
+from worldpose.geometry.rigid import (
+    Index,
+    Rigid,
+    checked,
+    common_batch,
+    leading,
+    nearest_rotation,
+)
+
+_PARTS = {"focal": 2, "principal_point": 2, "distortion": 5, "image_size": 2}
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """Pixels of world points, and their derivatives by the point and by the camera.
+
+    All arrays are NaN where `status` is not OK.
+    """
+
+    points_image: NDArray[np.float64]
+    """(..., n, 2) [px]."""
+    d_points: NDArray[np.float64]
+    """(..., n, 2, 3) [px/m], by the world point."""
+    d_pose: NDArray[np.float64]
+    """(..., n, 2, 6) [px/rad, px/m], by the delta of `cam_from_world.updated(delta)`: rotation
+    vector, then translation, both acting in the camera frame."""
+    d_intrinsics: NDArray[np.float64]
+    """(..., n, 2, 4), by fx fy cx cy."""
+    d_distortion: NDArray[np.float64]
+    """(..., n, 2, 5) [px], by k1 k2 p1 p2 k3."""
+    status: NDArray[np.uint8]
+    """(..., n) RayStatus."""
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One pinhole camera with OpenCV's five distortion coefficients, or a batch of them.
+
+    Batch dimensions of the fields broadcast against each other. A camera with a NaN is missing: its
+    pixels and rays are NaN.
+
+    Raises:
+        InputError: a field has the wrong shape, or the batches do not broadcast.
+
+    Note:
+        C3, C5.
+    """
+
+    focal: NDArray[np.float64]
+    """(..., 2) fx, fy [px]."""
+    principal_point: NDArray[np.float64]
+    """(..., 2) cx, cy [px]; (0, 0) is the centre of the top-left pixel."""
+    distortion: NDArray[np.float64]
+    """(..., 5) k1 k2 p1 p2 k3."""
+    cam_from_world: Rigid
+    """(...) pose."""
+    image_size: NDArray[np.int64]
+    """(..., 2) width, height [px]."""
+
+    def __post_init__(self) -> None:
+        pose = self.cam_from_world
+        parts = {
+            name: checked(f"Camera.{name}", getattr(self, name), (length,))
+            for name, length in _PARTS.items()
+        }
+        batch = common_batch(
+            "Camera", pose.batch_shape, *(part.shape[:-1] for part in parts.values())
+        )
+        parts["image_size"] = parts["image_size"].astype(np.int64)
+        for name, part in parts.items():
+            object.__setattr__(self, name, np.broadcast_to(part, (*batch, part.shape[-1])))
+        if pose.batch_shape != batch:
+            rotation = np.broadcast_to(pose.rotation, (*batch, 3, 3))
+            object.__setattr__(self, "cam_from_world", Rigid(rotation, pose.translation))
+
+    @classmethod
+    def stack(cls, cameras: Sequence[Camera]) -> Camera:
+        """Return one batch of cameras, stacked along a new first dimension.
+
+        Raises:
+            InputError: there are none, or their batch shapes differ.
+        """
+        if len({camera.batch_shape for camera in cameras}) != 1:
+            raise InputError(
+                "Camera.stack",
+                expected="one or more cameras of one batch shape",
+                found=f"batch shapes {[camera.batch_shape for camera in cameras]}",
+                todo="Stack single cameras.",
+            )
+        poses = [camera.cam_from_world for camera in cameras]
+        return cls(
+            **{name: np.stack([getattr(camera, name) for camera in cameras]) for name in _PARTS},
+            cam_from_world=Rigid(
+                np.stack([pose.rotation for pose in poses]),
+                np.stack([pose.translation for pose in poses]),
+            ),
+        )
+
+    @classmethod
+    def from_calibration(cls, calibration: CameraCalibration) -> Camera:
+        """Return the camera of a record, its rotation replaced by the nearest exact one.
+
+        Raises:
+            InputError: a focal length or the image size is not positive, or the rotation is not
+                orthonormal with determinant 1 within what six decimals allow.
+        """
+        where = f"camera {calibration.id}"
+        if min(*calibration.focal_px, *calibration.image_size) <= 0:
+            raise InputError(
+                where,
+                expected="positive focal lengths and image size",
+                found=f"focal_px {calibration.focal_px}, image_size {calibration.image_size}",
+                todo="Correct the calibration.",
+            )
+        rotation = nearest_rotation(f"{where}: rotation", calibration.rotation)
+        return cls(
+            focal=np.array(calibration.focal_px),
+            principal_point=np.array(calibration.principal_point_px),
+            distortion=np.array(calibration.distortion),
+            cam_from_world=Rigid(rotation, np.array(calibration.translation)),
+            image_size=np.array(calibration.image_size, dtype=np.int64),
+        )
+
+    def to_calibration(self, camera_id: str) -> CameraCalibration:
+        """Return the record of a single camera.
+
+        Raises:
+            InputError: this is a batch.
+        """
+        if self.batch_shape:
+            raise InputError(
+                "Camera.to_calibration",
+                expected="a single camera",
+                found=f"a batch of shape {self.batch_shape}",
+                todo="Index the batch first.",
+            )
+        width, height = (int(n) for n in self.image_size)
+        fx, fy = self.focal.tolist()
+        cx, cy = self.principal_point.tolist()
+        k1, k2, p1, p2, k3 = self.distortion.tolist()
+        rows = tuple(_vector3(row) for row in self.cam_from_world.rotation)
+        return CameraCalibration(
+            id=camera_id,
+            image_size=(width, height),
+            focal_px=(fx, fy),
+            principal_point_px=(cx, cy),
+            distortion=(k1, k2, p1, p2, k3),
+            rotation=(rows[0], rows[1], rows[2]),
+            translation=_vector3(self.cam_from_world.translation),
+        )
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Shape of the batch; () for a single camera."""
+        return self.focal.shape[:-1]
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """Camera centres (..., 3) [m], world."""
+        return self.cam_from_world.inverse().translation
+
+    @property
+    def numbers(self) -> NDArray[np.float64]:
+        """Rows (..., 22) as the compiled kernels of `worldpose.geometry.projection` take them."""
+        return np.concatenate(
+            [
+                self.focal,
+                self.principal_point,
+                self.distortion,
+                self.cam_from_world.rotation.reshape(*self.batch_shape, 9),
+                self.cam_from_world.translation,
+                fold_radius(self.distortion)[..., None],
+            ],
+            axis=-1,
+        )
+
+    def __getitem__(self, index: Index) -> Camera:
+        return Camera(
+            **{name: getattr(self, name)[leading(index, 1)] for name in _PARTS},
+            cam_from_world=self.cam_from_world[index],
+        )
+
+    def project(self, points_world: ArrayLike) -> NDArray[np.float64]:
+        """Return the pixels of world points.
+
+        Args:
+            points_world: (..., n, 3) [m]; the cameras broadcast against the dimensions before n,
+                so that cameras (C,) and points (n, 3) give (C, n, 2).
+
+        Returns:
+            (..., n, 2) [px], also outside the image; NaN behind the camera, and where the lens
+            model is not one to one.
+
+        Raises:
+            InputError: the shapes do not agree.
+        """
+        batch, cameras, points = self._flat("Camera.project: points_world", points_world, 3)
+        image = np.empty((*points.shape[:-1], 2))
+        projection.project(cameras, points, image)
+        return image.reshape(*batch, *image.shape[1:])
+
+    def project_with_jacobians(self, points_world: ArrayLike) -> Projection:
+        """Return the pixels of world points with their derivatives.
+
+        Args:
+            points_world: (..., n, 3) [m], as in `project`.
+
+        Raises:
+            InputError: the shapes do not agree.
+        """
+        batch, cameras, points = self._flat("Camera.project: points_world", points_world, 3)
+        shape = points.shape[:-1]
+        image = np.empty((*shape, 2))
+        jacobian = np.empty((*shape, 2, 18))
+        status = np.empty(shape, dtype=np.uint8)
+        projection.project_with_jacobians(cameras, points, image, jacobian, status)
+        jacobian = jacobian.reshape(*batch, *jacobian.shape[1:])
+        return Projection(
+            points_image=image.reshape(*batch, *image.shape[1:]),
+            d_points=jacobian[..., :3],
+            d_pose=jacobian[..., 3:9],
+            d_intrinsics=jacobian[..., 9:13],
+            d_distortion=jacobian[..., 13:],
+            status=status.reshape(*batch, *status.shape[1:]),
+        )
+
+    def unproject(self, points_image: ArrayLike) -> Rays:
+        """Return the rays of image points.
+
+        Args:
+            points_image: (..., n, 2) [px]; the cameras broadcast against the dimensions before n.
+
+        Returns:
+            (..., n) rays, NaN with a status where the lens model has no inverse.
+
+        Raises:
+            InputError: the shapes do not agree.
+        """
+        batch, cameras, points = self._flat("Camera.unproject: points_image", points_image, 2)
+        plane, status = _normalize(cameras, points)
+        directions = np.empty((*points.shape[:-1], 3))
+        projection.point_rays(cameras, plane, directions)
+        return Rays(
+            origins=self.center[..., None, :],
+            directions=directions.reshape(*batch, *directions.shape[1:]),
+            status=status.reshape(*batch, *status.shape[1:]),
+        )
+
+    def normalize(self, points_image: ArrayLike) -> NDArray[np.float64]:
+        """Return the undistorted coordinates of image points on the plane z = 1.
+
+        Args:
+            points_image: (..., n, 2) [px], as in `unproject`.
+
+        Returns:
+            (..., n, 2), NaN where the lens model has no inverse.
+
+        Raises:
+            InputError: the shapes do not agree.
+        """
+        batch, cameras, points = self._flat("Camera.normalize: points_image", points_image, 2)
+        plane, _ = _normalize(cameras, points)
+        return plane.reshape(*batch, *plane.shape[1:])
+
+    def _flat(
+        self, where: str, points: ArrayLike, width: int
+    ) -> tuple[tuple[int, ...], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the common batch shape, cameras (batch, 22) and points (batch, n, width)."""
+        values = checked(where, points, (-1, width))
+        batch = common_batch(where, self.batch_shape, values.shape[:-2])
+        size = int(np.prod(batch))
+        cameras = np.broadcast_to(self.numbers, (*batch, 22)).reshape(size, 22)
+        shape = values.shape[-2:]
+        return batch, cameras, np.broadcast_to(values, (*batch, *shape)).reshape(size, *shape)
+
+
+def _normalize(
+    cameras: NDArray[np.float64], points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Return undistorted coordinates (batch, n, 2) and their status (batch, n)."""
+    plane = np.empty(points.shape)
+    status = np.empty(points.shape[:-1], dtype=np.uint8)
+    projection.normalize(cameras, points, plane, status)
+    return plane, status
+
+
+def _vector3(values: NDArray[np.float64]) -> Vector3:
+    x, y, z = values.tolist()
+    return x, y, z

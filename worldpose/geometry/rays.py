@@ -1,0 +1,166 @@
+"""Half-lines from camera centres through image points: distances and intersection."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldpose.errors import InputError
+from worldpose.geometry.rigid import Index, checked, common_batch, leading
+
+
+class RayStatus(IntEnum):
+    """Reason for a point without image, or an image point without ray."""
+
+    OK = 0
+    MISSING = 1
+    """The input, or a parameter of the camera, is not finite."""
+    BEHIND = 2
+    """The point is at or behind the plane of the camera centre."""
+    BEYOND_FOLD = 3
+    """The lens model is not one to one there: a point has no meaningful image, a pixel no ray."""
+    NOT_CONVERGED = 4
+    """The inverse of the lens model did not converge."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Half-lines in the world frame.
+
+    Raises:
+        InputError: the shapes do not agree.
+    """
+
+    origins: NDArray[np.float64]
+    """(..., 3) camera centres [m], world."""
+    directions: NDArray[np.float64]
+    """(..., 3) unit vectors, world; NaN where `status` is not OK."""
+    status: NDArray[np.uint8]
+    """(...) RayStatus."""
+
+    def __post_init__(self) -> None:
+        directions = checked("Rays.directions", self.directions, (3,))
+        origins = checked("Rays.origins", self.origins, (3,))
+        status = np.asarray(self.status, dtype=np.uint8)
+        batch = common_batch("Rays", directions.shape[:-1], origins.shape[:-1], status.shape)
+        object.__setattr__(self, "origins", np.broadcast_to(origins, (*batch, 3)))
+        object.__setattr__(self, "directions", np.broadcast_to(directions, (*batch, 3)))
+        object.__setattr__(self, "status", np.broadcast_to(status, batch))
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(...) whether the ray exists."""
+        return np.asarray(self.status == RayStatus.OK)
+
+    def __getitem__(self, index: Index) -> Rays:
+        return Rays(
+            self.origins[leading(index, 1)],
+            self.directions[leading(index, 1)],
+            self.status[leading(index, 0)],
+        )
+
+
+def distance_to_rays(points: ArrayLike, rays: Rays) -> NDArray[np.float64]:
+    """Return the distance of points to rays.
+
+    A ray begins at its camera: for a point behind it, the distance to the camera counts.
+
+    Args:
+        points: (..., 3) [m], world; broadcasts against the rays.
+        rays: (...) rays.
+
+    Returns:
+        (...) [m]; NaN where the point or the ray is missing.
+
+    Note:
+        T1.
+    """
+    offset = checked("distance_to_rays: points", points, (3,)) - rays.origins
+    along = np.maximum(np.einsum("...i,...i->...", offset, rays.directions), 0.0)
+    distance: NDArray[np.float64] = np.linalg.norm(
+        offset - along[..., None] * rays.directions, axis=-1
+    )
+    return distance
+
+
+def ray_to_ray_distance(a: Rays, b: Rays) -> NDArray[np.float64]:
+    """Return the least distance between the points of two rays.
+
+    Args:
+        a: (...) rays.
+        b: (...) rays; the batches broadcast.
+
+    Returns:
+        (...) [m]; NaN where a ray is missing.
+    """
+    offset = b.origins - a.origins
+    normal = np.cross(a.directions, b.directions)
+    sine = np.linalg.norm(normal, axis=-1)
+    # The common perpendicular counts when its feet lie on both rays; else the nearest pair holds
+    # an origin, which is exact for parallel rays too. Below an angle of sqrt(epsilon) the
+    # rounding of the perpendicular, about epsilon |offset| / angle, exceeds what is lost.
+    along_a = np.einsum("...i,...i->...", np.cross(offset, b.directions), normal)
+    along_b = np.einsum("...i,...i->...", np.cross(offset, a.directions), normal)
+    apart = sine > np.sqrt(np.finfo(np.float64).eps)
+    gap = np.abs(np.einsum("...i,...i->...", offset, normal)) / np.where(apart, sine, 1.0)
+    at_origins = np.minimum(distance_to_rays(b.origins, a), distance_to_rays(a.origins, b))
+    return np.where(apart & (along_a >= 0.0) & (along_b >= 0.0), gap, at_origins)
+
+
+def intersect_rays(
+    rays: Rays, weights: ArrayLike | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the points nearest to each bundle of rays in the weighted least-squares sense.
+
+    The point p minimises the sum of weight * squared distance to the lines of the rays.
+
+    Args:
+        rays: (..., m) bundles of m rays; missing rays are left out.
+        weights: (..., m), not negative; 0 or NaN leaves a ray out; None weighs all rays alike.
+
+    Returns:
+        Points (..., 3) [m], world, and normal matrices (..., 3, 3), the sums of
+        weight * (identity - d d^T). With weights 1 / sigma^2 [1/m^2] the inverse of a normal
+        matrix is the covariance of its point. Points are NaN where fewer than two rays remain
+        or all remaining rays are parallel.
+
+    Raises:
+        InputError: a weight is negative.
+
+    Note:
+        T3. Parallel means an angle below about 2e-6 rad, where rounding moves the point by more
+        than a millimetre at 100 m.
+    """
+    weight = np.ones(rays.status.shape) if weights is None else np.asarray(weights, dtype=float)
+    if np.any(weight < 0.0):
+        raise InputError(
+            "intersect_rays: weights",
+            expected="no negative weight",
+            found=f"{np.nanmin(weight):g}",
+            todo="Give 1 / sigma^2, or 0 to leave a ray out.",
+        )
+    used = rays.valid & (weight > 0.0)
+    weight = np.where(used, weight, 0.0)
+    directions = np.where(used[..., None], rays.directions, 0.0)
+    origins = np.where(used[..., None], rays.origins, 0.0)
+    total = weight.sum(-1)
+    with np.errstate(invalid="ignore"):
+        # Coordinates about the mean origin keep the digits that the world's origin would cost.
+        mean = (weight[..., None] * origins).sum(-2) / total[..., None]
+    offset = np.where(used[..., None], origins - mean[..., None, :], 0.0)
+    normal = total[..., None, None] * np.eye(3) - np.einsum(
+        "...m,...mi,...mj->...ij", weight, directions, directions
+    )
+    along = np.einsum("...mi,...mi->...m", offset, directions)
+    right = np.einsum("...m,...mi->...i", weight, offset - along[..., None] * directions)
+    with np.errstate(invalid="ignore"):
+        # The eigenvalues of normal / total sum to 2 and none exceeds 1, so the determinant is
+        # the smallest eigenvalue up to a factor of 3: sin^2(angle / 2) for two equal rays.
+        # One ray or none leaves it zero or NaN.
+        solvable = np.linalg.det(normal / total[..., None, None]) > 1e-12
+    safe = np.where(solvable[..., None, None], normal, np.eye(3))
+    points = np.linalg.solve(safe, right[..., None])[..., 0] + mean
+    return np.where(solvable[..., None], points, np.nan), normal

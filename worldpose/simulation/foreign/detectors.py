@@ -1,0 +1,380 @@
+"""Detectors of the second simulator: joint definitions, errors, and uninformative confidence.
+
+An error has components that the first simulator lacks: definitions tied to limbs, bias with the
+first and third harmonic of the azimuth and with the camera's elevation, resonant noise along limbs,
+heavy tails, and grids of heatmaps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from worldpose.ingest import Observations
+from worldpose.simulation.foreign.profiles import DetectorProfile
+from worldpose.simulation.foreign.visibility import View, facing
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+_PARENT: Final = (5, 0, 0, 1, 2, 6, 5, 5, 6, 7, 8, 12, 11, 11, 12, 13, 14)
+"""Parent joint of the limb that leads to each joint."""
+_OTHER: Final = (0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15)
+"""The same joint on the other side."""
+_EASE: Final = np.array(
+    [0.5, 0.45, 0.45, 0.6, 0.6, 0.9, 0.9, 1.0, 1.0, 1.25, 1.25, 1.3, 1.3, 1.05, 1.05, 1.15, 1.15]
+)
+"""Error of each joint relative to the average one [1]."""
+_PARTS: Final = ((1, 2, 3, 4), (5, 6, 7, 8, 9, 10), (11, 12, 13, 14, 15, 16))
+"""Joints that are swapped left to right together."""
+
+_STICKMAN: Final = (
+    np.array(
+        [
+            *([0.0, 0.02, -0.02, 0.04, -0.04, 0.1, -0.1, 0.12, -0.12, 0.12, -0.12]),
+            *([0.06, -0.06, 0.07, -0.07, 0.07, -0.07]),
+            *([0.07, 0.05, 0.05, 0.06, 0.06, 0.18, 0.18, 0.34, 0.34, 0.48, 0.48]),
+            *([0.5, 0.5, 0.74, 0.74, 0.95, 0.95]),
+        ]
+    )
+    .reshape(2, 17)
+    .T
+)
+"""Across and down, of a figure of height one that faces the camera."""
+
+
+@dataclass(frozen=True, eq=False)
+class Detector:
+    """A profile with the values drawn for one match.
+
+    Attributes:
+        profile: rates and spreads.
+        definition: (17, 3) offsets along the limb, to the left and across both [m].
+        view_bias: (17, 2, 4) of cosine and sine of the first and third harmonic along the image
+            axes [1].
+        height_bias: (17,) [1].
+    """
+
+    profile: DetectorProfile
+    definition: Floats
+    view_bias: Floats
+    height_bias: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """A camera's detections and the person of each.
+
+    Attributes:
+        observations: input of the factory.
+        person: (frames, detections) int16, -1 for false positives and padding.
+        displaced: (frames, detections, 17), joints with gross errors.
+    """
+
+    observations: Observations
+    person: NDArray[np.int16]
+    displaced: Flags
+
+
+def draw_detector(profile: DetectorProfile, rng: np.random.Generator) -> Detector:
+    """Return a detector of this profile; left and right are mirror images."""
+    definition = profile.definition * rng.standard_normal((17, 3))
+    height_bias = profile.height_bias * rng.standard_normal(17)
+    for joint, mirror in enumerate(_OTHER):
+        if mirror < joint:
+            definition[joint] = definition[mirror] * [1.0, -1.0, 1.0]
+            height_bias[joint] = height_bias[mirror]
+    definition[0, 1] = 0.0
+    view_bias = profile.view_bias * rng.standard_normal((17, 2, 4))
+    return Detector(profile, definition, view_bias, height_bias)
+
+
+def defined_joints(joints: Floats, detector: Detector, personal: Floats) -> Floats:
+    """Return the joints as the detector defines them (frames, persons, 17, 3) [m], world.
+
+    Args:
+        joints: anatomical ones (frames, persons, 17, 3) [m], world.
+        detector: definitions.
+        personal: (persons, 17, 3) each person's own offsets, in units of the profile's.
+    """
+    _, left = facing(joints)
+    along = joints - joints[:, :, _PARENT]
+    along = along / np.linalg.norm(along, axis=-1, keepdims=True)
+    side = left[:, :, None] - (left[:, :, None] * along).sum(-1, keepdims=True) * along
+    # An arm stretched out sideways has no left direction of its own.
+    side = side / np.maximum(np.linalg.norm(side, axis=-1, keepdims=True), 0.2)
+    offset = detector.definition + detector.profile.personal * personal
+    moved = joints + offset[..., :1] * along + offset[..., 1:2] * side
+    moved = moved + offset[..., 2:] * np.cross(along, side)
+    outward = np.array([1.0, -1.0])[:, None] * left[:, :, None]
+    hips = detector.profile.wide_hips * outward
+    hips[..., 2] -= detector.profile.low_hips
+    moved[:, :, 11:13] += hips
+    return np.asarray(moved)
+
+
+def detect_people(
+    detector: Detector,
+    view: View,
+    defined: Floats,
+    image_size: NDArray[np.int64],
+    fps: float,
+    lost: float,
+    rng: np.random.Generator,
+) -> Report:
+    """Return the detections in a camera's images.
+
+    Args:
+        detector: of the match.
+        view: people in the camera's images.
+        defined: pixels (frames, persons, 17, 2) of the joints as the detector defines them [px].
+        image_size: width and height [px].
+        fps: [1/s].
+        lost: share of frames that the camera lost [1].
+        rng: this camera's own.
+    """
+    profile = detector.profile
+    frames, persons = view.size.shape
+    size = np.nan_to_num(view.size, nan=1.0)
+    spread = profile.noise * size * (size / 100.0) ** -0.3
+    spread = np.hypot(spread, profile.floor)[..., None] * _EASE
+    hidden = (view.hider >= 0) | view.behind_self
+    error = _draw_errors(profile, frames, persons, fps, rng) * spread[..., None]
+    error *= np.where(hidden, 2.0, 1.0)[..., None]
+    known = np.linalg.norm(error, axis=-1) / size[..., None]
+    error = error + _bias(detector, view, size)
+    keypoints = defined + error
+    keypoints, strayed = _misplace_joints(profile, keypoints, view, fps, rng)
+    keypoints = _swap_sides(profile, keypoints, view, fps, rng)
+    if profile.grid > 0.0:
+        cell = profile.grid * size[..., None, None]
+        keypoints = np.round(keypoints / cell) * cell
+
+    luck = rng.random((frames, persons, 17))
+    there = view.inside & np.where(hidden, luck < profile.hidden_kept, luck > profile.joint_missed)
+    there &= np.isfinite(keypoints).all(axis=-1)
+    found = rng.random(persons) < 1.0 / (1.0 + (profile.smallest / np.maximum(size, 1.0)) ** 6)
+    found &= ~_draw_bursts(profile.person_missed, 0.25, (frames, persons), fps, rng)
+    found &= (view.hider >= 0).mean(axis=-1) < 0.75
+    keypoints, there, found = _merge_people(profile, keypoints, there, found, view, fps, rng)
+    found &= there.sum(axis=-1) >= 4
+    if lost > 0.0:
+        found &= ~_draw_bursts(lost, 0.1, (frames, 1), fps, rng)
+    confidence = _draw_confidence(profile, known, hidden, rng)
+    false, sure = _draw_false_positives(profile, size, image_size, frames, rng)
+    doubles = found & (rng.random(found.shape) < profile.duplicates)
+    again = keypoints + 0.5 * spread[..., None] * rng.standard_normal(keypoints.shape)
+    keypoints = np.concatenate([keypoints, again, false], axis=1)
+    confidence = np.concatenate([confidence, 0.8 * confidence, sure], axis=1)
+    there = np.concatenate([there, there, np.isfinite(false[..., 0])], axis=1)
+    found = np.concatenate([found, doubles, np.isfinite(false[..., 0]).any(-1)], axis=1)
+    whose = np.concatenate([np.arange(persons), np.arange(persons), np.full(false.shape[1], -1)])
+    displaced = np.concatenate([strayed, strayed, np.zeros(false.shape[:3], np.bool_)], axis=1)
+    there &= found[..., None]
+    keypoints = np.where(there[..., None], keypoints, np.nan)
+    confidence = np.where(there, np.clip(confidence, 0.01, 1.0), np.nan)
+    return _list_detections(keypoints, confidence, whose, displaced & there, rng)
+
+
+def _draw_errors(
+    profile: DetectorProfile, frames: int, persons: int, fps: float, rng: np.random.Generator
+) -> Floats:
+    """Return unit errors (frames, persons, 17, 2): resonant, sudden, and shared along limbs."""
+    shape = (persons, 17, 2)
+    lead = round(2.0 * fps)
+    driven = rng.standard_normal((frames + lead, *shape))
+    swinging = np.empty(driven.shape)
+    for joint in range(17):
+        period = rng.uniform(*profile.resonance)
+        decay = np.exp(-1.0 / (0.7 * period * fps))
+        turn = 2.0 * np.pi / max(period * fps, 4.0)
+        poles = [1.0, -2.0 * decay * np.cos(turn), decay**2]
+        swinging[:, :, joint] = lfilter([1.0], poles, driven[:, :, joint], axis=0)
+    swinging = swinging[lead:] / swinging[lead:].std(axis=(0, 1, 3), keepdims=True)
+    jumps = np.clip(rng.standard_t(profile.tail, (frames, *shape)), -15.0, 15.0)
+    jumps /= np.sqrt(profile.tail / (profile.tail - 2.0))
+    own = np.sqrt(1.0 - profile.sudden) * swinging + np.sqrt(profile.sudden) * jumps
+    for joint in (7, 8, 9, 10, 13, 14, 15, 16):
+        mixed = profile.limbs * own[:, :, _PARENT[joint]] + own[:, :, joint]
+        own[:, :, joint] = mixed / np.hypot(1.0, profile.limbs)
+    return np.asarray(own)
+
+
+def _bias(detector: Detector, view: View, size: Floats) -> Floats:
+    """Return the bias (frames, persons, 17, 2) [px] by azimuth and elevation of the camera."""
+    azimuth = view.azimuth
+    waves = [np.cos(azimuth), np.sin(azimuth), np.cos(3.0 * azimuth), np.sin(3.0 * azimuth)]
+    bias = np.einsum("fpw,jaw->fpja", np.stack(waves, axis=-1), detector.view_bias)
+    bias[..., 1] += np.sin(view.elevation)[..., None] * detector.height_bias
+    return np.asarray(bias * size[..., None, None])
+
+
+def _misplace_joints(
+    profile: DetectorProfile, keypoints: Floats, view: View, fps: float, rng: np.random.Generator
+) -> tuple[Floats, Flags]:
+    """Return keypoints with gross errors in bursts, and their flags."""
+    shape = keypoints.shape[:3]
+    away = _draw_bursts(profile.strayed, 0.12, shape, fps, rng)
+    # A joint behind another person more often gets that person's position.
+    away |= (view.hider >= 0) & _draw_bursts(6.0 * profile.strayed, 0.15, shape, fps, rng)
+    frame, person, joint = np.nonzero(away)
+    kind = rng.integers(3, size=len(frame))
+    hider = view.hider[frame, person, joint]
+    kind = np.where((hider >= 0) & (rng.random(len(frame)) < 0.7), 3, kind)
+    parents, others = np.array(_PARENT), np.array(_OTHER)
+    share = rng.uniform(0.3, 0.9, len(frame))[:, None]
+    here = keypoints[frame, person, joint]
+    parent = keypoints[frame, person, parents[joint]]
+    angle = rng.uniform(0.0, 2.0 * np.pi, len(frame))
+    throw = 0.25 * view.size[frame, person] * rng.uniform(0.3, 1.0, len(frame))
+    targets = [
+        keypoints[frame, person, others[joint]],
+        share * parent + (1.0 - share) * here,
+        here + throw[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1),
+        keypoints[frame, np.maximum(hider, 0), joint],
+    ]
+    moved = keypoints.copy()
+    moved[frame, person, joint] = np.choose(kind[:, None], targets)
+    return moved, away
+
+
+def _swap_sides(
+    profile: DetectorProfile, keypoints: Floats, view: View, fps: float, rng: np.random.Generator
+) -> Floats:
+    """Return keypoints with left-right swaps of parts in bursts, more often from behind."""
+    swapped = keypoints.copy()
+    for part in (*_PARTS, tuple(range(17))):
+        on = _draw_bursts(0.5 * profile.swapped, 0.2, view.size.shape, fps, rng)
+        more = _draw_bursts(profile.swapped, 0.2, view.size.shape, fps, rng)
+        on |= more & (np.cos(view.azimuth) < 0.0)
+        frame, person = np.nonzero(on)
+        joints = np.array(part)
+        mirror = np.array(_OTHER)[joints]
+        swapped[frame[:, None], person[:, None], joints] = keypoints[
+            frame[:, None], person[:, None], mirror
+        ]
+    return swapped
+
+
+def _merge_people(
+    profile: DetectorProfile,
+    keypoints: Floats,
+    there: Flags,
+    found: Flags,
+    view: View,
+    fps: float,
+    rng: np.random.Generator,
+) -> tuple[Floats, Flags, Flags]:
+    """Merge two people who overlap: half of the joints of each."""
+    frames, persons = found.shape
+    keypoints, there, found = keypoints.copy(), there.copy(), found.copy()
+    merging = _draw_bursts(profile.merged, 0.3, (frames, persons), fps, rng)
+    crowded = (view.hider >= 0).mean(axis=-1) > 0.4
+    for frame, person in np.argwhere(merging & crowded & found):
+        hiders = view.hider[frame, person]
+        before = int(np.bincount(hiders[hiders >= 0]).argmax())
+        if not found[frame, before]:
+            continue
+        half = slice(0, 11) if rng.random() < 0.5 else slice(11, 17)
+        keypoints[frame, before, half] = keypoints[frame, person, half]
+        there[frame, before, half] = there[frame, person, half]
+        found[frame, person] = False
+    return keypoints, there, found
+
+
+def _draw_confidence(
+    profile: DetectorProfile, known: Floats, hidden: Flags, rng: np.random.Generator
+) -> Floats:
+    """Return confidence (frames, persons, 17); biases, gross errors and swaps do not lower it."""
+    luck = rng.standard_normal(known.shape)
+    honest = 1.0 / (1.0 + (known / 0.06) ** 2) * np.where(hidden, 0.6, 1.0) + 0.06 * luck
+    if profile.confidence == "honest":
+        return np.asarray(honest)
+    if profile.confidence == "meek":
+        return np.asarray(0.1 + 0.35 * np.clip(honest, 0.0, 1.0))
+    if profile.confidence == "sure":
+        return np.asarray(np.minimum(0.96 + 0.02 * luck, 1.0) - 0.05 * hidden)
+    return np.asarray(rng.beta(4.0, 2.0, known.shape))
+
+
+def _draw_false_positives(
+    profile: DetectorProfile,
+    size: Floats,
+    image_size: NDArray[np.int64],
+    frames: int,
+    rng: np.random.Generator,
+) -> tuple[Floats, Floats]:
+    """Return keypoints (frames, false, 17, 2) of false positives, and their confidence."""
+    ghosts = int(rng.poisson(profile.ghosts))
+    flashes = rng.poisson(profile.flashes, frames)
+    count = ghosts + int(flashes.max(initial=0))
+    places = np.full((frames, count, 17, 2), np.nan)
+    usual = float(np.median(size))
+
+    def figure(rows: int) -> Floats:
+        tall = usual * rng.lognormal(0.0, 0.35)
+        middle = rng.uniform(0.05, 0.9, 2) * image_size
+        warped = _STICKMAN * rng.uniform(0.6, 1.4, (17, 2)) * tall + middle
+        return np.asarray(warped + 0.02 * tall * rng.standard_normal((rows, 17, 2)))
+
+    for ghost in range(ghosts):
+        shown = rng.random(frames) < rng.uniform(0.3, 0.95)
+        places[:, ghost] = np.where(shown[:, None, None], figure(frames), np.nan)
+    for frame in np.flatnonzero(flashes):
+        for flash in range(flashes[frame]):
+            places[frame, ghosts + flash] = figure(1)[0]
+    outside = ((places < 0.0) | (places > image_size - 1.0)).any(axis=-1)
+    places[outside] = np.nan
+    return places, rng.uniform(0.15, 0.8, places.shape[:3])
+
+
+def _list_detections(
+    keypoints: Floats,
+    confidence: Floats,
+    whose: NDArray[np.int64],
+    displaced: Flags,
+    rng: np.random.Generator,
+) -> Report:
+    """Return detections in random order, with boxes and scores."""
+    found: Flags = np.asarray(np.isfinite(confidence).any(axis=-1))
+    order = np.argsort(np.where(found, rng.random(found.shape), np.inf), axis=1)
+    order = order[:, : int(found.sum(axis=1).max(initial=0))]
+    rows = np.arange(len(found))[:, None]
+    keypoints, confidence = keypoints[rows, order], confidence[rows, order]
+    found = found[rows, order]
+    low = np.where(np.isfinite(keypoints), keypoints, np.inf).min(axis=2, initial=np.inf)
+    high = np.where(np.isfinite(keypoints), keypoints, -np.inf).max(axis=2, initial=-np.inf)
+    room = (
+        rng.uniform(0.02, 0.12, (*found.shape, 2)) * np.where(found[..., None], high - low, 0.0)
+        + 1.0
+    )
+    boxes = np.where(found[..., None], np.concatenate([low - room, high + room], axis=-1), np.nan)
+    joints = np.maximum(np.isfinite(confidence).sum(axis=-1), 1)
+    score = np.where(found, np.nansum(confidence, axis=-1) / joints, np.nan)
+    observations = Observations(
+        frame=np.arange(len(found), dtype=np.int64),
+        keypoints=keypoints.astype(np.float32),
+        confidence=confidence.astype(np.float32),
+        boxes=boxes.astype(np.float32),
+        score=np.clip(score, 0.01, 1.0).astype(np.float32),
+    )
+    person = np.where(found, whose[order], -1).astype(np.int16)
+    return Report(observations, person, displaced[rows, order] & found[..., None])
+
+
+def _draw_bursts(
+    share: float, length: float, shape: tuple[int, ...], fps: float, rng: np.random.Generator
+) -> Flags:
+    """Return flags set for a share of the first dimension, in bursts of a mean duration [s]."""
+    stop = min(1.0, 1.0 / max(length * fps, 1.0))
+    begin = min(1.0, stop * share / max(1.0 - share, 1e-9))
+    luck = rng.random(shape)
+    on = np.empty(shape, np.bool_)
+    on[0] = luck[0] < share
+    for row in range(1, shape[0]):
+        on[row] = np.where(on[row - 1], luck[row] >= stop, luck[row] < begin)
+    return on

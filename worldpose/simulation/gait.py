@@ -1,0 +1,217 @@
+"""Gait: 17 joints of people who stand, walk, run and act, from a path over the ground.
+
+A kinematic model: planted feet follow the path's footholds, knees follow by two-bone inverse
+kinematics, arms swing against the legs. Bones between joints keep their lengths exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.simulation.actions import act
+from worldpose.simulation.bodies import Body
+from worldpose.simulation.clips import play_clip
+from worldpose.simulation.paths import GroundPath
+from worldpose.simulation.poses import Pose, level_axes, pose_joints, unit
+
+Floats = NDArray[np.float64]
+Ground = Callable[[Floats, Floats], Floats]
+"""Height of the ground [m] at x and y [m], world."""
+
+RIGID_BONES: Final = (
+    *((5, 7), (7, 9), (6, 8), (8, 10), (5, 6), (11, 12), (11, 13), (13, 15), (12, 14), (14, 16)),
+    *((0, 1), (0, 2), (1, 3), (2, 4)),
+)
+"""Pairs of joints at constant distance in a person; the spine twists and the head turns."""
+
+STRIDES: Final = (
+    (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.0, 9.0),
+    (0.91, 1.0, 1.10, 1.26, 1.36, 1.43, 1.53, 1.68, 1.85, 2.2),
+)
+"""Speeds [m/s] and strides per second at them: walkers up to 2 m/s, runners beyond."""
+STANDING_SPEED: Final = 0.25
+"""A person slower than this for `STANDING_TIME` stands [m/s]."""
+STANDING_TIME: Final = 0.3
+"""[s]"""
+TURNING_ARM: Final = 0.5
+"""Turning by 1 rad/s needs as many steps as walking at this many metres per second [m]; a turn of
+less than half of that uses the hips alone."""
+
+
+def walk(
+    body: Body,
+    path: GroundPath,
+    times: Floats,
+    ground: Ground,
+    rng: np.random.Generator,
+) -> Floats:
+    """Return joints (frames, 17, 3) [m], world, of a person who follows a path; see `tread`."""
+    return tread(body, path, times, ground, rng)[0]
+
+
+def tread(
+    body: Body,
+    path: GroundPath,
+    times: Floats,
+    ground: Ground,
+    rng: np.random.Generator,
+) -> tuple[Floats, Floats]:
+    """Return joints (frames, 17, 3) [m], world, and feet directions of a person on a path.
+
+    Feet point (frames, 2) [rad], left and right, from the x axis towards y, along the path at the
+    time of their placement. Actions of the path are blended in.
+
+    Args:
+        body: measures.
+        path: covers `times` and a stride before and after.
+        times: (frames,) [s].
+        ground: height of the ground under the feet.
+        rng: draws the stride phase at the start of the path and the turns of the head.
+    """
+    cycle = stride_cycle(path, rng.random())
+    swing = 2.0 * np.pi * np.interp(times, path.time, cycle)
+    speed, heading = (np.interp(times, path.time, x) for x in (path.speed, path.heading))
+    run = _running(speed)
+    # Slow people hardly swing their arms.
+    pace = np.minimum(speed, 1.0)
+    sway = pace * np.sin(swing)
+
+    up = np.array([0.0, 0.0, 1.0])
+    pelvis_xy = np.stack([np.interp(times, path.time, x) for x in path.position.T], axis=-1)
+    # Walkers rise over the planted leg, runners sink onto it.
+    rise = (0.945 - 0.04 * run) * body.leg + pace * (0.015 - 0.05 * run) * np.cos(2.0 * swing)
+    pelvis = np.concatenate(
+        [pelvis_xy, (ground(*pelvis_xy.T) + body.ankle_height + rise)[:, None]], axis=-1
+    )
+    forward, leftward = level_axes(heading + np.radians(6.0) * sway)
+    chest_forward, chest_left = level_axes(heading - np.radians(8.0) * sway)
+    lean = np.radians(2.0 + 6.0 * run)[:, None]
+    look = np.radians(35.0) * np.sin(2.0 * np.pi * (times / rng.uniform(3.0, 6.0) + rng.random()))
+    gaze, gaze_left = level_axes(heading + look)
+    arms, ankles = np.empty((len(times), 2, 2, 3)), np.empty((len(times), 2, 3))
+    courses = np.empty((len(times), 2))
+    for side, (sign, offset) in enumerate(((1.0, 0.0), (-1.0, 0.5))):  # left, right
+        ankles[:, side], courses[:, side] = _ankles(body, path, cycle + offset, times, ground, sign)
+        # The left arm is forward when the left leg is back.
+        raised = (0.35 + 0.35 * run) * sign * sway - 0.15 * run
+        bent = raised + np.radians(20.0 + 65.0 * run)
+        outward = 0.15 * sign * chest_left
+        arms[:, side, 0] = _arm(raised, chest_forward, outward)
+        arms[:, side, 1] = _arm(bent, chest_forward, 0.0 * outward)
+    pose = Pose(
+        pelvis=pelvis,
+        hips_left=leftward,
+        trunk=np.cos(lean) * up + np.sin(lean) * level_axes(heading)[0],
+        shoulders_left=chest_left,
+        head=np.stack([gaze, gaze_left, np.broadcast_to(up, gaze.shape)], axis=-2),
+        arms=arms,
+        ankles=ankles,
+        knees=np.stack([forward, forward], axis=1),
+        feet=courses,
+    )
+    for action in path.actions:
+        act(body, path, action, times, ground, pose)
+    joints = pose_joints(body, pose)
+    if path.clip is not None:
+        joints = play_clip(body, path.clip, times, ground, joints)
+    return joints, pose.feet
+
+
+def stride_cycle(path: GroundPath, phase: float) -> Floats:
+    """Return strides made (samples,): whole at mid-stance of the left foot, half at the right's.
+
+    Strides get longer and faster with speed: 0.9 per second at 1 m/s, 1.4 at 4 m/s, 2.2 at 9 m/s.
+    Sources are in docs/synthetic.md.
+    A standing person rests a quarter of the way between the two, with both feet on the ground.
+
+    Args:
+        path: of a person.
+        phase: stride at the start of the path [1], for a person who never stands.
+    """
+    pace = _pace(path)
+    rate = np.where(pace < 1.0, 0.91 * np.sqrt(pace), np.interp(pace, *STRIDES))
+    cycle = phase + np.concatenate(
+        [[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(path.time))]
+    )
+    rests = _rests(path, pace)
+    if not rests:
+        return cycle
+    made = np.empty_like(cycle)
+    first = rests[0][0]
+    here = np.round(2.0 * cycle[first] - 0.5) / 2.0 + 0.25
+    made[: first + 1] = cycle[: first + 1] + here - cycle[first]
+    for (begin, end), (following, _) in zip(rests, [*rests[1:], (len(cycle), 0)], strict=True):
+        made[begin:end] = here
+        natural = cycle[end - 1 : following + 1] - cycle[end - 1]
+        if following < len(cycle):
+            # Whole steps lead from one rest to the next; a shift sideways takes one or two.
+            moved = float(np.linalg.norm(path.position[following] - path.position[end - 1]))
+            steps = max(round(2.0 * natural[-1]), min(2, int(np.ceil(moved / 0.2 - 0.25))))
+            natural = natural * (0.5 * steps / natural[-1])
+        made[end - 1 : following + 1] = here + natural
+        here = made[min(following, len(cycle) - 1)]
+    return made
+
+
+def _pace(path: GroundPath) -> Floats:
+    """Return the speed that determines steps (samples,) [m/s], turning on the spot included."""
+    turning = TURNING_ARM * np.abs(np.gradient(path.heading, path.time))
+    return np.maximum(path.speed, np.minimum(turning, 1.0))
+
+
+def _rests(path: GroundPath, pace: Floats) -> list[tuple[int, int]]:
+    """Return the intervals of samples, first and behind the last, in which a person stands."""
+    slow = np.concatenate([[False], pace < STANDING_SPEED, [False]])
+    begins, ends = np.flatnonzero(~slow[:-1] & slow[1:]), np.flatnonzero(slow[:-1] & ~slow[1:])
+    long = path.time[np.minimum(ends, len(path.time) - 1)] - path.time[begins] >= STANDING_TIME
+    return [(int(a), int(b)) for a, b in zip(begins[long], ends[long], strict=True)]
+
+
+def _running(speed: Floats) -> Floats:
+    """Return the running share: 0 at a walk of 1 m/s, 1 at 4 m/s, at most 1.5."""
+    return np.clip((speed - 1.0) / 3.0, 0.0, 1.5)
+
+
+def _arm(angle: Floats, forward: Floats, outward: Floats) -> Floats:
+    """Return unit vectors from hanging, raised forward by `angle` [rad] and a little outward."""
+    down = np.array([0.0, 0.0, -1.0])
+    vector = np.cos(angle)[:, None] * down + np.sin(angle)[:, None] * forward + outward
+    return unit(vector)
+
+
+def _ankles(
+    body: Body,
+    path: GroundPath,
+    cycle: Floats,
+    times: Floats,
+    ground: Ground,
+    sign: float,
+) -> tuple[Floats, Floats]:
+    """Return ankles (frames, 3) and the directions of the feet (frames,) [rad].
+
+    An ankle is planted around whole cycles, and moves to the next foothold in between.
+    """
+    now = np.interp(times, path.time, cycle)
+    before = np.floor(now)
+    places, courses, stance = [], [], []
+    for count in (before, before + 1.0):
+        when = np.interp(count, cycle, path.time)
+        speed, heading = (np.interp(when, path.time, x) for x in (path.speed, path.heading))
+        beneath = np.stack([np.interp(when, path.time, x) for x in path.position.T], axis=-1)
+        courses.append(heading)
+        places.append(beneath + sign * 0.8 * body.hip_half_width * level_axes(heading)[1][:, :2])
+        # Share of the cycle on the ground: 62 % at a walk, 30 % at 4 m/s.
+        stance.append(0.62 - 0.32 * _running(speed))
+    leave, land = before + 0.5 * stance[0], before + 1.0 - 0.5 * stance[1]
+    done = np.clip((now - leave) / (land - leave), 0.0, 1.0)
+    moved = done**2 * (3.0 - 2.0 * done)
+    course = (1.0 - moved) * courses[0] + moved * courses[1]
+    place = (1.0 - moved)[:, None] * places[0] + moved[:, None] * places[1]
+    run = _running(np.interp(times, path.time, path.speed))
+    lift = (0.08 + 0.27 * run) * np.sin(np.pi * done) ** 2
+    height = ground(*place.T) + body.ankle_height + lift
+    return np.concatenate([place, height[:, None]], axis=-1), course

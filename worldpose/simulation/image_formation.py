@@ -1,0 +1,275 @@
+"""Image formation of one exposure: people and things drawn over a scene, then lens and sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from worldpose.compiled import compiled
+from worldpose.geometry import Camera
+from worldpose.geometry.outlines import Box, Outlines, outline_surfaces
+from worldpose.geometry.rasters import NOBODY, Samples, draw_triangles, resolve
+from worldpose.simulation.casting import Cast
+from worldpose.simulation.looks import RenderingSettings
+from worldpose.simulation.mannequins import Surfaces
+from worldpose.simulation.people_shadows import shade_ground
+from worldpose.simulation.props import Prop
+from worldpose.simulation.venues import FOG_COLOR, Venue
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+
+AMBIENT: Final = 0.58
+"""Ambient light on an upright surface [1]."""
+FROM_ABOVE: Final = 0.12
+"""Additional ambient light on a surface that faces up [1]."""
+DIRECT: Final = 1.3
+"""Light on a surface that faces a light source, per share of light that its shadow takes [1]."""
+_MARGIN: Final = 3
+"""Margin around pixels that people change [px]: the extent of the blur."""
+_SPARE: Final = 64
+"""Additional rows and columns of noise, for another offset in every frame [px]."""
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedFrame:
+    """An image with its pixel labels.
+
+    Attributes:
+        picture: (height, width, 3) RGB.
+        person_ids: (height, width) the person that fills most of a pixel, -1 for none.
+        boxes: (persons, 4) left, top, right, bottom of every person's whole outline [px], also
+            outside the image; NaN for a person who is missing or behind the camera.
+        visible: (persons,) unoccluded share of the outline's part in the image [1]; 0 for a person
+            outside the image.
+    """
+
+    picture: Bytes
+    person_ids: NDArray[np.int16]
+    boxes: Floats
+    visible: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """People and other things while the shutter is open.
+
+    Attributes:
+        cast: the people.
+        opened: their surfaces when the shutter opens.
+        closed: their surfaces when it closes.
+        props: static things.
+    """
+
+    cast: Cast
+    opened: Surfaces
+    closed: Surfaces
+    props: Sequence[Prop]
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """A surface as `draw_triangles` takes it."""
+
+    faces: NDArray[np.int32]
+    backs: NDArray[np.bool_]
+    texels: Singles
+    picture: Bytes
+    opened: Singles
+    closed: Singles
+    light: Singles
+
+
+def expose(
+    venue: Venue, camera: Camera, sharp: Bytes, blurred: Bytes, grain: NDArray[np.int8],
+    moment: Moment, frame: int,
+) -> RenderedFrame:  # fmt: skip
+    """Return the image of people before a scene.
+
+    Args:
+        venue: the stadium.
+        camera: a single camera.
+        sharp: (height, width, 3) the scene without them; changed in place.
+        blurred: the same through the lens; changed in place.
+        grain: of `sensor_grain`.
+        moment: people and things in the scene.
+        frame: seeds the noise of this image.
+    """
+    height, width = sharp.shape[:2]
+    cast = moment.cast
+    persons = len(cast.shaped)
+    throwing = [(each.faces, each.surfaces.vertices) for each in moment.props if each.shadow]
+    throwing.append((cast.mannequin.faces, moment.opened.vertices))
+    changed = shade_ground(venue, camera, sharp, throwing)
+    drawn, spans, boxes = _outlined(venue, camera, moment, width, height)
+    ids = np.full((height, width), NOBODY, dtype=np.int16)
+    seen, filled = np.zeros(persons, dtype=np.int64), np.zeros(persons, dtype=np.int64)
+    for (left, top, right, bottom), members in clusters(spans):
+        samples = Samples.empty(left, top, right, bottom)
+        for number in members:
+            thing = drawn[number]
+            count = draw_triangles(
+                thing.opened,
+                thing.closed,
+                thing.faces,
+                thing.backs,
+                thing.texels,
+                thing.picture,
+                thing.light,
+                _haze(venue, thing.opened),
+                number,
+                left,
+                top,
+                samples.depth,
+                samples.who,
+                samples.color,
+                samples.last,
+            )
+            if number < persons:
+                filled[number] = count
+        part = (slice(top, bottom), slice(left, right))
+        resolve(samples.who, samples.color, sharp[part], ids[part], seen)
+        changed.append((left, top, right, bottom))
+    for box in changed:
+        _refocus(venue.settings, sharp, blurred, box)
+    rng = np.random.default_rng([venue.seed, 7, frame])
+    down, across = (int(n) for n in rng.integers(_SPARE, size=2))
+    _add_grain(blurred, grain[down : down + height, 3 * across : 3 * (across + width)])
+    visible = np.where(filled > 0, seen / np.maximum(filled, 1), 0.0)
+    return RenderedFrame(blurred, ids, boxes, visible)
+
+
+def _outlined(
+    venue: Venue, camera: Camera, moment: Moment, width: int, height: int
+) -> tuple[list[_Drawn], list[Box | None], Floats]:
+    """Return all surfaces, people first; the image region of each; people's boxes (n, 4)."""
+    cast = moment.cast
+    opened = outline_surfaces(camera, moment.opened.vertices)
+    closed = opened
+    if moment.closed is not moment.opened:
+        closed = outline_surfaces(camera, moment.closed.vertices)
+    light = _lit(venue, moment.opened)
+    shape = cast.mannequin
+    drawn = [
+        _Drawn(shape.faces, shape.backs, shape.texels, *each)
+        for each in zip(cast.pictures, opened.pixels, closed.pixels, light, strict=True)
+    ]
+    spans = [_span(opened, closed, person, width, height) for person in range(len(drawn))]
+    for prop in moment.props:
+        outline = outline_surfaces(camera, prop.surfaces.vertices)
+        pixels = outline.pixels[0]
+        lit = _lit(venue, prop.surfaces)[0]
+        drawn.append(_Drawn(prop.faces, prop.backs, prop.texels, prop.picture, pixels, pixels, lit))
+        spans.append(outline.box(0, 1, width, height))
+    both = np.stack([opened.boxes, closed.boxes])
+    boxes = np.concatenate([both[..., :2].min(axis=0), both[..., 2:].max(axis=0)], axis=1)
+    return drawn, spans, boxes
+
+
+def _span(opened: Outlines, closed: Outlines, person: int, width: int, height: int) -> Box | None:
+    a, b = (each.box(person, 1, width, height) for each in (opened, closed))
+    if a is None or b is None:
+        return None
+    return min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3])
+
+
+def _lit(venue: Venue, surfaces: Surfaces) -> Singles:
+    """Return the light (persons, vertices) on surfaces, 1 = their own colour."""
+    normals, vertices = surfaces.normals, surfaces.vertices
+    light = np.float32(AMBIENT) + np.float32(FROM_ABOVE) * normals[..., 2]
+    for way in venue.lights:
+        toward = (-way[:3] / np.linalg.norm(way[:3])).astype(np.float32)
+        direct = np.float32(DIRECT * way[3]) * np.maximum(normals @ toward, np.float32(0.0))
+        if venue.shade > 0.0:
+            y = vertices[..., 1]
+            height = vertices[..., 2] + np.float32(venue.bend) * y * y
+            fallen = np.asarray(y + height * np.float32(way[1]), dtype=np.float32)
+            direct *= np.float32(1.0) - venue.in_shadow(fallen)
+        light = light + direct
+    return np.asarray(np.float32(venue.settings.exposure) * light, dtype=np.float32)
+
+
+def _haze(venue: Venue, outline: Singles) -> Singles:
+    """Return the haze before a thing, as `draw_triangles` takes it."""
+    share = 0.0
+    if venue.settings.fog > 0.0:
+        share = 1.0 - np.exp(-venue.settings.fog * float(np.nanmean(outline[:, 2])))
+    return np.array([share, *(255.0 * venue.settings.exposure * FOG_COLOR)], dtype=np.float32)
+
+
+def clusters(spans: Sequence[Box | None]) -> list[tuple[Box, list[int]]]:
+    """Return image regions that share no pixel, each with the indices of the things in it.
+
+    Args:
+        spans: left, top, right, bottom of each thing; None for a thing outside the image.
+    """
+    parts: list[tuple[Box, list[int]]] = []
+    for number, span in enumerate(spans):
+        if span is None:
+            continue
+        box, members = span, [number]
+        # A region that grows may reach others that it did not reach before.
+        while touching := [each for each in parts if _overlap(each[0], box)]:
+            parts = [each for each in parts if each not in touching]
+            for other, others in touching:
+                low, high = map(min, box[:2], other[:2]), map(max, box[2:], other[2:])
+                (left, top), (right, bottom) = low, high
+                box, members = (left, top, right, bottom), members + others
+        parts.append((box, sorted(members)))
+    return parts
+
+
+def _overlap(a: Box, b: Box) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+def through_lens(light: Singles, settings: RenderingSettings) -> Singles:
+    """Return an image blurred by the lens."""
+    if settings.blur == 0.0:
+        return light
+    return np.asarray(cv2.GaussianBlur(light, (0, 0), settings.blur), dtype=np.float32)
+
+
+def to_bytes(light: Singles) -> Bytes:
+    """Return levels of 255 rounded and clipped."""
+    return np.asarray(np.clip(np.rint(light), 0.0, 255.0), dtype=np.uint8)
+
+
+def sensor_grain(venue: Venue, camera: Camera) -> NDArray[np.int8]:
+    """Return noise (height + 64, 3 (width + 64)) of a camera, the same for all colours."""
+    width, height = (int(n) for n in camera.image_size.reshape(-1, 2)[0])
+    center = np.abs(np.rint(1e3 * camera.center.reshape(-1, 3)[0])).astype(int)
+    rng = np.random.default_rng([venue.seed, 3, *center])
+    field = rng.standard_normal((height + _SPARE, width + _SPARE), dtype=np.float32)
+    levels = np.clip(np.rint(np.float32(venue.settings.noise) * field), -127, 127)
+    return np.repeat(levels.astype(np.int8), 3, axis=1)
+
+
+def _refocus(settings: RenderingSettings, sharp: Bytes, blurred: Bytes, box: Box) -> None:
+    """Write `sharp` blurred by the lens into `blurred` around a box."""
+    height, width = sharp.shape[:2]
+    left, top = max(box[0] - _MARGIN, 0), max(box[1] - _MARGIN, 0)
+    right, bottom = min(box[2] + _MARGIN, width), min(box[3] + _MARGIN, height)
+    if settings.blur == 0.0:
+        blurred[top:bottom, left:right] = sharp[top:bottom, left:right]
+        return
+    a, b = max(left - _MARGIN, 0), max(top - _MARGIN, 0)
+    part = sharp[b : bottom + _MARGIN, a : right + _MARGIN]
+    soft = cv2.GaussianBlur(part, (0, 0), settings.blur)
+    blurred[top:bottom, left:right] = soft[top - b : bottom - b, left - a : right - a]
+
+
+@compiled
+def _add_grain(picture: Bytes, grain: NDArray[np.int8]) -> None:
+    """Add noise (height, 3 width) to an image (height, width, 3), in place."""
+    for v in range(picture.shape[0]):
+        row, noise = picture[v].reshape(-1), grain[v]
+        for u in range(len(row)):
+            value = np.int16(row[u]) + np.int16(noise[u])
+            row[u] = np.uint8(min(max(value, np.int16(0)), np.int16(255)))

@@ -1,0 +1,204 @@
+"""Settings of a scenario: people, cameras, their calibration errors and the detections."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from data_contracts.pitch import Coordinate, PitchSpec
+from data_contracts.records import Count, FramesPerSecond, ImageLength, Name, Positive, Record
+from worldpose.simulation.looks import RenderingSettings
+from worldpose.simulation.noise import ObservationNoise
+
+Value = Annotated[float, Field(ge=-1e6, le=1e6)]
+Range = tuple[Value, Value]
+
+
+class ActionRates(Record):
+    """Rates of actions that people perform while they move or stand.
+
+    Shares are of the ball's touches, 18 per minute. Rates and measurements in matches:
+    docs/synthetic.md.
+    """
+
+    headers: float = Field(default=0.12, ge=0, le=1)
+    """Share of balls that two opponents jump for [1]: 9 headers per player and match."""
+    tackles: float = Field(default=0.06, ge=0, le=1)
+    """Share of balls that an opponent slides into [1]."""
+    tripped: float = Field(default=0.5, ge=0, le=1)
+    """Share of tackled players who fall [1]; the others hurdle the leg."""
+    shots: float = Field(default=0.12, ge=0, le=1)
+    """Share of balls within 28 m of a goal that are shot at it [1]."""
+    jumps: float = Field(default=3.0, ge=0, le=1000)
+    """Per wandering person [1/min]: as in a penalty area."""
+    falls: float = Field(default=0.4, ge=0, le=100)
+    """Per wandering person [1/min]."""
+    standing_about: float = Field(default=0.7, ge=0, le=1)
+    """Share of the time of standing, rests under 1.6 s left out, in which people shift their
+    weight, look around or rest their hands on their hips [1]."""
+
+    @classmethod
+    def none(cls) -> ActionRates:
+        """Return rates without actions: people only move and stand."""
+        return cls(headers=0, tackles=0, shots=0, jumps=0, falls=0, standing_about=0)
+
+
+class CrowdSettings(Record):
+    """The people and the part of the pitch they move on."""
+
+    people: int = Field(default=5, ge=0, le=1000)
+    """Number [1]."""
+    movement: Literal["wander", "football", "corner", "crossing"] = "wander"
+    """People wander independently within the area, two teams follow a ball, players contest a ball
+    in the area, or people run to and fro through its middle; personal space holds for those who
+    wander, area and speed for all but teams."""
+    officials: int = Field(default=0, ge=0, le=100)
+    """Number of people who are a referee and assistants [1], the last ones; only in football."""
+    area_center: tuple[Coordinate, Coordinate] = (-41.0, 12.0)
+    """Middle of the area [m]: off both axes, so that a wrong sign or a flat pitch shows, and at a
+    corner of a penalty area, so that cameras have markings to be calibrated from."""
+    area_size: tuple[Positive, Positive] = (20.0, 14.0)
+    """Length along x and y [m]; people turn back towards the middle at its border."""
+    speed: Range = (1.0, 4.0)
+    """Slowest and fastest [m/s]: a stroll and a steady run; while below zero, they stand."""
+    personal_space: float = Field(default=1.5, ge=0, le=1000)
+    """Distance below which people avoid others [m]."""
+    height: Range = (1.70, 1.95)
+    """Shortest and tallest body height [m]: professional players."""
+    actions: ActionRates = ActionRates()
+    """Actions of the people."""
+
+
+class Seat(Record):
+    """Position and aim of a static camera of a stadium."""
+
+    place: tuple[Coordinate, Coordinate, Coordinate]
+    """Its center, world [m]."""
+    aim: tuple[Coordinate, Coordinate]
+    """Point of the pitch in the middle of its image [m]."""
+    focal: float = Field(gt=0, le=1e5)
+    """Focal length [px]."""
+
+
+class RigSettings(Record):
+    """Static cameras: in given seats, or in a ring around the people's area off the pitch."""
+
+    cameras: int = Field(default=6, ge=1, le=1000)
+    """Number [1]."""
+    seats: tuple[Seat, ...] = ()
+    """Seats, used in order; none = a ring. Cameras beyond the seats stand in the ring."""
+    seat_spread: float = Field(default=0.5, ge=0, le=100)
+    """Variation of seats and aims between seeds, along each axis [m]."""
+    image_size: tuple[ImageLength, ImageLength] = (1920, 1080)
+    """Width and height [px] (C8)."""
+    distance: Range = (6.0, 30.0)
+    """Of the ring from the pitch border [m]: stands of a stadium."""
+    height: Range = (10.0, 20.0)
+    """Of the ring above the pitch [m]: roofs and upper tiers."""
+    person_height: float = Field(default=115.0, gt=0, le=100000)
+    """Height of a person of 1.8 m in the area's middle in the ring's images [px]; sets the focal
+    length."""
+    clock_spread: float = Field(default=0.0, ge=0, le=100)
+    """Standard deviation of a camera's clock offset from match.yaml [frame]; unknown to the
+    factory."""
+
+
+class BroadcastSettings(Record):
+    """The moving camera: a tripod on the main stand and an operator.
+
+    Ranges are those of 20 released clips of the 2022 World Cup (K, k, R, t of WorldPose).
+    """
+
+    setback: Range = (67.0, 88.0)
+    """From the long axis of the pitch [m], at negative y."""
+    height: Range = (12.0, 19.0)
+    """Above the pitch [m]."""
+    aside: float = Field(default=0.3, ge=0, le=100)
+    """Maximum distance off the halfway line [m]."""
+    focal: Range = (2900.0, 6200.0)
+    """Widest and closest zoom within a clip [px]; all clips together span 2400 to 7100."""
+    zoom_period: Range = (10.0, 24.0)
+    """Time from wide to close and back [s]; the focal length then changes by at most about 20 px
+    per frame."""
+    lag: float = Field(default=0.5, gt=0, le=100)
+    """Time constant with which the operator follows the action [s]: a reaction, and a damped
+    head."""
+    sway: float = Field(default=4.0, ge=0, le=1000)
+    """Drift of the aim off the action along x [m]: operators lead and trail play."""
+    sweep: float = Field(default=0.0, ge=0, le=100)
+    """Amplitude along x of a steady pan back and forth around the action [m]."""
+
+
+class CalibrationErrors(Record):
+    """Errors of the static cameras in calibration.toml against the true ones.
+
+    Spreads are standard deviations. All zero = exact. Careful calibration from pitch markings
+    leaves about a third of a milliradian and a tenth of a metre.
+    """
+
+    rotation: float = Field(default=0.0, ge=0, le=100)
+    """About each axis of the camera [rad]."""
+    center: float = Field(default=0.0, ge=0, le=100)
+    """Along each axis of the world [m]; the rotation then keeps the image centre on the same point
+    60 m away, as a fit to markings does."""
+    focal: float = Field(default=0.0, ge=0, le=100)
+    """Of the focal length, relative [1]."""
+    bad_cameras: int = Field(default=0, ge=0, le=100)
+    """Number of cameras whose errors are `bad_factor` times as large [1]."""
+    bad_factor: float = Field(default=10.0, ge=1, le=1000)
+    """[1]"""
+
+
+class ClickSettings(Record):
+    """Model of a person's clicks on named pitch points in the image of a static camera."""
+
+    points: tuple[Count, Count] = (8, 12)
+    """Minimum and maximum in one camera [1], limited by the number of visible points."""
+    noise: float = Field(default=1.0, ge=0, le=100)
+    """Error of a click, standard deviation along each image axis [px]: a click on the middle of a
+    painted corner at full resolution."""
+    clustered: float = Field(default=0.0, ge=0, le=1)
+    """Share of cameras in which all points lie within `window` [1]: where one part of the image
+    holds most of the markings, as behind a goal, people look no farther."""
+    window: float = Field(default=0.34, gt=0, le=1)
+    """Of the image width [1]."""
+    clustered_points: tuple[Count, Count] = (5, 7)
+    """Minimum and maximum number of points in such a camera [1]."""
+    wrong: float = Field(default=0.2, ge=0, le=1)
+    """Share of cameras with one wrong click [1]: every second of them a point with another's name,
+    the other a slip."""
+    wrong_distance: Range = (20.0, 60.0)
+    """Distance of a slip [px]."""
+    enough: int = Field(default=8, ge=0, le=1000)
+    """If fewer points are visible, lines and arcs are drawn, too [1]."""
+    drawn_points: int = Field(default=8, ge=2, le=1000)
+    """Maximum number of points along a drawn marking [1]; their errors are those of the others."""
+
+
+class Scenario(Record):
+    """One synthetic match: everything but the seed."""
+
+    name: Name
+    about: str
+    """One sentence for a user who chooses."""
+    duration: float = Field(gt=0, le=100_000)
+    """[s]"""
+    fps: FramesPerSecond = 25.0
+    """[1/s]"""
+    crowd: CrowdSettings = CrowdSettings()
+    rig: RigSettings = RigSettings()
+    broadcast: BroadcastSettings | None = None
+    """None = no moving camera."""
+    key_frames: int = Field(default=0, ge=0, le=100)
+    """Number of annotated broadcast frames [1]; if there are any, the video is written."""
+    calibration: CalibrationErrors = CalibrationErrors()
+    noise: ObservationNoise = ObservationNoise()
+    clicks: ClickSettings = ClickSettings()
+    look: RenderingSettings = RenderingSettings()
+    """Look of rendered footage."""
+    pitch: PitchSpec = PitchSpec()
+    """The pitch as painted."""
+    survey_error: float = Field(default=0.006, ge=0, le=1)
+    """Error of the points in pitch.json, standard deviation along each axis [m], together about 1
+    cm: a total station measures to millimetres, but the middle of a painted corner is ambiguous."""
