@@ -15,10 +15,10 @@ import time
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 from static_accuracy import SHARES, ground_errors
 
+from data_contracts.arrays import Floats
 from worldpose.bundle_adjustment import Clicks, Clip, adjust_cameras
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
@@ -28,7 +28,6 @@ from worldpose.static_calibration import StaticCalibration, calibrate, project_w
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
-Floats = NDArray[np.float64]
 MOMENTS = 6
 """Number of frames of a clip whose players count."""
 

@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.body import BodyParameters, load_open_body
 from worldpose.body_fitting import (
     BodyFit,
@@ -42,7 +43,6 @@ from worldpose.simulation.monocular import MonocularErrors, estimate_bodies
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, reconstruct_joints, unswap
 
-Floats = NDArray[np.float64]
 BODY = load_open_body()
 SETTINGS, TRIANGULATION = BodyFittingSettings(), TriangulationSettings()
 LIMBS = ((16, 18), (18, 20), (1, 4), (4, 7), (1, 2), (16, 17))

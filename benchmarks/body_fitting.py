@@ -21,8 +21,8 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from worldpose.body import BodyModel, BodyParameters, fold_keypoints, load_open_body
 from worldpose.body.differentiable import DifferentiableBody
@@ -31,8 +31,6 @@ from worldpose.body.skeletons import JOINT_OF_POINT, VERTEX_OF_POINT
 from worldpose.body_fitting import BodyFittingSettings, fit_bodies
 from worldpose.body_fitting.pose_space import SPREAD, load_pose_prior
 from worldpose.body_fitting.starting import start_poses
-
-Floats = NDArray[np.float64]
 
 NOISE = 0.02
 WEIGHT = 1e-4

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from data_contracts.arrays import Floats
 from worldpose.broadcast_calibration import (
     BroadcastCalibrationSettings,
     MovingCamera,
@@ -39,7 +40,6 @@ from worldpose.ingest import MatchFolder, read_match, read_unit
 from worldpose.pitch import PitchTemplate
 from worldpose.video import VideoReader
 
-Floats = NDArray[np.float64]
 LASTING, ANEW = 0.01, 0.02
 SHARES = (0.5, 0.8, 0.95, 0.99)
 

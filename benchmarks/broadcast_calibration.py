@@ -17,10 +17,10 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix, lil_matrix, vstack
 
+from data_contracts.arrays import Floats
 from worldpose.broadcast_calibration.adam import descend
 from worldpose.broadcast_calibration.evidence import PLAYER, FlowEvidence, PointEvidence
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
@@ -32,7 +32,6 @@ from worldpose.pitch import PitchTemplate
 from worldpose.simulation.broadcast import film
 from worldpose.simulation.settings import BroadcastSettings
 
-Floats = NDArray[np.float64]
 SMOOTH = np.array([np.inf, np.inf, np.inf, 1e-4, 1e-3, 1e-2, 1e-2])
 NOISE, OUTLIERS, LOSS = 2.0, 0.08, 4.0
 

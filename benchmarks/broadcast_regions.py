@@ -15,7 +15,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+
+from data_contracts.arrays import Floats
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -43,7 +44,6 @@ from worldpose.static_calibration.line_samples import (
     thinned,
 )
 
-Floats = NDArray[np.float64]
 NOISE = 0.15
 """Noise of a line's sample [px]."""
 

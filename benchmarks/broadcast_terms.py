@@ -17,9 +17,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from broadcast_accuracy import Floats, feet_in_picture, people_of, true_camera
+from broadcast_accuracy import feet_in_picture, people_of, true_camera
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.broadcast_calibration import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.calibrating import refine, track
 from worldpose.broadcast_calibration.evidence import together

@@ -20,9 +20,9 @@ from typing import TypeVar
 import numpy as np
 import torch
 
+from data_contracts.arrays import Image
 from worldpose.detection import People
 from worldpose.detection.bundled import embedded_detector, embedded_pose
-from worldpose.detection.interfaces import Picture
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS
 from worldpose.simulation.casting import dress_people, roles_of
@@ -85,7 +85,7 @@ def main() -> None:
         )
 
 
-def rendered(people: int, frames: int) -> tuple[float, list[Picture]]:
+def rendered(people: int, frames: int) -> tuple[float, list[Image]]:
     """Return the images of a moving crowd from one camera, after the seconds that they took."""
     scenario = SCENARIOS["match"]
     pitch = PitchTemplate.from_spec(scenario.pitch)
@@ -105,7 +105,7 @@ def rendered(people: int, frames: int) -> tuple[float, list[Picture]]:
     camera = place_camera(rig, 3, middle, scenario.pitch, np.random.default_rng(5))
     view = open_view(camera, pitch, 5, looks)
 
-    def film(frame: int) -> Picture:
+    def film(frame: int) -> Image:
         moment = (cast.posed(poses[:, frame]), cast.posed(later[:, frame]))
         return render_frame(view, cast, *moment, frame=frame).picture
 
@@ -113,7 +113,7 @@ def rendered(people: int, frames: int) -> tuple[float, list[Picture]]:
     return timed(lambda: [film(frame) for frame in range(frames)])
 
 
-def decoded(pictures: list[Picture]) -> float:
+def decoded(pictures: list[Image]) -> float:
     """Return the seconds to decode as many images from a video."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "pictures.mp4"

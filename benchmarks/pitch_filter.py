@@ -20,10 +20,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Image
 from worldpose.detection import DetectionSettings, PeopleFinder, Place
 from worldpose.detection.boxes import overlaps
 from worldpose.detection.bundled import embedded_detector, embedded_pose
-from worldpose.detection.interfaces import Picture
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS
@@ -32,8 +32,6 @@ from worldpose.simulation.filming import open_view, render_frame
 from worldpose.simulation.image_formation import RenderedFrame
 from worldpose.simulation.scene import simulate_scene
 from worldpose.simulation.settings import Scenario
-
-Floats = NDArray[np.float64]
 
 SEEN = 0.5
 """Minimum visible share of a person that counts as to be found."""
@@ -105,7 +103,7 @@ def filmed(
         )
 
 
-def boxes_of(finder: PeopleFinder, picture: Picture, place: Place | None) -> Floats:
+def boxes_of(finder: PeopleFinder, picture: Image, place: Place | None) -> Floats:
     """Return the boxes (n, 4) [px] that stage `detection` would store for an image."""
     (stretch,) = finder.find([(0, picture)], place)
     boxes = stretch.boxes[0].astype(float)
@@ -129,7 +127,7 @@ def shared(boxes: Floats, others: Floats, share: float = SHARED) -> NDArray[np.b
     return np.asarray(overlaps(boxes, others).max(axis=1) >= share)
 
 
-def draw(file: Path, picture: Picture, boxes: Floats, kept: NDArray[np.bool_]) -> None:
+def draw(file: Path, picture: Image, boxes: Floats, kept: NDArray[np.bool_]) -> None:
     """Write the image with kept people in green and removed ones in red."""
     drawn = picture.copy()
     for box, is_kept in zip(boxes.round().astype(int), kept, strict=True):

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from data_contracts.arrays import Floats, Image
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.evaluation.cameras import surface_points
@@ -30,8 +30,6 @@ from worldpose.simulation import SCENARIOS, simulate_scene
 from worldpose.simulation.rendering import render_pitch
 from worldpose.static_calibration import CameraEstimate, StaticCalibration, calibrate
 
-Floats = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 SHARES = (0.5, 0.8, 0.95, 0.99)
 BORDER = 4.0
 """Points nearer to the image border count as outside [px]."""
@@ -105,7 +103,7 @@ def region(estimate: CameraEstimate, true: Camera) -> float:
 
 
 def calibrated(
-    surveyed: PitchTemplate, clicked: ClickedMarkings, size: tuple[int, int], still: Picture
+    surveyed: PitchTemplate, clicked: ClickedMarkings, size: tuple[int, int], still: Image
 ) -> list[StaticCalibration]:
     """Return the calibration from clicks, and that with the image's lines."""
     return [calibrate(surveyed, clicked, size, picture=each) for each in (None, still)]

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from data_contracts.arrays import Floats
 from worldpose.geometry import Camera, Rigid
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.rendering import render_pitch
@@ -46,8 +47,6 @@ FARTHEST = 30.0
 """Upper limit of the distance map [px]."""
 ROBUST = 3.0
 """Cauchy scale of the peers' residuals on the map [px]: boards and shadows have edges, too."""
-
-Floats = NDArray[np.float64]
 
 
 def line_points(camera: Camera, count: int) -> Floats:

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from data_contracts.arrays import Floats
 from flows.fan_out import task_of
 from flows.method import METHOD
 from flows.planning import PlannedUnit, plan_run
@@ -34,7 +35,6 @@ from worldpose.simulation import SCENARIOS
 from worldpose.simulation.matches import simulate_match
 from worldpose.store import Store, key_of
 
-Floats = NDArray[np.float64]
 SCENARIO, PEOPLE = SCENARIOS["tiny-broadcast"], 12
 LENGTH = (0.6, 1.2)
 """Duration of a chunk [s]."""

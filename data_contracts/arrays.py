@@ -9,8 +9,15 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data_contracts.records import CONTRACT_VERSION, Name, Record
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+Image = NDArray[np.uint8]
 
 Missing = Literal["nan", "-1", "0", "none"]
 

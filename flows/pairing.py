@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.run import RunRecord
 from flows.release import bodies_unit
 from worldpose.store import Run, Store
@@ -17,8 +18,6 @@ FRAMES: Final = 50
 """Frames whose positions are compared, spread over a clip, so that briefly close people differ."""
 NEAR: Final = 1.0
 """Maximum mean joint distance of one person [m]: no two people stay closer for long."""
-
-Floats = NDArray[np.float64]
 
 
 def paired_people(store: Store, a: RunRecord, b: RunRecord) -> dict[tuple[str, str], str]:

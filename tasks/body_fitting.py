@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import GroupLayout
+from data_contracts.arrays import Floats, GroupLayout
 from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.pitch import PitchSpec
 from data_contracts.work import Recipe, Work
@@ -32,8 +32,6 @@ from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.store import ResultWriter, Store
 from worldpose.triangulation import unswap
-
-Floats = NDArray[np.float64]
 
 
 @unit_task

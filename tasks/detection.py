@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 from pydantic import TypeAdapter
 
+from data_contracts.arrays import Image
 from data_contracts.detection import DETECTION
 from data_contracts.pitch import PitchSpec
 from data_contracts.work import Work
@@ -25,7 +26,6 @@ from worldpose.detection import (
     load_pose,
     weights_of,
 )
-from worldpose.detection.interfaces import Picture
 from worldpose.errors import InputError
 from worldpose.geometry.stored import camera_from_arrays
 from worldpose.ingest import Observations
@@ -138,7 +138,7 @@ def _detected(store: Store, work: Work, spool: Spool) -> _Found:
     )
 
 
-def _pictures(store: Store, work: Work) -> Iterator[tuple[int, Picture | None]]:
+def _pictures(store: Store, work: Work) -> Iterator[tuple[int, Image | None]]:
     """Yield every match frame of the clip with its image, decoded once and in order."""
     sources: dict[str, Any] = work.recipe.sources
     first, count = sources["first_frame"], sources["frame_count"]

@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Image
 from data_contracts.conventions import COCO17
 from data_contracts.pitch import PitchSpec
 from data_contracts.redetection import REDETECTION
@@ -20,7 +21,6 @@ from tasks.detection import footage_index, require_weights
 from tasks.triangulation import settings_before
 from tasks.unit import open_input, require_registered, unit_task
 from worldpose.detection import DetectionSettings, Place, load_pose
-from worldpose.detection.interfaces import Picture
 from worldpose.filtering import (
     BodyViews,
     Spread,
@@ -212,7 +212,7 @@ def _answers(store: Store, work: Work, case: _Case, sought: Sought) -> Answers:
 
 def _pictures(
     store: Store, work: Work, case: _Case, places: NDArray[np.int64]
-) -> Iterator[tuple[int, Picture | None]]:
+) -> Iterator[tuple[int, Image | None]]:
     """Yield the images of some frame indices in order, without those that the video lacks.
 
     Decoding skips images without a search.

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.refitting import REFITTING
 from data_contracts.work import Work
 from tasks.body_fitting import fit_people, open_people, publish_fit
@@ -28,8 +29,6 @@ from worldpose.body_fitting import (
 from worldpose.geometry import Camera
 from worldpose.geometry.stored import camera_from_arrays
 from worldpose.store import Store
-
-Floats = NDArray[np.float64]
 
 KNOWN: Final = 2.0
 """Frames with a larger expected reprojection error of players are left out [px]: keypoint errors

@@ -23,7 +23,7 @@ from worldpose.broadcast_calibration import camera_before
 from worldpose.formats import JointTracks, whole_file
 from worldpose.geometry.stored import camera_from_arrays
 from worldpose.ingest import unit_frames
-from worldpose.reports import Picture
+from worldpose.reports import CaptionedImage
 from worldpose.reports.broadcast import (
     angles_of,
     before_after_picture,
@@ -44,14 +44,14 @@ LENGTH: Final = 30.0
 """Maximum duration of overlay videos [s]."""
 
 
-def broadcast_pictures(run: Run, match: Match) -> list[Picture]:
+def broadcast_pictures(run: Run, match: Match) -> list[CaptionedImage]:
     """Plot each clip's broadcast camera over time, and its frames of largest uncertainty."""
     pictures = []
     for clip, camera in broadcast_cameras(run).items():
         result = run[f"broadcast_calibration/{clip}"]
         frame, expected = result["frame"].values, result["reprojection_error"].values
         pictures.append(
-            Picture(
+            CaptionedImage(
                 f"{clip_title(clip)}: the broadcast camera over its frames, smoothed (blue, with "
                 "bands of two standard deviations) and each frame on its own (orange).",
                 course_picture(
@@ -74,7 +74,7 @@ def broadcast_pictures(run: Run, match: Match) -> list[Picture]:
             with open_video(match.folder.videos[clip]) as video:
                 still = video.frame(video_number)
             pictures.append(
-                Picture(
+                CaptionedImage(
                     f"{clip_title(clip)}, frame {number}, {video_number} of its video, among those "
                     f"where the broadcast camera is known least ({expected[place]:.2g} px): "
                     "markings and people as it projects them.",
@@ -91,7 +91,9 @@ def broadcast_pictures(run: Run, match: Match) -> list[Picture]:
     return pictures
 
 
-def _before_and_after(run: Run, match: Match, clip: str, tracks: JointTracks) -> list[Picture]:
+def _before_and_after(
+    run: Run, match: Match, clip: str, tracks: JointTracks
+) -> list[CaptionedImage]:
     """Crop the person that player refinement moved most, before and after; else empty."""
     result = run[f"broadcast_calibration/{clip}"]
     if result.attrs["players_off"][1] is None:
@@ -113,7 +115,7 @@ def _before_and_after(run: Run, match: Match, clip: str, tracks: JointTracks) ->
         "{:.2f} and {:.2f}".format(*result.attrs[name]) for name in ("markings_off", "players_off")
     )
     return [
-        Picture(
+        CaptionedImage(
             f"{clip_title(clip)}, frame {number}: before and after players and all frames "
             "together. Crosses: keypoints that were seen. In the median, markings are "
             f"{markings} px off, people {players} px.",

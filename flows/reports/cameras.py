@@ -12,7 +12,7 @@ from data_contracts.match import MatchSpec
 from flows.stage import Match
 from worldpose.geometry import Camera
 from worldpose.ingest.stills import read_still
-from worldpose.reports import CameraSummary, Picture
+from worldpose.reports import CameraSummary, CaptionedImage
 from worldpose.reports.static_cameras import (
     NEAR,
     Click,
@@ -64,7 +64,7 @@ def _reasons(run: Run, camera_id: str) -> tuple[str, ...]:
 
 def camera_pictures(
     store: Store, run: Run, match: Match, cameras: Mapping[str, Camera]
-) -> list[Picture]:
+) -> list[CaptionedImage]:
     """Draw the weakest calibrated cameras: their clicks, and the expected error over the pitch."""
     errors = {
         name: run.record.figures.get(f"static_calibration/{name}", {}).get(
@@ -75,7 +75,7 @@ def camera_pictures(
     weakest = sorted((name for name in cameras if errors[name]), key=lambda name: -errors[name])
     shown = weakest[:SHOWN] if match.folder.pitch is not None else ()
     return [
-        Picture(
+        CaptionedImage(
             f"One of the least certain cameras, {name}: the pitch as it projects it, clicks "
             "as circles, clicks that it does not rest on as crosses; below, its expected "
             f"error on the ground, median {errors[name]:.2g} m.",
@@ -85,7 +85,7 @@ def camera_pictures(
     ]
 
 
-def paint_pictures(run: Run, match: Match, cameras: Mapping[str, Camera]) -> list[Picture]:
+def paint_pictures(run: Run, match: Match, cameras: Mapping[str, Camera]) -> list[CaptionedImage]:
     """Draw painted lines in the still of the camera with most of them, and the distance map."""
     if match.folder.pitch is None:
         return []
@@ -101,7 +101,7 @@ def paint_pictures(run: Run, match: Match, cameras: Mapping[str, Camera]) -> lis
     assert still is not None, "only cameras with a still are counted"
     png, share = paint_picture(cameras[name], still, match.folder.pitch)
     return [
-        Picture(
+        CaptionedImage(
             f"Camera {name}: paint in its picture, and how far every pixel is from it, with the "
             "markings as the found camera projects them. Where any paint is within "
             f"{NEAR:.0f} px, {share:.0%} of them lie on it. A check from outside: cameras are not "

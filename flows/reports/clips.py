@@ -18,7 +18,7 @@ from flows.stage import Match
 from flows.stages.redetection import seen_in
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
-from worldpose.reports import Picture, Scene
+from worldpose.reports import CaptionedImage, Scene
 from worldpose.reports.bodies import bodies_picture
 from worldpose.reports.body_rendering import BodyTracks
 from worldpose.reports.clips import camera_picture, paths_picture, stadium_picture
@@ -28,7 +28,7 @@ from worldpose.store import Run, Store
 
 def clip_pictures(
     run: Run, match: Match, clip: str, truth: JointTracks | None = None
-) -> list[Picture]:
+) -> list[CaptionedImage]:
     """Draw the stadium from a camera and from above, the bodies, and all trajectories."""
     cameras = static_cameras(run, match.folder.spec)
     tracks = joint_tracks(run, clip)
@@ -42,14 +42,14 @@ def clip_pictures(
         here = f"{clip_title(clip)}, frame {first}"
         beneath = "" if still is None else ", over its still"
         pictures = [
-            Picture(
+            CaptionedImage(
                 f"{here}, from camera {widest}: markings and people as the found cameras and "
                 f"joints put them{beneath}.",
                 camera_picture(
                     cameras[widest], f"camera {widest}", tracks, 0, still=still, pitch=pitch
                 ),
             ),
-            Picture(
+            CaptionedImage(
                 f"{here}, from above. The more cameras see a place, the darker it is.",
                 stadium_picture(cameras, "", tracks, 0, pitch=pitch),
             ),
@@ -58,11 +58,13 @@ def clip_pictures(
         if bodies is not None:
             pictures.append(_bodies(bodies, match, clip, widest, cameras[widest]))
     above = paths_picture(tracks, truth=truth, cameras=cameras, pitch=pitch)
-    pictures.append(Picture(f"{clip_title(clip)}: everybody's way.", above))
+    pictures.append(CaptionedImage(f"{clip_title(clip)}: everybody's way.", above))
     return pictures
 
 
-def _bodies(bodies: BodyTracks, match: Match, clip: str, camera_id: str, camera: Camera) -> Picture:
+def _bodies(
+    bodies: BodyTracks, match: Match, clip: str, camera_id: str, camera: Camera
+) -> CaptionedImage:
     """Draw the bodies of a clip's first frame on a camera's still."""
     frame, still = int(bodies.frames[0]), still_of(match, camera_id)
     png = bodies_picture(
@@ -74,14 +76,14 @@ def _bodies(bodies: BodyTracks, match: Match, clip: str, camera_id: str, camera:
         still=still,
         pitch=match.folder.pitch,
     )
-    return Picture(
+    return CaptionedImage(
         f"{clip_title(clip)}, frame {frame}: fitted bodies ({bodies.model.name}) where camera "
         f"{camera_id} shows most people{'' if still is None else ', over its still'}.",
         png,
     )
 
 
-def detection_pictures(store: Store, run: Run, match: Match, clip: str) -> list[Picture]:
+def detection_pictures(store: Store, run: Run, match: Match, clip: str) -> list[CaptionedImage]:
     """Draw the view with most people: its detections, and their track assignments."""
     placed = placed_joints(run, clip)
     seen = placed["inliers"].any("joint").sum("person").values
@@ -109,7 +111,7 @@ def detection_pictures(store: Store, run: Run, match: Match, clip: str) -> list[
         pitch=match.folder.pitch,
     )
     return [
-        Picture(
+        CaptionedImage(
             f"Camera {name}, frame {number}, before: what its detector said; orange belongs to "
             "nobody. After: people of all cameras as this one sees them; dashed boxes are those "
             "that its own detector does not carry.",

@@ -12,7 +12,7 @@ from flows.reports.match_pictures import frame_picture
 from flows.stage import Match
 from flows.stages.redetection import seen_in
 from worldpose.formats import JointTracks
-from worldpose.reports import Picture
+from worldpose.reports import CaptionedImage
 from worldpose.reports.detections import detections_picture
 from worldpose.store import Run, Store
 
@@ -59,7 +59,7 @@ def worst_views(run: Run, match: Match, clip: str, tracks: JointTracks) -> list[
     return worst
 
 
-def disagreement_pictures(store: Store, run: Run, match: Match, clip: str) -> list[Picture]:
+def disagreement_pictures(store: Store, run: Run, match: Match, clip: str) -> list[CaptionedImage]:
     """Crop the people whose detections and projected joints differ most, before and after."""
     tracks = joint_tracks(run, clip)
     cameras = static_cameras(run, match.folder.spec)
@@ -86,7 +86,7 @@ def disagreement_pictures(store: Store, run: Run, match: Match, clip: str) -> li
             part=(pixels.mean(axis=0) - 0.5 * side, side),
         )
         pictures.append(
-            Picture(
+            CaptionedImage(
                 f"{clip_title(clip)}, frame {number}, camera {name}: person "
                 f"{tracks.person_ids[person]}, whose keypoints differ most from what all cameras "
                 f"together found: by {percent} % of the person's height in the median.",

@@ -13,13 +13,13 @@ from worldpose.broadcast_calibration.optical_flow import follow
 from worldpose.broadcast_calibration.turning import modified_z_scores
 from worldpose.geometry import Camera
 from worldpose.ingest import unit_frames
-from worldpose.reports import Picture
+from worldpose.reports import CaptionedImage
 from worldpose.reports.broadcast import flow_picture
 from worldpose.store import Run
 from worldpose.video import open_video
 
 
-def flow_pictures(run: Run, match: Match, clip: str, camera: Camera) -> list[Picture]:
+def flow_pictures(run: Run, match: Match, clip: str, camera: Camera) -> list[CaptionedImage]:
     """Draw points tracked between the two frames with the largest camera rotation.
 
     Args:
@@ -54,7 +54,7 @@ def flow_pictures(run: Run, match: Match, clip: str, camera: Camera) -> list[Pic
     rejected = modified_z_scores(predicted - end) >= settings.flow_outlier
     png = flow_picture(stills[0], start, end, rejected, predicted)
     return [
-        Picture(
+        CaptionedImage(
             f"{clip_title(clip)}, frame {number}, where the camera turns most from one frame to "
             "the next: points of the background where the next frame has them (arrows), those "
             "that do not move with the others (orange), and where the found camera puts them "

@@ -25,7 +25,7 @@ from flows.reports.people import adjustment_tables, body_tables
 from flows.stage import Match
 from flows.web.app_context import Desk
 from worldpose.formats import JointTracks
-from worldpose.reports import Picture
+from worldpose.reports import CaptionedImage
 from worldpose.reports.clips import paths_picture
 from worldpose.reports.html_page import Table
 from worldpose.review import requests_by_id
@@ -40,7 +40,7 @@ KEPT: Final = 16
 class Evidence:
     """Evidence for one review request."""
 
-    pictures: tuple[Picture, ...] = ()
+    pictures: tuple[CaptionedImage, ...] = ()
     tables: tuple[Table, ...] = ()
     curves: tuple[Curve, ...] = ()
     first_frame: int = 0
@@ -130,7 +130,7 @@ def _camera(store: Store, run: Run, match: Match, camera: str) -> Evidence:
         "The pitch as this camera projects it; clicks as circles, those that it does not rest on "
         "as crosses; below, the expected error on the ground."
     )
-    return Evidence((Picture(caption, png),))
+    return Evidence((CaptionedImage(caption, png),))
 
 
 def _identities(store: Store, run: Run, match: Match, clip: str) -> Evidence:
@@ -153,7 +153,7 @@ def _identities(store: Store, run: Run, match: Match, clip: str) -> Evidence:
         for join in result.attrs["joins"]
     )
     columns = (">track that stops", ">that begins", "frames", "", ">cost")
-    return Evidence((Picture("Everybody's way.", png),), (Table("Joins", columns, rows),))
+    return Evidence((CaptionedImage("Everybody's way.", png),), (Table("Joins", columns, rows),))
 
 
 def _clip(store: Store, run: Run, match: Match, clip: str) -> Evidence:

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.baselines.pickled import FILE_BYTES
 from worldpose.errors import InputError
-
-Floats = NDArray[np.float64]
 
 
 def wrong(where: object, expected: str, found: str) -> InputError:

@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.baselines.result import MethodResult
 from worldpose.formats import JointTracks
-
-Floats = NDArray[np.float64]
 
 
 def resampled(result: MethodResult, seen_fps: float, fps: float) -> MethodResult:

@@ -9,13 +9,13 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from worldpose.body import OPEN_BODY, BodyModel, BodyParameters, fold_keypoints
 from worldpose.errors import InputError
 from worldpose.formats import JointTracks
 from worldpose.geometry import Rigid
 
-Floats = NDArray[np.float64]
 World = Literal["shared", "own", "camera"]
 """Reference frame of people: one for all, one per person, or the camera's in each frame."""
 Shape = Literal["smpl", "open", "other"]

@@ -14,12 +14,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.body.keypoints import FoldedKeypoints
 from worldpose.body.model import JOINTS, BodyModel
 from worldpose.body.parameters import BodyParameters
 from worldpose.compiled import compiled
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,11 +11,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.compiled import compiled
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

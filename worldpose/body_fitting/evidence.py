@@ -8,10 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17_SIGMAS
 from worldpose.body_fitting.settings import BodyFittingSettings
-
-Floats = NDArray[np.float64]
 
 DIFFICULTY: Final = np.array(COCO17_SIGMAS) / 0.08
 """Spread of each joint relative to an average one: COCO's sigmas over their mean of 0.08."""

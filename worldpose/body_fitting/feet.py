@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.body import BodyModel
 from worldpose.body_fitting.settings import BodyFittingSettings
 
-Floats = NDArray[np.float64]
 Ground = Callable[[Floats, Floats], Floats]
 """Height of the ground [m] at x and y [m], world."""
 

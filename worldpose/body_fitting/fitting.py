@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from worldpose.body import BodyModel, BodyParameters, fold_keypoints
 from worldpose.body.jacobian import ChainedKeypoints
@@ -33,8 +34,6 @@ from worldpose.body_fitting.shaping import Shapes, fit_shapes
 from worldpose.body_fitting.shared_bias import body_axes
 from worldpose.body_fitting.solving import Solver
 from worldpose.errors import InputError
-
-Floats = NDArray[np.float64]
 
 SURE: Final = 0.035
 """Joints are well determined if their median standard deviation per axis is below this [m]: 16

@@ -15,13 +15,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.body.model import JOINTS
 from worldpose.errors import InputError
 from worldpose.geometry import Rigid
 from worldpose.ingest.npz_files import read_npz
 from worldpose.ingest.text_files import require_file
-
-Floats = NDArray[np.float64]
 
 ESTIMATE_BYTES: Final = 1 << 30
 """Maximum size of the arrays of one file [byte]: 1.5 million bodies as matrices."""

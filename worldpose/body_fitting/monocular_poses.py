@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from data_contracts.arrays import Floats
 from worldpose.body_fitting.monocular import MonocularEstimates
 from worldpose.body_fitting.pose_space import GATHER
 from worldpose.body_fitting.starting import bridged
 from worldpose.geometry import Camera, Rigid
-
-Floats = NDArray[np.float64]
 
 GATE: Final = 0.35
 """Maximum image distance between an estimate and its person [person height]."""

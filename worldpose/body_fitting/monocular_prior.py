@@ -13,11 +13,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.body_fitting.monocular_poses import MonocularPoses
 from worldpose.body_fitting.pose_space import SIZE
 from worldpose.geometry import Rigid
-
-Floats = NDArray[np.float64]
 
 DOUBT: Final = 0.25
 """Prior standard deviation of an angle [rad]: 80 mm on a limb of 0.3 m."""

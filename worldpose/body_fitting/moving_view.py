@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from data_contracts.arrays import Floats
 from worldpose.body_fitting.ray_constraints import Sightings, lines_of_sight
 from worldpose.geometry import Camera
-
-Floats = NDArray[np.float64]
 
 GATE: Final = 0.2
 """Maximum mean distance between keypoints and their person's joints [person height]."""

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.body import BodyParameters
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body_fitting.evidence import Evidence
@@ -22,8 +22,6 @@ from worldpose.body_fitting.monocular_prior import Guidance
 from worldpose.body_fitting.pose_space import HIGHEST, LOWEST, SIZE, SPREAD, PosePrior
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shared_bias import MIRRORED_OFFSETS, body_axes
-
-Floats = NDArray[np.float64]
 
 UNKNOWNS: Final = 6 + SIZE
 """Unknowns per frame: translation, orientation and angles."""

@@ -14,12 +14,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.body.parameters import BODY_POSE
 from worldpose.body.skeletons import JOINT_NAMES
-
-Floats = NDArray[np.float64]
 
 COORDINATES: Final = (
     ("spine1", "spine2", "spine3"),

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.body_fitting.starting import bridged
 from worldpose.geometry import Camera
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.body_fitting.bones import Shape, fit_shape, measure_bones, shorten_limbs
 from worldpose.body_fitting.evidence import DIFFICULTY, Evidence
 from worldpose.body_fitting.objective import Pose, Track
@@ -25,7 +25,6 @@ from worldpose.body_fitting.shared_bias import MIRRORED_OFFSETS
 from worldpose.body_fitting.solving import Solver, factor
 from worldpose.body_fitting.starting import bridged, start_poses
 
-Floats = NDArray[np.float64]
 Joints = tuple[Floats, Floats]
 
 PIECE: Final = 1.0

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.body import BodyParameters
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body.parameters import BODY_POSE
@@ -23,8 +23,6 @@ from worldpose.body_fitting.shared_bias import body_axes
 from worldpose.body_fitting.starting import bridged, start_poses
 from worldpose.errors import DegenerateError
 from worldpose.geometry import Rigid
-
-Floats = NDArray[np.float64]
 
 ALIKE: Final = float((1.0 / LIVELINESS**2).sum())
 """Number of hip accelerations that equal independent accelerations of all keypoints [1]. But a body

@@ -9,13 +9,11 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.body import BodyModel
 from worldpose.body_fitting.pose_space import SIZE, PosePrior
 from worldpose.geometry import Rigid
-
-Floats = NDArray[np.float64]
 
 TORSO: Final = (5, 6, 11, 12)
 """Shoulders and hips of COCO-17."""

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Image
 from data_contracts.broadcast_calibration import KeyFrame
 from worldpose.broadcast_calibration.adam import descend
 from worldpose.broadcast_calibration.chain import Chain, chain
@@ -42,9 +42,7 @@ from worldpose.broadcast_calibration.weights import (
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 
-Floats = NDArray[np.float64]
-Picture = NDArray[np.uint8]
-Pictures = Callable[[], Iterator[Picture]]
+Pictures = Callable[[], Iterator[Image]]
 """Starts a new pass over all frames of the clip, grey (height, width), in order."""
 
 
@@ -146,7 +144,7 @@ def track(
             found=f"{sorted(key.frame for key in key_frames)}",
             todo="Put all clicks of a frame into one entry.",
         )
-    kept: dict[int, Picture] = {}
+    kept: dict[int, Image] = {}
     followed = follow(_keeping(pictures(), wanted, kept), boxes, settings.flow_points)
     missing = sorted(wanted - set(kept))
     if missing:
@@ -268,8 +266,8 @@ def _stacked(parts: Sequence[Floats]) -> Floats:
 
 
 def _keeping(
-    pictures: Iterator[Picture], wanted: set[int], kept: dict[int, Picture]
-) -> Iterator[Picture]:
+    pictures: Iterator[Image], wanted: set[int], kept: dict[int, Image]
+) -> Iterator[Image]:
     """Yield all frames, and store the wanted ones in `kept`."""
     for number, picture in enumerate(pictures):
         if number in wanted:

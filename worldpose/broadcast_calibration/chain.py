@@ -9,12 +9,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.broadcast_calibration.moving_camera import MovingCamera, joined
 from worldpose.broadcast_calibration.optical_flow import Followed
 from worldpose.broadcast_calibration.turning import modified_z_scores, turn
 from worldpose.geometry import Rigid
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

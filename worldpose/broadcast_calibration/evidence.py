@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from data_contracts.arrays import Floats, Integers
 
 ENDS = 2
 """Maximum template points that define a place: the ends of its line, or the center of its arc, or

@@ -8,10 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.players import People, boxes_of, match
-
-Floats = NDArray[np.float64]
 
 _COARSE: Final = 25.0
 """Maximum offset of the search [frame]."""

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.broadcast_calibration.evidence import MARKING, PLAYER, PointEvidence
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
-
-Floats = NDArray[np.float64]
 
 
 def pixels_off(camera: MovingCamera, points: PointEvidence) -> Floats:

@@ -6,13 +6,10 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Integers
 from worldpose.broadcast_calibration.normal_equations import direction_row
 from worldpose.compiled import compiled
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _UNDISTORT: Final = 30
 """Maximum Newton steps; a lens that displaces the corner by a twentieth takes three or four."""

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Image
 from worldpose.broadcast_calibration.cuts import require_one_shot
 from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, follow_lines
@@ -21,13 +21,10 @@ from worldpose.broadcast_calibration.uncertainty import Uncertainty, uncertainty
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 
-Floats = NDArray[np.float64]
-Picture = NDArray[np.uint8]
-
 
 def follow_given_lens(
     camera: MovingCamera,
-    pictures: Callable[[], Iterator[Picture]],
+    pictures: Callable[[], Iterator[Image]],
     *,
     pitch: PitchTemplate | None = None,
     boxes: Floats | None = None,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Image
 from data_contracts.broadcast_calibration import KeyFrame
 from worldpose.broadcast_calibration.evidence import (
     CLICK,
@@ -24,9 +25,6 @@ from worldpose.errors import DegenerateError, InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import CameraEstimate, StaticCalibration, calibrate
 from worldpose.static_calibration.residuals import nearest_on_markings
-
-Floats = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 _ROUNDS = 3
 """Iterations that match drawn markings and painted lines again [1]."""
@@ -55,7 +53,7 @@ def calibrate_keys(
     pitch: PitchTemplate,
     key_frames: Sequence[KeyFrame],
     image_size: tuple[int, int],
-    pictures: Mapping[int, Picture],
+    pictures: Mapping[int, Image],
     settings: BroadcastCalibrationSettings,
     where: str,
     first: int = 0,

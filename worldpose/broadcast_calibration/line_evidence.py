@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Image
 from worldpose.broadcast_calibration.evidence import (
     MARKING,
     PointEvidence,
@@ -28,9 +29,6 @@ from worldpose.static_calibration.line_samples import (
     see_lines,
     thinned,
 )
-
-Floats = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 _SPACING: Final = 0.25
 """Spacing of samples in the world [m]."""
@@ -69,7 +67,7 @@ class FieldSamples:
 def find_lines(
     camera: MovingCamera,
     samples: FieldSamples,
-    picture: Picture,
+    picture: Image,
     people: Floats | None,
     settings: BroadcastCalibrationSettings,
 ) -> tuple[PointEvidence, MovingCamera]:
@@ -94,7 +92,7 @@ def find_lines(
 def _look(
     camera: MovingCamera,
     samples: FieldSamples,
-    picture: Picture,
+    picture: Image,
     people: Floats | None,
     settings: BroadcastCalibrationSettings,
     reach: float,
@@ -249,7 +247,7 @@ class FollowedLines:
 def follow_lines(
     camera: MovingCamera,
     samples: FieldSamples,
-    pictures: Iterable[Picture],
+    pictures: Iterable[Image],
     boxes: Floats | None,
     settings: BroadcastCalibrationSettings,
 ) -> FollowedLines:

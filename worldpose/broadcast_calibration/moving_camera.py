@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.geometry import Camera, Rigid
-
-Floats = NDArray[np.float64]
 
 FRAME_SIZE = 7
 """Parameters of a frame's step: rotation [rad] in the camera's axes, log focal, k1, k2, k3."""

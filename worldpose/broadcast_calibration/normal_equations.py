@@ -7,12 +7,9 @@ template's points; the matrix is an arrow: a band of frame blocks, and a border 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Integers
 from worldpose.compiled import compiled
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _NEAR = 0.5
 """Minimum depth of a point [m]: a camera in the stands sees none nearer."""

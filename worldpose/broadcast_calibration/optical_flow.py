@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Picture = NDArray[np.uint8]
+from data_contracts.arrays import Floats, Image
 
 _WINDOW: Final = (21, 21)
 _LEVELS: Final = 4
@@ -46,7 +45,7 @@ class Followed:
     together: float
 
 
-def follow(pictures: Iterable[Picture], boxes: Floats | None, points: int) -> list[Followed]:
+def follow(pictures: Iterable[Image], boxes: Floats | None, points: int) -> list[Followed]:
     """Return the points followed between all neighbouring frames.
 
     The function selects new corners in every frame, evenly over the image, so that errors do not
@@ -59,7 +58,7 @@ def follow(pictures: Iterable[Picture], boxes: Floats | None, points: int) -> li
         points: approximate number of points.
     """
     followed: list[Followed] = []
-    before: Picture | None = None
+    before: Image | None = None
     for number, picture in enumerate(pictures):
         if before is not None:
             people = None if boxes is None else boxes[number - 1]
@@ -68,7 +67,7 @@ def follow(pictures: Iterable[Picture], boxes: Floats | None, points: int) -> li
     return followed
 
 
-def _follow(before: Picture, after: Picture, people: Floats | None, points: int) -> Followed:
+def _follow(before: Image, after: Image, people: Floats | None, points: int) -> Followed:
     start = _corners(before, people, points)
     if len(start) < _TELLING:
         return Followed(np.empty((0, 2)), np.empty((0, 2)), float("nan"))
@@ -92,7 +91,7 @@ def _follow(before: Picture, after: Picture, people: Floats | None, points: int)
     return Followed(one, two, together)
 
 
-def _corners(picture: Picture, people: Floats | None, points: int) -> NDArray[np.float32]:
+def _corners(picture: Image, people: Floats | None, points: int) -> NDArray[np.float32]:
     """Return corners (n, 2) [px], the strongest of each image cell, outside people's boxes."""
     half = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     strength = cv2.cornerMinEigenVal(half, 5)

@@ -6,16 +6,13 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from data_contracts.arrays import Floats, Integers
 from worldpose.broadcast_calibration.evidence import PLAYER, PointEvidence
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.errors import InputError
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 BONES: Final = np.array(
     [

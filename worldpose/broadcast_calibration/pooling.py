@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from data_contracts.arrays import Floats
 from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
-
-Floats = NDArray[np.float64]
 
 _UNLIKELY = 1e-3
 """Significance level of the test that clips have one center [1]."""

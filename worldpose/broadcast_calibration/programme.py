@@ -8,13 +8,11 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from data_contracts.arrays import Image
 from data_contracts.records import Record
 from worldpose.broadcast_calibration.optical_flow import follow
-
-Picture = NDArray[np.uint8]
 
 _POINTS: Final = 200
 """Approximate number of points followed between two frames [1]."""
@@ -72,7 +70,7 @@ class Shot:
     grass: float
     tallest: float
     pan: float
-    pictures: tuple[Picture, ...]
+    pictures: tuple[Image, ...]
     unfit: tuple[str, ...]
 
 
@@ -84,13 +82,13 @@ class _Course:
     last: int
     grass: list[float] = field(default_factory=list)
     tallest: list[float] = field(default_factory=list)
-    pictures: list[Picture] = field(default_factory=list)
+    pictures: list[Image] = field(default_factory=list)
     every: int = 1
     aim: float = 0.0
     left: float = 0.0
     right: float = 0.0
 
-    def look(self, picture: Picture) -> None:
+    def look(self, picture: Image) -> None:
         """Record the grass share and the tallest region of a frame."""
         grass, tallest = grass_and_people(picture)
         if len(self.grass) % self.every == 0:
@@ -108,7 +106,7 @@ class _Course:
 
 
 def find_shots(
-    pictures: Iterable[tuple[int, Picture | None]],
+    pictures: Iterable[tuple[int, Image | None]],
     fps: float,
     settings: ProgrammeSettings = ProgrammeSettings(),  # noqa: B008
 ) -> Iterator[Shot]:
@@ -126,7 +124,7 @@ def find_shots(
     stride = max(1, round(fps / settings.rate))
     looked = max(1, round(_LOOK * fps / stride))
     course: _Course | None = None
-    before: Picture | None = None
+    before: Image | None = None
     waiting: _Course | None = None
     ended: int | None = None
     count = 0
@@ -160,7 +158,7 @@ def find_shots(
         yield _shot(waiting, ended, None, fps, stride, settings)
 
 
-def grass_and_people(picture: Picture) -> tuple[float, float]:
+def grass_and_people(picture: Image) -> tuple[float, float]:
     """Return the share of grass [1] and the height of the tallest region on it [1].
 
     The height is in image heights: that of the tallest connected region that is not green within
@@ -185,9 +183,7 @@ def grass_and_people(picture: Picture) -> tuple[float, float]:
     return share, tallest / len(picture)
 
 
-def _moved(
-    before: Picture, picture: Picture | None, settings: ProgrammeSettings
-) -> tuple[bool, float]:
+def _moved(before: Image, picture: Image | None, settings: ProgrammeSettings) -> tuple[bool, float]:
     """Return whether a frame continues a shot, and its motion to the right [widths]."""
     if picture is None:
         return False, 0.0

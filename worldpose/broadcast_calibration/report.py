@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Integers
 from data_contracts.broadcast_calibration import FRAME_STATUS
 from worldpose.broadcast_calibration.chain import Chain
 from worldpose.broadcast_calibration.evidence import (
@@ -27,9 +28,6 @@ from worldpose.broadcast_calibration.settings import BroadcastCalibrationSetting
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
 from worldpose.broadcast_calibration.weights import Weights
 from worldpose.pitch import PitchTemplate
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _FEW_LINES: Final = 30
 """Minimum line samples that determine a frame's camera [1]."""

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.geometry import Rigid
-
-Floats = NDArray[np.float64]
 
 
 def second_differences(camera: MovingCamera) -> Floats:

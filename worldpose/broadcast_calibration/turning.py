@@ -6,14 +6,12 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.broadcast_calibration.flow_equations import add_flow, flow_row
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.optical_flow import Followed
 from worldpose.compiled import compiled
-
-Floats = NDArray[np.float64]
 
 _SCALES: Final = (20.0, 5.0, 1.5, 0.6, 0.6)
 """Decreasing scales of the loss [px]."""

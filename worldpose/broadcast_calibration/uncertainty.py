@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Integers
 from worldpose.body_fitting.banded import BandedFactor
 from worldpose.broadcast_calibration.evidence import CLICK, PLAYER
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE
@@ -15,10 +15,6 @@ from worldpose.broadcast_calibration.normal_equations import point_row
 from worldpose.broadcast_calibration.solving import Problem, Solution
 from worldpose.compiled import compiled
 from worldpose.errors import DegenerateError
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-
 
 _LENS: Final = 3
 """Parameters of a frame's step before those of its lens."""

@@ -5,15 +5,12 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Integers
 from data_contracts.records import Record
 from worldpose.broadcast_calibration.chain import Chain
 from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.smoothness import second_differences
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _HAND: Final = 2e-3
 """Largest plausible second difference of the rotation at 50 frames per second [rad]: it bridges

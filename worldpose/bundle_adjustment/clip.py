@@ -9,12 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Integers
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.bundle_adjustment.building import camera_knowledge, known_covariance
 from worldpose.bundle_adjustment.clip import Clip, keypoints_of, predict
 from worldpose.bundle_adjustment.held_out_validation import HeldOut, joints_without
@@ -22,7 +23,6 @@ from worldpose.errors import InputError
 from worldpose.static_calibration import PARAMETERS
 from worldpose.triangulation.calibration_errors import StatedErrors, stated_errors
 
-Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
 
 _SIZE: Final = len(PARAMETERS)

@@ -10,11 +10,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.geometry import Camera, Rigid
-
-Floats = NDArray[np.float64]
 
 SIMILARITY: Final = 7
 """Degrees of freedom: translation, rotation, scale."""

@@ -11,14 +11,11 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Integers
 from worldpose.compiled import compiled
 from worldpose.geometry.distortion import distort
 from worldpose.geometry.projection import project_point
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 STEPS = 12
 """Parameters per camera, in the order of `worldpose.static_calibration.PARAMETERS`."""

@@ -11,6 +11,7 @@ from pydantic import Field
 from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
 from scipy.linalg.blas import dsyrk
 
+from data_contracts.arrays import Floats
 from data_contracts.records import Record
 from worldpose.bundle_adjustment.schur_complement import (
     STEPS,
@@ -22,8 +23,6 @@ from worldpose.bundle_adjustment.schur_complement import (
 from worldpose.errors import InputError, InternalError
 from worldpose.geometry import Camera
 from worldpose.static_calibration import stepped
-
-Floats = NDArray[np.float64]
 
 BLOCK: Final = 256
 """Points eliminated at a time: their rows for 18 cameras (1.3 MB) stay in the cache."""

@@ -9,13 +9,11 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.bundle_adjustment.clip import Clip
 from worldpose.static_calibration.line_samples import sample_markings, see_lines, thinned
 from worldpose.static_calibration.line_settings import LineRefinementSettings
-
-Floats = NDArray[np.float64]
 
 _SPACING: Final = 0.25
 """Spacing of samples along painted lines [m]."""

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.camera_consistency.hypotheses import STATED, Hypothesis
 from worldpose.camera_consistency.pair_scores import MIN_JOINTS, pair_scores
 from worldpose.camera_consistency.settings import ConsistencySettings
@@ -18,7 +19,6 @@ from worldpose.tracking.affinity import match_greedily, ray_affinity
 from worldpose.tracking.epipolar import associate
 from worldpose.tracking.settings import TrackingSettings
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 HEIGHTS: Final = (-0.4, 2.2)

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.release import Finding
 from worldpose.formats.camera_rows import CameraRows
 from worldpose.formats.challenge import ChallengeClip
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

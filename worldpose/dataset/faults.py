@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.dataset.contents import PointSource
 from worldpose.formats.camera_rows import CameraRows
-
-Floats = NDArray[np.float64]
 
 LATEST: Final = 3
 """Maximum frame offset that is tested [frame]."""

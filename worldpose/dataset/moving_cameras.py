@@ -8,14 +8,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.release import Finding
 from worldpose.dataset.contents import PointSource, View
 from worldpose.dataset.faults import LATEST, Fault, camera_faults, frame_faults, point_faults
 from worldpose.dataset.plausibility import center_of, centers
 from worldpose.dataset.settings import CheckSettings
 from worldpose.formats.camera_rows import CameraRows
-
-Floats = NDArray[np.float64]
 
 TALL: Final = (8.0, 1500.0)
 """Minimum and maximum height of a person in the image [px]."""

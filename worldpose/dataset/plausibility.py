@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.release import Finding
 from worldpose.dataset.contents import PointSource, View
 from worldpose.dataset.faults import Fault, point_faults
 from worldpose.dataset.settings import CheckSettings
 from worldpose.formats.camera_rows import CameraRows
-
-Floats = NDArray[np.float64]
 
 FEET = ("left_big_toe", "right_big_toe", "left_heel", "right_heel", "left_ankle", "right_ankle")
 ANKLE = 0.09

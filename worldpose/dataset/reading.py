@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.release import Finding, ReleaseManifest
 from worldpose.body import BODY25, CHALLENGE15, BodyModel, BodyParameters, fold_keypoints
@@ -21,8 +21,6 @@ from worldpose.formats.challenge import read_challenge, read_submission, submiss
 from worldpose.formats.joints_file import read_joints
 from worldpose.formats.pose_file import read_poses
 from worldpose.geometry import Rigid
-
-Floats = NDArray[np.float64]
 
 SUBMISSIONS = ("submission.zip", "submission.npz")
 _FRAMES = 200

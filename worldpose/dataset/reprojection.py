@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.release import Finding
 from worldpose.dataset.contents import PointSource, View
 from worldpose.dataset.faults import Fault, camera_faults, frame_faults, point_faults
@@ -16,7 +17,6 @@ from worldpose.dataset.settings import CheckSettings
 from worldpose.formats.camera_rows import CameraRows
 from worldpose.geometry import Camera
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 SOUND = Fault("none", "as shipped")

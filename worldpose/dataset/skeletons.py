@@ -6,15 +6,13 @@ from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.release import Finding
 from worldpose.dataset.faults import axis_orders
 from worldpose.dataset.plausibility import BONES
 from worldpose.dataset.settings import CheckSettings
 from worldpose.formats.camera_rows import CameraRows
-
-Floats = NDArray[np.float64]
 
 _BODIES: Final = 400
 """Maximum number of sampled bodies."""

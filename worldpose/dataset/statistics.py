@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.release import ClipStatistics, DataSetStatistics
 from worldpose.errors import InputError
@@ -17,7 +17,6 @@ from worldpose.formats.challenge import read_submission
 from worldpose.formats.joints_file import read_joints
 from worldpose.formats.pose_file import read_poses
 
-Floats = NDArray[np.float64]
 CameraKind = Literal["S", "M", "M+Z"]
 KINDS: Final[tuple[CameraKind, ...]] = ("S", "M", "M+Z")
 """Static, moving, or moving and zooming cameras, as in the paper's table."""

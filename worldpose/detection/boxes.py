@@ -7,9 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.detection.interfaces import People, Poses
-
-Floats = NDArray[np.float64]
 
 SUREST: Final = 12
 """Number of surest keypoints that decide whether a box holds a person: others may be hidden."""

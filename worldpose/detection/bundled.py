@@ -15,20 +15,14 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Image
 from worldpose.detection.boxes import overlaps, suppress
 from worldpose.detection.bundled_crops import crops_of_boxes, cut, picture_from_crop
 from worldpose.detection.bundled_looks import Look
 from worldpose.detection.bundled_surroundings import CELL, MAPS, SAME, surroundings
 from worldpose.detection.bundled_weights import load_weights
 from worldpose.detection.groups import groups
-from worldpose.detection.interfaces import (
-    LEAST_SCORE,
-    Detector,
-    People,
-    Picture,
-    PoseEstimator,
-    Poses,
-)
+from worldpose.detection.interfaces import LEAST_SCORE, Detector, People, PoseEstimator, Poses
 from worldpose.detection.occluded_people import find_occluded_people
 from worldpose.detection.rival_joints import shared_out
 from worldpose.errors import InputError
@@ -38,7 +32,6 @@ if TYPE_CHECKING:
 
     from worldpose.detection.bundled_nets import KeypointNet, PeopleNet
 
-Floats = NDArray[np.float64]
 Net = TypeVar("Net", bound="torch.nn.Module")
 
 EMBEDDED: Final = (
@@ -106,11 +99,11 @@ class EmbeddedDetector:
         """None: the detector takes whole frames of any size."""
         return
 
-    def detect(self, pictures: Sequence[Picture]) -> list[People]:
+    def detect(self, pictures: Sequence[Image]) -> list[People]:
         """Return the people in each frame, computed one by one."""
         return [self._people(picture) for picture in pictures]
 
-    def _people(self, picture: Picture) -> People:
+    def _people(self, picture: Image) -> People:
         whole = self._look(picture)
         looks = [
             whole,
@@ -123,7 +116,7 @@ class EmbeddedDetector:
         scores = np.concatenate([people.scores for people in looks])
         return suppress(People(boxes, scores), OVERLAP)
 
-    def _look(self, picture: Picture) -> People:
+    def _look(self, picture: Image) -> People:
         """Return the detections in an image; the same person may be there twice."""
         import torch
 
@@ -150,7 +143,7 @@ class EmbeddedPose:
     def __init__(self, net: KeypointNet, device: str = "cpu", half: bool = False) -> None:
         self._net, self._device, self._half = _placed(net, device), device, half
 
-    def estimate(self, picture: Picture, boxes: NDArray[np.float64]) -> Poses:
+    def estimate(self, picture: Image, boxes: NDArray[np.float64]) -> Poses:
         """Return the pose in each box; confidence is the probability that a keypoint is correct.
 
         A correct keypoint is within a twentieth of the box's longer side, about a fifth of a torso.
@@ -173,13 +166,13 @@ class EmbeddedPose:
         looked.replace(again, self._look(picture, asked[again], around))
         return looked.poses(shared_out(looked.places, looked.mass, looked.boxes))
 
-    def beside(self, picture: Picture, people: People) -> tuple[People, Poses]:
+    def beside(self, picture: Image, people: People) -> tuple[People, Poses]:
         """Return people partly occluded by the detected ones, with their poses."""
         return find_occluded_people(
             lambda boxes, others: self._look(picture, boxes, others), people
         )
 
-    def _look(self, picture: Picture, boxes: Floats, others: Sequence[Floats]) -> Look:
+    def _look(self, picture: Image, boxes: Floats, others: Sequence[Floats]) -> Look:
         """Return the net's output for a crop around each box.
 
         Args:

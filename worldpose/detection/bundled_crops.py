@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from data_contracts.arrays import Floats
 
 MARGIN: Final = 1.25
 """Size of a crop over that of its box [1]: keypoints may lie outside of a box."""

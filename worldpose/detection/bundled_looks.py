@@ -7,10 +7,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.detection.boxes import SUREST
 from worldpose.detection.interfaces import Poses
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

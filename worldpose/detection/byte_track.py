@@ -5,13 +5,10 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from data_contracts.arrays import Floats, Integers
 from worldpose.detection.boxes import overlaps
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 SURE_OVERLAP: Final = 0.2
 """A high-score box continues a track whose predicted box it overlaps more [1]: a small box moves by

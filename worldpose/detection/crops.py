@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from worldpose.detection.interfaces import Picture
-
-Floats = NDArray[np.float64]
+from data_contracts.arrays import Floats, Image
 
 
 def crop_frames(boxes: Floats, size: tuple[int, int], padding: float) -> Floats:
@@ -25,7 +22,7 @@ def crop_frames(boxes: Floats, size: tuple[int, int], padding: float) -> Floats:
     return np.hstack([corner, scale[:, None]])
 
 
-def cut_crops(picture: Picture, frames: Floats, size: tuple[int, int], fill: int = 0) -> Picture:
+def cut_crops(picture: Image, frames: Floats, size: tuple[int, int], fill: int = 0) -> Image:
     """Return the crops (boxes, height, width, 3), smoothed where they are smaller than the frame.
 
     Args:

@@ -7,10 +7,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-
-Floats = NDArray[np.float64]
 
 HEAD_HEIGHT: Final = 1.75
 """Height of the head above the ground, for a person whose feet the lower border cuts off [m]."""

@@ -7,7 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.detection.interfaces import Picture, PoseEstimator, Poses
+from data_contracts.arrays import Image
+from worldpose.detection.interfaces import PoseEstimator, Poses
 
 SIDES: Final = (0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15)
 """The COCO-17 joint that each joint becomes in the mirror image."""
@@ -22,7 +23,7 @@ class Mirrored:
     def __init__(self, estimator: PoseEstimator) -> None:
         self._estimator = estimator
 
-    def estimate(self, picture: Picture, boxes: NDArray[np.float64]) -> Poses:
+    def estimate(self, picture: Image, boxes: NDArray[np.float64]) -> Poses:
         """Return the pose in each box."""
         last = picture.shape[1] - 1
         seen = self._estimator.estimate(picture, boxes)

@@ -7,13 +7,11 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Image
 from worldpose.detection.byte_track import BoxTracker
-from worldpose.detection.interfaces import People, Picture
+from worldpose.detection.interfaces import People
 from worldpose.detection.settings import DetectionSettings
-
-Floats = NDArray[np.float64]
 
 
 @dataclass
@@ -21,7 +19,7 @@ class _Held:
     """A buffered frame whose gaps may still be filled."""
 
     number: int
-    picture: Picture | None
+    picture: Image | None
     boxes: dict[int, tuple[Floats, float]] = field(default_factory=dict)
 
 
@@ -48,8 +46,8 @@ class Follower:
         self.bridged = self.flickers = 0
 
     def follow(
-        self, frames: Iterable[tuple[int, Picture | None, People | None]]
-    ) -> Iterator[tuple[int, Picture | None, People]]:
+        self, frames: Iterable[tuple[int, Image | None, People | None]]
+    ) -> Iterator[tuple[int, Image | None, People]]:
         """Yield each frame with the people in it.
 
         Args:
@@ -93,7 +91,7 @@ class Follower:
                 held.boxes[track] = between, (1.0 - part) * before.score + part * score
                 self.bridged += 1
 
-    def _released(self) -> tuple[int, Picture | None, People]:
+    def _released(self) -> tuple[int, Image | None, People]:
         held = self._held.popleft()
         least = min(self._settings.min_hits, self._looks)
         kept = {
@@ -115,11 +113,11 @@ class Follower:
 
 
 def looked_at(
-    frames: Iterable[tuple[int, Picture | None]],
-    look: Callable[[list[Picture]], list[People]],
+    frames: Iterable[tuple[int, Image | None]],
+    look: Callable[[list[Image]], list[People]],
     stride: int,
     batch: int,
-) -> Iterator[tuple[int, Picture | None, People | None]]:
+) -> Iterator[tuple[int, Image | None, People | None]]:
     """Yield each frame with its detections; detectors run on every `stride`-th and the last one.
 
     Args:
@@ -128,11 +126,11 @@ def looked_at(
         stride: frames between runs of the detector.
         batch: images per call of the detector.
     """
-    waiting: list[tuple[int, Picture | None]] = []
+    waiting: list[tuple[int, Image | None]] = []
     chosen: list[int] = []
     due: int | None = None
 
-    def found() -> Iterator[tuple[int, Picture | None, People | None]]:
+    def found() -> Iterator[tuple[int, Image | None, People | None]]:
         pictures = [picture for at in chosen if (picture := waiting[at][1]) is not None]
         people = dict(zip(chosen, look(pictures) if pictures else [], strict=True))
         for at, (number, picture) in enumerate(waiting):

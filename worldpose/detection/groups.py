@@ -7,13 +7,11 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from data_contracts.arrays import Floats, Image
 from worldpose.detection.boxes import overlaps, suppress
-from worldpose.detection.interfaces import People, Picture
-
-Floats = NDArray[np.float64]
+from worldpose.detection.interfaces import People
 
 TALL: Final = (100.0, 160.0)
 """The enlarged heights of a group's people [px], one pass per height: the detector is trained on
@@ -50,7 +48,7 @@ class Group:
     inner: Floats
     tall: float
 
-    def shown(self, picture: Picture) -> Picture:
+    def shown(self, picture: Image) -> Image:
         """Return the enlarged crop of the frame."""
         (left, top), (right, bottom) = self.corner, self.end
         part = picture[top:bottom, left:right]

@@ -9,8 +9,7 @@ from typing import Final, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-Picture = NDArray[np.uint8]
-"""An image (height, width, 3) RGB."""
+from data_contracts.arrays import Image
 
 LEAST_SCORE: Final = 0.05
 """A detector reports every box from this score on; the stage applies its own thresholds."""
@@ -57,7 +56,7 @@ class Detector(Protocol):
         The caller cuts larger frames into overlapping views of this size.
         """
 
-    def detect(self, pictures: Sequence[Picture]) -> list[People]:
+    def detect(self, pictures: Sequence[Image]) -> list[People]:
         """Return the people in each image, from `LEAST_SCORE` on.
 
         Args:
@@ -69,7 +68,7 @@ class Detector(Protocol):
 class PoseEstimator(Protocol):
     """An estimator of the keypoints of people whose boxes are known."""
 
-    def estimate(self, picture: Picture, boxes: NDArray[np.float64]) -> Poses:
+    def estimate(self, picture: Image, boxes: NDArray[np.float64]) -> Poses:
         """Return the pose in each box, in frame pixels; keypoints may lie outside of their box.
 
         Args:
@@ -83,7 +82,7 @@ class PoseEstimator(Protocol):
 class LooksBeside(PoseEstimator, Protocol):
     """An estimator that also finds occluded people that a detector misses."""
 
-    def beside(self, picture: Picture, people: People) -> tuple[People, Poses]:
+    def beside(self, picture: Image, people: People) -> tuple[People, Poses]:
         """Return occluded people next to the detected ones, with the estimator's boxes.
 
         Args:

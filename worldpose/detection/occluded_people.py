@@ -8,11 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.detection.boxes import best_of, overlaps, suppress
 from worldpose.detection.bundled_looks import Look
 from worldpose.detection.interfaces import People, Poses
-
-Floats = NDArray[np.float64]
 
 SURE: Final = 0.25
 """Score of a detection from which on its neighbourhood is searched [1]."""

@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17_SIGMAS
 from worldpose.detection.boxes import areas
 from worldpose.detection.interfaces import People, Poses
-
-Floats = NDArray[np.float64]
 
 DOUBT: Final = 0.5
 """Share of its score that a box with the pose of a better box loses [1]."""

@@ -9,8 +9,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Image
 from worldpose.detection.boxes import suppress
-from worldpose.detection.interfaces import LEAST_SCORE, Detector, People, Picture
+from worldpose.detection.interfaces import LEAST_SCORE, Detector, People
 from worldpose.detection.onnx_session import OnnxNet, unknown_outputs
 
 PERSON: Final = 0
@@ -74,7 +75,7 @@ class _OnnxDetector:
         """Input size of the net."""
         return self._net.size
 
-    def detect(self, pictures: Sequence[Picture]) -> list[People]:
+    def detect(self, pictures: Sequence[Image]) -> list[People]:
         """Return the people in each view."""
         if not pictures:
             return []

@@ -8,11 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Image
 from worldpose.detection.crops import crop_frames, cut_crops, in_picture
-from worldpose.detection.interfaces import Picture, PoseEstimator, Poses
+from worldpose.detection.interfaces import PoseEstimator, Poses
 from worldpose.detection.onnx_session import OnnxNet, unknown_outputs
-
-Floats = NDArray[np.float64]
 
 CROP_SIZE: Final = (192, 256)
 """Input size for a net that takes any size [px]."""
@@ -55,7 +54,7 @@ class _OnnxPose:
     def __init__(self, net: OnnxNet, *, normal: bool) -> None:
         self._net, self._normal = net, normal
 
-    def estimate(self, picture: Picture, boxes: Floats) -> Poses:
+    def estimate(self, picture: Image, boxes: Floats) -> Poses:
         """Return the pose in each box."""
         if not len(boxes):
             return Poses(np.empty((0, 17, 2)), np.empty((0, 17)))

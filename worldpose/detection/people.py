@@ -9,10 +9,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Image
 from worldpose.detection.boxes import areas, fuse, suppress
 from worldpose.detection.crowd import on_pitch
 from worldpose.detection.followed import Follower, looked_at
-from worldpose.detection.interfaces import Detector, People, Picture, PoseEstimator, Poses
+from worldpose.detection.interfaces import Detector, People, PoseEstimator, Poses
 from worldpose.detection.oks_nms import told_apart
 from worldpose.detection.posed import find_poses
 from worldpose.detection.settings import DetectionSettings
@@ -119,7 +120,7 @@ class PeopleFinder:
         self.report = DetectionReport()
 
     def find(
-        self, frames: Iterable[tuple[int, Picture | None]], place: Place | None = None
+        self, frames: Iterable[tuple[int, Image | None]], place: Place | None = None
     ) -> Iterator[Stretch]:
         """Yield the people of a video in chunks of frames.
 
@@ -149,7 +150,7 @@ class PeopleFinder:
             yield self._stretch(rows, unreadable)
         self.report.bridged, self.report.flickers = follower.bridged, follower.flickers
 
-    def _people(self, pictures: list[Picture], place: Place | None) -> list[People]:
+    def _people(self, pictures: list[Image], place: Place | None) -> list[People]:
         """Return the people on the pitch in each frame."""
         settings = self._settings
         found = [detector.detect(pictures) for detector in self._detectors]
@@ -172,13 +173,13 @@ class PeopleFinder:
             everybody.append(people)
         return everybody
 
-    def _inside(self, people: People, picture: Picture, place: Place) -> NDArray[np.bool_]:
+    def _inside(self, people: People, picture: Image, place: Place) -> NDArray[np.bool_]:
         """Return whether people's feet are on the pitch or near it (people,)."""
         size = (picture.shape[1], picture.shape[0])
         margin = self._settings.pitch_margin_m
         return on_pitch(people.boxes, place.camera, size, place.pitch, margin)
 
-    def _posed(self, picture: Picture, people: People, place: Place | None) -> tuple[People, Poses]:
+    def _posed(self, picture: Image, people: People, place: Place | None) -> tuple[People, Poses]:
         """Return keypoints of people; drop those without any or with the pose of a better box."""
         found = len(people.scores)
         people, poses = find_poses(self._estimator, picture, people, self._settings)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from data_contracts.arrays import Image
 from worldpose.detection.boxes import seen_closer
-from worldpose.detection.interfaces import LooksBeside, People, Picture, PoseEstimator, Poses
+from worldpose.detection.interfaces import LooksBeside, People, PoseEstimator, Poses
 from worldpose.detection.settings import DetectionSettings
 
 
 def find_poses(
-    estimator: PoseEstimator, picture: Picture, people: People, settings: DetectionSettings
+    estimator: PoseEstimator, picture: Image, people: People, settings: DetectionSettings
 ) -> tuple[People, Poses]:
     """Return people with the estimator's boxes and poses, then occluded people next to them.
 

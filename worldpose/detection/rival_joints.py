@@ -7,10 +7,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.detection.boxes import overlaps
 from worldpose.detection.flip_test import SIDES
-
-Floats = NDArray[np.float64]
 
 RIVALRY: Final = 2.0
 """Cost of a candidate that certainly is another person's joint [nats]."""

@@ -13,14 +13,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.detection.interfaces import (
-    LEAST_SCORE,
-    Detector,
-    People,
-    Picture,
-    PoseEstimator,
-    Poses,
-)
+from data_contracts.arrays import Image
+from worldpose.detection.interfaces import LEAST_SCORE, Detector, People, PoseEstimator, Poses
 from worldpose.errors import InputError
 
 DETECTORS: Final = ("rt_detr", "rt_detr_v2", "d_fine", "detr")
@@ -74,7 +68,7 @@ class _TransformersDetector:
         """Size to which the processor scales images."""
         return self._size
 
-    def detect(self, pictures: Sequence[Picture]) -> list[People]:
+    def detect(self, pictures: Sequence[Image]) -> list[People]:
         """Return the people in each image."""
         people = []
         for picture in pictures:  # one by one: kernels for other batches round differently
@@ -105,7 +99,7 @@ class _TransformersPose:
         experts = getattr(net.config.backbone_config, "num_experts", 1)
         self._expert = 0 if experts > 1 else None  # of ViTPose+, the one for COCO
 
-    def estimate(self, picture: Picture, boxes: NDArray[np.float64]) -> Poses:
+    def estimate(self, picture: Image, boxes: NDArray[np.float64]) -> Poses:
         """Return the pose in each box."""
         if not len(boxes):
             return Poses(np.empty((0, 17, 2)), np.empty((0, 17)))
@@ -119,7 +113,7 @@ class _TransformersPose:
         )
 
     def _one(
-        self, picture: Picture, box: NDArray[np.float64]
+        self, picture: Image, box: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         x0, y0, x1, y1 = box
         corner = [[[float(x0), float(y0), float(x1 - x0), float(y1 - y0)]]]

@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Image
 from worldpose.detection.boxes import suppress
-from worldpose.detection.interfaces import Detector, People, Picture
+from worldpose.detection.interfaces import Detector, People
 
 EDGE: Final = 3.0
 """A view's edge cuts a person whose box ends this near to it [px of the view]."""
@@ -61,7 +62,7 @@ class Tiled:
         """None: frames of any size."""
         return
 
-    def detect(self, pictures: Sequence[Picture]) -> list[People]:
+    def detect(self, pictures: Sequence[Image]) -> list[People]:
         """Return the people in each frame, from views that do not cut them."""
         people = []
         for picture in pictures:
@@ -112,11 +113,11 @@ def _starts(length: int, view: int, overlap: float) -> list[int]:
     return [round(start) for start in np.linspace(0, length - view, count)]
 
 
-def _cut(picture: Picture, views: Sequence[View], size: tuple[int, int]) -> list[Picture]:
+def _cut(picture: Image, views: Sequence[View], size: tuple[int, int]) -> list[Image]:
     """Return each view of a frame, filled with grey beyond the frame's border."""
     import cv2  # late: it takes a fifth of a second, and planning a run needs none of it
 
-    scaled: dict[float, Picture] = {}
+    scaled: dict[float, Image] = {}
     cut = []
     for view in views:
         if view.scale not in scaled:

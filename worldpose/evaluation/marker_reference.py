@@ -9,14 +9,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.optimize import minimize_scalar
 
+from data_contracts.arrays import Floats
 from data_contracts.records import Record
 from worldpose.errors import DegenerateError
 from worldpose.evaluation.alignment import Similarity, align
 from worldpose.evaluation.matching import joint_distances, match_people, taken
 from worldpose.evaluation.registration import register_world
 from worldpose.formats import JointTracks
-
-Floats = NDArray[np.float64]
 
 
 class ReferenceSettings(Record):

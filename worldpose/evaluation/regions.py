@@ -5,16 +5,14 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from data_contracts.arrays import Flags
 from data_contracts.conventions import COCO17
 from worldpose.errors import InputError
 from worldpose.evaluation.matching import joint_distances, match_people, taken
 from worldpose.evaluation.settings import EvaluationSettings
 from worldpose.formats import JointTracks
-
-Flags = NDArray[np.bool_]
 
 JOINT_GROUPS: Final = {
     "head": ("nose", "eye", "ear"),

@@ -13,11 +13,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.filtering.residuals import Places, Residuals
 from worldpose.geometry import Camera
 from worldpose.static_calibration.parameters import by_step
-
-Floats = NDArray[np.float64]
 
 STEP: Final = 7
 """Parameters of a camera's step: rotation, shift and focal length."""

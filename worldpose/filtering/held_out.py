@@ -8,10 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.geometry import Camera
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
-
-Floats = NDArray[np.float64]
 
 FOLDS: Final = 4
 """Groups of cameras; each is held out once."""

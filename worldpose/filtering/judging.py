@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17, COCO17_BONES
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.filtering.residuals import Residuals
@@ -15,8 +16,6 @@ from worldpose.filtering.settings import FilteringSettings
 from worldpose.filtering.spread import Spread, learn_spread
 from worldpose.filtering.views import BodyViews
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Places = NDArray[np.int64]
 
 _BONES: Final = np.array(COCO17_BONES)

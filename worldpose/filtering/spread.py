@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from data_contracts.arrays import Floats
 
 BINS: Final = 8
 """Confidence classes."""

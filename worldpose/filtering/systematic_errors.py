@@ -10,16 +10,14 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.filtering.clock_offsets import ClockEquations
 from worldpose.filtering.judging import Suspects, body_residuals, judge_detections, learn_from
 from worldpose.filtering.settings import FilteringSettings
 from worldpose.filtering.view_bias import ViewBias, find_azimuths, learn_view_bias
 from worldpose.filtering.views import BodyViews
 from worldpose.geometry import Camera
-
-Floats = NDArray[np.float64]
 
 LASTING: Final = 0.3
 """Correlation time of a detector's error, to a factor e [s]."""

@@ -13,11 +13,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.body_fitting.shared_bias import body_axes
 from worldpose.filtering.residuals import Residuals
 from worldpose.geometry import Camera
-
-Floats = NDArray[np.float64]
 
 WAVES: Final = (2, 3)
 """Harmonics of the azimuth. A constant bias and the first harmonic are those of a point next to the

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.body_fitting.shared_bias import body_axes
 from worldpose.geometry import Camera
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

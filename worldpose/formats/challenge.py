@@ -15,13 +15,12 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.body import BODY25, CHALLENGE15, BodyModel, BodyParameters, fold_keypoints
 from worldpose.errors import InputError
 from worldpose.formats.archives import Member, read_archive, write_archive, wrong
 from worldpose.formats.files import whole_file
 from worldpose.geometry import Camera
-
-Floats = NDArray[np.float64]
 
 _FRAMES: Final = 8
 """Frames whose surfaces are in memory at a time; 33 MB for 25 people."""

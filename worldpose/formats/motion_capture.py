@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from worldpose.body import SKELETONS, BodyModel, BodyParameters
 from worldpose.errors import InputError
@@ -68,8 +69,6 @@ def _rows(tracks: JointTracks, person: int) -> tuple[int, NDArray[np.float64]]:
     markers[numbers - first] = tracks.joints[seen, person] @ Y_UP.T * MILLIMETRES
     return first, markers
 
-
-Floats = NDArray[np.float64]
 
 CENTIMETRES: Final = 100.0
 """In a metre: animation tools interpret the numbers of a BVH file as centimetres."""

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Singles
 from worldpose.compiled import compiled
 from worldpose.geometry.pinhole import Camera
 from worldpose.geometry.projection import project_point
 from worldpose.geometry.rays import RayStatus
 
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
 Box = tuple[int, int, int, int]
 
 _OK = int(RayStatus.OK)

@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.compiled import compiled
 from worldpose.geometry.distortion import distort
 from worldpose.geometry.rays import RayStatus
 
-Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 _OK = int(RayStatus.OK)

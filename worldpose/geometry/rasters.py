@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Singles
 from worldpose.compiled import compiled
 
-Singles = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
 SAMPLES = 4

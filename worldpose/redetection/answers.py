@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Flags, Floats, Image
 from worldpose.detection import People, PoseEstimator, Poses
 from worldpose.detection.boxes import SUREST, areas, overlaps, seen_closer
-from worldpose.detection.interfaces import Picture
 from worldpose.detection.oks_nms import likeness
 from worldpose.filtering import (
     BodyViews,
@@ -23,9 +22,6 @@ from worldpose.filtering import (
 from worldpose.redetection.expected import Expected
 from worldpose.redetection.settings import RedetectionSettings
 from worldpose.redetection.sought import Sought
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 FEWEST: Final = 8
 """Least number of keypoints of a result [1]: half a body."""
@@ -81,7 +77,7 @@ class Verdicts:
 
 
 def look_again(
-    pictures: Iterable[tuple[int, Picture | None]],
+    pictures: Iterable[tuple[int, Image | None]],
     sought: Sought,
     estimator: PoseEstimator,
     least_keypoint: float,

@@ -8,10 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17, COCO17_BONES
 from worldpose.filtering import BodyViews
-
-Floats = NDArray[np.float64]
 
 AROUND: Final = (0.12, 0.20, 0.12, 0.10)
 """Margins of a person beyond the joints: left, up to the top of the head, right, and down to the

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Flags, Floats
 from worldpose.detection import Place
 from worldpose.detection.crowd import on_pitch
 from worldpose.redetection.expected import Expected
 from worldpose.redetection.settings import RedetectionSettings
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Places = NDArray[np.int64]
 
 

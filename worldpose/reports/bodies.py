@@ -11,13 +11,11 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Image
 from data_contracts.pitch import PitchSpec
 from worldpose.geometry import Camera
 from worldpose.reports.body_rendering import paint_bodies, zoomed
 from worldpose.reports.drawing import INK, draw_label, markings, person_color, png, style
-
-Floats = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 WIDTH: Final = 1540
 """Width of the image [px]."""
@@ -37,7 +35,7 @@ def bodies_picture(
     faces: NDArray[np.int64],
     person_ids: Sequence[int] | NDArray[np.int64],
     *,
-    still: Picture | None = None,
+    still: Image | None = None,
     pitch: PitchSpec | None = None,
 ) -> bytes:
     """Return a PNG of all bodies in one camera: the part of the image with most people.
@@ -97,8 +95,8 @@ def crowded_part(camera: Camera, bodies: Floats) -> tuple[Floats, Floats]:
 
 
 def _background(
-    camera: Camera, corner: Floats, scale: float, still: Picture | None, pitch: PitchSpec | None
-) -> Picture:
+    camera: Camera, corner: Floats, scale: float, still: Image | None, pitch: PitchSpec | None
+) -> Image:
     width, height = (int(n) for n in camera.image_size)
     if still is not None:
         # Pixel (x, y) of the part shows place (x + 0.5) / scale + corner of the still.
@@ -109,7 +107,7 @@ def _background(
         return np.asarray(
             cv2.warpAffine(still, part, (width, height), flags=flags, borderMode=edge), np.uint8
         )
-    canvas: Picture = np.full((height, width, 3), _GROUND, dtype=np.uint8)
+    canvas: Image = np.full((height, width, 3), _GROUND, dtype=np.uint8)
     for line in markings(pitch) if pitch is not None else ():
         pixels = camera.project(line)
         # Points far outside do not fit into 32 bits, and are not visible.

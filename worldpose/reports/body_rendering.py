@@ -10,14 +10,11 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Image, Singles
 from worldpose.body import BodyModel, BodyParameters
 from worldpose.geometry import Camera
 from worldpose.geometry.outlines import outline_surfaces
 from worldpose.geometry.rasters import NOBODY, Samples, draw_triangles, resolve
-
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Picture = NDArray[np.uint8]
 
 _SUN: Final = np.array([0.35, -0.45, 0.82], dtype=np.float32)
 """Direction to the light, world: high, from the main camera's side."""
@@ -59,7 +56,7 @@ def zoomed(camera: Camera, corner: Floats, scale: float, size: tuple[int, int]) 
 
 
 def paint_bodies(
-    canvas: Picture,
+    canvas: Image,
     camera: Camera,
     bodies: Floats,
     faces: NDArray[np.int64],

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.pitch import PitchSpec
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry import Camera
@@ -21,8 +22,6 @@ from worldpose.reports.drawing import (
     png,
     style,
 )
-
-Floats = NDArray[np.float64]
 
 _STEP: Final = {"rx": 0, "ry": 1, "rz": 2, "log_focal": 3, "k1": 4, "k2": 5}
 """Indices into the covariance of a frame's step."""

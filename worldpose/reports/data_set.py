@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from data_contracts.release import CheckReport, DataSetStatistics
 from worldpose.reports.drawing import INK, PALE, png, style
-from worldpose.reports.html_page import Failure, Picture, Section, Table, whole_page
+from worldpose.reports.html_page import CaptionedImage, Failure, Section, Table, whole_page
 
 
 def data_set_page(title: str, found: DataSetStatistics, checks: Mapping[str, CheckReport]) -> str:
@@ -59,8 +59,10 @@ def counted_section(found: DataSetStatistics) -> Section:
         ">mean speed m/s",
         ">longest way m",
     )
-    blocks: list[Table | Picture] = [Table("", columns, (row,))]
-    blocks.append(Picture("How far people go, and how long clips are.", statistics_picture(found)))
+    blocks: list[Table | CaptionedImage] = [Table("", columns, (row,))]
+    blocks.append(
+        CaptionedImage("How far people go, and how long clips are.", statistics_picture(found))
+    )
     if len(found.clips) > 1:
         rows = tuple(
             (

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.pitch import PitchSpec
 from worldpose.geometry import Camera
 from worldpose.reports.bodies import crowded_part
@@ -26,8 +27,6 @@ from worldpose.reports.drawing import (
     png,
     style,
 )
-
-Floats = NDArray[np.float64]
 
 USED: Final = PALETTE[5]
 LEFT_OUT: Final = PALETTE[1]

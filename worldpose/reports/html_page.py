@@ -17,7 +17,7 @@ from worldpose.reports.scene import Scene, scene_html
 
 
 @dataclass(frozen=True)
-class Picture:
+class CaptionedImage:
     """A PNG with a caption."""
 
     caption: str
@@ -50,7 +50,7 @@ class Section:
     """
 
     heading: str
-    blocks: tuple[Picture | Table | Scene, ...]
+    blocks: tuple[CaptionedImage | Table | Scene, ...]
     lead: str = ""
 
 
@@ -137,10 +137,10 @@ def _section(section: Section, number: int) -> str:
     )
 
 
-def _block(block: Picture | Table | Scene) -> str:
+def _block(block: CaptionedImage | Table | Scene) -> str:
     if isinstance(block, Scene):
         return scene_html(block)
-    if isinstance(block, Picture):
+    if isinstance(block, CaptionedImage):
         return _figure(block)
     heading = f"<h3>{escape(block.heading)}</h3>\n" if block.heading else ""
     return heading + _table(block.columns, block.rows)
@@ -155,7 +155,7 @@ def _folded(last: Folded) -> str:
     )
 
 
-def _figure(picture: Picture) -> str:
+def _figure(picture: CaptionedImage) -> str:
     kind, content, (width, height) = small_enough(picture.png)
     data = base64.b64encode(content).decode("ascii")
     caption = escape(picture.caption)

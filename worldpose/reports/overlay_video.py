@@ -9,15 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Image
 from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry import Camera
 from worldpose.reports.body_rendering import BodyTracks, paint_bodies, zoomed
 from worldpose.reports.drawing import TEMPLATE, markings, person_color
-
-Floats = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 _PARTS: Final = 16
 """Subpixel steps of line coordinates per pixel."""
@@ -30,13 +28,13 @@ _MARGIN: Final = 0.1
 
 
 def overlay_frames(
-    pictures: Iterable[Picture],
+    pictures: Iterable[Image],
     camera: Camera,
     tracks: JointTracks,
     frames: NDArray[np.int64],
     pitch: PitchSpec | None = None,
     bodies: BodyTracks | None = None,
-) -> Iterator[Picture]:
+) -> Iterator[Image]:
     """Yield frames at half size with projected markings and people.
 
     Args:
@@ -69,7 +67,7 @@ def overlay_frames(
 
 
 def _paint(
-    canvas: Picture,
+    canvas: Image,
     camera: Camera,
     joints: Floats,
     person_ids: NDArray[np.int64],
@@ -94,7 +92,7 @@ def _paint(
     return embodied
 
 
-def _draw(canvas: Picture, pixels: Floats, color: tuple[int, int, int]) -> None:
+def _draw(canvas: Image, pixels: Floats, color: tuple[int, int, int]) -> None:
     """Draw the finite parts of a polyline (n, 2) [px]."""
     with np.errstate(invalid="ignore"):
         near = (np.abs(pixels) < _FAR * canvas.shape[1]).all(axis=-1)

@@ -12,6 +12,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Image
 from data_contracts.pitch import PitchSpec
 from worldpose.geometry import Camera
 from worldpose.reports.drawing import (
@@ -142,8 +143,6 @@ def _draw_error_map(figure: SubFigure, error_map: ErrorMap, pitch: PitchSpec) ->
     axes.set_title("Grey: not in the picture", color=INK, loc="left", fontsize=11)
 
 
-Picture = NDArray[np.uint8]
-
 CONTRAST: Final = 18
 """Minimum brightness of paint above both sides [levels of 255]."""
 WIDEST: Final = 15
@@ -156,7 +155,7 @@ NEAR: Final = 12.0
 """Maximum distance of samples to paint [px]; beyond, they are occluded, or their paint is faint."""
 
 
-def paint_of(still: Picture) -> NDArray[np.bool_]:
+def paint_of(still: Image) -> NDArray[np.bool_]:
     """Return the mask (height, width) of pixels as bright as paint against both sides.
 
     Args:
@@ -204,7 +203,7 @@ def marking_distances(
     return np.asarray(found[found < NEAR])
 
 
-def paint_picture(camera: Camera, still: Picture, pitch: PitchSpec) -> tuple[bytes, float]:
+def paint_picture(camera: Camera, still: Image, pitch: PitchSpec) -> tuple[bytes, float]:
     """Return a PNG of paint and of distances to it, and the share of markings on paint [1].
 
     Args:

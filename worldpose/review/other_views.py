@@ -12,9 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.geometry import Camera, Rays, intersect_rays
-
-Floats = NDArray[np.float64]
 
 HEIGHTS: Final = (-0.3, 3.2)
 """Range of joint heights above the ground [m]: the ground may be lower at its edges, and arms are

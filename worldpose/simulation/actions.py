@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
+from data_contracts.arrays import Floats
 from worldpose.simulation.bodies import Body
 from worldpose.simulation.motions import (
     ARMS,
@@ -25,8 +25,6 @@ from worldpose.simulation.motions import (
 )
 from worldpose.simulation.paths import GroundPath
 from worldpose.simulation.poses import Pose, level_axes, unit
-
-Floats = NDArray[np.float64]
 
 CLEARANCE: Final = 0.05
 """Height of wrists and ankles on the ground above it [m]: half a hand, half a foot."""

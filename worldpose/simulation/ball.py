@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.simulation.paths import STEP
 from worldpose.simulation.settings import ActionRates
-
-Floats = NDArray[np.float64]
 
 PASS_EVERY: Final = (2.0, 4.5)
 """Time between passes [s]."""

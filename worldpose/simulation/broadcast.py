@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.geometry import Camera, Rigid
 from worldpose.simulation.processes import drift
 from worldpose.simulation.settings import BroadcastSettings
 from worldpose.simulation.stadium import looking
-
-Floats = NDArray[np.float64]
 
 CALM: Final = 0.02
 """Time step of the operator's motion [s]: one frame at 50 per second."""

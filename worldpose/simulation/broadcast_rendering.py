@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
@@ -23,7 +24,6 @@ from worldpose.simulation.image_formation import Moment, RenderedFrame, expose, 
 from worldpose.simulation.looks import RenderingSettings
 from worldpose.simulation.venues import Venue, build_venue, paint_venue
 
-Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 _CELL: Final = 4

@@ -9,9 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.errors import InputError
-
-Floats = NDArray[np.float64]
 
 _CHANNELS: Final = (
     *("Xposition", "Yposition", "Zposition"),

@@ -7,11 +7,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.compiled import compiled
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 
-Floats = NDArray[np.float64]
 Pictures = NDArray[np.float32]
 
 _SHIRT, _SHORTS, _SKIN, _SOCKS, _BOOTS, _HAIR = range(6)

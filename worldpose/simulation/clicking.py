@@ -9,12 +9,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.settings import ClickSettings
-
-Floats = NDArray[np.float64]
 
 SPACING: Final = 0.25
 """Distance between samples along a marking [m]."""

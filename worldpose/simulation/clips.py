@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from data_contracts.arrays import Floats
 from worldpose.errors import InputError
 from worldpose.simulation.bodies import Body
 from worldpose.simulation.bvh import Capture, Clip, read_bvh
 from worldpose.simulation.paths import STEP, GroundPath
 from worldpose.simulation.poses import unit
-
-Floats = NDArray[np.float64]
 
 NAMES: Final = {
     "left shoulder": ("lShldr", "LeftArm", "LeftShoulder"),

@@ -10,14 +10,12 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.simulation.motions import Action
 from worldpose.simulation.moves import jump
 from worldpose.simulation.paths import MARGIN, STEP, GroundPath
 from worldpose.simulation.settings import CrowdSettings
-
-Floats = NDArray[np.float64]
 
 TOUCH: Final = 0.48
 """Distance between the middles of people whose bodies begin to touch [m]: chests and shoulders are

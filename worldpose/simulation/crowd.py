@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.body import BodyParameters
 from worldpose.body.parameters import BODY_POSE
 from worldpose.pitch import PitchTemplate
@@ -22,8 +22,6 @@ from worldpose.simulation.idling import stand_about
 from worldpose.simulation.inverse_kinematics import Embodied, embody
 from worldpose.simulation.paths import GroundPath, wander
 from worldpose.simulation.settings import Scenario
-
-Floats = NDArray[np.float64]
 
 CONTESTS: Final = {"corner": take_corner, "crossing": run_through}
 """Movements in which people make contact."""

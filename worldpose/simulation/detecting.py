@@ -8,9 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17, COCO17_SIGMAS
 from worldpose.simulation.noise import ObservationNoise
-from worldpose.simulation.occlusion import Flags, Floats, Sight, facing
+from worldpose.simulation.occlusion import Sight, facing
 from worldpose.simulation.processes import bursts, drift
 
 DIFFICULTY: Final = np.array(COCO17_SIGMAS) / 0.08

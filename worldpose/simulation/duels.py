@@ -8,14 +8,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.simulation.ball import Touch
 from worldpose.simulation.motions import Action, Motion
 from worldpose.simulation.moves import jump, kick
 from worldpose.simulation.paths import MARGIN, STEP
 from worldpose.simulation.settings import ActionRates
 from worldpose.simulation.tumbles import dive, fall, slide
-
-Floats = NDArray[np.float64]
 
 CALL: Final = 2.5
 """Time before a touch at which a player goes for the ball [s]."""

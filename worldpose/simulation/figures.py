@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from worldpose.body import BodyModel, load_open_body
 from worldpose.body.skeletons import VERTEX_OF_POINT
-
-Floats = NDArray[np.float64]
 
 BUILD: Final = (-1.0, 0.5)
 """Mean and standard deviation of the second beta [1]: wide shoulders, narrow hips, little fat."""

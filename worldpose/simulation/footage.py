@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Singles
 from worldpose.formats import write_archive
 from worldpose.ingest.stills import write_still
 from worldpose.pitch import PitchTemplate
@@ -27,7 +28,6 @@ from worldpose.simulation.settings import Scenario
 from worldpose.simulation.venues import build_venue
 from worldpose.video import write_video
 
-Singles = NDArray[np.float32]
 Advance = Callable[[str, int, int], None]
 
 AT_ONCE: Final = 4

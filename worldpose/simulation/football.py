@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import interp1d
 
+from data_contracts.arrays import Floats
 from worldpose.simulation.ball import roll_ball
 from worldpose.simulation.duels import (
     AT_EASE,
@@ -22,8 +23,6 @@ from worldpose.simulation.idling import keep_ready
 from worldpose.simulation.paths import MARGIN, STEP, GroundPath
 from worldpose.simulation.processes import drift
 from worldpose.simulation.settings import CrowdSettings
-
-Floats = NDArray[np.float64]
 
 FORMATION: Final = np.array(
     # goalkeeper, four defenders, three midfielders, three forwards

@@ -10,15 +10,14 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.simulation.actions import act
 from worldpose.simulation.bodies import Body
 from worldpose.simulation.clips import play_clip
 from worldpose.simulation.paths import GroundPath
 from worldpose.simulation.poses import Pose, level_axes, pose_joints, unit
 
-Floats = NDArray[np.float64]
 Ground = Callable[[Floats, Floats], Floats]
 """Height of the ground [m] at x and y [m], world."""
 

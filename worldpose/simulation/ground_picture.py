@@ -7,12 +7,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.compiled import compiled
 from worldpose.geometry import Camera
 from worldpose.simulation.surroundings import BOARD_HEIGHT, scenery
 from worldpose.simulation.turf import grass, paint_cover, surface_hit, wear
 
-Floats = NDArray[np.float64]
 Pictures = NDArray[np.float32]
 
 _CELL: Final = 4

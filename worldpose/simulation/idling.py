@@ -8,12 +8,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.simulation.motions import Action
 from worldpose.simulation.paths import GroundPath
 from worldpose.simulation.settings import ActionRates
 from worldpose.simulation.standing import hands_on_hips, look_around, ready, shift_weight
-
-Floats = NDArray[np.float64]
 
 STANDING_SPEED: Final = 0.25
 """Slower people stand [m/s]."""

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Singles
 from worldpose.compiled import compiled
 from worldpose.geometry import Camera
 from worldpose.geometry.outlines import Box, Outlines, outline_surfaces
@@ -21,8 +22,6 @@ from worldpose.simulation.people_shadows import shade_ground
 from worldpose.simulation.props import Prop
 from worldpose.simulation.venues import FOG_COLOR, Venue
 
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
 AMBIENT: Final = 0.58

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.body import BodyParameters
 from worldpose.body.parameters import BODY_POSE
 from worldpose.geometry import Rigid
 from worldpose.simulation.figures import Figure
 
-Floats = NDArray[np.float64]
 Ground = Callable[[Floats, Floats], Floats]
 
 BIAS: Final = 0.1

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.simulation.looks import PATTERNS, Pattern
 from worldpose.simulation.mannequins import (
     BOOT,
@@ -23,7 +24,6 @@ from worldpose.simulation.mannequins import (
     WAIST,
 )
 
-Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 Role = Literal["first", "second", "first keeper", "second keeper", "official"]
 _CLOTH: Final = np.array(

@@ -9,11 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Singles
 from worldpose.body import BodyModel, BodyParameters, load_open_body
 from worldpose.compiled import compiled
-
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
 
 CELL: Final = 0.03
 """Cell size of the vertex clustering [m]: half a pixel to four at 38 to 150 px."""

@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from data_contracts.arrays import Floats
 from data_contracts.records import Record
 from worldpose.body import BodyModel, BodyParameters, load_open_body
 from worldpose.formats import write_archive
 from worldpose.geometry import Camera, Rigid
 from worldpose.simulation.processes import drift
-
-Floats = NDArray[np.float64]
 
 
 class MonocularErrors(Record):

@@ -8,10 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Flags, Floats
 from worldpose.geometry import Camera
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 TRUNK: Final = (5, 6, 11, 12)
 

@@ -7,12 +7,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.simulation.motions import Action, Motion
 from worldpose.simulation.moves import jump
 from worldpose.simulation.settings import ActionRates
 from worldpose.simulation.tumbles import fall
-
-Floats = NDArray[np.float64]
 
 SETTLE: Final = 0.35
 """Time before take-off with constant pace [s]."""

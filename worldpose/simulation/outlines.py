@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Singles
 from worldpose.compiled import compiled
 from worldpose.geometry import Camera
 from worldpose.geometry.outlines import Outlines, outline_surfaces
 from worldpose.simulation.venues import Venue
-
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
 
 
 def outline_shadows(venue: Venue, camera: Camera, vertices: Singles, light: Floats) -> Outlines:

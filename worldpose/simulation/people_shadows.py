@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Singles
 from worldpose.compiled import compiled
 from worldpose.geometry import Camera
 from worldpose.geometry.outlines import Box
@@ -16,7 +17,6 @@ from worldpose.geometry.rasters import cover_triangles
 from worldpose.simulation.outlines import outline_shadows
 from worldpose.simulation.venues import Venue
 
-Singles = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 Faces = NDArray[np.int32]
 

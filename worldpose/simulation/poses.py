@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.simulation.bodies import Body
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,11 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Singles
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.mannequins import Surfaces
-
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
 
 POST: Final = 0.06
 """Radius of posts and crossbar [m] (Law 1: at most 12 cm across)."""

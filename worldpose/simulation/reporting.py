@@ -8,9 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Flags, Floats
 from worldpose.ingest import Observations
 from worldpose.simulation.detecting import Detections
-from worldpose.simulation.occlusion import Flags, Floats
 
 ROOM: Final = 0.06
 """Margin of a box around the keypoints, for head, hands and feet [person height]."""

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.simulation.motions import Arm, Height, Motion, Stance, key, motion_of
 from worldpose.simulation.moves import STANDING
-
-Floats = NDArray[np.float64]
 
 
 def shift_weight(duration: float) -> Motion:

@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.compiled import compiled
 from worldpose.simulation.turf import surface_hit
-
-Floats = NDArray[np.float64]
 
 BOARD_SETBACK: Final = (5.0, 4.0)
 """From the goal lines and from the touch lines [m]."""

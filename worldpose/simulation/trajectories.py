@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
+from data_contracts.arrays import Floats
 from worldpose.errors import InputError
 from worldpose.simulation.paths import MARGIN, STEP, GroundPath
-
-Floats = NDArray[np.float64]
 
 SMOOTHING: Final = 0.15
 """Standard deviation of the smoothing in time [s]: tracking jitters by decimetres between samples,

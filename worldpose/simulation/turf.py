@@ -10,13 +10,11 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.pitch import ArcSpec
 from worldpose.compiled import compiled
 from worldpose.pitch import PitchTemplate
-
-Floats = NDArray[np.float64]
 
 LINE_WIDTH: Final = 0.12
 """Width of the painted markings, centred on the template's line [m] (Law 1)."""

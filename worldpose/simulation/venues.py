@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.capsules import draw_shadows, draw_things
@@ -17,7 +18,6 @@ from worldpose.simulation.looks import RenderingSettings
 from worldpose.simulation.surroundings import BOARD_SETBACK
 from worldpose.simulation.turf import paint_rows
 
-Floats = NDArray[np.float64]
 Pictures = NDArray[np.float32]
 
 FOG_COLOR: Final = np.array([0.74, 0.76, 0.78])

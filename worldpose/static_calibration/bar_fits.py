@@ -11,8 +11,9 @@ from typing import Final
 
 import numpy as np
 
+from data_contracts.arrays import Floats, Image
 from worldpose.compiled import compiled
-from worldpose.static_calibration.edges import ALONG, BESIDE, Floats, Picture
+from worldpose.static_calibration.edges import ALONG, BESIDE
 
 _BLUR: Final = 0.75
 """Standard deviation of a bar's edges [px]: of a sharp lens, 0.7, and of a pixel's own size."""
@@ -25,7 +26,7 @@ _FITTINGS: Final = 5
 
 @compiled
 def fit_bars(
-    grey: Picture,
+    grey: Image,
     places: Floats,
     normals: Floats,
     widths: Floats,
@@ -75,7 +76,7 @@ def fit_bars(
 
 @compiled
 def _gather(
-    grey: Picture,
+    grey: Image,
     place: Floats,
     normal: Floats,
     curvature: float,

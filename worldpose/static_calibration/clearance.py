@@ -12,12 +12,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Integers
 from worldpose.compiled import compiled
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _STEP: Final = 0.5
 """Spacing of the polylines' corners [m]: the error of a corner arc is then 3 cm, a quarter of its

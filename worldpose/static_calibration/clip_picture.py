@@ -6,17 +6,15 @@ from collections.abc import Iterable
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Image
 from worldpose.errors import InputError
-
-Picture = NDArray[np.uint8]
 
 _BAND: Final = 64
 """Rows per median computation: sorting copies them."""
 
 
-def median_picture(frames: Iterable[Picture], most: int = 64) -> Picture:
+def median_picture(frames: Iterable[Image], most: int = 64) -> Image:
     """Return the median of a clip's frames, which shows no moving people.
 
     At most `most` frames are in memory, evenly spread over the clip: when the limit is reached, the
@@ -39,7 +37,7 @@ def median_picture(frames: Iterable[Picture], most: int = 64) -> Picture:
             found=f"{most}",
             todo="Give for example 64.",
         )
-    kept: list[Picture] = []
+    kept: list[Image] = []
     stride = 1
     for index, frame in enumerate(frames):
         if kept and frame.shape != kept[0].shape:

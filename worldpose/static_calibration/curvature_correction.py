@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.static_calibration.adjustment import Problem, camera_of_row
 from worldpose.static_calibration.descent import step_row
 from worldpose.static_calibration.line_search import difference, turned
@@ -23,8 +23,6 @@ from worldpose.static_calibration.residuals import (
     point_residuals,
     prior_residuals,
 )
-
-Floats = NDArray[np.float64]
 
 _POSE_SPREAD: Final = np.array([1.0] * 3 + [100.0] * 3 + [np.inf] * 6)
 """Pose prior of a camera refined on painted lines [rad, m]: far wider than its uncertainty; it

@@ -7,12 +7,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Integers
 from worldpose.compiled import compiled
 from worldpose.static_calibration.residuals import (
     PRIORS,
     SIZE,
-    Floats,
-    Integers,
     drawn_residuals,
     point_residuals,
     prior_residuals,

@@ -11,13 +11,10 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Image
 from worldpose.compiled import compiled
 from worldpose.errors import InputError
-
-Floats = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 CANDIDATES: Final = 4
 """Maximum bar candidates per place [1]."""
@@ -33,7 +30,7 @@ BESIDE: Final = _GAP + _FLANK
 """Minimum distance of a bar from other structures [px]."""
 
 
-def brightness(picture: Picture) -> Picture:
+def brightness(picture: Image) -> Image:
     """Return the luma (height, width) of an image; chroma has half the resolution in video.
 
     Raises:
@@ -57,7 +54,7 @@ def brightness(picture: Picture) -> Picture:
 
 @compiled
 def find_bars(
-    grey: Picture,
+    grey: Image,
     places: Floats,
     normals: Floats,
     widths: Floats,
@@ -130,7 +127,7 @@ def find_bars(
 
 
 @compiled
-def _read(grey: Picture, place: Floats, normal: Floats, curvature: float, profile: Floats) -> None:
+def _read(grey: Image, place: Floats, normal: Floats, curvature: float, profile: Floats) -> None:
     """Write the brightness profile across a line, centered on `place`; NaN outside the image.
 
     Samples are means along the line and follow its curvature: at the ends of a flat ellipse, the

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.geometry import Camera
 from worldpose.static_calibration.adjustment import Problem, row_of
 from worldpose.static_calibration.curvature_correction import weighted
@@ -20,8 +20,6 @@ from worldpose.static_calibration.line_profiles import Bars
 from worldpose.static_calibration.line_search import difference
 from worldpose.static_calibration.parameters import CameraEstimate, stepped
 from worldpose.static_calibration.residuals import SIZE
-
-Floats = NDArray[np.float64]
 
 _TURNS: Final = 20
 """Gauss-Newton steps at most [1]."""

@@ -9,11 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.geometry import Camera
 from worldpose.static_calibration.line_samples import LineSamples
 from worldpose.static_calibration.parameters import project_with_jacobian
-
-Floats = NDArray[np.float64]
 
 _STRIDE: Final = 0.1
 """Step along a marking for finite differences of its projection [m]."""

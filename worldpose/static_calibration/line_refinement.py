@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from data_contracts.arrays import Floats
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
@@ -27,8 +28,6 @@ from worldpose.static_calibration.line_samples import (
 from worldpose.static_calibration.line_search import Found, LineSearch
 from worldpose.static_calibration.line_settings import SURVEY_ERROR, LineRefinementSettings
 from worldpose.static_calibration.parameters import CameraEstimate
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.parameters import by_step
-
-Floats = NDArray[np.float64]
 
 _STRIDE: Final = 0.1
 """Step along an arc for finite differences of its curvature [m]."""

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.bar_fits import fit_bars
@@ -18,8 +19,6 @@ from worldpose.static_calibration.line_profiles import Bars
 from worldpose.static_calibration.line_samples import LineSamples, SeenLines, see_lines
 from worldpose.static_calibration.line_settings import LineRefinementSettings
 from worldpose.static_calibration.parameters import CameraEstimate, stepped
-
-Floats = NDArray[np.float64]
 
 _ROUNDS: Final = 8
 """Maximum iterations of search and fit; one or two from ordinary clicks."""

@@ -9,14 +9,11 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Integers
 from worldpose.compiled import compiled
 from worldpose.geometry.distortion import fold_squared
 from worldpose.geometry.projection import project_with_jacobians
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 SIZE: Final = 12
 """Parameters of a step."""

@@ -8,11 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.detection.boxes import overlaps
 from worldpose.detection.interfaces import People
 from worldpose.training.labels import LabelledPicture
-
-Floats = NDArray[np.float64]
 
 OVERLAP: Final = 0.5
 """Least intersection over union of a true positive [1]."""

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from data_contracts.arrays import Floats
 
 SHARE: Final = 0.2
 """Share of the torso within which a keypoint is correct [1]."""

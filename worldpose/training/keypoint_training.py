@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.records import Record
 from worldpose.detection.boxes import overlaps
@@ -23,8 +24,6 @@ from worldpose.training.augmentation import AugmentationSettings, augment
 from worldpose.training.box_overlap import shared
 from worldpose.training.labels import LabelledPicture
 from worldpose.training.pictures import PictureCache
-
-Floats = NDArray[np.float64]
 
 MIRRORED: Final = np.array(
     [

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from worldpose.errors import InputError
-
-Floats = NDArray[np.float64]
 
 
 class _Given(BaseModel):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from data_contracts.arrays import Floats
 from data_contracts.records import Record
 from worldpose.detection.bundled_crops import cut, picture_from_crop
 from worldpose.detection.bundled_nets import STRIDE, PeopleNet, normalised
@@ -20,8 +21,6 @@ from worldpose.training.augmentation import AugmentationSettings, augment
 from worldpose.training.box_overlap import shared
 from worldpose.training.labels import LabelledPicture
 from worldpose.training.pictures import PictureCache
-
-Floats = NDArray[np.float64]
 
 SPREAD: Final = 0.12
 """Standard deviation of the target around a centre, as a share of the box's sides [1]."""

@@ -11,9 +11,9 @@ from typing import Final
 import cv2
 import numpy as np
 
+from data_contracts.arrays import Image
 from worldpose.detection import DetectionSettings, Detector, People, PoseEstimator
 from worldpose.detection.boxes import fuse, seen_closer
-from worldpose.detection.interfaces import Picture
 from worldpose.training.labels import LabelledPicture, write_labels
 
 SEEN: Final = 0.5
@@ -21,7 +21,7 @@ SEEN: Final = 0.5
 
 
 def propose_labels(
-    frames: Iterable[tuple[str, Picture]],
+    frames: Iterable[tuple[str, Image]],
     detectors: list[Detector],
     pose: PoseEstimator,
     folder: Path,
@@ -50,7 +50,7 @@ def propose_labels(
 
 
 def _write(
-    frames: Iterable[tuple[str, Picture]],
+    frames: Iterable[tuple[str, Image]],
     detectors: list[Detector],
     pose: PoseEstimator,
     folder: Path,

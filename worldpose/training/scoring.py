@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Image
 from worldpose.detection.boxes import overlaps
-from worldpose.detection.interfaces import Detector, People, Picture, PoseEstimator
+from worldpose.detection.interfaces import Detector, People, PoseEstimator
 from worldpose.detection.oks_nms import told_apart
 from worldpose.detection.posed import find_poses
 from worldpose.detection.settings import DetectionSettings
@@ -71,7 +72,7 @@ def score_people(
 
 def stored(
     people: People,
-    picture: Picture,
+    picture: Image,
     estimator: PoseEstimator,
     settings: DetectionSettings | None = None,
 ) -> People:

@@ -13,11 +13,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.compiled import compiled
-
-Floats = NDArray[np.float64]
 
 LANES: Final = 64
 """Joints per tile: 16 cameras x 64 joints fit the L2 cache of a processor core."""

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.geometry import Camera
 from worldpose.triangulation.reports import Histogram
 from worldpose.triangulation.settings import TriangulationSettings
-
-Floats = NDArray[np.float64]
 
 RADIAL = [0, 1, 4]
 """k1, k2, k3 among the five coefficients."""

@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.geometry import Camera
 from worldpose.tracking.clip_arrays import ClipArray
 from worldpose.triangulation.batched_gauss_newton import LANES
@@ -30,8 +31,6 @@ from worldpose.triangulation.robust import (
 )
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.smoothing import Smoothing, smooth_joints
-
-Floats = NDArray[np.float64]
 
 PART: Final = 512
 """Frames per chunk: some hundred megabytes with 25 people in 16 cameras."""

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.records import Record
 from worldpose.geometry import Camera, projection
 from worldpose.tracking.clip_arrays import ClipArray
@@ -20,7 +21,6 @@ from worldpose.triangulation.observations import Rig
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.solving import no_shift, solve
 
-Floats = NDArray[np.float64]
 Moved = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.int16]]
 
 GATES: Final = (10.0, 10.0, 5.0, 3.5, 3.5, 3.5, 3.5)

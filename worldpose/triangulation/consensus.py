@@ -9,8 +9,8 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.compiled import compiled
 from worldpose.triangulation.batched_gauss_newton import (
     CHANGED,
@@ -32,8 +32,6 @@ from worldpose.triangulation.batched_gauss_newton import (
     step,
     survey,
 )
-
-Floats = NDArray[np.float64]
 
 MAX_STEPS: Final = 8
 CONVERGED: Final = 1e-6

@@ -8,15 +8,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.compiled import compiled
 from worldpose.geometry.projection import project_point
 from worldpose.triangulation.observations import Rig
 from worldpose.triangulation.solving import Solution
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 PAIRS: Final = np.array(
     [

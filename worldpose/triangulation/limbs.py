@@ -13,13 +13,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from worldpose.geometry import projection
 from worldpose.triangulation.observations import Rig
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.solving import Solution, solve
-
-Floats = NDArray[np.float64]
 
 LIMBS: Final = tuple(
     (COCO17.index(f"{side}_{upper}"), COCO17.index(f"{side}_{lower}"))

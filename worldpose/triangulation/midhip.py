@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from worldpose.geometry import projection
 from worldpose.triangulation.noise_model import NoiseModel
 from worldpose.triangulation.observations import Rig
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.solving import no_shift, solve
-
-Floats = NDArray[np.float64]
 
 HIPS = [COCO17.index("left_hip"), COCO17.index("right_hip")]
 

@@ -9,13 +9,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from worldpose.geometry import projection
 from worldpose.triangulation.observations import Rig
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.track_solver import held_out_cost, prepare, solve_segment
-
-Floats = NDArray[np.float64]
 
 ACCELERATIONS: Final = (3.0, 6.0, 12.0, 25.0, 50.0, 100.0, 200.0)
 """Candidates [m/s^2]: from a stroller's trunk to a kicking foot."""

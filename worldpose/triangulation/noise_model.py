@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.compiled import compiled
 from worldpose.triangulation.batched_gauss_newton import (
     EXTRA,
@@ -23,8 +24,6 @@ from worldpose.triangulation.batched_gauss_newton import (
 )
 from worldpose.triangulation.consensus import consensus
 from worldpose.triangulation.observations import Rig, gather, linearize
-
-Floats = NDArray[np.float64]
 
 BINS: Final = 8
 """Confidence classes with equally many observations."""

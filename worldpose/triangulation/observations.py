@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.compiled import compiled
 from worldpose.geometry import Camera, fold_radius, projection
 from worldpose.geometry.distortion import distort
@@ -21,8 +22,6 @@ from worldpose.triangulation.batched_gauss_newton import (
     A,
     B,
 )
-
-Floats = NDArray[np.float64]
 
 NEWTON_STEPS: Final = 2
 """Newton steps that invert most lens models to rounding; the others are inverted one by one."""

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.compiled import compiled
 from worldpose.triangulation.batched_gauss_newton import (
     EXTRA,
@@ -32,9 +33,6 @@ from worldpose.triangulation.batched_gauss_newton import (
 )
 from worldpose.triangulation.observations import Rig, gather, linearize
 from worldpose.triangulation.solving import Solution
-
-Floats = NDArray[np.float64]
-
 
 ROUNDS: Final = 6
 """Updates of the variance factor; the last changes it by a few percent."""

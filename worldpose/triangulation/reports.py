@@ -9,9 +9,8 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.records import Record
-
-Floats = NDArray[np.float64]
 
 LEAST: Final = 1e-7
 WIDTH: Final = 0.005

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.geometry import Camera
 from worldpose.triangulation.array_checks import check_arrays
@@ -22,9 +23,6 @@ from worldpose.triangulation.offsets import estimate_offsets, learn_factor
 from worldpose.triangulation.reports import Agreement, Histogram, TriangulationReport
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.solving import Solution, no_shift, solve
-
-Floats = NDArray[np.float64]
-
 
 SAMPLE: Final = 6000
 """Joints in the sample for detector and calibration errors: a confidence class then has thousands

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.geometry import Camera
 from worldpose.triangulation.left_right_swaps import undo_swaps
 from worldpose.triangulation.motion_model import MotionModel, choose_stretches, learn_motion
@@ -15,8 +16,6 @@ from worldpose.triangulation.reports import Changes, Histogram, SmoothingReport
 from worldpose.triangulation.robust import Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.track_solver import solve_segment
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

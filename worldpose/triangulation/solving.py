@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.compiled import compiled
 from worldpose.triangulation.batched_gauss_newton import (
     LANES,
@@ -22,8 +23,6 @@ from worldpose.triangulation.batched_gauss_newton import (
 from worldpose.triangulation.consensus import consensus
 from worldpose.triangulation.observations import Rig, gather, linearize
 from worldpose.triangulation.settings import TriangulationSettings
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.compiled import compiled
 from worldpose.triangulation.batched_gauss_newton import (
     LANES,
@@ -29,8 +30,6 @@ from worldpose.triangulation.batched_gauss_newton import (
     clear,
 )
 from worldpose.triangulation.observations import Rig, gather, linearize
-
-Floats = NDArray[np.float64]
 
 BAND: Final = 6
 MAX_STEPS: Final = 12

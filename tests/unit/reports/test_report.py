@@ -11,7 +11,7 @@ import pytest
 from data_contracts.evaluation import Evaluation
 from data_contracts.run import RunRecord, UnitFailure
 from worldpose.formats import JointTracks
-from worldpose.reports import CameraSummary, Picture, Scene, Section, report_page
+from worldpose.reports import CameraSummary, CaptionedImage, Scene, Section, report_page
 from worldpose.reports.html_page import small_enough
 from worldpose.reports.run_report import camera_table
 from worldpose.reports.score_names import MEANINGS
@@ -106,7 +106,7 @@ def pictured(*pictures, heading="Seen"):
 
 
 def test_text_is_escaped():
-    hostile = pictured(Picture('"><img', PNG), heading="<script>1</script>")
+    hostile = pictured(CaptionedImage('"><img', PNG), heading="<script>1</script>")
     tiles = [("<i>3</i>", "<u>")]
     text = report_page("<b>bold</b> & more", run(), seconds={}, sections=hostile, tiles=tiles)
     for tag in ("<b>bold", "<script>", "<i>", "<u>"):
@@ -116,7 +116,9 @@ def test_text_is_escaped():
 
 
 def test_nothing_is_asked_from_outside():
-    text = report_page("A run", run(), seconds={}, sections=pictured(Picture("from above", PNG)))
+    text = report_page(
+        "A run", run(), seconds={}, sections=pictured(CaptionedImage("from above", PNG))
+    )
     page = Page(text)
     jumps = [address for address in page.addresses if address.startswith("#")]
     assert jumps == ["#part1", "#last"]
@@ -141,7 +143,7 @@ def test_a_scene_brings_the_one_script_that_the_page_may_run():
 
 
 def test_parts_without_content_are_left_out():
-    empty = [Section("Nothing", ()), *pictured(Picture("from above", PNG))]
+    empty = [Section("Nothing", ()), *pictured(CaptionedImage("from above", PNG))]
     text = report_page("A run", run(), seconds={}, sections=empty)
     assert "Nothing" not in text
     assert '<a href="#part1">Seen</a>' in text

@@ -8,11 +8,12 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.review import AddedDetection, DeletedDetection, MovedKeypoint
 from data_contracts.static_calibration import Pixel
 from worldpose.errors import InputError
-from worldpose.formats.annotations.pictures import AnnotatedPerson, AnnotatedPicture, Floats
+from worldpose.formats.annotations.pictures import AnnotatedPerson, AnnotatedPicture
 from worldpose.review.detections import SAME, DetectionEdit
 
 

@@ -10,6 +10,7 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from worldpose.formats.annotations.attributes import attributes_of, read_attributes
 from worldpose.formats.annotations.pictures import (
@@ -17,7 +18,6 @@ from worldpose.formats.annotations.pictures import (
     AnnotatedPerson,
     AnnotatedPicture,
     ContentError,
-    Floats,
     hull,
 )
 from worldpose.formats.annotations.xml_reading import read_xml

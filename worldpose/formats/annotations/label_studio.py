@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from worldpose.formats.annotations.attributes import attributes_of, read_attributes
 from worldpose.formats.annotations.pictures import (
@@ -16,7 +17,6 @@ from worldpose.formats.annotations.pictures import (
     AnnotatedPerson,
     AnnotatedPicture,
     ContentError,
-    Floats,
 )
 
 HIDDEN: Final = "hidden"

@@ -8,9 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.review import Origin
 
-Floats = NDArray[np.float64]
 CORNER: Final = 0.5
 """Offset of the image corner from the centre of the first pixel [px]: CVAT and Label Studio
 count from the corner, the conventions of worldpose and its COCO files from the centre."""

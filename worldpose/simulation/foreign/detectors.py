@@ -14,12 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from data_contracts.arrays import Flags, Floats
 from worldpose.ingest import Observations
 from worldpose.simulation.foreign.profiles import DetectorProfile
 from worldpose.simulation.foreign.visibility import View, facing
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 _PARENT: Final = (5, 0, 0, 1, 2, 6, 5, 5, 6, 7, 8, 12, 11, 11, 12, 13, 14)
 """Parent joint of the limb that leads to each joint."""

@@ -12,12 +12,10 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from data_contracts.arrays import Floats
 from worldpose.simulation.foreign.skeletons import Posture
-
-Floats = NDArray[np.float64]
 
 _WALK: Final = np.array(
     [

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 
+from data_contracts.arrays import Floats
 from worldpose.errors import InputError
 from worldpose.simulation.foreign.skeletons import Posture, Skeleton
 from worldpose.simulation.foreign.trajectories import LEAD, Trajectory
-
-Floats = NDArray[np.float64]
 
 JOINTS: Final = {
     **{"neck": ("neck",), "chest": ("chest",), "head": ("head",)},

@@ -8,10 +8,10 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.geometry import Camera, Rigid
 from worldpose.geometry.distortion import fold_radius
 
-Floats = NDArray[np.float64]
 Layout = Literal["bowl", "one-side", "low", "goals", "mixed", "hall"]
 
 SIZES: Final = (

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any, Final, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
+from data_contracts.arrays import Floats
 from data_contracts.cameras import CameraCalibration
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.formats import JointTracks
@@ -45,8 +45,6 @@ from worldpose.simulation.foreign.statements import (
 )
 from worldpose.simulation.foreign.trajectories import LEAD, Role, Trajectory, follow_tracks, wander
 from worldpose.simulation.foreign.visibility import view_people
-
-Floats = NDArray[np.float64]
 
 MOTION_RATE: Final = 100.0
 """Minimum rate of the motion's computation [1/s], a multiple of the frame rate."""

@@ -13,11 +13,10 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+from data_contracts.arrays import Flags, Floats
+
 Ground = Callable[[Floats, Floats], Floats]
 """Height of the ground [m] at x and y [m], world."""
 Kind = Literal["man", "woman", "child"]

@@ -8,13 +8,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
 from worldpose.geometry import Camera, Rigid
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.foreign.rigs import RigCamera
-
-Floats = NDArray[np.float64]
 
 PAINTING: Final = 0.015
 """Error of painted points against the Laws of the Game, standard deviation along each axis [m]."""

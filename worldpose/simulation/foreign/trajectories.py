@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-Floats = NDArray[np.float64]
+from data_contracts.arrays import Floats
+
 Role = Literal["roam", "duel", "cross", "stand", "sprint"]
 
 LEAD: Final = 2.0

@@ -8,10 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Flags, Floats
 from worldpose.simulation.foreign.rigs import RigCamera
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 CAPSULES: Final = (
     *((5, 12, 0.06), (6, 11, 0.06), (5, 6, 0.04), (11, 12, 0.05)),
