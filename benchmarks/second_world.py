@@ -36,10 +36,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.run import RunRecord
-from flows.clock_advice import clock_advice
 from flows.fan_out import task_of
 from flows.registering import find_match
-from flows.release import joint_tracks
+from flows.results.best_results import joint_tracks
+from flows.review.clock_advice import clock_advice
 from flows.run_record import RunLog
 from flows.settings import selected_stages
 from worldpose.evaluation import evaluate_joints

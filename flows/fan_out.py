@@ -15,7 +15,7 @@ from prefect.context import FlowRunContext
 from prefect.futures import as_completed
 
 from data_contracts.work import Work
-from flows.cluster_errors import require_workers
+from flows.orchestration.cluster_errors import require_workers
 from flows.planning import PlannedUnit
 from flows.stage import Stage
 

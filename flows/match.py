@@ -16,14 +16,14 @@ from data_contracts.run import GatePolicy, RunRecord
 from flows.basis import basis_of
 from flows.fan_out import compute
 from flows.gatekeeping import Gatekeeper, undecided
+from flows.orchestration.suspension import is_deployed, take_verdict
+from flows.orchestration.time_limits import TimeLimits, seconds_of
 from flows.outlook import look_ahead
 from flows.progress import reporter
 from flows.registering import open_match
 from flows.run_record import RunLog, latest_run
 from flows.settings import Overrides, selected_stages
 from flows.stage import Match, Stage
-from flows.suspension import is_deployed, take_verdict
-from flows.time_limits import TimeLimits, seconds_of
 from worldpose.errors import WorldposeError
 from worldpose.store import Store
 

@@ -40,7 +40,7 @@ METHOD: tuple[Stage, ...] = (
     broadcast_calibration.STAGE,  # [clip]  M1-M6; then gate BROADCAST
     broadcast_pooling.STAGE,  # [clip]  M1
     refitting.STAGE,  # [clip]          S1, S4
-    filtering.STAGE,  # [clip]          R2; then again from tracking, R1 (flows/iteration.py)
+    filtering.STAGE,  # [clip]          R2; then again from tracking, R1 (flows/iterate.py)
     # release, evaluation               X1-X3, E1-E6
 )
 

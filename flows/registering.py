@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from data_contracts.match import MatchSpec, Registration, SourceFile
-from flows.corrections import corrected_match
+from flows.review.corrections import corrected_match
 from flows.stage import Match
 from worldpose.body_fitting import read_monocular
 from worldpose.errors import CorruptionError, InputError

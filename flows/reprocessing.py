@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from data_contracts.run import RunRecord
-from flows.iteration import iterate_match
+from flows.iterate import iterate_match
 from flows.planning import PlannedUnit
 from flows.progress import reporter
 from flows.running import RunRequest, run_match, shared_machines

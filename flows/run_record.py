@@ -10,13 +10,13 @@ from typing import Any, Self
 
 from data_contracts.run import GatePolicy, RunRecord, RunState, UnitFailure, WaitingUnit
 from flows.basis import basis_of
-from flows.edit_conflicts import EditedMeanwhileError
 from flows.gatekeeping import Gatekeeper, passed
 from flows.left_out import left_out_cameras, left_out_warnings
 from flows.method import GATES, METHOD
 from flows.planning import PlannedUnit, StagePlan, plan_stage
 from flows.progress import reporter
 from flows.renames import rename_settings
+from flows.review.edit_conflicts import EditedMeanwhileError
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
 from flows.stages import body_fitting, tracking, triangulation

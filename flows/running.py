@@ -14,17 +14,17 @@ from typing import TYPE_CHECKING, Any, cast
 
 from data_contracts.run import GatePolicy, RunRecord
 from flows.basis import basis_of
-from flows.cluster_errors import require_room, require_workers
 from flows.gatekeeping import Gatekeeper
-from flows.local_cluster import kept_complete, starting_cluster, workers_for
+from flows.orchestration.cluster_errors import require_room, require_workers
+from flows.orchestration.local_cluster import kept_complete, starting_cluster, workers_for
+from flows.orchestration.prefect_environment import START_SECONDS, has_server, prefect_server
+from flows.orchestration.time_limits import TimeLimits
 from flows.outlook import look_ahead
 from flows.planning import PlannedUnit
-from flows.prefect_environment import START_SECONDS, has_server, prefect_server
 from flows.progress import reporter
 from flows.run_record import RunLog, latest_run
 from flows.settings import Overrides, selected_stages
 from flows.stage import Match, Stage
-from flows.time_limits import TimeLimits
 from worldpose.errors import InputError, WorldposeError
 from worldpose.store import Store
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from distributed import Security
     from prefect.task_runners import TaskRunner
 
-    from flows.private_cluster import PrivateCluster
+    from flows.orchestration.private_cluster import PrivateCluster
 
 DASK_SECONDS = 10.0
 """Timeout of a Dask scheduler's answer."""

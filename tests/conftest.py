@@ -12,7 +12,7 @@ from hypothesis import settings
 from moto.server import ThreadedMotoServer
 from werkzeug.serving import WSGIRequestHandler
 
-from flows.prefect_environment import prefect_server
+from flows.orchestration.prefect_environment import prefect_server
 
 # How long a case takes says how busy a machine is.
 settings.register_profile("untimed", deadline=None)

@@ -13,7 +13,7 @@ from http.cookiejar import CookieJar
 import psutil
 from command_line import WORLDPOSE, worldpose
 
-from flows.prefect_environment import authorization
+from flows.orchestration.prefect_environment import authorization
 
 TOKEN = "a token of twenty-four.."
 PATIENCE = 900.0

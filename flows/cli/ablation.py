@@ -10,7 +10,7 @@ import numpy as np
 from flows.cli.console import errors, line, print_json, print_table
 
 if TYPE_CHECKING:
-    from flows.ablation import Score
+    from flows.results.ablation import Score
 
 
 def print_ablation(seeds: int, *, as_json: bool) -> None:
@@ -20,7 +20,7 @@ def print_ablation(seeds: int, *, as_json: bool) -> None:
         seeds: number of trials, with seeds from 0.
         as_json: print every trial's metrics instead of a table.
     """
-    from flows.ablation import PAPER, TRIANGULATIONS, Score, ablation
+    from flows.results.ablation import PAPER, TRIANGULATIONS, Score, ablation
 
     trials = ablation(
         range(seeds), lambda clicks, seed: line(f"{clicks}: trial {seed} done", to=errors)
@@ -51,7 +51,7 @@ def print_ablation(seeds: int, *, as_json: bool) -> None:
 
 def _is_of(row: str, how: str) -> bool:
     """Return whether a row is triangulated this way; the first way has no name."""
-    from flows.ablation import TRIANGULATIONS
+    from flows.results.ablation import TRIANGULATIONS
 
     return max((end for end in TRIANGULATIONS if row.endswith(end)), key=len) == how
 

@@ -34,7 +34,7 @@ def check(
 
     Example: worldpose check exported
     """
-    from flows.checking import check as check_data_set
+    from flows.results.checking import check as check_data_set
 
     tell_unstated_rate(folder, fps)
     report = check_data_set(folder, fps=fps, body=body, pitch=pitch)
@@ -65,7 +65,7 @@ def check(
 
 def tell_unstated_rate(folder: Path, fps: float | None) -> None:
     """Print the assumed frame rate, since seconds and speeds depend on it."""
-    from flows.checking import USUAL_FPS, stated_rates
+    from flows.results.checking import USUAL_FPS, stated_rates
 
     if None in stated_rates(folder, fps).values():
         line(f"{folder}: frames a second not stated: taken as {USUAL_FPS:g} (--fps)", to=errors)

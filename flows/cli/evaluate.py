@@ -104,8 +104,8 @@ def evaluate(
         print_ablation(ablation, as_json=as_json)
         return
     if method and reference is not None and prediction is None:
-        from flows.baselines import score_methods
         from flows.cli.methods import named_rates, print_methods
+        from flows.results.baselines import score_methods
 
         found = score_methods(
             method,
@@ -125,7 +125,7 @@ def evaluate(
             found="others",
             todo="Name what is scored and the truth, or ask for --ablation 10.",
         )
-    from flows.evaluation import score
+    from flows.results.evaluation import score
     from worldpose.reports.score_names import score_rows
 
     scores = score(

@@ -51,7 +51,7 @@ def label(
 
     Example: worldpose label cam00.mp4 cam01.mp4 --out labels
     """
-    from flows.labelling import propose
+    from flows.review.labelling import propose
     from worldpose.detection import DetectionSettings
 
     settings = DetectionSettings(detector=tuple(detectors or ["embedded"]), pose=pose)
@@ -87,7 +87,7 @@ def finetune(
 
     Example: worldpose finetune labels/labels.json --project worldpose-data
     """
-    from flows.prefect_environment import prefect_server
+    from flows.orchestration.prefect_environment import prefect_server
 
     if "://" in project:
         raise UsageError(

@@ -10,8 +10,8 @@ from pydantic import JsonValue
 
 from data_contracts.run import RunRecord
 from flows.cli.console import line, print_table
-from flows.comparison import KINDS, Mark, compare_runs, count_marks
-from flows.iteration import Iteration, Iterations
+from flows.iterate import Iteration, Iterations
+from flows.results.comparison import KINDS, Mark, compare_runs, count_marks
 from worldpose.errors import UsageError
 from worldpose.store import Store
 

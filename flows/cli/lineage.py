@@ -15,9 +15,9 @@ from flows.cli.console import (
     print_json,
     print_table,
 )
-from flows.comparison import KINDS, SubjectChange, compare_runs, count_marks
 from flows.lineage import explain_unit, find_run, run_difference
-from flows.pose_diff import largest_pose_changes
+from flows.results.comparison import KINDS, SubjectChange, compare_runs, count_marks
+from flows.results.pose_diff import largest_pose_changes
 from flows.settings import parse_overrides
 from worldpose.store import Store
 
@@ -28,11 +28,12 @@ def diff(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Say what changed between two runs: keys, reasons and figures, and who fares better or worse.
+    """Show what changed between two runs: keys, reasons and metrics, and whether it is better.
 
-    A figure of which less is better is better or worse where it changed by more than 1 % and by
-    more than matters of it (flows/comparison.py). A camera, clip or player is better where some
-    figures are better and none is worse, worse the other way round, mixed where both are.
+    Only metrics where lower is better count. A metric is better or worse if it changed by more than
+    1 % and by more than its minimum relevant change (flows/results/comparison.py). A camera, clip
+    or player is better if some of its metrics are better and none is worse, worse in the opposite
+    case, and mixed if both occur.
 
     Example: worldpose diff tiny-1/0001 tiny-1/0002
     """

@@ -21,7 +21,7 @@ from flows.cli.console import (
 from flows.lineage import unit_state
 from flows.planning import plan_run
 from flows.registering import find_registration, open_match
-from flows.review import still_waiting
+from flows.review.verdicts import still_waiting
 from flows.run_record import latest_run
 from worldpose.errors import WorldposeError
 from worldpose.store import Store, collect, list_pins, plan_gc, repair

@@ -19,11 +19,11 @@ from flows.cli.console import (
     print_table,
     progress,
 )
+from flows.orchestration.time_limits import parse_time_limits
 from flows.registering import find_registration
 from flows.reprocessing import Reprocessed, reprocess_matches
 from flows.running import RunRequest
 from flows.settings import parse_overrides
-from flows.time_limits import parse_time_limits
 from flows.touched import Touched
 from worldpose.store import Store
 

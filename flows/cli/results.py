@@ -49,10 +49,10 @@ def export(
 
     Example: worldpose export tiny-1 --format joints --out exported
     """
-    from flows.formats import Origin
     from flows.registering import find_registration
-    from flows.releasing import export as export_formats
-    from flows.releasing import release as write_release
+    from flows.results.formats import Origin
+    from flows.results.releasing import export as export_formats
+    from flows.results.releasing import release as write_release
 
     if (release is None) != (licence is None):
         raise UsageError(

@@ -9,7 +9,6 @@ import typer
 from pydantic import TypeAdapter, ValidationError
 
 from data_contracts.review import Edit
-from flows import review
 from flows.cli import review_exchange, review_text
 from flows.cli.console import (
     DEFAULT_PROJECT,
@@ -21,9 +20,10 @@ from flows.cli.console import (
 )
 from flows.cli.review_serve import serve
 from flows.cli.review_text import correction_json, in_words, print_review, review_json, when
-from flows.prefect_environment import has_server
+from flows.orchestration.prefect_environment import has_server
 from flows.registering import find_registration, open_for_review, open_match
-from flows.review import Review, reviews_of
+from flows.review import verdicts
+from flows.review.verdicts import Review, reviews_of
 from flows.run_record import latest_run
 from flows.stage import Match
 from worldpose.errors import InputError, WorldposeError
@@ -115,7 +115,7 @@ def show(
             )
         print_review(known[request], as_json)
         return
-    origins = review.origins_of(store, opened, latest) if latest else {}
+    origins = verdicts.origins_of(store, opened, latest) if latest else {}
     marked = {name: origin for name, origin in origins.items() if origin != "automatic"}
     if as_json:
         print_json(
@@ -186,7 +186,7 @@ def correct(
     Example: worldpose review correct tiny-1 --who Ada --edits edits.json
     """
     store = Store.open(project)
-    said = review.correct(store, open_match(store, match), _read_edits(edits), who=who, why=why)
+    said = verdicts.correct(store, open_match(store, match), _read_edits(edits), who=who, why=why)
     if as_json:
         print_json({"corrections": [correction_json(each) for each in said]})
         return
@@ -209,7 +209,7 @@ def withdraw(
     Example: worldpose review withdraw tiny-1 moved_point.0a1b2c3d4e5f --who Ada
     """
     store = Store.open(project)
-    review.withdraw(store, open_match(store, match), correction, who=who, why=why)
+    verdicts.withdraw(store, open_match(store, match), correction, who=who, why=why)
     if as_json:
         print_json({"withdrawn": correction})
         return
@@ -226,7 +226,7 @@ def resume(
     Example: worldpose review resume tiny-1
     """
     store = Store.open(project)
-    resumed = review.resume(store, open_match(store, match))
+    resumed = verdicts.resume(store, open_match(store, match))
     if as_json:
         print_json({"resumed": resumed})
         return
@@ -244,7 +244,7 @@ def _decide(
     as_json: bool,
 ) -> None:
     store = Store.open(project)
-    ids, corrections = review.decide(
+    ids, corrections = verdicts.decide(
         store,
         open_match(store, match),
         requests or (),

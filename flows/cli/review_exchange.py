@@ -41,7 +41,7 @@ def export_annotations(
 
     Example: worldpose review export tiny-1 --format cvat --camera cam03 --out to_annotate
     """
-    from flows.exchange import export_people
+    from flows.review.annotation_exchange import export_people
 
     store = Store.open(project)
     opened = open_match(store, match)
@@ -76,7 +76,7 @@ def import_annotations(
 
     Example: worldpose review import tiny-1 out.xml --exported to_annotate/exported.json --who Ada
     """
-    from flows.exchange import import_people
+    from flows.review.annotation_exchange import import_people
 
     store = Store.open(project)
     known = None if form is None else _format(form)

@@ -15,7 +15,7 @@ from data_contracts.review import (
     RedrawnMarking,
 )
 from flows.cli.console import line, print_json, print_table
-from flows.review import Review
+from flows.review.verdicts import Review
 
 
 def print_list(shown: list[Review]) -> None:

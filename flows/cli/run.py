@@ -23,15 +23,15 @@ from flows.cli.console import (
 )
 from flows.cli.iterations import as_json as iterations_as_json
 from flows.cli.iterations import parse_iterations, print_iterations
-from flows.click_advice import click_advice
-from flows.clock_advice import clock_advice
-from flows.iteration import iterate_match
+from flows.iterate import iterate_match
 from flows.method import METHOD
+from flows.orchestration.time_limits import parse_time_limits
 from flows.registering import find_match
-from flows.review import warnings_of
+from flows.review.click_advice import click_advice
+from flows.review.clock_advice import clock_advice
+from flows.review.verdicts import warnings_of
 from flows.running import RunRequest, run_match
 from flows.settings import parse_overrides, selected_stages
-from flows.time_limits import parse_time_limits
 from worldpose.errors import UsageError
 from worldpose.store import Store
 

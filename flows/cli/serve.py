@@ -20,7 +20,7 @@ from flows.cli.page_server import (
     TokenOption,
     certificate_and_key,
 )
-from flows.time_limits import parse_time_limits
+from flows.orchestration.time_limits import parse_time_limits
 from worldpose.errors import UsageError
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def serve(
     if check:
         _check(folder, as_json=as_json)
         return
-    from flows.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN
+    from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN
     from flows.service.senders import senders_of
     from flows.service.service_secrets import METRICS_TOKEN, secrets_of
     from flows.service.serving import serve as serve_all

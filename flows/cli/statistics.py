@@ -33,7 +33,7 @@ def statistics(
 
     Example: worldpose statistics exported --picture lengths.png
     """
-    from flows.statistics import count
+    from flows.results.statistics import count
 
     for folder in folders:
         tell_unstated_rate(folder, fps)
@@ -45,7 +45,7 @@ def statistics(
         with whole_file(picture) as draft:
             draft.write_bytes(statistics_picture(found))
     if page is not None:
-        from flows.checking import check
+        from flows.results.checking import check
         from worldpose.formats.files import whole_file
         from worldpose.reports.data_set import data_set_page
 

@@ -15,7 +15,7 @@ from flows.cli.console import (
     print_table,
 )
 from flows.registering import find_registration
-from flows.timings import run_time
+from flows.results.timings import run_time
 from worldpose.store import Store
 
 

@@ -9,14 +9,14 @@ from typing import Final
 import numpy as np
 
 from data_contracts.broadcast_calibration import FRAME_STATUS
-from flows.release import (
+from flows.reports.flow import flow_pictures
+from flows.results.best_results import (
     body_tracks,
     broadcast_cameras,
     broadcast_unit,
     clip_title,
     joint_tracks,
 )
-from flows.reports.flow import flow_pictures
 from flows.stage import Match
 from flows.stages.detection import seen_in_broadcast
 from worldpose.broadcast_calibration import camera_before

@@ -9,15 +9,15 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.release import (
+from flows.reports.broadcast import write_broadcast_videos
+from flows.reports.match_pictures import frame_pictures
+from flows.results.best_results import (
     body_tracks,
     broadcast_cameras,
     joint_tracks,
     placed_joints,
     static_cameras,
 )
-from flows.reports.broadcast import write_broadcast_videos
-from flows.reports.match_pictures import frame_pictures
 from flows.stage import Match
 from worldpose.geometry import Camera
 from worldpose.reports.overlay_video import overlay_frames

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from flows.release import (
+from flows.reports.cameras import still_of
+from flows.reports.match_pictures import frame_picture
+from flows.results.best_results import (
     body_tracks,
     broadcast_cameras,
     clip_title,
@@ -12,8 +14,6 @@ from flows.release import (
     placed_joints,
     static_cameras,
 )
-from flows.reports.cameras import still_of
-from flows.reports.match_pictures import frame_picture
 from flows.stage import Match
 from flows.stages.redetection import seen_in
 from worldpose.formats import JointTracks

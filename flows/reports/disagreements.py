@@ -6,9 +6,9 @@ from typing import Final
 
 import numpy as np
 
-from flows.release import clip_title, joint_tracks, static_cameras
 from flows.reports.cameras import still_of
 from flows.reports.match_pictures import frame_picture
+from flows.results.best_results import clip_title, joint_tracks, static_cameras
 from flows.stage import Match
 from flows.stages.redetection import seen_in
 from worldpose.formats import JointTracks

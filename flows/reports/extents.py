@@ -6,7 +6,7 @@ import numpy as np
 
 from data_contracts.evaluation import Evaluation
 from data_contracts.release import DataSetStatistics
-from flows.release import broadcast_cameras, clips_of, joint_tracks
+from flows.results.best_results import broadcast_cameras, clips_of, joint_tracks
 from flows.stage import Match
 from worldpose.dataset.statistics import clip_statistics, data_set_statistics, kind_of
 from worldpose.reports import Section

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from flows.release import clip_title
+from flows.results.best_results import clip_title
 from flows.stage import Match
 from flows.stages.detection import seen_in_broadcast
 from worldpose.broadcast_calibration import BroadcastCalibrationSettings

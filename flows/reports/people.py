@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from data_contracts.conventions import COCO17
-from flows.release import ADJUSTED, bodies_unit, clip_title
+from flows.results.best_results import ADJUSTED, bodies_unit, clip_title
 from worldpose.reports.html_page import Table
 from worldpose.reports.score_names import shown_number
 from worldpose.store import Run

@@ -6,8 +6,6 @@ from pathlib import Path
 
 from data_contracts.evaluation import Evaluation
 from data_contracts.run import RunRecord
-from flows.evaluation import load_reference, score
-from flows.release import clips_of, static_cameras
 from flows.reports.broadcast import (
     broadcast_pictures,
     broadcast_tables,
@@ -20,6 +18,8 @@ from flows.reports.disagreements import disagreement_pictures
 from flows.reports.extents import extent_section, tiles_of
 from flows.reports.people import adjustment_tables, body_tables
 from flows.reports.review import review_table
+from flows.results.best_results import clips_of, static_cameras
+from flows.results.evaluation import load_reference, score
 from flows.stage import Match
 from worldpose.errors import UsageError
 from worldpose.formats import whole_file

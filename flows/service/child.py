@@ -34,7 +34,7 @@ def prefect(plan: ServePlan) -> None:
     """Run Prefect's server: API, services and dashboard."""
     from urllib.parse import urlsplit
 
-    from flows.prefect_server import serve
+    from flows.orchestration.prefect_server import serve
 
     address = urlsplit(plan.prefect)
     serve(address.hostname or "127.0.0.1", address.port or 80, ())

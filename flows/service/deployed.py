@@ -19,7 +19,7 @@ from data_contracts.finetune import NetKind
 from data_contracts.operations import Arrival
 from data_contracts.records import Name
 from flows.match import process_match
-from flows.prefect_environment import served_cluster
+from flows.orchestration.prefect_environment import served_cluster
 from flows.registering import open_match
 from flows.service.arrivals import take_in
 from flows.service.plan import ServePlan
@@ -112,9 +112,9 @@ def release(
     Raises:
         WorldposeError: the latest run is not complete.
     """
-    from flows.formats import Origin  # imported here, as everything that few runs need
-    from flows.releasing import release as write_release
     from flows.reports.report import write_report
+    from flows.results.formats import Origin  # imported here, as everything that few runs need
+    from flows.results.releasing import release as write_release
 
     store = Store.open(project)
     opened = open_match(store, match_id)

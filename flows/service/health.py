@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from data_contracts.operations import Serving
-from flows.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN, authorization
+from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN, authorization
 from flows.service.layout import StateFolder, is_alive
 from flows.service.plan import FLOWS
 

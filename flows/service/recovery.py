@@ -27,7 +27,7 @@ from prefect.events.filters import (
 )
 from prefect.states import Cancelled, Crashed, Scheduled
 
-from flows.cluster_errors import LostWorkersError
+from flows.orchestration.cluster_errors import LostWorkersError
 from flows.service.layout import is_alive
 from flows.service.plan import ServePlan
 

@@ -10,7 +10,13 @@ from pathlib import Path
 from secrets import token_urlsafe
 from typing import Final
 
-from flows.prefect_environment import CLIENT_LOGIN, CLOUD_LOGIN, DATABASE, SERVER_LOGIN, new_login
+from flows.orchestration.prefect_environment import (
+    CLIENT_LOGIN,
+    CLOUD_LOGIN,
+    DATABASE,
+    SERVER_LOGIN,
+    new_login,
+)
 from flows.service.plan import ServePlan
 from flows.web.access import TOKEN_LENGTH
 from worldpose.errors import UsageError

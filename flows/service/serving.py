@@ -19,8 +19,8 @@ from types import FrameType
 from typing import Final
 
 from data_contracts.operations import Service, Serving
-from flows.prefect_database import begin_database, keep_database
-from flows.prefect_environment import one_authority, require_login, served_environment
+from flows.orchestration.prefect_database import begin_database, keep_database
+from flows.orchestration.prefect_environment import one_authority, require_login, served_environment
 from flows.service.health import at_prefect
 from flows.service.layout import PRIORITIES
 from flows.service.plan import ServePlan

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from data_contracts.records import Name, Record
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking, Pixel
-from flows.review import reviews_of
+from flows.review.verdicts import reviews_of
 from flows.run_record import latest_run
 from flows.stage import Match
 from flows.web.app_context import Desk

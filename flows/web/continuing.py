@@ -10,9 +10,9 @@ from pathlib import Path
 from threading import Lock, Thread
 from typing import Any
 
-from flows.prefect_environment import has_server
+from flows.orchestration.prefect_environment import has_server
 from flows.registering import open_for_review
-from flows.review import resume
+from flows.review.verdicts import resume
 from worldpose.store import Store
 
 _COMMAND = [sys.executable, "-c", "from flows.cli import main; main()", "run"]

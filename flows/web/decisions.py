@@ -11,8 +11,8 @@ from data_contracts.records import Name, Record
 from data_contracts.review import Edit
 from data_contracts.run import GatePolicy
 from flows.cli.review_text import correction_json
-from flows.corrections import keep_edits
-from flows.review import decide, still_waiting, withdraw
+from flows.review.corrections import keep_edits
+from flows.review.verdicts import decide, still_waiting, withdraw
 from flows.run_record import latest_run
 from flows.web.app_context import Desk, Person
 

@@ -12,9 +12,9 @@ from pydantic import Field
 
 from data_contracts.conventions import COCO17, COCO17_BONES
 from data_contracts.records import Record
-from flows.acceptance import accept, left_to_look_at
-from flows.detections import detections_now
 from flows.reports.match_pictures import frame_picture
+from flows.review.acceptance import accept, left_to_look_at
+from flows.review.detections import detections_now
 from flows.stage import Match
 from flows.web.app_context import Desk, Person
 from worldpose.errors import InputError

@@ -9,7 +9,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 
-from flows.edit_conflicts import StaleEditError
+from flows.review.edit_conflicts import StaleEditError
 from worldpose.errors import InputError, InternalError, WorldposeError
 
 LOG = logging.getLogger("worldpose.pages")

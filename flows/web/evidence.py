@@ -16,12 +16,12 @@ from fastapi.responses import FileResponse, Response
 from numpy.typing import NDArray
 
 from data_contracts.review import ReviewRequest
-from flows.release import placed_joints, static_cameras
 from flows.reports.broadcast import broadcast_pictures, broadcast_tables
 from flows.reports.cameras import camera_evidence
 from flows.reports.clip_video import clip_view, write_clip_video
 from flows.reports.clips import clip_pictures, detection_pictures
 from flows.reports.people import adjustment_tables, body_tables
+from flows.results.best_results import placed_joints, static_cameras
 from flows.stage import Match
 from flows.web.app_context import Desk
 from worldpose.formats import JointTracks

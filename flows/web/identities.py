@@ -9,8 +9,8 @@ from fastapi import APIRouter, HTTPException
 from fastapi.responses import Response
 from numpy.typing import NDArray
 
-from flows.identities import identities_now
-from flows.release import static_cameras
+from flows.results.best_results import static_cameras
+from flows.review.identities import identities_now
 from flows.stage import Match
 from flows.web.app_context import Desk
 from worldpose.ingest import unit_frames

@@ -11,7 +11,7 @@ from fastapi import APIRouter, HTTPException
 
 from data_contracts.conventions import COCO17
 from data_contracts.review import DeletedDetection, MovedKeypoint, MovedPoint
-from flows.release import ADJUSTED
+from flows.results.best_results import ADJUSTED
 from flows.stage import Match
 from flows.stages.detection import seen_by
 from flows.web.app_context import Desk

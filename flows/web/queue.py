@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query
 from data_contracts.review import Correction, ReviewRequest
 from flows.cli.review_text import correction_json, in_words, review_json
 from flows.method import GATES
-from flows.review import Review, reviews_of, still_waiting
+from flows.review.verdicts import Review, reviews_of, still_waiting
 from flows.run_record import latest_run
 from flows.stage import Match
 from flows.web.app_context import Desk

@@ -11,9 +11,9 @@ from fastapi import APIRouter
 from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17
-from flows.detections import detections_now
-from flows.identities import identities_now
-from flows.release import static_cameras
+from flows.results.best_results import static_cameras
+from flows.review.detections import detections_now
+from flows.review.identities import identities_now
 from flows.stage import Match
 from flows.web.app_context import Desk
 from worldpose.errors import InputError

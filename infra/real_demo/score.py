@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 import worldpose
 from data_contracts.conventions import COCO17_BONES
-from flows.release import bodies_unit, joint_tracks, placed_joints, static_cameras
+from flows.results.best_results import bodies_unit, joint_tracks, placed_joints, static_cameras
 from worldpose.ingest import read_match
 from worldpose.video import VideoReader, write_video
 

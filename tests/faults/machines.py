@@ -15,7 +15,12 @@ from pathlib import Path
 
 import psutil
 
-from flows.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN, new_login, served_environment
+from flows.orchestration.prefect_environment import (
+    CLIENT_LOGIN,
+    SERVER_LOGIN,
+    new_login,
+    served_environment,
+)
 from flows.service.plan import ServePlan
 from flows.service.serving import answers
 

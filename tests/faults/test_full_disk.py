@@ -8,9 +8,9 @@ import subprocess
 import pytest
 from command_line import worldpose
 
-from flows import prefect_database
-from flows.cluster_errors import require_room
-from flows.prefect_database import begin_database
+from flows.orchestration import prefect_database
+from flows.orchestration.cluster_errors import require_room
+from flows.orchestration.prefect_database import begin_database
 from worldpose.errors import MemoryLimitError, StoreError, require_memory
 from worldpose.simulation import SCENARIOS, simulate_match
 

@@ -15,12 +15,12 @@ from command_line import WORLDPOSE, succeed
 from test_killed_runs import assert_nothing_half_written, assert_same_store, files_of
 
 from data_contracts.review import DeletedDetection
-from flows import iteration
+from flows import iterate
 from flows import match as match_flow
 from flows.fan_out import task_of
-from flows.iteration import iterate_match
+from flows.iterate import iterate_match
 from flows.registering import open_match, register
-from flows.review import correct
+from flows.review.verdicts import correct
 from flows.running import RunRequest
 from flows.settings import selected_stages
 from worldpose.simulation import SCENARIOS, simulate_match
@@ -57,8 +57,8 @@ def loop(project, folder, at_commit_point):
     """The loop over iterations in this process."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(match_flow, "compute", compute_here)
-        patch.setattr(iteration, "run_match", run_here)
-        patch.setattr(iteration, "shared_machines", no_machines)
+        patch.setattr(iterate, "run_match", run_here)
+        patch.setattr(iterate, "shared_machines", no_machines)
         install_fault_hook(at_commit_point)
         store = Store.open_or_new(str(project))
         match, _ = register(store, folder)

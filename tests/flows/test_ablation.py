@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from flows import ablation
-from flows.ablation import CLICKS, Score, trial
 from flows.cli.ablation import print_ablation
+from flows.results import ablation
+from flows.results.ablation import CLICKS, Score, trial
 
 
 @pytest.fixture

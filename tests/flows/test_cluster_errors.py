@@ -9,9 +9,9 @@ from distributed import Client, LocalCluster
 from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError
 
-from flows import local_cluster
-from flows.cluster_errors import LostWorkersError, require_workers
-from flows.prefect_environment import local_cluster_options
+from flows.orchestration import local_cluster
+from flows.orchestration.cluster_errors import LostWorkersError, require_workers
+from flows.orchestration.prefect_environment import local_cluster_options
 from worldpose.errors import InputError, StoreError
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from command_line import TINY
 
-from flows.detections import detections_now
-from flows.edit_conflicts import StaleEditError
-from flows.exchange import export_people, import_people
 from flows.registering import open_match
+from flows.review.annotation_exchange import export_people, import_people
+from flows.review.detections import detections_now
+from flows.review.edit_conflicts import StaleEditError
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.annotations import FORMATS, read_annotations, write_annotations
 from worldpose.store import Store

@@ -13,7 +13,7 @@ from flows.gatekeeping import Gatekeeper
 from flows.method import GATES, METHOD
 from flows.planning import plan_run
 from flows.registering import open_match
-from flows.review import (
+from flows.review.verdicts import (
     correct,
     decide,
     origins_of,

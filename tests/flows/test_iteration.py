@@ -9,14 +9,14 @@ from test_refitting import halves
 
 from data_contracts.review import DeletedDetection
 from data_contracts.run import RunRecord
-from flows import iteration
+from flows import iterate
 from flows.cli.iterations import parse_iterations
-from flows.iteration import Iteration, held_out_error, iterate_match
+from flows.iterate import Iteration, held_out_error, iterate_match
 from flows.method import METHOD
 from flows.outlook import Outlook
 from flows.planning import plan_run, results_before
 from flows.registering import register
-from flows.review import correct
+from flows.review.verdicts import correct
 from flows.running import RunRequest
 from worldpose.errors import UsageError
 from worldpose.store import Store
@@ -148,12 +148,10 @@ def looped(monkeypatch):
             state = (states or {}).get(request.iteration, "complete")
             return record(request.iteration, errors[request.iteration - 1], state)
 
-        monkeypatch.setattr(iteration, "run_match", run)
-        monkeypatch.setattr(iteration, "_outlook", lambda *_: Outlook((), {}, ()))
-        monkeypatch.setattr(iteration, "_recorded", lambda *_: None)
-        monkeypatch.setattr(
-            iteration, "latest_run", lambda *_: record(ran[-1], errors[ran[-1] - 1])
-        )
+        monkeypatch.setattr(iterate, "run_match", run)
+        monkeypatch.setattr(iterate, "_outlook", lambda *_: Outlook((), {}, ()))
+        monkeypatch.setattr(iterate, "_recorded", lambda *_: None)
+        monkeypatch.setattr(iterate, "latest_run", lambda *_: record(ran[-1], errors[ran[-1] - 1]))
 
         class Anything:
             match_id = "m"

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from flows import labelling
+from flows.review import labelling
 from worldpose.detection import DetectionSettings, People, Poses
 from worldpose.errors import InputError
 from worldpose.training import read_labels

@@ -12,11 +12,11 @@ from command_line import TINY
 
 from data_contracts.conventions import COCO17
 from data_contracts.review import MergedTracks, MovedKeypoint, SplitTrack
-from flows.corrections import keep_edits
-from flows.detections import detections_now
-from flows.evaluation import score
-from flows.identities import identities_now
 from flows.registering import open_match
+from flows.results.evaluation import score
+from flows.review.corrections import keep_edits
+from flows.review.detections import detections_now
+from flows.review.identities import identities_now
 from flows.running import RunRequest, run_match
 from worldpose.store import Store
 

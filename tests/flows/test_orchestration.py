@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from command_line import TINY, succeed, worldpose
 
-from flows.prefect_environment import CLIENT_LOGIN, authorization
+from flows.orchestration.prefect_environment import CLIENT_LOGIN, authorization
 from worldpose.store import Store, compare_stores
 
 LOOPBACK_ONLY = str(Path(__file__).with_name("loopback_only"))

@@ -17,9 +17,9 @@ import psutil
 import pytest
 from distributed import Client, Security
 
-from flows import prefect_database
-from flows.prefect_database import DATABASE, begin_database, keep_database
-from flows.prefect_environment import (
+from flows.orchestration import prefect_database
+from flows.orchestration.prefect_database import DATABASE, begin_database, keep_database
+from flows.orchestration.prefect_environment import (
     AUTHORITIES,
     CLIENT_LOGIN,
     SERVER_LOGIN,
@@ -30,7 +30,7 @@ from flows.prefect_environment import (
     require_login,
     without_secrets,
 )
-from flows.private_cluster import PrivateCluster
+from flows.orchestration.private_cluster import PrivateCluster
 from flows.service.child import PARTS
 from flows.service.plan import ServePlan
 from flows.service.service_secrets import METRICS_TOKEN, secrets_of
@@ -140,7 +140,7 @@ def test_only_the_run_itself_gets_an_answer_of_its_server(tmp_path, kept, monkey
 
 
 def test_a_prefect_server_without_a_login_does_not_start():
-    server = [sys.executable, "-m", "flows.prefect_server", "--host", "0.0.0.0"]
+    server = [sys.executable, "-m", "flows.orchestration.prefect_server", "--host", "0.0.0.0"]
     environment = without_secrets(os.environ)
     said = subprocess.run(server, env=environment, capture_output=True, text=True, timeout=300)
     assert said.returncode != 0

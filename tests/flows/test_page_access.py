@@ -10,7 +10,7 @@ import pytest
 from command_line import TINY
 from page_client import HERE, MATCH, TOKEN, a_click, moved
 
-from flows import corrections
+from flows.review import corrections
 from flows.web.access import SESSION_SECONDS, WRONG_SECONDS, WRONG_TOKENS, access_for
 from flows.web.app import create_app
 from flows.web.guard import BODY_BYTES, OPEN

@@ -7,8 +7,8 @@ import pytest
 from command_line import TINY
 from page_client import MATCH, a_click, moved
 
-from flows import corrections
 from flows.registering import open_match, register
+from flows.review import corrections
 from worldpose.errors import StoreError
 from worldpose.review import read_journal
 from worldpose.store import Store

@@ -8,7 +8,7 @@ from page_client import MATCH
 from data_contracts.conventions import COCO17
 from flows.planning import plan_run
 from flows.registering import open_match
-from flows.release import static_cameras
+from flows.results.best_results import static_cameras
 from tasks.ingest import ingest
 from worldpose.store import Store, open_run
 

@@ -14,12 +14,12 @@ from data_contracts.run import UnitFailure
 from flows import planning, reprocessing
 from flows.cli.app import app
 from flows.cli.reprocess import exit_code
-from flows.edit_conflicts import edits_since
 from flows.method import METHOD
 from flows.registering import open_match, register
 from flows.reprocess import UnprocessedError, reprocess
 from flows.reprocessing import Reprocessed, reprocess_matches
-from flows.review import correct
+from flows.review.edit_conflicts import edits_since
+from flows.review.verdicts import correct
 from flows.running import RunRequest
 from flows.stages.tracking import STAGE
 from flows.touched import find_touched

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from data_contracts.run import RunRecord
-from flows import comparison, pose_diff
-from flows.comparison import compare_runs, count_marks
-from flows.pairing import BodiesOfBoth, pair_people
+from flows.results import comparison, pose_diff
+from flows.results.comparison import compare_runs, count_marks
+from flows.results.pairing import BodiesOfBoth, pair_people
 from worldpose.geometry import Camera, Rigid
 
 

@@ -6,13 +6,13 @@ import pytest
 from command_line import TINY
 
 from data_contracts.review import MergedTracks
-from flows import iteration, run_record
-from flows.edit_conflicts import EditedMeanwhileError
+from flows import iterate, run_record
 from flows.gates import IDENTITIES, IdentityLimits
-from flows.iteration import Iteration, iterate_match
+from flows.iterate import Iteration, iterate_match
 from flows.method import METHOD
 from flows.registering import open_match
-from flows.review import correct
+from flows.review.edit_conflicts import EditedMeanwhileError
+from flows.review.verdicts import correct
 from flows.run_record import RunLog
 from flows.running import RunRequest
 from flows.touched import find_touched
@@ -92,7 +92,7 @@ def test_iterations_begin_again_when_the_match_is_edited_between_two(store, monk
             raise EditedMeanwhileError("x", expected="a", found="b", todo="c")
         return Iteration(request.iteration, store.run(TINY), None)
 
-    monkeypatch.setattr(iteration, "_pass", one_pass)
+    monkeypatch.setattr(iterate, "_pass", one_pass)
     iterate_match(store, open_match(store, TINY), RunRequest({}), 2)
     assert begun == [(1, 0), (2, 0), (1, 1), (2, 1)]
 

@@ -3,7 +3,7 @@
 import pytest
 
 from flows.method import METHOD
-from flows.time_limits import LONGEST, parse_time_limits, seconds_of
+from flows.orchestration.time_limits import LONGEST, parse_time_limits, seconds_of
 from worldpose.errors import UsageError
 
 

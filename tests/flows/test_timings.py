@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from flows import timings
+from flows.results import timings
 
 BEGUN = datetime(2026, 5, 1, 12, tzinfo=UTC)
 

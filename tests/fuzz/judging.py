@@ -215,7 +215,7 @@ def _open_results_once(store_kind):
 
 def warnings_said(record, match):
     """What `worldpose run` warns of after a run, in its own words."""
-    from flows import clock_advice
+    from flows.review import clock_advice
 
     said = [*record.warnings, *clock_advice.clock_advice(record.figures, match.folder.spec)]
     for name, figures in record.figures.items():

@@ -175,7 +175,7 @@ def use_store(project):
     """Everything that reads a project, as the command line does it: exceptions by command."""
     from flows.cli.project import _match_status
     from flows.registering import open_match
-    from flows.review import reviews_of, warnings_of
+    from flows.review.verdicts import reviews_of, warnings_of
     from flows.run_record import latest_run
     from worldpose.store import Store, open_run, plan_gc, repair, verify
 

@@ -14,7 +14,7 @@ import typer
 import yaml
 
 from flows.cli.app import app
-from flows.private_cluster import write_certificate
+from flows.orchestration.private_cluster import write_certificate
 
 INFRA = Path(__file__).parents[2] / "infra"
 KUSTOMIZATION = INFRA / "kubernetes" / "kustomization.yaml"
@@ -74,7 +74,7 @@ def test_compose_publishes_only_what_asks_for_a_login():
     assert SERVICES["serve"]["environment"]["WORLDPOSE_METRICS_TOKEN"]
     login = SERVICES["prefect"]["environment"]["PREFECT_SERVER_API_AUTH_STRING"]
     assert SERVICES["serve"]["environment"]["PREFECT_API_AUTH_STRING"] == login
-    guarded = ["python", "-m", "flows.prefect_server"]
+    guarded = ["python", "-m", "flows.orchestration.prefect_server"]
     assert SERVICES["prefect"]["entrypoint"][:3] == guarded
 
 
@@ -160,7 +160,7 @@ def test_pods_of_kubernetes_are_reached_by_those_alone_that_a_policy_names():
             ports = {port["name"] for port in container.get("ports", ())}
             assert {port["port"] for port in rule.get("ports", ())} <= ports, name
     text = str([each for each in manifests() if named(each) == ("Deployment", "prefect")])
-    assert "flows.prefect_server" in text
+    assert "flows.orchestration.prefect_server" in text
     assert "prefect-login" in text
     # The guard answers a probe that names the server.
     assert text.count("'name': 'Host', 'value': 'prefect'") == 2
@@ -314,8 +314,14 @@ def test_the_batch_script_is_a_shell_script_that_asks_for_its_arguments():
     assert {"--nodes", "--time", "--requeue"} <= set(directives)
     text = script.read_text()
     assert "prefect server start" not in text
-    assert text.index('mktemp -d "$project/operations') < text.index("flows.private_cluster")
-    for started in ("dask scheduler --protocol tls", "flows.prefect_server", "--preload tasks"):
+    assert text.index('mktemp -d "$project/operations') < text.index(
+        "flows.orchestration.private_cluster"
+    )
+    for started in (
+        "dask scheduler --protocol tls",
+        "flows.orchestration.prefect_server",
+        "--preload tasks",
+    ):
         assert text.index("COMM__REQUIRE_ENCRYPTION=true") < text.index(started)
 
 

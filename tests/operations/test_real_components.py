@@ -9,7 +9,12 @@ import uuid
 import pytest
 from command_line import TINY, succeed
 
-from flows.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN, new_login, served_environment
+from flows.orchestration.prefect_environment import (
+    CLIENT_LOGIN,
+    SERVER_LOGIN,
+    new_login,
+    served_environment,
+)
 from flows.service.plan import ServePlan
 from flows.service.serving import answers
 from worldpose.store import Store, compare_stores, verify

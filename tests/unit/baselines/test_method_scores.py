@@ -20,8 +20,8 @@ from method_files import (
 )
 from typer.testing import CliRunner
 
-from flows.baselines import score_methods
 from flows.cli.app import app
+from flows.results.baselines import score_methods
 from worldpose.baselines import METHODS
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation.method_table import table_csv, table_latex, table_rows

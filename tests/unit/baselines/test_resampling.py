@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from method_files import FRAMES, WRITERS, scene, truth_of
 
-from flows.baselines import score_methods
 from flows.cli.methods import named_rates
+from flows.results.baselines import score_methods
 from worldpose.baselines import MethodResult, resampled
 from worldpose.body import BodyParameters
 from worldpose.errors import UsageError

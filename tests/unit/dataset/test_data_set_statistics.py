@@ -12,9 +12,9 @@ from matplotlib.image import imread
 from typer.testing import CliRunner
 
 from data_contracts.release import ClipStatistics
-from flows.checking import check
 from flows.cli.app import app
-from flows.statistics import count
+from flows.results.checking import check
+from flows.results.statistics import count
 from worldpose.body import BodyParameters
 from worldpose.dataset.manifest import frame_rate_of, read_frame_rates, write_frame_rates
 from worldpose.dataset.statistics import clip_statistics, data_set_statistics

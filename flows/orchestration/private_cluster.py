@@ -2,7 +2,7 @@
 
 Dask runs any code that a client sends, and a scheduler is reachable for every user of its machine.
 This one requires a certificate that exists only in the memory of one run's processes. For a cluster
-over several machines, `python -m flows.private_cluster FOLDER` writes a certificate.
+over several machines, `python -m flows.orchestration.private_cluster FOLDER` writes a certificate.
 """
 
 from __future__ import annotations
@@ -57,5 +57,5 @@ def write_certificate(folder: Path) -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) != 2:
-        sys.exit("usage: python -m flows.private_cluster FOLDER")
+        sys.exit("usage: python -m flows.orchestration.private_cluster FOLDER")
     write_certificate(Path(sys.argv[1]))

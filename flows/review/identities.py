@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pydantic import JsonValue
 
 from data_contracts.review import Edit
-from flows.edit_conflicts import StaleEditError, edits_since
+from flows.review.edit_conflicts import StaleEditError, edits_since
 from flows.stage import Match
 from worldpose.errors import InputError
 from worldpose.review.identities import (

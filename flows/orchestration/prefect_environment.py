@@ -27,7 +27,7 @@ from urllib.parse import urlsplit
 
 import certifi
 
-from flows.prefect_database import begin_database, keep_database
+from flows.orchestration.prefect_database import begin_database, keep_database
 from worldpose.errors import InputError, WorldposeError
 from worldpose.store.blobs import storage_errors
 
@@ -157,7 +157,7 @@ def served_cluster() -> dict[str, Any]:
     if address:
         return {"address": address}
     return {
-        "cluster_class": "flows.private_cluster.PrivateCluster",
+        "cluster_class": "flows.orchestration.private_cluster.PrivateCluster",
         "cluster_kwargs": local_cluster_options(int(os.environ.get("WORLDPOSE_WORKERS") or 0)),
     }
 
@@ -263,7 +263,13 @@ def _embedded_server(home: Path, log: Path) -> Iterator[tuple[str, Callable[[], 
         # The server ends when its standard input closes, so a killed run leaves none behind. It
         # inherits a socket rather than a port, which another process could take in between.
         server = subprocess.Popen(
-            [sys.executable, "-m", "flows.prefect_server", "--socket", str(listening.fileno())],
+            [
+                sys.executable,
+                "-m",
+                "flows.orchestration.prefect_server",
+                "--socket",
+                str(listening.fileno()),
+            ],
             stdin=subprocess.PIPE,
             stdout=output,
             stderr=subprocess.STDOUT,

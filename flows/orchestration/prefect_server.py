@@ -1,4 +1,6 @@
-"""Prefect's server behind a guard: `python -m flows.prefect_server --host HOST --port PORT`.
+"""Prefect's server behind a guard.
+
+    python -m flows.orchestration.prefect_server --host HOST --port PORT
 
 Prefect's own program checks neither Host nor Origin, and requires a login only if
 PREFECT_SERVER_API_AUTH_STRING is set. This one does not start without it.
@@ -16,7 +18,7 @@ import threading
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final
 
-from flows.prefect_environment import SERVER_LOGIN
+from flows.orchestration.prefect_environment import SERVER_LOGIN
 from flows.web.host_guard import HostGuard
 from flows.web.http_server import serve_http
 from worldpose.errors import UsageError
@@ -82,7 +84,7 @@ def main() -> None:
     `--socket` is for `worldpose run`: serve the inherited socket until standard input closes.
     Prefect's own temporary server outlives a killed parent; this one does not.
     """
-    parser = argparse.ArgumentParser(prog="python -m flows.prefect_server")
+    parser = argparse.ArgumentParser(prog="python -m flows.orchestration.prefect_server")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at")
     parser.add_argument("--port", type=int, default=4200)
     parser.add_argument(

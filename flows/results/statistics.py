@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from data_contracts.release import DataSetStatistics
-from flows.checking import USUAL_FPS, stated_rates
+from flows.results.checking import USUAL_FPS, stated_rates
 from worldpose.dataset.statistics import (
     camera_kind,
     clip_statistics,

@@ -9,7 +9,7 @@ from pathlib import Path
 from data_contracts.evaluation import Evaluation
 from data_contracts.match import MatchSpec
 from flows.registering import find_match
-from flows.release import (
+from flows.results.best_results import (
     JOINT_STAGES,
     broadcast_cameras,
     clips_of,

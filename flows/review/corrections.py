@@ -9,9 +9,9 @@ from weakref import WeakKeyDictionary
 
 from data_contracts.match import Registration
 from data_contracts.review import Correction, Edit, MovedPoint, RedrawnMarking, Withdrawal
-from flows.detections import require_seen
-from flows.edit_conflicts import StaleEditError
-from flows.identities import require_fitting
+from flows.review.detections import require_seen
+from flows.review.edit_conflicts import StaleEditError
+from flows.review.identities import require_fitting
 from flows.stage import Match
 from worldpose.errors import InputError
 from worldpose.ingest import MatchFolder

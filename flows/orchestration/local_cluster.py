@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from flows.orchestration.prefect_environment import START_SECONDS, local_cluster_options
 from flows.planning import PlannedUnit
-from flows.prefect_environment import START_SECONDS, local_cluster_options
 
 if TYPE_CHECKING:
-    from flows.private_cluster import PrivateCluster
+    from flows.orchestration.private_cluster import PrivateCluster
 
 KEEP_SECONDS = 5.0
 """Interval at which lost workers are restarted."""
@@ -28,7 +28,7 @@ def starting_cluster(asked: int | None, missing: list[PlannedUnit]) -> PrivateCl
     """
     import dask
 
-    from flows.private_cluster import PrivateCluster
+    from flows.orchestration.private_cluster import PrivateCluster
 
     given = dask.config.get("distributed.worker.preload")
     named = [given] if isinstance(given, str) else given

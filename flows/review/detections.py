@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from pydantic import JsonValue
 
 from data_contracts.review import Edit
-from flows.edit_conflicts import StaleEditError, edits_since
+from flows.review.edit_conflicts import StaleEditError, edits_since
 from flows.stage import Match
 from flows.stages.detection import seen_by, seen_in_broadcast
 from flows.stages.ingest import edits_by_camera

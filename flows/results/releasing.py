@@ -10,8 +10,8 @@ import numpy as np
 
 from data_contracts.pin import Pin
 from data_contracts.release import ReleasedClip, ReleaseManifest
-from flows.formats import EXPORTS, Origin
-from flows.release import bodies_unit, joint_tracks, static_cameras
+from flows.results.best_results import bodies_unit, joint_tracks, static_cameras
+from flows.results.formats import EXPORTS, Origin
 from worldpose.dataset.manifest import (
     read_manifest,
     released_files,

@@ -13,13 +13,13 @@ from typing import Final
 
 from data_contracts.run import RunRecord
 from flows.basis import basis_of
-from flows.edit_conflicts import EditedMeanwhileError
 from flows.gatekeeping import Gatekeeper
 from flows.method import METHOD
 from flows.outlook import Outlook, look_ahead
 from flows.planning import PlannedUnit
 from flows.progress import reporter
 from flows.registering import open_match
+from flows.review.edit_conflicts import EditedMeanwhileError
 from flows.run_record import latest_run
 from flows.running import RunRequest, run_match, shared_machines
 from flows.stage import Match

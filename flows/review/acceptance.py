@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 
 from data_contracts.review import Acceptance
-from flows.detections import results_of, stored_people
+from flows.review.detections import results_of, stored_people
 from flows.stage import Match
 from worldpose.review import say
 from worldpose.review.acceptance import OpenDetections, open_detections

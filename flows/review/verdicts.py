@@ -9,10 +9,10 @@ from typing import Literal
 
 from data_contracts.review import Correction, Edit, Origin, ReviewDecision, ReviewRequest
 from data_contracts.run import RunRecord, WaitingUnit
-from flows.corrections import new_corrections, withdrawal
-from flows.edit_conflicts import StaleEditError
 from flows.method import GATES
-from flows.prefect_environment import has_server
+from flows.orchestration.prefect_environment import has_server
+from flows.review.corrections import new_corrections, withdrawal
+from flows.review.edit_conflicts import StaleEditError
 from flows.run_record import latest_run
 from flows.stage import Match
 from worldpose.errors import InputError
@@ -243,6 +243,8 @@ def resume(store: Store, match: Match) -> list[str]:
             found=f"none on {', '.join(review.request.id for review in waiting)}",
             todo="Decide first: worldpose review approve, or reject.",
         )
-    from flows.suspension import resume_suspended  # imported here: Prefect takes seconds to import
+    from flows.orchestration.suspension import (
+        resume_suspended,  # imported here: Prefect takes seconds to import
+    )
 
     return resume_suspended(store.url, match_id)

@@ -11,9 +11,9 @@ from typing import Final
 import numpy as np
 
 from data_contracts.review import Correction, Edit
-from flows.corrections import keep_edits
-from flows.detections import detections_now
 from flows.reports.match_pictures import frame_picture
+from flows.review.corrections import keep_edits
+from flows.review.detections import detections_now
 from flows.stage import Match
 from worldpose.errors import UsageError
 from worldpose.formats.annotations import (

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.run import RunRecord
-from flows.release import bodies_unit
+from flows.results.best_results import bodies_unit
 from worldpose.store import Run, Store
 
 FRAMES: Final = 50

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.evaluation import MethodScore
-from flows.evaluation import cameras_of, reference_side
+from flows.results.evaluation import cameras_of, reference_side
 from worldpose.baselines import MethodResult, find_method, resampled
 from worldpose.body import OPEN_BODY, find_body
 from worldpose.errors import UsageError

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from data_contracts.run import RunRecord
-from flows.pairing import paired_people
-from flows.release import BODY_STAGES
+from flows.results.best_results import BODY_STAGES
+from flows.results.pairing import paired_people
 from worldpose.store import Store
 
 Kind = Literal["match", "clip", "camera", "player"]

@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 
 from data_contracts.run import RunRecord
-from flows.pairing import BodiesOfBoth, bodies_of_both
 from flows.registering import find_registration
-from flows.release import static_cameras
+from flows.results.best_results import static_cameras
+from flows.results.pairing import BodiesOfBoth, bodies_of_both
 from worldpose.geometry import Camera
 from worldpose.store import Run, Store
 

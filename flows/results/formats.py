@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.match import MatchSpec, Registration
 from data_contracts.release import BaselineSettings
-from flows.release import (
+from flows.results.best_results import (
     bodies_unit,
     broadcast_unit,
     clips_of,

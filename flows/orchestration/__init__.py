@@ -1,0 +1,1 @@
+"""Prefect and Dask for runs: their environment, servers, workers and failures."""
