@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from data_contracts.evaluation import MethodScore
 from flows.results.evaluation import cameras_of, reference_side
-from worldpose.baselines import MethodResult, find_method, resampled
 from worldpose.body import OPEN_BODY, find_body
 from worldpose.errors import UsageError
 from worldpose.evaluation import EvaluationSettings, evaluate_joints
 from worldpose.evaluation.method_table import meaningful
 from worldpose.formats import JointTracks
+from worldpose.formats.baselines import MethodResult, find_method, resample_result
 from worldpose.formats.camera_file import RELEASE_SIZE
 from worldpose.geometry import Camera
 
@@ -76,9 +76,9 @@ def score_methods(
                 found=f"{path or 'no path'}, which does not exist",
                 todo="Name the file or folder that the method wrote.",
             )
-        result = method.read(Path(path), model, _picture(camera))
+        result = method.read(Path(path), model, _image_size(camera))
         if name in (seen_fps or {}):
-            result = resampled(result, (seen_fps or {})[name], _clip_fps(rate, name))
+            result = resample_result(result, (seen_fps or {})[name], _clip_fps(rate, name))
         if result.world != "shared" and (camera is None or result.boxes is None):
             raise UsageError(
                 f"--method {item}",
@@ -138,7 +138,7 @@ def _clip_fps(fps: float | None, name: str) -> float:
     return fps
 
 
-def _picture(camera: Camera | None) -> tuple[int, int]:
+def _image_size(camera: Camera | None) -> tuple[int, int]:
     """Return width and height of the video [px]."""
     if camera is None:
         return RELEASE_SIZE
@@ -148,7 +148,7 @@ def _picture(camera: Camera | None) -> tuple[int, int]:
 
 def _boxes(result: MethodResult, camera: Camera | None) -> NDArray[np.float64] | None:
     """Return the method's boxes in the camera's image [px]."""
-    if result.boxes is None or camera is None or result.picture is None:
+    if result.boxes is None or camera is None or result.image_size is None:
         return result.boxes
-    width, height = np.array(_picture(camera)) / np.array(result.picture)
+    width, height = np.array(_image_size(camera)) / np.array(result.image_size)
     return np.asarray(result.boxes * np.array([width, height, width, height]))

@@ -43,7 +43,6 @@ ORDER_IN_WORLDPOSE = (
     "filtering",
     "redetection",
     "evaluation",
-    "baselines",
     "dataset",
     "reports",
     "simulation",

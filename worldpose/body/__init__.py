@@ -5,13 +5,16 @@ Input: `BodyParameters`, and the open body or an installed one. Output: world po
 gradients; only the latter needs torch.
 """
 
-from worldpose.body.body_file import OPEN_BODY, load_body, load_open_body, save_body
-from worldpose.body.installing import (
+from worldpose.body.body_file import (
     BODY_FOLDER,
+    OPEN_BODY,
     body_path,
     digest_of_body,
     find_body,
     install_body,
+    load_body,
+    load_open_body,
+    save_body,
 )
 from worldpose.body.keypoints import FoldedKeypoints, fold_keypoints, fold_regressor
 from worldpose.body.model import BodyModel

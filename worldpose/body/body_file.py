@@ -1,8 +1,14 @@
-"""Body models as npz files: arrays under SMPL's own keys and a name; never a pickle."""
+"""Body models as files: the open body, and the installation of a user's own such as SMPL.
+
+SMPL's licence forbids to ship it. Installed models are npz files with arrays under SMPL's own keys
+and a name, never pickles.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -12,8 +18,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.body.model import BodyModel
-from worldpose.errors import InputError
+from worldpose.body.model import POSE_FEATURES, SMPL_VERTICES, BodyModel
+from worldpose.errors import InputError, UsageError
+from worldpose.pickles import plain, read_notes
 
 OPEN_BODY: Final = "open-neutral/2"
 """The body that ships with worldpose: SMPL's layout, not SMPL (docs/body_model.md)."""
@@ -28,6 +35,11 @@ KEYS: Final = (
     "f",
 )
 """Names of a model's arrays in SMPL's files."""
+
+BODY_FOLDER: Final = Path("~/.local/share/worldpose/bodies")
+"""Default folder of installed bodies."""
+
+_NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]*")
 
 _SHAPES: Final = 10
 """Number of betas that are read, as in the released poses (X3)."""
@@ -44,8 +56,8 @@ def load_body(path: Path) -> BodyModel:
     Raises:
         InputError: the file is missing, damaged or no body model.
     """
-    arrays = read_arrays(path, (*KEYS, "name"))
-    return model_of(arrays, str(arrays["name"]), path)
+    arrays = read_npz_arrays(path, (*KEYS, "name"))
+    return _build_model(arrays, str(arrays["name"]), path)
 
 
 def save_body(path: Path, model: BodyModel) -> None:
@@ -69,7 +81,7 @@ def save_body(path: Path, model: BodyModel) -> None:
         partial.unlink(missing_ok=True)
 
 
-def read_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[np.generic]]:
+def read_npz_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[np.generic]]:
     """Return arrays of an npz file; Python objects in it are refused unread.
 
     Raises:
@@ -82,12 +94,46 @@ def read_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[np.gener
         with file:
             return {key: file[key] for key in keys}
     except KeyError as error:
-        raise unreadable(path, f"none named {error}") from None
+        missing = str(error.args[0]).removesuffix(" is not a file in the archive")
+        raise _body_file_error(path, f"no array named {missing}") from None
     except (OSError, EOFError, ValueError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
-        raise unreadable(path, f"what cannot be read ({error})") from None
+        raise _body_file_error(path, f"a file that cannot be read ({error})") from None
 
 
-def unreadable(path: Path, found: str) -> InputError:
+def read_pickled_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[np.generic]]:
+    """Return arrays of a pickled dictionary, dense even if the pickle holds sparse ones.
+
+    The function reads numpy's, scipy's and chumpy's arrays without running anything that the file
+    names (`worldpose.pickles`).
+
+    Raises:
+        InputError: the file cannot be read, names anything but arrays, or lacks a key.
+    """
+    try:
+        content = read_notes(path)
+    except OSError as error:
+        raise _body_file_error(path, f"a file that cannot be read ({error})") from None
+    except ValueError as error:
+        raise _body_file_error(path, f"a file that cannot be read as a pickle ({error})") from error
+    if not isinstance(content, dict):
+        raise _body_file_error(path, f"a pickled {type(content).__name__.strip('_').lower()}")
+    lacking = [key for key in keys if key not in content]
+    if lacking:
+        raise _body_file_error(path, f"no array named {', '.join(lacking)}")
+    arrays = {}
+    for key in keys:
+        try:
+            array = plain(content[key])
+        except (ValueError, MemoryError) as error:
+            reason = str(error) or type(error).__name__
+            raise _body_file_error(path, f"{key} that is not an array ({reason})") from None
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+            raise _body_file_error(path, f"{key} that is not an array of numbers")
+        arrays[key] = array
+    return arrays
+
+
+def _body_file_error(path: Path, found: str) -> InputError:
     """Return the error of a file that is not a body model."""
     return InputError(
         str(path),
@@ -97,7 +143,7 @@ def unreadable(path: Path, found: str) -> InputError:
     )
 
 
-def model_of(arrays: Mapping[str, NDArray[np.generic]], name: str, path: Path) -> BodyModel:
+def _build_model(arrays: Mapping[str, NDArray[np.generic]], name: str, path: Path) -> BodyModel:
     """Return the model of a file's arrays.
 
     Raises:
@@ -107,7 +153,7 @@ def model_of(arrays: Mapping[str, NDArray[np.generic]], name: str, path: Path) -
         dimensions = 3 if key in ("shapedirs", "posedirs") else 2
         kinds = "iu" if key in ("kintree_table", "f") else "fiu"
         if key in KEYS and (array.ndim != dimensions or array.dtype.kind not in kinds):
-            raise unreadable(path, f"{key} of shape {array.shape} and type {array.dtype}")
+            raise _body_file_error(path, f"{key} of shape {array.shape} and type {array.dtype}")
     parents = arrays["kintree_table"][:1].astype(np.int64).ravel()
     try:
         return BodyModel(
@@ -125,3 +171,80 @@ def model_of(arrays: Mapping[str, NDArray[np.generic]], name: str, path: Path) -
         raise InputError(
             f"{path}: {error.where}", expected=error.expected, found=error.found, todo=error.todo
         ) from None
+
+
+def install_body(file: Path, folder: Path = BODY_FOLDER, name: str | None = None) -> BodyModel:
+    """Return a model read from SMPL's own file, after saving it as a safe npz file.
+
+    Args:
+        file: SMPL's .pkl or .npz, as downloaded. Only its first 10 shape directions are used. The
+            pickle's content is read, never run (`read_pickled_arrays`).
+        folder: where `<name>.npz` is written; one of the same name is replaced.
+        name: name of the model in results; from the file's name by default, so that
+            SMPL_NEUTRAL.pkl becomes smpl-neutral.
+
+    Raises:
+        InputError: the file is not a body model in SMPL's layout, or names code to run.
+        UsageError: the name is invalid.
+    """
+    model_name = name or file.stem.lower().replace("_", "-")
+    if not _NAME.fullmatch(model_name):
+        raise UsageError(
+            f"name of the body model {model_name!r}",
+            expected="small letters, digits, dots and hyphens",
+            found=repr(model_name),
+            todo="Give another name with --name.",
+        )
+    reader = read_npz_arrays if zipfile.is_zipfile(file) else read_pickled_arrays
+    model = _build_model(reader(file, KEYS), model_name, file)
+    counts = len(model.template), model.pose_directions.shape[-1], model.shapes > 0
+    if counts != (SMPL_VERTICES, POSE_FEATURES, True):
+        raise InputError(
+            str(file),
+            expected=f"{SMPL_VERTICES} vertices, {POSE_FEATURES} pose and some shape directions",
+            found=f"{counts[0]}, {counts[1]} and {model.shapes}",
+            todo="Take SMPL's file, not that of SMPL-H, SMPL-X or another model.",
+        )
+    path = body_path(model_name, folder)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_body(path, model)
+    return load_body(path)
+
+
+def body_path(name: str, folder: Path = BODY_FOLDER) -> Path:
+    """Return the path of the installed model of that name."""
+    return folder.expanduser() / f"{name}.npz"
+
+
+def digest_of_body(name: str, folder: Path = BODY_FOLDER) -> str:
+    """Return the SHA-256 of an installed model's file.
+
+    Raises:
+        UsageError: no body of that name is installed.
+    """
+    return hashlib.sha256(_find_installed(name, folder).read_bytes()).hexdigest()
+
+
+def find_body(name: str = OPEN_BODY, folder: Path = BODY_FOLDER) -> BodyModel:
+    """Return the open body or an installed one.
+
+    Raises:
+        UsageError: no body of that name is installed.
+        InputError: its file is damaged.
+    """
+    if name == OPEN_BODY:
+        return load_open_body()
+    return load_body(_find_installed(name, folder))
+
+
+def _find_installed(name: str, folder: Path) -> Path:
+    path = body_path(name, folder)
+    if not _NAME.fullmatch(name) or not path.is_file():
+        installed = sorted(each.stem for each in folder.expanduser().glob("*.npz"))
+        raise UsageError(
+            f"body model {name!r}",
+            expected=f"one of {', '.join([OPEN_BODY, *installed])}",
+            found="none of that name",
+            todo="Install one with worldpose body install FILE, or take the open body.",
+        )
+    return path

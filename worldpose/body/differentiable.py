@@ -90,7 +90,7 @@ class DifferentiableBody:
     def _feature(self, betas: Tensor, local: Tensor, corrected: bool) -> Tensor:
         """Return the linear features of the unposed surface (..., 1 + shapes + pose features)."""
         batch = local.shape[:-3]
-        parts = [betas.new_ones((*batch, 1)), betas.expand(*batch, -1)]
+        parts = [betas.new_ones((*batch, 1)), betas.expand((*batch, -1))]
         if corrected:
             parts.append((local[..., 1:, :, :] - self._identity).flatten(-3))
         return torch.cat(parts, dim=-1)
@@ -105,9 +105,11 @@ class DifferentiableBody:
         batch = np.broadcast_shapes(
             betas.shape[:-1], global_orient.shape[:-1], body_pose.shape[:-1]
         )
-        angles = torch.cat([global_orient.expand(*batch, -1), body_pose.expand(*batch, -1)], dim=-1)
+        angles = torch.cat(
+            [global_orient.expand((*batch, -1)), body_pose.expand((*batch, -1))], dim=-1
+        )
         local = self._rotations(_split(angles, JOINTS, 3))
-        rest = shaped.expand(*batch, -1, -1)
+        rest = shaped.expand((*batch, -1, -1))
         rotations, joints = [local[..., 0, :, :]], [rest[..., 0, :]]
         for joint, parent in enumerate(self._parents[1:], start=1):
             bone = (rest[..., joint, :] - rest[..., parent, :])[..., None]
@@ -130,4 +132,4 @@ class DifferentiableBody:
 
 def _split(tensor: Tensor, *sizes: int) -> Tensor:
     """Return the tensor with its last dimension split."""
-    return tensor.reshape(*tensor.shape[:-1], *sizes)
+    return tensor.reshape((*tensor.shape[:-1], *sizes))

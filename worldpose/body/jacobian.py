@@ -106,9 +106,9 @@ class ChainedKeypoints:
                 "nakjf,njfd->nkajd", by_feature, own, optimize=True
             ).reshape(by_pose[..., 3:].shape)
         return KeypointJacobian(
-            keypoints.reshape(*batch, count, 3),
-            by_betas.reshape(*batch, count, 3, linear - 1),
-            by_pose.reshape(*batch, count, 3, 3 * JOINTS),
+            keypoints.reshape((*batch, count, 3)),
+            by_betas.reshape((*batch, count, 3, linear - 1)),
+            by_pose.reshape((*batch, count, 3, 3 * JOINTS)),
         )
 
     @cached_property

@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from worldpose.body.articulation import articulate
+from worldpose.body.model import articulate
 from worldpose.geometry.rigid import Rigid
 
 CHAIN = np.array([-1, 0, 1])

@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 
 from worldpose.body import OPEN_BODY, find_body, load_body, save_body
-from worldpose.body.body_file import KEYS, read_arrays
+from worldpose.body.body_file import KEYS, read_npz_arrays
 from worldpose.errors import InputError, UsageError
 
 
 def rewritten(path, body, **changes):
     """The body's file with some arrays changed or, where None, left out."""
     save_body(path, body)
-    arrays = {**read_arrays(path, (*KEYS, "name")), **changes}
+    arrays = {**read_npz_arrays(path, (*KEYS, "name")), **changes}
     np.savez(path, **{key: array for key, array in arrays.items() if array is not None})
     return path
 
@@ -53,8 +53,8 @@ def test_only_ten_shapes_are_read(tmp_path, open_body):
 @pytest.mark.parametrize(
     ("changes", "found"),
     [
-        ({"weights": None}, "none named 'weights"),
-        ({"name": None}, "none named 'name"),
+        ({"weights": None}, "no array named weights"),
+        ({"name": None}, "no array named name"),
         ({"weights": np.zeros((24, 6890))}, "weights"),
         ({"weights": np.zeros(6890)}, "weights of shape"),
         ({"v_template": np.array([["text"]])}, "v_template of shape"),

@@ -8,7 +8,7 @@ import pytest
 from smpl_pickles import pickled, smpl_like
 
 from worldpose.body import BodyParameters, find_body, install_body
-from worldpose.body.body_file import KEYS, read_arrays, save_body
+from worldpose.body.body_file import KEYS, read_npz_arrays, save_body
 from worldpose.errors import InputError, UsageError
 
 
@@ -19,7 +19,7 @@ def arrays(open_body, tmp_path_factory):
     directions[::7, :, ::5] = 0.001
     path = tmp_path_factory.mktemp("arrays") / "body.npz"
     save_body(path, replace(open_body, pose_directions=directions))
-    return read_arrays(path, KEYS)
+    return read_npz_arrays(path, KEYS)
 
 
 @pytest.fixture(scope="module")

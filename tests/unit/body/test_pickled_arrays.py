@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from smpl_pickles import Ch, Select, pickled
 
-from worldpose.body.pickled_arrays import read_pickled_arrays
+from worldpose.body.body_file import read_pickled_arrays
 from worldpose.errors import InputError
 
 NUMBERS = np.arange(12.0).reshape(3, 4)

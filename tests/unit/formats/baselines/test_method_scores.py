@@ -22,11 +22,11 @@ from typer.testing import CliRunner
 
 from flows.cli.app import app
 from flows.results.baselines import score_methods
-from worldpose.baselines import METHODS
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation.method_table import table_csv, table_latex, table_rows
 from worldpose.evaluation.selected_joints import paper_joints
 from worldpose.formats import JointTracks, write_joints, write_moving_camera
+from worldpose.formats.baselines import METHODS
 
 LOCAL, ALONE = ("hybrik", "4dhumans"), ("wham", "gvhmr")
 NOT_SEEN = "smpl"

@@ -11,21 +11,49 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from worldpose.baselines.pickled import FILE_BYTES
 from worldpose.errors import InputError
+from worldpose.pickles import FILE_BYTES, plain, read_notes
 
 
-def wrong(where: object, expected: str, found: str) -> InputError:
+def format_error(where: object, expected: str, found: str) -> InputError:
     """Return the error about one place of a method's file."""
     return InputError(
         str(where),
         expected=expected,
         found=found,
-        todo="Take the file that the method's own code wrote, or name another method.",
+        todo="Give the file that the method's own code wrote, or name another method.",
     )
 
 
-def part(where: str, content: object, *keys: object) -> Any:  # noqa: ANN401
+def read_pickled(path: Path) -> Any:  # noqa: ANN401
+    """Return the content of a file: dictionaries, lists, numbers, text and arrays.
+
+    `worldpose.pickles` reads pickles, also of joblib, numpy and torch, and runs nothing in them.
+
+    Raises:
+        InputError: the file is not readable, or names classes that no result needs.
+    """
+    try:
+        found = plain(read_notes(path))
+        if not isinstance(found, dict | list | np.ndarray):
+            raise ValueError(f"a {type(found).__name__}")
+        return found
+    except OSError as error:
+        raise _reading_error(path, f"a file that cannot be read ({error})") from None
+    except ValueError as error:
+        raise _reading_error(path, f"a file that cannot be read as such ({error})") from error
+
+
+def _reading_error(path: Path, found: str) -> InputError:
+    return InputError(
+        str(path),
+        expected="results of a method: arrays in a pickle, joblib, numpy or torch file",
+        found=found,
+        todo="Give the file that the method's own code wrote. Nothing in this file was run.",
+    )
+
+
+def get_part(where: str, content: object, *keys: object) -> Any:  # noqa: ANN401
     """Return the value at a path of keys in nested dictionaries.
 
     Raises:
@@ -34,7 +62,7 @@ def part(where: str, content: object, *keys: object) -> Any:  # noqa: ANN401
     for key in keys:
         if not isinstance(content, Mapping) or key not in content:
             known = ", ".join(map(str, list(content)[:8])) if isinstance(content, Mapping) else ""
-            raise wrong(where, f"{key}", known or f"a {type(content).__name__}")
+            raise format_error(where, f"{key}", known or f"a {type(content).__name__}")
         content = content[key]
         where = f"{where}: {key}"
     return content
@@ -49,7 +77,7 @@ def as_floats(where: str, value: object) -> Floats:
     try:
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise wrong(where, "numbers", f"a {type(value).__name__}") from None
+        raise format_error(where, "numbers", f"a {type(value).__name__}") from None
 
 
 def floats(where: str, value: object, shape: tuple[int | None, ...]) -> Floats:
@@ -72,11 +100,11 @@ def floats(where: str, value: object, shape: tuple[int | None, ...]) -> Floats:
         array = array.squeeze(lone)
     if not _fits(array.shape, shape):
         wanted = ", ".join("any" if n is None else str(n) for n in shape)
-        raise wrong(where, f"numbers of shape ({wanted})", f"{array.shape}")
+        raise format_error(where, f"numbers of shape ({wanted})", f"{array.shape}")
     return array
 
 
-def whole(where: str, value: object, count: int | None = None) -> NDArray[np.int64]:
+def integers(where: str, value: object, count: int | None = None) -> NDArray[np.int64]:
     """Return integers (count,), such as frames.
 
     Raises:
@@ -84,11 +112,11 @@ def whole(where: str, value: object, count: int | None = None) -> NDArray[np.int
     """
     array = floats(where, value, (count,))
     if not np.array_equal(array, np.round(array)):
-        raise wrong(where, "whole numbers", f"{array[:4]}")
+        raise format_error(where, "whole numbers", f"{array[:4]}")
     return array.astype(np.int64)
 
 
-def number(where: str, value: object) -> int:
+def integer(where: str, value: object) -> int:
     """Return one integer, also if written as text.
 
     Raises:
@@ -96,18 +124,18 @@ def number(where: str, value: object) -> int:
     """
     found = floats(where, value, ())
     if not np.isfinite(found) or found != np.round(found) or abs(found) > 2**53:
-        raise wrong(where, "a whole number", f"{value}")
+        raise format_error(where, "a whole number", f"{value}")
     return int(found)
 
 
-def rising(where: str, frames: NDArray[np.int64]) -> NDArray[np.int64]:
+def require_ascending(where: str, frames: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return frames after checking that they ascend.
 
     Raises:
         InputError: they do not ascend, or are negative.
     """
     if np.any(np.diff(frames) <= 0) or np.any(frames < 0):
-        raise wrong(where, "frames that rise from 0", f"{frames[:8]}")
+        raise format_error(where, "frames that rise from 0", f"{frames[:8]}")
     return frames
 
 
@@ -121,13 +149,13 @@ def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
         with zipfile.ZipFile(path) as file:
             size = sum(file.getinfo(f"{name}.npy").file_size for name in names)
         if size > FILE_BYTES:
-            raise wrong(path, f"at most {FILE_BYTES} bytes of arrays", f"{size}")
+            raise format_error(path, f"at most {FILE_BYTES} bytes of arrays", f"{size}")
         with np.load(path, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in names}
     except KeyError as error:
-        raise wrong(path, f"the arrays {', '.join(names)}", str(error.args[0])) from None
+        raise format_error(path, f"the arrays {', '.join(names)}", str(error.args[0])) from None
     except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise wrong(path, "a whole npz file", str(error)) from None
+        raise format_error(path, "a whole npz file", str(error)) from None
 
 
 def _fits(found: object, shape: tuple[int | None, ...]) -> bool:

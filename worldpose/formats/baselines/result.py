@@ -1,9 +1,9 @@
-"""Result of a baseline method for a clip, independent of its file format."""
+"""Result of a baseline method for a clip, independent of its file format and frame rate."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -38,7 +38,7 @@ class MethodResult:
     world: World
     boxes: Floats | None = None
     """(frames, persons, 4) x0 y0 x1 y1 [px] in the image; None if the file has none."""
-    picture: tuple[float, float] | None = None
+    image_size: tuple[float, float] | None = None
     """Width and height of the image that the boxes refer to [px]; None = that of the video."""
     notes: Mapping[str, str] = field(default_factory=dict)
     """Processing beyond reading, for the settings that are recorded with a score."""
@@ -62,7 +62,7 @@ class Track:
     """(frames,) scale factor of the body about its pelvis; None = 1."""
 
 
-def posed(
+def pose_track(
     track: Track, model: BodyModel, shape: Shape, place: Place = "transl"
 ) -> tuple[Floats, str]:
     """Return the joints (frames, 17, 3) [m] of one person, and the source of its shape.
@@ -104,7 +104,7 @@ def posed(
     return joints, "the file's betas" if used else f"the mean shape of {model.name}"
 
 
-def gathered(
+def merge_people(
     people: Sequence[tuple[int, NDArray[np.int64], Floats]],
     boxes: Sequence[Floats | None] | None = None,
 ) -> tuple[JointTracks, Floats | None]:
@@ -121,8 +121,8 @@ def gathered(
         raise InputError(
             "results of a method",
             expected="at least one person",
-            found="none",
-            todo="Run it again.",
+            found="no people",
+            todo="Check that this is the result for the clip, or run the method again.",
         )
     frames = np.unique(np.concatenate([own for _, own, _ in people]))
     joints = np.full((len(frames), len(people), len(COCO17), 3), np.nan)
@@ -137,7 +137,7 @@ def gathered(
     return JointTracks(frames, ids, joints), around if known else None
 
 
-def seen_boxes(joints: Floats, focal: Floats, center: Floats) -> Floats:
+def project_boxes(joints: Floats, focal: Floats, center: Floats) -> Floats:
     """Return boxes (frames, 4) x0 y0 x1 y1 [px] around one person's joints in an image.
 
     Args:
@@ -149,10 +149,10 @@ def seen_boxes(joints: Floats, focal: Floats, center: Floats) -> Floats:
     depth = np.where(ahead, joints[..., 2:], np.nan)
     focal, center = (np.broadcast_to(v, (len(joints), 2))[:, None] for v in (focal, center))
     pixels = joints[..., :2] / depth * focal + center
-    return around_points(pixels)
+    return boxes_around(pixels)
 
 
-def around_points(pixels: Floats) -> Floats:
+def boxes_around(pixels: Floats) -> Floats:
     """Return boxes (..., 4) around points (..., n, 2) [px]; NaN without any."""
     known = np.isfinite(pixels).all(-1, keepdims=True)
     low = np.where(known, pixels, np.inf).min(-2)
@@ -165,3 +165,50 @@ def rotation_vectors(matrices: Any) -> Floats:  # noqa: ANN401
     """Convert a file's rotation matrices (..., 3, 3) to rotation vectors (..., 3) [rad]."""
     array = np.asarray(matrices, dtype=np.float64)
     return Rigid(array, np.zeros(array.shape[:-1])).rotvec
+
+
+def resample_result(result: MethodResult, seen_fps: float, fps: float) -> MethodResult:
+    """Return a result at the frames of a clip, with linear interpolation of joints and boxes.
+
+    The first images of both are simultaneous. If a person is missing in one of the two images
+    around a frame, the person is missing in the frame, too.
+
+    Args:
+        result: its frames count the images of the method's input.
+        seen_fps: frame rate of those images [1/s].
+        fps: frame rate of the clip [1/s].
+    """
+    if seen_fps == fps or not len(result.joints.frames):
+        return result
+    own = result.joints.frames
+    # A rounding error must not drop the last frame.
+    first = int(np.ceil(own[0] * fps / seen_fps - 1e-6))
+    last = int(np.floor(own[-1] * fps / seen_fps + 1e-6))
+    frames = np.arange(first, last + 1)
+    places = np.clip(frames * seen_fps / fps, own[0], own[-1])
+    joints = _interpolate(result.joints.joints, own, places)
+    boxes = None if result.boxes is None else _interpolate(result.boxes, own, places)
+    note = f"from {seen_fps:g} to {fps:g} images per second, by linear interpolation"
+    return replace(
+        result,
+        joints=JointTracks(frames, result.joints.person_ids, joints),
+        boxes=boxes,
+        notes={**result.notes, "resampled": note},
+    )
+
+
+def _interpolate(values: Floats, own: NDArray[np.int64], places: Floats) -> Floats:
+    """Interpolate values (images, ...) at positions [images]; NaN if a neighbour is missing."""
+    before = np.floor(places + 1e-6).astype(np.int64)
+    share = np.clip(places - before, 0.0, 1.0)
+    share[share < 1e-6] = 0.0
+    one, two = (_take_rows(values, own, number) for number in (before, before + (share > 0.0)))
+    weight = share.reshape(-1, *(1,) * (values.ndim - 1))
+    return np.asarray((1.0 - weight) * one + weight * two)
+
+
+def _take_rows(values: Floats, own: NDArray[np.int64], wanted: NDArray[np.int64]) -> Floats:
+    rows = np.minimum(np.searchsorted(own, wanted), len(own) - 1)
+    found = values[rows]
+    found[own[rows] != wanted] = np.nan
+    return found

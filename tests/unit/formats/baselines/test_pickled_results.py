@@ -10,9 +10,8 @@ import joblib
 import numpy as np
 import pytest
 
-from worldpose.baselines import read_pickled
-from worldpose.baselines.fields import as_floats, number
 from worldpose.errors import InputError
+from worldpose.formats.baselines.fields import as_floats, integer, read_pickled
 
 rng = np.random.default_rng(0)
 CONTENT = {
@@ -136,7 +135,7 @@ def test_shared_parts_do_not_grow_and_circles_are_refused(tmp_path):
     circle = []
     circle.append(circle)
     (tmp_path / "b.pkl").write_bytes(pickle.dumps(circle))
-    with pytest.raises(InputError, match="holds itself"):
+    with pytest.raises(InputError, match="contains itself"):
         read_pickled(tmp_path / "b.pkl")
 
 
@@ -160,13 +159,13 @@ def test_tensor_beyond_its_storage_is_refused(tmp_path):
 
 @pytest.mark.parametrize(("text", "value"), [("7", 7), (np.int64(3), 3), ([4.0], 4)])
 def test_one_whole_number_is_read_however_it_is_written(text, value):
-    assert number("a: person", text) == value
+    assert integer("a: person", text) == value
 
 
 @pytest.mark.parametrize("text", ["player", 0.5, float("nan"), "1e300", None, [1, 2], {}])
 def test_what_is_no_whole_number_is_refused_with_its_place(text):
     with pytest.raises(InputError, match="a: person"):
-        number("a: person", text)
+        integer("a: person", text)
 
 
 def test_too_little_memory_is_no_fault_of_the_file(tmp_path, monkeypatch):
@@ -175,7 +174,7 @@ def test_too_little_memory_is_no_fault_of_the_file(tmp_path, monkeypatch):
     def full(*_):
         raise MemoryError
 
-    monkeypatch.setattr("worldpose.baselines.pickled.plain", full)
+    monkeypatch.setattr("worldpose.formats.baselines.fields.plain", full)
     with pytest.raises(MemoryError):
         read_pickled(tmp_path / "a.pkl")
 

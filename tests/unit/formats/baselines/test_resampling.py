@@ -6,10 +6,10 @@ from method_files import FRAMES, WRITERS, scene, truth_of
 
 from flows.cli.methods import named_rates
 from flows.results.baselines import score_methods
-from worldpose.baselines import MethodResult, resampled
 from worldpose.body import BodyParameters
 from worldpose.errors import UsageError
 from worldpose.formats import JointTracks, write_joints, write_moving_camera
+from worldpose.formats.baselines import MethodResult, resample_result
 
 
 def straight(frames, speed, persons=1):
@@ -24,7 +24,7 @@ def straight(frames, speed, persons=1):
     ("seen", "fps"), [(30.0, 50.0), (50.0, 30.0), (25.0, 50.0), (29.97, 59.94)]
 )
 def test_straight_motion_stays_what_it_is(seen, fps):
-    found = resampled(straight(np.arange(31), 1.0 / seen), seen, fps)
+    found = resample_result(straight(np.arange(31), 1.0 / seen), seen, fps)
     frames = found.joints.frames
     assert (frames[0], frames[-1]) == (0, int(np.floor(30 * fps / seen + 1e-6)))
     np.testing.assert_array_equal(np.diff(frames), 1)
@@ -35,12 +35,12 @@ def test_straight_motion_stays_what_it_is(seen, fps):
 
 def test_the_same_rate_changes_nothing():
     result = straight(np.arange(4), 1.0)
-    assert resampled(result, 50.0, 50.0) is result
+    assert resample_result(result, 50.0, 50.0) is result
 
 
 def test_a_gap_stays_a_gap_and_its_edges_are_not_drawn_out():
     result = straight([3, 4, 7, 8], 1.0)
-    found = resampled(result, 25.0, 50.0)
+    found = resample_result(result, 25.0, 50.0)
     known = found.joints.frames[np.isfinite(found.joints.joints[:, 0, 0, 0])]
     assert known.tolist() == [6, 7, 8, 14, 15, 16]
 
@@ -48,7 +48,7 @@ def test_a_gap_stays_a_gap_and_its_edges_are_not_drawn_out():
 def test_a_person_who_is_missing_in_one_of_two_pictures_is_missing_between_them():
     result = straight(np.arange(3), 1.0, persons=2)
     result.joints.joints[1, 1] = np.nan
-    found = resampled(result, 25.0, 50.0)
+    found = resample_result(result, 25.0, 50.0)
     there = np.isfinite(found.joints.joints[:, :, 0, 0])
     np.testing.assert_array_equal(there[:, 0], True)
     np.testing.assert_array_equal(there[:, 1], [True, False, False, False, True])
@@ -70,7 +70,7 @@ def test_a_file_of_every_second_picture_scores_as_one_of_all(tmp_path):
     (score,) = score_methods([f"smpl={path}"], str(tmp_path), fps=50.0, seen_fps={"smpl": 25.0})
     # All but the last frame, which lies behind the last picture of the half.
     assert score.evaluation.g_mpjpe_mm == pytest.approx(0.0, abs=0.01)
-    assert score.notes["resampled"] == "from 25 to 50 pictures a second, on straight lines"
+    assert score.notes["resampled"] == "from 25 to 50 images per second, by linear interpolation"
     with pytest.raises(UsageError, match="--method-fps tram"):
         score_methods([f"smpl={path}"], str(tmp_path), fps=50.0, seen_fps={"tram": 25.0})
     with pytest.raises(UsageError, match="--fps"):

@@ -1,4 +1,8 @@
-"""Supported baseline methods, with their names in the paper."""
+"""Baseline methods: readers for the results of other methods on a clip.
+
+Inputs: the files that a method's own code wrote, and the body model for its poses. Outputs:
+    `MethodResult`: joints, their world frame, boxes in the image.
+"""
 
 from __future__ import annotations
 
@@ -7,18 +11,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from worldpose.baselines.glamr import read_glamr
-from worldpose.baselines.gvhmr import read_gvhmr
-from worldpose.baselines.humans4d import read_humans4d
-from worldpose.baselines.hybrik import read_hybrik
-from worldpose.baselines.prompthmr import read_prompthmr
-from worldpose.baselines.result import MethodResult
-from worldpose.baselines.slahmr import WITH_MOTION_PRIOR, WITHOUT_MOTION_PRIOR, slahmr_reader
-from worldpose.baselines.smpl_file import read_smpl
-from worldpose.baselines.tram import read_tram
-from worldpose.baselines.wham import read_wham
 from worldpose.body import BodyModel
 from worldpose.errors import UsageError
+from worldpose.formats.baselines.camera_methods import read_humans4d, read_hybrik
+from worldpose.formats.baselines.result import MethodResult, resample_result
+from worldpose.formats.baselines.slahmr import (
+    WITH_MOTION_PRIOR,
+    WITHOUT_MOTION_PRIOR,
+    make_slahmr_reader,
+)
+from worldpose.formats.baselines.world_methods import (
+    read_glamr,
+    read_gvhmr,
+    read_prompthmr,
+    read_smpl,
+    read_tram,
+    read_wham,
+)
+
+__all__ = ["METHODS", "Method", "MethodResult", "find_method", "resample_result"]
 
 
 @dataclass(frozen=True)
@@ -39,9 +50,11 @@ METHODS: Final = {
         Method("hybrik", "HybrIK", read_hybrik),
         Method("4dhumans", "4DHumans", read_humans4d),
         Method("glamr", "GLAMR", read_glamr),
-        Method("slahmr", "SLAHMR", slahmr_reader(WITH_MOTION_PRIOR)),
-        Method("slahmr-true-cameras", "SLAHMR w/ GT cameras", slahmr_reader(WITH_MOTION_PRIOR)),
-        Method("slahmr-no-humor", "SLAHMR w/o HuMoR", slahmr_reader(WITHOUT_MOTION_PRIOR)),
+        Method("slahmr", "SLAHMR", make_slahmr_reader(WITH_MOTION_PRIOR)),
+        Method(
+            "slahmr-true-cameras", "SLAHMR w/ GT cameras", make_slahmr_reader(WITH_MOTION_PRIOR)
+        ),
+        Method("slahmr-no-humor", "SLAHMR w/o HuMoR", make_slahmr_reader(WITHOUT_MOTION_PRIOR)),
         Method("wham", "WHAM", read_wham),
         Method("gvhmr", "GVHMR", read_gvhmr),
         Method("tram", "TRAM", read_tram),

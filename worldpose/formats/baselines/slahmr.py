@@ -2,7 +2,7 @@
 
 Layout as written by vye16/slahmr at commit 58518fe, slahmr/run_opt.py, slahmr/optim/optimizers.py
 (`save_results`), slahmr/optim/output.py and slahmr/optim/moving_scene.py: in each run's folder
-`track_info.json` with the tracks' `index` and `vis_mask` and the intervals of pictures, and for
+`track_info.json` with the tracks' `index` and `vis_mask` and the intervals of images, and for
 each phase `<phase>/<clip>_<iteration>_world_results.npz` with SMPL+H `root_orient` (B, T, 3),
 `pose_body` (B, T, 63), `trans` (B, T, 3), and `cam_R` (B, T, 3, 3), `cam_t` (B, T, 3) of
 x_cam = R x_world + t; `<clip>_cameras_<iteration>.json` has `intrinsics` (T, 4) fx fy cx cy px.
@@ -22,9 +22,22 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.baselines.fields import floats, number, part, read_arrays, whole, wrong
-from worldpose.baselines.result import MethodResult, Track, gathered, posed, seen_boxes
 from worldpose.body import BodyModel
+from worldpose.formats.baselines.fields import (
+    floats,
+    format_error,
+    get_part,
+    integer,
+    integers,
+    read_arrays,
+)
+from worldpose.formats.baselines.result import (
+    MethodResult,
+    Track,
+    merge_people,
+    pose_track,
+    project_boxes,
+)
 
 WITH_MOTION_PRIOR: Final = "motion_chunks"
 """Phase with the final results."""
@@ -35,7 +48,7 @@ _ARRAYS: Final = ("root_orient", "pose_body", "trans", "cam_R", "cam_t")
 _Piece = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
 
 
-def slahmr_reader(phase: str) -> Callable[[Path, BodyModel, tuple[int, int]], MethodResult]:
+def make_slahmr_reader(phase: str) -> Callable[[Path, BodyModel, tuple[int, int]], MethodResult]:
     """Return a reader for the results of one phase."""
 
     def read(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
@@ -60,7 +73,7 @@ def read_slahmr(path: Path, model: BodyModel, phase: str) -> MethodResult:
         key=lambda run: run[0],
     )
     if not runs:
-        raise wrong(path, "track_info.json of a run", "none")
+        raise format_error(path, "track_info.json of a run", "no such file")
     pieces: dict[int, list[_Piece]] = {}
     last = None
     for _, people, centers, _ in runs:
@@ -75,7 +88,7 @@ def read_slahmr(path: Path, model: BodyModel, phase: str) -> MethodResult:
         frames, first = np.unique(frames, return_index=True)
         found.append((person, frames, joints[first]))
         around.append(boxes[first])
-    tracks, known = gathered(found, around)
+    tracks, known = merge_people(found, around)
     notes = {"shape": runs[-1][3], "phase": phase, "pieces": str(len(runs))}
     return MethodResult(tracks, "shared", known, notes=notes)
 
@@ -88,10 +101,10 @@ def _read_run(
     try:
         content: Any = json.loads(info.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
-        raise wrong(where, "JSON", str(error)) from None
+        raise format_error(where, "JSON", str(error)) from None
     files = sorted((info.parent / phase).glob("*_world_results.npz"))
     if not files:
-        raise wrong(info.parent / phase, "<clip>_<iteration>_world_results.npz", "none")
+        raise format_error(info.parent / phase, "<clip>_<iteration>_world_results.npz", "none")
     arrays = read_arrays(files[-1], _ARRAYS)
     place = floats(f"{files[-1]}: trans", arrays["trans"], (None, None, 3))
     count, length = place.shape[:2]
@@ -104,42 +117,42 @@ def _read_run(
             ("cam_t", (3,)),
         )
     )
-    focal, center = _intrinsics(files[-1], length)
-    begin = int(whole(where, part(where, content, "meta", "data_interval"), 2)[0])
-    start = int(whole(where, part(where, content, "meta", "seq_interval"), 2)[0])
+    focal, center = _read_intrinsics(files[-1], length)
+    begin = int(integers(where, get_part(where, content, "meta", "data_interval"), 2)[0])
+    start = int(integers(where, get_part(where, content, "meta", "seq_interval"), 2)[0])
     people: dict[int, _Piece] = {}
     used = ""
-    for name, track in part(where, content, "tracks").items():
-        row = number(where, part(where, track, "index"))
-        mask = floats(where, part(where, track, "vis_mask"), (None,)) > 0.5
+    for name, track in get_part(where, content, "tracks").items():
+        row = integer(where, get_part(where, track, "index"))
+        mask = floats(where, get_part(where, track, "vis_mask"), (None,)) > 0.5
         if not mask.any():
             continue
         if row >= count:
-            raise wrong(where, f"tracks below {count}, as the results have", f"{row}")
+            raise format_error(where, f"tracks below {count}, as the results have", f"{row}")
         # A track lasts from the first to the last image with a person, visible or not.
         seen = np.flatnonzero(mask) - start
         rows = np.arange(seen[0], min(seen[-1] + 1, length))
-        joints, used = posed(
+        joints, used = pose_track(
             Track(rows, turns[row, rows], pose[row, rows], place[row, rows]), model, "other"
         )
         relative = np.einsum("fab,fjb->fja", camera[row, rows], joints) + shift[row, rows, None]
-        boxes = seen_boxes(relative, focal[rows], center[rows])
-        people[number(where, name)] = (begin + start + rows, joints, boxes)
+        boxes = project_boxes(relative, focal[rows], center[rows])
+        people[integer(where, name)] = (begin + start + rows, joints, boxes)
     centers = -np.einsum("fba,fb->fa", camera[0], shift[0])
     return begin + start, people, centers, used
 
 
-def _intrinsics(results: Path, length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _read_intrinsics(results: Path, length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return focal lengths and principal points (images, 2) [px] for a results file."""
     iteration = results.name.split("_")[-3]
     files = sorted(results.parent.glob(f"*_cameras_{iteration}.json"))
     if not files:
-        raise wrong(results.parent, f"<clip>_cameras_{iteration}.json", "none")
+        raise format_error(results.parent, f"<clip>_cameras_{iteration}.json", "none")
     try:
         rows = json.loads(files[0].read_bytes())["intrinsics"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise wrong(files[0], "intrinsics in JSON", f"{error!r}") from None
+        raise format_error(files[0], "intrinsics in JSON", f"{error!r}") from None
     numbers = floats(f"{files[0]}: intrinsics", rows, (None, 4))
     if len(numbers) < length:
-        raise wrong(files[0], f"intrinsics of {length} pictures", f"{len(numbers)}")
+        raise format_error(files[0], f"intrinsics of {length} images", f"{len(numbers)}")
     return numbers[:length, :2], numbers[:length, 2:]

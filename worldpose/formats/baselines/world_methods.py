@@ -1,0 +1,302 @@
+"""Methods with poses in a world: GLAMR, WHAM, GVHMR, TRAM, PromptHMR, and the release's own layout.
+
+Each docstring states the layout as written by the method's own code at that commit.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from worldpose.body import OPEN_BODY, BodyModel
+from worldpose.formats.baselines.fields import (
+    floats,
+    format_error,
+    get_part,
+    integer,
+    integers,
+    read_pickled,
+    require_ascending,
+)
+from worldpose.formats.baselines.result import (
+    MethodResult,
+    Track,
+    boxes_around,
+    merge_people,
+    pose_track,
+    project_boxes,
+    rotation_vectors,
+)
+from worldpose.formats.pose_file import read_poses
+
+
+def read_glamr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
+    """Return the people of GLAMR's result, in the frames that contain them.
+
+    GLAMR: `grecon/<clip>_seed<n>.pkl`, a pickle of arrays by person, all in one world.
+
+    Layout as written by NVlabs/GLAMR at commit 44f820c, global_recon/run_demo.py and
+    global_recon/models/global_recon_model.py (`init_data`, `optimize`): `person_data[id]` with
+    `smpl_orient_world` (T, 3), `smpl_pose` (T, 69), `smpl_beta`, `root_trans_world` (T, 3),
+    where the pelvis is, `scale` or None, `exist_frames` (T,) and `kp_2d` (T, 26, 2) px, 0 where
+    there is none.
+
+    Args:
+        path: the pickle.
+        model: body model to pose.
+
+    Raises:
+        InputError: the file has another format.
+    """
+    people, boxes, used = [], [], ""
+    for name, person in get_part(str(path), read_pickled(path), "person_data").items():
+        where = f"{path}: person {name}"
+        exists = floats(where, get_part(where, person, "exist_frames"), (None,)) > 0.5
+        count = len(exists)
+
+        def numbers(key: str, *shape: int | None, data: object = person) -> np.ndarray:
+            return floats(f"{path}: {key}", get_part(str(path), data, key), shape)
+
+        scale = None if get_part(where, person, "scale") is None else numbers("scale", count)
+        track = Track(
+            frames=np.flatnonzero(exists),
+            global_orient=numbers("smpl_orient_world", count, 3)[exists],
+            body_pose=numbers("smpl_pose", count, 69)[exists],
+            place=numbers("root_trans_world", count, 3)[exists],
+            betas=numbers("smpl_beta", count, None)[exists],
+            scale=None if scale is None else scale[exists],
+        )
+        joints, used = pose_track(track, model, "smpl", "pelvis")
+        points = numbers("kp_2d", count, None, 2)[exists]
+        # Joints that HybrIK lacks, and people in frames without an image of them, are zeros.
+        points = np.where((points == 0.0).all(-1, keepdims=True), np.nan, points)
+        people.append((integer(where, name), track.frames, joints))
+        boxes.append(boxes_around(points))
+    tracks, around = merge_people(people, boxes)
+    return MethodResult(tracks, "shared", around, notes={"shape": used})
+
+
+def read_wham(path: Path, model: BodyModel, image_size: tuple[int, int]) -> MethodResult:
+    """Return the people of WHAM's result.
+
+    WHAM: `wham_output.pkl`, joblib's file by person, each in its own world.
+
+    Layout as written by yohanshin/WHAM at commit 2b54f77, demo.py: `pose_world` and `pose` (n,
+    72), `trans_world` and `trans` (n, 3), `betas` (n, 10), `frame_ids` (n,). `trans_world` is
+    the mid-hip (lib/models/smpl.py, `get_output`), `trans` is SMPL's own in camera axes; the
+    focal length is the image diagonal (lib/vis/run_vis.py). Every trajectory begins at its own
+    origin, so only scores of single people are meaningful.
+
+    Args:
+        path: joblib's file.
+        model: body model to pose.
+        image_size: width and height of the video [px], which determine the focal length.
+
+    Raises:
+        InputError: the file has another format.
+    """
+    content = read_pickled(path)
+    if not isinstance(content, dict):
+        raise format_error(path, "a dictionary by person", f"a {type(content).__name__}")
+    size = np.array(image_size, dtype=np.float64)
+    people, boxes, used = [], [], ""
+    for name, person in content.items():
+        where = f"{path}: person {name}"
+        frames = require_ascending(where, integers(where, get_part(where, person, "frame_ids")))
+        count = len(frames)
+
+        def track(suffix: str, data: object = person, own: np.ndarray = frames) -> Track:
+            pose, place, betas = (
+                floats(f"{path}: {key}", get_part(str(path), data, key), (len(own), length))
+                for key, length in ((f"pose{suffix}", 72), (f"trans{suffix}", 3), ("betas", None))
+            )
+            return Track(own, pose[:, :3], pose[:, 3:], place, betas)
+
+        joints, used = pose_track(track("_world"), model, "smpl", "mid_hip")
+        seen = pose_track(track(""), model, "smpl")[0]
+        focal = np.full(2, np.linalg.norm(size))
+        people.append((integer(where, name), frames, joints))
+        boxes.append(project_boxes(seen, focal, size / 2.0) if count else None)
+    tracks, around = merge_people(people, boxes)
+    return MethodResult(tracks, "own", around, notes={"shape": used})
+
+
+def read_gvhmr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
+    """Return the people of GVHMR's results, one for each file in order of their names.
+
+    GVHMR: `hmr4d_results.pt`, torch's file of one person; a folder of such files for several.
+
+    Layout as written by zju3dv/GVHMR at commit 44fbc19, tools/demo/demo.py and
+    hmr4d/model/gvhmr/gvhmr_pl_demo.py: `smpl_params_global` and `smpl_params_incam`, SMPL-X
+    with `global_orient` (T, 3), `body_pose` (T, 63), `transl` (T, 3) and `betas` (T, 10), and
+    `K_fullimg` (T, 3, 3) px. The method follows one person through the whole video, in a world
+    that begins at that person.
+
+    Args:
+        path: a file, or a folder with one file per person at any depth.
+        model: body model to pose.
+
+    Raises:
+        InputError: it is neither.
+    """
+    files = [path] if path.is_file() else sorted(path.rglob("*.pt"))
+    # The method keeps other torch files in preprocess/.
+    files = [file for file in files if file.parent.name != "preprocess"]
+    if not files:
+        raise format_error(path, "hmr4d_results.pt, or a folder of such files", "none")
+    people, boxes, used = [], [], ""
+    for person, file in enumerate(files):
+        content = read_pickled(file)
+        world, seen = (
+            _read_gvhmr_track(file, get_part(str(file), content, f"smpl_params_{name}"))
+            for name in ("global", "incam")
+        )
+        intrinsics = floats(
+            f"{file}: K_fullimg",
+            get_part(str(file), content, "K_fullimg"),
+            (len(seen.frames), 3, 3),
+        )
+        joints, used = pose_track(world, model, "other")
+        in_camera = pose_track(seen, model, "other")[0]
+        people.append((person, world.frames, joints))
+        boxes.append(project_boxes(in_camera, intrinsics[:, (0, 1), (0, 1)], intrinsics[:, :2, 2]))
+    tracks, around = merge_people(people, boxes)
+    return MethodResult(tracks, "own", around, notes={"shape": used})
+
+
+def _read_gvhmr_track(file: Path, parameters: object) -> Track:
+    where = str(file)
+    place = floats(where, get_part(where, parameters, "transl"), (None, 3))
+    turns, angles = (
+        floats(f"{file}: {key}", get_part(where, parameters, key), (len(place), length))
+        for key, length in (("global_orient", 3), ("body_pose", 63))
+    )
+    return Track(np.arange(len(place)), turns, angles, place)
+
+
+def read_tram(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
+    """Return the people of TRAM's result.
+
+    TRAM: a folder with `camera.npy` and `hps/hps_track_<n>.npy`, all people in one world.
+
+    Layout as written by yufu-wang/tram at commit 4861c11, scripts/estimate_camera.py,
+    scripts/estimate_humans.py and lib/models/hmr_vimo.py: numpy files that hold a dictionary;
+    of the camera `world_cam_R` (T, 3, 3), `world_cam_T` (T, 3), `img_focal` and `img_center`
+    px; of a person torch tensors `pred_rotmat` (n, 24, 3, 3), `pred_shape` (n, 10),
+    `pred_trans` (n, 1, 3) in camera axes and `frame` (n,). World points are `world_cam_R x +
+    world_cam_T`, the shape is the mean over the frames (lib/pipeline/visualization.py).
+
+    Args:
+        path: the folder of the video.
+        model: body model to pose.
+
+    Raises:
+        InputError: the folder has another layout.
+    """
+    files = {
+        int(found[1]): file
+        for file in (path / "hps").glob("hps_track_*.npy")
+        if (found := re.search(r"(\d+)\.npy$", file.name))
+    }
+    if not files:
+        raise format_error(path, "hps/hps_track_<n>.npy", "none")
+    file = path / "camera.npy"
+    camera = read_pickled(file)
+    turns = floats(f"{file}: world_cam_R", get_part(str(file), camera, "world_cam_R"), (None, 3, 3))
+    shifts = floats(
+        f"{file}: world_cam_T", get_part(str(file), camera, "world_cam_T"), (len(turns), 3)
+    )
+    focal = floats(f"{file}: img_focal", get_part(str(file), camera, "img_focal"), ())
+    center = floats(f"{file}: img_center", get_part(str(file), camera, "img_center"), (2,))
+    people, boxes, used = [], [], ""
+    for person, name in sorted(files.items()):
+        where, content = str(name), read_pickled(name)
+        # A track consists of pieces, in temporal order.
+        frames = require_ascending(where, integers(where, get_part(where, content, "frame")))
+        if frames[-1] >= len(turns):
+            raise format_error(
+                where, f"frames below {len(turns)}, as the camera has", f"{frames[-1]}"
+            )
+        count = len(frames)
+        matrices = floats(where, get_part(where, content, "pred_rotmat"), (count, 24, 3, 3))
+        vectors = rotation_vectors(matrices)
+        track = Track(
+            frames=frames,
+            global_orient=vectors[:, 0],
+            body_pose=vectors[:, 1:].reshape(-1, 69),
+            place=floats(where, get_part(where, content, "pred_trans"), (count, 3)),
+            betas=floats(where, get_part(where, content, "pred_shape"), (count, None)).mean(0),
+        )
+        joints, used = pose_track(track, model, "smpl")
+        world = np.einsum("fab,fjb->fja", turns[frames], joints) + shifts[frames, None]
+        people.append((person, frames, world))
+        boxes.append(project_boxes(joints, np.full(2, focal), center))
+    tracks, around = merge_people(people, boxes)
+    return MethodResult(tracks, "shared", around, notes={"shape": used})
+
+
+def read_prompthmr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
+    """Return the people of PromptHMR's result.
+
+    PromptHMR: `results.pkl`, joblib's file, all people in one world.
+
+    Layout as written by yufu-wang/PromptHMR at commit ea85d0a, pipeline/pipeline.py and
+    pipeline/world.py: `people[id]` with `frames` (n,), `bboxes` (n, 4) x0 y0 x1 y1 px and
+    `smplx_world`, SMPL-X with `pose` (n, 165), `shape` and `trans` (n, 3); `camera.img_center`
+    px is the principal point of the images, which the method downscales.
+
+    Args:
+        path: joblib's file, or the folder it lies in.
+        model: body model to pose.
+
+    Raises:
+        InputError: the file has another format.
+    """
+    file = path / "results.pkl" if path.is_dir() else path
+    content = read_pickled(file)
+    people, boxes, used = [], [], ""
+    for name, person in get_part(str(file), content, "people").items():
+        where = f"{file}: person {name}"
+        frames = require_ascending(where, integers(where, get_part(where, person, "frames")))
+        count = len(frames)
+        pose = floats(where, get_part(where, person, "smplx_world", "pose"), (count, 165))
+        place = floats(where, get_part(where, person, "smplx_world", "trans"), (count, 3))
+        joints, used = pose_track(Track(frames, pose[:, :3], pose[:, 3:66], place), model, "other")
+        people.append((integer(where, name), frames, joints))
+        box = floats(where, get_part(where, person, "bboxes"), (count, None))
+        boxes.append(box[:, :4])
+    tracks, around = merge_people(people, boxes)
+    center = floats(
+        f"{file}: img_center", get_part(str(file), content, "camera", "img_center"), (2,)
+    )
+    size = (2.0 * float(center[0]), 2.0 * float(center[1]))
+    return MethodResult(tracks, "shared", around, size, {"shape": used})
+
+
+def read_smpl(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
+    """Return the people of a file with `betas`, `global_orient`, `body_pose` and `transl`.
+
+    Args:
+        path: npz file, persons first, NaN where a person is missing (docs/formats.md).
+        model: body model to pose; betas of another body model are not used.
+
+    Raises:
+        InputError: the file has another format.
+    """
+    poses, named = read_poses(path)
+    people, used = [], ""
+    own = named is not None and named == model.name == OPEN_BODY
+    for person in range(poses.batch_shape[0]):
+        there = np.isfinite(poses.transl[person]).all(-1)
+        if not there.any():
+            continue
+        one = poses[person, there]
+        track = Track(
+            np.flatnonzero(there), one.global_orient, one.body_pose, one.transl, one.betas
+        )
+        same = named in (None, model.name)
+        joints, used = pose_track(track, model, "open" if own else "smpl" if same else "other")
+        people.append((person, track.frames, joints))
+    return MethodResult(merge_people(people)[0], "shared", notes={"shape": used})
