@@ -105,8 +105,8 @@ def filmed(
 
 def boxes_of(finder: PeopleFinder, picture: Image, place: Place | None) -> Floats:
     """Return the boxes (n, 4) [px] that stage `detection` would store for an image."""
-    (stretch,) = finder.find([(0, picture)], place)
-    boxes = stretch.boxes[0].astype(float)
+    (found,) = finder.find([(0, picture)], place)
+    boxes = found.boxes[0].astype(float)
     return np.asarray(boxes[np.isfinite(boxes).all(axis=1)])
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from data_contracts.arrays import ArrayLayout, GroupLayout
 from data_contracts.conventions import COCO17
-from data_contracts.observations import FRAME
+from data_contracts.keypoints import FRAME
 from data_contracts.tracking import PERSON
 
 

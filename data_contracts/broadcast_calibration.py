@@ -8,7 +8,7 @@ from pydantic import Field
 
 from data_contracts.arrays import ArrayLayout, GroupLayout
 from data_contracts.cameras import CAMERA_LABELS
-from data_contracts.observations import FRAME
+from data_contracts.keypoints import FRAME
 from data_contracts.records import CONTRACT_VERSION, FRAME_LIMIT, Record
 from data_contracts.static_calibration import ClickedMarkings
 

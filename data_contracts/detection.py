@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from data_contracts.arrays import GroupLayout
-from data_contracts.observations import FRAME, OBSERVATION_ARRAYS, OBSERVATION_LABELS
+from data_contracts.keypoints import FRAME, KEYPOINT_ARRAYS, KEYPOINT_LABELS
 
 DETECTION = GroupLayout(
     stage="detection",
     about="2D poses found in one camera's video, on the match's clock: as `ingest` has given ones.",
     coordinates=(FRAME,),
-    arrays=OBSERVATION_ARRAYS,
-    labels=OBSERVATION_LABELS,
+    arrays=KEYPOINT_ARRAYS,
+    labels=KEYPOINT_LABELS,
     attributes={
         "camera_id": "camera of the match, or clip of its broadcast camera",
         "unreadable": "[first, last] match frames of each stretch without a picture",

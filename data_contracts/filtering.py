@@ -6,7 +6,7 @@ from typing import Literal
 
 from data_contracts.arrays import ArrayLayout, GroupLayout, Missing
 from data_contracts.conventions import COCO17
-from data_contracts.observations import FRAME
+from data_contracts.keypoints import FRAME
 from data_contracts.tracking import PERSON
 
 _DETECTION = ("frame", "camera", "detection")

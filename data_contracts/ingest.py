@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from data_contracts.arrays import ArrayLayout, GroupLayout
-from data_contracts.observations import FRAME, OBSERVATION_ARRAYS, OBSERVATION_LABELS
+from data_contracts.keypoints import FRAME, KEYPOINT_ARRAYS, KEYPOINT_LABELS
 
 VIDEO_ARRAYS = (
     ArrayLayout(
@@ -37,11 +37,11 @@ INGEST = GroupLayout(
     stage="ingest",
     about="Given 2D poses of one camera, or the index of its video, on the match's clock.",
     coordinates=(FRAME,),
-    arrays=(*OBSERVATION_ARRAYS, *VIDEO_ARRAYS),
-    labels=OBSERVATION_LABELS,
+    arrays=(*KEYPOINT_ARRAYS, *VIDEO_ARRAYS),
+    labels=KEYPOINT_LABELS,
     attributes={
         "camera_id": "camera of the match, or clip of its broadcast camera",
         "video": "null, or a video's time_base [1, units a second], size [px], missing_frames",
     },
-    optional=tuple(array.name for array in (*OBSERVATION_ARRAYS, *VIDEO_ARRAYS)),
+    optional=tuple(array.name for array in (*KEYPOINT_ARRAYS, *VIDEO_ARRAYS)),
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from data_contracts.arrays import ArrayLayout, GroupLayout
-from data_contracts.observations import FRAME, OBSERVATION_ARRAYS, OBSERVATION_LABELS
+from data_contracts.keypoints import FRAME, KEYPOINT_ARRAYS, KEYPOINT_LABELS
 
 REDETECTION = GroupLayout(
     stage="redetection",
@@ -11,7 +11,7 @@ REDETECTION = GroupLayout(
     "the iteration before says that they must be.",
     coordinates=(FRAME,),
     arrays=(
-        *OBSERVATION_ARRAYS,
+        *KEYPOINT_ARRAYS,
         ArrayLayout(
             name="found_again",
             dims=("frame", "detection"),
@@ -33,7 +33,7 @@ REDETECTION = GroupLayout(
             chunk_dim="frame",
         ),
     ),
-    labels=OBSERVATION_LABELS,
+    labels=KEYPOINT_LABELS,
     attributes={"camera_id": "camera of the match"},
 )
 

@@ -14,6 +14,7 @@ from pydantic import TypeAdapter
 
 from data_contracts.arrays import Image
 from data_contracts.detection import DETECTION
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from data_contracts.work import Work
 from tasks.spool import Spool, spooling
@@ -28,7 +29,6 @@ from worldpose.detection import (
 )
 from worldpose.errors import InputError
 from worldpose.geometry.stored import camera_from_arrays
-from worldpose.ingest import Observations
 from worldpose.ingest.footage import stretches
 from worldpose.pitch import PitchTemplate
 from worldpose.review.detections import DetectionEdit, replay_detections
@@ -72,7 +72,7 @@ class _Found:
         figures: metrics.
     """
 
-    observations: Observations
+    observations: KeypointDetections
     unreadable: list[list[int]]
     figures: dict[str, float]
 
@@ -90,13 +90,7 @@ def _published(store: Store, work: Work) -> _Found | None:
         return None
     stored = store.open_result(*unit)
     return _Found(
-        Observations(
-            frame=stored["frame"].values,
-            keypoints=stored["keypoints"].values,
-            confidence=stored["confidence"].values,
-            boxes=stored["boxes"].values,
-            score=stored["score"].values,
-        ),
+        KeypointDetections.from_arrays(stored),
         stored.attrs["unreadable"],
         dict(store.manifest(*unit).figures),
     )
@@ -108,27 +102,25 @@ def _detected(store: Store, work: Work, spool: Spool) -> _Found:
     settings = DetectionSettings.model_validate(work.recipe.settings)
     finder = PeopleFinder(load_detectors(settings), load_pose(settings), settings)
     require_weights(settings, sources["weights"])
-    unreadable: list[int] = []
     most = 0
-    for stretch in finder.find(_pictures(store, work), _place(store, work)):
-        spool.add(stretch.arrays())
-        unreadable += stretch.unreadable
-        most = max(most, int(np.isfinite(stretch.score).sum(axis=1).max()))
+    for chunk in finder.find(_pictures(store, work), _place(store, work)):
+        spool.add(chunk.arrays())
+        most = max(most, int(np.isfinite(chunk.score).sum(axis=1).max()))
     require_registered(Path(work.folder) / sources["video"], sources["video_sha256"])
     report = finder.report
     return _Found(
-        Observations(
+        KeypointDetections(
             frame=np.arange(
                 sources["first_frame"], sources["first_frame"] + sources["frame_count"]
             ),
             **{name: values[:, :most] for name, values in spool.arrays().items()},
         ),
-        stretches(np.array(unreadable, dtype=np.int64)),
+        stretches(np.array(report.unreadable, dtype=np.int64)),
         {
             "frames": report.frames,
             "detections": report.detections,
             "detections_a_frame": report.detections / report.frames,
-            "unreadable_share": report.unreadable / report.frames,
+            "unreadable_share": len(report.unreadable) / report.frames,
             "empty_share": report.empty / report.frames,
             "stride": settings.stride,
             "crowd": report.crowd,

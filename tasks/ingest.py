@@ -10,9 +10,10 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from data_contracts.ingest import INGEST
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.work import Work
 from tasks.unit import require_registered, unit_task
-from worldpose.ingest import Observations, UnitFrames, read_observations
+from worldpose.ingest import UnitFrames, read_observations
 from worldpose.ingest.footage import Footage, read_footage
 from worldpose.review.detections import DetectionEdit, replay_detections
 from worldpose.store import Store
@@ -72,7 +73,7 @@ def _write_footage(result: ResultWriter, work: Work) -> None:
     result.figures["frames_missing"] = int(np.count_nonzero(footage.picture < 0))
 
 
-def _observations(work: Work) -> Observations:
+def _observations(work: Work) -> KeypointDetections:
     """Read the unit's 2D poses on match frames, and verify that the file matches the key.
 
     Raises:

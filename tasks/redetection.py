@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Image
 from data_contracts.conventions import COCO17
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from data_contracts.redetection import REDETECTION
 from data_contracts.work import Recipe, Work
@@ -37,7 +37,6 @@ from worldpose.geometry import Camera
 from worldpose.geometry.stored import camera_from_arrays
 from worldpose.pitch import PitchTemplate
 from worldpose.redetection import (
-    Answers,
     Expected,
     RedetectionSettings,
     Sought,
@@ -64,20 +63,20 @@ def redetection(work: Work) -> str:
     with store.publishing(work) as result:
         case = _open(store, work)
         sought = case.sought(settings)
-        answers = _answers(store, work, case, sought)
+        found = _search(store, work, case, sought)
         verdicts = judge_answers(
-            answers,
+            found,
             sought,
             case.expected,
-            (case.detected["keypoints"].values, case.detected["boxes"].values),
+            case.detected,
             case.spread,
             case.noise,
             settings,
         )
         result.write(
             REDETECTION,
-            arrays=_arrays(case, sought, answers, verdicts),
-            coordinates={"frame": case.detected["frame"].values},
+            arrays=_arrays(case, sought, found, verdicts),
+            coordinates={"frame": case.detected.frame},
             attributes={"camera_id": work.recipe.sources["camera"]},
         )
         for name in ("found", "unsure", "elsewhere", "another"):
@@ -93,7 +92,7 @@ class _Case:
     Attributes:
         camera: after adjustment to people.
         detection: recipe of the detection.
-        detected: the result of `detection`.
+        detected: the people of `detection` (frames, detections).
         person: (persons,) ids.
         expected: the bodies in the camera's images.
         shift: (frames, persons, 17, 2) [px], systematic error of keypoints relative to joints.
@@ -104,7 +103,7 @@ class _Case:
 
     camera: Camera
     detection: Recipe
-    detected: xr.Dataset
+    detected: KeypointDetections
     person: NDArray[np.integer]
     expected: Expected
     shift: NDArray[np.float64]
@@ -133,7 +132,7 @@ def _open(store: Store, work: Work) -> _Case:
     sources: dict[str, Any] = work.recipe.sources
     name, clip = sources["camera"], sources["clip"]
     unit, inputs = work.recipe.unit, work.recipe.inputs
-    detected = open_input(store, work, f"detection/{unit}")
+    detected = KeypointDetections.from_arrays(open_input(store, work, f"detection/{unit}"))
     manifest = store.manifest(work.recipe.match_id, "detection", unit, inputs[f"detection/{unit}"])
     tracks = open_input(store, work, f"tracking/{clip}")
     place = tracks["camera"].values.tolist().index(name)
@@ -157,17 +156,16 @@ def _open(store: Store, work: Work) -> _Case:
     offsets = placed["offsets"].values.astype(np.float64)
     beside = shift[:, 0] + offsets[:, 0, :, None]
 
-    count = detected.sizes["detection"]  # indices from here on: earlier redetections
+    count = detected.score.shape[1]  # indices from here on: earlier redetections
     index = tracks["detection_index"].values[:, place]
     fits, dropped = (said[name].values[:, place, :count] for name in ("fits", "dropped"))
     seen = who_is_seen(index, fits, dropped)
     edits: Any = manifest.recipe.sources.get("edits", [])
-    seen[np.isin(detected["frame"].values, [edit["frame"] for edit in edits])] = True
+    seen[np.isin(detected.frame, [edit["frame"] for edit in edits])] = True
     noise = settings_before(store, work, clip).noise
-    confidence = detected["confidence"].values.astype(np.float64)
     suspects = Suspects(
-        detected["keypoints"].values[:, None].astype(np.float64),
-        confidence[:, None],
+        detected.keypoints[:, None].astype(np.float64),
+        detected.confidence[:, None].astype(np.float64),
         np.where(index < count, index, -1)[:, None],
         offsets,
         placed["exchanged"].values,
@@ -194,20 +192,23 @@ def _spread(views: BodyViews, suspects: Suspects) -> Spread:
     return learn_from(views, suspects)
 
 
-def _answers(store: Store, work: Work, case: _Case, sought: Sought) -> Answers:
+def _search(store: Store, work: Work, case: _Case, sought: Sought) -> KeypointDetections:
     """Run the pose net of `detection` where people are expected."""
     settings = DetectionSettings.model_validate(case.detection.settings)
     sources: dict[str, Any] = case.detection.sources
     if not len(sought.frame):
-        return Answers.none(0)
+        return KeypointDetections.empty()
     require_weights(settings, sources["weights"])
     shown = _pictures(store, work, case, np.unique(sought.frame))
-    boxes = case.detected["boxes"].values
-    answers = look_again(
-        shown, sought, load_pose(settings), settings.min_keypoint_confidence, boxes
+    found = look_again(
+        shown,
+        sought,
+        load_pose(settings),
+        settings.min_keypoint_confidence,
+        case.detected.boxes,
     )
     require_registered(Path(work.folder) / sources["video"], sources["video_sha256"])
-    return answers
+    return found
 
 
 def _pictures(
@@ -219,7 +220,7 @@ def _pictures(
     """
     sources: dict[str, Any] = case.detection.sources
     footage = open_input(store, work, f"ingest/{work.recipe.sources['camera']}")
-    numbers = footage["picture_of_frame"].sel(frame=case.detected["frame"].values[places]).values
+    numbers = footage["picture_of_frame"].sel(frame=case.detected.frame[places]).values
     there = numbers >= 0
     place_of = dict(zip(numbers[there].tolist(), places[there].tolist(), strict=True))
     with open_video(Path(work.folder) / sources["video"], footage_index(footage)) as video:
@@ -228,18 +229,16 @@ def _pictures(
 
 
 def _arrays(
-    case: _Case, sought: Sought, answers: Answers, verdicts: Verdicts
+    case: _Case, sought: Sought, answers: KeypointDetections, verdicts: Verdicts
 ) -> dict[str, NDArray[Any]]:
     """Return all detections at their indices, followed by the redetected people."""
-    before = {
-        name: case.detected[name].values for name in ("keypoints", "confidence", "boxes", "score")
-    }
-    frames, count = before["score"].shape
+    before = case.detected.arrays()
+    frames, count = case.detected.score.shape
     (found,) = np.nonzero(verdicts.found)
     frame = sought.frame[found]
     behind = np.arange(len(found)) - np.searchsorted(frame, frame)
     more = int(behind.max(initial=-1)) + 1
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         name: np.pad(
             values,
             [(0, 0), (0, more)] + [(0, 0)] * (values.ndim - 2),

@@ -10,6 +10,7 @@ from typing import Final
 
 import numpy as np
 
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.review import Correction, Edit
 from flows.reports.match_pictures import frame_picture
 from flows.review.corrections import keep_edits
@@ -28,7 +29,6 @@ from worldpose.formats.annotations import (
 from worldpose.formats.annotations.changes import picture_name
 from worldpose.formats.annotations.formats import suffix_of
 from worldpose.formats.annotations.pictures import SEEN
-from worldpose.ingest import Observations
 from worldpose.review.detections import DETECTION_EDITS
 from worldpose.store import Store
 
@@ -131,7 +131,7 @@ def import_people(
     return changes, keep_edits(store, open_match, edits, who=who, note=note) if edits else []
 
 
-def _annotated(match: Match, camera: str, found: Observations, name: str) -> AnnotatedPicture:
+def _annotated(match: Match, camera: str, found: KeypointDetections, name: str) -> AnnotatedPicture:
     broadcast = {clip.id: clip.broadcast for clip in match.folder.spec.clips}
     spec = match.folder.spec.camera(broadcast.get(camera) or camera)
     corrected = {

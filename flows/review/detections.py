@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 from pydantic import JsonValue
 
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.review import Edit
 from flows.review.edit_conflicts import StaleEditError, edits_since
 from flows.stage import Match
 from flows.stages.detection import seen_by, seen_in_broadcast
 from flows.stages.ingest import edits_by_camera
 from worldpose.errors import InputError
-from worldpose.ingest import Observations
 from worldpose.review.detections import (
     DETECTION_EDITS,
     DetectionEdit,
@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # imports dask, which planning a run must not load
     import xarray as xr
 
 
-def detections_now(store: Store, match: Match, camera: str, frame: int) -> Observations:
+def detections_now(store: Store, match: Match, camera: str, frame: int) -> KeypointDetections:
     """Return a camera's corrected detections in one match frame; no row if the camera has no frame.
 
     Args:
@@ -42,13 +42,7 @@ def detections_now(store: Store, match: Match, camera: str, frame: int) -> Obser
     """
     stored, taken_in = _stored(store, match, camera, frame)
     row = stored.sel(frame=slice(frame, frame))
-    found = Observations(
-        frame=row["frame"].values,
-        keypoints=row["keypoints"].values,
-        confidence=row["confidence"].values,
-        boxes=row["boxes"].values,
-        score=row["score"].values,
-    )
+    found = KeypointDetections.from_arrays(row)
     said = [edit for edit in edits_by_camera(match).get(camera, ()) if edit.frame == frame]
     later = edits_since(said, taken_in, f"{camera}, frame {frame}", match.match_id)
     return replay_detections(found, later).observations
@@ -60,7 +54,7 @@ def require_seen(store: Store, match: Match, edits: Sequence[Edit]) -> None:
     Raises:
         StaleEditError: another person changed the detection, or the edit never fitted.
     """
-    found: dict[tuple[str, int], Observations] = {}
+    found: dict[tuple[str, int], KeypointDetections] = {}
     for edit in edits:
         if not isinstance(edit, DETECTION_EDITS):
             continue

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from data_contracts.conventions import COCO17, COCO17_BONES
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
 from flows.reports.match_pictures import frame_picture
 from flows.review.acceptance import accept, left_to_look_at
@@ -18,7 +19,6 @@ from flows.review.detections import detections_now
 from flows.stage import Match
 from flows.web.app_context import Desk, Person
 from worldpose.errors import InputError
-from worldpose.ingest import Observations
 from worldpose.store import Store
 
 LISTED: Final = 60
@@ -117,7 +117,7 @@ def _size(match: Match, owner: str) -> tuple[int, int]:
     return camera.width, camera.height
 
 
-def _seen(found: Observations) -> dict[str, Any]:
+def _seen(found: KeypointDetections) -> dict[str, Any]:
     """Return all detections of the first row, and the index for an added person."""
     there = np.isfinite(found.score[:1]).any(axis=0)
     occupied = np.flatnonzero(there)
@@ -125,7 +125,7 @@ def _seen(found: Observations) -> dict[str, Any]:
     return {"people": _people(found), "free": free}
 
 
-def _people(found: Observations) -> list[dict[str, Any]]:
+def _people(found: KeypointDetections) -> list[dict[str, Any]]:
     """Return all detections of the first row, the least certain first."""
     if not len(found.frame):
         return []

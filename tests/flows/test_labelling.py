@@ -4,8 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
+from data_contracts.keypoints import KeypointDetections
 from flows.review import labelling
-from worldpose.detection import DetectionSettings, People, Poses
+from worldpose.detection import DetectionSettings, People
 from worldpose.errors import InputError
 from worldpose.training import read_labels
 
@@ -18,7 +19,9 @@ class Brightness:
 
     def estimate(self, picture, boxes):
         value = float(picture[0, 0, 0])
-        return Poses(np.full((len(boxes), 17, 2), value), np.ones((len(boxes), 17)))
+        return KeypointDetections.from_keypoints(
+            np.full((len(boxes), 17, 2), value), np.ones((len(boxes), 17))
+        )
 
 
 @pytest.fixture(autouse=True)

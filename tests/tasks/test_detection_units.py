@@ -8,6 +8,7 @@ import pytest
 from filmed import write_filmed
 
 import tasks.detection
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.review import Correction, DeletedDetection
 from data_contracts.work import Work
 from flows.fan_out import task_of
@@ -15,7 +16,7 @@ from flows.method import METHOD
 from flows.planning import plan_stage
 from flows.registering import register
 from tasks.clip_inputs import open_clip, open_frames
-from worldpose.detection import People, Poses
+from worldpose.detection import People
 from worldpose.errors import InputError
 from worldpose.store import Store
 
@@ -36,7 +37,7 @@ class Reading:
 
     def estimate(self, picture, boxes):
         keypoints = np.repeat(boxes[:, None, :2], 17, axis=1)
-        return Poses(keypoints, np.full((len(boxes), 17), 0.9))
+        return KeypointDetections.from_keypoints(keypoints, np.full((len(boxes), 17), 0.9))
 
 
 @pytest.fixture

@@ -1,12 +1,12 @@
 """Detection of people in each camera's frames, with boxes and keypoints (D1-D3).
 
 Inputs: frames in order, detectors and a pose estimator, the calibrated camera and the pitch.
-Outputs: `Stretch` chunks of boxes, scores, keypoints and confidences, without the crowd.
+Outputs: `KeypointDetections` in chunks of frames, without the crowd.
 """
 
-from worldpose.detection.interfaces import Detector, People, PoseEstimator, Poses
+from worldpose.detection.interfaces import Detector, People, PoseEstimator
 from worldpose.detection.models import load_detectors, load_pose, weights_of
-from worldpose.detection.people import DetectionReport, PeopleFinder, Place, Stretch
+from worldpose.detection.people import DetectionReport, PeopleFinder, Place
 from worldpose.detection.settings import DetectionSettings
 
 __all__ = [
@@ -17,8 +17,6 @@ __all__ = [
     "PeopleFinder",
     "Place",
     "PoseEstimator",
-    "Poses",
-    "Stretch",
     "load_detectors",
     "load_pose",
     "weights_of",

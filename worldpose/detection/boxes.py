@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
-from worldpose.detection.interfaces import People, Poses
+from data_contracts.arrays import AnyFloats, Floats
+from data_contracts.keypoints import KeypointDetections
+from worldpose.detection.interfaces import People
 
 SUREST: Final = 12
 """Number of surest keypoints that decide whether a box holds a person: others may be hidden."""
 
 
-def overlaps(a: Floats, b: Floats) -> Floats:
+def overlaps(a: AnyFloats, b: AnyFloats) -> Floats:
     """Return the intersection over union of every pair of boxes (n, m), 0 for disjoint boxes.
 
     Args:
@@ -28,7 +30,7 @@ def overlaps(a: Floats, b: Floats) -> Floats:
     return np.asarray(np.divide(shared, union, out=np.zeros_like(shared), where=union > 0))
 
 
-def areas(boxes: Floats) -> Floats:
+def areas(boxes: AnyFloats) -> Floats:
     """Return the areas of boxes (n,) [px^2]."""
     return np.asarray(np.prod(np.maximum(boxes[:, 2:] - boxes[:, :2], 0.0), axis=1))
 
@@ -55,20 +57,30 @@ def suppress(people: People, overlap: float) -> People:
     return People(people.boxes[best], people.scores[best])
 
 
-def seen_closer(people: People, poses: Poses) -> People:
-    """Return the people with the boxes of the pose estimator, where it gives any.
+def surest_confidence(confidence: AnyFloats) -> Floats:
+    """Return the mean confidence of the `SUREST` keypoints with the highest; 0 without any.
+
+    Args:
+        confidence: (people, 17); NaN where not found.
+    """
+    return np.asarray(np.sort(np.nan_to_num(confidence), axis=1)[:, -SUREST:].mean(axis=1))
+
+
+def combine_boxes(people: People, poses: KeypointDetections) -> KeypointDetections:
+    """Return the poses with the estimator's boxes, where it gives any, else the detector's.
 
     Args:
         people: as a detector found them.
-        poses: of each person. A score becomes its geometric mean with the expected fit and the mean
-            confidence of the surest keypoints.
+        poses: the estimate for each person. Its score, the expected fit of its box, becomes the
+            geometric mean of the detector's score, the fit and the mean confidence of the surest
+            keypoints; without a fit the detector's score stays.
     """
-    if poses.boxes is None or poses.fit is None:
-        return people
     real = np.all(poses.boxes[:, 2:] - poses.boxes[:, :2] > 1.0, axis=1)
     boxes = np.where(real[:, None], poses.boxes, people.boxes)
-    sure = np.sort(np.nan_to_num(poses.confidence), axis=1)[:, -SUREST:].mean(axis=1)
-    return People(boxes, np.cbrt(people.scores * poses.fit * sure))
+    sure = surest_confidence(poses.confidence)
+    joint_score = np.cbrt(people.scores * poses.score * sure)
+    score = np.where(np.isnan(poses.score), people.scores, joint_score)
+    return replace(poses, boxes=boxes, score=score)
 
 
 def fuse(members: list[People], overlap: float) -> People:

@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image
+from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.boxes import overlaps, suppress
 from worldpose.detection.bundled_crops import crops_of_boxes, cut, picture_from_crop
 from worldpose.detection.bundled_looks import Look
 from worldpose.detection.bundled_surroundings import CELL, MAPS, SAME, surroundings
 from worldpose.detection.bundled_weights import load_weights
 from worldpose.detection.groups import groups
-from worldpose.detection.interfaces import LEAST_SCORE, Detector, People, PoseEstimator, Poses
+from worldpose.detection.interfaces import LEAST_SCORE, Detector, People, PoseEstimator
 from worldpose.detection.occluded_people import find_occluded_people
 from worldpose.detection.rival_joints import shared_out
 from worldpose.errors import InputError
@@ -143,7 +144,7 @@ class EmbeddedPose:
     def __init__(self, net: KeypointNet, device: str = "cpu", half: bool = False) -> None:
         self._net, self._device, self._half = _placed(net, device), device, half
 
-    def estimate(self, picture: Image, boxes: NDArray[np.float64]) -> Poses:
+    def estimate(self, picture: Image, boxes: NDArray[np.float64]) -> KeypointDetections:
         """Return the pose in each box; confidence is the probability that a keypoint is correct.
 
         A correct keypoint is within a twentieth of the box's longer side, about a fifth of a torso.
@@ -166,7 +167,7 @@ class EmbeddedPose:
         looked.replace(again, self._look(picture, asked[again], around))
         return looked.poses(shared_out(looked.places, looked.mass, looked.boxes))
 
-    def beside(self, picture: Image, people: People) -> tuple[People, Poses]:
+    def beside(self, picture: Image, people: People) -> KeypointDetections:
         """Return people partly occluded by the detected ones, with their poses."""
         return find_occluded_people(
             lambda boxes, others: self._look(picture, boxes, others), people

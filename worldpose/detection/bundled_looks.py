@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from worldpose.detection.boxes import SUREST
-from worldpose.detection.interfaces import Poses
+from data_contracts.keypoints import KeypointDetections
+from worldpose.detection.boxes import surest_confidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,13 +42,12 @@ class Look:
     @property
     def score(self) -> Floats:
         """Return the confidence that a box holds a person (people,): fit times surest keypoints."""
-        surest = np.sort(self.sure[..., 0], axis=1)[:, -SUREST:].mean(axis=1)
-        return np.asarray(self.fit * surest)
+        return np.asarray(self.fit * surest_confidence(self.sure[..., 0]))
 
-    def poses(self, taken: NDArray[np.intp]) -> Poses:
+    def poses(self, taken: NDArray[np.intp]) -> KeypointDetections:
         """Return the poses whose joints are at the chosen candidates (people, 17)."""
         one = taken[..., None]
-        return Poses(
+        return KeypointDetections(
             np.take_along_axis(self.places, one[..., None], axis=2)[:, :, 0],
             np.take_along_axis(self.sure, one, axis=2)[:, :, 0],
             self.boxes,

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Image
-from worldpose.detection.interfaces import PoseEstimator, Poses
+from data_contracts.keypoints import KeypointDetections
+from worldpose.detection.interfaces import PoseEstimator
 
 SIDES: Final = (0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15)
 """The COCO-17 joint that each joint becomes in the mirror image."""
@@ -23,7 +24,7 @@ class Mirrored:
     def __init__(self, estimator: PoseEstimator) -> None:
         self._estimator = estimator
 
-    def estimate(self, picture: Image, boxes: NDArray[np.float64]) -> Poses:
+    def estimate(self, picture: Image, boxes: NDArray[np.float64]) -> KeypointDetections:
         """Return the pose in each box."""
         last = picture.shape[1] - 1
         seen = self._estimator.estimate(picture, boxes)
@@ -39,12 +40,10 @@ class Mirrored:
         confidence = total / np.maximum((weights > 0.0).sum(axis=0), 1)
         keypoints = np.where(found[..., None], mean, np.nan)
         confidence = np.where(found, confidence, np.nan)
-        if seen.boxes is None or mirror.boxes is None or seen.fit is None or mirror.fit is None:
-            return Poses(keypoints, confidence)
         middle = 0.5 * (seen.boxes + _turned(mirror.boxes, last))
-        return Poses(keypoints, confidence, middle, 0.5 * (seen.fit + mirror.fit))
+        return KeypointDetections(keypoints, confidence, middle, 0.5 * (seen.score + mirror.score))
 
 
-def _turned(boxes: NDArray[np.float64], last: int) -> NDArray[np.float64]:
+def _turned(boxes: NDArray[np.floating], last: int) -> NDArray[np.float64]:
     """Return boxes (people, 4) in the mirror image of a frame whose last column is `last` [px]."""
     return np.asarray(boxes[:, [2, 1, 0, 3]] * [-1.0, 1.0, -1.0, 1.0] + [last, 0.0, last, 0.0])

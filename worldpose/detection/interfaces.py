@@ -1,4 +1,4 @@
-"""Interfaces of person detectors and pose estimators, and their results."""
+"""Interfaces of person detectors and pose estimators."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Final, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Image
+from data_contracts.arrays import Floats, Image
+from data_contracts.keypoints import KeypointDetections
 
 LEAST_SCORE: Final = 0.05
 """A detector reports every box from this score on; the stage applies its own thresholds."""
@@ -24,26 +25,15 @@ class People:
         scores: (people,) in (0, 1].
     """
 
-    boxes: NDArray[np.float64]
-    scores: NDArray[np.float64]
+    boxes: Floats
+    scores: Floats
 
-
-@dataclass(frozen=True)
-class Poses:
-    """Keypoints of the people in one frame.
-
-    Attributes:
-        keypoints: (people, 17, 2) COCO-17 [px]; NaN where not found.
-        confidence: (people, 17) in (0, 1]; NaN where not found.
-        boxes: (people, 4) as the estimator sees them in a crop, finer than a detector's [px]; None
-            from an estimator of joints alone.
-        fit: (people,) expected intersection over union of these and the true boxes [1].
-    """
-
-    keypoints: NDArray[np.float64]
-    confidence: NDArray[np.float64]
-    boxes: NDArray[np.float64] | None = None
-    fit: NDArray[np.float64] | None = None
+    @classmethod
+    def from_detections(cls, detections: KeypointDetections) -> People:
+        """Return the boxes and scores (people,) of one image's detections."""
+        return cls(
+            np.asarray(detections.boxes, np.float64), np.asarray(detections.score, np.float64)
+        )
 
 
 class Detector(Protocol):
@@ -68,13 +58,18 @@ class Detector(Protocol):
 class PoseEstimator(Protocol):
     """An estimator of the keypoints of people whose boxes are known."""
 
-    def estimate(self, picture: Image, boxes: NDArray[np.float64]) -> Poses:
+    def estimate(self, picture: Image, boxes: NDArray[np.float64]) -> KeypointDetections:
         """Return the pose in each box, in frame pixels; keypoints may lie outside of their box.
 
         Args:
             picture: the whole frame.
             boxes: (people, 4) x0, y0, x1, y1 [px]; may reach over the frame's border. No boxes is a
                 valid request.
+
+        Returns:
+            The poses in the order of `boxes`. Their boxes are as the estimator sees them in a crop,
+            finer than a detector's, and their scores are the expected intersections over union of
+            these and the true boxes; both are NaN from an estimator of joints alone.
         """
 
 
@@ -82,7 +77,7 @@ class PoseEstimator(Protocol):
 class LooksBeside(PoseEstimator, Protocol):
     """An estimator that also finds occluded people that a detector misses."""
 
-    def beside(self, picture: Image, people: People) -> tuple[People, Poses]:
+    def beside(self, picture: Image, people: People) -> KeypointDetections:
         """Return occluded people next to the detected ones, with the estimator's boxes.
 
         Args:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
+from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.boxes import best_of, overlaps, suppress
 from worldpose.detection.bundled_looks import Look
-from worldpose.detection.interfaces import People, Poses
+from worldpose.detection.interfaces import People
 
 SURE: Final = 0.25
 """Score of a detection from which on its neighbourhood is searched [1]."""
@@ -36,7 +38,7 @@ UNSEEN: Final = 0.3
 
 def find_occluded_people(
     look: Callable[[Floats, Sequence[Floats]], Look], people: People
-) -> tuple[People, Poses]:
+) -> KeypointDetections:
     """Return occluded people next to detected ones that the detector missed, with their poses.
 
     The net takes a target box and the boxes of its neighbours. It first runs on boxes a step to
@@ -63,7 +65,7 @@ def find_occluded_people(
     seen = seen.only(_others(seen, known, THERE))
     seen = seen.only(best_of(People(seen.boxes, seen.score), ONE))
     likeliest = np.zeros(seen.places.shape[:2], dtype=np.intp)
-    return People(seen.boxes, np.cbrt(UNSEEN * seen.score)), seen.poses(likeliest)
+    return replace(seen.poses(likeliest), score=np.cbrt(UNSEEN * seen.score))
 
 
 def _others(seen: Look, known: Floats, least: float) -> NDArray[np.bool_]:

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import AnyFloats, Floats
 from data_contracts.conventions import COCO17_SIGMAS
+from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.boxes import areas
-from worldpose.detection.interfaces import People, Poses
 
 DOUBT: Final = 0.5
 """Share of its score that a box with the pose of a better box loses [1]."""
 
 
-def likeness(keypoints: Floats, area: Floats) -> Floats:
+def likeness(keypoints: AnyFloats, area: AnyFloats) -> Floats:
     """Return COCO's object keypoint similarity of every pair of poses (people, people) [1].
 
     Args:
@@ -31,29 +32,28 @@ def likeness(keypoints: Floats, area: Floats) -> Floats:
     return np.asarray(np.divide(total, count, out=np.zeros_like(total), where=count > 0))
 
 
-def told_apart(
-    people: People, poses: Poses, least_keypoint: float, same_pose: float
-) -> tuple[People, Poses]:
+def suppress_poses(
+    detections: KeypointDetections, least_keypoint: float, same_pose: float
+) -> KeypointDetections:
     """Return the people that have a pose different from that of every better box.
 
     The more a pose resembles that of a better box, the lower its score falls (soft suppression,
     Bodla, 2017): a person behind another stays, a duplicate ranks last.
 
     Args:
-        people: with their boxes.
-        poses: of each.
+        detections: (people,) of one image.
         least_keypoint: a keypoint below this confidence was not found [1].
         same_pose: similarity of poses above which two boxes are of one person [1].
     """
     with np.errstate(invalid="ignore"):
-        found = (poses.confidence >= least_keypoint) & np.isfinite(poses.keypoints).all(axis=2)
-    confidence = np.where(found, poses.confidence, np.nan)
-    keypoints = np.where(found[..., None], poses.keypoints, np.nan)
-    alike = likeness(keypoints, areas(people.boxes))
-    kept = np.zeros(len(people.scores), dtype=np.bool_)
-    scores = people.scores.copy()
-    for row in np.argsort(-people.scores, kind="stable"):
+        found = detections.confidence >= least_keypoint
+        found &= np.isfinite(detections.keypoints).all(axis=2)
+    detections = detections.without(~found)
+    alike = likeness(detections.keypoints, areas(detections.boxes))
+    kept = np.zeros(len(detections.score), dtype=np.bool_)
+    score = detections.score.copy()
+    for row in np.argsort(-detections.score, kind="stable"):
         most = alike[row, kept].max(initial=0.0)
         kept[row] = found[row].any() and most <= same_pose
-        scores[row] *= 1.0 - DOUBT * most**2
-    return People(people.boxes[kept], scores[kept]), Poses(keypoints[kept], confidence[kept])
+        score[row] *= 1.0 - DOUBT * most**2
+    return replace(detections, score=score).select(kept)

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image
+from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.crops import crop_frames, cut_crops, in_picture
-from worldpose.detection.interfaces import PoseEstimator, Poses
+from worldpose.detection.interfaces import PoseEstimator
 from worldpose.detection.onnx_session import OnnxNet, unknown_outputs
 
 CROP_SIZE: Final = (192, 256)
@@ -54,10 +55,10 @@ class _OnnxPose:
     def __init__(self, net: OnnxNet, *, normal: bool) -> None:
         self._net, self._normal = net, normal
 
-    def estimate(self, picture: Image, boxes: Floats) -> Poses:
+    def estimate(self, picture: Image, boxes: Floats) -> KeypointDetections:
         """Return the pose in each box."""
         if not len(boxes):
-            return Poses(np.empty((0, 17, 2)), np.empty((0, 17)))
+            return KeypointDetections.empty()
         frames = crop_frames(boxes, self._net.size, PADDING)
         crops: NDArray[np.uint8] | NDArray[np.float32] = cut_crops(picture, frames, self._net.size)
         if self._normal:
@@ -66,7 +67,9 @@ class _OnnxPose:
         points, confidence = _read(outputs, self._net.size)
         found = confidence > 0.0
         points = np.where(found[..., None], in_picture(points, frames), np.nan)
-        return Poses(points, np.where(found, np.minimum(confidence, 1.0), np.nan))
+        return KeypointDetections.from_keypoints(
+            points, np.where(found, np.minimum(confidence, 1.0), np.nan)
+        )
 
 
 def _read(outputs: list[Floats], size: tuple[int, int]) -> tuple[Floats, Floats]:

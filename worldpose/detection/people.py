@@ -3,54 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Image
+from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.boxes import areas, fuse, suppress
 from worldpose.detection.crowd import on_pitch
 from worldpose.detection.followed import Follower, looked_at
-from worldpose.detection.interfaces import Detector, People, PoseEstimator, Poses
-from worldpose.detection.oks_nms import told_apart
+from worldpose.detection.interfaces import Detector, People, PoseEstimator
+from worldpose.detection.oks_nms import suppress_poses
 from worldpose.detection.posed import find_poses
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.views import Tiled
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 
-STRETCH: Final = 64
+CHUNK: Final = 64
 """Frames per chunk."""
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """People in a chunk of consecutive frames, in the form of given 2D poses.
-
-    Attributes:
-        keypoints: (frames, most_people, 17, 2) float32 [px]; NaN where not found.
-        confidence: (frames, most_people, 17) float32.
-        boxes: (frames, most_people, 4) float32 [px].
-        score: (frames, most_people) float32.
-        unreadable: numbers of frames without an image.
-    """
-
-    keypoints: NDArray[np.float32]
-    confidence: NDArray[np.float32]
-    boxes: NDArray[np.float32]
-    score: NDArray[np.float32]
-    unreadable: tuple[int, ...]
-
-    def arrays(self) -> dict[str, NDArray[np.float32]]:
-        """Return the arrays by name, as they are stored."""
-        return {
-            "keypoints": self.keypoints,
-            "confidence": self.confidence,
-            "boxes": self.boxes,
-            "score": self.score,
-        }
 
 
 @dataclass
@@ -59,7 +32,7 @@ class DetectionReport:
 
     Attributes:
         frames: requested.
-        unreadable: frames without an image.
+        unreadable: numbers of the frames without an image.
         empty: frames with an image and without people.
         detections: people in all frames.
         crowd: boxes outside of the pitch.
@@ -70,7 +43,7 @@ class DetectionReport:
     """
 
     frames: int = 0
-    unreadable: int = 0
+    unreadable: list[int] = field(default_factory=list)
     empty: int = 0
     detections: int = 0
     crowd: int = 0
@@ -121,7 +94,7 @@ class PeopleFinder:
 
     def find(
         self, frames: Iterable[tuple[int, Image | None]], place: Place | None = None
-    ) -> Iterator[Stretch]:
+    ) -> Iterator[KeypointDetections]:
         """Yield the people of a video in chunks of frames.
 
         Args:
@@ -136,18 +109,21 @@ class PeopleFinder:
             self._settings.stride,
             self._settings.batch,
         )
-        rows: list[tuple[People, Poses]] = []
-        unreadable: list[int] = []
+        rows: list[KeypointDetections] = []
+        numbers: list[int] = []
         for number, picture, people in follower.follow(looked):
+            numbers.append(number)
             if picture is None:
-                unreadable.append(number)
-                rows.append((_nobody(), Poses(np.empty((0, 17, 2)), np.empty((0, 17)))))
+                self.report.unreadable.append(number)
+                rows.append(KeypointDetections.empty())
             else:
-                rows.append(self._posed(picture, people, place))
-            if len(rows) == STRETCH:
-                yield self._stretch(rows, unreadable)
+                rows.append(self._find_poses(picture, people, place))
+                self.report.empty += not len(rows[-1].score)
+            if len(rows) == CHUNK:
+                yield self._chunk(numbers, rows)
+                rows, numbers = [], []
         if rows:
-            yield self._stretch(rows, unreadable)
+            yield self._chunk(numbers, rows)
         self.report.bridged, self.report.flickers = follower.bridged, follower.flickers
 
     def _people(self, pictures: list[Image], place: Place | None) -> list[People]:
@@ -179,49 +155,37 @@ class PeopleFinder:
         margin = self._settings.pitch_margin_m
         return on_pitch(people.boxes, place.camera, size, place.pitch, margin)
 
-    def _posed(self, picture: Image, people: People, place: Place | None) -> tuple[People, Poses]:
+    def _find_poses(
+        self, picture: Image, people: People, place: Place | None
+    ) -> KeypointDetections:
         """Return keypoints of people; drop those without any or with the pose of a better box."""
-        found = len(people.scores)
-        people, poses = find_poses(self._estimator, picture, people, self._settings)
-        self.report.beside += len(people.scores) - found
+        settings = self._settings
+        detected = len(people.scores)
+        found = find_poses(self._estimator, picture, people, settings)
+        self.report.beside += len(found.score) - detected
         if place is not None:
             # Detected people are on the pitch; a person they occlude may be a bystander.
-            kept = self._inside(people, picture, place) | (np.arange(len(people.scores)) < found)
-            people = People(people.boxes[kept], people.scores[kept])
-            poses = Poses(poses.keypoints[kept], poses.confidence[kept])
-        known, own = told_apart(
-            people, poses, self._settings.min_keypoint_confidence, self._settings.oks_nms
-        )
-        self.report.unsure += len(people.scores) - len(known.scores)
-        best = np.sort(np.argsort(-known.scores, kind="stable")[: self._settings.max_people])
-        return (
-            People(known.boxes[best], known.scores[best]),
-            Poses(own.keypoints[best], own.confidence[best]),
-        )
+            inside = self._inside(People.from_detections(found), picture, place)
+            found = found.select(inside | (np.arange(len(found.score)) < detected))
+        distinct = suppress_poses(found, settings.min_keypoint_confidence, settings.oks_nms)
+        self.report.unsure += len(found.score) - len(distinct.score)
+        best = np.sort(np.argsort(-distinct.score, kind="stable")[: settings.max_people])
+        return distinct.select(best)
 
-    def _stretch(self, rows: list[tuple[People, Poses]], unreadable: list[int]) -> Stretch:
+    def _chunk(self, numbers: list[int], rows: list[KeypointDetections]) -> KeypointDetections:
+        """Return the detections of frames in one record, padded to `max_people` with NaN."""
         shape = (len(rows), self._settings.max_people)
-        stretch = Stretch(
+        chunk = KeypointDetections(
             keypoints=np.full((*shape, 17, 2), np.nan, dtype=np.float32),
             confidence=np.full((*shape, 17), np.nan, dtype=np.float32),
             boxes=np.full((*shape, 4), np.nan, dtype=np.float32),
             score=np.full(shape, np.nan, dtype=np.float32),
-            unreadable=tuple(unreadable),
+            frame=np.array(numbers, dtype=np.int64),
         )
-        for row, (people, poses) in enumerate(rows):
-            count = len(people.scores)
-            stretch.keypoints[row, :count] = poses.keypoints
-            stretch.confidence[row, :count] = poses.confidence
-            stretch.boxes[row, :count] = people.boxes
-            stretch.score[row, :count] = people.scores
+        for row, found in enumerate(rows):
+            count = len(found.score)
+            for name, values in found.arrays().items():
+                chunk.arrays()[name][row, :count] = values
             self.report.detections += count
         self.report.frames += len(rows)
-        self.report.unreadable += len(unreadable)
-        self.report.empty += sum(not len(people.scores) for people, _ in rows) - len(unreadable)
-        rows.clear()
-        unreadable.clear()
-        return stretch
-
-
-def _nobody() -> People:
-    return People(np.empty((0, 4)), np.empty(0))
+        return chunk

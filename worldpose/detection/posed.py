@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from data_contracts.arrays import Image
-from worldpose.detection.boxes import seen_closer
-from worldpose.detection.interfaces import LooksBeside, People, PoseEstimator, Poses
+from data_contracts.keypoints import KeypointDetections
+from worldpose.detection.boxes import combine_boxes
+from worldpose.detection.interfaces import LooksBeside, People, PoseEstimator
 from worldpose.detection.settings import DetectionSettings
 
 
 def find_poses(
     estimator: PoseEstimator, picture: Image, people: People, settings: DetectionSettings
-) -> tuple[People, Poses]:
-    """Return people with the estimator's boxes and poses, then occluded people next to them.
+) -> KeypointDetections:
+    """Return the poses of people with the estimator's boxes, then of occluded people next to them.
 
     Args:
         estimator: of poses.
@@ -21,18 +20,8 @@ def find_poses(
         people: detected people.
         settings: of the stage.
     """
-    poses = estimator.estimate(picture, people.boxes)
-    people = seen_closer(people, poses)
+    poses = combine_boxes(people, estimator.estimate(picture, people.boxes))
     if not (settings.find_occluded and isinstance(estimator, LooksBeside)):
-        return people, poses
-    others, theirs = estimator.beside(picture, people)
-    return (
-        People(
-            np.concatenate([people.boxes, others.boxes]),
-            np.concatenate([people.scores, others.scores]),
-        ),
-        Poses(
-            np.concatenate([poses.keypoints, theirs.keypoints]),
-            np.concatenate([poses.confidence, theirs.confidence]),
-        ),
-    )
+        return poses
+    occluded = estimator.beside(picture, People.from_detections(poses))
+    return KeypointDetections.concatenate([poses, occluded])

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Image
-from worldpose.detection.interfaces import LEAST_SCORE, Detector, People, PoseEstimator, Poses
+from data_contracts.keypoints import KeypointDetections
+from worldpose.detection.interfaces import LEAST_SCORE, Detector, People, PoseEstimator
 from worldpose.errors import InputError
 
 DETECTORS: Final = ("rt_detr", "rt_detr_v2", "d_fine", "detr")
@@ -99,15 +100,15 @@ class _TransformersPose:
         experts = getattr(net.config.backbone_config, "num_experts", 1)
         self._expert = 0 if experts > 1 else None  # of ViTPose+, the one for COCO
 
-    def estimate(self, picture: Image, boxes: NDArray[np.float64]) -> Poses:
+    def estimate(self, picture: Image, boxes: NDArray[np.float64]) -> KeypointDetections:
         """Return the pose in each box."""
         if not len(boxes):
-            return Poses(np.empty((0, 17, 2)), np.empty((0, 17)))
+            return KeypointDetections.empty()
         each = [self._one(picture, box) for box in boxes]
         keypoints = np.stack([points for points, _ in each])
         confidence = np.stack([score for _, score in each])
         found = confidence > 0.0
-        return Poses(
+        return KeypointDetections.from_keypoints(
             np.where(found[..., None], keypoints, np.nan),
             np.where(found, np.minimum(confidence, 1.0), np.nan),
         )

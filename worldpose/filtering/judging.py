@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Flags, Floats
+from data_contracts.arrays import AnyFloats, Flags, Floats
 from data_contracts.conventions import COCO17, COCO17_BONES
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.filtering.residuals import Residuals
@@ -37,8 +37,8 @@ class Suspects:
         noise: what keypoints are stated to err by, [px] and [m].
     """
 
-    keypoints: Floats
-    confidence: Floats
+    keypoints: AnyFloats
+    confidence: AnyFloats
     index: NDArray[np.integer]
     offsets: Floats
     exchanged: Flags

@@ -2,7 +2,7 @@
 
 Inputs: match.yaml, calibration.toml, clicked markings, detections/, pitch.json, videos; or files of
 other tools.
-Outputs: `MatchFolder`, `Registration`, `Observations` on match frames.
+Outputs: `MatchFolder`, `Registration`, `KeypointDetections` on match frames.
 """
 
 from worldpose.ingest.calibration_files import read_calibration, write_calibration_toml
@@ -10,14 +10,12 @@ from worldpose.ingest.importing import import_match
 from worldpose.ingest.importing_videos import import_videos
 from worldpose.ingest.keypoint_files import read_observations
 from worldpose.ingest.match_folder import MatchFolder, read_match, require_calibrated
-from worldpose.ingest.observations import Observations
 from worldpose.ingest.registration import register_match
 from worldpose.ingest.units import UnitFrames, read_unit, unit_frames
 from worldpose.ingest.writing import write_match
 
 __all__ = [
     "MatchFolder",
-    "Observations",
     "UnitFrames",
     "import_match",
     "import_videos",

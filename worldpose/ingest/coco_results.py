@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import FRAME_LIMIT
 from worldpose.errors import InputError
 from worldpose.ingest.json_items import JsonItems
@@ -26,7 +27,6 @@ from worldpose.ingest.keypoint_arrays import (
     PEOPLE_LIMIT,
 )
 from worldpose.ingest.npz_files import PACKED_BYTES, PACKED_RATIO
-from worldpose.ingest.observations import Observations
 
 JSON_BYTES: Final = 1 << 30
 """Maximum size of a JSON file [byte], about two million people; npz holds more and is faster."""
@@ -42,7 +42,7 @@ _COUNT_TODO: Final = "Export all 17 joints in COCO's order, and 0, 0, 0 where on
 _CONFIDENCE_TODO: Final = "Scale the detector's scores so that 1 is certain and 0 is missing."
 
 
-def read_coco_results(path: Path) -> Observations:
+def read_coco_results(path: Path) -> KeypointDetections:
     """Return the people of a results file by rising frame, without frames that have no people.
 
     The function reads in batches: the arrays bound the memory, not Python objects.
@@ -188,7 +188,7 @@ def _by_frame(
     triples: NDArray[np.float32],
     boxes: NDArray[np.float64],
     scores: NDArray[np.float64],
-) -> Observations:
+) -> KeypointDetections:
     found = triples[..., 2] > 0
     confidence = np.where(found, np.minimum(triples[..., 2], 1), np.float32(np.nan))
     keypoints = np.where(found[..., None], triples[..., :2], np.float32(np.nan))
@@ -228,7 +228,7 @@ def _by_frame(
         dense[row, slot] = values[order]
         return dense
 
-    return Observations(
+    return KeypointDetections(
         frame=frame,
         keypoints=padded(keypoints),
         confidence=padded(confidence),

@@ -1,8 +1,8 @@
-"""Reader and writer of 2D poses as npz: the arrays of `Observations`, faster than JSON.
+"""Reader and writer of 2D poses as npz: the arrays of `KeypointDetections`, faster than JSON.
 
 Members: `frame` (frames,) int64, `keypoints` (frames, detections, 17, 2), `confidence` (frames,
 detections, 17), `boxes` (frames, detections, 4) and `score` (frames, detections), all float32 in
-little-endian order, NaN where missing (`data_contracts.observations`).
+little-endian order, NaN where missing (`data_contracts.keypoints`).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import FRAME_LIMIT
 from worldpose.errors import InputError
 from worldpose.ingest.npz_files import (
@@ -26,7 +27,6 @@ from worldpose.ingest.npz_files import (
     read_header,
     require_size,
 )
-from worldpose.ingest.observations import Observations
 from worldpose.ingest.text_files import require_file
 
 ARRAY_BYTES: Final = 4 << 30
@@ -52,7 +52,7 @@ _SHAPES: Final = {
 }
 
 
-def write_keypoint_arrays(path: Path, people: Observations) -> None:
+def write_keypoint_arrays(path: Path, people: KeypointDetections) -> None:
     """Write an npz file; the same arrays give the same bytes on every machine.
 
     The file has no compression, since a compressor's output changes with its version.
@@ -65,7 +65,7 @@ def write_keypoint_arrays(path: Path, people: Observations) -> None:
                 npy.write_array(member, np.ascontiguousarray(array, dtype), allow_pickle=False)
 
 
-def read_keypoint_arrays(path: Path) -> Observations:
+def read_keypoint_arrays(path: Path) -> KeypointDetections:
     """Return the people of an npz file as stored; frames rise, possibly with gaps.
 
     The function checks every declared type, shape and size before it unpacks data.
@@ -80,7 +80,7 @@ def read_keypoint_arrays(path: Path) -> Observations:
         headers = {name: read_header(path, file, info) for name, info in infos.items()}
         _check_headers(path, infos, headers)
         arrays = {name: read_array(path, file, info) for name, info in infos.items()}
-    people = Observations(
+    people = KeypointDetections(
         frame=cast("NDArray[np.int64]", arrays["frame"]),
         keypoints=cast("NDArray[np.float32]", arrays["keypoints"]),
         confidence=cast("NDArray[np.float32]", arrays["confidence"]),
@@ -127,7 +127,7 @@ def _check_headers(
     require_size(path, list(infos.values()), ARRAY_BYTES)
 
 
-def _check_values(path: Path, people: Observations) -> None:
+def _check_values(path: Path, people: KeypointDetections) -> None:
     steps = np.diff(people.frame)
     if np.any(steps <= 0):
         place = int(np.argmax(steps <= 0)) + 1
@@ -138,10 +138,10 @@ def _check_values(path: Path, people: Observations) -> None:
         raise npz_error(f"{path}: frame", f"frame numbers up to {FRAME_LIMIT}", "larger ones")
     block = max(1, min(_BLOCK, _BLOCK_PEOPLE // max(1, people.score.shape[1])))
     for start in range(0, len(people.frame), block):
-        _check_block(path, start, people.rows(slice(start, start + block)))
+        _check_block(path, start, people[start : start + block])
 
 
-def _check_block(path: Path, start: int, people: Observations) -> None:
+def _check_block(path: Path, start: int, people: KeypointDetections) -> None:
     found = np.isfinite(people.confidence)
     person = np.any(found, axis=-1)
     unlike = (np.isfinite(people.keypoints) != found[..., None]).any(axis=-1)

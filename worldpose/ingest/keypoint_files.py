@@ -7,14 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import FRAME_LIMIT
 from worldpose.errors import InputError
 from worldpose.ingest.coco_results import read_coco_results
 from worldpose.ingest.keypoint_arrays import ARRAY_BYTES, read_keypoint_arrays
-from worldpose.ingest.observations import Observations
 
 
-def read_observations(path: Path, ranges: Sequence[tuple[int, int]] | None = None) -> Observations:
+def read_observations(
+    path: Path, ranges: Sequence[tuple[int, int]] | None = None
+) -> KeypointDetections:
     """Return the detections of one camera, dense over ranges of the camera's own frames.
 
     Args:
@@ -44,7 +46,9 @@ def read_observations(path: Path, ranges: Sequence[tuple[int, int]] | None = Non
     return on_frames(path, people, ranges)
 
 
-def on_frames(path: Path, people: Observations, ranges: Sequence[tuple[int, int]]) -> Observations:
+def on_frames(
+    path: Path, people: KeypointDetections, ranges: Sequence[tuple[int, int]]
+) -> KeypointDetections:
     """Return the people of `path` on exactly these frames; missing frames are NaN.
 
     Raises:
@@ -62,10 +66,10 @@ def on_frames(path: Path, people: Observations, ranges: Sequence[tuple[int, int]
             todo="Check the frame numbers; cut a long match into clips.",
         )
     wanted = [np.arange(first, first + count, dtype=np.int64) for first, count in ranges]
-    return people.on_frames(np.concatenate(wanted))
+    return people.reindex(np.concatenate(wanted))
 
 
-def seen_frames(people: Observations) -> tuple[int, int] | None:
+def seen_frames(people: KeypointDetections) -> tuple[int, int] | None:
     """Return the first and last frame with a person; None without people."""
     frames = people.frame[np.isfinite(people.confidence).any(axis=(1, 2))]
     return (int(frames[0]), int(frames[-1])) if len(frames) else None

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from data_contracts.cameras import CameraCalibration
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
 from worldpose.ingest.keypoint_files import read_observations
 from worldpose.ingest.match_folder import MatchFolder
-from worldpose.ingest.observations import Observations
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,9 @@ def unit_frames(spec: MatchSpec, unit_id: str) -> UnitFrames:
     return UnitFrames(first, sum(ranges[-1]) - first, offset, tuple(ranges))
 
 
-def read_unit(match: MatchFolder, unit_id: str) -> tuple[Observations, CameraCalibration | None]:
+def read_unit(
+    match: MatchFolder, unit_id: str
+) -> tuple[KeypointDetections, CameraCalibration | None]:
     """Return detections and given calibration of a static camera or a clip's broadcast camera.
 
     Args:
@@ -62,7 +64,7 @@ def read_unit(match: MatchFolder, unit_id: str) -> tuple[Observations, CameraCal
         unit_id: id of a static camera, or of a clip that names a broadcast camera.
 
     Returns:
-        Observations with `frame` in match frames, and the calibration if given.
+        Detections with `frame` in match frames, and the calibration if given.
 
     Raises:
         InputError: the match has no such unit, or no or invalid detections for it.

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from data_contracts.broadcast_calibration import KeyFrames
 from data_contracts.cameras import CameraCalibration
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
@@ -22,7 +23,6 @@ from worldpose.ingest.annotations import write_clicked_markings, write_key_frame
 from worldpose.ingest.calibration_files import write_calibration_toml
 from worldpose.ingest.keypoint_arrays import read_keypoint_arrays, write_keypoint_arrays
 from worldpose.ingest.match_folder import read_match
-from worldpose.ingest.observations import Observations
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.ingest.places import require_local
 from worldpose.ingest.stills import write_still
@@ -33,7 +33,7 @@ def write_match(
     spec: MatchSpec,
     *,
     calibrations: Mapping[str, CameraCalibration],
-    observations: Mapping[str, Observations],
+    observations: Mapping[str, KeypointDetections],
     pitch: PitchSpec | None = None,
     clicked: Mapping[str, ClickedMarkings] = MappingProxyType({}),
     stills: Mapping[str, NDArray[np.uint8]] = MappingProxyType({}),

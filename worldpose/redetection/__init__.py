@@ -4,13 +4,12 @@ Input: bodies of the previous iteration in one camera's frames, its detections, 
 Output: the people searched for, the estimator's results, and the accepted ones.
 """
 
-from worldpose.redetection.answers import Answers, Verdicts, judge_answers, look_again
+from worldpose.redetection.answers import Verdicts, judge_answers, look_again
 from worldpose.redetection.expected import Expected
 from worldpose.redetection.settings import RedetectionSettings
 from worldpose.redetection.sought import Sought, who_is_seen, whom_to_seek
 
 __all__ = [
-    "Answers",
     "Expected",
     "RedetectionSettings",
     "Sought",

@@ -8,9 +8,10 @@ from typing import Final
 
 import numpy as np
 
-from data_contracts.arrays import Flags, Floats, Image
-from worldpose.detection import People, PoseEstimator, Poses
-from worldpose.detection.boxes import SUREST, areas, overlaps, seen_closer
+from data_contracts.arrays import AnyFloats, Flags, Floats, Image
+from data_contracts.keypoints import KeypointDetections
+from worldpose.detection import People, PoseEstimator
+from worldpose.detection.boxes import areas, combine_boxes, overlaps, surest_confidence
 from worldpose.detection.oks_nms import likeness
 from worldpose.filtering import (
     BodyViews,
@@ -27,34 +28,6 @@ FEWEST: Final = 8
 """Least number of keypoints of a result [1]: half a body."""
 FARTHEST: Final = 0.3
 """Cap on the distance between a joint and a keypoint [m]."""
-
-
-@dataclass(frozen=True, eq=False)
-class Answers:
-    """Estimated poses of the people searched for; NaN where there was no frame.
-
-    Attributes:
-        keypoints: (n, 17, 2) [px]; NaN where not found.
-        confidence: (n, 17).
-        boxes: (n, 4) [px].
-        score: (n,) in (0, 1], comparable with those of detections.
-    """
-
-    keypoints: Floats
-    confidence: Floats
-    boxes: Floats
-    score: Floats
-
-    @classmethod
-    def none(cls, count: int) -> Answers:
-        """Return empty results for `count` people."""
-        empty = (np.full((count, *shape), np.nan) for shape in ((17, 2), (17,), (4,), ()))
-        return cls(*empty)
-
-    @property
-    def sureness(self) -> Floats:
-        """Return the mean confidence of the surest keypoints (n,), 0 without any."""
-        return np.asarray(np.sort(np.nan_to_num(self.confidence), axis=1)[:, -SUREST:].mean(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +54,12 @@ def look_again(
     sought: Sought,
     estimator: PoseEstimator,
     least_keypoint: float,
-    detected: Floats | None = None,
-) -> Answers:
+    detected: AnyFloats | None = None,
+) -> KeypointDetections:
     """Return the poses that an estimator finds in predicted boxes.
+
+    The detections are those of the rows of `sought` (n,); they are missing where there was no
+    image, and scores are comparable with those of a detector.
 
     Args:
         pictures: images by index of the frame, rising, at least the frames to search in.
@@ -93,7 +69,13 @@ def look_again(
         detected: (frames, detections, 4) boxes of detections [px]: an estimator may separate people
             by the boxes of their neighbours.
     """
-    answers = Answers.none(len(sought.frame))
+    shape = (len(sought.frame), 17)
+    found = KeypointDetections(
+        keypoints=np.full((*shape, 2), np.nan),
+        confidence=np.full(shape, np.nan),
+        boxes=np.full((shape[0], 4), np.nan),
+        score=np.full(shape[0], np.nan),
+    )
     for frame, picture in pictures:
         rows = np.flatnonzero(sought.frame == frame)
         if picture is None or not len(rows):
@@ -102,31 +84,22 @@ def look_again(
         beside = np.empty((0, 4)) if detected is None else detected[frame].astype(np.float64)
         beside = beside[np.isfinite(beside).all(axis=1)]
         beside = beside[(overlaps(people.boxes, beside) > 0.0).any(axis=0)]
-        everybody = estimator.estimate(picture, np.concatenate([people.boxes, beside]))
-        poses = _first(everybody, len(rows))
-        people = seen_closer(people, poses)
+        estimated = estimator.estimate(picture, np.concatenate([people.boxes, beside]))
+        poses = combine_boxes(people, estimated.select(slice(len(rows))))
         with np.errstate(invalid="ignore"):
             there = (poses.confidence >= least_keypoint) & np.isfinite(poses.keypoints).all(axis=2)
-        answers.keypoints[rows] = np.where(there[..., None], poses.keypoints, np.nan)
-        answers.confidence[rows] = np.where(there, poses.confidence, np.nan)
-        answers.boxes[rows] = people.boxes
-        answers.score[rows] = people.scores
-    plain = answers.score >= 1.0  # of an estimator without boxes and fit
-    answers.score[plain] = np.clip(answers.sureness[plain], 1e-3, 1.0)
-    return answers
-
-
-def _first(poses: Poses, count: int) -> Poses:
-    """Return the first `count` poses."""
-    boxes, fit = (None if each is None else each[:count] for each in (poses.boxes, poses.fit))
-    return Poses(poses.keypoints[:count], poses.confidence[:count], boxes, fit)
+        for name, values in poses.without(~there).arrays().items():
+            found.arrays()[name][rows] = values
+    plain = found.score >= 1.0  # of an estimator without boxes and fit
+    found.score[plain] = np.clip(surest_confidence(found.confidence[plain]), 1e-3, 1.0)
+    return found
 
 
 def judge_answers(
-    answers: Answers,
+    answers: KeypointDetections,
     sought: Sought,
     expected: Expected,
-    detected: tuple[Floats, Floats],
+    detected: KeypointDetections,
     spread: Spread,
     noise: tuple[float, float],
     settings: RedetectionSettings,
@@ -141,14 +114,13 @@ def judge_answers(
         answers: of the estimator.
         sought: the people of these results.
         expected: all bodies in view of the camera.
-        detected: keypoints (frames, detections, 17, 2) and boxes (frames, detections, 4) [px] of
-            the detections in all frames.
+        detected: the detections (frames, detections) in all frames of the camera.
         spread: of keypoints around bodies.
         noise: stated standard deviation of keypoints, [px] and [m].
         settings: acceptance thresholds.
     """
     agrees, rejected = _agreeing(answers, sought, expected, spread, noise, settings)
-    unsure = ~(answers.sureness >= settings.min_confidence)
+    unsure = ~(surest_confidence(answers.confidence) >= settings.min_confidence)
     away = _distances(answers, sought, expected)
     rows = np.arange(len(away))
     own = away[rows, sought.person]
@@ -159,8 +131,8 @@ def judge_answers(
     for frame in np.unique(sought.frame[open_]):
         here = np.flatnonzero(open_ & (sought.frame == frame))
         here = here[np.argsort(own[here], kind="stable")]
-        boxes = np.concatenate([answers.boxes[here], detected[1][frame]])
-        pose = np.concatenate([answers.keypoints[here], detected[0][frame]])
+        boxes = np.concatenate([answers.boxes[here], detected.boxes[frame]])
+        pose = np.concatenate([answers.keypoints[here], detected.keypoints[frame]])
         alike = likeness(pose, np.nan_to_num(areas(boxes)))[: len(here)]
         same = np.asarray(alike > settings.oks_nms)
         for k, row in enumerate(here):
@@ -170,7 +142,7 @@ def judge_answers(
 
 
 def _agreeing(
-    answers: Answers,
+    answers: KeypointDetections,
     sought: Sought,
     expected: Expected,
     spread: Spread,
@@ -202,7 +174,7 @@ def _agreeing(
     return judged.fits[:, 0, 0] == 0, judged.rejected[:, 0, 0]
 
 
-def _distances(answers: Answers, sought: Sought, expected: Expected) -> Floats:
+def _distances(answers: KeypointDetections, sought: Sought, expected: Expected) -> Floats:
     """Return mean distances (n, persons) of a result's keypoints to bodies of its frame [m]."""
     image, scale = expected.image[sought.frame], expected.scale[sought.frame]
     with np.errstate(invalid="ignore"):

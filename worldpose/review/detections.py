@@ -9,8 +9,8 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from data_contracts.conventions import COCO17
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.review import AddedDetection, DeletedDetection, MovedKeypoint
-from worldpose.ingest import Observations
 
 DetectionEdit: TypeAlias = AddedDetection | DeletedDetection | MovedKeypoint
 DETECTION_EDITS = (AddedDetection, DeletedDetection, MovedKeypoint)
@@ -28,11 +28,11 @@ class DetectionReplay:
         objections: per edit the reason why it does not apply; None if it does.
     """
 
-    observations: Observations
+    observations: KeypointDetections
     objections: tuple[str | None, ...]
 
 
-def replay_detections(found: Observations, edits: Iterable[DetectionEdit]) -> DetectionReplay:
+def replay_detections(found: KeypointDetections, edits: Iterable[DetectionEdit]) -> DetectionReplay:
     """Return the detections of one camera with corrections applied in order.
 
     An edit applies only if the current value equals its `was`. Corrected keypoints and added people
@@ -43,7 +43,7 @@ def replay_detections(found: Observations, edits: Iterable[DetectionEdit]) -> De
         found: detected or given observations; not modified.
         edits: of this camera, in the order they were made.
     """
-    changed = Observations(
+    changed = KeypointDetections(
         frame=found.frame,
         keypoints=found.keypoints.copy(),
         confidence=found.confidence.copy(),
@@ -74,7 +74,7 @@ def replay_detections(found: Observations, edits: Iterable[DetectionEdit]) -> De
     return DetectionReplay(changed, tuple(objections))
 
 
-def objection_to(found: Observations, edit: DetectionEdit) -> str | None:
+def objection_to(found: KeypointDetections, edit: DetectionEdit) -> str | None:
     """Return why an edit does not apply to a camera's detections; None if it does."""
     place = f"detection {edit.detection} of {edit.camera} in frame {edit.frame}"
     row = _row(found, edit.frame)
@@ -99,7 +99,7 @@ def objection_to(found: Observations, edit: DetectionEdit) -> str | None:
     return None
 
 
-def _with_place(found: Observations, detection: int) -> Observations:
+def _with_place(found: KeypointDetections, detection: int) -> KeypointDetections:
     """Return observations with room for a detection index; new entries are NaN."""
     if detection < found.score.shape[1]:
         return found
@@ -107,10 +107,10 @@ def _with_place(found: Observations, detection: int) -> Observations:
         name: np.pad(array, [(0, 0), (0, 1)] + [(0, 0)] * (array.ndim - 2), constant_values=np.nan)
         for name, array in found.arrays().items()
     }
-    return Observations(frame=found.frame, **widened)
+    return KeypointDetections(frame=found.frame, **widened)
 
 
-def _row(found: Observations, frame: int) -> int | None:
+def _row(found: KeypointDetections, frame: int) -> int | None:
     """Return the row of a match frame; None if the camera has no such frame."""
     row = int(np.searchsorted(found.frame, frame))
     return row if row < len(found.frame) and found.frame[row] == frame else None

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
-from worldpose.ingest import Observations
+from data_contracts.keypoints import KeypointDetections
 from worldpose.simulation.detecting import Detections
 
 ROOM: Final = 0.06
@@ -26,7 +26,7 @@ class Report:
         displaced: (frames, detections, 17), joints with gross errors.
     """
 
-    observations: Observations
+    observations: KeypointDetections
     person: NDArray[np.int16]
     displaced: Flags
 
@@ -60,7 +60,7 @@ def report(
     boxes = np.take_along_axis(boxes, order[..., None], axis=1)
     joints = np.maximum(np.isfinite(confidence).sum(-1), 1)
     score = np.where(found, np.nansum(confidence, axis=-1) / joints, np.nan)
-    observations = Observations(
+    observations = KeypointDetections(
         frame=np.arange(first_frame, first_frame + len(found), dtype=np.int64),
         keypoints=keypoints.astype(np.float32),
         confidence=confidence.astype(np.float32),

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from worldpose.body import BodyParameters
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
-from worldpose.ingest import Observations
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.broadcast import film
 from worldpose.simulation.bvh import Clip
@@ -102,7 +102,7 @@ class Scene:
     cameras: dict[str, Camera]
     given: dict[str, Camera]
     broadcast: Camera | None
-    observations: dict[str, Observations]
+    observations: dict[str, KeypointDetections]
     identities: dict[str, Identities]
     clocks: dict[str, float]
     clicks: dict[str, Clicks]

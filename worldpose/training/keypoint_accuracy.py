@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import AnyFloats, Floats
 
 SHARE: Final = 0.2
 """Share of the torso within which a keypoint is correct [1]."""
@@ -23,7 +23,7 @@ def torso_sizes(keypoints: Floats) -> Floats:
     return np.asarray(np.linalg.norm(diagonals, axis=-1).max(axis=-1))
 
 
-def correct_keypoints(found: Floats, true: Floats, share: float = SHARE) -> Floats:
+def correct_keypoints(found: AnyFloats, true: Floats, share: float = SHARE) -> Floats:
     """Return 1 for keypoints within a share of the torso, else 0 (people, 17); NaN without truth.
 
     Args:

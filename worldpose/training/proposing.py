@@ -13,7 +13,7 @@ import numpy as np
 
 from data_contracts.arrays import Image
 from worldpose.detection import DetectionSettings, Detector, People, PoseEstimator
-from worldpose.detection.boxes import fuse, seen_closer
+from worldpose.detection.boxes import combine_boxes, fuse
 from worldpose.training.labels import LabelledPicture, write_labels
 
 SEEN: Final = 0.5
@@ -62,8 +62,7 @@ def _write(
         people = fuse([each.detect([picture])[0] for each in detectors], settings.nms_iou)
         sure = people.scores >= settings.high_score_threshold
         kept = People(people.boxes[sure], people.scores[sure])
-        poses = pose.estimate(picture, kept.boxes)
-        kept = seen_closer(kept, poses)
+        poses = combine_boxes(kept, pose.estimate(picture, kept.boxes))
         found = poses.confidence >= settings.min_keypoint_confidence
         path = folder / "pictures" / f"{name}.png"
         cv2.imwrite(str(path), picture[..., ::-1])
@@ -71,10 +70,10 @@ def _write(
         proposed.append(
             LabelledPicture(
                 path=path,
-                boxes=kept.boxes,
+                boxes=np.asarray(poses.boxes, dtype=np.float64),
                 keypoints=np.where(found[..., None], poses.keypoints, np.nan),
                 visible=visible.astype(np.int8),
-                ignored=np.zeros(len(kept.boxes), dtype=np.bool_),
+                ignored=np.zeros(len(poses.boxes), dtype=np.bool_),
             )
         )
         size = (picture.shape[1], picture.shape[0])

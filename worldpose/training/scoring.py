@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Image
 from worldpose.detection.boxes import overlaps
 from worldpose.detection.interfaces import Detector, People, PoseEstimator
-from worldpose.detection.oks_nms import told_apart
+from worldpose.detection.oks_nms import suppress_poses
 from worldpose.detection.posed import find_poses
 from worldpose.detection.settings import DetectionSettings
 from worldpose.training.average_precision import average_precision
@@ -80,8 +80,9 @@ def stored(
     chosen = settings or DetectionSettings()
     kept = people.scores >= chosen.low_score_threshold
     people = People(people.boxes[kept], people.scores[kept])
-    people, poses = find_poses(estimator, picture, people, chosen)
-    return told_apart(people, poses, chosen.min_keypoint_confidence, chosen.oks_nms)[0]
+    found = find_poses(estimator, picture, people, chosen)
+    distinct = suppress_poses(found, chosen.min_keypoint_confidence, chosen.oks_nms)
+    return People.from_detections(distinct)
 
 
 def apart(pictures: Sequence[LabelledPicture], share: float = 0.3) -> list[LabelledPicture]:

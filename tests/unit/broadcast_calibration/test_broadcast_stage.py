@@ -9,6 +9,7 @@ import turning_clip as clip
 
 from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.broadcast_calibration import FRAME_STATUS, KeyFrame, KeyFrames
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
@@ -19,7 +20,7 @@ from tasks.broadcast_calibration import broadcast_calibration
 from tasks.broadcast_pooling import broadcast_pooling
 from tasks.ingest import ingest
 from worldpose.geometry import Camera
-from worldpose.ingest import Observations, write_match
+from worldpose.ingest import write_match
 from worldpose.simulation.broadcast_rendering import render_broadcast
 from worldpose.store import Store
 from worldpose.video import write_video
@@ -43,7 +44,7 @@ def joints(frames):
 def observed(frame, keypoints):
     known = np.isfinite(keypoints).all(axis=-1)
     low, high = keypoints.min(axis=-2), keypoints.max(axis=-2)
-    return Observations(
+    return KeypointDetections(
         frame=frame,
         keypoints=keypoints.astype(np.float32),
         confidence=np.where(known, 0.9, np.nan).astype(np.float32),

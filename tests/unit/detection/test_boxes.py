@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from worldpose.detection.boxes import fuse, overlaps, seen_closer, suppress
-from worldpose.detection.interfaces import People, Poses
+from data_contracts.keypoints import KeypointDetections
+from worldpose.detection.boxes import combine_boxes, fuse, overlaps, suppress
+from worldpose.detection.interfaces import People
 from worldpose.detection.views import Tiled
 
 
@@ -96,9 +97,9 @@ def test_a_person_in_a_scaled_view_lies_where_the_picture_has_them(zoom):
 def test_a_closer_look_scores_by_detector_fit_and_the_surest_keypoints():
     confidence = np.full((1, 17), 0.5)
     confidence[0, :5] = np.nan, 0.1, 0.1, 0.1, 0.1  # a hidden head tells nothing
-    poses = Poses(
+    poses = KeypointDetections(
         np.zeros((1, 17, 2)), confidence, np.array([[1.0, 1.0, 5.0, 9.0]]), np.array([0.8])
     )
-    found = seen_closer(People(np.array([[0.0, 0.0, 6.0, 9.0]]), np.array([0.54])), poses)
+    found = combine_boxes(People(np.array([[0.0, 0.0, 6.0, 9.0]]), np.array([0.54])), poses)
     np.testing.assert_array_equal(found.boxes, poses.boxes)
-    np.testing.assert_allclose(found.scores, [(0.54 * 0.8 * 0.5) ** (1 / 3)])
+    np.testing.assert_allclose(found.score, [(0.54 * 0.8 * 0.5) ** (1 / 3)])

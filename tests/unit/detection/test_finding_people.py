@@ -1,11 +1,14 @@
 """Players are found and the crowd is not, by a detector that knows the truth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from worldpose.detection import DetectionSettings, People, PeopleFinder, Place, Poses
+from data_contracts.keypoints import KeypointDetections
+from worldpose.detection import DetectionSettings, People, PeopleFinder, Place
 from worldpose.detection.crowd import on_pitch
-from worldpose.detection.oks_nms import likeness, told_apart
+from worldpose.detection.oks_nms import likeness, suppress_poses
 from worldpose.geometry import Camera
 from worldpose.ingest.given_cameras import given_camera
 from worldpose.pitch import PitchTemplate
@@ -86,7 +89,7 @@ class Knowing:
         keypoints = boxes[:, None, :2] + (boxes[:, 2:] - boxes[:, :2])[:, None] * across[:, None]
         confidence = np.full((len(boxes), 17), 0.8)
         confidence[:, 3] = 0.01  # an ear that is not there
-        return Poses(keypoints, confidence)
+        return KeypointDetections.from_keypoints(keypoints, confidence)
 
 
 def test_a_video_becomes_arrays_in_the_form_of_given_poses(camera):
@@ -118,12 +121,11 @@ def test_a_video_becomes_arrays_in_the_form_of_given_poses(camera):
     there = np.delete(np.arange(frames), 30)
     assert np.isfinite(found["score"]).sum(axis=1)[there].tolist() == [players] * 69
     assert np.isnan(found["score"][30]).all()
-    assert [number for stretch in stretches for number in stretch.unreadable] == [130]
     np.testing.assert_allclose(found["boxes"][:, :players][there][8], boxes[8][:5], atol=1e-3)
     assert np.isnan(found["confidence"][:, :, 3]).all()
     assert np.array_equal(np.isnan(found["confidence"]), np.isnan(found["keypoints"]).any(axis=3))
     report = finder.report
-    assert (report.crowd, report.unreadable, report.empty, report.flickers) == (69, 1, 0, 0)
+    assert (report.crowd, report.unreadable, report.empty, report.flickers) == (69, [130], 0, 0)
 
 
 class LookingCloser(Knowing):
@@ -133,7 +135,7 @@ class LookingCloser(Knowing):
         poses = super().estimate(picture, boxes)
         wider = boxes + (boxes[:, 2:] - boxes[:, :2])[:, [0, 1, 0, 1]] * [-0.1, 0.0, 0.1, 0.0]
         wider[1] = wider[1, [0, 1, 0, 1]]  # a box of no size is none
-        return Poses(poses.keypoints, poses.confidence, wider, np.full(len(boxes), 0.4))
+        return replace(poses, boxes=wider, score=np.full(len(boxes), 0.4))
 
 
 def test_boxes_are_those_of_who_looked_closer():
@@ -161,11 +163,12 @@ def test_of_two_boxes_with_one_pose_the_better_stays_and_who_is_close_to_one_com
     person = np.stack([np.linspace(0, 30, 17), np.linspace(0, 80, 17)], axis=1)
     near, far = person + [6.0, 0.0], person + [200.0, 0.0]
     keypoints = np.stack([person + 0.5, near, person, far])
-    poses = Poses(keypoints, np.full((4, 17), 0.9))
     box = np.array([0.0, 0.0, 30.0, 80.0])
     boxes = box + np.array([0.5, 6.0, 0.0, 200.0])[:, None] * [1.0, 0.0, 1.0, 0.0]
-    people, own = told_apart(People(boxes, np.array([0.6, 0.7, 0.8, 0.5])), poses, 0.05, 0.85)
-    np.testing.assert_array_equal(own.keypoints, keypoints[1:])
+    score = np.array([0.6, 0.7, 0.8, 0.5])
+    people = KeypointDetections(keypoints, np.full((4, 17), 0.9), boxes, score)
+    kept = suppress_poses(people, 0.05, 0.85)
+    np.testing.assert_array_equal(kept.keypoints, keypoints[1:])
     alike = likeness(keypoints[1:3], np.full(2, 2400.0))[0, 1]
     assert 0.3 < alike < 0.85
-    np.testing.assert_allclose(people.scores, [0.7 * (1.0 - 0.5 * alike**2), 0.8, 0.5])
+    np.testing.assert_allclose(kept.score, [0.7 * (1.0 - 0.5 * alike**2), 0.8, 0.5])

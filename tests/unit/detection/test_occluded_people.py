@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from worldpose.detection import DetectionSettings, People, PeopleFinder, Place, Poses
+from data_contracts.keypoints import KeypointDetections
+from worldpose.detection import DetectionSettings, People, PeopleFinder, Place
 from worldpose.detection.boxes import overlaps
 from worldpose.detection.bundled import embedded_pose
 from worldpose.detection.bundled_looks import Look
@@ -45,11 +46,11 @@ def found(*boxes, score=0.8):
 
 def test_who_is_hidden_by_half_is_found_once_with_his_own_box_and_pose():
     look = Told(FRONT, HIDDEN, FAR)
-    people, poses = find_occluded_people(look, found(FRONT, FAR))
+    people = find_occluded_people(look, found(FRONT, FAR))
     assert_allclose(people.boxes, [HIDDEN])
-    assert_allclose(people.scores, [np.cbrt(0.3 * 0.9 * 0.8)])
-    assert_allclose(poses.keypoints[0, 0], HIDDEN[:2])
-    assert_allclose(poses.keypoints[0, 16], HIDDEN[2:])
+    assert_allclose(people.score, [np.cbrt(0.3 * 0.9 * 0.8)])
+    assert_allclose(people.keypoints[0, 0], HIDDEN[:2])
+    assert_allclose(people.keypoints[0, 16], HIDDEN[2:])
     # A step of 0.35 widths to either side of both; then about the one who was seen.
     assert_allclose(look.asked[0][:, 0], [86.0, 386.0, 114.0, 414.0])
     assert_allclose(look.asked[1], [HIDDEN] * len(look.asked[1]))
@@ -57,11 +58,11 @@ def test_who_is_hidden_by_half_is_found_once_with_his_own_box_and_pose():
 
 @pytest.mark.parametrize("people", [found(FRONT, FAR), found(FRONT, HIDDEN, FAR), found()])
 def test_where_all_are_known_nobody_is_found(people):
-    others, poses = find_occluded_people(Told(*people.boxes), people)
+    others = find_occluded_people(Told(*people.boxes), people)
     assert others.boxes.shape == (0, 4)
-    assert others.scores.shape == (0,)
-    assert poses.keypoints.shape == (0, 17, 2)
-    assert poses.confidence.shape == (0, 17)
+    assert others.score.shape == (0,)
+    assert others.keypoints.shape == (0, 17, 2)
+    assert others.confidence.shape == (0, 17)
 
 
 def test_nobody_is_asked_for_where_somebody_is_known():
@@ -74,14 +75,14 @@ def test_nobody_is_asked_for_where_somebody_is_known():
 
 def test_beside_whom_the_detector_doubts_nobody_is_asked_for():
     look = Told(FRONT, HIDDEN)
-    people, _ = find_occluded_people(look, found(FRONT, score=0.2))
+    people = find_occluded_people(look, found(FRONT, score=0.2))
     assert len(people.boxes) == 0
     assert len(look.asked[0]) == 0
 
 
 def test_an_answer_that_is_not_sure_is_none():
-    assert len(find_occluded_people(Told(FRONT, HIDDEN, fit=0.51), found(FRONT))[0].boxes) == 1
-    assert len(find_occluded_people(Told(FRONT, HIDDEN, fit=0.49), found(FRONT))[0].boxes) == 0
+    assert len(find_occluded_people(Told(FRONT, HIDDEN, fit=0.51), found(FRONT)).boxes) == 1
+    assert len(find_occluded_people(Told(FRONT, HIDDEN, fit=0.49), found(FRONT)).boxes) == 0
 
 
 class Finding:
@@ -93,10 +94,14 @@ class Finding:
         return [found(FRONT)] * len(pictures)
 
     def estimate(self, picture, boxes):
-        return Poses(np.repeat(boxes[:, None, :2], 17, axis=1), np.full((len(boxes), 17), 0.9))
+        return KeypointDetections.from_keypoints(
+            np.repeat(boxes[:, None, :2], 17, axis=1), np.full((len(boxes), 17), 0.9)
+        )
 
     def beside(self, picture, people):
-        return found(HIDDEN, score=0.5), Poses(np.full((1, 17, 2), 200.0), np.full((1, 17), 0.9))
+        return KeypointDetections(
+            np.full((1, 17, 2), 200.0), np.full((1, 17), 0.9), HIDDEN[None], np.array([0.5])
+        )
 
 
 def people_of(settings, place=None):
@@ -122,5 +127,5 @@ def test_the_embedded_net_looks_beside_and_means_of_two_looks_do_not():
     pose = embedded_pose()
     assert isinstance(pose, LooksBeside)
     assert not isinstance(Mirrored(pose), LooksBeside)
-    people, poses = pose.beside(np.zeros((240, 320, 3), np.uint8), found(FRONT))
-    assert len(people.boxes) == len(poses.keypoints) == 0  # nobody in the dark
+    people = pose.beside(np.zeros((240, 320, 3), np.uint8), found(FRONT))
+    assert len(people.boxes) == len(people.keypoints) == 0  # nobody in the dark

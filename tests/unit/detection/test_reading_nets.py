@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from worldpose.detection import DetectionSettings, Poses, load_detectors, weights_of
+from data_contracts.keypoints import KeypointDetections
+from worldpose.detection import DetectionSettings, load_detectors, weights_of
 from worldpose.detection.crops import crop_frames, cut_crops, in_picture
 from worldpose.detection.flip_test import SIDES, Mirrored
 from worldpose.detection.onnx_detectors import _corners, _grid, _multipose
@@ -102,7 +103,7 @@ class Leaning:
         confidence[:, 9] = np.nan
         keypoints = np.stack([x, np.repeat(boxes[:, 1:2], 17, axis=1)], axis=2)
         keypoints[:, 9] = np.nan
-        return Poses(keypoints, confidence)
+        return KeypointDetections.from_keypoints(keypoints, confidence)
 
 
 def test_what_leans_to_one_side_is_set_right_by_the_mirror():

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from data_contracts.cameras import CameraCalibration
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from worldpose.ingest.observations import Observations
 from worldpose.ingest.writing import write_match
 
 
@@ -19,7 +19,7 @@ def make_people():
             confidence[0, 0, 3] = np.nan
         keypoints[np.isnan(confidence)] = np.nan
         low, high = np.nanmin(keypoints, axis=2), np.nanmax(keypoints, axis=2)
-        return Observations(
+        return KeypointDetections(
             frame=np.arange(first_frame, first_frame + frames, dtype=np.int64),
             keypoints=keypoints,
             confidence=confidence,

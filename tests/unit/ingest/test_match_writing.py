@@ -6,12 +6,12 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec, PlayerSpec
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
 from worldpose.ingest.keypoint_files import read_observations
 from worldpose.ingest.match_folder import read_match
-from worldpose.ingest.observations import Observations
 from worldpose.ingest.writing import write_match
 
 
@@ -254,7 +254,7 @@ def test_any_match_yaml_comes_back(
 
 def _nobody():
     empty = np.empty
-    return Observations(
+    return KeypointDetections(
         frame=empty(0, np.int64),
         keypoints=empty((0, 0, 17, 2), np.float32),
         confidence=empty((0, 0, 17), np.float32),

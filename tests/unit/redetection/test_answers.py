@@ -8,9 +8,8 @@ from bystander import NOISE, SIZE, as_stated, expected
 from hypothesis import given
 from hypothesis import strategies as st
 
-from worldpose.detection import Poses
+from data_contracts.keypoints import KeypointDetections
 from worldpose.redetection import (
-    Answers,
     RedetectionSettings,
     Sought,
     judge_answers,
@@ -19,6 +18,7 @@ from worldpose.redetection import (
 )
 
 SETTINGS = RedetectionSettings()
+NOTHING = KeypointDetections.from_keypoints(np.full((1, 17, 2), np.nan), np.full((1, 17), np.nan))
 KINDS = ("found", "unsure", "elsewhere", "another")
 
 
@@ -31,7 +31,7 @@ def answer(bodies, *persons, off=(0.0, 0.0), confidence=0.9):
     """As if the net saw these bodies, so far off."""
     keypoints = bodies.image[0, list(persons)] + off
     count = len(persons)
-    return Answers(
+    return KeypointDetections(
         keypoints, np.full((count, 17), confidence), bodies.boxes[0, persons] + 0.0, np.ones(count)
     )
 
@@ -39,7 +39,8 @@ def answer(bodies, *persons, off=(0.0, 0.0), confidence=0.9):
 def judge(bodies, answers, sought, detected=()):
     pose = bodies.image[:, list(detected)] if len(detected) else np.empty((1, 0, 17, 2))
     boxes = bodies.boxes[:, list(detected)] if len(detected) else np.empty((1, 0, 4))
-    given_ = (pose, boxes)
+    none = np.full(pose.shape[:3], np.nan)
+    given_ = KeypointDetections(pose, none, boxes, none[..., 0])
     return judge_answers(answers, sought, bodies, given_, as_stated(), NOISE, SETTINGS)
 
 
@@ -73,7 +74,7 @@ def test_an_answer_that_the_net_doubts_is_nothing():
     bodies = expected((0.0, 0.0))
     doubted = answer(bodies, 0, confidence=SETTINGS.min_confidence - 0.01)
     assert kinds(judge(bodies, doubted, seek(bodies, 0))) == ["unsure"]
-    assert kinds(judge(bodies, Answers.none(1), seek(bodies, 0))) == ["unsure"]
+    assert kinds(judge(bodies, NOTHING, seek(bodies, 0))) == ["unsure"]
 
 
 def test_the_neighbour_s_pose_is_the_neighbour_s():
@@ -121,12 +122,7 @@ def test_half_a_body_is_too_little():
 def test_every_answer_is_of_one_kind(answers, detected):
     bodies = expected((0.0, 0.0), (0.4, 0.5))
     seen = [answer(bodies, n, off=off, confidence=c) for n, (*off, c) in enumerate(answers)]
-    together = Answers(
-        *(
-            np.concatenate([getattr(each, name) for each in seen])
-            for name in ("keypoints", "confidence", "boxes", "score")
-        )
-    )
+    together = KeypointDetections.concatenate(seen)
     verdicts = judge(bodies, together, seek(bodies, 0, 1), detected)
     assert (np.sum([getattr(verdicts, kind) for kind in KINDS], axis=0) == 1).all()
 
@@ -138,7 +134,7 @@ class Seeing:
         middle = 0.5 * (boxes[:, None, :2] + boxes[:, None, 2:])
         confidence = np.full((len(boxes), 17), 0.8)
         confidence[:, 9] = 0.01
-        return Poses(np.repeat(middle, 17, axis=1), confidence)
+        return KeypointDetections.from_keypoints(np.repeat(middle, 17, axis=1), confidence)
 
 
 def test_pictures_are_asked_for_everybody_who_is_sought_in_them():

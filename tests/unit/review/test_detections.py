@@ -1,12 +1,14 @@
 """Corrections of detections change what they name and nothing else, or say why not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
 from data_contracts.conventions import COCO17
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.review import AddedDetection, DeletedDetection, MovedKeypoint
-from worldpose.ingest import Observations
 from worldpose.review.detections import replay_detections
 
 FIRST = 50
@@ -21,7 +23,7 @@ def observations():
     score = np.full((2, 2), 0.9, dtype=np.float32)
     for array in (keypoints, confidence, boxes, score):
         array[1, 1] = np.nan
-    return Observations(np.arange(FIRST, FIRST + 2), keypoints, confidence, boxes, score)
+    return KeypointDetections(keypoints, confidence, boxes, score, np.arange(FIRST, FIRST + 2))
 
 
 def keypoint(xy, was=(0.0, 1.0), **where):
@@ -147,7 +149,7 @@ def test_where_all_places_are_taken_an_added_person_makes_one_more():
 
 def test_frames_between_clips_are_no_frames_of_the_camera():
     people = observations()
-    apart = Observations(np.array([FIRST, FIRST + 1000]), **people.arrays())
+    apart = replace(people, frame=np.array([FIRST, FIRST + 1000]))
     replay = replay_detections(apart, [keypoint((3.0, 4.0), was=(68.0, 69.0), frame=FIRST + 1000)])
     assert replay.objections == (None,)
     np.testing.assert_array_equal(replay.observations.keypoints[1, 0, 0], [3.0, 4.0])

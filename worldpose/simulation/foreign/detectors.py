@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from data_contracts.arrays import Flags, Floats
-from worldpose.ingest import Observations
+from data_contracts.keypoints import KeypointDetections
 from worldpose.simulation.foreign.profiles import DetectorProfile
 from worldpose.simulation.foreign.visibility import View, facing
 
@@ -73,7 +73,7 @@ class Report:
         displaced: (frames, detections, 17), joints with gross errors.
     """
 
-    observations: Observations
+    observations: KeypointDetections
     person: NDArray[np.int16]
     displaced: Flags
 
@@ -353,7 +353,7 @@ def _list_detections(
     boxes = np.where(found[..., None], np.concatenate([low - room, high + room], axis=-1), np.nan)
     joints = np.maximum(np.isfinite(confidence).sum(axis=-1), 1)
     score = np.where(found, np.nansum(confidence, axis=-1) / joints, np.nan)
-    observations = Observations(
+    observations = KeypointDetections(
         frame=np.arange(len(found), dtype=np.int64),
         keypoints=keypoints.astype(np.float32),
         confidence=confidence.astype(np.float32),

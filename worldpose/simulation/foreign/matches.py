@@ -8,9 +8,10 @@ from typing import Final
 
 import numpy as np
 
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from worldpose.formats import JointTracks, write_archive, write_joints, write_static_camera
-from worldpose.ingest import Observations, write_calibration_toml, write_match
+from worldpose.ingest import write_calibration_toml, write_match
 from worldpose.simulation.foreign.recordings import read_recordings
 from worldpose.simulation.foreign.scenarios import ForeignScenario
 from worldpose.simulation.foreign.scenes import ForeignScene, simulate_foreign_scene
@@ -101,9 +102,9 @@ def simulate_foreign_match(
     return spec
 
 
-def _number_frames(observations: Observations, offset: int) -> Observations:
+def _number_frames(observations: KeypointDetections, offset: int) -> KeypointDetections:
     """Return the observations with the camera's own frame numbers."""
-    return Observations(frame=observations.frame + offset, **observations.arrays())
+    return KeypointDetections(frame=observations.frame + offset, **observations.arrays())
 
 
 def _write_reference(folder: Path, scene: ForeignScene) -> None:
