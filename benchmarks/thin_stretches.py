@@ -33,7 +33,7 @@ from flows.stages import refitting
 from worldpose.formats import read_joints, write_archive
 from worldpose.simulation import SCENARIOS
 from worldpose.simulation.matches import simulate_match
-from worldpose.store import Store, key_of
+from worldpose.store import Store, recipe_key
 
 SCENARIO, PEOPLE = SCENARIOS["tiny-broadcast"], 12
 LENGTH = (0.6, 1.2)
@@ -119,7 +119,7 @@ def refitted(store: Store, match: Path, *, without: bool = False) -> Floats:
     if without:
         sources = unit.recipe.sources | {"estimates": None, "estimates_sha256": None}
         recipe = unit.recipe.model_copy(update={"sources": sources})
-        key = key_of(recipe)
+        key = recipe_key(recipe)
         work = replace(unit, recipe=recipe, key=key).work(
             store.url, register(store, match)[0], "0001"
         )

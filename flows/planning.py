@@ -14,7 +14,7 @@ from flows.left_out import left_out_cameras
 from flows.method import METHOD
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
-from worldpose.store import Store, code_version, key_of, libraries
+from worldpose.store import Store, code_version, libraries, recipe_key
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def plan_stage(
         if known.keys() != inputs.keys():
             blocked.append(f"{stage.name}/{unit}")
             continue
-        # Not validated here: all values are ours, `key_of` refuses values that are not plain JSON,
+        # Not validated here: all values are ours, `recipe_key` refuses values that are not JSON,
         # and validating thousands of corrections one by one takes longer than all other steps.
         recipe = Recipe.model_construct(
             match_id=match.match_id,
@@ -112,7 +112,7 @@ def plan_stage(
             code=code_version(f"tasks.{stage.name}"),
             libraries=libraries(),
         )
-        key = key_of(recipe)
+        key = recipe_key(recipe)
         published = store.has(match.match_id, stage.name, unit, key)
         units.append(PlannedUnit(recipe, key, published))
     return StagePlan(tuple(units), tuple(blocked))

@@ -32,7 +32,7 @@ from worldpose.geometry.stored import camera_from_arrays
 from worldpose.ingest.footage import stretches
 from worldpose.pitch import PitchTemplate
 from worldpose.review.detections import DetectionEdit, replay_detections
-from worldpose.store import Store, key_of
+from worldpose.store import Store, recipe_key
 from worldpose.video import FrameIndex, open_video
 
 
@@ -84,7 +84,7 @@ def _published(store: Store, work: Work) -> _Found | None:
     """
     recipe = work.recipe
     sources = {name: each for name, each in recipe.sources.items() if name != "edits"}
-    plain = key_of(recipe.model_copy(update={"sources": sources}))
+    plain = recipe_key(recipe.model_copy(update={"sources": sources}))
     unit = (recipe.match_id, recipe.stage, recipe.unit, plain)
     if not store.has(*unit):
         return None

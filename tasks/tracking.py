@@ -17,7 +17,7 @@ from worldpose.review.identities import (
     replay_identities,
     stored_identities,
 )
-from worldpose.store import Store, key_of
+from worldpose.store import Store, recipe_key
 from worldpose.tracking import (
     TrackingSettings,
     describe_doubts,
@@ -71,7 +71,7 @@ def _automatic(store: Store, work: Work) -> Tracked:
     recipe = work.recipe
     sources = {name: each for name, each in recipe.sources.items() if name != "identities"}
     plain = recipe.model_copy(update={"sources": sources})
-    unit = (recipe.match_id, recipe.stage, recipe.unit, key_of(plain))
+    unit = (recipe.match_id, recipe.stage, recipe.unit, recipe_key(plain))
     if not store.has(*unit):
         return _tracked(store, work)
     manifest = store.manifest(*unit)

@@ -4,7 +4,7 @@ from datetime import UTC, datetime, timedelta
 
 from data_contracts.review import Correction, JournalEntry, MovedKeypoint, MovedPoint
 from flows.registering import open_for_review
-from worldpose.store.documents import checksum_of, seal
+from worldpose.store.documents import record_checksum, seal
 
 POINTS_EVERY = 10
 """One in so many corrections moves a clicked point, the others move keypoints."""
@@ -39,4 +39,4 @@ def write_corrections(store, match_id, count):
         )
         entry = JournalEntry(match_id=match_id, number=number, previous=tip, records=(correction,))
         (folder / f"{number:06d}.json").write_bytes(seal(entry))
-        tip = checksum_of(entry)
+        tip = record_checksum(entry)

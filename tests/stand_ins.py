@@ -5,10 +5,9 @@ from datetime import UTC, datetime
 from data_contracts.records import CONTRACT_VERSION
 from data_contracts.run import ResultManifest
 from worldpose.store import ResultId
-from worldpose.store.canonical import digest
-from worldpose.store.documents import checksum_of, seal
+from worldpose.store.documents import digest, record_checksum, seal
 from worldpose.store.paths import MANIFEST
-from worldpose.store.writer import content_of, stored_files
+from worldpose.store.writer import content_digest, stored_files
 
 
 def publish_stand_in(store, match, unit, files=("zarr.json",)):
@@ -24,13 +23,13 @@ def publish_stand_in(store, match, unit, files=("zarr.json",)):
         key=unit.key,
         recipe=unit.recipe,
         files=stored,
-        content=content_of(stored),
+        content=content_digest(stored),
         figures={},
         created_at=datetime.now(UTC),
         seconds=1.0,
         run_id="0001",
         checksum=digest(b""),
     )
-    manifest = manifest.model_copy(update={"checksum": checksum_of(manifest)})
-    path = ResultId.of(unit.work(store.url, match, "0001")).path
+    manifest = manifest.model_copy(update={"checksum": record_checksum(manifest)})
+    path = ResultId.for_work(unit.work(store.url, match, "0001")).path
     assert store.blobs.publish_tree(folder, path, MANIFEST, seal(manifest))

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from worldpose.store.opened_run import open_run as open_run
+    from worldpose.store.store import open_run as open_run
 
 __all__ = ["open_run"]
 
@@ -16,7 +16,7 @@ __all__ = ["open_run"]
 def __getattr__(name: str) -> object:
     # Lazy import: most of the library needs neither the store nor xarray.
     if name == "open_run":
-        from worldpose.store.opened_run import open_run
+        from worldpose.store.store import open_run
 
         return open_run
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -27,7 +27,7 @@ from data_contracts.run import WaitingUnit
 from worldpose.errors import WorldposeError
 from worldpose.review import Journal, say
 from worldpose.store import Store
-from worldpose.store.canonical import canonical_json, digest
+from worldpose.store.documents import canonical_json, digest
 from worldpose.store.store import open_blobs
 
 PATIENCE: Final = timedelta(days=90)

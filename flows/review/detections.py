@@ -21,7 +21,7 @@ from worldpose.review.detections import (
     objection_to,
     replay_detections,
 )
-from worldpose.store import Store, key_of
+from worldpose.store import Store, recipe_key
 
 if TYPE_CHECKING:  # imports dask, which planning a run must not load
     import xarray as xr
@@ -155,7 +155,7 @@ def _result(store: Store, match: Match, name: str) -> _Result:
     sources = dict(recipe.sources)
     taken_in = sources.pop("edits", None) or []
     assert isinstance(taken_in, list)
-    plain = key_of(recipe.model_copy(update={"sources": sources}))
+    plain = recipe_key(recipe.model_copy(update={"sources": sources}))
     if store.has(*place, plain):
         return _Result(store.open_result(*place, plain), plain, [])
     return _Result(store.open_result(*place, key), plain, taken_in)

@@ -18,7 +18,7 @@ from worldpose.review.identities import (
     replay_identities,
     stored_identities,
 )
-from worldpose.store import Store, key_of
+from worldpose.store import Store, recipe_key
 
 
 def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
@@ -79,7 +79,7 @@ def _found(store: Store, match: Match, clip: str) -> tuple[Identities, list[Json
     sources = dict(recipe.sources)
     taken_in = sources.pop("identities", None) or []
     assert isinstance(taken_in, list)
-    plain = key_of(recipe.model_copy(update={"sources": sources}))
+    plain = recipe_key(recipe.model_copy(update={"sources": sources}))
     if taken_in and not store.has(*unit, plain):
         return stored_identities(store.open_result(*unit, key)), taken_in
     return stored_identities(store.open_result(*unit, plain)), []

@@ -18,7 +18,7 @@ def problems_of(project, undisturbed):
     for match in store.matches():
         dead = [f"{match}/{each.run_id}" for each in store.unfinished_runs(match)]
         collect(store, plan_gc(store, forget=dead, older_than=timedelta(0)))
-    problems += [f"{each.path}: cannot be cleared away" for each in store.blobs.staged()]
+    problems += [f"{each.path}: cannot be cleared away" for each in store.blobs.staged_entries()]
     return problems + [f"cleared: {each}" for each in differences(project, undisturbed)]
 
 

@@ -12,7 +12,7 @@ import signal
 import sys
 from pathlib import Path
 
-from worldpose.store import commit_points
+from worldpose.store.blobs import install_fault_hook
 
 
 def install():
@@ -35,7 +35,7 @@ def install():
             os.killpg(0, signal.SIGKILL)
         os.kill(os.getpid(), signal.SIGKILL)
 
-    commit_points.install_fault_hook(strike)
+    install_fault_hook(strike)
 
 
 def dask_setup(worker):

@@ -12,7 +12,7 @@ import time
 import numpy as np
 
 from worldpose.store import Store
-from worldpose.store.folder import LocalBlobs
+from worldpose.store.blobs import LocalBlobs
 from worldpose.store.writer import ResultWriter
 
 

@@ -25,7 +25,7 @@ from flows.running import RunRequest
 from flows.settings import selected_stages
 from worldpose.simulation import SCENARIOS, simulate_match
 from worldpose.store import Store
-from worldpose.store.commit_points import install_fault_hook
+from worldpose.store.blobs import install_fault_hook
 
 pytestmark = pytest.mark.faults
 

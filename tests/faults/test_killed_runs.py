@@ -13,7 +13,7 @@ import pytest
 from checker import half_written, problems_of
 from command_line import WORLDPOSE, succeed
 
-from worldpose.store.commit_points import COMMIT_POINTS
+from worldpose.store.blobs import COMMIT_POINTS
 
 pytestmark = [pytest.mark.usefixtures("server"), pytest.mark.faults]
 

@@ -32,7 +32,7 @@ def test_matches_under_random_faults_end_as_undisturbed_ones(tmp_path):
     ("how", "found"),
     [
         # Each process computes bytes of its own: what is computed again is another result.
-        ("own", "other bytes"),
+        ("own", "the bytes differ"),
         # Manifest first: workers that are killed in between leave halves.
         ("half", "is missing"),
     ],

@@ -7,7 +7,7 @@ import pytest
 from data_contracts.work import Recipe, Work
 from tasks import batch, tracking
 from worldpose.errors import DegenerateError, StoreError
-from worldpose.store import Store, key_of
+from worldpose.store import Store, recipe_key
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def works(tmp_path):
         for unit in ("a", "b", "c")
     ]
     return [
-        Work(project=str(tmp_path), folder="m", recipe=each, key=key_of(each), run_id="0001")
+        Work(project=str(tmp_path), folder="m", recipe=each, key=recipe_key(each), run_id="0001")
         for each in recipes
     ]
 

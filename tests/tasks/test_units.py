@@ -21,7 +21,7 @@ from worldpose.errors import CorruptionError, InputError, StoreError, WorldposeE
 from worldpose.formats import read_camera
 from worldpose.geometry.stored import camera_from_arrays
 from worldpose.ingest.stills import write_still
-from worldpose.store import Store, explain_difference, key_of
+from worldpose.store import Store, explain_difference, recipe_key
 
 
 @pytest.fixture
@@ -145,7 +145,7 @@ def test_a_camera_that_its_clicks_do_not_determine_is_published_as_left_out(clic
     few = {"points": dict(list(listed["points"].items())[:2]), "drawn": {}}
     recipe = recipe.model_copy(update={"sources": recipe.sources | {"clicked": {file: few}}})
     work = units["static_calibration/cam00"].work(store.url, match, "0001")
-    changes = {"recipe": recipe, "key": key_of(recipe)}
+    changes = {"recipe": recipe, "key": recipe_key(recipe)}
     work = work.model_copy(update=changes)
     static_calibration.fn(work)
     (reason,) = store.manifest(

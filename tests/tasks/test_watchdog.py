@@ -8,7 +8,7 @@ import pytest
 
 from data_contracts.work import Recipe, Work
 from tasks.watchdog import TaskTimeoutError, WorkerCrashError, kill_on_timeout
-from worldpose.store import key_of
+from worldpose.store import recipe_key
 
 
 @pytest.fixture
@@ -16,7 +16,7 @@ def work(tmp_path, monkeypatch):
     at_work(monkeypatch, tmp_path, "tcp://127.0.0.1:1000")
     nothing = {"sources": {}, "inputs": {}, "settings": {}, "code": {}, "libraries": {}}
     recipe = Recipe(match_id="m", stage="tracking", unit="c", **nothing)
-    key = key_of(recipe)
+    key = recipe_key(recipe)
     return Work(project="p", folder="m", recipe=recipe, key=key, run_id="0001", seconds=60.0)
 
 

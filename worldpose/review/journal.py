@@ -27,7 +27,7 @@ from data_contracts.review import (
 )
 from worldpose.errors import CorruptionError
 from worldpose.store import Store
-from worldpose.store.documents import checksum_of, read_checksum, seal, unseal
+from worldpose.store.documents import read_checksum, record_checksum, seal, unseal
 from worldpose.store.paths import checked_name
 
 _ENTRY = re.compile(r"(\d{6,})\.json")
@@ -223,7 +223,7 @@ def append(store: Store, journal: Journal, records: Sequence[ReviewRecord]) -> J
     )
     if not store.blobs.put_new(_path(journal.match_id, number), seal(entry)):
         return None
-    return journal.extended([entry], number, (), checksum_of(entry))
+    return journal.extended([entry], number, (), record_checksum(entry))
 
 
 def say(

@@ -5,14 +5,12 @@ Output: labelled arrays, the runs that used them, and the reasons for difference
 """
 
 from worldpose.store.comparison import compare_stores
-from worldpose.store.fingerprint import code_version, libraries
 from worldpose.store.garbage import Garbage, GcPlan, collect, plan_gc
 from worldpose.store.integrity import Finding, repair, verify
-from worldpose.store.opened_run import Run, open_run
 from worldpose.store.paths import ResultId
-from worldpose.store.pins import list_pins, pin_run, unpin_run
-from worldpose.store.recipes import explain_difference, key_of
-from worldpose.store.store import Store
+from worldpose.store.recipes import code_version, explain_difference, libraries, recipe_key
+from worldpose.store.runs import list_pins, pin_run, unpin_run
+from worldpose.store.store import Run, Store, open_run
 from worldpose.store.writer import ResultWriter
 
 __all__ = [
@@ -27,12 +25,12 @@ __all__ = [
     "collect",
     "compare_stores",
     "explain_difference",
-    "key_of",
     "libraries",
     "list_pins",
     "open_run",
     "pin_run",
     "plan_gc",
+    "recipe_key",
     "repair",
     "unpin_run",
     "verify",

@@ -1,4 +1,4 @@
-"""Comparison of two projects: do their computations give the same answer."""
+"""Comparison of two projects: whether their computations give the same results."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from data_contracts.records import Record
 from worldpose.store.paths import ResultId
 from worldpose.store.store import Store
 
-_PASSING = {
+_TRANSIENT_FIELDS = {
     "manifest": {"created_at", "seconds", "run_id", "checksum"},
     "run": {"run_id", "parent", "executed", "reused", "started_at", "finished_at", "seconds"},
     "registration": {"folder", "files"},
@@ -26,39 +26,46 @@ def compare_stores(ours: Store, theirs: Store) -> list[str]:
     places, and whether a run computed or reused a unit.
     """
     return [
-        *_matches(ours, theirs),
-        *_results(ours, theirs),
-        *_runs(ours, theirs),
+        *_compare_matches(ours, theirs),
+        *_compare_results(ours, theirs),
+        *_compare_runs(ours, theirs),
     ]
 
 
-def _matches(ours: Store, theirs: Store) -> Iterator[str]:
-    yield from _structure("match", ours.matches(), theirs.matches())
+def _compare_matches(ours: Store, theirs: Store) -> Iterator[str]:
+    yield from _compare_names("match", ours.matches(), theirs.matches())
     for match_id in sorted({*ours.matches()} & {*theirs.matches()}):
         one, other = ours.registration(match_id), theirs.registration(match_id)
         if one and other:
-            yield from _fields(f"match {match_id}", one, other, "registration")
-            files = [{file.path: file.sha256 for file in each.files} for each in (one, other)]
-            yield from _values(f"match {match_id}", *files)
+            yield from _compare_fields(f"match {match_id}", one, other, "registration")
+            yield from _compare_values(
+                f"match {match_id}",
+                {file.path: file.sha256 for file in one.files},
+                {file.path: file.sha256 for file in other.files},
+            )
 
 
-def _results(ours: Store, theirs: Store) -> Iterator[str]:
-    yield from _structure("result", _paths(ours), _paths(theirs))
+def _compare_results(ours: Store, theirs: Store) -> Iterator[str]:
+    yield from _compare_names("result", _result_paths(ours), _result_paths(theirs))
     for result in sorted({*ours.results()} & {*theirs.results()}):
-        place = (result.match_id, result.stage, result.unit, result.key)
-        yield from _fields(result.path, ours.manifest(*place), theirs.manifest(*place), "manifest")
-        yield from _files(result, ours, theirs)
+        manifests = [
+            store.manifest(result.match_id, result.stage, result.unit, result.key)
+            for store in (ours, theirs)
+        ]
+        yield from _compare_fields(result.path, manifests[0], manifests[1], "manifest")
+        yield from _compare_files(result, ours, theirs)
 
 
-def _runs(ours: Store, theirs: Store) -> Iterator[str]:
+def _compare_runs(ours: Store, theirs: Store) -> Iterator[str]:
     for match_id in sorted({*_matches_with_runs(ours)} | {*_matches_with_runs(theirs)}):
         finished = [store.runs(match_id) for store in (ours, theirs)]
         if all(finished):
-            yield from _fields(
+            yield from _compare_fields(
                 f"latest run of {match_id}", ours.run(match_id), theirs.run(match_id), "run"
             )
         elif any(finished):
-            yield f"match {match_id}: only {'the first' if finished[0] else 'the second'} has runs"
+            having = "first" if finished[0] else "second"
+            yield f"match {match_id}: only the {having} project has finished runs"
 
 
 def _matches_with_runs(store: Store) -> Iterator[str]:
@@ -66,44 +73,48 @@ def _matches_with_runs(store: Store) -> Iterator[str]:
         yield entry.path.split("/")[1]
 
 
-def _paths(store: Store) -> list[str]:
+def _result_paths(store: Store) -> list[str]:
     return [result.path for result in store.results()]
 
 
-def _files(result: ResultId, ours: Store, theirs: Store) -> Iterator[str]:
+def _compare_files(result: ResultId, ours: Store, theirs: Store) -> Iterator[str]:
     names = []
     for store in (ours, theirs):
         entries = store.blobs.entries(result.path)
         names.append({entry.path for entry in entries} - {result.manifest_path})
-    yield from _structure("file", *names)
+    yield from _compare_names("file", names[0], names[1])
     for path in sorted(names[0] & names[1]):
         one, other = ours.blobs.read(path), theirs.blobs.read(path)
         if one == other:
             continue
         if path.endswith("/zarr.json") and one and other:
-            yield from _values(path, json.loads(one), json.loads(other))
+            yield from _compare_values(path, json.loads(one), json.loads(other))
         else:
-            yield f"{path}: other bytes"
+            yield f"{path}: the bytes differ"
 
 
-def _structure(kind: str, ours: Iterable[str], theirs: Iterable[str]) -> Iterator[str]:
-    yield from (f"{kind} {name}: only in the first" for name in sorted({*ours} - {*theirs}))
-    yield from (f"{kind} {name}: only in the second" for name in sorted({*theirs} - {*ours}))
+def _compare_names(kind: str, ours: Iterable[str], theirs: Iterable[str]) -> Iterator[str]:
+    yield from (f"{kind} {name}: only in the first project" for name in sorted({*ours} - {*theirs}))
+    yield from (
+        f"{kind} {name}: only in the second project" for name in sorted({*theirs} - {*ours})
+    )
 
 
-def _fields(where: str, ours: Record, theirs: Record, kind: str) -> Iterator[str]:
-    excluded = _PASSING[kind]
-    yield from _values(
+def _compare_fields(where: str, ours: Record, theirs: Record, kind: str) -> Iterator[str]:
+    excluded = _TRANSIENT_FIELDS[kind]
+    yield from _compare_values(
         where,
         ours.model_dump(mode="json", exclude=excluded),
         theirs.model_dump(mode="json", exclude=excluded),
     )
 
 
-def _values(where: str, ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> Iterator[str]:
+def _compare_values(
+    where: str, ours: Mapping[str, Any], theirs: Mapping[str, Any]
+) -> Iterator[str]:
     for name in sorted(ours.keys() | theirs.keys()):
         one, other = ours.get(name), theirs.get(name)
         if isinstance(one, Mapping) and isinstance(other, Mapping):
-            yield from _values(f"{where}: {name}", one, other)
+            yield from _compare_values(f"{where}: {name}", one, other)
         elif one != other:
-            yield f"{where}: {name}: {one!r} and {other!r}"
+            yield f"{where}: {name}: {one!r} in the first project, {other!r} in the second"

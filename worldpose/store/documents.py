@@ -1,37 +1,86 @@
-"""Sealed records: the JSON documents of a project, each with its own checksum.
+"""Canonical JSON and its digest, and sealed records: documents with their own checksum.
 
-A sealed document is one line of canonical JSON whose field `checksum` is the digest of the rest.
-Any other bytes, even a changed space, are refused.
+Equal values have equal canonical bytes, so they have equal digests. A sealed document is one line
+of canonical JSON whose field `checksum` is the digest of the rest; `unseal` refuses any other
+bytes, even a changed space.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
+from collections.abc import Iterable
 from typing import Any, Final, TypeVar
 
 from pydantic import ValidationError
 
 from data_contracts.records import CONTRACT_VERSION, Record
 from worldpose.errors import CorruptionError, InputError
-from worldpose.store.canonical import canonical_json, digest
+
+_CONTAINERS: Final = (dict, list, tuple)
+
+
+def canonical_json(value: object) -> bytes:
+    """Return the JSON of `value`: sorted keys, no spaces, UTF-8, finite numbers only.
+
+    Raises:
+        InputError: the value contains something without an exact JSON form: NaN, infinity, a key
+            that is not text, a lone surrogate, an array.
+    """
+    try:
+        text = json.dumps(
+            value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
+        )
+        _refuse_other_keys(value)
+        return text.encode("utf-8")
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(
+            "a value to be stored or hashed",
+            expected=(
+                "plain JSON: text, finite numbers, true, false, null, lists, and maps with keys of "
+                "text"
+            ),
+            found=str(error),
+            todo="Replace missing numbers by null and arrays by lists.",
+        ) from error
+
+
+def _refuse_other_keys(value: object) -> None:
+    # json.dumps silently turns a key 1 into "1", and two values would share a digest. It has
+    # already refused a value that contains itself, so this recursion ends.
+    containers = [value] if isinstance(value, _CONTAINERS) else []
+    for container in containers:
+        inner: Iterable[object] = container
+        if isinstance(container, dict):
+            for key in container:
+                if not isinstance(key, str):
+                    raise TypeError(f"the key {key!r} of type {type(key).__name__}")
+            inner = container.values()
+        containers += [each for each in inner if isinstance(each, _CONTAINERS)]
+
+
+def digest(data: bytes) -> str:
+    """Return the SHA-256 of `data` in lower-case hexadecimal."""
+    return hashlib.sha256(data).hexdigest()
+
 
 R = TypeVar("R", bound=Record)
 
-_FURTHER = "extra_forbidden"
+_UNKNOWN_FIELD = "extra_forbidden"
 """pydantic's error type for an unknown field."""
 _SEAL: Final = re.compile(rb'\{"checksum":"([0-9a-f]{64})",')
 """Start of a document with no key before `checksum`."""
 
 
-def checksum_of(record: Record) -> str:
+def record_checksum(record: Record) -> str:
     """Return the digest that seals `record`: of all its fields but `checksum`."""
-    return digest(canonical_json(_fields(record)))
+    return digest(canonical_json(_dump_fields(record)))
 
 
 def seal(record: Record) -> bytes:
     """Return the document of `record`."""
-    fields = _fields(record)
+    fields = _dump_fields(record)
     return canonical_json({**fields, "checksum": digest(canonical_json(fields))}) + b"\n"
 
 
@@ -57,12 +106,14 @@ def unseal(kind: type[R], data: bytes, where: str) -> R:
     try:
         fields = json.loads(data)
         checksum = fields.pop("checksum")
-        whole = digest(canonical_json(fields)) == checksum
-        whole = whole and canonical_json({**fields, "checksum": checksum}) + b"\n" == data
+        is_intact = digest(canonical_json(fields)) == checksum
+        is_intact = is_intact and canonical_json({**fields, "checksum": checksum}) + b"\n" == data
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, InputError) as error:
-        raise CorruptionError(f"{where} is damaged: not a sealed document ({error})") from error
-    if not whole:
-        raise CorruptionError(f"{where} is damaged: its checksum does not fit its content")
+        raise CorruptionError(
+            f"{where} is damaged: it is not a sealed document ({error})"
+        ) from error
+    if not is_intact:
+        raise CorruptionError(f"{where} is damaged: its checksum does not match its content")
     if fields.get("contract", CONTRACT_VERSION) != CONTRACT_VERSION:
         raise InputError(
             where,
@@ -75,15 +126,15 @@ def unseal(kind: type[R], data: bytes, where: str) -> R:
     try:
         return kind.model_validate_json(json.dumps(fields))
     except ValidationError as error:
-        further = {str(each["loc"][0]) for each in error.errors() if each["type"] == _FURTHER}
-        if len(further) == error.error_count():
+        unknown = {str(each["loc"][0]) for each in error.errors() if each["type"] == _UNKNOWN_FIELD}
+        if len(unknown) == error.error_count():
             raise InputError(
                 where,
-                expected=f"a {kind.__name__} as this version of worldpose knows it",
-                found=f"{', '.join(sorted(further))} beside, of a later version",
+                expected=f"only fields of {kind.__name__} that this version of worldpose knows",
+                found=f"the fields {', '.join(sorted(unknown))} of a later version",
                 todo="Use the worldpose version that wrote it, or a later one.",
             ) from error
-        raise CorruptionError(f"{where} is not a {kind.__name__}: {error}") from error
+        raise CorruptionError(f"{where} is not a valid {kind.__name__}: {error}") from error
 
 
 def unseal_repairable(kind: type[R], data: bytes, where: str) -> R:
@@ -122,5 +173,5 @@ def _content_after_seal(data: bytes) -> bytes | None:
     return content if digest(content) == found[1].decode() else None
 
 
-def _fields(record: Record) -> dict[str, Any]:
+def _dump_fields(record: Record) -> dict[str, Any]:
     return record.model_dump(mode="json", exclude={"checksum"})

@@ -1,4 +1,4 @@
-"""Garbage collection of everything that no kept run needs: planned first, removed second."""
+"""Garbage collection: plan which results no kept run needs, then remove them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from data_contracts.run import Reservation, RunRecord
 from worldpose.errors import CorruptionError, InputError, StoreError
 from worldpose.store.blobs import Entry
 from worldpose.store.paths import MANIFEST, ResultId, is_name, record_path, reservation_path
-from worldpose.store.pins import list_pins
-from worldpose.store.runs import may_be_at_work, run_order
+from worldpose.store.runs import list_pins, may_be_running, run_order
 from worldpose.store.store import Store
 
 
@@ -32,7 +31,7 @@ class GcPlan:
 
     garbage: tuple[Garbage, ...]
     held: tuple[str, ...]
-    """One line for each skipped match, because a run may be in progress or a record is damaged."""
+    """One sentence per skipped match: a run of it may be in progress, or a record is damaged."""
     runs: frozenset[str]
     """The run records, reservations and pins known to the plan."""
 
@@ -55,7 +54,8 @@ def plan_gc(
     is kept, however old. Recent results and leftovers are kept; results are also kept while a run
     of their match may be in progress, which may be about to name them, and leftovers while any run
     may be. Reservations are kept while they hold the highest number, so that no number is reused
-    unless `forget` frees it. Planning removes nothing.
+    unless `forget` frees it. A match with a damaged run record, reservation, pin or manifest is
+    skipped, because the results that its runs reach are unknown. Planning removes nothing.
 
     Args:
         store: the project.
@@ -64,27 +64,25 @@ def plan_gc(
             must be unpinned first.
         older_than: the age below which results and leftovers are kept.
 
-    A match with a damaged run record, reservation, pin or manifest is skipped, as the results that
-    its runs reach are unknown.
 
     Raises:
         InputError: `forget` names a missing or pinned run, or `keep_last` is below 1.
     """
-    known = _known(store)
+    known = _run_files(store)
     _check_arguments(store, keep_last, forget)
     sizes = {entry.path: entry.size for entry in store.blobs.entries("runs")}
     garbage: list[Garbage] = []
-    at_work: list[Reservation] = []
+    active: list[Reservation] = []
     reached: set[ResultId] = set()
     damaged: dict[str, str] = {}
     for match_id in _matches_with_runs(sizes):
         try:
-            dropped, kept = _sorted_out(store, match_id, keep_last, forget)
+            dropped, kept = _select_runs(store, match_id, keep_last, forget)
             for run_id in kept:
-                _reach(store, store.run(match_id, run_id), reached)
+                _add_reached_results(store, store.run(match_id, run_id), reached)
             reservations = list(_reservations(store, match_id, sizes))
         except CorruptionError as error:
-            damaged[match_id] = f"{match_id} is left alone: {error}"
+            damaged[match_id] = f"Match {match_id} is skipped: {error}"
             continue
         for run_id in dropped:
             path = record_path(match_id, run_id)
@@ -92,21 +90,21 @@ def plan_gc(
         for path, reservation in reservations:
             if reservation is None or f"{match_id}/{reservation.run_id}" in forget:
                 garbage.append(Garbage(path, "reservation of a dead run", sizes[path]))
-            elif may_be_at_work(reservation):
-                at_work.append(reservation)
+            elif may_be_running(reservation):
+                active.append(reservation)
     before = datetime.now(UTC) - older_than
-    spared = {*damaged, *(run.match_id for run in at_work)}
-    garbage.extend(_unreached(store, reached, spared, before))
+    spared = {*damaged, *(run.match_id for run in active)}
+    garbage.extend(_find_unreached_results(store, reached, spared, before))
     garbage.extend(
         Garbage(entry.path, "staging of a dead writer", entry.size)
-        for entry in store.blobs.staged()
-        if entry.modified <= before and not at_work  # staging does not tell its match
+        for entry in store.blobs.staged_entries()
+        if entry.modified <= before and not active  # staging does not tell its match
     )
     held = tuple(
-        f"{run.match_id} is left alone: run {run.run_id}, process {run.pid} on {run.host}, may "
-        f"be at work since {run.started_at:%Y-%m-%d %H:%M} UTC. If it is dead, forget "
-        f"{run.match_id}/{run.run_id}."
-        for run in at_work
+        f"Match {run.match_id} is skipped: run {run.run_id} (process {run.pid} on {run.host}), "
+        f"started at {run.started_at:%Y-%m-%d %H:%M} UTC, may still be active. If it is dead, "
+        f"forget {run.match_id}/{run.run_id}."
+        for run in active
     )
     return GcPlan(tuple(garbage), (*held, *damaged.values()), known)
 
@@ -120,10 +118,10 @@ def collect(store: Store, plan: GcPlan) -> int:
     Raises:
         StoreError: a run was started, ended or pinned since the plan was made; nothing is removed.
     """
-    if plan.runs != _known(store):
+    if plan.runs != _run_files(store):
         raise StoreError(
-            f"{store.url}: a run has begun, ended or been pinned since this was planned. Nothing "
-            "was removed; plan again."
+            f"{store.url}: a run has started, ended or been pinned since the garbage collection "
+            "was planned. Nothing was removed. Make a new plan."
         )
     for item in sorted(plan.garbage, key=lambda item: not item.path.startswith("runs/")):
         if item.path.startswith("runs/"):
@@ -139,13 +137,13 @@ def _matches_with_runs(paths: Iterable[str]) -> list[str]:
     return sorted({each[1] for each in parts if len(each) == 3 and is_name(each[1])})
 
 
-def _known(store: Store) -> frozenset[str]:
-    """Return all files that define which runs exist and which are kept."""
+def _run_files(store: Store) -> frozenset[str]:
+    """Return the paths of all files that define which runs exist and which are kept."""
     folders = (store.blobs.entries(top) for top in ("runs", "pins"))
     return frozenset(entry.path for entries in folders for entry in entries)
 
 
-def _pinned(store: Store, match_id: str) -> dict[str, str]:
+def _pin_names(store: Store, match_id: str) -> dict[str, str]:
     """Map each pinned run to one of its names."""
     return {pin.run_id: pin.name for pin in list_pins(store.blobs, match_id)}
 
@@ -153,7 +151,10 @@ def _pinned(store: Store, match_id: str) -> dict[str, str]:
 def _check_arguments(store: Store, keep_last: int | None, forget: Collection[str]) -> None:
     if keep_last is not None and keep_last < 1:
         raise InputError(
-            "keep_last", expected="1 or more", found=str(keep_last), todo="Keep at least one run."
+            "keep_last",
+            expected="an integer of at least 1",
+            found=str(keep_last),
+            todo="Keep at least one run.",
         )
     for name in forget:
         match_id, _, run_id = name.partition("/")
@@ -163,25 +164,25 @@ def _check_arguments(store: Store, keep_last: int | None, forget: Collection[str
         }
         if run_id not in known:
             raise InputError(
-                f"run to forget, {name}",
-                expected=f"match/run, with a run of {', '.join(sorted(known)) or 'no match'}",
+                f"run to forget: {name}",
+                expected=f"match/run with one of the runs: {', '.join(sorted(known)) or '(none)'}",
                 found="no such run",
                 todo="List the runs with `worldpose status`.",
             )
-        if run_id in (pinned := _pinned(store, match_id)):
+        if run_id in (pinned := _pin_names(store, match_id)):
             raise InputError(
-                f"run to forget, {name}",
-                expected="one that is not pinned",
-                found=f"the name {pinned[run_id]}",
+                f"run to forget: {name}",
+                expected="a run that is not pinned",
+                found=f"a run pinned as {pinned[run_id]}",
                 todo=f"Run first: worldpose unpin {match_id}/{pinned[run_id]}.",
             )
 
 
-def _sorted_out(
+def _select_runs(
     store: Store, match_id: str, keep_last: int | None, forget: Collection[str]
 ) -> tuple[list[str], list[str]]:
-    """Return run records to drop, and to keep."""
-    finished, pinned = store.runs(match_id), _pinned(store, match_id)
+    """Return the ids of the finished runs to drop, and of those to keep."""
+    finished, pinned = store.runs(match_id), _pin_names(store, match_id)
     newest = finished if keep_last is None else finished[-keep_last:]
     kept = [
         run_id
@@ -194,7 +195,7 @@ def _sorted_out(
 def _reservations(
     store: Store, match_id: str, known: Collection[str]
 ) -> Iterator[tuple[str, Reservation | None]]:
-    """Yield paths of a match's reservations; None marks those without a purpose."""
+    """Yield path and reservation of a match's runs; None marks one that nobody needs any more."""
     finished = store.runs(match_id)
     for run_id in finished:
         path = reservation_path(match_id, run_id)
@@ -203,13 +204,15 @@ def _reservations(
     unfinished = store.unfinished_runs(match_id)
     numbers = (*finished, *(run.run_id for run in unfinished))
     for run in unfinished:
-        is_spent = not may_be_at_work(run) and run.run_id != max(numbers, key=run_order)
+        is_spent = not may_be_running(run) and run.run_id != max(numbers, key=run_order)
         yield reservation_path(match_id, run.run_id), None if is_spent else run
 
 
-def _reach(store: Store, record: RunRecord, reached: set[ResultId]) -> None:
+def _add_reached_results(store: Store, record: RunRecord, reached: set[ResultId]) -> None:
     """Add to `reached` the results that a run names, and all their inputs."""
-    waiting = [ResultId.named(record.match_id, name, key) for name, key in record.results.items()]
+    waiting = [
+        ResultId.from_name(record.match_id, name, key) for name, key in record.results.items()
+    ]
     while waiting:
         result = waiting.pop()
         if result in reached:
@@ -219,16 +222,17 @@ def _reach(store: Store, record: RunRecord, reached: set[ResultId]) -> None:
         if store.has(result.match_id, result.stage, result.unit, result.key):
             recipe = store.manifest(result.match_id, result.stage, result.unit, result.key).recipe
             waiting.extend(
-                ResultId.named(result.match_id, name, key) for name, key in recipe.inputs.items()
+                ResultId.from_name(result.match_id, name, key)
+                for name, key in recipe.inputs.items()
             )
 
 
-def _unreached(
+def _find_unreached_results(
     store: Store, reached: set[ResultId], held: Collection[str], before: datetime
 ) -> Iterator[Garbage]:
     groups: dict[ResultId, list[Entry]] = {}
     for entry in store.blobs.entries("results"):
-        result = ResultId.at(entry.path)
+        result = ResultId.from_path(entry.path)
         if result and result not in reached and result.match_id not in held:
             groups.setdefault(result, []).append(entry)
     for result, entries in groups.items():

@@ -1,28 +1,266 @@
-"""A result's arrays as one Zarr group, and back as an xarray data set."""
+"""Arrays of a result: checked against their layout, written as one Zarr group, and read again."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import asyncio
+import json
+from collections.abc import AsyncIterator, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 import zarr
-from zarr.abc.store import Store
+from numpy.typing import NDArray
+from zarr.abc.store import (
+    ByteRequest,
+    OffsetByteRequest,
+    RangeByteRequest,
+    Store,
+    SuffixByteRequest,
+)
 from zarr.codecs import BloscCodec, Crc32cCodec
-from zarr.core.buffer import Buffer
+from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import LocalStore
 
 from data_contracts.arrays import ArrayLayout, GroupLayout
 from data_contracts.conventions import CONVENTIONS
-from worldpose.store.layout_checks import (
-    Arrays,
-    array_parts,
-    checked_arrays,
-    checked_attributes,
-    with_one_nan,
-)
+from data_contracts.run import ResultManifest
+from worldpose.errors import InputError, InternalError
+from worldpose.store.blobs import Blobs, read_published
+from worldpose.store.documents import canonical_json
+from worldpose.store.paths import ResultId
+
+Arrays = Mapping[str, NDArray[Any]]
+
+PART_CHUNKS = 16
+"""Number of chunks of an array in memory at once: enough for every core to compress one."""
+
+
+def checked_arrays(
+    layout: GroupLayout, arrays: Arrays, coordinates: Arrays
+) -> dict[str, NDArray[Any]]:
+    """Return all arrays by name in the layout's order, unchanged.
+
+    Raises:
+        InternalError: an array is unknown, absent, of another dtype or dimension, disagrees with
+            another in a dimension's size, or holds NaN or infinity against its layout.
+    """
+    _check_names(layout, "array", arrays, [array.name for array in layout.arrays])
+    _check_names(layout, "coordinate", coordinates, [array.name for array in layout.coordinates])
+    given = {**coordinates, **arrays}
+    sizes = {dim: (len(names), "the layout's labels") for dim, names in layout.labels.items()}
+    checked = {}
+    for array in (*layout.coordinates, *layout.arrays):
+        if array.name not in given:
+            continue
+        where = f"{layout.stage}: array {array.name}"
+        values = np.asarray(given[array.name])
+        _check_form(where, array, values)
+        for dim, size in zip(array.dims, values.shape, strict=True):
+            expected, source = sizes.setdefault(dim, (size, f"array {array.name}"))
+            if size != expected:
+                raise InternalError(
+                    f"{where}, dimension {dim}",
+                    f"expected size {expected}, as in {source}, found size {size}, shape "
+                    f"{values.shape}",
+                )
+        _check_values(where, array, values)
+        checked[array.name] = values
+    return checked
+
+
+def array_parts(array: ArrayLayout, shape: tuple[int, ...]) -> list[tuple[slice, ...]]:
+    """Return the slices of consecutive parts of an array of `shape`: a few whole chunks each.
+
+    An array can be longer than memory, so it is processed one part at a time.
+    """
+    if 0 in shape:
+        return []
+    whole = tuple(slice(0, size) for size in shape)
+    if array.chunk_dim is None:
+        return [whole]
+    axis = array.dims.index(array.chunk_dim)
+    size, length = shape[axis], PART_CHUNKS * array.chunks(shape)[axis]
+    return [
+        (*whole[:axis], slice(first, min(first + length, size)), *whole[axis + 1 :])
+        for first in range(0, size, length)
+    ]
+
+
+def normalize_nans(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the values with one bit pattern for every NaN.
+
+    The sign and payload of NaNs depend on the processor's code path.
+    """
+    if values.dtype.kind != "f":
+        return values
+    return np.where(np.isnan(values), values.dtype.type(np.nan), values)
+
+
+def checked_attributes(
+    layout: GroupLayout, arrays: Arrays, attributes: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the group's attributes as plain JSON, in the layout's order.
+
+    An attribute with the name of a dimension labels it, so it must be a list of the dimension's
+    size.
+
+    Raises:
+        InternalError: an attribute is unknown, absent, not plain JSON, or a wrong label of a
+            dimension.
+    """
+    _check_names(layout, "attribute", attributes, list(layout.attributes))
+    try:
+        plain: dict[str, Any] = json.loads(canonical_json(dict(attributes)))
+    except InputError as error:
+        raise InternalError(
+            f"{layout.stage}: attributes", f"expected {error.expected}, found {error.found}"
+        ) from error
+    sizes = {
+        dim: size
+        for array in (*layout.coordinates, *layout.arrays)
+        if array.name in arrays
+        for dim, size in zip(array.dims, arrays[array.name].shape, strict=True)
+    }
+    for name in plain.keys() & sizes.keys():
+        value = plain[name]
+        if not isinstance(value, list) or len(value) != sizes[name]:
+            found = f"{len(value)} labels" if isinstance(value, list) else repr(value)
+            raise InternalError(
+                f"{layout.stage}: attribute {name}",
+                f"expected a list of {sizes[name]} labels, one for each {name}, found {found}",
+            )
+    return {name: plain[name] for name in layout.attributes if name in plain}
+
+
+def _check_names(
+    layout: GroupLayout, kind: str, given: Mapping[str, Any], known: list[str]
+) -> None:
+    unknown = sorted(given.keys() - set(known))
+    absent = sorted(set(known) - given.keys() - set(layout.optional))
+    if unknown or absent:
+        raise InternalError(
+            f"{layout.stage}: {kind}s",
+            f"expected {', '.join(known) or 'none'}, found unknown: "
+            f"{', '.join(unknown) or 'none'}; absent: {', '.join(absent) or 'none'}",
+        )
+
+
+def _check_form(where: str, array: ArrayLayout, values: NDArray[Any]) -> None:
+    if values.dtype != np.dtype(array.dtype):
+        raise InternalError(where, f"expected dtype {array.dtype}, found dtype {values.dtype}")
+    if values.ndim != len(array.dims):
+        raise InternalError(
+            where, f"expected dimensions ({', '.join(array.dims)}), found shape {values.shape}"
+        )
+
+
+def _check_values(where: str, array: ArrayLayout, values: NDArray[Any]) -> None:
+    number, first, value = 0, (), None
+    for part in array_parts(array, values.shape):
+        wrong = _wrong_values(array, values[part])
+        if not wrong.any():
+            continue
+        if not number:
+            inside = np.argwhere(wrong)[0]
+            first = tuple(int(i) + at.start for i, at in zip(inside, part, strict=True))
+            value = values[first]
+        number += int(wrong.sum())
+    if number:
+        allowed = {"nan": "finite numbers or NaN", "-1": "indices from 0, or -1 for missing"}
+        expected = allowed.get(array.missing, "finite numbers only")
+        raise InternalError(
+            f"{where}{list(first)}",
+            f"expected {expected}, found {value}; {number} values in all are wrong",
+        )
+
+
+def _wrong_values(array: ArrayLayout, values: NDArray[Any]) -> NDArray[np.bool_]:
+    wrong: NDArray[np.bool_] = np.zeros((), dtype=np.bool_)
+    if values.dtype.kind == "f":
+        wrong = np.isinf(values) if array.missing == "nan" else ~np.isfinite(values)
+    elif array.missing == "-1":
+        wrong = values < -1
+    return wrong
+
+
+class PublishedFiles(Store):
+    """Read-only Zarr store that raises an error for a lost or changed file, never a fill value."""
+
+    supports_writes = False
+    supports_deletes = False
+    supports_listing = True
+
+    def __init__(self, blobs: Blobs, result: ResultId, manifest: ResultManifest) -> None:
+        super().__init__(read_only=True)
+        self._blobs, self._result = blobs, result
+        self._files = {file.path: file for file in manifest.files}
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, PublishedFiles)
+            and (self._blobs.url, self._result) == (other._blobs.url, other._result)
+            and self._files == other._files
+        )
+
+    def __repr__(self) -> str:
+        return f"PublishedFiles({self._blobs.url}/{self._result.path})"
+
+    async def get(
+        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
+        """Return the file `key` or a range of it, None if the result has no such file."""
+        file = self._files.get(key)
+        if file is None:
+            return None
+        data = await asyncio.to_thread(read_published, self._blobs, self._result, file)
+        match byte_range:
+            case RangeByteRequest():
+                data = data[byte_range.start : byte_range.end]
+            case OffsetByteRequest():
+                data = data[byte_range.offset :]
+            case SuffixByteRequest():
+                data = data[max(0, len(data) - byte_range.suffix) :]
+        return prototype.buffer.from_bytes(data)
+
+    async def get_partial_values(
+        self,
+        prototype: BufferPrototype,
+        key_ranges: Iterable[tuple[str, ByteRequest | None]],
+    ) -> list[Buffer | None]:
+        """Return ranges of several files."""
+        return [await self.get(key, prototype, part) for key, part in key_ranges]
+
+    async def exists(self, key: str) -> bool:
+        """Return whether the manifest names the file `key`."""
+        return key in self._files
+
+    async def set(self, key: str, value: Buffer) -> None:
+        """Raise an error: a published result never changes."""
+        self._check_writable()
+
+    async def delete(self, key: str) -> None:
+        """Raise an error: a published result never changes."""
+        self._check_writable()
+
+    async def list(self) -> AsyncIterator[str]:
+        """Yield every file."""
+        for key in self._files:
+            yield key
+
+    async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
+        """Yield every file whose path starts with `prefix`."""
+        for key in self._files:
+            if key.startswith(prefix):
+                yield key
+
+    async def list_dir(self, prefix: str) -> AsyncIterator[str]:
+        """Yield names of files and folders directly inside the folder `prefix`."""
+        base = f"{prefix.rstrip('/')}/" if prefix.strip("/") else ""
+        inside = (key[len(base) :] for key in self._files if key.startswith(base))
+        for name in dict.fromkeys(key.split("/")[0] for key in inside):
+            yield name
 
 
 class _PrivateFolder(LocalStore):
@@ -88,7 +326,7 @@ def write_group(
             config={"write_empty_chunks": True},
         )
         for part in array_parts(array, values.shape):
-            stored[part] = with_one_nan(values[part])
+            stored[part] = normalize_nans(values[part])
         files += 1 + stored.nchunks
     return files
 

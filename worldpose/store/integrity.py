@@ -1,4 +1,4 @@
-"""Verification of a project: finds every changed, lost or foreign byte."""
+"""Verification of a project: find every changed, lost or foreign file, and repair the project."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from data_contracts.pin import Pin
 from data_contracts.review import JournalEntry
 from data_contracts.run import Project, Reservation, RunRecord
 from worldpose.errors import CorruptionError, InputError, StoreError
-from worldpose.store.blobs import Entry
-from worldpose.store.documents import checksum_of, unseal
+from worldpose.store.blobs import Entry, read_published
+from worldpose.store.documents import record_checksum, unseal
 from worldpose.store.paths import DAMAGED, MANIFEST, PROJECT, ResultId, damaged_path, is_name
-from worldpose.store.published import read_published
 from worldpose.store.runs import is_run_file
 from worldpose.store.store import Store
-from worldpose.store.writer import content_of
+from worldpose.store.writer import content_digest
 
 Progress = Callable[[int, int], None]
 """Called with the number of verified bytes, and the total."""
@@ -38,7 +37,7 @@ class Finding:
 def verify(
     store: Store, match_id: str | None = None, progress: Progress | None = None
 ) -> tuple[Finding, ...]:
-    """Return all damage in a project, or in one match of it; empty if all is as published.
+    """Return all damage in a project, or in one match of it; empty if nothing has changed.
 
     Reads everything: each result's files against its manifest, each manifest, run record, pin,
     journal entry, reservation and registration against its own checksum, and each run record's
@@ -83,8 +82,8 @@ def repair(
     """Withdraw damaged results and set damaged records aside; return results, and record paths.
 
     The next run recomputes only the withdrawn results. A record that is set aside keeps its bytes
-    under another name (`damaged_path`) in the same folder, and a run its number. Journal entries
-    stay: people's decisions are restored from a copy, never dropped.
+    under another name (`damaged_path`) in the same folder, and a run keeps its number. Journal
+    entries stay: decisions of people are restored from a copy, never dropped.
     """
     findings = list(findings)
     results = sorted({finding.result for finding in findings if finding.result})
@@ -103,7 +102,7 @@ def _by_result(
     groups: dict[ResultId, dict[str, Entry]] = {}
     strays = []
     for entry in entries:
-        result = ResultId.at(entry.path)
+        result = ResultId.from_path(entry.path)
         if result is None:
             strays.append(entry.path)
         else:
@@ -122,8 +121,10 @@ def _check_result(
     except (StoreError, InputError) as error:
         yield Finding(result.manifest_path, str(error), result)
         return
-    if content_of(manifest.files) != manifest.content:
-        yield Finding(result.manifest_path, "its content digest is not its files'", result)
+    if content_digest(manifest.files) != manifest.content:
+        yield Finding(
+            result.manifest_path, "its content digest differs from the digest of its files", result
+        )
     for file in manifest.files:
         try:
             read_published(store.blobs, result, file)
@@ -168,7 +169,7 @@ def _check_document(
                 is_record = True
                 record = unseal(RunRecord, data, where)
                 fits = (match_id, name) == (record.match_id, f"{record.run_id}.json")
-                yield from _check_results_of(record, path, published)
+                yield from _check_named_results(record, path, published)
             case ["reviews", match_id, name] if name.endswith(".json"):
                 entry = unseal(JournalEntry, data, where)
                 fits = (match_id, name) == (entry.match_id, f"{entry.number:06d}.json")
@@ -180,7 +181,9 @@ def _check_document(
             case _:
                 raise CorruptionError(f"{where} is not a file of a project")
         if not fits:
-            raise CorruptionError(f"{where} is the record of something else")
+            raise CorruptionError(
+                f"{where} holds the record of another match, run, entry or pin than its path says"
+            )
     except CorruptionError as error:
         yield Finding(path, str(error), is_damaged_record=is_record)
     except (StoreError, InputError) as error:
@@ -197,12 +200,14 @@ def _check_chain(entries: list[JournalEntry]) -> Iterator[Finding]:
     for entry in sorted(entries, key=lambda entry: entry.number):
         if entry.previous != tip:
             path = f"reviews/{entry.match_id}/{entry.number:06d}.json"
-            yield Finding(path, "builds on an entry that is gone or damaged")
-        tip = checksum_of(entry)
+            yield Finding(path, "its previous entry is missing or damaged")
+        tip = record_checksum(entry)
 
 
-def _check_results_of(record: RunRecord, path: str, published: set[ResultId]) -> Iterator[Finding]:
+def _check_named_results(
+    record: RunRecord, path: str, published: set[ResultId]
+) -> Iterator[Finding]:
     for name, key in record.results.items():
-        result = ResultId.named(record.match_id, name, key)
+        result = ResultId.from_name(record.match_id, name, key)
         if result not in published:
             yield Finding(path, f"names {result.path}, which is not published")

@@ -12,8 +12,7 @@ from functools import cached_property
 from pathlib import Path
 
 from worldpose.errors import InputError, NondeterminismError, StoreError
-from worldpose.store.blobs import Entry, storage_errors
-from worldpose.store.commit_points import reached
+from worldpose.store.blobs import Entry, pass_commit_point, storage_errors
 from worldpose.store.paths import checked_path
 
 try:
@@ -110,11 +109,11 @@ class ObjectBlobs:
 
     def entries(self, prefix: str) -> list[Entry]:
         """See `Blobs`."""
-        return self._listed(checked_path(prefix))
+        return self._list_objects(checked_path(prefix))
 
     def all_entries(self) -> list[Entry]:
         """Return all objects below the root, sorted by path; any program can have named them."""
-        return self._listed(None)
+        return self._list_objects(None)
 
     def download(self, path: str, file: Path) -> None:
         """Write the object at `path` to a new file, piece by piece, since it can be a video."""
@@ -127,7 +126,7 @@ class ObjectBlobs:
         with self._errors(path):
             yield from obstore.get(self._s3, checked_path(path)).stream()
 
-    def _listed(self, prefix: str | None) -> list[Entry]:
+    def _list_objects(self, prefix: str | None) -> list[Entry]:
         with self._errors(prefix or ""):
             return sorted(
                 (
@@ -143,7 +142,7 @@ class ObjectBlobs:
         with storage_errors(tempfile.gettempdir()):
             return Path(tempfile.mkdtemp(prefix="worldpose-"))
 
-    def staged(self) -> list[Entry]:
+    def staged_entries(self) -> list[Entry]:
         """See `Blobs`. Always empty: staging is on the writers' own machines."""
         return []
 
@@ -159,17 +158,17 @@ class ObjectBlobs:
         with storage_errors(str(folder)), ThreadPoolExecutor(UPLOADS) as uploads:
             names = [f"{prefix}/{path.relative_to(folder).as_posix()}" for path in paths]
             for _ in uploads.map(self._put_same, names, paths):
-                reached("during_publish")
-        reached("before_commit")
+                pass_commit_point("during_publish")
+        pass_commit_point("before_commit")
         return self.put_new(f"{prefix}/{manifest_name}", manifest)
 
     def _put_same(self, path: str, source: Path) -> None:
         data = source.read_bytes()
         if not self.put_new(path, data) and self.read(path) != data:
             raise NondeterminismError(
-                f"{self.url}/{path} was left by an interrupted writer of the same key, with other "
-                "bytes. The computation does not repeat itself exactly; remove the leftovers "
-                "with `worldpose gc` and report the stage."
+                f"{self.url}/{path}: an interrupted writer of the same key left a file with other "
+                "bytes, so the computation is not deterministic. Remove the leftovers with "
+                "`worldpose gc` and report the stage."
             )
 
     @cached_property
@@ -191,5 +190,5 @@ class ObjectBlobs:
             what = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise StoreError(
                 f"{self.url}/{path}: {what}. Check the bucket, AWS_ENDPOINT_URL, AWS_REGION and "
-                "the credentials, and run again; published results are untouched."
+                "the credentials, and run again. Published results are unchanged."
             ) from error

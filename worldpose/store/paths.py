@@ -43,23 +43,23 @@ class ResultId:
                 "key of a result",
                 expected="32 lower-case hexadecimal digits",
                 found=repr(self.key),
-                todo="Take the key from a run record or from key_of(recipe).",
+                todo="Take the key from a run record or from recipe_key(recipe).",
             ) from error
 
     @classmethod
-    def of(cls, work: Work) -> ResultId:
+    def for_work(cls, work: Work) -> ResultId:
         """Return the result that `work` computes."""
         recipe = work.recipe
         return cls(recipe.match_id, recipe.stage, recipe.unit, work.key)
 
     @classmethod
-    def named(cls, match_id: str, name: str, key: str) -> ResultId:
+    def from_name(cls, match_id: str, name: str, key: str) -> ResultId:
         """Return the result of the unit `name`, such as `tracking/clip`."""
         stage, _, unit = name.partition("/")
         return cls(match_id, stage, unit, key)
 
     @classmethod
-    def at(cls, path: str) -> ResultId | None:
+    def from_path(cls, path: str) -> ResultId | None:
         """Return the result that contains the file at `path`, None if there is none."""
         parts = path.split("/")
         if len(parts) < 6 or parts[0] != "results":
@@ -136,7 +136,7 @@ def _bad_name(where: str, length: str, name: str) -> InputError:
         where,
         expected=f"{length} letters, digits, '.', '_' or '-', the first a letter or digit",
         found=repr(name),
-        todo="Rename it.",
+        todo="Choose a name of these characters, such as final-2022.",
     )
 
 

@@ -1,17 +1,182 @@
-"""Key of a result, and the differences between two recipes."""
+"""Recipe of a result: its key, the versions of code and libraries, differences of two recipes."""
 
 from __future__ import annotations
 
+import ast
+import functools
+import sys
 from collections.abc import Iterator, Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 from data_contracts.work import Recipe
-from worldpose.store.canonical import canonical_json, digest
+from worldpose.errors import StoreError
+from worldpose.store.documents import canonical_json, digest
+
+FOLLOWED = ("tasks", "worldpose", "data_contracts")
+"""Packages whose imports affect a result."""
+NOT_FOLLOWED = "worldpose.store"
+"""The storage code does not affect numbers of results; `STORE_FORMAT` covers their bytes."""
+STORE_FORMAT = "1"
+"""Increased when the same arrays are written as other bytes."""
+NUMERIC_LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "av", "zarr", "numcodecs")
+
+PARSING_ATTEMPTS = 10
+"""Attempts to parse a source while other threads parse, too; see `_parse`."""
+
+_HOME = (Path(__file__).resolve().parents[2],)
+
+
+@functools.cache
+def code_version(root_module: str, roots: tuple[Path, ...] = _HOME) -> dict[str, str]:
+    """Return the digest of each source module that `root_module` depends on, by module name.
+
+    Follows imports, also inside functions, into `tasks`, `worldpose` (not its store) and
+    `data_contracts`. A package's `__init__` counts if an import takes a name from it, not merely
+    because a module inside it is imported. A data file next to a module counts if the module names
+    it. Comments, docstrings and formatting are ignored, so that editing them recomputes nothing.
+    Only literal import statements are detected. Computed once per process: a process keeps the code
+    that it started with.
+
+    Args:
+        root_module: the module to start from, such as `tasks.tracking`.
+        roots: folders that hold the packages.
+
+    Raises:
+        StoreError: a module's source is missing or cannot be parsed.
+    """
+    versions: dict[str, str] = {}
+    seen = {root_module}
+    waiting = [root_module]
+    while waiting:
+        of_module, imported = _read_module(waiting.pop(), roots)
+        versions |= of_module
+        waiting.extend(imported - seen)
+        seen |= imported
+    return dict(sorted(versions.items()))
+
+
+@functools.cache
+def _read_module(name: str, roots: tuple[Path, ...]) -> tuple[dict[str, str], frozenset[str]]:
+    """Return digests of one module and of the data files that it names, and its imports."""
+    path = _source_file(name, roots)
+    if path is None:
+        raise StoreError(
+            f"found no source of module {name} below {', '.join(map(str, roots))}. Install "
+            "worldpose with its sources, for example with `pip install -e .`."
+        )
+    try:
+        tree = _parse(path.read_bytes())
+    except (OSError, SyntaxError, ValueError) as error:
+        raise StoreError(f"{path}: cannot read module {name}: {error}") from error
+    nodes = _drop_text(tree)
+    versions = {name: digest(ast.unparse(tree).encode())}
+    versions |= {
+        f"{name}:{data.name}": digest(data.read_bytes()) for data in _data_files(nodes, path)
+    }
+    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    return versions, frozenset(filter(_is_followed, _imported_modules(nodes, package, roots)))
+
+
+@functools.cache
+def libraries() -> dict[str, str]:
+    """Return versions that affect a result's bytes: Python, numeric libraries, store format."""
+    versions = {
+        "python": f"{sys.version_info.major}.{sys.version_info.minor}",
+        "store": STORE_FORMAT,
+    }
+    for name in NUMERIC_LIBRARIES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            versions[name] = "absent"
+    return versions
+
+
+def _parse(source: bytes) -> ast.Module:
+    """Parse a source, also while another thread parses.
+
+    Python 3.11 shares its recursion depth counter between threads, and raises an error if the count
+    is wrong at the end (python/cpython issue 106905).
+    """
+    for _ in range(PARSING_ATTEMPTS - 1):
+        try:
+            return ast.parse(source)
+        except SystemError:
+            continue
+    return ast.parse(source)
+
+
+def _is_followed(name: str) -> bool:
+    inside_store = name == NOT_FOLLOWED or name.startswith(NOT_FOLLOWED + ".")
+    return name.split(".")[0] in FOLLOWED and not inside_store
+
+
+def _source_file(name: str, roots: tuple[Path, ...]) -> Path | None:
+    for root in roots:
+        base = root.joinpath(*name.split("."))
+        for path in (base / "__init__.py", base.with_name(base.name + ".py")):
+            if path.is_file():
+                return path
+    return None
+
+
+def _data_files(nodes: list[ast.AST], path: Path) -> Iterator[Path]:
+    """Yield files next to a module that a string in it names."""
+    texts = {node.value for node in nodes if isinstance(node, ast.Constant)}
+    yield from (
+        file
+        for file in sorted(path.parent.iterdir())
+        if file.suffix in (".npz", ".safetensors") and file.name in texts
+    )
+
+
+def _imported_modules(nodes: list[ast.AST], package: str, roots: tuple[Path, ...]) -> Iterator[str]:
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                parents = package.split(".")
+                parents = parents[: len(parents) - node.level + 1]
+                base = ".".join([*parents, base] if base else parents)
+            for alias in node.names:
+                inner = f"{base}.{alias.name}"
+                yield inner if _source_file(inner, roots) else base
+
+
+def _drop_text(tree: ast.Module) -> list[ast.AST]:
+    """Return all nodes of a tree, after removing string statements from it.
+
+    These are docstrings and field docstrings.
+    """
+    nodes: list[ast.AST] = [tree]
+    for node in nodes:  # the list grows during the loop
+        for name, value in ast.iter_fields(node):
+            if isinstance(value, ast.AST):
+                nodes.append(value)
+            elif isinstance(value, list):
+                kept = [each for each in value if not _is_text(each)]
+                if name == "body" and not kept:
+                    kept = [ast.Pass()]
+                value[:] = kept
+                nodes.extend(each for each in kept if isinstance(each, ast.AST))
+    return nodes
+
+
+def _is_text(node: object) -> bool:
+    """Return whether this is a statement that contains only a string."""
+    if not isinstance(node, ast.Expr) or not isinstance(node.value, ast.Constant):
+        return False
+    return isinstance(node.value.value, str)
+
 
 KEY_LENGTH = 32
 
 
-def key_of(recipe: Recipe) -> str:
+def recipe_key(recipe: Recipe) -> str:
     """Return the key of the result of `recipe`: the first 128 bits of the recipe's SHA-256."""
     return digest(canonical_json(dict(recipe)))[:KEY_LENGTH]
 
@@ -26,26 +191,26 @@ def explain_difference(old: Recipe, new: Recipe) -> list[str]:
         *_changes("contract", {"": old.contract}, {"": new.contract}),
         *_changes("match", {"": old.match_id}, {"": new.match_id}),
         *_changes("unit", {"": old.name}, {"": new.name}),
-        *_changes("source", _flat(old.sources), _flat(new.sources)),
+        *_changes("source", _flatten(old.sources), _flatten(new.sources)),
         *_changes("input", old.inputs, new.inputs),
-        *_changes("setting", _flat(old.settings), _flat(new.settings)),
+        *_changes("setting", _flatten(old.settings), _flatten(new.settings)),
         *_changes("module", old.code, new.code),
         *_changes("library", old.libraries, new.libraries),
     ]
     # Digests with equal beginnings look equal when shortened; every difference must show.
-    if not lines and key_of(old) != key_of(new):
-        lines.append(f"recipe: {key_of(old)} -> {key_of(new)}")
+    if not lines and recipe_key(old) != recipe_key(new):
+        lines.append(f"recipe: {recipe_key(old)} -> {recipe_key(new)}")
     return lines
 
 
 def _changes(kind: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
     for name in sorted(old.keys() | new.keys()):
-        before, after = _shown(old, name), _shown(new, name)
+        before, after = _format_value(old, name), _format_value(new, name)
         if before != after:
             yield f"{kind} {name}".rstrip() + f": {before} -> {after}"
 
 
-def _shown(values: Mapping[str, Any], name: str) -> str:
+def _format_value(values: Mapping[str, Any], name: str) -> str:
     if name not in values:
         return "absent"
     value = values[name]
@@ -54,15 +219,15 @@ def _shown(values: Mapping[str, Any], name: str) -> str:
     return f"{text[:12]}..." if is_digest else text
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return every leaf by its path: `camera.focal_px[0]`."""
     flat: dict[str, Any] = {}
     for name, value in values.items():
         if isinstance(value, Mapping) and value:
-            flat.update(_flat(value, f"{prefix}{name}."))
+            flat.update(_flatten(value, f"{prefix}{name}."))
         elif isinstance(value, list | tuple) and value:
             items = {f"{name}[{index}]": item for index, item in enumerate(value)}
-            flat.update(_flat(items, prefix))
+            flat.update(_flatten(items, prefix))
         else:
             flat[prefix + name] = value
     return flat

@@ -1,4 +1,7 @@
-"""Numbers and records of runs in a project."""
+"""Runs of a project: their numbers, reservations, records and pins.
+
+A pin is a name of a run, and garbage collection keeps every pinned run.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +10,79 @@ import platform
 import re
 from datetime import UTC, datetime
 
+from data_contracts.pin import Pin
 from data_contracts.run import Reservation, RunRecord
 from worldpose.errors import InputError, StoreError
-from worldpose.store.blobs import Blobs
-from worldpose.store.commit_points import reached
+from worldpose.store.blobs import Blobs, pass_commit_point
 from worldpose.store.documents import seal, unseal_repairable
-from worldpose.store.paths import checked_name, record_path, reservation_path
-from worldpose.store.pins import read_pin
+from worldpose.store.paths import checked_name, is_name, pin_path, record_path, reservation_path
+
+
+def pin_run(blobs: Blobs, pin: Pin) -> Pin:
+    """Pin a run under a name; return the pin in force.
+
+    Pinning the same run under the same name again changes nothing.
+
+    Raises:
+        InputError: the name is a number or `latest`, or is another run's.
+    """
+    if pin.name == "latest" or pin.name.isdigit():
+        raise InputError(
+            f"name of run {pin.run_id} of {pin.match_id}",
+            expected="a name that is neither a number nor 'latest'",
+            found=repr(pin.name),
+            todo="Choose a name with a letter, such as v1.",
+        )
+    if blobs.put_new(pin_path(pin.match_id, pin.name), seal(pin)):
+        return pin
+    known = read_pin(blobs, pin.match_id, pin.name)
+    if known is None or known.run_id != pin.run_id:
+        raise InputError(
+            f"name {pin.name} of a run of {pin.match_id}",
+            expected="a name that no other run has",
+            found=(
+                "a pin that was removed at the same time"
+                if known is None
+                else f"run {known.run_id} pinned under this name"
+            ),
+            todo="Choose another name, or unpin that run first.",
+        )
+    return known
+
+
+def unpin_run(blobs: Blobs, match_id: str, name: str) -> Pin:
+    """Remove a pin, so that its run can be forgotten; return it.
+
+    Raises:
+        InputError: there is no such name.
+    """
+    pin = read_pin(blobs, match_id, name)
+    if pin is None:
+        names = ", ".join(known.name for known in list_pins(blobs, match_id))
+        raise InputError(
+            f"pin {match_id}/{name}",
+            expected=f"one of {names or '(none)'}",
+            found="no such name",
+            todo="List them with `worldpose status`.",
+        )
+    blobs.delete(pin_path(match_id, name))
+    return pin
+
+
+def read_pin(blobs: Blobs, match_id: str, name: str) -> Pin | None:
+    """Return the pin of a name, None if no run has it."""
+    path = pin_path(match_id, name)
+    data = blobs.read(path)
+    return None if data is None else unseal_repairable(Pin, data, f"{blobs.url}/{path}")
+
+
+def list_pins(blobs: Blobs, match_id: str) -> tuple[Pin, ...]:
+    """Return all pins of a match, sorted by name."""
+    files = [entry.path.rpartition("/")[2] for entry in blobs.entries(f"pins/{match_id}")]
+    names = [file.removesuffix(".json") for file in files if file.endswith(".json")]
+    pins = (read_pin(blobs, match_id, name) for name in names if is_name(name))
+    return tuple(pin for pin in pins if pin is not None)
+
 
 LATEST = "latest"
 
@@ -21,7 +90,7 @@ _FILE = re.compile(r"(\d+)(\.open)?\.json(\.damaged)?")
 """Name of a run's record or reservation, in use or set aside; other files are foreign."""
 
 
-def may_be_at_work(reservation: Reservation) -> bool:
+def may_be_running(reservation: Reservation) -> bool:
     """Return whether the run's process may be active; True for a process on another machine."""
     if reservation.host != platform.node():
         return True
@@ -66,7 +135,7 @@ def reserve_run(blobs: Blobs, match_id: str) -> str:
 
 
 def read_reservation(blobs: Blobs, match_id: str, run_id: str) -> Reservation | None:
-    """Return the reservation of a run, None if there is none, or none any more."""
+    """Return the reservation of a run; None if there is none, for example after its end."""
     path = reservation_path(match_id, run_id)
     data = blobs.read(path)
     return None if data is None else unseal_repairable(Reservation, data, f"{blobs.url}/{path}")
@@ -102,13 +171,13 @@ def write_record(blobs: Blobs, record: RunRecord) -> None:
         StoreError: the run already has another record.
     """
     path, data = record_path(record.match_id, record.run_id), seal(record)
-    reached("before_run_record")
+    pass_commit_point("before_run_record")
     if not blobs.put_new(path, data) and blobs.read(path) != data:
         raise StoreError(
             f"{blobs.url}/{path} exists with other content: run {record.run_id} of match "
-            f"{record.match_id} was finished before. Reserve a new run."
+            f"{record.match_id} was finished earlier. Reserve a new run."
         )
-    reached("after_run_record")
+    pass_commit_point("after_run_record")
     blobs.delete(reservation_path(record.match_id, record.run_id))
 
 

@@ -1,10 +1,10 @@
-"""Project: content-addressed results, written atomically and never overwritten."""
+"""Project: content-addressed results, written atomically and never overwritten; opened runs."""
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,15 +13,17 @@ from typing import TYPE_CHECKING
 from data_contracts.match import Registration
 from data_contracts.run import Project, Reservation, ResultManifest, RunRecord
 from data_contracts.work import Work
-from worldpose.errors import CorruptionError, InputError, NondeterminismError, StoreError
-from worldpose.store.blobs import Blobs
-from worldpose.store.commit_points import reached
+from worldpose.errors import (
+    CorruptionError,
+    InputError,
+    NondeterminismError,
+    StoreError,
+    UsageError,
+)
+from worldpose.store.blobs import Blobs, LocalBlobs, pass_commit_point, read_published
 from worldpose.store.documents import seal, unseal, unseal_repairable
-from worldpose.store.fingerprint import STORE_FORMAT
-from worldpose.store.folder import LocalBlobs
 from worldpose.store.paths import MANIFEST, PROJECT, ResultId, is_name, registration_path
-from worldpose.store.published import read_published
-from worldpose.store.recipes import key_of
+from worldpose.store.recipes import STORE_FORMAT, recipe_key
 from worldpose.store.runs import (
     LATEST,
     list_runs,
@@ -89,7 +91,7 @@ class Store:
                 f"{where}: store_format",
                 expected=repr(STORE_FORMAT),
                 found=repr(project.store_format),
-                todo="Use the version of worldpose that made the project, or make a new one.",
+                todo="Use the version of worldpose that made the project, or make a new project.",
             )
         return cls(blobs)
 
@@ -136,7 +138,7 @@ class Store:
     def results(self, match_id: str | None = None) -> tuple[ResultId, ...]:
         """Return all published results, of one match or of all, sorted."""
         top = "results" if match_id is None else f"results/{match_id}"
-        found = ((entry.path, ResultId.at(entry.path)) for entry in self.blobs.entries(top))
+        found = ((entry.path, ResultId.from_path(entry.path)) for entry in self.blobs.entries(top))
         return tuple(
             sorted(result for path, result in found if result and path == result.manifest_path)
         )
@@ -153,14 +155,17 @@ class Store:
         data = self.blobs.read(result.manifest_path)
         if data is None:
             raise StoreError(
-                f"{where}: no such result. Run `worldpose run {match_id}` to compute it; "
-                "`worldpose gc` removes leftovers of an interrupted one."
+                f"{where}: there is no such result. Run `worldpose run {match_id}` to compute it. "
+                "`worldpose gc` removes leftovers of an interrupted run."
             )
         manifest = unseal(ResultManifest, data, where)
         recipe = manifest.recipe
-        named = (recipe.match_id, recipe.stage, recipe.unit, key_of(recipe))
+        named = (recipe.match_id, recipe.stage, recipe.unit, recipe_key(recipe))
         if named != (match_id, stage, unit, key) or manifest.key != key:
-            raise CorruptionError(f"{where} is the manifest of another result: {'/'.join(named)}")
+            raise CorruptionError(
+                f"{where} is the manifest of another result: {'/'.join(named)}. Run `worldpose "
+                "verify --repair`."
+            )
         return manifest
 
     @contextmanager
@@ -175,25 +180,25 @@ class Store:
             NondeterminismError: the key is published with other content.
             StoreError: the disk is full or not writable; nothing is published.
         """
-        if work.key != key_of(work.recipe):
+        if work.key != recipe_key(work.recipe):
             raise InputError(
                 f"work on {work.recipe.name}",
-                expected=f"key {key_of(work.recipe)}, its recipe's",
+                expected=f"key {recipe_key(work.recipe)} of its recipe",
                 found=f"key {work.key}",
-                todo="Make the key with worldpose.store.key_of.",
+                todo="Compute the key with worldpose.store.recipe_key.",
             )
         folder = self.blobs.staging()
         try:
             writer = ResultWriter(work, folder)
             yield writer
             manifest = writer.sealed_manifest()
-            reached("before_publish")
-            result = ResultId.of(work)
+            pass_commit_point("before_publish")
+            result = ResultId.for_work(work)
             if self.blobs.publish_tree(folder, result.path, MANIFEST, seal(manifest)):
-                reached("after_commit")
+                pass_commit_point("after_commit")
                 writer.manifest = manifest
             else:
-                writer.manifest = self._published_twin(result, manifest)
+                writer.manifest = self._check_same_content(result, manifest)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
@@ -217,8 +222,7 @@ class Store:
         """
         # Imported here: status and resumed runs need only manifests, and Zarr takes most of a
         # second.
-        from worldpose.store.groups import read_group
-        from worldpose.store.zarr_files import PublishedFiles
+        from worldpose.store.groups import PublishedFiles, read_group
 
         result = ResultId(match_id, stage, unit, key)
         manifest = self.manifest(match_id, stage, unit, key)
@@ -244,7 +248,7 @@ class Store:
             StoreError: a named result is not published, or the run has another record.
         """
         results = [
-            ResultId.named(record.match_id, name, key) for name, key in record.results.items()
+            ResultId.from_name(record.match_id, name, key) for name, key in record.results.items()
         ]
         with ThreadPoolExecutor(8) as pool:
             published = pool.map(self.blobs.exists, (result.manifest_path for result in results))
@@ -253,8 +257,8 @@ class Store:
             ]
         if lost:
             raise StoreError(
-                f"run {record.run_id} of match {record.match_id} names results that are not in "
-                f"{self.url}: {', '.join(lost)}. Run `worldpose run {record.match_id}` again."
+                f"run {record.run_id} of match {record.match_id} names results that {self.url} "
+                f"does not have: {', '.join(lost)}. Run `worldpose run {record.match_id}` again."
             )
         write_record(self.blobs, record)
 
@@ -277,20 +281,20 @@ class Store:
         """
         return read_record(self.blobs, match_id, run_id)
 
-    def _published_twin(self, result: ResultId, ours: ResultManifest) -> ResultManifest:
+    def _check_same_content(self, result: ResultId, ours: ResultManifest) -> ResultManifest:
         theirs = self.manifest(result.match_id, result.stage, result.unit, result.key)
         if theirs.content != ours.content:
             changed = sorted({file.path for file in {*theirs.files} ^ {*ours.files}})
             raise NondeterminismError(
-                f"{self.url}/{result.path} is published with other content than this computation "
-                f"gave; {len(changed)} files differ, the first is {changed[0]}. The same recipe "
-                "must give the same bytes: report the stage. The published result stays."
+                f"{self.url}/{result.path}: the published content differs from the content of this "
+                f"computation in {len(changed)} files; the first is {changed[0]}. The same recipe "
+                "must give the same bytes. The published result stays. Report the stage."
             )
         return theirs
 
 
 def open_blobs(url: str) -> Blobs:
-    """The disk or object storage at `url`: a folder, or `s3://bucket/prefix`.
+    """Return the files at `url`: a folder, or `s3://bucket/prefix`.
 
     Raises:
         InputError: another scheme, or no bucket.
@@ -308,3 +312,91 @@ def open_blobs(url: str) -> Blobs:
             todo="Name a folder, or an S3-compatible store with AWS_ENDPOINT_URL set.",
         )
     return LocalBlobs(Path(url).expanduser().absolute())
+
+
+class Run(Mapping[str, "xr.Dataset"]):
+    """Results of one run: `run["triangulation/clip"].joints`.
+
+    Each is opened on first access, and its values are read on access.
+    """
+
+    def __init__(self, store: Store, record: RunRecord, *, complete: bool = False) -> None:
+        self.record = record
+        """Record of the run: results, settings, metrics, versions, times."""
+        self._store = store
+        self._complete = complete
+        self._opened: dict[str, xr.Dataset] = {}
+
+    def __getitem__(self, name: str) -> xr.Dataset:
+        if name not in self.record.results:
+            failures = {failure.unit: failure for failure in self.record.failed}
+            if name in failures:
+                why = f"it failed with {failures[name].error}: {failures[name].message}"
+            elif name in self.record.blocked and self.record.waiting:
+                why = f"{len(self.record.waiting)} results that it needs wait for review"
+            else:
+                why = f"the run has {', '.join(self) or 'no results'}"
+            raise KeyError(f"run {self.record.run_id} has no result of {name!r}: {why}")
+        if name not in self._opened:
+            stage, _, unit = name.partition("/")
+            result = self._store.open_result(
+                self.record.match_id, stage, unit, self.record.results[name]
+            )
+            if self._complete:
+                self._require_all_arrays(name, stage, result)
+            self._opened[name] = result
+        return self._opened[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(sorted(self.record.results))
+
+    def __len__(self) -> int:
+        return len(self.record.results)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.record.results
+
+    def _require_all_arrays(self, name: str, stage: str, result: xr.Dataset) -> None:
+        from data_contracts.schemas import LAYOUTS  # imported here: it imports every record class
+
+        (layout,) = (each for each in LAYOUTS if each.stage == stage)
+        written = {*(array.name for array in layout.arrays), *layout.attributes}
+        absent = sorted(written - set(layout.optional) - {*result.variables, *result.attrs})
+        if absent:
+            raise UsageError(
+                f"run {self.record.run_id} of match {self.record.match_id}: {name}",
+                expected="a result of this version of worldpose",
+                found=f"a result of an earlier version, without {', '.join(absent)}",
+                todo=f"Recompute it: worldpose run {self.record.match_id}.",
+            )
+
+    def __repr__(self) -> str:
+        record = self.record
+        title = f"Run {record.run_id} of match {record.match_id}: {record.state}"
+        return "\n".join(
+            [
+                f"{title}, finished {record.finished_at:%Y-%m-%d %H:%M} UTC, {self._store.url}",
+                *(f"  {name}  {record.results[name][:12]}" for name in self),
+                *(f"  {failure.unit}  failed: {failure.error}" for failure in record.failed),
+            ]
+        )
+
+
+def open_run(
+    project: str | os.PathLike[str], match: str, run: str = LATEST, *, complete: bool = False
+) -> Run:
+    """Open a match run's results as labelled arrays (xarray), metres and pixels, world frame.
+
+    Args:
+        project: the project's folder or `s3://bucket/prefix`.
+        match: the match's id.
+        run: the run's number, such as `0003`, or `latest`.
+        complete: refuse, on opening, a result that an earlier version of worldpose computed without
+            some array of this version.
+
+    Raises:
+        InputError: there is no such project, match or run.
+        CorruptionError: stored bytes differ from the published ones.
+    """
+    store = Store.open(project)
+    return Run(store, store.run(match, run), complete=complete)

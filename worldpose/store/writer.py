@@ -7,18 +7,18 @@ import time
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from data_contracts.arrays import GroupLayout
 from data_contracts.records import CONTRACT_VERSION
 from data_contracts.run import ResultManifest, StoredFile
 from data_contracts.work import Work
 from worldpose.errors import InternalError, StoreError
-from worldpose.store.blobs import storage_errors
-from worldpose.store.canonical import canonical_json, digest
-from worldpose.store.commit_points import reached
-from worldpose.store.documents import checksum_of
-from worldpose.store.layout_checks import Arrays
+from worldpose.store.blobs import pass_commit_point, storage_errors
+from worldpose.store.documents import canonical_json, digest, record_checksum
+
+if TYPE_CHECKING:
+    from worldpose.store.groups import Arrays
 
 
 class ResultWriter:
@@ -61,18 +61,22 @@ class ResultWriter:
 
         name = self._work.recipe.name
         if self._files:
-            raise StoreError(f"{name}: a result is written once; it has been written")
+            raise StoreError(
+                f"{name}: a result is written only once, and this one has been written already. "
+                "Pass all arrays to one call of ResultWriter.write."
+            )
         if layout.stage != self._work.recipe.stage:
             raise InternalError(
                 f"result of {name}",
                 f"expected the layout of stage {self._work.recipe.stage}, found the layout of "
                 f"stage {layout.stage}",
             )
-        reached("before_write")
+        pass_commit_point("before_write")
         with storage_errors(str(self._folder)):
-            given = (arrays, coordinates or {}, attributes or {})
-            self._files = write_group(self._folder, layout, *given)
-        reached("after_write")
+            self._files = write_group(
+                self._folder, layout, arrays, coordinates or {}, attributes or {}
+            )
+        pass_commit_point("after_write")
 
     def sealed_manifest(self) -> ResultManifest:
         """Return the manifest of the written files.
@@ -83,26 +87,29 @@ class ResultWriter:
         """
         name = self._work.recipe.name
         if not self._files:
-            raise StoreError(f"{name}: nothing was written, so there is nothing to publish")
-        for figure, value in self.figures.items():
+            raise StoreError(
+                f"{name}: the stage wrote no arrays, so there is nothing to publish. Call "
+                "ResultWriter.write before the block of Store.publishing ends."
+            )
+        for metric, value in self.figures.items():
             if not math.isfinite(value):
                 raise InternalError(
-                    f"figure {figure} of {name}", f"expected a finite number, found {value}"
+                    f"metric {metric} of {name}", f"expected a finite number, found {value}"
                 )
         with storage_errors(str(self._folder)):
             files = stored_files(self._folder)
         if len(files) != self._files:
             raise StoreError(
-                f"{self._folder}: of {self._files} files of {name} {len(files)} are there, so that "
-                "nothing was published: something removed them. Run again."
+                f"{self._folder}: {name} has {self._files} files, but only {len(files)} of them "
+                "exist, so nothing was published. Another program removed the others. Run again."
             )
         manifest = ResultManifest(
             contract=CONTRACT_VERSION,
             key=self._work.key,
             recipe=self._work.recipe,
             files=files,
-            content=content_of(files),
-            figures={figure: float(value) for figure, value in self.figures.items()},
+            content=content_digest(files),
+            figures={metric: float(value) for metric, value in self.figures.items()},
             left_out=dict(sorted(self.left_out.items())),
             warnings=tuple(self.warnings),
             created_at=datetime.now(UTC),
@@ -110,7 +117,7 @@ class ResultWriter:
             run_id=self._work.run_id,
             checksum="0" * 64,
         )
-        return manifest.model_copy(update={"checksum": checksum_of(manifest)})
+        return manifest.model_copy(update={"checksum": record_checksum(manifest)})
 
 
 def stored_files(folder: Path) -> tuple[StoredFile, ...]:
@@ -124,6 +131,6 @@ def stored_files(folder: Path) -> tuple[StoredFile, ...]:
     return tuple(sorted(found, key=lambda file: file.path))
 
 
-def content_of(files: tuple[StoredFile, ...]) -> str:
+def content_digest(files: tuple[StoredFile, ...]) -> str:
     """Return a digest that is equal for all valid computations of one key."""
     return digest(canonical_json([file.model_dump(mode="json") for file in files]))

@@ -16,7 +16,7 @@ from worldpose.bundle_adjustment import (
 )
 from worldpose.bundle_adjustment.building import KeypointNoise
 from worldpose.static_calibration import PARAMETERS
-from worldpose.store.layout_checks import checked_arrays
+from worldpose.store.groups import checked_arrays
 
 
 def found(made, cameras, limit=4.2, longest=10_000):

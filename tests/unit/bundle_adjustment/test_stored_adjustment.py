@@ -12,7 +12,7 @@ from worldpose.bundle_adjustment import (
     weak_direction,
 )
 from worldpose.geometry.stored import camera_from_arrays
-from worldpose.store.layout_checks import checked_arrays, checked_attributes
+from worldpose.store.groups import checked_arrays, checked_attributes
 
 
 @pytest.mark.parametrize("evidence", ["markings_and_players", "markings"])

@@ -254,7 +254,7 @@ def test_a_full_disk_is_told_and_leaves_the_journal_as_it_was(store, monkeypatch
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("worldpose.store.folder.os.fsync", fail)
+        patch.setattr("worldpose.store.blobs.os.fsync", fail)
         with pytest.raises(StoreError, match="No space left"):
             say(store, "m", lambda _: [correction("b")])
     assert said(read_journal(store, "m")) == ["a"]
@@ -266,11 +266,9 @@ def test_an_entry_is_on_the_disk_before_it_is_acknowledged(store, monkeypatch):
 
     steps = []
     sync, link = os.fsync, os.link
+    monkeypatch.setattr("worldpose.store.blobs.os.fsync", lambda f: (steps.append("sync"), sync(f)))
     monkeypatch.setattr(
-        "worldpose.store.folder.os.fsync", lambda f: (steps.append("sync"), sync(f))
-    )
-    monkeypatch.setattr(
-        "worldpose.store.folder.os.link", lambda a, b: (steps.append("link"), link(a, b))
+        "worldpose.store.blobs.os.link", lambda a, b: (steps.append("link"), link(a, b))
     )
     say(store, "m", lambda _: [correction("a")])
     assert "sync" in steps[: steps.index("link")]

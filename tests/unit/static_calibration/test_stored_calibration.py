@@ -13,7 +13,7 @@ from worldpose.static_calibration import (
     given_attributes,
     left_out_attributes,
 )
-from worldpose.store.layout_checks import checked_arrays, checked_attributes
+from worldpose.store.groups import checked_arrays, checked_attributes
 
 
 def test_a_calibration_keeps_its_layout():

@@ -10,7 +10,7 @@ from store_samples import SMALL_CHUNK
 
 import data_contracts.arrays
 from worldpose.store import Store
-from worldpose.store.commit_points import install_fault_hook
+from worldpose.store.blobs import install_fault_hook
 
 
 @pytest.fixture(params=["folder", "s3"])

@@ -16,8 +16,8 @@ from data_contracts.arrays import ArrayLayout, GroupLayout
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec, Registration, SourceFile
 from data_contracts.run import RunRecord
 from data_contracts.work import Recipe, Work
-from worldpose.store import ResultWriter, Store, key_of
-from worldpose.store.commit_points import install_fault_hook
+from worldpose.store import ResultWriter, Store, recipe_key
+from worldpose.store.blobs import install_fault_hook
 
 FRAMES, PERSONS = 40, 3
 SMALL_CHUNK = 1024
@@ -132,7 +132,7 @@ def sample_recipe(unit: str = "clip", **changes: Any) -> Recipe:
 def sample_work(store: Store, recipe: Recipe | None = None, run_id: str = "0001") -> Work:
     recipe = recipe or sample_recipe()
     return Work(
-        project=store.url, folder="/match", recipe=recipe, key=key_of(recipe), run_id=run_id
+        project=store.url, folder="/match", recipe=recipe, key=recipe_key(recipe), run_id=run_id
     )
 
 
@@ -147,7 +147,7 @@ def publish(
 
 def place(recipe: Recipe | None = None) -> tuple[str, str, str, str]:
     recipe = recipe or sample_recipe()
-    return recipe.match_id, recipe.stage, recipe.unit, key_of(recipe)
+    return recipe.match_id, recipe.stage, recipe.unit, recipe_key(recipe)
 
 
 def sample_record(run_id: str, *recipes: Recipe, **changes: Any) -> RunRecord:
@@ -157,7 +157,7 @@ def sample_record(run_id: str, *recipes: Recipe, **changes: Any) -> RunRecord:
         "match_id": "final",
         "parent": None,
         "state": "complete",
-        "results": {recipe.name: key_of(recipe) for recipe in recipes},
+        "results": {recipe.name: recipe_key(recipe) for recipe in recipes},
         "settings": {},
         "overrides": {},
         "executed": tuple(recipe.name for recipe in recipes),

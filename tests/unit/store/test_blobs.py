@@ -32,7 +32,7 @@ def test_new_is_put_once(store: Store) -> None:
     assert store.blobs.put_new("a/b", b"first")
     assert not store.blobs.put_new("a/b", b"second")
     assert store.blobs.read("a/b") == b"first"
-    assert store.blobs.staged() == []
+    assert store.blobs.staged_entries() == []
 
 
 def test_of_many_that_put_one_new_file_one_succeeds(store: Store) -> None:
@@ -77,7 +77,7 @@ def test_what_goes_while_it_is_listed_is_not_there(
 
     monkeypatch.setattr(os, "scandir", scan_and_delete)
     assert [entry.path for entry in blobs.entries("a")] == ["a/2"]
-    assert [entry.size for entry in blobs.staged()] == [0]
+    assert [entry.size for entry in blobs.staged_entries()] == [0]
 
 
 def test_tree_is_removed_with_the_first_file_first(store: Store) -> None:
@@ -87,7 +87,7 @@ def test_tree_is_removed_with_the_first_file_first(store: Store) -> None:
         store.blobs.delete_tree("tree", "manifest.json")
     assert store.blobs.entries("tree") == []
     assert store.blobs.exists("tree2/a")
-    assert store.blobs.staged() == []
+    assert store.blobs.staged_entries() == []
 
 
 def test_a_local_disk_that_fails_a_download_is_not_blamed_on_the_bucket(

@@ -39,7 +39,7 @@ def test_times_and_numbers_of_runs_do_not_count(twins: tuple[Store, Store]) -> N
 def test_changed_chunk_is_a_difference(twins: tuple[Store, Store]) -> None:
     path = f"{ResultId(*place()).path}/joints/c/0/0/0"
     twins[1].blobs.put(path, b"changed")
-    assert compare_stores(*twins) == [f"{path}: other bytes"]
+    assert compare_stores(*twins) == [f"{path}: the bytes differ"]
 
 
 def test_changed_attribute_is_a_difference_that_is_named(twins: tuple[Store, Store]) -> None:
@@ -47,7 +47,9 @@ def test_changed_attribute_is_a_difference_that_is_named(twins: tuple[Store, Sto
     data = twins[1].blobs.read(path)
     assert data is not None
     twins[1].blobs.put(path, data.replace(b'"unit": "m"', b'"unit": "px"'))
-    assert compare_stores(*twins) == [f"{path}: attributes: unit: 'm' and 'px'"]
+    assert compare_stores(*twins) == [
+        f"{path}: attributes: unit: 'm' in the first project, 'px' in the second"
+    ]
 
 
 def test_lost_and_added_files_are_differences(twins: tuple[Store, Store]) -> None:
@@ -55,14 +57,16 @@ def test_lost_and_added_files_are_differences(twins: tuple[Store, Store]) -> Non
     twins[0].blobs.delete(f"{top}/views/c/0")
     twins[0].blobs.put(f"{top}/more", b"more")
     assert compare_stores(*twins) == [
-        f"file {top}/more: only in the first",
-        f"file {top}/views/c/0: only in the second",
+        f"file {top}/more: only in the first project",
+        f"file {top}/views/c/0: only in the second project",
     ]
 
 
 def test_lost_result_is_a_difference(twins: tuple[Store, Store]) -> None:
     twins[0].withdraw(ResultId(*place()))
-    assert compare_stores(*twins) == [f"result {ResultId(*place()).path}: only in the second"]
+    assert compare_stores(*twins) == [
+        f"result {ResultId(*place()).path}: only in the second project"
+    ]
 
 
 def test_other_content_of_one_key_is_a_difference(folder_store: Store, tmp_path: Path) -> None:
@@ -71,18 +75,20 @@ def test_other_content_of_one_key_is_a_difference(folder_store: Store, tmp_path:
     publish(other, seed=1)
     lines = compare_stores(folder_store, other)
     assert any("content" in line for line in lines)
-    assert any("joints/c/0/0/0: other bytes" in line for line in lines)
+    assert any("joints/c/0/0/0: the bytes differ" in line for line in lines)
 
 
 def test_other_run_is_a_difference(twins: tuple[Store, Store]) -> None:
     twins[0].finish_run(sample_record("0002", sample_recipe(), state="partial"))
-    assert compare_stores(*twins) == ["latest run of final: state: 'partial' and 'complete'"]
+    assert compare_stores(*twins) == [
+        "latest run of final: state: 'partial' in the first project, 'complete' in the second"
+    ]
 
 
 def test_absent_run_and_match_are_differences(twins: tuple[Store, Store]) -> None:
     twins[0].blobs.delete("runs/final/0001.json")
     twins[0].blobs.delete("matches/final.json")
     assert compare_stores(*twins) == [
-        "match final: only in the second",
-        "match final: only the second has runs",
+        "match final: only in the second project",
+        "match final: only the second project has finished runs",
     ]

@@ -22,10 +22,9 @@ from store_samples import (
 )
 
 from worldpose.store import ResultId, Store, collect, compare_stores, plan_gc, verify
-from worldpose.store.commit_points import COMMIT_POINTS, install_fault_hook, reached
-from worldpose.store.folder import LocalBlobs
+from worldpose.store.blobs import COMMIT_POINTS, LocalBlobs, install_fault_hook, pass_commit_point
 from worldpose.store.objects import ObjectBlobs
-from worldpose.store.runs import may_be_at_work
+from worldpose.store.runs import may_be_running
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +65,7 @@ def test_killed_run_leaves_nothing_half_and_the_next_gives_the_same_answer(
     assert store.has(*place()) == (index >= COMMIT_POINTS.index("after_commit"))
     assert bool(store.runs("final")) == (point == "after_run_record")
     unfinished = store.unfinished_runs("final")
-    assert [run.run_id for run in unfinished if not may_be_at_work(run)] == (
+    assert [run.run_id for run in unfinished if not may_be_running(run)] == (
         [] if point == "after_run_record" else ["0001"]
     )
 
@@ -78,7 +77,7 @@ def test_killed_run_leaves_nothing_half_and_the_next_gives_the_same_answer(
     )
 
     collect(store, plan_gc(store, older_than=timedelta(0)))
-    assert store.blobs.staged() == []
+    assert store.blobs.staged_entries() == []
     assert store.unfinished_runs("final") == ()
     assert compare_stores(store, undisturbed) == []
 
@@ -125,7 +124,7 @@ def publish_manifest_first() -> None:
         target = self.root / prefix
         target.mkdir(parents=True)
         (target / manifest_name).write_bytes(manifest)
-        reached("during_publish")
+        pass_commit_point("during_publish")
         for path in folder.iterdir():
             path.rename(target / path.name)
         return True
@@ -134,7 +133,7 @@ def publish_manifest_first() -> None:
         self: ObjectBlobs, folder: Path, prefix: str, manifest_name: str, manifest: bytes
     ) -> bool:
         self.put_new(f"{prefix}/{manifest_name}", manifest)
-        reached("during_publish")
+        pass_commit_point("during_publish")
         for path in folder.rglob("*"):
             if path.is_file():
                 self.put_new(f"{prefix}/{path.relative_to(folder)}", path.read_bytes())
@@ -211,5 +210,5 @@ def test_interruption_by_hand_leaves_no_staging(store: Store, tmp_path: Path, po
         run_once(store)
     install_fault_hook(None)
     check_never_half(store)
-    assert store.blobs.staged() == []
+    assert store.blobs.staged_entries() == []
     assert [path for path in tmp_path.iterdir() if path.name.startswith("worldpose-")] == []

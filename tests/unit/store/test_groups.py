@@ -111,7 +111,7 @@ def test_array_of_many_parts_is_stored_as_in_one_piece(
     values = np.random.default_rng(0).normal(size=(3, 100))
     values[1, ::7] = np.nan
     write_group(tmp_path / "parts", long_layout, {"x": values}, {}, {})
-    monkeypatch.setattr("worldpose.store.layout_checks.PART_CHUNKS", 100)
+    monkeypatch.setattr("worldpose.store.groups.PART_CHUNKS", 100)
     write_group(tmp_path / "whole", long_layout, {"x": values}, {}, {})
     assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
     stored = zarr.open_group(tmp_path / "parts", mode="r")["x"]
@@ -123,7 +123,7 @@ def test_wrong_values_of_all_parts_are_counted_and_nothing_is_written(
 ) -> None:
     values = np.zeros((3, 100))
     values[2, 40], values[0, 99] = np.inf, -np.inf
-    with pytest.raises(InternalError, match=r"x\[2, 40\].*found inf, and 2 such in all"):
+    with pytest.raises(InternalError, match=r"x\[2, 40\].*found inf; 2 values in all are wrong"):
         write_group(tmp_path, long_layout, {"x": values}, {}, {})
     assert list(tmp_path.iterdir()) == []
 
@@ -142,7 +142,7 @@ def test_wrong_values_of_all_parts_are_counted_and_nothing_is_written(
         ({"height": np.array(np.nan, np.float32)}, r"height\[\]: expected finite numbers only"),
         (
             {"detection_index": np.full((40, 2), -2, np.int16)},
-            "or -1 for missing, found -2, and 80",
+            "or -1 for missing, found -2; 80",
         ),
         ({"surprise": np.zeros(3)}, "unknown: surprise"),
         ({"extra": np.zeros(41, np.int32)}, "dimension frame"),
@@ -170,7 +170,7 @@ def test_absent_array_is_refused_unless_optional(tmp_path: Path) -> None:
     [
         ({"camera": ["left", "right"]}, "absent: detector"),
         ({**ATTRIBUTES, "more": 1}, "unknown: more"),
-        ({**ATTRIBUTES, "camera": ["left"]}, "expected a list of 2 labels.*found 1 of them"),
+        ({**ATTRIBUTES, "camera": ["left"]}, "expected a list of 2 labels.*found 1 labels"),
         ({**ATTRIBUTES, "camera": "left"}, "found 'left'"),
         ({**ATTRIBUTES, "detector": float("nan")}, "plain JSON"),
     ],

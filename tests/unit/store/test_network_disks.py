@@ -14,7 +14,7 @@ from store_samples import place, publish, run_once
 
 from worldpose.errors import StoreError
 from worldpose.store import Store, verify
-from worldpose.store import folder as folder_module
+from worldpose.store import blobs as folder_module
 from worldpose.store.blobs import storage_errors
 
 
@@ -83,7 +83,7 @@ def test_without_hard_links_a_file_is_still_created_whole_and_once(tmp_path: Pat
         done = list(pool.map(lambda data: store.blobs.put_new("a/b.json", data), contents))
     assert sum(done) == 1
     assert store.blobs.read("a/b.json") == contents[done.index(True)]
-    assert store.blobs.staged() == []
+    assert store.blobs.staged_entries() == []
     run_once(store)
     assert verify(store) == ()
 

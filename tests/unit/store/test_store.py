@@ -3,6 +3,8 @@ from __future__ import annotations
 import errno
 import os
 import pickle
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from store_samples import (
     all_sample_arrays,
     place,
     publish,
+    run_once,
     run_process,
     sample_arrays,
     sample_coordinates,
@@ -23,15 +26,18 @@ from store_samples import (
     sample_work,
 )
 
+import worldpose
+from data_contracts.run import UnitFailure
 from worldpose.errors import (
     CorruptionError,
     InputError,
     InternalError,
     NondeterminismError,
     StoreError,
+    UsageError,
 )
 from worldpose.store import ResultId, Store, verify
-from worldpose.store.canonical import canonical_json, digest
+from worldpose.store.documents import canonical_json, digest
 from worldpose.store.paths import MANIFEST, PROJECT
 
 
@@ -92,13 +98,13 @@ def test_error_while_computing_leaves_nothing(store: Store) -> None:
         raise ZeroDivisionError
     assert not store.has(*place())
     assert store.results() == ()
-    assert store.blobs.staged() == []
+    assert store.blobs.staged_entries() == []
     assert [entry.path for entry in store.blobs.entries("results")] == []
 
 
 def test_result_without_arrays_is_not_published(folder_store: Store) -> None:
     with (
-        pytest.raises(StoreError, match="nothing was written"),
+        pytest.raises(StoreError, match="the stage wrote no arrays"),
         folder_store.publishing(sample_work(folder_store)),
     ):
         pass
@@ -107,7 +113,7 @@ def test_result_without_arrays_is_not_published(folder_store: Store) -> None:
 
 def test_result_is_written_once(folder_store: Store) -> None:
     with (
-        pytest.raises(StoreError, match="written once"),
+        pytest.raises(StoreError, match="written only once"),
         folder_store.publishing(sample_work(folder_store)) as writer,
     ):
         for _ in range(2):
@@ -117,7 +123,7 @@ def test_result_is_written_once(folder_store: Store) -> None:
 
 def test_work_with_a_foreign_key_is_refused(folder_store: Store) -> None:
     work = sample_work(folder_store).model_copy(update={"key": "0" * 32})
-    with pytest.raises(InputError, match="its recipe's"), folder_store.publishing(work):
+    with pytest.raises(InputError, match="of its recipe"), folder_store.publishing(work):
         pass
 
 
@@ -132,7 +138,7 @@ def test_layout_of_another_stage_is_refused(folder_store: Store) -> None:
 
 def test_figure_that_is_not_finite_is_refused(folder_store: Store) -> None:
     with (
-        pytest.raises(InternalError, match="figure error_px"),
+        pytest.raises(InternalError, match="metric error_px"),
         folder_store.publishing(sample_work(folder_store)) as writer,
     ):
         writer.write(LAYOUT, sample_arrays(), sample_coordinates(), ATTRIBUTES)
@@ -172,7 +178,7 @@ def test_many_writers_of_one_key_make_one_result(store: Store) -> None:
         assert writer.exitcode == 0
     assert contents == {store.manifest(*place()).content}
     assert verify(store) == ()
-    assert store.blobs.staged() == []
+    assert store.blobs.staged_entries() == []
 
 
 def test_lost_chunk_is_corruption_and_never_a_fill_value(store: Store) -> None:
@@ -180,7 +186,10 @@ def test_lost_chunk_is_corruption_and_never_a_fill_value(store: Store) -> None:
     data = store.open_result(*place())
     store.blobs.delete(f"{ResultId(*place()).path}/joints/c/1/0/0")
     np.testing.assert_array_equal(data.joints[:10], sample_arrays()["joints"][:10])
-    with pytest.raises(CorruptionError, match="joints/c/1/0/0 is not as published: it is missing"):
+    with pytest.raises(
+        CorruptionError,
+        match="joints/c/1/0/0 has changed since its publication: the file is missing",
+    ):
         data.joints[15:20].load()
     with pytest.raises(CorruptionError, match="joints/c/1/0/0"):
         store.open_result(*place(), verify=True)
@@ -194,7 +203,7 @@ def test_flipped_bit_is_named_when_it_is_read(store: Store) -> None:
         data = store.blobs.read(path)
         assert data is not None
         store.blobs.put(path, data[:-1] + bytes([data[-1] ^ 1]))
-        with pytest.raises(CorruptionError, match=f"{path} is not as published"):
+        with pytest.raises(CorruptionError, match=f"{path} has changed since its publication"):
             store.open_result(*place()).load()
         store.blobs.put(path, data)
     store.open_result(*place()).load()
@@ -321,7 +330,7 @@ def test_name_that_could_leave_the_project_is_refused(tmp_path: Path, name: str)
 
 def test_run_that_names_an_absent_result_is_not_finished(folder_store: Store) -> None:
     run_id = folder_store.reserve_run("final")
-    with pytest.raises(StoreError, match="not in"):
+    with pytest.raises(StoreError, match="does not have"):
         folder_store.finish_run(sample_record(run_id, sample_recipe()))
     assert folder_store.runs("final") == ()
 
@@ -350,10 +359,10 @@ def test_failing_disk_is_a_store_error_and_a_retry_succeeds(
         with pytest.raises(StoreError, match=os.strerror(code)) as caught:
             publish(store)
     assert str(tmp_path / "project") in str(caught.value)
-    assert "published results are untouched" in str(caught.value)
+    assert "Published results are unchanged" in str(caught.value)
     assert not store.has(*place())
     assert verify(store) == ()
-    assert store.blobs.staged() == []
+    assert store.blobs.staged_entries() == []
     publish(store)
     assert verify(store) == ()
 
@@ -377,7 +386,7 @@ def test_chunk_that_finds_no_room_is_a_store_error(store: Store) -> None:
     assert "File too large" in message
     assert "run again" in message
     assert not store.has(*place())
-    assert store.blobs.staged() == []
+    assert store.blobs.staged_entries() == []
     publish(store)
     assert verify(store) == ()
 
@@ -395,3 +404,68 @@ def test_absent_bucket_is_a_store_error_that_names_it(bucket: str) -> None:
         Store.create("s3://")
     with pytest.raises(InputError, match="scheme 'gs'"):
         Store.open("gs://elsewhere/project")
+
+
+def test_run_gives_its_results_by_unit(store: Store) -> None:
+    run_once(store, sample_recipe("late"), sample_recipe())
+    run = worldpose.open_run(store.url, "final")
+    assert list(run) == ["tracking/clip", "tracking/late"]
+    assert len(run) == 2
+    assert run.record.run_id == "0001"
+    assert "tracking/clip" in run
+    np.testing.assert_array_equal(run["tracking/clip"].joints, sample_arrays()["joints"])
+    assert run["tracking/clip"] is run["tracking/clip"]
+    assert "Run 0001 of match final: complete" in repr(run)
+    assert "tracking/late" in repr(run)
+
+
+def test_older_run_stays_open_to_readers(folder_store: Store) -> None:
+    run_once(folder_store, sample_recipe("one"))
+    run_once(folder_store, sample_recipe("two"))
+    assert list(worldpose.open_run(folder_store.url, "final", "0001")) == ["tracking/one"]
+
+
+def test_result_of_an_earlier_version_is_refused_where_all_of_it_is_needed(
+    folder_store: Store,
+) -> None:
+    run_once(folder_store)
+    assert "joints" in worldpose.open_run(folder_store.url, "final")["tracking/clip"]
+    run = worldpose.open_run(folder_store.url, "final", complete=True)
+    with pytest.raises(UsageError, match=r"earlier version, without joins, .*worldpose run final"):
+        run["tracking/clip"]
+
+
+def test_absent_unit_says_what_there_is(folder_store: Store) -> None:
+    failure = UnitFailure(unit="tracking/bad", error="InputError", message="no detections")
+    run_once(folder_store)
+    folder_store.finish_run(
+        sample_record("0002", sample_recipe(), state="partial", failed=(failure,))
+    )
+    run = worldpose.open_run(folder_store.url, "final")
+    assert "tracking/bad" not in run
+    assert run.get("tracking/bad") is None
+    with pytest.raises(KeyError, match="it failed with InputError: no detections"):
+        run["tracking/bad"]
+    with pytest.raises(KeyError, match="the run has tracking/clip"):
+        run["tracking/other"]
+    assert "tracking/bad  failed: InputError" in repr(run)
+
+
+def test_absent_project_and_match_say_what_to_do(tmp_path: Path, folder_store: Store) -> None:
+    with pytest.raises(InputError, match="worldpose init"):
+        worldpose.open_run(tmp_path / "nowhere", "final")
+    with pytest.raises(InputError, match="worldpose run semi"):
+        worldpose.open_run(folder_store.url, "semi")
+
+
+def test_library_has_no_other_names() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'open_runs'"):
+        worldpose.open_runs  # noqa: B018
+
+
+def test_neither_the_library_nor_the_store_imports_zarr_until_arrays_are_used() -> None:
+    code = (
+        "import sys, worldpose, worldpose.store\n"
+        "sys.exit(bool({'zarr', 'xarray', 'obstore', 'prefect', 'dask'} & sys.modules.keys()))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

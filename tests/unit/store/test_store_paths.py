@@ -49,11 +49,11 @@ def test_accepted_path_stays_inside(path: str) -> None:
 
 def test_result_is_known_from_its_files() -> None:
     result = ResultId(*place())
-    assert ResultId.at(result.manifest_path) == result
-    assert ResultId.at(f"{result.path}/joints/c/0") == result
-    assert ResultId.at(result.path) is None
-    assert ResultId.at(f"runs/{result.manifest_path}") is None
-    assert ResultId.named("final", result.name, result.key) == result
+    assert ResultId.from_path(result.manifest_path) == result
+    assert ResultId.from_path(f"{result.path}/joints/c/0") == result
+    assert ResultId.from_path(result.path) is None
+    assert ResultId.from_path(f"runs/{result.manifest_path}") is None
+    assert ResultId.from_name("final", result.name, result.key) == result
 
 
 @pytest.mark.parametrize("key", ["", "0" * 31, "0" * 33, "G" * 32, "A" * 32, "../" + "0" * 29])

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta
 
 import pytest
 from store_samples import (
@@ -13,9 +14,19 @@ from store_samples import (
     sample_record,
 )
 
+from data_contracts.pin import Pin
 from worldpose.errors import CorruptionError, InputError, StoreError
-from worldpose.store import Store
-from worldpose.store.runs import may_be_at_work
+from worldpose.store import (
+    Store,
+    collect,
+    list_pins,
+    open_run,
+    pin_run,
+    plan_gc,
+    unpin_run,
+    verify,
+)
+from worldpose.store.runs import may_be_running
 
 
 def test_runs_are_numbered_from_one(store: Store) -> None:
@@ -39,7 +50,7 @@ def test_unfinished_run_is_seen_and_is_not_the_latest(store: Store) -> None:
     assert store.run("final").run_id == "0001"
     (unfinished,) = store.unfinished_runs("final")
     assert (unfinished.run_id, unfinished.pid) == ("0002", os.getpid())
-    assert may_be_at_work(unfinished)
+    assert may_be_running(unfinished)
     with pytest.raises(InputError, match="an unfinished run"):
         store.run("final", "0002")
 
@@ -60,7 +71,7 @@ def test_record_is_written_once(store: Store) -> None:
     record = sample_record(store.reserve_run("final"))
     store.finish_run(record)
     store.finish_run(record)
-    with pytest.raises(StoreError, match="was finished before"):
+    with pytest.raises(StoreError, match="was finished earlier"):
         store.finish_run(record.model_copy(update={"state": "failed"}))
     assert store.run("final") == record
 
@@ -118,13 +129,13 @@ def test_run_of_a_dead_process_is_known_to_be_dead(store: Store) -> None:
     process = run_process(reserve_some, store.url, outcome)
     outcome.get(timeout=60)
     process.join(60)
-    assert [may_be_at_work(run) for run in store.unfinished_runs("final")] == [False] * 4
+    assert [may_be_running(run) for run in store.unfinished_runs("final")] == [False] * 4
 
 
 def test_run_on_another_machine_may_be_alive(folder_store: Store) -> None:
     folder_store.reserve_run("final")
     (run,) = folder_store.unfinished_runs("final")
-    assert may_be_at_work(run.model_copy(update={"host": "elsewhere", "pid": 2**22 + 1}))
+    assert may_be_running(run.model_copy(update={"host": "elsewhere", "pid": 2**22 + 1}))
 
 
 def test_results_can_be_reused_by_a_later_run(folder_store: Store) -> None:
@@ -132,3 +143,83 @@ def test_results_can_be_reused_by_a_later_run(folder_store: Store) -> None:
     run_once(folder_store)
     run_once(folder_store)
     assert folder_store.run("final", "0001").results == folder_store.run("final", "0002").results
+
+
+NOW = timedelta(0)
+
+
+def pin(name: str, run_id: str = "0001", why: str = "") -> Pin:
+    return Pin(
+        match_id="final", name=name, run_id=run_id, who="Ada", why=why, pinned_at=datetime.now(UTC)
+    )
+
+
+@pytest.fixture
+def two_runs(folder_store: Store) -> Store:
+    run_once(folder_store, sample_recipe("first"))
+    run_once(folder_store, sample_recipe("second"))
+    return folder_store
+
+
+def test_a_pinned_run_and_its_results_outlast_all_others(two_runs: Store) -> None:
+    pin_run(two_runs.blobs, pin("paper"))
+    plan = plan_gc(two_runs, keep_last=1, older_than=NOW)
+    assert plan.garbage == ()
+    unpin_run(two_runs.blobs, "final", "paper")
+    plan = plan_gc(two_runs, keep_last=1, older_than=NOW)
+    assert {item.reason for item in plan.garbage} == {"run forgotten", "no kept run reaches it"}
+    collect(two_runs, plan)
+    assert two_runs.runs("final") == ("0002",)
+
+
+def test_a_pinned_run_is_forgotten_only_after_its_name(two_runs: Store) -> None:
+    pin_run(two_runs.blobs, pin("paper"))
+    with pytest.raises(InputError, match="worldpose unpin final/paper"):
+        plan_gc(two_runs, forget=["final/0001"])
+    unpin_run(two_runs.blobs, "final", "paper")
+    assert len(plan_gc(two_runs, forget=["final/0001"], older_than=NOW).garbage) == 2
+
+
+def test_a_run_that_is_pinned_after_planning_is_not_removed(two_runs: Store) -> None:
+    plan = plan_gc(two_runs, keep_last=1, older_than=NOW)
+    pin_run(two_runs.blobs, pin("paper"))
+    with pytest.raises(StoreError, match="Make a new plan"):
+        collect(two_runs, plan)
+    assert two_runs.runs("final") == ("0001", "0002")
+
+
+def test_a_name_is_as_good_as_a_number(two_runs: Store) -> None:
+    pin_run(two_runs.blobs, pin("paper"))
+    assert two_runs.run("final", "paper").run_id == "0001"
+    assert open_run(two_runs.url, "final", "paper").record.run_id == "0001"
+    with pytest.raises(InputError, match="no such run"):
+        two_runs.run("final", "other")
+
+
+def test_a_name_is_one_run_s_for_good(two_runs: Store) -> None:
+    kept = pin_run(two_runs.blobs, pin("paper", why="first"))
+    assert pin_run(two_runs.blobs, pin("paper", why="again")) == kept
+    with pytest.raises(InputError, match="run 0001 pinned under"):
+        pin_run(two_runs.blobs, pin("paper", run_id="0002"))
+    pin_run(two_runs.blobs, pin("best", run_id="0001"))
+    assert [each.name for each in list_pins(two_runs.blobs, "final")] == ["best", "paper"]
+    with pytest.raises(InputError, match="best, paper"):
+        unpin_run(two_runs.blobs, "final", "other")
+
+
+@pytest.mark.parametrize("name", ["0002", "7", "latest"])
+def test_a_name_cannot_be_taken_for_a_number(two_runs: Store, name: str) -> None:
+    with pytest.raises(InputError, match="neither a number nor"):
+        pin_run(two_runs.blobs, pin(name))
+
+
+def test_a_changed_pin_is_found(two_runs: Store) -> None:
+    pin_run(two_runs.blobs, pin("paper"))
+    assert verify(two_runs) == ()
+    path = "pins/final/paper.json"
+    data = two_runs.blobs.read(path)
+    assert data is not None
+    two_runs.blobs.put(path, data.replace(b"0001", b"0002"))
+    (finding,) = verify(two_runs)
+    assert finding.path == path
+    assert "checksum" in finding.problem

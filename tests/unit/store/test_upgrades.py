@@ -11,8 +11,8 @@ from store_samples import place, publish, run_once, sample_recipe, sample_record
 
 from data_contracts.run import UnitFailure
 from worldpose.errors import InputError
-from worldpose.store import Store, key_of, verify
-from worldpose.store.canonical import canonical_json, digest
+from worldpose.store import Store, recipe_key, verify
+from worldpose.store.documents import canonical_json, digest
 
 
 def rewrite(store: Store, path: str, change: Callable[[dict[str, Any]], None]) -> None:
@@ -56,7 +56,7 @@ def test_a_run_that_an_earlier_version_recorded_opens(folder_store: Store) -> No
 def test_a_run_that_a_later_version_recorded_is_refused_as_such(folder_store: Store) -> None:
     run_once(folder_store)
     rewrite(folder_store, "runs/final/0001.json", lambda fields: fields.update(mood="good"))
-    with pytest.raises(InputError, match="found mood beside, of a later version"):
+    with pytest.raises(InputError, match="found the fields mood of a later version"):
         folder_store.run("final")
     # It is not damaged, but it is said.
     (finding,) = verify(folder_store)
@@ -68,5 +68,5 @@ def test_results_of_other_code_are_never_taken_for_ours(folder_store: Store) -> 
     ours = sample_recipe()
     for part in ("code", "libraries"):
         other = ours.model_copy(update={part: {**getattr(ours, part), "numpy": "another"}})
-        assert key_of(other) != key_of(ours)
+        assert recipe_key(other) != recipe_key(ours)
         assert not folder_store.has(*place(other))
