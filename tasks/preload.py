@@ -9,11 +9,15 @@ from __future__ import annotations
 import gc
 import os
 
+import dask
 from distributed import Scheduler, Worker
 
 gc.disable()
 # Before Prefect is imported with the first task: it would send telemetry.
 os.environ.setdefault("DO_NOT_TRACK", "1")
+# Dask would sample every worker's stack 100 times per second for a page that is not served, and
+# keep the samples for an hour, a few MB per run.
+dask.config.set({"distributed.worker.profile.enabled": False})
 
 
 def dask_setup(node: Worker | Scheduler) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 import logging
 import platform
+import threading
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -12,6 +14,11 @@ from typing import Any, Final
 import xarray as xr
 from prefect import Task, task
 from prefect.client.schemas.objects import State, TaskRun
+from prefect.context import TaskRunContext
+from prefect.events.clients import PrefectEventsClient
+from prefect.events.worker import EventsWorker
+from prefect.logging.handlers import APILogWorker
+from prefect.settings import PREFECT_API_URL
 
 from data_contracts.records import Record
 from data_contracts.work import Work
@@ -31,6 +38,14 @@ from worldpose.store import Store, code_version, libraries
 RETRIES: Final = 2
 RETRY_SECONDS: Final = 1.0
 """Before a retry of a temporary failure."""
+MAX_SERVERS: Final = 4
+"""Prefect servers to which a worker stays connected."""
+RECONNECTIONS: Final = 3
+"""Attempts to connect again for each event; events that fail wait for the next attempt, after 30 s.
+Prefect's 10, with a second in between, keep the events of an ended server for minutes."""
+
+_senders: OrderedDict[str, tuple[APILogWorker, EventsWorker]] = OrderedDict()
+"""What sends log lines and events of this process, by server, the least recently used first."""
 
 
 def unit_task(compute: Callable[[Work], str]) -> Task[[Work], str]:
@@ -40,6 +55,7 @@ def unit_task(compute: Callable[[Work], str]) -> Task[[Work], str]:
     def checked(work: Work) -> str:
         # A log line that Prefect's server rejects (a full disk) is not output of a worker.
         logging.raiseExceptions = False
+        send_to_own_server()
         require_same_code(work)
         with kill_on_timeout(work):
             try:
@@ -79,6 +95,28 @@ def require_same_code(work: Work) -> None:
             found=f"others in {', '.join(differing)}",
             todo="Install the same worldpose on all workers, restart them, and run again.",
         )
+
+
+def send_to_own_server() -> None:
+    """Send log lines and events of the current task to the server of its run.
+
+    Every run on the command line may have a server of its own. Prefect keeps one sender of log
+    lines for each server that a process ever had, and a single sender of events, which continues
+    to address the first server: in a worker that stays, lost events and their contexts used 10 MB more
+    with each run. Here each server has its senders, and those of the least recently used
+    servers end.
+    """
+    address = PREFECT_API_URL.value()
+    if TaskRunContext.get() is None or address is None:
+        return
+    EventsWorker.set_client_override(
+        PrefectEventsClient, api_url=address, reconnection_attempts=RECONNECTIONS
+    )
+    _senders[address] = APILogWorker.instance(), EventsWorker.instance()
+    _senders.move_to_end(address)
+    while len(_senders) > MAX_SERVERS:
+        for sender in _senders.popitem(last=False)[1]:
+            threading.Thread(target=sender.drain, daemon=True).start()  # its server may be gone
 
 
 def open_input(store: Store, work: Work, name: str) -> xr.Dataset:

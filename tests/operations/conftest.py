@@ -90,6 +90,7 @@ def dask():
     python = [sys.executable, "-m"]
     scheduler = ["distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(port)]
     worker = ["distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard"]
+    worker += ["--preload", "tasks.preload"]  # as all deployments do
     commands = [[*python, *scheduler, "--no-dashboard"], *[[*python, *worker]] * 2]
     processes = [subprocess.Popen(each, stderr=subprocess.DEVNULL) for each in commands]
     deadline = time.monotonic() + 120
