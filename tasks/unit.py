@@ -102,8 +102,8 @@ def send_to_own_server() -> None:
 
     Every run on the command line may have a server of its own. Prefect keeps one sender of log
     lines for each server that a process ever had, and a single sender of events, which continues
-    to address the first server: in a worker that stays, lost events and their contexts used 10 MB more
-    with each run. Here each server has its senders, and those of the least recently used
+    to address the first server: in a worker that stays, lost events and their contexts used 10 MB
+    more with each run. Here each server has its senders, and those of the least recently used
     servers end.
     """
     address = PREFECT_API_URL.value()
