@@ -16,8 +16,7 @@ from worldpose.ingest import (
     register_match,
     require_calibrated,
 )
-from worldpose.ingest.footage import require_footage
-from worldpose.ingest.stills import read_still
+from worldpose.ingest.footage import read_still, require_footage
 from worldpose.store import Store
 
 

@@ -22,7 +22,7 @@ from tasks.unit import require_registered, unit_task
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.geometry.stored import camera_arrays
-from worldpose.ingest.stills import read_still
+from worldpose.ingest.footage import read_still
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import (
     CalibrationReport,

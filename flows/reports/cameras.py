@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from data_contracts.match import MatchSpec
 from flows.stage import Match
 from worldpose.geometry import Camera
-from worldpose.ingest.stills import read_still
+from worldpose.ingest.footage import read_still
 from worldpose.reports import CameraSummary, CaptionedImage
 from worldpose.reports.static_cameras import (
     NEAR,

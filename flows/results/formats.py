@@ -22,7 +22,7 @@ from flows.results.best_results import (
 from worldpose.body import BodyModel, BodyParameters, find_body
 from worldpose.errors import WorldposeError
 from worldpose.formats import coco_dataset, write_coco, write_joints
-from worldpose.formats.baseline_inputs import (
+from worldpose.formats.baselines.inputs import (
     write_baseline_settings,
     write_slahmr_cameras,
     write_tracks,

@@ -18,17 +18,15 @@ from flows.review.detections import detections_now
 from flows.stage import Match
 from worldpose.errors import UsageError
 from worldpose.formats.annotations import (
+    AnnotatedImage,
     AnnotatedPerson,
-    AnnotatedPicture,
-    Changes,
     Format,
-    changes_of,
+    format_suffix,
     read_annotations,
     write_annotations,
 )
-from worldpose.formats.annotations.changes import picture_name
-from worldpose.formats.annotations.formats import suffix_of
-from worldpose.formats.annotations.pictures import SEEN
+from worldpose.formats.annotations.annotated_images import SEEN
+from worldpose.review.annotation_changes import Changes, find_changes, image_name
 from worldpose.review.detections import DETECTION_EDITS
 from worldpose.store import Store
 
@@ -86,10 +84,10 @@ def export_people(
     exported, unseen = [], 0
     for camera, frame in places:
         found = detections_now(store, match, camera, frame)
-        name = f"{PICTURES}/{picture_name(camera, frame)}"
+        name = f"{PICTURES}/{image_name(camera, frame)}"
         exported.append(_annotated(match, camera, found, name))
         unseen += not _write_picture(store, match, camera, frame, folder / name)
-    annotations = folder / f"labels{suffix_of(form)}"
+    annotations = folder / f"labels{format_suffix(form)}"
     write_annotations(annotations, exported, form)
     write_annotations(folder / EXPORTED, exported)
     people = sum(len(picture.people) for picture in exported)
@@ -119,7 +117,7 @@ def import_people(
         StaleEditError: another person corrected the same detection in between.
         InputError: a file has the wrong format, or a change does not apply; no change is kept.
     """
-    changes = changes_of(
+    changes = find_changes(
         read_annotations(exported, "coco"), read_annotations(file, form), str(file)
     )
     content = hashlib.sha256(exported.read_bytes() + file.read_bytes()).hexdigest()
@@ -131,7 +129,7 @@ def import_people(
     return changes, keep_edits(store, open_match, edits, who=who, note=note) if edits else []
 
 
-def _annotated(match: Match, camera: str, found: KeypointDetections, name: str) -> AnnotatedPicture:
+def _annotated(match: Match, camera: str, found: KeypointDetections, name: str) -> AnnotatedImage:
     broadcast = {clip.id: clip.broadcast for clip in match.folder.spec.clips}
     spec = match.folder.spec.camera(broadcast.get(camera) or camera)
     corrected = {
@@ -155,7 +153,7 @@ def _annotated(match: Match, camera: str, found: KeypointDetections, name: str) 
                 score=float(found.score[0, k]),
             )
         )
-    return AnnotatedPicture(name, (spec.width, spec.height), tuple(people))
+    return AnnotatedImage(name, (spec.width, spec.height), tuple(people))
 
 
 def _write_picture(store: Store, match: Match, camera: str, frame: int, file: Path) -> bool:

@@ -18,7 +18,7 @@ from typing import Final
 from data_contracts.operations import Arrival, ArrivalState, Priority
 from flows.service.layout import PRIORITIES
 from worldpose.errors import InputError
-from worldpose.ingest.places import require_local
+from worldpose.ingest.validation import require_local
 
 SUMS: Final = "SHA256SUMS"
 """An optional checksum list in the format of `sha256sum`, of all files to expect."""

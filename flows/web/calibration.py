@@ -21,7 +21,7 @@ from flows.run_record import latest_run
 from flows.stage import Match
 from flows.web.app_context import Desk
 from worldpose.errors import InputError, WorldposeError
-from worldpose.ingest.stills import read_still
+from worldpose.ingest.footage import read_still
 from worldpose.pitch import PitchTemplate
 from worldpose.review.preview import PitchDrawing, Preview, preview
 from worldpose.static_calibration import StaticCalibrationSettings

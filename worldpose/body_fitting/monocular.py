@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from worldpose.body.model import JOINTS
 from worldpose.errors import InputError
+from worldpose.formats.archives import read_npz
+from worldpose.formats.files import require_file
 from worldpose.geometry import Rigid
-from worldpose.ingest.npz_files import read_npz
-from worldpose.ingest.text_files import require_file
 
 ESTIMATE_BYTES: Final = 1 << 30
 """Maximum size of the arrays of one file [byte]: 1.5 million bodies as matrices."""

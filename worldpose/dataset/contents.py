@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.release import Finding
-from worldpose.formats.camera_rows import CameraRows
+from worldpose.formats.camera_file import CameraRows
 from worldpose.formats.challenge import ChallengeClip
 
 

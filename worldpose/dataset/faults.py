@@ -11,7 +11,7 @@ import numpy as np
 
 from data_contracts.arrays import Floats
 from worldpose.dataset.contents import PointSource
-from worldpose.formats.camera_rows import CameraRows
+from worldpose.formats.camera_file import CameraRows
 
 LATEST: Final = 3
 """Maximum frame offset that is tested [frame]."""

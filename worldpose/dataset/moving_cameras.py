@@ -14,7 +14,7 @@ from worldpose.dataset.contents import PointSource, View
 from worldpose.dataset.faults import LATEST, Fault, camera_faults, frame_faults, point_faults
 from worldpose.dataset.plausibility import center_of, centers
 from worldpose.dataset.settings import CheckSettings
-from worldpose.formats.camera_rows import CameraRows
+from worldpose.formats.camera_file import CameraRows
 
 TALL: Final = (8.0, 1500.0)
 """Minimum and maximum height of a person in the image [px]."""

@@ -11,7 +11,7 @@ from data_contracts.release import Finding
 from worldpose.dataset.contents import PointSource, View
 from worldpose.dataset.faults import Fault, point_faults
 from worldpose.dataset.settings import CheckSettings
-from worldpose.formats.camera_rows import CameraRows
+from worldpose.formats.camera_file import CameraRows
 
 FEET = ("left_big_toe", "right_big_toe", "left_heel", "right_heel", "left_ankle", "right_ankle")
 ANKLE = 0.09

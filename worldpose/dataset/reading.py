@@ -16,7 +16,7 @@ from worldpose.body import BODY25, CHALLENGE15, BodyModel, BodyParameters, fold_
 from worldpose.dataset.contents import PointSource, ShippedClip, View, absent_rows
 from worldpose.errors import InputError
 from worldpose.formats.archives import wrong
-from worldpose.formats.camera_rows import read_camera_rows
+from worldpose.formats.camera_file import read_camera_rows
 from worldpose.formats.challenge import read_challenge, read_submission, submission_clips
 from worldpose.formats.joints_file import read_joints
 from worldpose.formats.pose_file import read_poses

@@ -14,7 +14,7 @@ from data_contracts.release import Finding
 from worldpose.dataset.contents import PointSource, View
 from worldpose.dataset.faults import Fault, camera_faults, frame_faults, point_faults
 from worldpose.dataset.settings import CheckSettings
-from worldpose.formats.camera_rows import CameraRows
+from worldpose.formats.camera_file import CameraRows
 from worldpose.geometry import Camera
 
 Ints = NDArray[np.int64]

@@ -12,7 +12,7 @@ from data_contracts.release import Finding
 from worldpose.dataset.faults import axis_orders
 from worldpose.dataset.plausibility import BONES
 from worldpose.dataset.settings import CheckSettings
-from worldpose.formats.camera_rows import CameraRows
+from worldpose.formats.camera_file import CameraRows
 
 _BODIES: Final = 400
 """Maximum number of sampled bodies."""

@@ -12,7 +12,7 @@ from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.release import ClipStatistics, DataSetStatistics
 from worldpose.errors import InputError
-from worldpose.formats.camera_rows import read_camera_rows
+from worldpose.formats.camera_file import read_camera_rows
 from worldpose.formats.challenge import read_submission
 from worldpose.formats.joints_file import read_joints
 from worldpose.formats.pose_file import read_poses

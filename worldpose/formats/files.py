@@ -1,12 +1,25 @@
-"""Atomic writing of files."""
+"""Atomic writing of files, and reading of untrusted YAML, JSON and TOML.
+
+Hostile or broken files raise `InputError`. `JsonItems` streams the entries of a long JSON list with
+the memory of one entry: Python objects take up to thirty times the memory of their text, so that a
+parsed file of a gigabyte would end the process.
+"""
 
 from __future__ import annotations
 
+import codecs
+import json
 import os
 import tempfile
-from collections.abc import Iterator
+import tomllib
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO, Any, Final
+
+import yaml
+
+from worldpose.errors import InputError
 
 
 @contextmanager
@@ -32,3 +45,337 @@ def _sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+SETTINGS_BYTES: Final = 1 << 21
+"""Maximum size of match.yaml, calibration.toml or pitch.json [byte].
+
+A full match has 0.1 MB; 5,000 calibrated cameras, as in the load test, take 2.0 MB.
+"""
+
+NESTING: Final = 32
+"""Maximum levels of lists and mappings in a YAML file; match.yaml has four."""
+
+EVENTS: Final = 100_000
+"""Maximum keys, values and brackets in a YAML file, two seconds' work; 1000 clips have 10 000."""
+
+
+TOML_LINE: Final = 4096
+"""Maximum line length of a TOML file; the time for a key of n dotted parts grows as n squared."""
+
+
+def read_yaml(path: Path) -> Any:  # noqa: ANN401
+    """Return the only document of a YAML file, as plain values, without aliases or repeated keys.
+
+    Dates stay text, so that `match_id: 2024-05-01` is a name.
+
+    Raises:
+        InputError: no such file, too large, not YAML, nested too deep, an alias or a repeated key.
+    """
+    text = _read_text(path, SETTINGS_BYTES)
+    return _parse(path, "YAML", _load_yaml, text)
+
+
+def read_json(path: Path, limit: int = SETTINGS_BYTES) -> Any:  # noqa: ANN401
+    """Return the content of a JSON file of at most `limit` bytes, including NaN and Infinity.
+
+    Raises:
+        InputError: no such file, too large or not JSON.
+    """
+    return _parse(path, "JSON", json.loads, _read_text(path, limit))
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the tables of a TOML file.
+
+    Raises:
+        InputError: no such file, too large, a line too long, or not TOML.
+    """
+    text = _read_text(path, SETTINGS_BYTES)
+    longest = max(map(len, text.splitlines()), default=0)
+    if longest > TOML_LINE:
+        raise InputError(
+            str(path),
+            expected=f"lines of at most {TOML_LINE} characters",
+            found=f"one of {longest}",
+            todo="Break the line.",
+        )
+    tables: dict[str, Any] = _parse(path, "TOML", tomllib.loads, text)
+    return tables
+
+
+def require_file(path: Path) -> int:
+    """Return the size of a regular file [byte].
+
+    Raises:
+        InputError: there is no such file, it is not a regular file, or it is unreachable.
+    """
+    try:
+        if not path.is_file():
+            raise InputError(
+                str(path),
+                expected="a file",
+                found="something else" if path.exists() else "nothing",
+                todo="Put the file there, or correct the name.",
+            )
+        return path.stat().st_size
+    except (OSError, ValueError) as error:
+        raise InputError(
+            str(path),
+            expected="a readable file",
+            found=str(error),
+            todo="Check its name and rights.",
+        ) from error
+
+
+def _read_text(path: Path, limit: int) -> str:
+    size = require_file(path)
+    if size > limit:
+        raise InputError(
+            str(path),
+            expected=f"at most {limit} bytes",
+            found=f"{size} bytes",
+            todo="Check that it is the file that is meant.",
+        )
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except (OSError, ValueError) as error:
+        raise InputError(
+            str(path), expected="readable UTF-8 text", found=str(error), todo="Save it as UTF-8."
+        ) from error
+
+
+def _parse(path: Path, form: str, parse: Callable[[str], Any], text: str) -> Any:  # noqa: ANN401
+    try:
+        return parse(text)
+    except RecursionError as error:
+        raise InputError(
+            str(path), expected=form, found="nesting without end", todo="Write the file anew."
+        ) from error
+    # ValueError: json and tomllib, and numbers or dates that Python's constructors reject.
+    # The others: PyYAML, where a tag such as !!int or !!bool precedes text of another type.
+    except (yaml.YAMLError, ValueError, OverflowError, LookupError, AttributeError) as error:
+        found = " ".join(str(error).replace('"<unicode string>", ', "").split())
+        raise InputError(
+            str(path), expected=form, found=found, todo="Correct the place that is named."
+        ) from error
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe loader that rejects aliases and repeated keys, and reads dates as text."""
+
+    yaml_implicit_resolvers = {
+        first: [(tag, regexp) for tag, regexp in rules if not tag.endswith(":timestamp")]
+        for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                continue
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {key.value!r} is given twice", key.start_mark
+                )
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+def _load_yaml(text: str) -> Any:  # noqa: ANN401
+    # Events arrive one by one, so that the check rejects a bomb before construction.
+    depth = 0
+    for count, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):
+        if isinstance(event, yaml.AliasEvent):
+            raise yaml.YAMLError(f"an alias (*), which is not allowed {event.start_mark}")
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        if count > EVENTS:
+            raise yaml.YAMLError(f"more than {EVENTS} entries")
+        if depth > NESTING:
+            raise yaml.YAMLError(f"more than {NESTING} levels {event.start_mark}")
+    return yaml.load(text, Loader=_Loader)
+
+
+CHUNK: Final = 1 << 20
+"""Bytes per read."""
+ENTRY_LENGTH: Final = 1 << 20
+"""Maximum characters of one entry; a person's keypoints have under a thousand."""
+
+_SPACE: Final = " \t\n\r"
+_DECODER: Final = json.JSONDecoder()
+
+
+class JsonItems:
+    """Entries of a JSON file: of its list, or of the list under a key of its mapping.
+
+    Iterate once. NaN and Infinity are valid.
+
+    Attributes:
+        is_mapping: whether the file is a mapping; set when iteration begins.
+        other: value in place of the list, None if there is no value or the list.
+        has_list: whether the file has the list; set when iteration ends.
+    """
+
+    def __init__(self, path: Path, key: str, limit: int) -> None:
+        """Prepare reading.
+
+        Args:
+            path: the file.
+            key: of the list if the file is a mapping.
+            limit: maximum size of the file [byte].
+
+        Raises:
+            InputError: no such file, or too large.
+        """
+        size = require_file(path)
+        if size > limit:
+            raise InputError(
+                str(path),
+                expected=f"at most {limit} bytes",
+                found=f"{size} bytes",
+                todo="Check that it is the file that is meant.",
+            )
+        self.path, self.key = path, key
+        self.is_mapping = False
+        self.has_list = False
+        self.other: Any = None
+
+    def __iter__(self) -> Iterator[Any]:
+        """Yield the entries.
+
+        Raises:
+            InputError: the file is unreadable, is not JSON, or has an entry that is too long.
+        """
+        try:
+            with self.path.open("rb") as file:
+                yield from self._entries(_Text(file))
+        except RecursionError as error:
+            raise self._wrong("nesting without end") from error
+        except json.JSONDecodeError as error:
+            raise self._wrong(f"{error.msg} (character {error.pos})") from error
+        except UnicodeDecodeError as error:
+            raise InputError(
+                str(self.path), expected="UTF-8 text", found=str(error), todo="Save it as UTF-8."
+            ) from error
+        except ValueError as error:  # a number with more digits than Python converts
+            raise self._wrong(str(error)) from error
+        except OSError as error:
+            raise self._wrong(str(error)) from error
+
+    def _entries(self, text: _Text) -> Iterator[Any]:
+        if text.ahead() == "[":
+            self.has_list = True
+            yield from _read_list(text)
+        elif text.ahead() == "{":
+            self.is_mapping = True
+            yield from self._read_mapping(text)
+        else:
+            self.other = text.value()
+        if text.ahead():
+            raise text.error("Extra data")
+
+    def _read_mapping(self, text: _Text) -> Iterator[Any]:
+        text.take("{")
+        while text.ahead() != "}":
+            name = text.value() if text.ahead() == '"' else None
+            if name is None:
+                raise text.error("Expecting property name enclosed in double quotes")
+            text.take(":")
+            if name != self.key:
+                _skip(text)
+            elif self.has_list or self.other is not None:
+                raise text.error(f"{self.key!r} is given twice")
+            elif text.ahead() == "[":
+                self.has_list = True
+                yield from _read_list(text)
+            else:
+                self.other = text.value()
+            if text.ahead() != "}":
+                text.take(",")
+                if text.ahead() == "}":
+                    raise text.error("Illegal trailing comma before end of object")
+        text.take("}")
+
+    def _wrong(self, found: str) -> InputError:
+        todo = "Correct the place that is named."
+        return InputError(str(self.path), expected="JSON", found=found, todo=todo)
+
+
+def _read_list(text: _Text) -> Iterator[Any]:
+    text.take("[")
+    while text.ahead() != "]":
+        yield text.value()
+        if text.ahead() != "]":
+            text.take(",")
+            if text.ahead() == "]":
+                raise text.error("Illegal trailing comma before end of array")
+    text.take("]")
+
+
+def _skip(text: _Text) -> None:
+    if text.ahead() == "[":
+        for _ in _read_list(text):
+            pass
+    else:
+        text.value()
+
+
+class _Text:
+    """Buffered text of a file, at most one entry and one chunk at a time."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self._decode = codecs.getincrementaldecoder("utf-8-sig")().decode
+        self._buffer, self._place, self._before = "", 0, 0
+        self._is_whole = False
+
+    def ahead(self) -> str:
+        """Return the next character that is no space; empty at the end."""
+        while True:
+            while self._place < len(self._buffer):
+                if self._buffer[self._place] not in _SPACE:
+                    return self._buffer[self._place]
+                self._place += 1
+            if self._is_whole:
+                return ""
+            self._fill()
+
+    def take(self, wanted: str) -> None:
+        """Consume a required character."""
+        if self.ahead() != wanted:
+            raise self.error(f"Expecting {wanted!r}")
+        self._place += 1
+
+    def value(self) -> Any:  # noqa: ANN401
+        """Return the next value."""
+        self.ahead()
+        while True:
+            try:
+                value, end = _DECODER.raw_decode(self._buffer, self._place)
+            except json.JSONDecodeError as error:
+                if self._is_whole:
+                    raise self.error(error.msg, error.pos) from None
+            else:
+                # A prefix of a number may be a number too.
+                if self._is_whole or self._buffer[end : end + 1] in (*_SPACE, *",:]}"):
+                    self._place = end
+                    return value
+            if len(self._buffer) - self._place > ENTRY_LENGTH:
+                raise self.error(f"an entry that is wrong or longer than {ENTRY_LENGTH} characters")
+            self._fill()
+
+    def error(self, message: str, place: int | None = None) -> json.JSONDecodeError:
+        """Return the error with its position in the file."""
+        error = json.JSONDecodeError(message, self._buffer, self._place if place is None else place)
+        error.pos += self._before
+        return error
+
+    def _fill(self) -> None:
+        data = self._file.read(CHUNK)
+        self._is_whole = not data
+        self._before += self._place
+        self._buffer = self._buffer[self._place :] + self._decode(data, not data)
+        self._place = 0

@@ -5,13 +5,12 @@ other tools.
 Outputs: `MatchFolder`, `Registration`, `KeypointDetections` on match frames.
 """
 
-from worldpose.ingest.calibration_files import read_calibration, write_calibration_toml
-from worldpose.ingest.importing import import_match
-from worldpose.ingest.importing_videos import import_videos
-from worldpose.ingest.keypoint_files import read_observations
+from worldpose.formats.calibration_files import read_calibration, write_calibration_toml
+from worldpose.formats.keypoint_files import read_observations
+from worldpose.ingest.footage import UnitFrames, read_unit, unit_frames
+from worldpose.ingest.importing import import_match, import_videos
 from worldpose.ingest.match_folder import MatchFolder, read_match, require_calibrated
 from worldpose.ingest.registration import register_match
-from worldpose.ingest.units import UnitFrames, read_unit, unit_frames
 from worldpose.ingest.writing import write_match
 
 __all__ = [

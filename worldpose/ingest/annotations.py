@@ -12,9 +12,8 @@ from data_contracts.match import CameraSpec, MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, Pixel
 from worldpose.errors import InputError
-from worldpose.ingest.places import existing_file
-from worldpose.ingest.text_files import read_json
-from worldpose.ingest.validation import validate_record
+from worldpose.formats.files import read_json
+from worldpose.ingest.validation import existing_file, validate_record
 from worldpose.pitch import PitchTemplate
 
 CLICKED_FOLDER: Final = "annotations/static_calibration"

@@ -1,18 +1,93 @@
-"""Map from match frames to the frames of a unit's video, and missing frames."""
+"""Data of one unit of a match folder: frames, detections, calibration, video and still."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.cameras import CameraCalibration
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
-from worldpose.ingest.units import UnitFrames, unit_frames
+from worldpose.formats.files import require_file
+from worldpose.formats.keypoint_files import read_observations
+from worldpose.ingest.match_folder import MatchFolder
 from worldpose.video import FrameIndex, index_video
+from worldpose.video.images import declared_size, decode_image
+
+
+@dataclass(frozen=True)
+class UnitFrames:
+    """Match frames of a static camera, or of a clip's broadcast camera.
+
+    Attributes:
+        first: first match frame.
+        count: number of frames, including those between clips.
+        offset: match frame = camera frame - offset.
+        ranges: first match frame and number of frames of every interval covered by clips, rising
+            and disjoint: only these contain people.
+    """
+
+    first: int
+    count: int
+    offset: int
+    ranges: tuple[tuple[int, int], ...] = ()
+
+
+def unit_frames(spec: MatchSpec, unit_id: str) -> UnitFrames:
+    """Return the frames of a unit: all clips of a static camera, the clip of a broadcast camera.
+
+    The function rounds a broadcast offset to the nearest frame; the rest stays in the clip's
+    `broadcast_offset_frames`.
+    """
+    clips = spec.clips
+    if unit_id in {clip.id for clip in clips}:
+        clip = spec.clip(unit_id)
+        clips = (clip,)
+        offset = round(clip.broadcast_offset_frames) - clip.first_frame
+    else:
+        offset = int(spec.camera(unit_id).offset_frames)
+    ranges: list[tuple[int, int]] = []
+    for first, stop in sorted((c.first_frame, c.first_frame + c.frame_count) for c in clips):
+        if ranges and first <= sum(ranges[-1]):
+            begin, count = ranges[-1]
+            ranges[-1] = (begin, max(begin + count, stop) - begin)
+        else:
+            ranges.append((first, stop - first))
+    first = ranges[0][0]
+    return UnitFrames(first, sum(ranges[-1]) - first, offset, tuple(ranges))
+
+
+def read_unit(
+    match: MatchFolder, unit_id: str
+) -> tuple[KeypointDetections, CameraCalibration | None]:
+    """Return detections and given calibration of a static camera or a clip's broadcast camera.
+
+    Args:
+        match: as read by `read_match`.
+        unit_id: id of a static camera, or of a clip that names a broadcast camera.
+
+    Returns:
+        Detections with `frame` in match frames, and the calibration if given.
+
+    Raises:
+        InputError: the match has no such unit, or no or invalid detections for it.
+    """
+    if unit_id not in match.detections:
+        raise InputError(
+            str(match.folder / "detections"),
+            expected=f"2D poses of {unit_id!r} ({unit_id}.json or {unit_id}.npz)",
+            found=f"those of {', '.join(match.detections) or 'none'}",
+            todo="Add the file, or correct the name.",
+        )
+    frames = unit_frames(match.spec, unit_id)
+    ranges = [(first + frames.offset, count) for first, count in frames.ranges]
+    people = read_observations(match.detections[unit_id], ranges)
+    return replace(people, frame=people.frame - frames.offset), match.calibrations.get(unit_id)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,3 +186,47 @@ def stretches(numbers: NDArray[np.int64]) -> list[list[int]]:
     firsts = np.concatenate([numbers[:1], numbers[breaks + 1]])
     lasts = np.concatenate([numbers[breaks], numbers[-1:]])
     return [[int(a), int(b)] for a, b in zip(firsts, lasts, strict=True)]
+
+
+STILL_BYTES = 1 << 28
+"""Maximum size of a still [byte]; a noisy 4K image has 25 MB."""
+
+
+def read_still(path: Path, image_size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return the image (height, width, 3), RGB.
+
+    Args:
+        path: a PNG file.
+        image_size: width and height of the camera [px].
+
+    Raises:
+        InputError: no such file, no image, or another image size.
+    """
+    size = require_file(path)
+    content = np.fromfile(path, dtype=np.uint8) if size <= STILL_BYTES else np.empty(0, np.uint8)
+    declared = declared_size(content)
+    if declared is not None and declared != image_size:
+        raise InputError(
+            str(path),
+            expected=f"{image_size[0]} x {image_size[1]} px, the size in match.yaml",
+            found=f"{declared[0]} x {declared[1]}",
+            todo="Export the still at the size of the video, or correct match.yaml.",
+        )
+    image = decode_image(content)
+    if image is None:
+        raise InputError(
+            str(path),
+            expected=f"a PNG image of at most {STILL_BYTES} bytes",
+            found=f"{size} bytes that are none",
+            todo="Export the still again.",
+        )
+    return image
+
+
+def write_still(path: Path, picture: NDArray[np.uint8]) -> None:
+    """Write an image (height, width, 3), RGB, as PNG; equal images give equal bytes."""
+    import cv2  # late: it takes a fifth of a second, and few commands open an image
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _, content = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    path.write_bytes(content.tobytes())

@@ -13,12 +13,11 @@ from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
+from worldpose.formats.calibration_files import read_calibration
+from worldpose.formats.files import read_yaml
 from worldpose.ingest.annotations import clicked_file, read_clicked, read_key_frames
-from worldpose.ingest.calibration_files import read_calibration
 from worldpose.ingest.pitch_file import read_pitch
-from worldpose.ingest.places import existing_file, reachable
-from worldpose.ingest.text_files import read_yaml
-from worldpose.ingest.validation import validate_record
+from worldpose.ingest.validation import existing_file, reachable, validate_record
 
 CLICKS_NEEDED: Final = "at least four points of the pitch, better 8 to 12 all over the picture,"
 """Request in messages on cameras without calibration."""

@@ -9,9 +9,8 @@ from typing import Final, TypeGuard
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
-from worldpose.ingest.places import existing_file
-from worldpose.ingest.text_files import read_json, read_yaml
-from worldpose.ingest.validation import validate_record
+from worldpose.formats.files import read_json, read_yaml
+from worldpose.ingest.validation import existing_file, validate_record
 from worldpose.pitch.laws import law_points
 
 SIZES: Final = {"length": (80.0, 130.0), "width": (40.0, 100.0)}

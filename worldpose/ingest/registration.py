@@ -12,7 +12,7 @@ from data_contracts.match import Registration, SourceFile
 from worldpose.errors import InputError
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.ingest.pitch_file import pitch_file
-from worldpose.ingest.places import reachable
+from worldpose.ingest.validation import reachable
 
 SETTLE_SECONDS: Final = 0.5
 """A file changed within this time [s] is checked again; recorders and copies write more often."""
@@ -130,8 +130,9 @@ def _require_settled(folder: Path, files: tuple[SourceFile, ...]) -> None:
     """Raise InputError for files that changed during reading, or change a moment later."""
     newest = max(file.modified_ns for file in files) / 1e9
     wait = newest + SETTLE_SECONDS - time.time()
-    if 0 < wait <= SETTLE_SECONDS:
-        time.sleep(wait)
+    if wait > 0:
+        # A time in the future, of a clock that runs ahead, tells nothing about the other files.
+        time.sleep(min(wait, SETTLE_SECONDS))
     for file in files:
         try:
             now = (folder / file.path).stat()

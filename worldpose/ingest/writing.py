@@ -19,13 +19,13 @@ from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
+from worldpose.formats.calibration_files import write_calibration_toml
+from worldpose.formats.keypoint_files import read_keypoint_arrays, write_keypoint_arrays
 from worldpose.ingest.annotations import write_clicked_markings, write_key_frames
-from worldpose.ingest.calibration_files import write_calibration_toml
-from worldpose.ingest.keypoint_arrays import read_keypoint_arrays, write_keypoint_arrays
+from worldpose.ingest.footage import write_still
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.pitch_file import NO_PITCH
-from worldpose.ingest.places import require_local
-from worldpose.ingest.stills import write_still
+from worldpose.ingest.validation import require_local
 
 
 def write_match(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Singles
 from worldpose.formats import write_archive
-from worldpose.ingest.stills import write_still
+from worldpose.ingest.footage import write_still
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.broadcast_rendering import film_broadcast
 from worldpose.simulation.casting import Cast, dress_people, roles_of, stand_by

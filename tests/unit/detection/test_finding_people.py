@@ -9,8 +9,8 @@ from data_contracts.keypoints import KeypointDetections
 from worldpose.detection import DetectionSettings, People, PeopleFinder, Place
 from worldpose.detection.crowd import on_pitch
 from worldpose.detection.oks_nms import likeness, suppress_poses
+from worldpose.formats.calibration_files import build_camera
 from worldpose.geometry import Camera
-from worldpose.ingest.given_cameras import given_camera
 from worldpose.pitch import PitchTemplate
 
 SIZE = (1920, 1080)
@@ -26,7 +26,7 @@ def camera():
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     return Camera.from_calibration(
-        given_camera(
+        build_camera(
             "camera",
             name="cam",
             size=np.array(SIZE, dtype=np.float64),

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
-from worldpose.ingest.calibration_files import read_calibration, write_calibration_toml
+from worldpose.formats.calibration_files import read_calibration, write_calibration_toml
 
 ANIPOSE = """
 [cam_0]

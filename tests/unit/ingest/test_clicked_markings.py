@@ -11,9 +11,9 @@ import pytest
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
 from worldpose.errors import InputError
+from worldpose.ingest.footage import read_still
 from worldpose.ingest.match_folder import read_match, require_calibrated
 from worldpose.ingest.registration import register_match
-from worldpose.ingest.stills import read_still
 from worldpose.ingest.writing import write_match
 
 CLICKED = ClickedMarkings(

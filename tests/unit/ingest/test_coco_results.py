@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldpose.errors import InputError
-from worldpose.ingest import coco_results, json_items
-from worldpose.ingest.coco_results import read_coco_results
+from worldpose.formats import files, keypoint_files
+from worldpose.formats.keypoint_files import read_coco_results
 
 
 def person(frame=0, **changes):
@@ -173,12 +173,12 @@ def test_crowd_that_would_fill_the_memory_is_refused(read, refusal, monkeypatch)
     # One frame with many people pads every other frame: 4000 frames x 200 people.
     results = [person(frame) for frame in range(4000)] + [person(0)] * 199
     assert read(results[:10]).keypoints.shape == (10, 1, 17, 2)
-    monkeypatch.setattr("worldpose.ingest.coco_results.ARRAY_BYTES", 100 << 20)
+    monkeypatch.setattr("worldpose.formats.keypoint_files.ARRAY_BYTES", 100 << 20)
     assert "200 people in frame 0" in refusal(results).found
 
 
 def test_results_of_several_batches_keep_their_places(read, refusal, monkeypatch):
-    monkeypatch.setattr(coco_results, "BATCH", 3)
+    monkeypatch.setattr(keypoint_files, "BATCH", 3)
     results = [person(frame, score=0.1 * frame + 0.1) for frame in range(8)]
     np.testing.assert_allclose(read(results).score[:, 0], 0.1 * np.arange(1, 9), rtol=1e-6)
     for index, wrong in ((4, person(keypoints=[1.0] * 3)), (5, person(score=-1)), (7, 3)):
@@ -212,17 +212,17 @@ def test_what_is_no_json_is_said_so(tmp_path, content):
     path = tmp_path / "cam1.json"
     path.write_text(content)
     with pytest.raises(InputError) as caught:
-        list(json_items.JsonItems(path, "annotations", 1 << 20))
+        list(files.JsonItems(path, "annotations", 1 << 20))
     assert (caught.value.where, caught.value.expected) == (str(path), "JSON")
 
 
 def test_an_entry_without_end_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(json_items, "ENTRY_LENGTH", 1000)
-    monkeypatch.setattr(json_items, "CHUNK", 100)
+    monkeypatch.setattr(files, "ENTRY_LENGTH", 1000)
+    monkeypatch.setattr(files, "CHUNK", 100)
     path = tmp_path / "cam1.json"
     path.write_text("[" + "[1, 2], " * 10 + "[" + "1, " * 5000)
     with pytest.raises(InputError, match="longer than 1000 characters"):
-        list(json_items.JsonItems(path, "annotations", 1 << 20))
+        list(files.JsonItems(path, "annotations", 1 << 20))
 
 
 def test_bytes_that_are_no_text_are_said_so(tmp_path):
@@ -244,8 +244,8 @@ def test_entries_are_those_that_python_reads_wherever_the_file_is_cut(tmp_path_f
     )
     path.write_text(json.dumps(content, ensure_ascii=data.draw(st.booleans()), indent=1))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(json_items, "CHUNK", data.draw(st.integers(1, 40)))
-        items = json_items.JsonItems(path, "annotations", 1 << 20)
+        patch.setattr(files, "CHUNK", data.draw(st.integers(1, 40)))
+        items = files.JsonItems(path, "annotations", 1 << 20)
         assert json.dumps(list(items)) == json.dumps(values)
     assert (items.has_list, items.is_mapping) == (True, isinstance(content, dict))
 

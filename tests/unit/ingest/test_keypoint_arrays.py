@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldpose.errors import InputError
-from worldpose.ingest import keypoint_arrays
-from worldpose.ingest.keypoint_arrays import read_keypoint_arrays, write_keypoint_arrays
+from worldpose.formats import keypoint_files
+from worldpose.formats.keypoint_files import read_keypoint_arrays, write_keypoint_arrays
 
 
 @pytest.fixture
@@ -156,7 +156,7 @@ def test_wrong_array_is_refused_by_name(path, make_people, refusal, name, change
 
 
 def test_wrong_value_is_named_with_its_frame(path, make_people, refusal, monkeypatch):
-    monkeypatch.setattr(keypoint_arrays, "_BLOCK", 2)
+    monkeypatch.setattr(keypoint_files, "_BLOCK", 2)
     people = make_people(100, 5)
     people.keypoints[3, 1, 9, 0] = np.nan
     write_keypoint_arrays(path, people)
@@ -201,7 +201,7 @@ def test_declared_bomb_is_refused_before_it_is_unpacked(path, refusal):
 
 def test_arrays_beyond_the_limit_are_refused(path, make_people, refusal, monkeypatch):
     write_keypoint_arrays(path, make_people())
-    monkeypatch.setattr(keypoint_arrays, "ARRAY_BYTES", 1000)
+    monkeypatch.setattr(keypoint_files, "ARRAY_BYTES", 1000)
     assert refusal().expected == "at most 1000 bytes of arrays"
 
 

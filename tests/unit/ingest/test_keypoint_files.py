@@ -5,8 +5,12 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.ingest.keypoint_arrays import write_keypoint_arrays
-from worldpose.ingest.keypoint_files import on_frames, read_observations, seen_frames
+from worldpose.formats.keypoint_files import (
+    on_frames,
+    read_observations,
+    seen_frames,
+    write_keypoint_arrays,
+)
 
 
 @pytest.fixture

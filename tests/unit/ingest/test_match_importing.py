@@ -5,11 +5,11 @@ import pytest
 
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
-from worldpose.ingest.calibration_files import write_calibration_toml
+from worldpose.formats.calibration_files import write_calibration_toml
+from worldpose.formats.keypoint_files import write_keypoint_arrays
+from worldpose.ingest.footage import read_unit
 from worldpose.ingest.importing import import_match
-from worldpose.ingest.keypoint_arrays import write_keypoint_arrays
 from worldpose.ingest.match_folder import read_match, require_calibrated
-from worldpose.ingest.units import read_unit
 
 
 def results(*frames):

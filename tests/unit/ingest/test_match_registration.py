@@ -174,6 +174,26 @@ def test_a_fresh_file_is_looked_at_again_after_a_moment(folder, monkeypatch):
     assert 0 < waits[0] <= registration.SETTLE_SECONDS
 
 
+@pytest.mark.parametrize("hidden", ["videos/cam1.mp4", "pitch.json"])
+def test_a_time_in_the_future_does_not_skip_the_second_look(folder, monkeypatch, hidden):
+    # A camera's clock may run ahead: its file must not hide that another one is being written.
+    video = folder / "videos" / "cam1.mp4"
+    video.write_bytes(b"the first half")
+    ahead = time.time() + 3600.0
+    os.utime(folder / hidden, (ahead, ahead))
+    waits = []
+
+    def write_more(seconds):
+        waits.append(seconds)
+        video.write_bytes(b"the first half and the second")
+
+    monkeypatch.setattr(time, "sleep", write_more)
+    with pytest.raises(InputError, match="still being written"):
+        register(folder)
+    assert len(waits) == 1
+    assert 0 < waits[0] <= registration.SETTLE_SECONDS
+
+
 def test_a_file_that_vanishes_is_refused(folder, monkeypatch):
     match = read_match(folder)
     (folder / "videos" / "cam1.mp4").unlink()

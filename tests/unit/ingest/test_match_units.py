@@ -3,9 +3,9 @@ import pytest
 import yaml
 
 from worldpose.errors import InputError
-from worldpose.ingest.keypoint_arrays import write_keypoint_arrays
+from worldpose.formats.keypoint_files import write_keypoint_arrays
+from worldpose.ingest.footage import UnitFrames, read_unit, unit_frames
 from worldpose.ingest.match_folder import read_match
-from worldpose.ingest.units import UnitFrames, read_unit, unit_frames
 
 
 def test_units_lie_on_the_matchs_clock(spec):

@@ -10,7 +10,7 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec, PlayerSpec
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
-from worldpose.ingest.keypoint_files import read_observations
+from worldpose.formats.keypoint_files import read_observations
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.writing import write_match
 

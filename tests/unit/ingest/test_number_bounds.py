@@ -10,9 +10,8 @@ from pydantic import ValidationError
 from data_contracts.match import MatchSpec
 from data_contracts.review import AddedDetection, DeletedDetection, MergedTracks, MovedPoint
 from worldpose.errors import InputError
-from worldpose.ingest.calibration_toml import read_calibration_toml
-from worldpose.ingest.coco_results import read_coco_results
-from worldpose.ingest.keypoint_arrays import PEOPLE_LIMIT, read_keypoint_arrays
+from worldpose.formats.calibration_files import read_calibration_toml
+from worldpose.formats.keypoint_files import PEOPLE_LIMIT, read_coco_results, read_keypoint_arrays
 from worldpose.ingest.match_folder import read_match
 
 CAMERA = {
@@ -150,7 +149,7 @@ def test_an_npz_has_at_most_1000_people_per_frame(tmp_path):
 
 
 def test_a_small_file_does_not_unpack_to_gigabytes(tmp_path, monkeypatch):
-    monkeypatch.setattr("worldpose.ingest.npz_files.PACKED_BYTES", 1 << 16)
+    monkeypatch.setattr("worldpose.formats.archives.PACKED_BYTES", 1 << 16)
     save(tmp_path / "a.npz", PEOPLE_LIMIT, np.savez_compressed)
     with pytest.raises(InputError, match="arrays packed at most 200 to 1"):
         read_keypoint_arrays(tmp_path / "a.npz")

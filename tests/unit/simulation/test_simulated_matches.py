@@ -8,7 +8,7 @@ from worldpose.errors import InputError
 from worldpose.formats import read_joints
 from worldpose.geometry import Camera
 from worldpose.ingest import read_calibration, read_match, read_unit
-from worldpose.ingest.stills import read_still
+from worldpose.ingest.footage import read_still
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS, Scenario, simulate_match, simulate_scene
 

@@ -8,8 +8,7 @@ import pytest
 
 from worldpose.errors import InputError
 from worldpose.ingest import UnitFrames
-from worldpose.ingest.footage import read_footage
-from worldpose.ingest.stills import write_still
+from worldpose.ingest.footage import read_footage, write_still
 from worldpose.video import index_video, open_video
 
 SIZE = (48, 64)

@@ -1,25 +1,115 @@
 """Exchange of detections with external annotation tools.
 
-Inputs and outputs: `AnnotatedPicture`s; COCO keypoints JSON, CVAT for images XML 1.1 or Label
-Studio JSON; an annotator's changes, as corrections.
+Inputs and outputs: `AnnotatedImage`s; COCO keypoints JSON, CVAT for images XML 1.1 or Label Studio
+JSON. `worldpose.review.annotation_changes` finds an annotator's changes.
 """
 
-from worldpose.formats.annotations.changes import Changes, changes_of
-from worldpose.formats.annotations.formats import (
-    FORMATS,
-    Format,
-    read_annotations,
-    write_annotations,
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final, Literal, NamedTuple, TypeAlias, get_args
+
+from pydantic import ValidationError
+
+from worldpose.errors import InputError
+from worldpose.formats.annotations.annotated_images import (
+    AnnotatedImage,
+    AnnotatedPerson,
+    ContentError,
 )
-from worldpose.formats.annotations.pictures import AnnotatedPerson, AnnotatedPicture
+from worldpose.formats.annotations.coco import coco_bytes, read_coco
+from worldpose.formats.annotations.cvat import cvat_bytes, read_cvat
+from worldpose.formats.annotations.label_studio import label_studio_bytes, read_label_studio
 
 __all__ = [
     "FORMATS",
+    "AnnotatedImage",
     "AnnotatedPerson",
-    "AnnotatedPicture",
-    "Changes",
     "Format",
-    "changes_of",
+    "detect_format",
+    "format_suffix",
     "read_annotations",
     "write_annotations",
 ]
+
+Format: TypeAlias = Literal["coco", "cvat", "label-studio"]
+FORMATS: Final[tuple[Format, ...]] = get_args(Format)
+MOST: Final = 1 << 28
+"""Maximum file size [bytes], about that of a hundred thousand people."""
+
+
+class _Codec(NamedTuple):
+    name: str
+    suffix: str
+    encode: Callable[[Sequence[AnnotatedImage]], bytes]
+    decode: Callable[[bytes], list[AnnotatedImage]]
+
+
+_CODECS: Final[dict[Format, _Codec]] = {
+    "coco": _Codec("COCO keypoints JSON", ".json", coco_bytes, read_coco),
+    "cvat": _Codec("CVAT for images XML 1.1", ".xml", cvat_bytes, read_cvat),
+    "label-studio": _Codec("Label Studio JSON", ".json", label_studio_bytes, read_label_studio),
+}
+
+
+def format_suffix(form: Format) -> str:
+    """Return the file name suffix of a format."""
+    return _CODECS[form].suffix
+
+
+def detect_format(content: bytes) -> Format:
+    """Detect the format of a file from its first characters: XML, a list of tasks, or an object."""
+    begin = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1]
+    return "cvat" if begin == b"<" else "label-studio" if begin == b"[" else "coco"
+
+
+def write_annotations(
+    path: Path, pictures: Sequence[AnnotatedImage], form: Format = "coco"
+) -> None:
+    """Write annotated images in a format.
+
+    Args:
+        path: the file; overwritten.
+        pictures: with unique names.
+        form: the format.
+    """
+    path.write_bytes(_CODECS[form].encode(pictures))
+
+
+def read_annotations(path: Path, form: Format | None = None) -> list[AnnotatedImage]:
+    """Return the images of a file, in its order.
+
+    Args:
+        path: the file.
+        form: its format; None = detect from its content.
+
+    Raises:
+        InputError: the content is invalid; nothing is read.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MOST:
+            raise ContentError(f"{size} bytes, more than {MOST}")
+        content = path.read_bytes()
+        form = form or detect_format(content)
+        pictures = _CODECS[form].decode(content)
+        if len({picture.name for picture in pictures}) < len(pictures):
+            raise ContentError("two pictures of one name")
+        return pictures
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        raise _refusal(path, form, f"{place}: {first['msg']}" if place else first["msg"]) from None
+    except (OSError, ContentError) as error:
+        raise _refusal(path, form, str(error)) from error
+
+
+def _refusal(path: Path, form: Format | None, found: str) -> InputError:
+    known = " or ".join(codec.name for codec in _CODECS.values())
+    return InputError(
+        str(path),
+        expected=known if form is None else _CODECS[form].name,
+        found=found,
+        todo="Export it again from the annotator; docs/review.md says how.",
+    )

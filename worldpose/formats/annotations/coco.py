@@ -10,8 +10,13 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from data_contracts.conventions import COCO17
-from worldpose.formats.annotations.attributes import attributes_of, read_attributes
-from worldpose.formats.annotations.pictures import AnnotatedPerson, AnnotatedPicture, ContentError
+from worldpose.formats.annotations.annotated_images import (
+    AnnotatedImage,
+    AnnotatedPerson,
+    ContentError,
+    format_attributes,
+    read_attributes,
+)
 
 Scalar = str | int | float | bool | None
 
@@ -46,7 +51,7 @@ class _Dataset(_Given):
     categories: tuple[_Category, ...] = ()
 
 
-def coco_bytes(pictures: Sequence[AnnotatedPicture]) -> bytes:
+def coco_bytes(pictures: Sequence[AnnotatedImage]) -> bytes:
     """Write a COCO keypoints file; `attributes` holds the fields that COCO lacks."""
     images: list[dict[str, Any]] = []
     people: list[dict[str, Any]] = []
@@ -60,7 +65,7 @@ def coco_bytes(pictures: Sequence[AnnotatedPicture]) -> bytes:
     return (json.dumps(dataset, separators=(",", ":"), allow_nan=False) + "\n").encode()
 
 
-def read_coco(content: bytes) -> list[AnnotatedPicture]:
+def read_coco(content: bytes) -> list[AnnotatedImage]:
     """Read the images of a COCO keypoints file, in its order.
 
     Raises:
@@ -78,7 +83,7 @@ def read_coco(content: bytes) -> list[AnnotatedPicture]:
             raise ContentError(f"an annotation is of image {given.image_id}, which is not there")
         people[given.image_id].append(_read(given))
     return [
-        AnnotatedPicture(image.file_name, (image.width, image.height), tuple(people[image.id]))
+        AnnotatedImage(image.file_name, (image.width, image.height), tuple(people[image.id]))
         for image in dataset.images
     ]
 
@@ -93,7 +98,7 @@ def _annotation(person: AnnotatedPerson) -> dict[str, Any]:
         "area": (right - x) * (bottom - y),
         "num_keypoints": int((person.visible > 0).sum()),
         "keypoints": [value for a, b, v in triples for value in (a, b, int(v))],
-        "attributes": attributes_of(person),
+        "attributes": format_attributes(person),
     }
 
 

@@ -6,21 +6,63 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
+from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
-from worldpose.formats.annotations.attributes import attributes_of, read_attributes
-from worldpose.formats.annotations.pictures import (
+from worldpose.formats.annotations.annotated_images import (
     CORNER,
+    AnnotatedImage,
     AnnotatedPerson,
-    AnnotatedPicture,
     ContentError,
+    format_attributes,
     hull,
+    read_attributes,
 )
-from worldpose.formats.annotations.xml_reading import read_xml
+
+DEEPEST: Final = 16
+"""Maximum nesting of elements; annotations have five."""
+
+
+def read_xml(content: bytes) -> ElementTree.Element:
+    """Return the root element of a document without a document type and thus without entities.
+
+    Raises:
+        ContentError: it is not XML, declares a document type, or is nested deeply.
+    """
+    parser, builder = expat.ParserCreate(), ElementTree.TreeBuilder()
+    depth = 0
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal depth
+        depth += 1
+        if depth > DEEPEST:
+            raise ContentError(f"elements nested more than {DEEPEST} deep")
+        builder.start(tag, attributes)
+
+    def end(tag: str) -> None:
+        nonlocal depth
+        depth -= 1
+        builder.end(tag)
+
+    def refuse(*_: object) -> None:
+        raise ContentError("a document type declaration, which can hide other files and floods")
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.CharacterDataHandler = builder.data
+    parser.StartDoctypeDeclHandler = refuse
+    try:
+        parser.Parse(content, True)
+    except ContentError:
+        raise
+    # ValueError and LookupError: an encoding unknown to expat or Python.
+    except (expat.ExpatError, ValueError, LookupError) as error:
+        raise ContentError(f"no XML: {error}") from error
+    return builder.close()
+
 
 BOX: Final = "person"
 """Label of boxes; must differ from the label of skeletons."""
@@ -28,7 +70,7 @@ SKELETON: Final = "pose"
 """Label of skeletons, whose points are the 17 joints of COCO."""
 
 
-def cvat_bytes(pictures: Sequence[AnnotatedPicture]) -> bytes:
+def cvat_bytes(pictures: Sequence[AnnotatedImage]) -> bytes:
     """Write a CVAT for images file."""
     root = Element("annotations")
     SubElement(root, "version").text = "1.1"
@@ -43,7 +85,7 @@ def cvat_bytes(pictures: Sequence[AnnotatedPicture]) -> bytes:
     return content + b"\n"
 
 
-def read_cvat(content: bytes) -> list[AnnotatedPicture]:
+def read_cvat(content: bytes) -> list[AnnotatedImage]:
     """Read the images of a CVAT for images file, in its order.
 
     A skeleton and a box of one detection or one group are one person; a skeleton alone has the box
@@ -81,12 +123,12 @@ def _write(image: Element, group: int, person: AnnotatedPerson) -> None:
                 "points": f"{x},{y}",
             },
         )
-    for name, value in attributes_of(person).items():
+    for name, value in format_attributes(person).items():
         for element in (box, skeleton):
             SubElement(element, "attribute", {"name": name}).text = value
 
 
-def _read_image(image: Element) -> AnnotatedPicture:
+def _read_image(image: Element) -> AnnotatedImage:
     name, size = _given(image, "name"), (_whole(image, "width"), _whole(image, "height"))
     boxes: dict[tuple[str, str], Element] = {}
     for key, box in _of_label(image, "box", BOX):
@@ -110,7 +152,7 @@ def _read_image(image: Element) -> AnnotatedPicture:
         AnnotatedPerson(_box(box), *_nowhere(), **read_attributes(_attributes(box)))
         for box in boxes.values()
     ]
-    return AnnotatedPicture(name, size, tuple(people))
+    return AnnotatedImage(name, size, tuple(people))
 
 
 def _of_label(

@@ -11,12 +11,13 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
-from worldpose.formats.annotations.attributes import attributes_of, read_attributes
-from worldpose.formats.annotations.pictures import (
+from worldpose.formats.annotations.annotated_images import (
     CORNER,
+    AnnotatedImage,
     AnnotatedPerson,
-    AnnotatedPicture,
     ContentError,
+    format_attributes,
+    read_attributes,
 )
 
 HIDDEN: Final = "hidden"
@@ -72,7 +73,7 @@ class _Task(_Given):
     predictions: tuple[_Answer, ...] = ()
 
 
-def label_studio_bytes(pictures: Sequence[AnnotatedPicture]) -> bytes:
+def label_studio_bytes(pictures: Sequence[AnnotatedImage]) -> bytes:
     """Write Label Studio tasks, with the detections as predictions."""
     tasks = [
         {
@@ -88,7 +89,7 @@ def label_studio_bytes(pictures: Sequence[AnnotatedPicture]) -> bytes:
     return (json.dumps(tasks, separators=(",", ":"), allow_nan=False) + "\n").encode()
 
 
-def read_label_studio(content: bytes) -> list[AnnotatedPicture]:
+def read_label_studio(content: bytes) -> list[AnnotatedImage]:
     """Read the images of a Label Studio export, in its order.
 
     For each task the last annotation that was not cancelled is used, or else the last prediction. A
@@ -100,7 +101,7 @@ def read_label_studio(content: bytes) -> list[AnnotatedPicture]:
     return [_read(task) for task in TypeAdapter(tuple[_Task, ...]).validate_json(content)]
 
 
-def _result(picture: AnnotatedPicture) -> list[dict[str, Any]]:
+def _result(picture: AnnotatedImage) -> list[dict[str, Any]]:
     regions: list[dict[str, Any]] = []
     width, height = picture.size
     percent = 100.0 / np.array(picture.size, dtype=np.float64)
@@ -129,7 +130,7 @@ def _result(picture: AnnotatedPicture) -> list[dict[str, Any]]:
                     "rotation": 0,
                     "rectanglelabels": ["person"],
                 },
-                "meta": {"text": [f"{k}={v}" for k, v in attributes_of(person).items()]},
+                "meta": {"text": [f"{k}={v}" for k, v in format_attributes(person).items()]},
             }
         )
         for joint, xy, visible in zip(COCO17, person.keypoints, person.visible, strict=True):
@@ -150,7 +151,7 @@ def _result(picture: AnnotatedPicture) -> list[dict[str, Any]]:
     return regions
 
 
-def _read(task: _Task) -> AnnotatedPicture:
+def _read(task: _Task) -> AnnotatedImage:
     size = (task.data.width, task.data.height)
     name = task.data.image
     given = [each for each in task.annotations if not each.was_cancelled] or [*task.predictions]
@@ -200,7 +201,7 @@ def _read(task: _Task) -> AnnotatedPicture:
         )
         for owner, (region, box) in boxes.items()
     )
-    return AnnotatedPicture(name, size, tuple(people))
+    return AnnotatedImage(name, size, tuple(people))
 
 
 def _owner(name: str, region: _Region, place: Floats, boxes: dict[str, Floats]) -> str:

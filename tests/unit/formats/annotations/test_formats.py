@@ -12,12 +12,13 @@ from data_contracts.conventions import COCO17
 from worldpose.errors import InputError
 from worldpose.formats.annotations import (
     FORMATS,
+    AnnotatedImage,
     AnnotatedPerson,
-    AnnotatedPicture,
+    detect_format,
+    format_suffix,
     read_annotations,
     write_annotations,
 )
-from worldpose.formats.annotations.formats import format_of, suffix_of
 
 SIZE = (1920, 1080)
 
@@ -35,7 +36,7 @@ def person(rng, **known):
 def pictures(seed=0):
     rng = np.random.default_rng(seed)
     return [
-        AnnotatedPicture(
+        AnnotatedImage(
             "pictures/cam00_000050.png",
             SIZE,
             (
@@ -44,7 +45,7 @@ def pictures(seed=0):
                 person(rng),
             ),
         ),
-        AnnotatedPicture('pictures/<&"é>_000051.png', SIZE),
+        AnnotatedImage('pictures/<&"é>_000051.png', SIZE),
     ]
 
 
@@ -60,9 +61,9 @@ def assert_same(one, other):
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=20)
 def test_every_bit_comes_back(tmp_path_factory, form, seed):
-    file = tmp_path_factory.mktemp("out") / f"labels{suffix_of(form)}"
+    file = tmp_path_factory.mktemp("out") / f"labels{format_suffix(form)}"
     write_annotations(file, pictures(seed), form)
-    assert format_of(file.read_bytes()) == form
+    assert detect_format(file.read_bytes()) == form
     assert_same(read_annotations(file), pictures(seed))
 
 
@@ -71,7 +72,7 @@ def test_formats_count_from_where_their_annotators_do(tmp_path):
     keypoints, visible = np.full((17, 2), np.nan), np.zeros(17, dtype=np.int8)
     keypoints[0], visible[0] = 0.0, 2
     one = AnnotatedPerson(np.array([0.0, 0.0, 20.0, 10.0]), keypoints, visible)
-    given = [AnnotatedPicture("a.png", (200, 100), (one,))]
+    given = [AnnotatedImage("a.png", (200, 100), (one,))]
     content = {}
     for form in FORMATS:
         write_annotations(tmp_path / form, given, form)

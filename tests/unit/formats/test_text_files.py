@@ -5,8 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldpose.errors import InputError
-from worldpose.ingest import text_files
-from worldpose.ingest.text_files import read_json, read_toml, read_yaml
+from worldpose.formats import files
+from worldpose.formats.files import read_json, read_toml, read_yaml
 
 
 @pytest.fixture
@@ -71,13 +71,13 @@ def test_a_tag_before_text_that_is_none_is_refused(tmp_path, text):
 
 
 def test_a_flood_of_entries_is_refused_before_it_is_built(refused, monkeypatch):
-    monkeypatch.setattr(text_files, "EVENTS", 1000)
+    monkeypatch.setattr(files, "EVENTS", 1000)
     refused(read_yaml, "- a\n" * 1001, "more than 1000 entries")
 
 
 @pytest.mark.parametrize("read", [read_yaml, read_json, read_toml])
 def test_a_file_beyond_the_limit_is_refused_unread(refused, read):
-    refused(read, b"#" * (text_files.SETTINGS_BYTES + 1), "2097153 bytes")
+    refused(read, b"#" * (files.SETTINGS_BYTES + 1), "2097153 bytes")
 
 
 @pytest.mark.parametrize("read", [read_yaml, read_json, read_toml])

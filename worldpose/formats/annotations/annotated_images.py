@@ -1,9 +1,11 @@
-"""Annotated images and people in them."""
+"""Annotated images, the people in them, and their attributes as text."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypedDict, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +47,7 @@ class AnnotatedPerson:
 
 
 @dataclass(frozen=True, eq=False)
-class AnnotatedPicture:
+class AnnotatedImage:
     """One image and the people in it.
 
     Attributes:
@@ -67,3 +69,42 @@ def hull(keypoints: Floats) -> Floats:
     """
     there = keypoints[np.isfinite(keypoints).all(axis=1)]
     return np.concatenate([there.min(axis=0), there.max(axis=0)])
+
+
+class Attributes(TypedDict):
+    """Fields of `AnnotatedPerson` besides its shape."""
+
+    detection: int | None
+    origin: Origin | None
+    score: float | None
+
+
+def format_attributes(person: AnnotatedPerson) -> dict[str, str]:
+    """Return the attributes of a person, as text by name."""
+    given = {"detection": person.detection, "origin": person.origin, "score": person.score}
+    return {name: str(value) for name, value in given.items() if value is not None}
+
+
+def read_attributes(given: Mapping[str, str]) -> Attributes:
+    """Parse attributes; unknown names are ignored, an empty text means none.
+
+    Raises:
+        ContentError: a value is invalid.
+    """
+    detection, origin, score = (given.get(name) for name in ("detection", "origin", "score"))
+    origins: tuple[Origin, ...] = get_args(Origin)
+    if detection and not (detection.isdecimal() and detection.isascii() and len(detection) < 10):
+        raise ContentError(f"attribute detection is {detection[:40]!r}")
+    if origin and origin not in origins:
+        raise ContentError(f"attribute origin is {origin[:40]!r}")
+    try:
+        value = float(score) if score else None
+    except ValueError:
+        raise ContentError(f"attribute score is {str(score)[:40]!r}") from None
+    if value is not None and not math.isfinite(value):
+        raise ContentError(f"attribute score is {value}")
+    return Attributes(
+        detection=int(detection) if detection else None,
+        origin=next((each for each in origins if each == origin), None),
+        score=value,
+    )

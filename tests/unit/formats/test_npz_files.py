@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.ingest.npz_files import read_npz
+from worldpose.formats.archives import read_npz
 
 
 def written(path, **members):

@@ -13,7 +13,7 @@ from data_contracts.conventions import COCO17
 from data_contracts.review import AddedDetection, DeletedDetection, MovedKeypoint
 from data_contracts.static_calibration import Pixel
 from worldpose.errors import InputError
-from worldpose.formats.annotations.pictures import AnnotatedPerson, AnnotatedPicture
+from worldpose.formats.annotations.annotated_images import AnnotatedImage, AnnotatedPerson
 from worldpose.review.detections import SAME, DetectionEdit
 
 
@@ -32,13 +32,13 @@ class Changes:
     boxes: int
 
 
-def picture_name(camera: str, frame: int) -> str:
+def image_name(camera: str, frame: int) -> str:
     """Return the name of a camera's image of a match frame."""
     return f"{camera}_{frame:06d}.png"
 
 
-def changes_of(
-    exported: Sequence[AnnotatedPicture], edited: Sequence[AnnotatedPicture], where: str
+def find_changes(
+    exported: Sequence[AnnotatedImage], edited: Sequence[AnnotatedImage], where: str
 ) -> Changes:
     """Return the changes between an export and an annotator's file.
 
@@ -46,7 +46,7 @@ def changes_of(
     of a pixel count as equal, since annotation tools round.
 
     Args:
-        exported: named by `picture_name`, people with their `detection`.
+        exported: named by `image_name`, people with their `detection`.
         edited: from the annotator; names can have a folder, or a prefix that ends in `-`, before
             them.
         where: the annotator's file, for messages.
@@ -96,7 +96,7 @@ def changes_of(
     return Changes(tuple(edits), len(edited), boxes)
 
 
-def _exported_name(given: str, known: dict[str, AnnotatedPicture]) -> str | None:
+def _exported_name(given: str, known: dict[str, AnnotatedImage]) -> str | None:
     """Return the exported image's name for an annotator's name."""
     name = PurePosixPath(given.replace("\\", "/")).name
     return next((each for each in known if name == each or name.endswith(f"-{each}")), None)

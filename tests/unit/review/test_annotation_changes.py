@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.formats.annotations import AnnotatedPerson, AnnotatedPicture, changes_of
-from worldpose.formats.annotations.changes import picture_name
+from worldpose.formats.annotations import AnnotatedImage, AnnotatedPerson
+from worldpose.review.annotation_changes import find_changes, image_name
 
-NAME = picture_name("cam_03", 120)
+NAME = image_name("cam_03", 120)
 
 
 def person(detection, shift=0.0):
@@ -21,7 +21,7 @@ def person(detection, shift=0.0):
 
 
 def picture(*people, name=f"pictures/{NAME}", size=(100, 50)):
-    return AnnotatedPicture(name, size, people)
+    return AnnotatedImage(name, size, people)
 
 
 BEFORE = [picture(person(0), person(7))]
@@ -32,12 +32,12 @@ BEFORE = [picture(person(0), person(7))]
 )
 def test_what_only_was_rounded_is_no_change(name):
     back = [picture(person(7, 0.004), person(0, -0.004), name=name)]
-    changes = changes_of(BEFORE, back, "file")
+    changes = find_changes(BEFORE, back, "file")
     assert (changes.edits, changes.pictures, changes.boxes) == ((), 1, 0)
 
 
 def test_a_picture_that_did_not_come_back_was_not_worked_on():
-    assert changes_of(BEFORE, [], "file").edits == ()
+    assert find_changes(BEFORE, [], "file").edits == ()
 
 
 def test_moved_hidden_found_added_and_deleted_are_told_apart():
@@ -46,7 +46,7 @@ def test_moved_hidden_found_added_and_deleted_are_told_apart():
     changed.keypoints[1] = np.nan
     changed.keypoints[3] = (9.0, 9.5)
     new = replace(person(None), box=np.array([1.0, 2.0, 30.0, 40.0]))
-    changes = changes_of(BEFORE, [picture(changed, new)], "file")
+    changes = find_changes(BEFORE, [picture(changed, new)], "file")
     deleted, nose, eye, ear, added = changes.edits
     assert (deleted.kind, deleted.detection) == ("deleted_detection", 0)
     assert {(each.camera, each.frame) for each in changes.edits} == {("cam_03", 120)}
@@ -61,7 +61,7 @@ def test_moved_hidden_found_added_and_deleted_are_told_apart():
 
 def test_a_changed_box_of_somebody_who_was_there_is_told():
     wider = replace(person(0), box=np.array([0.0, 0.0, 50.0, 34.0]))
-    changes = changes_of(BEFORE, [picture(wider, person(7))], "file")
+    changes = find_changes(BEFORE, [picture(wider, person(7))], "file")
     assert (changes.edits, changes.boxes) == ((), 1)
 
 
@@ -77,4 +77,4 @@ def test_a_changed_box_of_somebody_who_was_there_is_told():
 )
 def test_what_is_not_of_this_export_is_refused(back, found):
     with pytest.raises(InputError, match=found):
-        changes_of(BEFORE, back, "file")
+        find_changes(BEFORE, back, "file")
