@@ -20,8 +20,8 @@ from scipy.optimize import linear_sum_assignment
 
 from worldpose.geometry import Camera, Rigid
 from worldpose.tracking import TrackingSettings, track_people
-from worldpose.tracking.affinity import match_greedily, match_optimally, ray_affinity
 from worldpose.tracking.epipolar import associate
+from worldpose.tracking.ray_matching import match_greedily, match_optimally, ray_affinity
 
 SETTINGS = TrackingSettings()
 CAMERAS, FPS, GATE = 16, 50.0, SETTINGS.gate

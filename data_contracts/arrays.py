@@ -6,7 +6,7 @@ reader needs no other source to know what the numbers are.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,18 @@ AnyFloats = NDArray[np.floating]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 Image = NDArray[np.uint8]
+
+
+class ClipArray(Protocol):
+    """An array that can be sliced along frames, its first dimension; NumPy's arrays can."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape, with frames first."""
+
+    def __getitem__(self, frames: slice, /) -> NDArray[Any]:
+        """Return the values of a chunk of frames."""
+
 
 Missing = Literal["nan", "-1", "0", "none"]
 

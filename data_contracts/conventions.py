@@ -50,6 +50,21 @@ COCO17_BONES = (
 )
 """Pairs of indices into `COCO17` that are drawn as bones."""
 
+COCO17_BODY_BONES = (
+    (5, 6),
+    (5, 7),
+    (6, 8),
+    (7, 9),
+    (8, 10),
+    (5, 11),
+    (6, 12),
+    (11, 13),
+    (12, 14),
+    (13, 15),
+    (14, 16),
+)
+"""Bones below the neck whose lengths measure a person's size."""
+
 COCO17_SIGMAS = (
     0.026,
     0.025,

@@ -11,13 +11,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from data_contracts.arrays import ClipArray
 from data_contracts.redetection import again_of
 from data_contracts.work import Work
 from tasks.unit import open_input
 from worldpose.geometry import Camera
 from worldpose.geometry.stored import camera_from_arrays
 from worldpose.store import Store
-from worldpose.tracking.clip_arrays import ClipArray
 
 PAGE = 256
 """Frames per read."""

@@ -9,7 +9,7 @@ from pydantic import JsonValue
 from flows.stage import Match, Stage
 from flows.stages import detection
 from worldpose.review.identities import IDENTITY_EDITS
-from worldpose.tracking import TrackingSettings, people_allowed
+from worldpose.tracking import TrackingSettings, roster_limit
 
 MIN_CAMERAS: Final = 2
 """Minimum number of static cameras for triangulation [1]."""
@@ -62,7 +62,7 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
         **({"identities": said} if said else {}),
         **clip_sources(match, unit),
         "pitch_size": None if pitch is None else [pitch.length, pitch.width],
-        "people": people_allowed(match.folder.spec.roster),
+        "people": roster_limit(match.folder.spec.roster),
     }
 
 

@@ -15,8 +15,8 @@ from worldpose.camera_consistency.hypotheses import STATED, Hypothesis
 from worldpose.camera_consistency.pair_scores import MIN_JOINTS, pair_scores
 from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.geometry import Camera
-from worldpose.tracking.affinity import match_greedily, ray_affinity
 from worldpose.tracking.epipolar import associate
+from worldpose.tracking.ray_matching import match_greedily, ray_affinity
 from worldpose.tracking.settings import TrackingSettings
 
 Ints = NDArray[np.int64]

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import ClipArray, Floats
 from data_contracts.camera_consistency import FaultKind
 from worldpose.camera_consistency.comparison import Comparison, Trial, chance_noise
 from worldpose.camera_consistency.hypotheses import (
@@ -25,7 +25,6 @@ from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.static_calibration.parameters import project_with_jacobian
-from worldpose.tracking.clip_arrays import ClipArray
 
 PARTNERS: Final = 4
 """Number of partners for the closer comparison of a camera that agrees with others."""

@@ -6,7 +6,7 @@ and camera, quick joints [m], and a summary of each track.
 
 from worldpose.tracking.diagnosis import NoPeople, diagnose_no_people
 from worldpose.tracking.doubts import describe_doubts
-from worldpose.tracking.rosters import people_allowed
+from worldpose.tracking.people_selection import roster_limit
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import Tracking, TrackingReport, track_people
 
@@ -17,6 +17,6 @@ __all__ = [
     "TrackingSettings",
     "describe_doubts",
     "diagnose_no_people",
-    "people_allowed",
+    "roster_limit",
     "track_people",
 ]

@@ -13,15 +13,13 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import ClipArray, Flags, Floats
 from worldpose.geometry import Camera
-from worldpose.tracking.camera_gates import CameraGates
-from worldpose.tracking.clip_arrays import ClipArray
-from worldpose.tracking.pair_agreement import SAMPLES, Meeting, match_pair
+from worldpose.tracking.camera_statistics import CameraGates, CameraVisibility
+from worldpose.tracking.pair_agreement import SAMPLES, PairMatches, match_pair
 from worldpose.tracking.pair_births import judge_pairs
 from worldpose.tracking.settings import TrackingSettings
-from worldpose.tracking.visibility import CameraSight
 
 WINDOW: Final = 400
 """Most frames that the diagnosis uses."""
@@ -69,15 +67,15 @@ def diagnose_no_people(
         ground: whether people stand on z = 0.
         births: tracks that began and were dropped again.
     """
-    usable = _usable(keypoints, confidence, settings.min_joints)
+    usable = _usable_detections(keypoints, confidence, settings.min_joints)
     present = np.asarray(usable.any(axis=-1))
     counts = usable.sum(axis=(0, 2))
     detected = {name: float(n) for name, n in zip(camera_ids, counts, strict=True)}
-    empty = _too_little(present, detected, keypoints, confidence, settings)
+    empty = _explain_missing_detections(present, detected, keypoints, confidence, settings)
     if empty is not None:
         return empty
-    frames = _window(present)
-    rays = _rays(cameras, keypoints, confidence, frames, settings.min_joints)
+    frames = _common_window(present)
+    rays = _usable_rays(cameras, keypoints, confidence, frames, settings.min_joints)
     extent = float(np.ptp(cameras.center[counts > 0], axis=0).max())
     if extent < SAME_PLACE:
         together = " and ".join(name for name, count in detected.items() if count > 0)
@@ -92,9 +90,9 @@ def diagnose_no_people(
         for pair in combinations(range(len(camera_ids)), 2)
         if present[:, pair].all(axis=1).any()
     ]
-    meetings = [match_pair(cameras, rays, pair, 0, settings.min_joints) for pair in pairs]
-    meetings.sort(key=lambda each: (each.agrees, len(each.angle) * each.share), reverse=True)
-    agreeing = [each for each in meetings if each.agrees]
+    matched_pairs = [match_pair(cameras, rays, pair, 0, settings.min_joints) for pair in pairs]
+    matched_pairs.sort(key=lambda each: (each.agrees, len(each.angle) * each.share), reverse=True)
+    agreeing = [each for each in matched_pairs if each.agrees]
     if agreeing:
         if not births and _all_pairs_have_rivals(cameras, rays, ground, settings):
             return NoPeople(
@@ -105,22 +103,22 @@ def diagnose_no_people(
                 "mount one higher.",
                 evidence={"matches": float(len(agreeing[0].angle))},
             )
-        return _limit(cameras, camera_ids, agreeing, settings, ground, births)
-    matched = [each for each in meetings if len(each.angle)]
+        return _explain_limit(cameras, camera_ids, agreeing, settings, ground, births)
+    matched = [each for each in matched_pairs if len(each.angle)]
     if matched and max(np.median(each.angle) for each in matched) < settings.min_angle:
         # Cameras at nearly one position share few people if they look in different directions.
-        return _limit(cameras, camera_ids, matched, settings, ground, births)
-    found = _other_clock(cameras, camera_ids, rays, meetings, fps, settings)
+        return _explain_limit(cameras, camera_ids, matched, settings, ground, births)
+    found = _explain_clock_offset(cameras, camera_ids, rays, matched_pairs, fps, settings)
     if found is not None:
         return found
-    if not _overlap(cameras, rays, ground, settings):
+    if not _views_overlap(cameras, rays, ground, settings):
         return NoPeople(
             cause="one_camera_each",
             message="no place where the people of one camera may be is in the image of another: "
             "every person is seen by one camera. Two cameras must show the same people.",
             evidence=detected,
         )
-    best = meetings[0]
+    best = matched_pairs[0]
     a, b = (camera_ids[n] for n in best.cameras)
     return NoPeople(
         cause="cameras_contradict",
@@ -133,14 +131,14 @@ def diagnose_no_people(
 
 
 def _all_pairs_have_rivals(
-    cameras: Camera, rays: NDArray[np.float64], ground: bool, settings: TrackingSettings
+    cameras: Camera, rays: Floats, ground: bool, settings: TrackingSettings
 ) -> bool:
     """Return whether two cameras' detections form people, but always in several likely ways."""
-    sight, gates, some = CameraSight(cameras), CameraGates(len(cameras.focal)), False
+    visibility, gates, some = CameraVisibility(cameras), CameraGates(len(cameras.focal)), False
     for frame in np.unique(np.linspace(0, len(rays) - 1, SAMPLES).astype(int)):
         weights = np.isfinite(rays[frame, ..., 0]).astype(np.float64)
         pairs = judge_pairs(
-            rays[frame], weights, sight, gates, ground, settings, everything=weights
+            rays[frame], weights, visibility, gates, ground, settings, everything=weights
         )
         if pairs.unique.any():
             return False
@@ -148,7 +146,7 @@ def _all_pairs_have_rivals(
     return some
 
 
-def _usable(keypoints: ClipArray, confidence: ClipArray, least: int) -> NDArray[np.bool_]:
+def _usable_detections(keypoints: ClipArray, confidence: ClipArray, least: int) -> Flags:
     """Return which detections (frames, cameras, detections) have enough joints."""
     rows = [
         np.count_nonzero(
@@ -162,8 +160,8 @@ def _usable(keypoints: ClipArray, confidence: ClipArray, least: int) -> NDArray[
     return np.concatenate(rows) if rows else np.zeros(confidence.shape[:3], dtype=np.bool_)
 
 
-def _too_little(
-    present: NDArray[np.bool_],
+def _explain_missing_detections(
+    present: Flags,
     detected: dict[str, float],
     keypoints: ClipArray,
     confidence: ClipArray,
@@ -181,8 +179,8 @@ def _too_little(
     seeing = [name for name, count in detected.items() if count > 0]
     counts = ", ".join(f"{name} {count:.0f}" for name, count in detected.items())
     if not seeing:
-        any_, most = _usable(keypoints, confidence, 1).sum(), 0
-        while any_ and _usable(keypoints, confidence, most + 1).any():
+        any_, most = _usable_detections(keypoints, confidence, 1).sum(), 0
+        while any_ and _usable_detections(keypoints, confidence, most + 1).any():
             most += 1
         if any_:
             return NoPeople(
@@ -218,16 +216,16 @@ def _too_little(
     return None
 
 
-def _window(present: NDArray[np.bool_]) -> slice:
+def _common_window(present: Flags) -> slice:
     """Return up to `WINDOW` frames around the middle of those in which two cameras see people."""
     both = np.flatnonzero(np.count_nonzero(present, axis=1) >= 2)
     start = max(0, int(both[len(both) // 2]) - WINDOW // 2)
     return slice(start, min(len(present), start + WINDOW))
 
 
-def _rays(
+def _usable_rays(
     cameras: Camera, keypoints: ClipArray, confidence: ClipArray, frames: slice, least: int
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return unit rays (frames, cameras, detections, 17, 3) [world]; NaN where not usable."""
     image = np.asarray(keypoints[frames], dtype=np.float64)
     rays = cameras.unproject(image.reshape(*image.shape[:2], -1, 2)).directions
@@ -237,10 +235,10 @@ def _rays(
     return rays
 
 
-def _limit(
+def _explain_limit(
     cameras: Camera,
     names: Sequence[str],
-    agreeing: list[Meeting],
+    agreeing: list[PairMatches],
     settings: TrackingSettings,
     ground: bool,
     births: int,
@@ -337,18 +335,18 @@ def _limit(
     )
 
 
-def _other_clock(
+def _explain_clock_offset(
     cameras: Camera,
     names: Sequence[str],
-    rays: NDArray[np.float64],
-    meetings: list[Meeting],
+    rays: Floats,
+    matched_pairs: list[PairMatches],
     fps: float,
     settings: TrackingSettings,
 ) -> NoPeople | None:
     """Return the clock offset at which two cameras agree that otherwise do not, or None."""
     reach = min(len(rays) // 2, round(4.0 * fps))
-    found: list[tuple[float, int, Meeting]] = []
-    busiest = sorted(meetings, key=lambda each: each.possible, reverse=True)[:3]
+    found: list[tuple[float, int, PairMatches]] = []
+    busiest = sorted(matched_pairs, key=lambda each: each.possible, reverse=True)[:3]
     for now in busiest:
         for shift in range(-reach, reach + 1):
             then = match_pair(cameras, rays, now.cameras, shift, settings.min_joints)
@@ -362,7 +360,7 @@ def _other_clock(
     shift = near[len(near) // 2]
     share, _, then = next(each for each in found if each[1] == shift)
     a, b = (names[n] for n in then.cameras)
-    now = next(each for each in meetings if each.cameras == then.cameras)
+    now = next(each for each in matched_pairs if each.cameras == then.cameras)
     return NoPeople(
         cause="clock",
         message=f"{a} and {b} agree on {100 * share:.0f} % of their people when {b} is taken "
@@ -372,9 +370,7 @@ def _other_clock(
     )
 
 
-def _overlap(
-    cameras: Camera, rays: NDArray[np.float64], ground: bool, settings: TrackingSettings
-) -> bool:
+def _views_overlap(cameras: Camera, rays: Floats, ground: bool, settings: TrackingSettings) -> bool:
     """Return whether people seen by one camera may be in the image of another."""
     centers, size = cameras.center, cameras.image_size
     middle = 0.5 * sum(settings.body_heights)

@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Integers
 from data_contracts.tracking import Join
 from worldpose.tracking.person import Person
 
 UNDECIDED_SHARE: Final = 0.2
 """Undecided joins per person [1] up to which a run does not warn: in most clips a person leaves the
 view and comes back, and an undecided join leaves two tracks, which mixes up no identities."""
-NAMED: Final = 3
+MAX_NAMED: Final = 3
 """Most doubts that the warning names one by one."""
 
 
@@ -36,8 +36,8 @@ class Takeover:
 def find_takeovers(
     people: Sequence[Person],
     frame: int,
-    index: NDArray[np.int64],
-    affinity: NDArray[np.float64],
+    index: Integers,
+    affinity: Floats,
 ) -> list[Takeover]:
     """Return people who, after a gap, took a detection that another person lost in this frame.
 
@@ -86,7 +86,7 @@ def lasting_takeovers(
 
 
 def describe_doubts(
-    frames: NDArray[np.int64],
+    frames: Integers,
     people: int,
     takeovers: Sequence[Takeover],
     joins: Sequence[Join],
@@ -105,33 +105,34 @@ def describe_doubts(
             f"person {each.person}"
             + (f" and person {each.other}" if each.other >= 0 else "")
             + f" in frame {frames[each.frame]}"
-            for each in takeovers[:NAMED]
+            for each in takeovers[:MAX_NAMED]
         ]
         parts.append(
-            f"{_count(len(takeovers), 'track')} may have passed from one person to another where "
-            f"a camera hid one of them ({_listed(named, len(takeovers))})"
+            f"{_count_noun(len(takeovers), 'track')} may have passed from one person to another "
+            f"where one of them is hidden from a camera ({_list_named(named, len(takeovers))})"
         )
     undecided = [join for join in joins if not join.decided]
     if len(undecided) > UNDECIDED_SHARE * people:
         named = [
             f"person {join.before} until frame {frames[join.last_frame]} and person {join.after} "
             f"from frame {frames[join.first_frame]}"
-            for join in undecided[:NAMED]
+            for join in undecided[:MAX_NAMED]
         ]
         parts.append(
-            f"{_count(len(undecided), 'pair')} of tracks may each be one person "
-            f"({_listed(named, len(undecided))})"
+            f"{_count_noun(len(undecided), 'pair')} of tracks may each be one person "
+            f"({_list_named(named, len(undecided))})"
         )
     if not parts:
         return None
     return (
-        "; ".join(parts) + ". Look at these frames on the pages, and split or join the tracks there"
+        "; ".join(parts)
+        + ". Look at these frames on the review pages, and split or join the tracks there"
     )
 
 
-def _count(number: int, noun: str) -> str:
+def _count_noun(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def _listed(named: list[str], count: int) -> str:
+def _list_named(named: list[str], count: int) -> str:
     return "; ".join(named) + (f"; and {count - len(named)} more" if count > len(named) else "")

@@ -5,22 +5,21 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Integers
 from worldpose.compiled import compiled
-from worldpose.tracking.affinity import ray_affinity
-from worldpose.tracking.intersection import intersect_people
-from worldpose.tracking.limbs import plausible
+from worldpose.tracking.limbs import has_adult_size
+from worldpose.tracking.person import Sighting
+from worldpose.tracking.ray_matching import intersect_people, ray_affinity
 from worldpose.tracking.settings import TrackingSettings
-from worldpose.tracking.sightings import Sighting
 
 
 @compiled
 def footprints(
-    centers: NDArray[np.float64],
-    directions: NDArray[np.float64],
+    centers: Floats,
+    directions: Floats,
     ground: tuple[float, float],
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return the ground position of each detection's person (n, 3): x, y and uncertainty [m].
 
     The mean ray is cut at the height of a body's centre; the uncertainty is the length of its
@@ -51,14 +50,14 @@ def footprints(
 
 @compiled
 def pair_distances(
-    centers: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    camera: NDArray[np.int64],
-    places: NDArray[np.float64],
+    centers: Floats,
+    directions: Floats,
+    camera: Integers,
+    places: Floats,
     min_joints: int,
     min_sine: float,
     gate: float,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return the mean distance between the rays of every two detections of different cameras.
 
     Args:
@@ -106,9 +105,9 @@ def pair_distances(
 
 
 def associate(
-    centers: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    weights: NDArray[np.float64],
+    centers: Floats,
+    directions: Floats,
+    weights: Floats,
     ground: bool,
     settings: TrackingSettings,
 ) -> list[Sighting]:
@@ -154,7 +153,7 @@ def associate(
             continue
         seed = np.full(cameras, -1)
         seed[camera[[a, b]]] = detection[[a, b]]
-        group = _grown(seed, centers, directions, free, settings)
+        group = _grow_group(seed, centers, directions, free, settings)
         views = np.count_nonzero(group.index >= 0)
         if views >= needed and is_person(group.joints, ground, settings):
             groups.append(group)
@@ -164,20 +163,20 @@ def associate(
     return groups
 
 
-def is_person(joints: NDArray[np.float64], ground: bool, settings: TrackingSettings) -> bool:
+def is_person(joints: Floats, ground: bool, settings: TrackingSettings) -> bool:
     """Return whether joints (17, 3) [m] have a person's size, and a person's height if `ground`."""
     known = np.isfinite(joints[:, 2])
-    if not plausible(joints, settings.size_range):
+    if not has_adult_size(joints, settings.size_range):
         return False
     low, high = settings.body_heights
     return not ground or low <= float(joints[known, 2].mean()) <= high
 
 
-def _grown(
-    index: NDArray[np.int64],
-    centers: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    weights: NDArray[np.float64],
+def _grow_group(
+    index: Integers,
+    centers: Floats,
+    directions: Floats,
+    weights: Floats,
     settings: TrackingSettings,
 ) -> Sighting:
     """Return the group around a seed of two detections (cameras,).

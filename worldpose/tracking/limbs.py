@@ -1,44 +1,36 @@
-"""Limb lengths of adults, and of the person of a track."""
+"""Body size: limb lengths relative to an adult's, and limb lengths over a track."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-LIMBS = np.array(
-    [
-        (5, 6),
-        (5, 7),
-        (6, 8),
-        (7, 9),
-        (8, 10),
-        (5, 11),
-        (6, 12),
-        (11, 13),
-        (12, 14),
-        (13, 15),
-        (14, 16),
-    ]
-)
+from data_contracts.arrays import Floats
+from data_contracts.conventions import COCO17_BODY_BONES
+
+LIMBS = np.array(COCO17_BODY_BONES)
 """Pairs of COCO-17 joints whose distances measure a person's size."""
-LIMB_LENGTHS = np.array([0.36, 0.30, 0.30, 0.25, 0.25, 0.51, 0.51, 0.42, 0.42, 0.42, 0.42])
-"""Their lengths in an adult of 1.75 m [m]: Drillis and Contini's segment ratios, with the torso
-and shoulders measured between joint centres."""
+ADULT_LENGTHS = np.array([0.36, 0.30, 0.30, 0.25, 0.25, 0.51, 0.51, 0.42, 0.42, 0.42, 0.42])
+"""Lengths of `LIMBS` in an adult of 1.75 m [m]: Drillis and Contini's segment ratios, with the
+torso and shoulders measured between joint centres."""
 ERROR_TIME = 0.3
 """Correlation time of a detector's errors [s]: frames nearer to each other add no information."""
 
 
-def plausible(joints: NDArray[np.float64], size_range: tuple[float, float]) -> bool:
+def size_ratios(joints: Floats) -> Floats:
+    """Return the limb lengths (..., 11) of joints (..., 17, 3) [m] over those of an adult [1]."""
+    ends = joints[..., LIMBS[:, 0], :], joints[..., LIMBS[:, 1], :]
+    return np.asarray(np.linalg.norm(ends[0] - ends[1], axis=-1) / ADULT_LENGTHS)
+
+
+def has_adult_size(joints: Floats, size_range: tuple[float, float]) -> bool:
     """Return whether joints (17, 3) [m] have the size of a person: the median over known limbs."""
-    lengths = np.linalg.norm(joints[LIMBS[:, 0]] - joints[LIMBS[:, 1]], axis=-1)
-    ratios = (lengths / LIMB_LENGTHS)[np.isfinite(lengths)]
+    ratios = size_ratios(joints)
+    ratios = ratios[np.isfinite(ratios)]
     low, high = size_range
     return bool(len(ratios)) and low <= float(np.median(ratios)) <= high
 
 
-def limb_lengths(
-    joints: NDArray[np.float64], fps: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def limb_lengths(joints: Floats, fps: float) -> tuple[Floats, Floats]:
     """Return median limb lengths (11,) [m] over a track and their variance (11,) [m^2].
 
     Args:

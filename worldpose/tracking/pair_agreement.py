@@ -12,24 +12,24 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.geometry import Camera
-from worldpose.tracking.limbs import LIMB_LENGTHS, LIMBS
+from worldpose.tracking.limbs import size_ratios
 
 SAMPLES: Final = 24
 """Most frames in which detections are compared."""
 TOLERANCE: Final = 0.15
 """Largest mean epipolar angle of two detections of one person, in spreads of a body's joints [1]:
-7 cm on an adult, whose joints spread 0.5 m."""
-AGREE: Final = 0.5
+7 cm on an adult, whose joints have a spread of 0.5 m."""
+MIN_SHARE: Final = 0.5
 """Share of detections with a partner from which two cameras agree [1]."""
-FEW: Final = 4
+MIN_MATCHES: Final = 4
 """Least number of matches for a conclusion."""
 
 
 @dataclass(frozen=True)
-class Meeting:
+class PairMatches:
     """Matches of the detections of two cameras.
 
     Attributes:
@@ -44,11 +44,11 @@ class Meeting:
 
     cameras: tuple[int, int]
     possible: int
-    angle: NDArray[np.float64]
-    distance: NDArray[np.float64]
-    size: NDArray[np.float64]
-    height: NDArray[np.float64]
-    depth: NDArray[np.float64]
+    angle: Floats
+    distance: Floats
+    size: Floats
+    height: Floats
+    depth: Floats
 
     @property
     def share(self) -> float:
@@ -58,12 +58,12 @@ class Meeting:
     @property
     def agrees(self) -> bool:
         """Whether most detections have a partner."""
-        return len(self.angle) >= FEW and self.share >= AGREE
+        return len(self.angle) >= MIN_MATCHES and self.share >= MIN_SHARE
 
 
 def match_pair(
-    cameras: Camera, rays: NDArray[np.float64], pair: tuple[int, int], shift: int, least: int
-) -> Meeting:
+    cameras: Camera, rays: Floats, pair: tuple[int, int], shift: int, least: int
+) -> PairMatches:
     """Return the matches of two cameras' detections, the second's `shift` frames later.
 
     Args:
@@ -83,18 +83,19 @@ def match_pair(
         p, q = rays[frame, a], rays[frame + shift, b]
         p, q = p[np.isfinite(p[..., 0]).any(-1)], q[np.isfinite(q[..., 0]).any(-1)]
         possible += min(len(p), len(q))
-        rows.append(_matches(origins[a], p, origins[b], q, least))
+        rows.append(_match_detections(origins[a], p, origins[b], q, least))
     table = np.concatenate(rows) if rows else np.empty((0, 5))
-    return Meeting(pair, possible, *table.T)
+    angle, distance, size, height, depth = table.T
+    return PairMatches(pair, possible, angle, distance, size, height, depth)
 
 
-def _matches(
-    origin: NDArray[np.float64],
-    p: NDArray[np.float64],
-    other: NDArray[np.float64],
-    q: NDArray[np.float64],
+def _match_detections(
+    origin: Floats,
+    p: Floats,
+    other: Floats,
+    q: Floats,
     least: int,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return angle, distance, size, height and depth (matches, 5) of detections that are partners.
 
     Args:
@@ -110,8 +111,8 @@ def _matches(
         return np.empty((0, 5))
     axis = baseline / length
     off = np.maximum(
-        _epipolar_angles(axis, p, q) / _spread(q)[None, :, None],
-        _epipolar_angles(axis, q, p).swapaxes(0, 1) / _spread(p)[:, None, None],
+        _epipolar_angles(axis, p, q) / _joint_spreads(q)[None, :, None],
+        _epipolar_angles(axis, q, p).swapaxes(0, 1) / _joint_spreads(p)[:, None, None],
     )
     known = np.isfinite(off)
     count = known.sum(axis=-1)
@@ -120,15 +121,13 @@ def _matches(
     found = []
     for n, m in zip(*np.nonzero(mean <= TOLERANCE), strict=True):
         if mean[n, m] <= mean[n].min() and mean[n, m] <= mean[:, m].min():
-            row = _where(origin, p[n], baseline, q[m])
+            row = _locate_match(origin, p[n], baseline, q[m])
             if row is not None:
                 found.append(row)
     return np.array(found).reshape(-1, 5)
 
 
-def _epipolar_angles(
-    axis: NDArray[np.float64], p: NDArray[np.float64], q: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _epipolar_angles(axis: Floats, p: Floats, q: Floats) -> Floats:
     """Return the angles (n, m, 17) [rad] of rays q from the planes of rays p and the baseline."""
     normals = np.cross(axis, p)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -136,17 +135,17 @@ def _epipolar_angles(
     return np.asarray(np.abs((normals[:, None] * q[None]).sum(axis=-1)))
 
 
-def _spread(rays: NDArray[np.float64]) -> NDArray[np.float64]:
+def _joint_spreads(rays: Floats) -> Floats:
     """Return root mean square angles (n,) of each detection's joints from their mean [rad]."""
     middle = np.nanmean(rays, axis=1, keepdims=True)
     return np.asarray(np.sqrt(np.nanmean(((rays - middle) ** 2).sum(axis=-1), axis=1)))
 
 
-def _where(
-    origin: NDArray[np.float64],
-    p: NDArray[np.float64],
-    baseline: NDArray[np.float64],
-    q: NDArray[np.float64],
+def _locate_match(
+    origin: Floats,
+    p: Floats,
+    baseline: Floats,
+    q: Floats,
 ) -> tuple[float, float, float, float, float] | None:
     """Return angle, distance, size, height and depth of one match; None behind a camera."""
     cosine = (p * q).sum(axis=-1)
@@ -159,7 +158,7 @@ def _where(
     joints = origin + 0.5 * (near + far)
     if not (np.nanmedian(s) > 0.0 and np.nanmedian(u) > 0.0):
         return None
-    limbs = np.linalg.norm(joints[LIMBS[:, 0]] - joints[LIMBS[:, 1]], axis=-1) / LIMB_LENGTHS
+    limbs = size_ratios(joints)
     size = float(np.nanmedian(limbs)) if np.isfinite(limbs).any() else math.nan
     return (
         float(np.nanmedian(np.arctan2(sine, np.abs(cosine)))),

@@ -13,16 +13,14 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from worldpose.tracking.camera_gates import CameraGates
+from data_contracts.arrays import Flags, Floats, Integers
+from worldpose.tracking.camera_statistics import CameraGates, CameraVisibility
 from worldpose.tracking.epipolar import is_person, pair_distances
-from worldpose.tracking.intersection import intersect_people
-from worldpose.tracking.limbs import LIMB_LENGTHS, LIMBS
-from worldpose.tracking.person import separations
+from worldpose.tracking.limbs import size_ratios
+from worldpose.tracking.person import Sighting, separations
+from worldpose.tracking.ray_matching import intersect_people
 from worldpose.tracking.settings import TrackingSettings
-from worldpose.tracking.sightings import Sighting
-from worldpose.tracking.visibility import CameraSight
 
 SIZE_SPREAD: Final = 0.15
 """Standard deviation of the logarithm of a person's size from one frame [1]."""
@@ -47,14 +45,14 @@ class Pairs:
         unique: (pairs,) whether the pair is likelier than all its rivals together.
     """
 
-    cameras: NDArray[np.int64]
-    detections: NDArray[np.int64]
-    joints: NDArray[np.float64]
-    distance: NDArray[np.float64]
-    odds: NDArray[np.float64]
-    unique: NDArray[np.bool_]
+    cameras: Integers
+    detections: Integers
+    joints: Floats
+    distance: Floats
+    odds: Floats
+    unique: Flags
 
-    def find(self, index: NDArray[np.int64]) -> int | None:
+    def find(self, index: Integers) -> int | None:
         """Return the number of the pair of two detections (cameras,), -1 = none; None if absent."""
         cameras = np.flatnonzero(index >= 0)
         same = (self.cameras == cameras) & (self.detections == index[cameras])
@@ -63,14 +61,14 @@ class Pairs:
 
 
 def judge_pairs(
-    directions: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    sight: CameraSight,
+    directions: Floats,
+    weights: Floats,
+    visibility: CameraVisibility,
     gates: CameraGates,
     ground: bool,
     settings: TrackingSettings,
     *,
-    everything: NDArray[np.float64],
+    everything: Floats,
 ) -> Pairs:
     """Return the odds of every pair of detections of two cameras.
 
@@ -78,13 +76,13 @@ def judge_pairs(
         directions: (cameras, detections, 17, 3) unit rays, world; NaN where not seen.
         weights: (cameras, detections, 17), of the squared angle; 0 where not seen, or where other
             views explain the detection.
-        sight: visibility statistics of the cameras.
+        visibility: visibility statistics of the cameras.
         gates: distances between rays of one person; updated here.
         ground: whether people stand on z = 0.
         settings: gates and accepted sizes.
         everything: the weights of all detections, explained or not.
     """
-    centers = sight.centers
+    centers = visibility.centers
     usable = np.count_nonzero(weights > 0.0, axis=-1) >= settings.min_joints
     camera, detection = np.nonzero(usable)
     rays = directions[camera, detection]
@@ -115,14 +113,14 @@ def judge_pairs(
     keep = np.array([is_person(each, ground, settings) for each in joints], dtype=np.bool_)
     first, second, joints = first[keep], second[keep], joints[keep]
     distance = distances[first, second]
-    gates.learn_pairs(distance[_mutual(first, second, distance, len(camera))])
+    gates.learn_pairs(distance[_mutually_nearest(first, second, distance, len(camera))])
     noise = gates.pair_noise(camera[first], camera[second])
     with np.errstate(invalid="ignore"):
-        score = -0.5 * (distance / noise) ** 2 + _body_score(joints)
+        score = -0.5 * (distance / noise) ** 2 + _body_scores(joints)
     own = np.zeros((len(centers), len(first)), dtype=np.bool_)
     own[camera[first], np.arange(len(first))] = own[camera[second], np.arange(len(first))] = True
-    score += sight.misses_score(joints, directions, everything, own)
-    likelihood, rivals = np.exp(score), _rivals(first, second, joints, score)
+    score += visibility.misses_score(joints, directions, everything, own)
+    likelihood, rivals = np.exp(score), _rival_likelihoods(first, second, joints, score)
     return Pairs(
         np.stack([camera[first], camera[second]], axis=-1),
         np.stack([detection[first], detection[second]], axis=-1),
@@ -133,9 +131,7 @@ def judge_pairs(
     )
 
 
-def group_pairs(
-    pairs: Pairs, weights: NDArray[np.float64], settings: TrackingSettings
-) -> list[Sighting]:
+def group_pairs(pairs: Pairs, weights: Floats, settings: TrackingSettings) -> list[Sighting]:
     """Return the pairs that are likelier than their rivals, the likeliest first.
 
     Args:
@@ -160,12 +156,12 @@ def group_pairs(
     return groups
 
 
-def _mutual(
-    first: NDArray[np.int64],
-    second: NDArray[np.int64],
-    distance: NDArray[np.float64],
+def _mutually_nearest(
+    first: Integers,
+    second: Integers,
+    distance: Floats,
     detections: int,
-) -> NDArray[np.bool_]:
+) -> Flags:
     """Return which pairs (pairs,) are the nearest of both their detections."""
     nearest = np.full(detections, np.inf)
     np.minimum.at(nearest, first, distance)
@@ -173,21 +169,20 @@ def _mutual(
     return np.asarray((distance <= nearest[first]) & (distance <= nearest[second]))
 
 
-def _body_score(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+def _body_scores(joints: Floats) -> Floats:
     """Return log likelihoods (n,) [nat] of the size and proportions of joints (n, 17, 3) [m]."""
-    limbs = np.linalg.norm(joints[:, LIMBS[:, 0]] - joints[:, LIMBS[:, 1]], axis=-1)
-    size = np.log(limbs / LIMB_LENGTHS)
+    size = np.log(size_ratios(joints))
     middle = np.nanmedian(size, axis=1)
     scatter = np.nanmean(np.square(size - middle[:, None]), axis=1)
     return np.asarray(-0.5 * (middle / SIZE_SPREAD) ** 2 - 0.5 * scatter / LIMB_SCATTER**2)
 
 
-def _rivals(
-    first: NDArray[np.int64],
-    second: NDArray[np.int64],
-    joints: NDArray[np.float64],
-    score: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def _rival_likelihoods(
+    first: Integers,
+    second: Integers,
+    joints: Floats,
+    score: Floats,
+) -> Floats:
     """Return the summed likelihood (pairs,) of each pair's rivals.
 
     A rival shares a detection and has its body elsewhere; a pair with a shared detection and the

@@ -1,16 +1,94 @@
-"""State of one track through a clip: pose, motion, and sightings so far."""
+"""Compact storage of a person's detections and joints per frame."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, MutableMapping
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Integers, Singles
 from worldpose.compiled import compiled
 from worldpose.tracking.settings import TrackingSettings
-from worldpose.tracking.sightings import Sighting, Sightings
+
+BLOCK: Final = 16
+"""Frames stored together: most ghosts need one block, and array headers cost little."""
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """Detections of one person in different views of one frame.
+
+    Attributes:
+        index: (cameras,) index of the detection; -1 = not seen.
+        ray_distance: (cameras,) mean distance of the detection's rays to the person [m]; NaN = not
+            seen.
+        joints: (17, 3) [m], world; NaN where the rays do not determine them.
+    """
+
+    index: Integers
+    ray_distance: Floats
+    joints: Floats
+
+    def fill_from(self, other: Sighting) -> Sighting:
+        """Return this with the other's detections in cameras without one of its own."""
+        own = self.index >= 0
+        return Sighting(
+            np.where(own, self.index, other.index),
+            np.where(own, self.ray_distance, other.ray_distance),
+            np.where(np.isfinite(self.joints), self.joints, other.joints),
+        )
+
+
+Block = tuple[NDArray[np.int16], Singles, Singles]
+
+
+class Sightings(MutableMapping[int, Sighting]):
+    """Sightings by frame, in order of insertion; stored as int16 and float32."""
+
+    def __init__(self) -> None:
+        self._place: dict[int, int] = {}
+        self._blocks: list[Block] = []
+        self._used = 0
+
+    def __setitem__(self, frame: int, sighting: Sighting) -> None:
+        place = self._place.get(frame, self._used)
+        number, row = divmod(place, BLOCK)
+        if number == len(self._blocks):
+            self._blocks.append(
+                (
+                    np.empty((BLOCK, *sighting.index.shape), np.int16),
+                    np.empty((BLOCK, *sighting.ray_distance.shape), np.float32),
+                    np.empty((BLOCK, *sighting.joints.shape), np.float32),
+                )
+            )
+        index, ray_distance, joints = self._blocks[number]
+        index[row] = sighting.index
+        ray_distance[row] = sighting.ray_distance
+        joints[row] = sighting.joints
+        self._place[frame] = place
+        self._used = max(self._used, place + 1)
+
+    def __getitem__(self, frame: int) -> Sighting:
+        number, row = divmod(self._place[frame], BLOCK)
+        index, ray_distance, joints = self._blocks[number]
+        return Sighting(
+            index[row].astype(np.int64),
+            ray_distance[row].astype(np.float64),
+            joints[row].astype(np.float64),
+        )
+
+    def __delitem__(self, frame: int) -> None:
+        del self._place[frame]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._place)
+
+    def __len__(self) -> int:
+        return len(self._place)
 
 
 @dataclass(eq=False)
@@ -30,9 +108,9 @@ class Person:
     """
 
     number: int
-    pose: NDArray[np.float64]
+    pose: Floats
     last_fixed: int
-    velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    velocity: Floats = field(default_factory=lambda: np.zeros(3))
     sightings: Sightings = field(default_factory=Sightings)
     misfit: float = 0.0
     fixed: int = 0
@@ -59,7 +137,7 @@ class Person:
         gain = 1.0 - math.exp(-1.0 / (fps * settings.velocity_time))
         self.misfit += gain * (float(np.nanmean(sighting.ray_distance)) - self.misfit)
         elapsed = (frame - self.last_fixed) / fps
-        pose, shift, known = _moved(self.pose, sighting.joints, elapsed > 0.0)
+        pose, shift, known = _shift_pose(self.pose, sighting.joints, elapsed > 0.0)
         if not known:
             return
         if elapsed > 0.0:
@@ -85,15 +163,13 @@ class Person:
         for frame in [frame for frame in other.sightings if frame >= since]:
             theirs = other.sightings.pop(frame)
             own = self.sightings.get(frame)
-            self.sightings[frame] = theirs if own is None else own.filled_from(theirs)
+            self.sightings[frame] = theirs if own is None else own.fill_from(theirs)
             other.fixed -= bool(np.isfinite(theirs.joints).any())
         other.evidence = min(other.evidence, float(other.fixed))
 
 
 @compiled
-def _moved(
-    pose: NDArray[np.float64], joints: NDArray[np.float64], move: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64], bool]:
+def _shift_pose(pose: Floats, joints: Floats, move: bool) -> tuple[Floats, Floats, bool]:
     """Return the pose with known joints replaced and others shifted, the shift, and any known."""
     both, known = np.empty((len(pose), 3)), False
     count = 0
@@ -114,7 +190,7 @@ def _moved(
     return out, shift, known
 
 
-def separations(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def separations(a: Floats, b: Floats) -> Floats:
     """Return the mean distance of the joints known in both poses of every pair [m].
 
     Args:

@@ -9,18 +9,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import ClipArray, Singles
 from data_contracts.conventions import COCO17
 from data_contracts.records import Record
 from data_contracts.tracking import Join, Track
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
-from worldpose.tracking.clip_arrays import ClipArray
 from worldpose.tracking.doubts import Takeover, lasting_takeovers
-from worldpose.tracking.following import Follower
-from worldpose.tracking.joining import Candidate
+from worldpose.tracking.frame_tracker import FrameTracker
+from worldpose.tracking.joins import Candidate
+from worldpose.tracking.people_selection import join_people
 from worldpose.tracking.person import Person
 from worldpose.tracking.settings import TrackingSettings
-from worldpose.tracking.whole_people import join_people
 
 JOINTS = len(COCO17)
 BLOCK = 64
@@ -74,8 +74,8 @@ class Tracking:
 
     person: NDArray[np.int32]
     detection_index: NDArray[np.int16]
-    ray_distance: NDArray[np.float32]
-    joints: NDArray[np.float32]
+    ray_distance: Singles
+    joints: Singles
     tracks: tuple[Track, ...]
     joins: tuple[Join, ...]
     takeovers: tuple[Takeover, ...]
@@ -128,7 +128,7 @@ def track_people(
             found=f"{keypoints.shape}, {confidence.shape}, {cameras.batch_shape}",
             todo="Give arrays of the same clip and cameras.",
         )
-    follower = Follower(cameras, fps, pitch_size is not None, people, settings)
+    tracker = FrameTracker(cameras, fps, pitch_size is not None, people, settings)
     frames = confidence.shape[0]
     for start in range(0, frames, BLOCK):
         image = np.asarray(keypoints[start : start + BLOCK], dtype=np.float64)
@@ -142,26 +142,28 @@ def track_people(
         directions = np.where(seen[..., None], directions, np.nan)
         is_empty = ~np.asarray(seen.any(axis=(1, 2, 3)))
         for offset in range(len(image)):
-            if not (is_empty[offset] and follower.is_idle):
-                follower.step(start + offset, directions[offset], weights[offset])
+            if not (is_empty[offset] and tracker.is_idle):
+                tracker.step(start + offset, directions[offset], weights[offset])
             if progress is not None:
                 progress(start + offset + 1, frames)
-    return _result(follower, frames, pitch_size)
+    return _build_result(tracker, frames, pitch_size)
 
 
-def _result(follower: Follower, frames: int, pitch_size: tuple[float, float] | None) -> Tracking:
+def _build_result(
+    tracker: FrameTracker, frames: int, pitch_size: tuple[float, float] | None
+) -> Tracking:
     """Return the people with enough evidence, over `frames` frames."""
-    causal = follower.settings.causal
-    everyone = follower.everyone()
+    causal = tracker.settings.causal
+    all_people = tracker.all_people()
     if causal:
-        lasting = [person for person in everyone if person.shown_from >= 0]
-        candidates, chains = follower.joins, [[person] for person in lasting]
+        lasting = [person for person in all_people if person.shown_from >= 0]
+        candidates, chains = tracker.joins, [[person] for person in lasting]
     else:
-        needed = min(max(1, follower.confirmed_after), frames)
-        lasting = [person for person in everyone if person.evidence >= needed - 1e-9]
-        candidates, chains = join_people(lasting, follower, pitch_size)
+        needed = min(max(1, tracker.confirmed_after), frames)
+        lasting = [person for person in all_people if person.evidence >= needed - 1e-9]
+        candidates, chains = join_people(lasting, tracker, pitch_size)
     chains.sort(key=lambda chain: (min(chain[0].sightings), chain[0].number))
-    cameras = len(follower.centers)
+    cameras = len(tracker.centers)
     index = np.full((frames, cameras, len(chains)), -1, dtype=np.int16)
     distance = np.full(index.shape, np.nan, dtype=np.float32)
     joints = np.full((frames, len(chains), JOINTS, 3), np.nan, dtype=np.float32)
@@ -175,29 +177,29 @@ def _result(follower: Follower, frames: int, pitch_size: tuple[float, float] | N
                     index[frame, :, n] = sighting.index
                     distance[frame, :, n] = sighting.ray_distance
                     joints[frame, n] = sighting.joints
-        tracks.append(_summary(n, index[:, :, n]))
+        tracks.append(_summarize_track(n, index[:, :, n]))
     matched = np.isfinite(distance)
     count = int(np.count_nonzero(matched))
-    joins = _joins(candidates, chains, everyone)
-    takeovers = lasting_takeovers(follower.takeovers, lasting, chains)
+    joins = _final_joins(candidates, chains, all_people)
+    takeovers = lasting_takeovers(tracker.takeovers, lasting, chains)
     report = TrackingReport(
         people=len(chains),
-        births=len(everyone),
-        dropped=len(everyone) - sum(map(len, chains)),
-        merged=follower.merged,
+        births=len(all_people),
+        dropped=len(all_people) - sum(map(len, chains)),
+        merged=tracker.merged,
         joined=sum(join.decided for join in joins),
         undecided=sum(not join.decided for join in joins),
         takeovers=len(takeovers),
         losses=sum(track.last_frame < frames - 1 for track in tracks),
-        detections=follower.detections,
-        unmatched_share=1.0 - count / follower.detections if follower.detections else None,
+        detections=tracker.detections,
+        unmatched_share=1.0 - count / tracker.detections if tracker.detections else None,
         mean_ray_distance_m=float(distance[matched].mean(dtype=np.float64)) if count else None,
     )
     ids = np.arange(len(chains), dtype=np.int32)
     return Tracking(ids, index, distance, joints, tuple(tracks), joins, takeovers, report)
 
 
-def _summary(person: int, index: NDArray[np.int16]) -> Track:
+def _summarize_track(person: int, index: NDArray[np.int16]) -> Track:
     """Return the summary of one person's detections (frames, cameras)."""
     views = np.count_nonzero(index >= 0, axis=1)
     present = np.flatnonzero(views)
@@ -210,8 +212,8 @@ def _summary(person: int, index: NDArray[np.int16]) -> Track:
     )
 
 
-def _joins(
-    candidates: list[Candidate], chains: list[list[Person]], everyone: list[Person]
+def _final_joins(
+    candidates: list[Candidate], chains: list[list[Person]], all_people: list[Person]
 ) -> tuple[Join, ...]:
     """Return the joins in terms of final people, without those of dropped tracks."""
     final = {person.number: n for n, chain in enumerate(chains) for person in chain}

@@ -14,9 +14,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import ClipArray, Floats
 from worldpose.geometry import Camera
-from worldpose.tracking.clip_arrays import ClipArray
 from worldpose.triangulation.batched_gauss_newton import LANES
 from worldpose.triangulation.clocks import CameraClocks, Moved, estimate_clocks, moved_in_time
 from worldpose.triangulation.left_right_swaps import undo_swaps

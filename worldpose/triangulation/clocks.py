@@ -12,10 +12,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import ClipArray, Floats
 from data_contracts.records import Record
 from worldpose.geometry import Camera, projection
-from worldpose.tracking.clip_arrays import ClipArray
 from worldpose.triangulation.noise_model import NoiseModel
 from worldpose.triangulation.observations import Rig
 from worldpose.triangulation.settings import TriangulationSettings

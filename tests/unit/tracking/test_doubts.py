@@ -75,9 +75,9 @@ def test_takeover_of_a_track_too_short_to_be_a_person_is_left_out(hidden):
 def test_takeovers_are_named_by_person_and_frame_of_the_clip():
     text = describe_doubts(FRAMES, 4, [Takeover(25, 0, 2), Takeover(99, 3, -1)], [])
     assert text == (
-        "2 tracks may have passed from one person to another where a camera hid one of them "
-        "(person 0 and person 2 in frame 325; person 3 in frame 399). Look at these frames on the "
-        "pages, and split or join the tracks there"
+        "2 tracks may have passed from one person to another where one of them is hidden from a "
+        "camera (person 0 and person 2 in frame 325; person 3 in frame 399). Look at these frames "
+        "on the review pages, and split or join the tracks there"
     )
 
 
@@ -86,7 +86,7 @@ def test_undecided_joins_are_named_where_they_are_many_for_the_people():
     assert describe_doubts(FRAMES, 5, [], joins) is None  # one of five people
     assert describe_doubts(FRAMES, 4, [], joins) == (
         "1 pair of tracks may each be one person (person 0 until frame 310 and person 3 from frame "
-        "340). Look at these frames on the pages, and split or join the tracks there"
+        "340). Look at these frames on the review pages, and split or join the tracks there"
     )
 
 

@@ -3,7 +3,7 @@ import pytest
 
 from worldpose.tracking import TrackingSettings
 from worldpose.tracking.epipolar import associate, footprints, pair_distances
-from worldpose.tracking.limbs import plausible
+from worldpose.tracking.limbs import has_adult_size
 
 SETTINGS = TrackingSettings(pair_evidence=0.0)
 ANYWHERE = np.array([[0.0, 0.0, np.inf]] * 2)
@@ -107,11 +107,11 @@ def test_second_detection_of_a_person_stays_out_of_the_group(ring, people):
 
 @pytest.mark.parametrize(("size", "expected"), [(1.0, True), (0.5, False), (1.6, False)])
 def test_only_the_size_of_a_person_is_plausible(people, size, expected):
-    assert plausible(size * people([0.0, 0.0]), SETTINGS.size_range) is expected
+    assert has_adult_size(size * people([0.0, 0.0]), SETTINGS.size_range) is expected
 
 
 def test_pose_without_limbs_is_not_plausible():
-    assert not plausible(np.full((17, 3), np.nan), SETTINGS.size_range)
+    assert not has_adult_size(np.full((17, 3), np.nan), SETTINGS.size_range)
 
 
 def test_giant_is_nobody(ring, people):

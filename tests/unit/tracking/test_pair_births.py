@@ -5,10 +5,9 @@ import pytest
 
 from worldpose.geometry import Camera, Rigid
 from worldpose.tracking import TrackingSettings, diagnose_no_people, track_people
-from worldpose.tracking.camera_gates import CameraGates
-from worldpose.tracking.following import Follower
+from worldpose.tracking.camera_statistics import CameraGates, CameraVisibility, find_covered_bodies
+from worldpose.tracking.frame_tracker import FrameTracker
 from worldpose.tracking.pair_births import group_pairs, judge_pairs
-from worldpose.tracking.visibility import CameraSight, bodies_covered
 
 SETTINGS = TrackingSettings()
 FPS = 25.0
@@ -54,10 +53,10 @@ def rays_of(cameras, joints, show=None):
     return directions, weights
 
 
-def judge(cameras, directions, weights, sight=None, ground=True):
-    sight = CameraSight(cameras) if sight is None else sight
-    gates = CameraGates(len(sight.centers))
-    return judge_pairs(directions, weights, sight, gates, ground, SETTINGS, everything=weights)
+def judge(cameras, directions, weights, visibility=None, ground=True):
+    visibility = CameraVisibility(cameras) if visibility is None else visibility
+    gates = CameraGates(len(visibility.centers))
+    return judge_pairs(directions, weights, visibility, gates, ground, SETTINGS, everything=weights)
 
 
 def test_two_high_cameras_keep_two_people_apart_from_their_two_ghosts(people):
@@ -126,10 +125,10 @@ def test_people_out_of_proportion_have_lower_odds(people):
 
 def known_sight(cameras, frames=98):
     """What cameras are like that have shown somebody, everywhere they look, in every frame."""
-    sight = CameraSight(cameras)
-    sight.reach[:] = 40.0
-    sight.shown[:], sight.missed[:] = frames, 0.0
-    return sight
+    visibility = CameraVisibility(cameras)
+    visibility.reach[:] = 40.0
+    visibility.shown[:], visibility.missed[:] = frames, 0.0
+    return visibility
 
 
 def test_camera_that_should_see_a_person_and_shows_nothing_is_evidence_against(people):
@@ -156,13 +155,13 @@ def test_camera_that_looks_elsewhere_says_nothing(people):
 
 
 def test_detection_that_lies_on_the_person_excuses_a_camera(people):
-    # The third camera sees one person before the other: on its line of sight, 3 m nearer.
+    # The third camera sees one person before the other: on its line of visibility, 3 m nearer.
     cameras = rig(*HIGH, THIRD)
     body = people([[0.0, 0.0]])
     toward = np.array(THIRD) - [0.0, 0.0, 1.0]
     before = body + 0.1 * toward * [1.0, 1.0, 1.0]
     directions, weights = rays_of(cameras, np.concatenate([body, before]), [[1, 0], [1, 0], [0, 1]])
-    covered = bodies_covered(body, cameras.center, directions, weights)
+    covered = find_covered_bodies(body, cameras.center, directions, weights)
     assert covered[:, 0].tolist() == [True, True, True]
     two = rig(*HIGH)
     judged = judge(cameras, directions, weights, known_sight(cameras))
@@ -173,17 +172,17 @@ def test_detection_that_lies_on_the_person_excuses_a_camera(people):
 
 def test_sight_learns_how_often_a_camera_misses_and_how_far_it_sees(people):
     cameras = rig(*HIGH, THIRD)
-    sight = CameraSight(cameras)
+    visibility = CameraVisibility(cameras)
     body = people([[0.0, 0.0]])
     for frame in range(10):
         show = [[1], [1], [frame % 2]]
         directions, weights = rays_of(cameras, body, show)
-        sight.learn(body, directions, weights, np.array(show, dtype=bool))
+        visibility.learn(body, directions, weights, np.array(show, dtype=bool))
     middle = body.mean(axis=1)[0]
-    np.testing.assert_allclose(sight.reach, np.linalg.norm(cameras.center - middle, axis=1))
+    np.testing.assert_allclose(visibility.reach, np.linalg.norm(cameras.center - middle, axis=1))
     # Until frame 1 the third had shown nobody, so frame 0 does not count.
-    assert sight.shown.tolist() == [10, 10, 9]
-    assert sight.missed.tolist() == [0, 0, 4]
+    assert visibility.shown.tolist() == [10, 10, 9]
+    assert visibility.missed.tolist() == [0, 0, 4]
 
 
 def picture(cameras, joints, show):
@@ -252,7 +251,7 @@ def test_detections_that_three_cameras_explain_are_left_to_them(people):
     joints = people([[0.0, 0.0], [2.0, 1.0]])
     show = [[1, 1], [1, 1], [1, 0]]
     directions, weights = rays_of(cameras, joints, show)
-    follower = Follower(cameras, FPS, True, None, SETTINGS)
-    follower.step(0, directions, weights)
-    found = sorted(tuple(person.sightings[0].index.tolist()) for person in follower.active)
+    tracker = FrameTracker(cameras, FPS, True, None, SETTINGS)
+    tracker.step(0, directions, weights)
+    found = sorted(tuple(person.sightings[0].index.tolist()) for person in tracker.active)
     assert found == [(0, 0, 0), (1, 1, -1)]

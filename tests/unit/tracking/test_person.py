@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from worldpose.tracking import TrackingSettings
-from worldpose.tracking.person import Person, separations
-from worldpose.tracking.sightings import Sighting
+from worldpose.tracking.person import BLOCK, Person, Sighting, Sightings, separations
 
 SETTINGS = TrackingSettings()
 FPS = 50.0
@@ -80,3 +79,34 @@ def test_absorbed_sightings_fill_the_empty_cameras(people):
     assert kept.sightings[2].index.tolist() == [3, 7]
     assert sorted(other.sightings) == [0, 1]
     assert other.fixed == 2
+
+
+FRAMES = 3 * BLOCK + 5
+
+
+def numbered_sighting(frame):
+    return Sighting(np.array([frame, -1]), np.array([0.25, np.nan]), np.full((17, 3), float(frame)))
+
+
+def test_sightings_give_back_what_was_put_in():
+    kept = Sightings()
+    for frame in range(10, 10 + FRAMES):
+        kept[frame] = numbered_sighting(frame)
+    assert list(kept) == list(range(10, 10 + FRAMES))
+    for frame, found in kept.items():
+        assert found.index.tolist() == [frame, -1]
+        np.testing.assert_array_equal(found.ray_distance, [0.25, np.nan])
+        assert (found.joints == frame).all()
+
+
+def test_a_sighting_is_replaced_or_taken_out_alone():
+    kept = Sightings()
+    for frame in range(FRAMES):
+        kept[frame] = numbered_sighting(frame)
+    kept[5] = numbered_sighting(500)
+    taken = kept.pop(6)
+    assert taken.index.tolist() == [6, -1]
+    kept[FRAMES] = numbered_sighting(FRAMES)
+    assert len(kept) == FRAMES
+    assert 6 not in kept
+    assert [kept[frame].index[0] for frame in (4, 5, 7, FRAMES)] == [4, 500, 7, FRAMES]

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from worldpose.errors import InputError
 from worldpose.tracking import TrackingSettings, track_people
-from worldpose.tracking.following import Follower
+from worldpose.tracking.frame_tracker import FrameTracker
 
 SETTINGS = TrackingSettings()
 FPS = 50.0
@@ -144,13 +144,13 @@ def test_frames_without_any_detection_cost_no_step_and_change_nothing(
     told = np.full(long.shape[:-1], np.nan)
     told[900:940] = confidence
     steps = []
-    step = Follower.step
+    step = FrameTracker.step
 
-    def counted(follower, frame, *rays):
+    def counted(tracker, frame, *rays):
         steps.append(frame)
-        step(follower, frame, *rays)
+        step(tracker, frame, *rays)
 
-    monkeypatch.setattr(Follower, "step", counted)
+    monkeypatch.setattr(FrameTracker, "step", counted)
     result = track_people(ring(5), long, told, FPS, SETTINGS)
     assert steps[0] == 900
     assert steps[-1] < 940 + FPS * max(SETTINGS.max_lost, SETTINGS.max_coast) + 2

@@ -6,20 +6,22 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.geometry import Camera
-from worldpose.tracking.affinity import match_greedily, match_optimally, ray_affinity
-from worldpose.tracking.camera_gates import CameraGates
+from worldpose.tracking.camera_statistics import CameraGates, CameraVisibility
 from worldpose.tracking.doubts import Takeover, find_takeovers
 from worldpose.tracking.epipolar import associate
-from worldpose.tracking.intersection import intersect_people
-from worldpose.tracking.joining import Candidate, End, decide, ends_of, join_costs
+from worldpose.tracking.joins import Candidate, End, choose_joins, fit_track_ends, join_costs
 from worldpose.tracking.pair_births import Pairs, group_pairs, judge_pairs
-from worldpose.tracking.person import Person, separations
+from worldpose.tracking.person import Person, Sighting, separations
+from worldpose.tracking.ray_matching import (
+    intersect_people,
+    match_greedily,
+    match_optimally,
+    ray_affinity,
+)
 from worldpose.tracking.settings import TrackingSettings
-from worldpose.tracking.sightings import Sighting
-from worldpose.tracking.visibility import CameraSight
 
 MIN_AREA = 25.0
 """Least ground area on which strangers may appear [m^2]: a room."""
@@ -29,7 +31,7 @@ LEARN_EVERY = 5
 """Interval between frames in which visibility statistics use known people."""
 
 
-class Follower:
+class FrameTracker:
     """Tracker state of a clip, updated frame by frame.
 
     Attributes:
@@ -52,8 +54,8 @@ class Follower:
     ) -> None:
         if not ground:
             settings = settings.model_copy(update={"newcomer_odds": settings.visitor_odds})
-        self.sight = CameraSight(cameras)
-        self.centers, self.fps, self.settings = self.sight.centers, fps, settings
+        self.visibility = CameraVisibility(cameras)
+        self.centers, self.fps, self.settings = self.visibility.centers, fps, settings
         self.ground, self.people = ground, people
         self.confirmed_after = math.ceil(settings.min_track * fps)
         self.active: list[Person] = []
@@ -76,32 +78,30 @@ class Follower:
         """Whether a frame without detections changes nothing: no person is followed or lost."""
         return not (self.active or self.lost)
 
-    def step(
-        self, frame: int, directions: NDArray[np.float64], weights: NDArray[np.float64]
-    ) -> None:
+    def step(self, frame: int, directions: Floats, weights: Floats) -> None:
         """Update with one frame's rays (cameras, detections, 17, 3) and weights."""
         usable = np.count_nonzero(weights > 0.0, axis=-1) >= self.settings.min_joints
         self.detections += int(np.count_nonzero(usable))
         for person in self.active:
             person.advance(frame, self.fps, self.settings)
         index, distance, joints = self._match(frame, directions, weights)
-        left = _without(weights, index)
+        left = _drop_matched(weights, index)
         groups: list[Sighting] = []
         if (usable & (left > 0.0).any(axis=-1)).any():
             groups = associate(self.centers, directions, left, self.ground, self.settings)
         views = np.count_nonzero(index >= 0, axis=0)
         known = views >= self.settings.birth_views
-        known |= np.array([self._confirmed(person) for person in self.active], dtype=np.bool_)
-        found = _stacked(groups, len(self.centers))
+        known |= np.array([self._is_confirmed(person) for person in self.active], dtype=np.bool_)
+        found = _stack_matches(groups, len(self.centers))
         self._learn(frame, joints, index, known, groups, directions, weights)
         pairs: Pairs | None = None
-        left = _without(left, found)
-        if (views[~known] == 2).any() or _two_cameras(left, self.settings.min_joints):
-            free = _without(_without(weights, index[:, known]), found)
+        left = _drop_matched(left, found)
+        if (views[~known] == 2).any() or _has_two_cameras(left, self.settings.min_joints):
+            free = _drop_matched(_drop_matched(weights, index[:, known]), found)
             pairs = judge_pairs(
                 directions,
                 free,
-                self.sight,
+                self.visibility,
                 self.gates,
                 self.ground,
                 self.settings,
@@ -119,12 +119,12 @@ class Follower:
     def _learn(
         self,
         frame: int,
-        joints: NDArray[np.float64],
-        index: NDArray[np.int64],
-        known: NDArray[np.bool_],
+        joints: Floats,
+        index: Integers,
+        known: Flags,
         groups: list[Sighting],
-        directions: NDArray[np.float64],
-        weights: NDArray[np.float64],
+        directions: Floats,
+        weights: Floats,
     ) -> None:
         """Update visibility statistics with new groups, and every few frames with known people."""
         seen = [(joints[n], index[:, n] >= 0) for n in np.flatnonzero(known).tolist()]
@@ -134,18 +134,18 @@ class Follower:
         if seen:
             bodies = np.stack([each for each, _ in seen])
             showing = np.stack([each for _, each in seen], axis=1)
-            self.sight.learn(bodies, directions, weights, showing)
+            self.visibility.learn(bodies, directions, weights, showing)
 
-    def everyone(self) -> list[Person]:
+    def all_people(self) -> list[Person]:
         """Return all people ever started, in order."""
         return sorted(self.active + self.lost + self.ended, key=lambda person: person.number)
 
-    def _confirmed(self, person: Person) -> bool:
+    def _is_confirmed(self, person: Person) -> bool:
         return person.evidence >= self.confirmed_after
 
     def _match(
-        self, frame: int, directions: NDArray[np.float64], weights: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+        self, frame: int, directions: Floats, weights: Floats
+    ) -> tuple[Integers, Floats, Floats]:
         """Match the known people.
 
         Returns:
@@ -156,8 +156,8 @@ class Follower:
         if not self.active:
             none = np.full((len(self.centers), 0), -1)
             return none, np.empty(none.shape), np.empty((0, directions.shape[2], 3))
-        self.active.sort(key=lambda person: (not self._confirmed(person), person.number))
-        confirmed = sum(map(self._confirmed, self.active))
+        self.active.sort(key=lambda person: (not self._is_confirmed(person), person.number))
+        confirmed = sum(map(self._is_confirmed, self.active))
         poses = np.stack([person.pose for person in self.active])
         doubt = [person.uncertainty(frame, self.fps, settings) for person in self.active]
         usual = np.maximum(
@@ -195,9 +195,9 @@ class Follower:
 
     def _drop_strangers(
         self,
-        index: NDArray[np.int64],
-        directions: NDArray[np.float64],
-        affinity: NDArray[np.float64],
+        index: Integers,
+        directions: Floats,
+        affinity: Floats,
     ) -> None:
         """Remove, from `index`, matches of two views whose rays are too far apart.
 
@@ -242,7 +242,7 @@ class Follower:
             if not beside.min() < self.settings.merge_distance:
                 new.append(group)
                 taken.append(group.joints)
-        found = self._found_again(frame, new) if self.settings.causal and self.lost else []
+        found = self._recover_lost(frame, new) if self.settings.causal and self.lost else []
         back = {join.after: join.before for join in found if join.decided}
         lost = {person.number: person for person in self.lost}
         numbers = []
@@ -261,18 +261,18 @@ class Follower:
             person.see(frame, group, self.fps, self.settings, evidence)
         self.joins += [replace(join, after=numbers[join.after]) for join in found]
 
-    def _found_again(self, frame: int, groups: list[Sighting]) -> list[Candidate]:
+    def _recover_lost(self, frame: int, groups: list[Sighting]) -> list[Candidate]:
         """Return which of the groups (`after`) are lost people, judged from the past alone."""
-        before = [self.end_of(person)[1] for person in self.lost]
+        before = [self.track_ends(person)[1] for person in self.lost]
         now = np.array([frame])
         after = [
-            ends_of(place, now, group.joints[None], self.fps, self.settings)[0]
+            fit_track_ends(place, now, group.joints[None], self.fps, self.settings)[0]
             for place, group in enumerate(groups)
         ]
         costs = join_costs(before, after, self.fps, self.area, self.settings)
-        return decide(before, after, costs, self.settings)
+        return choose_joins(before, after, costs, self.settings)
 
-    def end_of(self, person: Person) -> tuple[End, End]:
+    def track_ends(self, person: Person) -> tuple[End, End]:
         """Return the start and the end of a person's track."""
         fixed = [
             (frame, sighting.joints)
@@ -281,13 +281,13 @@ class Follower:
         ]
         frames = np.array([frame for frame, _ in fixed])
         joints = np.stack([joints for _, joints in fixed])
-        return ends_of(person.number, frames, joints, self.fps, self.settings)
+        return fit_track_ends(person.number, frames, joints, self.fps, self.settings)
 
     def _merge(self, frame: int) -> None:
         """End people whose track has coincided with another's for `merge_time`."""
         seen = [person for person in self.active if person.last_fixed == frame]
         seen.sort(key=lambda person: (-person.fixed, person.number))
-        apart = _apart([person.pose for person in seen], seen)
+        apart = _pose_distances([person.pose for person in seen], seen)
         near: dict[tuple[int, int], int] = {}
         for a, b in np.argwhere(np.triu(apart < self.settings.merge_distance, 1)):
             kept, other = seen[a], seen[b]
@@ -306,10 +306,10 @@ class Follower:
         """End or lose people unseen for too long; unconfirmed ones have a shorter limit."""
         settings = self.settings
         for person in list(self.active):
-            patience = settings.max_coast if self._confirmed(person) else settings.min_track
+            patience = settings.max_coast if self._is_confirmed(person) else settings.min_track
             if (frame - person.last_fixed) / self.fps > patience:
                 self.active.remove(person)
-                back = settings.causal and self._confirmed(person)
+                back = settings.causal and self._is_confirmed(person)
                 (self.lost if back else self.ended).append(person)
         for person in list(self.lost):
             if (frame - person.last_fixed) / self.fps > settings.max_lost:
@@ -317,9 +317,7 @@ class Follower:
                 self.ended.append(person)
 
 
-def ray_distance(
-    baseline: NDArray[np.float64], rays: NDArray[np.float64], others: NDArray[np.float64]
-) -> float:
+def ray_distance(baseline: Floats, rays: Floats, others: Floats) -> float:
     """Return the mean distance of two detections' rays (17, 3) [m]; infinite for no joint."""
     normal = np.cross(rays, others)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -328,7 +326,7 @@ def ray_distance(
     return float(apart[known].mean()) if known.any() else math.inf
 
 
-def _without(weights: NDArray[np.float64], index: NDArray[np.int64]) -> NDArray[np.float64]:
+def _drop_matched(weights: Floats, index: Integers) -> Floats:
     """Return weights (cameras, detections, 17), 0 for matched detections (cameras, n)."""
     left = weights.copy()
     camera, person = np.nonzero(index >= 0)
@@ -336,19 +334,19 @@ def _without(weights: NDArray[np.float64], index: NDArray[np.int64]) -> NDArray[
     return left
 
 
-def _stacked(groups: list[Sighting], cameras: int) -> NDArray[np.int64]:
+def _stack_matches(groups: list[Sighting], cameras: int) -> Integers:
     """Return the detections (cameras, groups) of groups; -1 = none."""
     none = np.full((cameras, 0), -1)
     return np.stack([group.index for group in groups], axis=1) if groups else none
 
 
-def _two_cameras(weights: NDArray[np.float64], min_joints: int) -> bool:
+def _has_two_cameras(weights: Floats, min_joints: int) -> bool:
     """Return whether two cameras have detections with enough joints."""
     usable = np.count_nonzero(weights > 0.0, axis=-1) >= min_joints
     return bool(np.count_nonzero(usable.any(axis=1)) >= 2)
 
 
-def _apart(poses: list[NDArray[np.float64]], people: list[Person]) -> NDArray[np.float64]:
+def _pose_distances(poses: list[Floats], people: list[Person]) -> Floats:
     """Return mean joint distances (poses, people) [m]."""
     if not poses or not people:
         return np.empty((len(poses), len(people)))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from worldpose.tracking import TrackingSettings
-from worldpose.tracking.joining import End, decide, ends_of, join_costs
+from worldpose.tracking.joins import End, choose_joins, fit_track_ends, join_costs
 from worldpose.tracking.limbs import limb_lengths
 
 SETTINGS = TrackingSettings()
@@ -26,7 +26,7 @@ def test_ends_are_where_the_torso_is_and_as_fast_as_it_moves(people):
     frames = np.arange(10, 40)
     time = (frames - 10) / FPS
     joints = people(np.stack([2.0 * time, 1.0 - time], axis=-1))
-    start, stop = ends_of(3, frames, joints, FPS, SETTINGS)
+    start, stop = fit_track_ends(3, frames, joints, FPS, SETTINGS)
     torso = people(np.zeros(2))[[5, 6, 11, 12], :2].mean(axis=0)
     # A line through exact points: rounding.
     np.testing.assert_allclose(start.place, torso + [0.0, 1.0], atol=1e-12)
@@ -37,7 +37,7 @@ def test_ends_are_where_the_torso_is_and_as_fast_as_it_moves(people):
 
 
 def test_single_frame_has_no_velocity(people):
-    start, stop = ends_of(0, np.array([7]), people(np.zeros((1, 2))), FPS, SETTINGS)
+    start, stop = fit_track_ends(0, np.array([7]), people(np.zeros((1, 2))), FPS, SETTINGS)
     assert np.isnan(start.velocity).all()
     assert start.frame == stop.frame == 7
 
@@ -83,7 +83,7 @@ def decided(costs, odds=1.0):
     chosen = SETTINGS.model_copy(update={"newcomer_odds": odds})
     return [
         (join.before, join.after, join.decided, join.margin)
-        for join in decide(before, after, np.array(costs), chosen)
+        for join in choose_joins(before, after, np.array(costs), chosen)
     ]
 
 
@@ -106,7 +106,7 @@ def test_odds_beforehand_tell_newcomers_from_who_was_lost():
 
 
 def test_nobody_to_join_is_no_join():
-    assert decide([], [], np.empty((0, 0)), SETTINGS) == []
+    assert choose_joins([], [], np.empty((0, 0)), SETTINGS) == []
     assert decided([[np.inf]]) == []
 
 

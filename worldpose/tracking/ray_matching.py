@@ -1,25 +1,33 @@
-"""Affinity of people and detections by point-to-ray distance, and matching on it (T1)."""
+"""Rays of detections: affinity to people by distance, matching on it (T1), and quick 3D joints."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.compiled import compiled
+
+ITERATIONS = 5
+MAX_LAST_STEP = 1e-3
+"""Length of a step that ends the iteration [m]: a tenth of the rays' accuracy."""
+MIN_DETERMINANT = 1e-9
+"""Determinant of a system with a diagonal of about 1 that counts as singular [1]."""
+
+Point = tuple[float, float, float]
 
 
 @compiled
 def ray_affinity(
-    joints: NDArray[np.float64],
-    centers: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    gates: NDArray[np.float64],
+    joints: Floats,
+    centers: Floats,
+    directions: Floats,
+    weights: Floats,
+    gates: Floats,
     min_joints: int,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return minus the mean distance of each person's joints to each detection's rays.
 
     Args:
@@ -74,9 +82,7 @@ def ray_affinity(
 
 
 @compiled
-def distance(
-    x: float, y: float, z: float, center: NDArray[np.float64], direction: NDArray[np.float64]
-) -> float:
+def distance(x: float, y: float, z: float, center: Floats, direction: Floats) -> float:
     """Return the distance [m] of a point to a ray; NaN where either is missing.
 
     For a point behind the camera, the distance to the camera counts.
@@ -90,7 +96,7 @@ def distance(
 
 
 @compiled
-def match_greedily(affinity: NDArray[np.float64]) -> NDArray[np.int64]:
+def match_greedily(affinity: Floats) -> Integers:
     """Return each person's detection in every camera, best pairs first.
 
     Args:
@@ -115,9 +121,7 @@ def match_greedily(affinity: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 @compiled
-def nearest_detections(
-    affinity: NDArray[np.float64], unmatched: float
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def nearest_detections(affinity: Floats, unmatched: float) -> tuple[Integers, Flags]:
     """Return each person's best detection (cameras, persons), and the cameras where two share one.
 
     Args:
@@ -140,7 +144,7 @@ def nearest_detections(
     return index, shared
 
 
-def match_optimally(affinity: NDArray[np.float64], unmatched: float) -> NDArray[np.int64]:
+def match_optimally(affinity: Floats, unmatched: float) -> Integers:
     """Return each person's detection in every camera, with the largest sum of affinities.
 
     Args:
@@ -162,3 +166,128 @@ def match_optimally(affinity: NDArray[np.float64], unmatched: float) -> NDArray[
         index[c] = -1
         index[c, persons[row[good]]] = detections[column[good]]
     return index
+
+
+@compiled
+def intersect_people(
+    centers: Floats,
+    directions: Floats,
+    weights: Floats,
+    index: Integers,
+    near: Floats,
+    gate: float,
+    min_sine: float,
+) -> Floats:
+    """Return the joints of people from the rays of their detections.
+
+    The point nearest to the rays, each weighted by `weights` over its squared length, under a
+    Geman-McClure loss: a view that shows another person has little influence.
+
+    Args:
+        centers: (cameras, 3) [m], world.
+        directions: (cameras, detections, joints, 3) unit rays, world; NaN where not seen.
+        weights: (cameras, detections, joints), of the squared angle; 0 where not seen.
+        index: (cameras, persons) index of the detection; -1 = not seen.
+        near: (persons, joints, 3) [m], predicted positions; NaN without prediction.
+        gate: distance [m] beyond which a ray is an outlier.
+        min_sine: least sine of the angle between two inlier rays.
+
+    Returns:
+        (persons, joints, 3) [m], world; NaN with fewer than two inlier rays.
+    """
+    cameras, _, joint_count, _ = directions.shape
+    persons = index.shape[1]
+    joints = np.full((persons, joint_count, 3), np.nan)
+    origin, ray = np.empty((cameras, 3)), np.empty((cameras, 3))
+    weight = np.empty(cameras)
+    for person in range(persons):
+        for joint in range(joint_count):
+            count = 0
+            for c in range(cameras):
+                detection = index[c, person]
+                if detection >= 0 and weights[c, detection, joint] > 0.0:
+                    for axis in range(3):
+                        origin[count, axis] = centers[c, axis]
+                        ray[count, axis] = directions[c, detection, joint, axis]
+                    weight[count] = weights[c, detection, joint]
+                    count += 1
+            if count < 2:
+                continue
+            x, y, z = near[person, joint]
+            scale = 0.5 * gate
+            if math.isnan(x):
+                x, y, z = _nearest_point(origin, ray, weight, count, (x, y, z), math.inf)
+                scale *= 4.0
+            for _ in range(ITERATIONS):
+                u, v, w = x, y, z
+                x, y, z = _nearest_point(origin, ray, weight, count, (x, y, z), scale)
+                settled = scale <= 0.5 * gate
+                scale = max(0.5 * gate, 0.5 * scale)
+                if settled and (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2 <= MAX_LAST_STEP**2:
+                    break
+            if _have_wide_angle(origin, ray, count, (x, y, z), gate, min_sine):
+                joints[person, joint, 0] = x
+                joints[person, joint, 1] = y
+                joints[person, joint, 2] = z
+    return joints
+
+
+@compiled
+def _nearest_point(
+    origin: Floats,
+    ray: Floats,
+    weight: Floats,
+    count: int,
+    point: Point,
+    scale: float,
+) -> Point:
+    """Return the point nearest to the rays, reweighted at `point`; NaN if they are parallel."""
+    a = b = c = d = e = f = g0 = g1 = g2 = total = 0.0
+    for k in range(count):
+        w = weight[k]
+        x, y, z = ray[k, 0], ray[k, 1], ray[k, 2]
+        ox, oy, oz = origin[k, 0], origin[k, 1], origin[k, 2]
+        if scale < math.inf:
+            away = distance(point[0], point[1], point[2], origin[k], ray[k])
+            length = (point[0] - ox) ** 2 + (point[1] - oy) ** 2 + (point[2] - oz) ** 2
+            w *= (scale * scale / (scale * scale + away * away)) ** 2 / length
+        xx, yy, zz = w * (1.0 - x * x), w * (1.0 - y * y), w * (1.0 - z * z)
+        xy, xz, yz = -w * x * y, -w * x * z, -w * y * z
+        a, b, c, d, e, f = a + xx, b + xy, c + xz, d + yy, e + yz, f + zz
+        g0 += xx * ox + xy * oy + xz * oz
+        g1 += xy * ox + yy * oy + yz * oz
+        g2 += xz * ox + yz * oy + zz * oz
+        total += w
+    p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
+    s, t, u = a * f - c * c, b * c - a * e, a * d - b * b
+    determinant = a * p + b * q + c * r
+    if not determinant > MIN_DETERMINANT * total**3:
+        return (math.nan, math.nan, math.nan)
+    return (
+        (p * g0 + q * g1 + r * g2) / determinant,
+        (q * g0 + s * g1 + t * g2) / determinant,
+        (r * g0 + t * g1 + u * g2) / determinant,
+    )
+
+
+@compiled
+def _have_wide_angle(
+    origin: Floats,
+    ray: Floats,
+    count: int,
+    point: Point,
+    gate: float,
+    min_sine: float,
+) -> bool:
+    """Return whether two rays that pass within the gate are `min_sine` apart."""
+    x, y, z = point
+    for k in range(count):
+        if not distance(x, y, z, origin[k], ray[k]) <= gate:
+            continue
+        for other in range(k):
+            cosine = ray[k, 0] * ray[other, 0] + ray[k, 1] * ray[other, 1]
+            cosine += ray[k, 2] * ray[other, 2]
+            apart = 1.0 - cosine * cosine >= min_sine * min_sine
+            if apart and distance(x, y, z, origin[other], ray[other]) <= gate:
+                return True
+    return False

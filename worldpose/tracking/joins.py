@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.tracking.limbs import limb_lengths
 from worldpose.tracking.settings import TrackingSettings
 
@@ -41,10 +41,10 @@ class End:
 
     number: int
     frame: int
-    place: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    limbs: NDArray[np.float64]
-    limb_variance: NDArray[np.float64]
+    place: Floats
+    velocity: Floats
+    limbs: Floats
+    limb_variance: Floats
 
 
 @dataclass(frozen=True)
@@ -70,10 +70,10 @@ class Candidate:
     decided: bool
 
 
-def ends_of(
+def fit_track_ends(
     number: int,
-    frames: NDArray[np.int64],
-    joints: NDArray[np.float64],
+    frames: Integers,
+    joints: Floats,
     fps: float,
     settings: TrackingSettings,
 ) -> tuple[End, End]:
@@ -101,9 +101,9 @@ def ends_of(
     return out[0], out[1]
 
 
-def _mean_known(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _mean_known(points: Floats) -> Floats:
     """Return the mean position (n, 2) of the known points among (n, points, 3); NaN without any."""
-    known: NDArray[np.bool_] = np.isfinite(points[..., :1])
+    known: Flags = np.isfinite(points[..., :1])
     total = np.where(known, points[..., :2], 0.0).sum(axis=1)
     with np.errstate(invalid="ignore"):
         return np.asarray(total / known.sum(axis=1))
@@ -115,7 +115,7 @@ def join_costs(
     fps: float,
     area: float,
     settings: TrackingSettings,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return the cost of joining every track that ends to every track that begins.
 
     Between two sightings a person's velocity is a random walk: the expected start of the second
@@ -138,11 +138,11 @@ def join_costs(
         for j, new in enumerate(after):
             gap = (new.frame - old.frame) / fps
             if 0.0 < gap <= settings.max_gap:
-                costs[i, j] = _cost(old, new, gap, area, settings)
+                costs[i, j] = _join_cost(old, new, gap, area, settings)
     return costs
 
 
-def _cost(old: End, new: End, gap: float, area: float, settings: TrackingSettings) -> float:
+def _join_cost(old: End, new: End, gap: float, area: float, settings: TrackingSettings) -> float:
     """Return minus the log odds that two ends `gap` [s] apart are one person."""
     offset = new.place - old.place
     if np.linalg.norm(offset) > TOP_SPEED * gap + 3.0 * PLACE_NOISE:
@@ -159,26 +159,26 @@ def _cost(old: End, new: End, gap: float, area: float, settings: TrackingSetting
         agility, speed = pace * settings.agility, pace * settings.mean_speed
         variance = PLACE_NOISE**2 + agility**2 * short**3 / (12.0 if both else 3.0)
         variance += 2.0 * speed**2 * memory * (gap - short)
-        prior.append(math.log(share) + _log_normal(first, speed**2 + VELOCITY_NOISE**2))
-        likelihood.append(prior[-1] + _log_normal(offset, variance))
+        prior.append(math.log(share) + _log_normal_density(first, speed**2 + VELOCITY_NOISE**2))
+        likelihood.append(prior[-1] + _log_normal_density(offset, variance))
         if both:
             spread = VELOCITY_NOISE**2 + agility**2 * short
-            likelihood[-1] += _log_normal(change, spread)
+            likelihood[-1] += _log_normal_density(change, spread)
     cost = float(np.logaddexp.reduce(prior) - np.logaddexp.reduce(likelihood)) - math.log(area)
     if both:
-        cost += _log_normal(change, VELOCITY_NOISE**2 + 2.0 * settings.mean_speed**2)
+        cost += _log_normal_density(change, VELOCITY_NOISE**2 + 2.0 * settings.mean_speed**2)
     difference = new.limbs - old.limbs
     known = np.isfinite(difference)
     own = settings.limb_noise**2 + old.limb_variance[known] + new.limb_variance[known]
     other = own + 2.0 * settings.limb_spread**2
-    evidence = _log_limb(difference[known], other) - _log_limb(difference[known], own)
+    evidence = _log_limb_density(difference[known], other) - _log_limb_density(
+        difference[known], own
+    )
     # Limb errors and differences of one person are correlated: their mean is worth two limbs.
     return cost + (2.0 * float(evidence.mean()) if known.any() else 0.0)
 
 
-def _log_limb(
-    difference: NDArray[np.float64], variance: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _log_limb_density(difference: Floats, variance: Floats) -> Floats:
     """Return the log density of differences of lengths (n,) [m], some of which are gross errors.
 
     If two views place an elbow at another person's arm, a limb becomes a metre longer.
@@ -189,15 +189,15 @@ def _log_limb(
     return np.asarray(np.logaddexp(usual, gross))
 
 
-def _log_normal(offset: NDArray[np.float64], variance: float) -> float:
+def _log_normal_density(offset: Floats, variance: float) -> float:
     """Return the log density of a normal distribution in the plane."""
     return -0.5 * float(offset @ offset) / variance - math.log(2.0 * math.pi * variance)
 
 
-def decide(
+def choose_joins(
     before: list[End],
     after: list[End],
-    costs: NDArray[np.float64],
+    costs: Floats,
     settings: TrackingSettings,
 ) -> list[Candidate]:
     """Return the joins of the likeliest assignment, each with its margin, cheapest first.
@@ -215,12 +215,12 @@ def decide(
     gain = np.minimum(costs + math.log(settings.newcomer_odds), 0.0)
     row, column = np.flatnonzero((gain < 0.0).any(1)), np.flatnonzero((gain < 0.0).any(0))
     gain = gain[np.ix_(row, column)]
-    chosen, best = _cheapest(gain)
+    chosen, best = _cheapest_assignment(gain)
     joins = []
     for i, j in chosen:
         kept = gain[i, j]
         gain[i, j] = 0.0
-        margin = _cheapest(gain)[1] - best
+        margin = _cheapest_assignment(gain)[1] - best
         gain[i, j] = kept
         old, new = before[row[i]], after[column[j]]
         cost = float(costs[row[i], column[j]])
@@ -232,7 +232,7 @@ def decide(
     return sorted(joins, key=lambda join: (join.cost, join.before))
 
 
-def _cheapest(gain: NDArray[np.float64]) -> tuple[list[tuple[int, int]], float]:
+def _cheapest_assignment(gain: Floats) -> tuple[list[tuple[int, int]], float]:
     """Return the pairs of the cheapest assignment and its cost; an unpaired track costs nothing."""
     row, column = linear_sum_assignment(gain)
     used = gain[row, column] < 0.0

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from worldpose.tracking import TrackingSettings, track_people
-from worldpose.tracking.following import Follower
-from worldpose.tracking.person import Person
-from worldpose.tracking.sightings import Sighting
+from worldpose.tracking.frame_tracker import FrameTracker
+from worldpose.tracking.person import Person, Sighting
 
 SETTINGS = TrackingSettings()
 FPS = 50.0
@@ -181,16 +180,16 @@ def test_who_is_unseen_may_be_as_far_beyond_the_gate_as_he_can_have_gone(
 def test_of_two_tracks_on_one_person_the_one_that_was_fixed_more_often_stays(ring, people):
     pose = people(np.zeros(2))
     younger, older = Person(0, pose, 20), Person(1, pose, 0)
-    follower = Follower(ring(2), FPS, True, None, SETTINGS)
-    follower.active = [younger, older]
+    tracker = FrameTracker(ring(2), FPS, True, None, SETTINGS)
+    tracker.active = [younger, older]
     here = Sighting(np.array([0, 0]), np.array([0.1, 0.1]), pose)
     for frame in range(40):
-        for person in follower.active:
+        for person in tracker.active:
             if frame >= person.last_fixed:
                 person.see(frame, here, FPS, SETTINGS)
-        follower._merge(frame)
-    assert follower.active == [older]
-    assert follower.ended == [younger]
+        tracker._merge(frame)
+    assert tracker.active == [older]
+    assert tracker.ended == [younger]
 
 
 def test_person_whom_a_camera_loses_is_not_carried_away_by_a_neighbour(ring, people, seen):

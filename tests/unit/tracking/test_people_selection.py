@@ -1,0 +1,274 @@
+"""Bystanders, shadows and surplus people are dropped, judged by whole people."""
+
+import numpy as np
+import pytest
+
+from data_contracts.match import PlayerSpec
+from worldpose.geometry import Camera, Rigid
+from worldpose.tracking import TrackingSettings, track_people
+from worldpose.tracking.frame_tracker import FrameTracker
+from worldpose.tracking.people_selection import (
+    drop_bystanders,
+    drop_shadows,
+    join_people,
+    limit_people,
+    roster_limit,
+)
+from worldpose.tracking.person import Person, Sighting
+
+FRAMES, FULL_PITCH = 20, (105.0, 68.0)
+BODY = np.stack([np.zeros(17), np.zeros(17), np.linspace(0.0, 1.7, 17)], axis=1)
+
+
+def standing(x, y):
+    """Return a person at a position [m], one or one per frame; NaN where rays give none."""
+    person = Person(0, BODY, FRAMES - 1)
+    for frame in range(FRAMES):
+        place = [np.broadcast_to(each, FRAMES)[frame] for each in (x, y)]
+        joints = BODY + [*place, 0.0 if np.isfinite(place).all() else np.nan]
+        person.sightings[frame] = Sighting(np.zeros(2), np.zeros(2), joints)
+    return person
+
+
+def stays(person, margin=2.0, pitch=FULL_PITCH):
+    return drop_bystanders([person], pitch, margin) == [person]
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_person_who_waits_behind_the_lines_is_a_bystander(side):
+    assert stays(standing(0.0, side * 35.9))
+    assert not stays(standing(0.0, side * 36.1))
+    assert stays(standing(side * 54.4, 0.0))
+    assert not stays(standing(side * 54.6, 0.0))
+    assert not stays(standing(0.0, side * 35.9), margin=1.5)
+
+
+def test_beside_a_corner_both_lines_count():
+    assert stays(standing(52.5 + 1.4, 34.0 + 1.4))
+    assert not stays(standing(52.5 + 1.5, 34.0 + 1.5))
+
+
+def test_a_player_who_runs_over_the_line_stays():
+    assert stays(standing(0.0, np.linspace(33.0, 40.0, FRAMES)))
+    out = np.full(FRAMES, 40.0)
+    out[-1] = 34.0
+    assert stays(standing(0.0, out))
+
+
+def test_frames_without_a_position_do_not_count():
+    nowhere = np.where(np.arange(FRAMES) < 10, np.nan, 40.0)
+    assert not stays(standing(nowhere, nowhere))
+    assert stays(standing(np.full(FRAMES, np.nan), np.full(FRAMES, np.nan)))
+
+
+def test_joints_that_are_not_determined_do_not_count():
+    person = standing(0.0, 36.5)
+    for frame, sighting in list(person.sightings.items()):
+        joints = sighting.joints.copy()
+        joints[5:] = np.nan
+        person.sightings[frame] = Sighting(sighting.index, sighting.ray_distance, joints)
+    assert not stays(person)
+
+
+def test_all_people_stay_without_a_pitch():
+    assert stays(standing(0.0, 80.0), pitch=None)
+
+
+CAMERAS = 10
+
+
+def shadow_track(number, views, x, frames=range(FRAMES), joints=17):
+    """Return a track at `x` [m], one or one per frame; joints from `joints` on are unknown."""
+    someone = Person(number, BODY, max(frames))
+    places = np.broadcast_to(x, FRAMES)
+    for frame in frames:
+        body = BODY + [places[frame], 0.0, 0.0]
+        body[joints:] = np.nan
+        index = np.where(np.arange(CAMERAS) < views, 0, -1)
+        someone.sightings[frame] = Sighting(index, np.full(CAMERAS, 0.02), body)
+    return someone
+
+
+def kept(*people, distance=0.5):
+    return [person.number for person in drop_shadows(list(people), distance)]
+
+
+def test_a_track_next_to_a_better_seen_person_is_a_shadow():
+    assert kept(shadow_track(0, 10, 0.0), shadow_track(1, 2, 0.2)) == [0]
+    assert kept(shadow_track(0, 10, 0.0), shadow_track(1, 2, 0.2), distance=0.0) == [0, 1]
+
+
+def test_a_neighbour_seen_by_half_as_many_cameras_stays():
+    assert kept(shadow_track(0, 10, 0.0), shadow_track(1, 5, 0.2)) == [0, 1]
+    assert kept(shadow_track(0, 5, 0.0), shadow_track(1, 2, 0.2)) == [0]
+
+
+def test_a_track_in_few_cameras_stays_if_it_stands_apart():
+    assert kept(shadow_track(0, 10, 0.0), shadow_track(1, 2, 0.6)) == [0, 1]
+
+
+@pytest.mark.parametrize(("near", "left"), [(14, [0]), (13, [0, 1])])
+def test_seven_tenths_of_the_time_decide(near, left):
+    way = np.where(np.arange(FRAMES) < near, 0.1, 3.0)
+    assert kept(shadow_track(0, 10, 0.0), shadow_track(1, 2, way)) == left
+
+
+def test_a_shadow_that_changes_from_one_person_to_another_goes():
+    way = np.where(np.arange(FRAMES) < 10, 0.1, 1.9)
+    assert kept(shadow_track(0, 10, 0.0), shadow_track(1, 2, way), shadow_track(2, 10, 2.0)) == [
+        0,
+        2,
+    ]
+
+
+def test_only_frames_and_joints_of_both_are_compared():
+    late = shadow_track(1, 2, 0.1, range(15, 20), joints=9)
+    assert kept(shadow_track(0, 10, 0.0, range(10)), late) == [0, 1]
+    assert kept(shadow_track(0, 10, 0.0), late) == [0]
+
+
+def test_a_track_without_positions_is_no_shadow():
+    assert kept(shadow_track(0, 10, 0.0), shadow_track(1, 1, 0.0, joints=0)) == [0, 1]
+    assert kept() == []
+
+
+def roster(red, blue, officials):
+    return [
+        *(PlayerSpec(id=f"r{n}", team="red") for n in range(red)),
+        *(PlayerSpec(id=f"b{n}", team="blue") for n in range(blue)),
+        *(PlayerSpec(id=f"o{n}", role="official") for n in range(officials)),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("people", "limit"),
+    [((11, 11, 3), 25), ((16, 18, 1), 23), ((11, 11, 0), None), ((11, 5, 3), None)],
+)
+def test_eleven_of_each_team_and_the_officials_are_allowed_if_all_are_named(people, limit):
+    assert roster_limit(roster(*people)) == limit
+
+
+def person(number, first, last, evidence):
+    nothing = Sighting(np.empty(0, int), np.empty(0), np.empty((0, 3)))
+    someone = Person(number, np.empty((0, 3)), last, evidence=evidence)
+    someone.sightings.update({first: nothing, last: nothing})
+    return someone
+
+
+def test_weakest_of_too_many_at_once_goes():
+    people = [
+        person(0, 0, 9, 9.0),
+        person(1, 0, 4, 4.0),
+        person(2, 3, 9, 5.0),
+        person(3, 6, 9, 1.0),
+    ]
+    kept = limit_people(people, 2)
+    assert [each.number for each in kept] == [0, 2]
+    assert limit_people(people, None) == people
+    assert limit_people([], 2) == []
+
+
+FPS, PITCH = 50.0, (20.0, 20.0)
+
+
+def track(number, frames, x, y=0.0, views=CAMERAS):
+    """Return a track over a time span [s] at a position [m], one or one per frame."""
+    frames = range(*(round(FPS * second) for second in frames))
+    x, y = np.broadcast_to(x, len(frames)), np.broadcast_to(y, len(frames))
+    someone = Person(number, BODY, frames[-1], fixed=len(frames), evidence=float(len(frames)))
+    index = np.where(np.arange(CAMERAS) < views, 0, -1)
+    for n, frame in enumerate(frames):
+        joints = BODY + [x[n], y[n], 0.0]
+        someone.sightings[frame] = Sighting(index, np.full(CAMERAS, 0.02), joints)
+    return someone
+
+
+def found(*tracks, people=None, **changed):
+    """Return the numbers of the tracks of each person."""
+    cameras = Camera.stack(
+        [
+            Camera(
+                focal=np.full(2, 1500.0),
+                principal_point=np.zeros(2),
+                distortion=np.zeros(5),
+                cam_from_world=Rigid(np.eye(3), np.zeros(3)),
+                image_size=np.array([1920, 1080]),
+            )
+        ]
+        * CAMERAS
+    )
+    tracker = FrameTracker(cameras, FPS, True, people, TrackingSettings(**changed))
+    tracker.born, tracker.low, tracker.high = 1, np.full(2, -10.0), np.full(2, 10.0)
+    _, chains = join_people(list(tracks), tracker, PITCH)
+    return sorted([part.number for part in chain] for chain in chains)
+
+
+def fetching(back=True):
+    """Return tracks of a player who leaves at 2 m/s, unseen on the line, and returns in 5 s."""
+    out = np.interp(np.arange(100), [0, 50, 100], [12.2, 13.5, 12.2])
+    parts = [track(0, (0, 1), 0.0, np.linspace(8.0, 10.0, 50)), track(1, (2, 4), 0.0, out)]
+    return [*parts, track(2, (5, 6), 0.0, np.linspace(10.0, 8.0, 50))][: 3 if back else 2]
+
+
+def test_a_player_who_fetches_the_ball_keeps_all_tracks():
+    assert found(*fetching()) == [[0, 1, 2]]
+
+
+def test_a_player_off_the_pitch_at_the_end_of_the_clip_stays():
+    assert found(*fetching(back=False)) == [[0, 1]]
+
+
+def test_a_person_never_on_the_pitch_goes_with_all_tracks():
+    away = [track(n, (2 * n, 2 * n + 1), -8.0, 12.5) for n in (3, 4, 5)]
+    assert found(*fetching(), *away) == [[0, 1, 2]]
+
+
+def duel():
+    """Return two people together for two seconds, in which few cameras see the second one."""
+    come, go = np.linspace(2.5, 0.4, 50), np.linspace(0.4, 2.5, 50)
+    parts = [track(1, (0, 1), come), track(2, (1.4, 3.4), 0.4, views=3), track(3, (3.8, 4.8), go)]
+    return track(0, (0, 5), 0.0), *parts
+
+
+def test_a_duel_that_few_cameras_see_is_the_players():
+    assert found(*duel()) == [[0], [1, 2, 3]]
+
+
+def test_a_shadow_in_several_tracks_goes():
+    person = track(0, (0, 6), 0.0)
+    shadows = [track(n, (2 * n - 2, 2 * n - 1), 0.2, views=2) for n in (1, 2, 3)]
+    assert found(person, *shadows) == [[0]]
+    assert len(found(person, *shadows, shadow_distance=0.0)) > 1
+
+
+def test_a_track_apart_does_not_save_a_shadow():
+    # In seven tenths of all frames a person is next to it.
+    apart = track(1, (0, 0.5), np.linspace(1.4, 0.6, 25), views=2)
+    assert found(track(0, (0, 6), 0.0), apart, track(2, (0.6, 3.6), 0.3, views=2)) == [[0], [1]]
+
+
+def test_a_shadow_breaks_no_join_of_accepted_tracks():
+    person, after = track(0, (0, 7), 0.0), track(3, (5.8, 6.8), np.linspace(0.4, 2.5, 50))
+    before = track(1, (0, 3), np.interp(np.arange(150), [0, 130], [4.0, 0.4]))
+    # It begins where the other stopped, and is still there when the player is back.
+    shadow = track(2, (3.1, 6.2), 0.4, views=3)
+    assert found(person, before, shadow, after) == [[0], [1, 3]]
+
+
+def test_a_roster_counts_whole_people():
+    assert found(*duel(), people=2) == [[0], [1, 2, 3]]
+
+
+@pytest.mark.parametrize("margin", [2.0, 1e3])
+def test_tracking_keeps_a_player_who_fetches_the_ball(ring, people, seen, margin):
+    seconds = np.arange(0.0, 6.0, 1.0 / FPS)
+    y = np.interp(seconds, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], [8.0, 10.0, 12.2, 13.4, 12.2, 10.0])
+    places = np.stack([np.zeros_like(y), y], axis=-1)[:, None]
+    keypoints, confidence = seen(ring(5), people(places))
+    unseen = ((seconds > 1.0) & (seconds < 2.0)) | ((seconds > 4.0) & (seconds < 5.0))
+    keypoints[unseen] = np.nan
+    settings = TrackingSettings(pitch_margin_m=margin)
+    result = track_people(ring(5), keypoints, confidence, FPS, settings, pitch_size=PITCH)
+    assert len(result.tracks) == 1
+    assert result.tracks[0].frames_seen == np.count_nonzero(~unseen)
+    assert result.report.dropped == 0

@@ -1,0 +1,265 @@
+"""Selection of real people among a clip's tracks, judged by whole people rather than fragments.
+
+A track ends after a moment unseen, so one person usually has several. A fragment of a player may
+look like a bystander, while fetching the ball, or like a shadow, if few cameras see the player in a
+duel; the player's other tracks show neither.
+
+Bystanders are never on the pitch or near it (D2, in 3D). A single camera locates a distant foot to
+a metre, and given 2D poses may show any person. Several cameras locate a track to centimetres, and
+so distinguish people waiting behind the lines from players.
+
+Shadows are false tracks that follow a person, in a few of the cameras that see it. If a detector
+reports halves of two people as a third, in two cameras at once, rays may meet. A real person so
+near to another is seen by most of the cameras that see the other; a shadow is not.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.match import PlayerSpec
+from worldpose.tracking.frame_tracker import FrameTracker
+from worldpose.tracking.joins import Candidate, choose_joins, join_costs
+from worldpose.tracking.person import Person
+
+MAX_VIEW_SHARE: Final = 0.4
+"""A shadow is seen by at most this share of the cameras that see the other person [1]."""
+MIN_SHADOW_SHARE: Final = 0.7
+"""In at least this share of its frames, a shadow has another person so near [1]."""
+TEAM_SIZE: Final = 11
+"""Players of a team on the pitch (Laws of the Game, 3)."""
+
+Chains = list[list[Person]]
+
+
+def join_people(
+    tracks: list[Person], tracker: FrameTracker, pitch_size: tuple[float, float] | None
+) -> tuple[list[Candidate], Chains]:
+    """Return the joins of a clip's tracks and the people, without shadows and bystanders.
+
+    Tracks that are neither by themselves are accepted. Another track stays if it is joined to an
+    accepted one, the chain as a whole is no shadow, and no join of accepted tracks breaks for it.
+
+    Args:
+        tracks: of the whole clip, without ghosts.
+        tracker: that made them.
+        pitch_size: length and width of the pitch around the origin [m]; None = there are no
+            bystanders.
+
+    Returns:
+        joins: of the tracks that stay.
+        chains: each person's tracks in time order.
+    """
+    settings = tracker.settings
+    sure = drop_shadows(tracks, settings.shadow_distance)
+    sure = drop_bystanders(sure, pitch_size, settings.pitch_margin_m)
+    limited = limit_people(sure, tracker.people)
+    joins, chains = join_tracks(limited, tracker)
+    if len(sure) == len(tracks):
+        return joins, chains
+    pairs = [(join.before, join.after) for join in joins if join.decided]
+    left = tracks
+    while True:
+        # Removal of tracks changes the joins: repeat until all joined tracks may stay.
+        joins, chains = join_tracks(left, tracker)
+        whole = _select_whole(chains, sure, pairs, settings.shadow_distance)
+        kept = limit_people(whole, tracker.people)
+        if len(kept) == len(left):
+            return joins, chains
+        left = kept
+
+
+def _select_whole(
+    chains: Chains, sure: list[Person], pairs: list[tuple[int, int]], distance: float
+) -> list[Person]:
+    """Return the accepted tracks, and the others of the chains that pass as a whole.
+
+    Args:
+        chains: of all tracks.
+        sure: accepted tracks, which always stay.
+        pairs: numbers of accepted tracks that are joined in the absence of others.
+        distance: of shadows [m].
+    """
+    place = {track.number: n for n, chain in enumerate(chains) for track in chain}
+    ends = [(place.get(before), place.get(after)) for before, after in pairs]
+    torn = {n for pair in ends for n in pair if pair[0] != pair[1]}
+    seen = {track.number: located_frames(track) for chain in chains for track in chain}
+    kept = []
+    for n, chain in enumerate(chains):
+        known = [track for track in chain if track in sure]
+        if 0 < len(known) < len(chain) and n not in torn:
+            mine = {track.number for track in chain}
+            others = [each for number, each in seen.items() if number not in mine]
+            if not is_shadow([seen[number] for number in mine], others, distance):
+                known = chain
+        kept.extend(known)
+    return sorted(kept, key=lambda track: track.number)
+
+
+def drop_bystanders(
+    people: list[Person], pitch_size: tuple[float, float] | None, margin: float
+) -> list[Person]:
+    """Return the people without those who are always farther outside than `margin`.
+
+    Args:
+        people: tracks of a clip.
+        pitch_size: length along x and width along y of the pitch around the origin [m]; None keeps
+            all.
+        margin: largest distance of a player outside of the lines [m].
+    """
+    if pitch_size is None:
+        return people
+    half = 0.5 * np.array(pitch_size)
+    return [person for person in people if _distance_outside(person, half) <= margin]
+
+
+def _distance_outside(person: Person, half: Floats) -> float:
+    """Return the least distance outside of the lines [m]; 0 on the pitch or without position."""
+    places = np.array([sighting.joints[:, :2] for sighting in person.sightings.values()])
+    places = places[np.isfinite(places[..., 0]).any(axis=1)]
+    outside = np.maximum(np.abs(np.nanmean(places, axis=1)) - half, 0.0)
+    return float(np.linalg.norm(outside, axis=1).min()) if len(places) else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class LocatedFrames:
+    """A track in the frames that determine its position.
+
+    Attributes:
+        frame: (frames,) rising.
+        joints: (frames, 17, 3) [m], world; NaN where not determined.
+        views: (frames,) cameras that see it.
+    """
+
+    frame: Integers
+    joints: Floats
+    views: Integers
+
+
+def drop_shadows(people: list[Person], distance: float) -> list[Person]:
+    """Return the people without those nearly always close to a person seen by far more cameras.
+
+    Args:
+        people: tracks of a clip.
+        distance: between bodies, below which one may be the other's shadow [m]; 0 keeps all.
+    """
+    if distance <= 0.0:
+        return people
+    seen = [located_frames(person) for person in people]
+    return [
+        person
+        for n, person in enumerate(people)
+        if not is_shadow(seen[n : n + 1], seen[:n] + seen[n + 1 :], distance)
+    ]
+
+
+def is_shadow(chain: list[LocatedFrames], others: list[LocatedFrames], distance: float) -> bool:
+    """Return whether a person is nearly always close to a person seen by far more cameras.
+
+    Args:
+        chain: the person's tracks.
+        others: the tracks of all other people.
+        distance: between bodies, below which one may be the other's shadow [m].
+    """
+    beside = np.concatenate([_near_better_seen(track, others, distance) for track in chain])
+    return bool(len(beside)) and float(beside.mean()) >= MIN_SHADOW_SHARE
+
+
+def _near_better_seen(track: LocatedFrames, others: list[LocatedFrames], distance: float) -> Flags:
+    """Return the frames (frames,) in which a person seen by far more cameras is so near."""
+    beside = np.zeros(len(track.frame), dtype=np.bool_)
+    for other in others:
+        _, mine, theirs = np.intersect1d(
+            track.frame, other.frame, assume_unique=True, return_indices=True
+        )
+        fewer = track.views[mine] <= MAX_VIEW_SHARE * other.views[theirs]
+        mine, theirs = mine[fewer], theirs[fewer]
+        apart = track.joints[mine] - other.joints[theirs]
+        known = np.isfinite(apart[..., 0])
+        total = np.where(known[..., None], apart, 0.0).sum(axis=1)
+        count = known.sum(axis=1)
+        # Of bodies, not of joints: a shadow's joints are another person's, or mix two people's.
+        beside[mine] |= np.linalg.norm(total, axis=1) < distance * count
+    return beside
+
+
+def located_frames(person: Person) -> LocatedFrames:
+    """Return a track in the frames that determine its position."""
+    frames = sorted(person.sightings)
+    sightings = [person.sightings[frame] for frame in frames]
+    joints = np.array([each.joints for each in sightings])
+    views = np.array([np.count_nonzero(each.index >= 0) for each in sightings])
+    placed = np.isfinite(joints[..., 0]).any(axis=1)
+    return LocatedFrames(np.array(frames)[placed], joints[placed], views[placed])
+
+
+def people_at_births(people: list[Person]) -> dict[int, list[Person]]:
+    """Return the people between birth and last fix, by the frame of every birth."""
+    births = sorted({min(person.sightings) for person in people})
+    return {
+        frame: [person for person in people if min(person.sightings) <= frame <= person.last_fixed]
+        for frame in births
+    }
+
+
+def limit_people(people: list[Person], limit: int | None) -> list[Person]:
+    """Return the people without those beyond the limit at any time, who have the least evidence.
+
+    Args:
+        people: tracks of a clip.
+        limit: most people at once; None = any number.
+    """
+    if limit is None:
+        return people
+    kept = list(people)
+    for together in people_at_births(people).values():
+        still = sorted(
+            (person for person in together if person in kept),
+            key=lambda person: (-person.evidence, person.number),
+        )
+        for person in still[limit:]:
+            kept.remove(person)
+    return kept
+
+
+def roster_limit(roster: Sequence[PlayerSpec]) -> int | None:
+    """Return the most people on the pitch at once in a match with this roster.
+
+    Eleven of each of two teams and the officials; None for a smaller roster, which may leave out
+    people.
+    """
+    teams = Counter(person.team for person in roster if person.role != "official")
+    officials = sum(person.role == "official" for person in roster)
+    complete = len(teams) == 2 and min(teams.values()) >= TEAM_SIZE and officials > 0
+    return 2 * TEAM_SIZE + officials if complete else None
+
+
+def join_tracks(
+    tracks: list[Person], tracker: FrameTracker
+) -> tuple[list[Candidate], list[list[Person]]]:
+    """Return the joins of a clip's tracks, and the people as chains of tracks in time order."""
+    if not tracks:
+        return [], []
+    numbers = [person.number for person in tracks]
+    ends = [tracker.track_ends(person) for person in tracks]
+    starts, stops = [start for start, _ in ends], [stop for _, stop in ends]
+    settings = tracker.settings
+    costs = join_costs(stops, starts, tracker.fps, tracker.area, settings)
+    joins = choose_joins(stops, starts, costs, settings)
+    after = {join.before: join.after for join in joins if join.decided}
+    people = {person.number: person for person in tracks}
+    chains = []
+    for number in numbers:
+        if number in after.values():
+            continue
+        chain = [people[number]]
+        while chain[-1].number in after:
+            chain.append(people[after[chain[-1].number]])
+        chains.append(chain)
+    return joins, chains
