@@ -21,11 +21,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.conventions import COCO17_FLIP
 from worldpose.camera_consistency import ConsistencySettings, check_consistency
 from worldpose.geometry import Camera, Rigid
 
 KINDS = ("flipped", "mirrored", "focal", "lens", "clock", "frame_rate", "swapped", "duplicate")
-FLIPPED_JOINTS = [0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15]
 """COCO-17 with left and right swapped."""
 MOCAP_JOINTS = ("head", "lShldr", "lForeArm", "lHand", "lThigh", "lShin", "lFoot")
 
@@ -319,7 +319,7 @@ def detect(
             joints = image[t, p] + error * scale + rng.normal(0, 0.5, (17, 2))
             joints[~inside[t, p] | (rng.random(17) < detector.joint_misses)] = np.nan
             if rng.random() < 0.03:
-                joints = joints[FLIPPED_JOINTS]
+                joints = joints[list(COCO17_FLIP)]
             here.append(joints)
         for place, model in ghosts:
             if rng.random() < 0.6 and np.isfinite(image[t, model]).all():
@@ -375,7 +375,7 @@ def plant(
         if way == 0:
             points = rig.keypoints[:, c]
             points[..., 0] = camera.image_size[0] - 1.0 - points[..., 0]
-            rig.keypoints[:, c] = points[..., FLIPPED_JOINTS, :]
+            rig.keypoints[:, c] = points[..., COCO17_FLIP, :]
         elif way < 3:
             turn = np.diag([-1.0, 1.0, -1.0] if way == 1 else [1.0, -1.0, -1.0])
             rig.cameras[c] = with_pose(camera, rotation @ turn, turn @ center)

@@ -22,7 +22,7 @@ import torch
 
 from data_contracts.arrays import Image
 from worldpose.detection import People
-from worldpose.detection.bundled import embedded_detector, embedded_pose
+from worldpose.detection.models import load_bundled_detector, load_bundled_pose
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS
 from worldpose.simulation.casting import dress_people, roles_of
@@ -51,7 +51,7 @@ def main() -> None:
     torch.set_num_threads(1)
     rendering, pictures = rendered(asked.people, asked.frames)
     decoding = decoded(pictures)
-    detector, estimator = embedded_detector(), embedded_pose()
+    detector, estimator = load_bundled_detector(), load_bundled_pose()
     detector.detect(pictures[:1])
     looking, found = timed(lambda: detector.detect(pictures))
     people = [People(p.boxes[p.scores >= SURE], p.scores[p.scores >= SURE]) for p in found]

@@ -19,11 +19,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from worldpose.detection.bundled import embedded_detector, embedded_pose
+from worldpose.detection.models import load_bundled_detector, load_bundled_pose
 from worldpose.training import FineTuningSettings, read_labels, write_labels
 from worldpose.training.fine_tuning import split
-from worldpose.training.pictures import PictureCache
-from worldpose.training.scoring import found_people, score_people
+from worldpose.training.labels import PictureCache
+from worldpose.training.metrics import detect_labelled, score_people
 
 WORLDPOSE = Path(sys.executable).with_name("worldpose")
 RECIPE = Path(__file__).parents[1] / "infra" / "embedded_detector"
@@ -53,8 +53,13 @@ def main() -> None:
 def stored(labels: Path, files: dict[str, Path]) -> float:
     """Return AP50 of the boxes that `detection` stores for held-out images with these nets."""
     held_out = split(read_labels(labels), FineTuningSettings())[2]
-    detector, pose = embedded_detector(files.get("people")), embedded_pose(files.get("keypoints"))
-    return score_people(found_people(detector, held_out, PictureCache(1 << 28), pose), held_out)[0]
+    detector, pose = (
+        load_bundled_detector(files.get("people")),
+        load_bundled_pose(files.get("keypoints")),
+    )
+    return score_people(detect_labelled(detector, held_out, PictureCache(1 << 28), pose), held_out)[
+        0
+    ]
 
 
 def _row(net: str, figure: str, before: float, after: float) -> str:

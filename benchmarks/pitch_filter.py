@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image
 from worldpose.detection import DetectionSettings, PeopleFinder, Place
-from worldpose.detection.boxes import overlaps
-from worldpose.detection.bundled import embedded_detector, embedded_pose
+from worldpose.detection.models import load_bundled_detector, load_bundled_pose
 from worldpose.geometry import Camera
+from worldpose.geometry.boxes import box_iou
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS
 from worldpose.simulation.casting import dress_people, roles_of, stand_by
@@ -52,7 +52,7 @@ def main() -> None:
     scenario = SCENARIOS[asked.scenario].model_copy(update={"duration": 0.2, "broadcast": None})
     pitch = PitchTemplate.from_spec(scenario.pitch)
     settings = DetectionSettings(high_score_threshold=DetectionSettings().low_score_threshold)
-    finder = PeopleFinder([embedded_detector()], embedded_pose(), settings)
+    finder = PeopleFinder([load_bundled_detector()], load_bundled_pose(), settings)
     for seed in asked.seeds:
         counts = np.zeros((5, 2), int)
         for name, camera, frame, bystanders in filmed(scenario, pitch, seed):
@@ -124,7 +124,7 @@ def shared(boxes: Floats, others: Floats, share: float = SHARED) -> NDArray[np.b
     """Return whether each box overlaps any of the others by a share (n,)."""
     if not len(others):
         return np.zeros(len(boxes), bool)
-    return np.asarray(overlaps(boxes, others).max(axis=1) >= share)
+    return np.asarray(box_iou(boxes, others).max(axis=1) >= share)
 
 
 def draw(file: Path, picture: Image, boxes: Floats, kept: NDArray[np.bool_]) -> None:

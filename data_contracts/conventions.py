@@ -65,6 +65,15 @@ COCO17_BODY_BONES = (
 )
 """Bones below the neck whose lengths measure a person's size."""
 
+COCO17_LIMBS = ((5, 7), (6, 8), (7, 9), (8, 10), (11, 13), (12, 14), (13, 15), (14, 16))
+"""Upper and lower ends of upper arms, forearms, thighs and shanks, left before right."""
+
+COCO17_TORSO = (5, 6, 11, 12)
+"""Left and right shoulder, left and right hip."""
+
+COCO17_FLIP = (0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15)
+"""The joint that each joint becomes in the mirror image."""
+
 COCO17_SIGMAS = (
     0.026,
     0.025,

@@ -10,7 +10,7 @@ from pathlib import Path
 from prefect import task
 
 from data_contracts.finetune import NetKind, NetVersion
-from worldpose.detection.bundled import EMBEDDED
+from worldpose.detection.models import BUNDLED_WEIGHTS
 from worldpose.training import FineTuningSettings, read_labels
 
 LOG = logging.getLogger("worldpose.finetune")
@@ -37,10 +37,10 @@ def finetune(
         settings: steps, learning rate, sampling shares of images, seed.
         start: initial weights; the shipped ones if None.
     """
-    from worldpose.training.fine_tuning import FIGURES, fine_tune
+    from worldpose.training.fine_tuning import NET_METRICS, fine_tune
 
     labels = _digest(annotations)
-    parent = start or EMBEDDED[0 if kind == "people" else 1]
+    parent = start or BUNDLED_WEIGHTS[0 if kind == "people" else 1]
     folder.mkdir(parents=True, exist_ok=True)
     # The name prevents other trainings from resuming its checkpoint.
     about = f"{labels}{_digest(parent)}{settings.model_dump_json()}".encode()
@@ -64,7 +64,7 @@ def finetune(
         labels=labels,
         learned=len(result.learned),
         held_out=tuple(picture.path.name for picture in result.held_out),
-        figure=FIGURES[kind],
+        figure=NET_METRICS[kind],
         before=result.before,
         after=result.after,
         steps=result.steps,

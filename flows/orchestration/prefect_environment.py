@@ -76,7 +76,7 @@ SERVED = {
     "DASK_DISTRIBUTED__DEPLOY__LOST_WORKER_TIMEOUT": str(START_SECONDS),
 }
 """Defaults of serving processes."""
-EMBEDDED = {
+BUNDLED_WEIGHTS = {
     # Used by automations and blocks, which a run's own server does not have.
     "PREFECT_API_BLOCKS_REGISTER_ON_START": "false",
     "PREFECT_SERVER_SERVICES_TRIGGERS_ENABLED": "false",
@@ -275,7 +275,7 @@ def _embedded_server(home: Path, log: Path) -> Iterator[tuple[str, Callable[[], 
             stderr=subprocess.STDOUT,
             pass_fds=[listening.fileno()],
             env={
-                **EMBEDDED,
+                **BUNDLED_WEIGHTS,
                 **without_secrets(os.environ, keep=DATABASE),
                 SERVER_LOGIN: os.environ[CLIENT_LOGIN],
                 "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": address.removesuffix("/api"),

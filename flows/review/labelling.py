@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from worldpose.detection import DetectionSettings, load_detectors, load_pose
 from worldpose.errors import InputError, UsageError
-from worldpose.training.proposing import propose_labels
+from worldpose.training.labels import propose_labels
 from worldpose.video import open_video
 
 

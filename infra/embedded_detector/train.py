@@ -21,12 +21,18 @@ import torch
 from scenes import CHECKING, CROWDS, HELD_OUT, TRAINING, VARIETY, read_set, render_set
 
 from worldpose.detection import DetectionSettings
-from worldpose.detection.bundled import EmbeddedDetector, EmbeddedPose
-from worldpose.detection.bundled_nets import KeypointNet, PeopleNet
-from worldpose.detection.bundled_weights import load_weights, save_weights
+from worldpose.detection.bundled_detector import BundledDetector
+from worldpose.detection.bundled_nets import KeypointNet, PeopleNet, load_weights, save_weights
+from worldpose.detection.bundled_pose import BundledPoseEstimator
 from worldpose.training import LabelledPicture, PictureCache, TrainingSettings
-from worldpose.training.nets import LEAST_HEIGHT, train_keypoint_net, train_people_net
-from worldpose.training.scoring import HEIGHTS, apart, found_people, score_keypoints, score_people
+from worldpose.training.metrics import (
+    HEIGHTS,
+    detect_labelled,
+    ignore_crowded,
+    score_keypoints,
+    score_people,
+)
+from worldpose.training.training_loop import MIN_HEIGHT, train_keypoint_net, train_people_net
 
 Net = TypeVar("Net", PeopleNet, KeypointNet)
 
@@ -144,21 +150,23 @@ def score(
     folder: Path, pictures: Sequence[LabelledPicture], cache: PictureCache
 ) -> dict[str, object]:
     """Return metrics on scenes outside training and selection."""
-    detector = EmbeddedDetector(load_weights(folder / "embedded_people.safetensors", PeopleNet()))
-    pose = EmbeddedPose(load_weights(folder / "embedded_keypoints.safetensors", KeypointNet()))
+    detector = BundledDetector(load_weights(folder / "embedded_people.safetensors", PeopleNet()))
+    pose = BundledPoseEstimator(
+        load_weights(folder / "embedded_keypoints.safetensors", KeypointNet())
+    )
     classes = ["all", *(f"{low:g} to {high:g} px" for low, high in HEIGHTS)]
-    found, kept = (found_people(detector, pictures, cache, each) for each in (None, pose))
-    beside = found_people(detector, pictures, cache, pose, DetectionSettings(find_occluded=True))
+    found, kept = (detect_labelled(detector, pictures, cache, each) for each in (None, pose))
+    beside = detect_labelled(detector, pictures, cache, pose, DetectionSettings(find_occluded=True))
     alone, stored, free, more = (
         dict(zip(classes, score_people(people, labels), strict=True))
         for people, labels in (
             (found, pictures),
             (kept, pictures),
-            (kept, apart(pictures)),
+            (kept, ignore_crowded(pictures)),
             (beside, pictures),
         )
     )
-    limits = [(LEAST_HEIGHT, 1e9), *HEIGHTS]
+    limits = [(MIN_HEIGHT, 1e9), *HEIGHTS]
     placed = {
         name: score_keypoints(pose, pictures, cache, each).__dict__
         for name, each in zip(classes, limits, strict=True)

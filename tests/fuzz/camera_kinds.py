@@ -204,13 +204,13 @@ def mirrored_images(draft, rng):
     name = some(draft, rng)
     camera = draft.cameras[name]
 
-    class Mirrored(Camera):
+    class FlipTest(Camera):
         def pixels(self, points):
             found = super().pixels(points)
             found[..., 0] = self.width - 1 - found[..., 0]
             return found
 
-    draft.cameras[name] = Mirrored(**vars(camera))
+    draft.cameras[name] = FlipTest(**vars(camera))
 
 
 # ------------------------------------------------------------------------- calibration.toml

@@ -13,6 +13,7 @@ from worldpose.dataset.faults import axis_orders
 from worldpose.dataset.plausibility import BONES
 from worldpose.dataset.settings import CheckSettings
 from worldpose.formats.camera_file import CameraRows
+from worldpose.geometry.boxes import box_iou
 
 _BODIES: Final = 400
 """Maximum number of sampled bodies."""
@@ -130,12 +131,9 @@ def _overlap(boxes: Floats, skel_2d: Floats) -> float:
     known = np.isfinite(skel_2d).all((-1, -2)) & np.isfinite(boxes).all(-1)
     if not np.any(known):
         return 1.0
-    box, points = boxes[known], skel_2d[known]
-    low, high = points.min(1), points.max(1)
-    both = np.minimum(high, box[:, 2:]) - np.maximum(low, box[:, :2])
-    shared = np.maximum(both, 0.0).prod(-1)
-    whole = np.maximum(box[:, 2:] - box[:, :2], 0.0).prod(-1) + (high - low).prod(-1) - shared
-    return float(np.median(shared / np.maximum(whole, 1e-9)))
+    points = skel_2d[known]
+    around = np.concatenate([points.min(1), points.max(1)], axis=-1)
+    return float(np.median(box_iou(boxes[known][:, None], around[:, None])))
 
 
 def _left(bodies: Floats, plane: Floats, focal: Floats) -> float:

@@ -2,20 +2,26 @@
 
 Needs torch; the rest of the package imports this module only on demand. Both nets are plain
 residual pyramids of 3 x 3 convolutions, which CPUs compute fastest; they differ in their heads.
+Their weights are safetensors files: names, shapes and numbers, no code.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import Final, NamedTuple, TypeVar
 
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from worldpose.detection.bundled_surroundings import MAPS
+from worldpose.detection.bundled_crops import MAP_COUNT
+from worldpose.errors import InputError
 
 Net = TypeVar("Net", bound=nn.Module)
 
@@ -29,7 +35,11 @@ CELL: Final = 2
 """Pixels of the crop per cell of the keypoint maps [px]."""
 EDGE_CELL: Final = 4
 """Pixels of the crop per cell of the edge maps [px]."""
+APART: Final = 3
+"""Cells to either side of a position in which no other position is chosen."""
 JOINTS: Final = 17
+FORMAT: Final = "worldpose-net"
+"""Key of a file's metadata that names the class of the net."""
 _SCALE: Final = 16.0
 """Distance of a box side of logarithm 0 from its cell [px]: that of a person of about 60 px."""
 
@@ -81,9 +91,9 @@ class Pyramid(nn.Module):
         self.stages, self.laterals = nn.ModuleList(stages), nn.ModuleList(laterals)
         self.merged = nn.ModuleList(merged)
 
-    def forward(self, picture: Tensor, added: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def forward(self, image: Tensor, added: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the finest and the coarsest map; `added` is added to the output of the stem."""
-        stem = self.stem(picture)
+        stem = self.stem(image)
         maps = [self.stages[0](stem if added is None else stem + added)]
         for stage in self.stages[1:]:
             maps.append(stage(maps[-1]))
@@ -105,17 +115,17 @@ class PeopleNet(nn.Module):
         last.bias = nn.Parameter(torch.tensor([-4.6, 0.0, 0.0, 0.0, 0.0]))
         self.head = nn.Sequential(Block(24, 32), last)
 
-    def forward(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Return the maps of frames whose sides are multiples of `COARSEST`.
 
         Args:
-            pictures: (batch, 3, height, width) `normalised`.
+            images: (batch, 3, height, width) from `normalize`.
 
         Returns:
             Logits that a cell is a person's centre (batch, rows, columns), and distances from the
             cell's centre to left, top, right and bottom (batch, 4, rows, columns) [px].
         """
-        features, _ = self.pyramid(pictures)
+        features, _ = self.pyramid(images)
         maps = self.head(features).float()
         return maps[:, 0], _SCALE * torch.exp(maps[:, 1:].clamp(-4.0, 4.0))
 
@@ -144,7 +154,7 @@ class KeypointNet(nn.Module):
         super().__init__()
         stem = nn.Sequential(Block(3, 16, stride=2), Block(16, 32, stride=2))
         self.pyramid = Pyramid(stem, (32, 64, 128), (2, 2, 2))
-        self.around = nn.Conv2d(MAPS, 32, 3, padding=1, bias=False)
+        self.around = nn.Conv2d(MAP_COUNT, 32, 3, padding=1, bias=False)
         nn.init.zeros_(self.around.weight)
         self.head = nn.Sequential(Block(32, 64), nn.Conv2d(64, 4 * JOINTS, 1))
         self.doubt = nn.Linear(128, JOINTS)
@@ -156,7 +166,7 @@ class KeypointNet(nn.Module):
         """Return the net's output for crops.
 
         Args:
-            crops: (batch, 3, height, width) `normalised`.
+            crops: (batch, 3, height, width) from `normalize`.
             surroundings: (batch, 3, rows, columns) maps of the target box and its neighbours.
         """
         features, coarsest = self.pyramid(crops, self.around(surroundings))
@@ -175,13 +185,13 @@ class KeypointNet(nn.Module):
             mass: (batch, 17) or, for several positions each, (batch, 17, places).
         """
         places = (1,) * (mass.ndim - 2)
-        trusted = self.trust.view(-1, *places) * torch.logit(mass, eps=1e-4)
-        return doubt.view(*doubt.shape, *places) + trusted
+        trusted = self.trust.view((-1, *places)) * torch.logit(mass, eps=1e-4)
+        return doubt.view((*doubt.shape, *places)) + trusted
 
 
-def normalised(pictures: Tensor) -> Tensor:
+def normalize(images: Tensor) -> Tensor:
     """Return images (batch, height, width, 3) of bytes as the nets take them (batch, 3, ...)."""
-    return pictures.permute(0, 3, 1, 2).float().sub_(115.0).div_(58.0)
+    return images.permute(0, 3, 1, 2).float().sub_(115.0).div_(58.0)
 
 
 def peaks(maps: Tensor) -> tuple[Tensor, Tensor]:
@@ -232,7 +242,7 @@ def edges(maps: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack(places, dim=1), torch.stack(spreads, dim=1)
 
 
-def folded(net: Net) -> Net:
+def fold_normalisations(net: Net) -> Net:
     """Return `net` for inference: its normalisations are part of its convolutions.
 
     Args:
@@ -246,3 +256,144 @@ def folded(net: Net) -> Net:
             module[0] = fuse_conv_bn_eval(convolution, normalisation)
             module[1] = nn.Identity()
     return net
+
+
+def cell_centres(count: int, device: torch.device) -> Tensor:
+    """Return the centres of the cells of a row in the frame (count,) [px]."""
+    return torch.arange(count, device=device) * STRIDE + 0.5 * (STRIDE - 1)
+
+
+def decode_boxes(logits: Tensor, sides: Tensor, least: float, most: int) -> tuple[Tensor, Tensor]:
+    """Return boxes (people, 4) [px] and scores (people,) of one frame, best first.
+
+    Args:
+        logits: (rows, columns) that a cell is a person's centre.
+        sides: (4, rows, columns) distances from there to left, top, right and bottom [px].
+        least: lowest score reported.
+        most: most people reported.
+    """
+    score = torch.sigmoid(logits)
+    best = functional.max_pool2d(score[None, None], 3, stride=1, padding=1)[0, 0]
+    row, column = torch.nonzero((score == best) & (score >= least), as_tuple=True)
+    order = torch.argsort(score[row, column], descending=True, stable=True)[:most]
+    row, column = row[order], column[order]
+    x = cell_centres(score.shape[1], score.device)[column]
+    y = cell_centres(score.shape[0], score.device)[row]
+    left, top, right, bottom = sides[:, row, column]
+    return torch.stack([x - left, y - top, x + right, y + bottom], dim=1), score[row, column]
+
+
+def decode_candidates(maps: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return candidate positions of each joint, finer than cells, the likeliest first.
+
+    Positions are the means over the 5 x 5 cells around the peaks of a map.
+
+    Args:
+        maps: (batch, joints, rows, columns) logits.
+        count: positions of each joint.
+
+    Returns:
+        Positions (batch, joints, count, 2) [px of the crop], and the probability around each
+        (batch, joints, count); 0 where a map has fewer peaks.
+    """
+    columns = maps.shape[-1]
+    chance = functional.softmax(maps.flatten(2), dim=-1).view_as(maps)
+    peak = chance == _highest_near(chance)
+    _, cell = torch.where(peak, chance, 0.0).flatten(2).topk(2 * count, dim=-1)
+    around = torch.arange(5, device=maps.device)
+    # In maps padded by two cells, the 5 x 5 cells around a cell begin at its own row and column.
+    padded = functional.pad(chance, (2, 2, 2, 2)).flatten(2)
+    first = cell // columns * (columns + 4) + cell % columns
+    at = first[..., None, None] + around[:, None] * (columns + 4) + around
+    about = padded.gather(-1, at.flatten(2)).view(at.shape)
+    mass = about.sum(dim=(-2, -1))
+    total = mass.clamp(min=1e-12)
+    x = cell % columns + (about * (around - 2.0)).sum(dim=(-2, -1)) / total
+    y = cell // columns + (about * (around[:, None] - 2.0)).sum(dim=(-2, -1)) / total
+    places = CELL * torch.stack([x, y], dim=-1) + 0.5 * (CELL - 1)
+    mass = torch.where(peak.flatten(2).gather(-1, cell), mass, 0.0)
+    mass, order = (each[..., :count] for each in mass.sort(dim=-1, descending=True, stable=True))
+    return places.gather(2, order[..., None].expand(*order.shape, 2)), mass
+
+
+def _highest_near(maps: Tensor) -> Tensor:
+    """Return the highest value within `APART` cells of each, along rows and columns."""
+    for axis in (2, 3):
+        border = (0, 0, APART, APART) if axis == 2 else (APART, APART)
+        wide = functional.pad(maps, border)
+        size = maps.shape[axis]
+        two = torch.maximum(wide.narrow(axis, 0, size + 5), wide.narrow(axis, 1, size + 5))
+        four = torch.maximum(two.narrow(axis, 0, size + 3), two.narrow(axis, 2, size + 3))
+        maps = torch.maximum(four.narrow(axis, 0, size), four.narrow(axis, 3, size))
+    return maps
+
+
+def save_weights(path: Path, net: nn.Module, about: dict[str, str] | None = None) -> None:
+    """Write a net's weights atomically; equal weights give equal bytes.
+
+    Args:
+        path: an existing file is replaced.
+        net: one of `worldpose.detection.bundled_nets`.
+        about: further metadata, such as the origin of the weights.
+    """
+    tensors = {name: value.detach().contiguous() for name, value in net.state_dict().items()}
+    data = save(tensors, {**(about or {}), FORMAT: type(net).__name__})
+    # The library orders metadata at random.
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    written = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    written = written.ljust(-(-len(written) // 8) * 8)
+    data = len(written).to_bytes(8, "little") + written + data[8 + length :]
+    draft = path.with_suffix(".part")
+    draft.write_bytes(data)
+    draft.replace(path)
+
+
+def load_weights(path: Path, net: Net) -> Net:
+    """Return `net` with the weights of a file, in evaluation mode.
+
+    Raises:
+        InputError: no safetensors file, weights of another net, or numbers that are not finite.
+    """
+
+    def refusal(found: str) -> InputError:
+        return InputError(
+            str(path),
+            expected=f"weights of {type(net).__name__} as a safetensors file",
+            found=found,
+            todo="Name a file that worldpose has written, or leave it out for the shipped weights.",
+        )
+
+    if not path.is_file():
+        raise refusal("no file")
+    try:
+        with safe_open(path, framework="pt") as file:
+            kind = (file.metadata() or {}).get(FORMAT)
+            if kind != type(net).__name__:
+                raise refusal(f"weights of {kind}" if kind else "weights of something else")
+            names = file.keys()
+            tensors = {name: file.get_tensor(name) for name in names}
+    except (SafetensorError, OSError) as error:
+        raise refusal(f"a file that cannot be read ({error})") from error
+    wanted = {name: tuple(value.shape) for name, value in net.state_dict().items()}
+    given = {name: tuple(value.shape) for name, value in tensors.items()}
+    if wanted != given:
+        odd = sorted(name for name, _ in wanted.items() ^ given.items())
+        raise refusal(f"other names or shapes: {', '.join(odd[:3])}")
+    if not all(bool(torch.isfinite(value).all()) for value in tensors.values()):
+        raise refusal("numbers that are not finite")
+    net.load_state_dict(tensors)
+    return net.eval()
+
+
+def place_net(net: Net, device: str) -> Net:
+    """Return the net on a device, its batch normalisations folded into convolutions."""
+    placed = fold_normalisations(net.eval()).to(device)
+    placed.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return placed
+
+
+def precision(device: str, half: bool) -> torch.autocast:
+    """Return the context in which a net computes, in half precision if `half`."""
+    return torch.autocast(device, torch.float16, enabled=half)

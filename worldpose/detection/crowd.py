@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 
@@ -19,7 +18,7 @@ CUT: Final = 3.0
 
 def on_pitch(
     boxes: Floats, camera: Camera, image_size: tuple[int, int], pitch: PitchTemplate, margin: float
-) -> NDArray[np.bool_]:
+) -> Flags:
     """Return whether people stand on the pitch or within a margin around it (people,).
 
     The middle of a box's lower edge is where the feet touch the ground. The ray to a spectator in

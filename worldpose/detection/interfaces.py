@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image
 from data_contracts.keypoints import KeypointDetections
 
-LEAST_SCORE: Final = 0.05
+MIN_SCORE: Final = 0.05
 """A detector reports every box from this score on; the stage applies its own thresholds."""
 
 
@@ -46,11 +45,11 @@ class Detector(Protocol):
         The caller cuts larger frames into overlapping views of this size.
         """
 
-    def detect(self, pictures: Sequence[Image]) -> list[People]:
-        """Return the people in each image, from `LEAST_SCORE` on.
+    def detect(self, images: Sequence[Image]) -> list[People]:
+        """Return the people in each image, from `MIN_SCORE` on.
 
         Args:
-            pictures: of one size. The detector chooses its batch size; a result must not depend on
+            images: of one size. The detector chooses its batch size; a result must not depend on
                 the other images of a batch.
         """
 
@@ -58,11 +57,11 @@ class Detector(Protocol):
 class PoseEstimator(Protocol):
     """An estimator of the keypoints of people whose boxes are known."""
 
-    def estimate(self, picture: Image, boxes: NDArray[np.float64]) -> KeypointDetections:
+    def estimate(self, image: Image, boxes: Floats) -> KeypointDetections:
         """Return the pose in each box, in frame pixels; keypoints may lie outside of their box.
 
         Args:
-            picture: the whole frame.
+            image: the whole frame.
             boxes: (people, 4) x0, y0, x1, y1 [px]; may reach over the frame's border. No boxes is a
                 valid request.
 
@@ -74,13 +73,13 @@ class PoseEstimator(Protocol):
 
 
 @runtime_checkable
-class LooksBeside(PoseEstimator, Protocol):
+class FindsOccludedPeople(PoseEstimator, Protocol):
     """An estimator that also finds occluded people that a detector misses."""
 
-    def beside(self, picture: Image, people: People) -> KeypointDetections:
+    def find_occluded(self, image: Image, people: People) -> KeypointDetections:
         """Return occluded people next to the detected ones, with the estimator's boxes.
 
         Args:
-            picture: the whole frame.
+            image: the whole frame.
             people: detected in it.
         """

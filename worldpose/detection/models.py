@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from types import ModuleType
 from typing import Final
 
-from worldpose.detection.flip_test import Mirrored
 from worldpose.detection.interfaces import Detector, PoseEstimator
 from worldpose.detection.settings import DetectionSettings
+from worldpose.detection.views import FlipTest
 from worldpose.errors import InputError
 from worldpose.ingest.registration import digest_of_files
 
@@ -18,6 +19,13 @@ LIBRARIES: Final = {
     "onnx": ("onnxruntime",),
 }
 """Libraries that compute each kind of net: their versions affect results."""
+
+
+BUNDLED_WEIGHTS: Final = (
+    Path(__file__).with_name("embedded_people.safetensors"),
+    Path(__file__).with_name("embedded_keypoints.safetensors"),
+)
+"""Shipped weights of the bundled detector and of the bundled pose estimator."""
 
 
 def load_detectors(settings: DetectionSettings) -> list[Detector]:
@@ -33,39 +41,80 @@ def load_detectors(settings: DetectionSettings) -> list[Detector]:
 def load_pose(settings: DetectionSettings) -> PoseEstimator:
     """Return the pose estimator that the settings name; raises as `load_detectors`."""
     estimator = _pose(settings)
-    return Mirrored(estimator) if settings.flip_test else estimator
+    return FlipTest(estimator) if settings.flip_test else estimator
 
 
 def _pose(settings: DetectionSettings) -> PoseEstimator:
-    kind, path = _parted(settings.pose)
+    kind, path = _split_name(settings.pose)
     if kind == "embedded":
-        from worldpose.detection.bundled import embedded_pose
-
-        return embedded_pose(path, settings.device, settings.half)
+        return load_bundled_pose(path, settings.device, settings.half)
     assert path is not None  # as parted
     if kind == "onnx":
-        from worldpose.detection.onnx_pose import onnx_pose
+        from worldpose.detection.onnx_nets import load_onnx_pose
 
-        return onnx_pose(path, settings.device)
-    from worldpose.detection.transformers_models import transformers_pose
+        return load_onnx_pose(path, settings.device)
+    from worldpose.detection.transformers_nets import load_transformers_pose
 
-    return transformers_pose(path, settings.device, settings.half)
+    return load_transformers_pose(path, settings.device, settings.half)
 
 
 def _detector(name: str, settings: DetectionSettings) -> Detector:
-    kind, path = _parted(name)
+    kind, path = _split_name(name)
     if kind == "embedded":
-        from worldpose.detection.bundled import embedded_detector
-
-        return embedded_detector(path, settings.device, settings.half)
+        return load_bundled_detector(path, settings.device, settings.half)
     assert path is not None  # as parted
     if kind == "onnx":
-        from worldpose.detection.onnx_detectors import onnx_detector
+        from worldpose.detection.onnx_nets import load_onnx_detector
 
-        return onnx_detector(path, settings.device)
-    from worldpose.detection.transformers_models import transformers_detector
+        return load_onnx_detector(path, settings.device)
+    from worldpose.detection.transformers_nets import load_transformers_detector
 
-    return transformers_detector(path, settings.device, settings.half)
+    return load_transformers_detector(path, settings.device, settings.half)
+
+
+def load_bundled_detector(
+    weights: Path | None = None, device: str = "cpu", half: bool = False
+) -> Detector:
+    """Return the bundled detector.
+
+    Args:
+        weights: a file of a fine-tuned version; the shipped one if None.
+        device: `cpu` or `cuda`.
+        half: compute in half precision, on a GPU only.
+
+    Raises:
+        InputError: the file holds other weights than this detector's, or torch is not installed.
+    """
+    nets = _bundled_nets()
+    from worldpose.detection.bundled_detector import BundledDetector
+
+    net = nets.load_weights(weights or BUNDLED_WEIGHTS[0], nets.PeopleNet())
+    return BundledDetector(net, device, half)
+
+
+def load_bundled_pose(
+    weights: Path | None = None, device: str = "cpu", half: bool = False
+) -> PoseEstimator:
+    """Return the bundled pose estimator; arguments and errors are those of the detector."""
+    nets = _bundled_nets()
+    from worldpose.detection.bundled_pose import BundledPoseEstimator
+
+    net = nets.load_weights(weights or BUNDLED_WEIGHTS[1], nets.KeypointNet())
+    return BundledPoseEstimator(net, device, half)
+
+
+def _bundled_nets() -> ModuleType:
+    """Return the module of the bundled nets, which needs torch."""
+    try:
+        from worldpose.detection import bundled_nets
+    except ImportError as error:
+        raise InputError(
+            "bundled nets",
+            expected="torch and safetensors",
+            found=str(error),
+            todo="Install worldpose[detectors].",
+        ) from error
+    return bundled_nets
 
 
 def weights_of(settings: DetectionSettings) -> dict[str, str | None]:
@@ -79,7 +128,7 @@ def weights_of(settings: DetectionSettings) -> dict[str, str | None]:
     names = (*settings.detector, settings.pose)
     found: dict[str, str | None] = {}
     for name in names:
-        kind, path = _parted(name)
+        kind, path = _split_name(name)
         found[name] = None if path is None else digest_of_weights(path)
         for library in LIBRARIES[kind]:
             try:
@@ -100,12 +149,13 @@ def digest_of_weights(path: Path) -> str:
             str(path),
             expected="the weights that detection.detector or detection.pose names",
             found="nothing",
-            todo="Put them there, or correct the name. Relative names begin where you are.",
+            todo="Put the weights there, or correct the name. A relative path starts at the "
+            "working directory.",
         )
     return digest_of_files(path)
 
 
-def _parted(name: str) -> tuple[str, Path | None]:
+def _split_name(name: str) -> tuple[str, Path | None]:
     """Return the kind of a model and the path of its weights; None for those that ship."""
     kind, colon, path = name.partition(":")
     if kind not in LIBRARIES or (colon and not path) or (kind != "embedded" and not path):

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 
 from data_contracts.records import Record
 
@@ -76,3 +76,12 @@ class DetectionSettings(Record):
     object keypoint similarity]."""
     max_people: int = Field(default=64, ge=1, le=1024)
     """Most people per frame; those with the best scores stay."""
+
+    @model_validator(mode="after")
+    def _refuse_occluded_search_in_flip_test(self) -> Self:
+        if self.find_occluded and self.flip_test:
+            raise ValueError(
+                "detection.find_occluded and detection.flip_test exclude each other, because the "
+                "flip test does not search for occluded people. Set one of them to false."
+            )
+        return self

@@ -9,9 +9,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Image
-from worldpose.detection.boxes import suppress
-from worldpose.detection.interfaces import Detector, People
+from data_contracts.arrays import Floats, Image
+from data_contracts.conventions import COCO17_FLIP
+from data_contracts.keypoints import KeypointDetections
+from worldpose.detection.interfaces import Detector, People, PoseEstimator
+from worldpose.detection.suppression import suppress
 
 EDGE: Final = 3.0
 """A view's edge cuts a person whose box ends this near to it [px of the view]."""
@@ -33,13 +35,13 @@ class View:
     y: int
     scale: float
 
-    def in_picture(self, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_frame(self, boxes: Floats) -> Floats:
         """Return boxes of the view in frame pixels: pixel centres are whole numbers in both."""
         corner = np.array([self.x, self.y, self.x, self.y], dtype=np.float64)
         return (boxes + corner + 0.5) / self.scale - 0.5
 
 
-class Tiled:
+class TiledDetector:
     """A detector that splits frames of any size into views."""
 
     def __init__(
@@ -62,14 +64,14 @@ class Tiled:
         """None: frames of any size."""
         return
 
-    def detect(self, pictures: Sequence[Image]) -> list[People]:
+    def detect(self, images: Sequence[Image]) -> list[People]:
         """Return the people in each frame, from views that do not cut them."""
         people = []
-        for picture in pictures:
-            views = list(self._views(picture.shape[1], picture.shape[0]))
-            found = self._detector.detect(_cut(picture, views, self._size))
+        for image in images:
+            views = list(self._views(image.shape[1], image.shape[0]))
+            found = self._detector.detect(_cut(image, views, self._size))
             seen = [
-                self._whole(view, one, picture.shape[1], picture.shape[0])
+                self._uncut_people(view, one, image.shape[1], image.shape[0])
                 for view, one in zip(views, found, strict=True)
             ]
             people.append(
@@ -92,7 +94,7 @@ class Tiled:
                 down = _starts(round(height * zoom), self._size[1], self._view_overlap)
                 yield from (View(x, y, zoom) for y in down for x in across)
 
-    def _whole(self, view: View, people: People, width: int, height: int) -> People:
+    def _uncut_people(self, view: View, people: People, width: int, height: int) -> People:
         """Return the people that no inner edge of the view cuts, in frame pixels."""
         x0, y0, x1, y1 = people.boxes.T
         right, low = round(width * view.scale), round(height * view.scale)
@@ -102,7 +104,7 @@ class Tiled:
             | ((x1 > self._size[0] - EDGE) & (view.x + self._size[0] < right))
             | ((y1 > self._size[1] - EDGE) & (view.y + self._size[1] < low))
         )
-        return People(view.in_picture(people.boxes[~cut]), people.scores[~cut])
+        return People(view.to_frame(people.boxes[~cut]), people.scores[~cut])
 
 
 def _starts(length: int, view: int, overlap: float) -> list[int]:
@@ -113,7 +115,7 @@ def _starts(length: int, view: int, overlap: float) -> list[int]:
     return [round(start) for start in np.linspace(0, length - view, count)]
 
 
-def _cut(picture: Image, views: Sequence[View], size: tuple[int, int]) -> list[Image]:
+def _cut(image: Image, views: Sequence[View], size: tuple[int, int]) -> list[Image]:
     """Return each view of a frame, filled with grey beyond the frame's border."""
     import cv2  # late: it takes a fifth of a second, and planning a run needs none of it
 
@@ -122,14 +124,48 @@ def _cut(picture: Image, views: Sequence[View], size: tuple[int, int]) -> list[I
     for view in views:
         if view.scale not in scaled:
             target = (
-                round(picture.shape[1] * view.scale),
-                round(picture.shape[0] * view.scale),
+                round(image.shape[1] * view.scale),
+                round(image.shape[0] * view.scale),
             )
             way = cv2.INTER_AREA if view.scale < 1.0 else cv2.INTER_LINEAR
-            resized = picture if view.scale == 1.0 else cv2.resize(picture, target, None, 0, 0, way)
+            resized = image if view.scale == 1.0 else cv2.resize(image, target, None, 0, 0, way)
             scaled[view.scale] = np.asarray(resized, dtype=np.uint8)
         part = scaled[view.scale][view.y : view.y + size[1], view.x : view.x + size[0]]
         filled = np.full((size[1], size[0], 3), FILLING, dtype=np.uint8)
         filled[: part.shape[0], : part.shape[1]] = part
         cut.append(filled)
     return cut
+
+
+class FlipTest:
+    """An estimator whose poses are the mean over an image and its mirror image.
+
+    Means are weighted by confidence; a keypoint that only one of the two shows comes from that one.
+    """
+
+    def __init__(self, estimator: PoseEstimator) -> None:
+        self._estimator = estimator
+
+    def estimate(self, image: Image, boxes: Floats) -> KeypointDetections:
+        """Return the pose in each box."""
+        last = image.shape[1] - 1
+        seen = self._estimator.estimate(image, boxes)
+        mirror = self._estimator.estimate(
+            np.ascontiguousarray(image[:, ::-1]), _mirror_boxes(boxes, last)
+        )
+        back = mirror.keypoints[:, COCO17_FLIP] * [-1.0, 1.0] + [last, 0.0]
+        both = np.stack([seen.keypoints, back])
+        weights = np.nan_to_num(np.stack([seen.confidence, mirror.confidence[:, COCO17_FLIP]]))
+        total = weights.sum(axis=0)
+        found = total > 0.0
+        mean = np.nansum(both * weights[..., None], axis=0) / np.where(found, total, 1.0)[..., None]
+        confidence = total / np.maximum((weights > 0.0).sum(axis=0), 1)
+        keypoints = np.where(found[..., None], mean, np.nan)
+        confidence = np.where(found, confidence, np.nan)
+        middle = 0.5 * (seen.boxes + _mirror_boxes(mirror.boxes, last))
+        return KeypointDetections(keypoints, confidence, middle, 0.5 * (seen.score + mirror.score))
+
+
+def _mirror_boxes(boxes: NDArray[np.floating], last: int) -> Floats:
+    """Return boxes (people, 4) in the mirror image of a frame whose last column is `last` [px]."""
+    return np.asarray(boxes[:, [2, 1, 0, 3]] * [-1.0, 1.0, -1.0, 1.0] + [last, 0.0, last, 0.0])

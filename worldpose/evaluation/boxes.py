@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.geometry import Camera
+from worldpose.geometry.boxes import box_iou
 
 
 def joint_boxes(joints: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
@@ -36,10 +37,5 @@ def box_overlaps(predicted: NDArray[np.float64], true: NDArray[np.float64]) -> N
         predicted: (frames, predicted persons, 4) x0 y0 x1 y1 [px].
         true: (frames, true persons, 4) [px].
     """
-    a, b = predicted[:, None], true[:, :, None]
-    sides = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
-    shared = np.maximum(sides, 0.0).prod(axis=-1)
-    union = (a[..., 2:] - a[..., :2]).prod(-1) + (b[..., 2:] - b[..., :2]).prod(-1) - shared
-    overlaps = np.where(np.isnan(union), np.nan, 0.0)
-    np.divide(shared, union, out=overlaps, where=union > 0.0)
-    return overlaps
+    missing = np.isnan(true[:, :, None]).any(axis=-1) | np.isnan(predicted[:, None]).any(axis=-1)
+    return np.where(missing, np.nan, box_iou(true, predicted))

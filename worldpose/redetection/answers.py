@@ -11,8 +11,11 @@ import numpy as np
 from data_contracts.arrays import AnyFloats, Flags, Floats, Image
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection import People, PoseEstimator
-from worldpose.detection.boxes import areas, combine_boxes, overlaps, surest_confidence
-from worldpose.detection.oks_nms import likeness
+from worldpose.detection.suppression import (
+    combine_boxes,
+    object_keypoint_similarity,
+    surest_confidence,
+)
 from worldpose.filtering import (
     BodyViews,
     FilteringSettings,
@@ -20,6 +23,7 @@ from worldpose.filtering import (
     Suspects,
     judge_detections,
 )
+from worldpose.geometry.boxes import box_areas, box_iou
 from worldpose.redetection.expected import Expected
 from worldpose.redetection.settings import RedetectionSettings
 from worldpose.redetection.sought import Sought
@@ -83,7 +87,7 @@ def look_again(
         people = People(sought.boxes[rows], np.ones(len(rows)))
         beside = np.empty((0, 4)) if detected is None else detected[frame].astype(np.float64)
         beside = beside[np.isfinite(beside).all(axis=1)]
-        beside = beside[(overlaps(people.boxes, beside) > 0.0).any(axis=0)]
+        beside = beside[(box_iou(people.boxes, beside) > 0.0).any(axis=0)]
         estimated = estimator.estimate(picture, np.concatenate([people.boxes, beside]))
         poses = combine_boxes(people, estimated.select(slice(len(rows))))
         with np.errstate(invalid="ignore"):
@@ -133,7 +137,7 @@ def judge_answers(
         here = here[np.argsort(own[here], kind="stable")]
         boxes = np.concatenate([answers.boxes[here], detected.boxes[frame]])
         pose = np.concatenate([answers.keypoints[here], detected.keypoints[frame]])
-        alike = likeness(pose, np.nan_to_num(areas(boxes)))[: len(here)]
+        alike = object_keypoint_similarity(pose, np.nan_to_num(box_areas(boxes)))[: len(here)]
         same = np.asarray(alike > settings.oks_nms)
         for k, row in enumerate(here):
             before = same[k, :k] & ~another[here[:k]]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from data_contracts.conventions import COCO17, COCO17_BONES
+from data_contracts.conventions import COCO17_BONES, COCO17_TORSO
 from worldpose.filtering import BodyViews
 
 AROUND: Final = (0.12, 0.20, 0.12, 0.10)
@@ -17,15 +17,18 @@ AROUND: Final = (0.12, 0.20, 0.12, 0.10)
 soles [m]."""
 BEHIND: Final = 0.2
 """A body occludes joints that are farther away than it by more than this [m]."""
-_TRUNK: Final = tuple(
-    COCO17.index(f"{side}_{part}") for part in ("shoulder", "hip") for side in ("left", "right")
-)
 
 
 def _capsules() -> tuple[NDArray[np.int64], Floats]:
     """Return pairs of joints at the ends of a body's solid parts, and their radii [m]."""
-    trunk = set(_TRUNK)
-    ends = [*COCO17_BONES, (_TRUNK[0], _TRUNK[3]), (_TRUNK[1], _TRUNK[2]), (3, 4)]
+    left_shoulder, right_shoulder, left_hip, right_hip = COCO17_TORSO
+    trunk = set(COCO17_TORSO)
+    ends = [
+        *COCO17_BONES,
+        (left_shoulder, right_hip),
+        (right_shoulder, left_hip),
+        (3, 4),
+    ]
     radius = [0.12 if a < 5 and b < 5 else 0.11 if {a, b} <= trunk else 0.06 for a, b in ends]
     return np.array(ends), np.array(radius)
 

@@ -9,11 +9,10 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.conventions import COCO17_TORSO
 from worldpose.tracking.limbs import limb_lengths
 from worldpose.tracking.settings import TrackingSettings
 
-TORSO = (5, 6, 11, 12)
-"""Shoulders and hips, whose mean is the position of a body."""
 PLACE_NOISE = 0.1
 """Standard deviation of a position from few frames [m]."""
 VELOCITY_NOISE = 0.5
@@ -86,7 +85,7 @@ def fit_track_ends(
         fps: frames per second [1/s].
         settings: times.
     """
-    torso, whole = _mean_known(joints[:, TORSO]), _mean_known(joints)
+    torso, whole = _mean_known(joints[:, COCO17_TORSO]), _mean_known(joints)
     places = np.where(np.isfinite(torso), torso, whole)
     limbs, variance = limb_lengths(joints, fps)
     out = []

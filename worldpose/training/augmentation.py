@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Image, Singles
 from data_contracts.records import Record
-
-Levels = NDArray[np.float32]
 
 
 class AugmentationSettings(Record):
@@ -30,16 +28,14 @@ class AugmentationSettings(Record):
     """Share with sensor noise [1]."""
 
 
-def augment(
-    picture: NDArray[np.uint8], settings: AugmentationSettings, rng: np.random.Generator
-) -> NDArray[np.uint8]:
+def augment(picture: Image, settings: AugmentationSettings, rng: np.random.Generator) -> Image:
     """Return the image (height, width, 3) as another camera, light or kit would show it."""
     mixing, offset = _colours(picture[::8, ::8].mean(), settings, rng)
-    levels: Levels = np.asarray(
+    levels: Singles = np.asarray(
         cv2.transform(picture.astype(np.float32), np.column_stack([mixing, offset])), np.float32
     )
     if rng.random() < settings.soft:
-        levels = _softened(levels, rng)
+        levels = _soften(levels, rng)
     if rng.random() < settings.grain:
         grain = rng.standard_normal((*levels.shape[:2], 1), dtype=np.float32)
         levels = levels + np.float32(rng.uniform(1.0, 10.0)) * grain
@@ -53,7 +49,7 @@ def augment(
 
 def _colours(
     middle: float, settings: AugmentationSettings, rng: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats]:
     """Return the colour transform of light, camera and air: matrix (3, 3) and offset (3,)."""
     strength = settings.strength
     mixing = np.eye(3)
@@ -73,7 +69,7 @@ def _colours(
     return mixing, offset
 
 
-def _softened(levels: Levels, rng: np.random.Generator) -> Levels:
+def _soften(levels: Singles, rng: np.random.Generator) -> Singles:
     if rng.random() < 0.5:
         return np.asarray(cv2.GaussianBlur(levels, (0, 0), rng.uniform(0.4, 1.6)), np.float32)
     height, width = levels.shape[:2]

@@ -10,26 +10,24 @@ import numpy as np
 import torch
 
 from data_contracts.finetune import NetKind
-from worldpose.detection.bundled import EMBEDDED
-from worldpose.detection.bundled_nets import KeypointNet, PeopleNet
-from worldpose.detection.bundled_weights import load_weights, save_weights
+from worldpose.detection.bundled_nets import KeypointNet, PeopleNet, load_weights, save_weights
+from worldpose.detection.models import BUNDLED_WEIGHTS
 from worldpose.errors import InputError
 from worldpose.training.augmentation import AugmentationSettings
 from worldpose.training.keypoint_training import KeypointCrops
-from worldpose.training.labels import LabelledPicture
-from worldpose.training.nets import (
-    keypoint_figure,
-    people_figure,
+from worldpose.training.labels import LabelledPicture, PictureCache
+from worldpose.training.people_training import PeopleWindows
+from worldpose.training.settings import FineTuningSettings
+from worldpose.training.training_loop import (
+    keypoint_score,
+    people_score,
     train_keypoint_net,
     train_people_net,
 )
-from worldpose.training.people_training import PeopleWindows
-from worldpose.training.pictures import PictureCache
-from worldpose.training.settings import FineTuningSettings
 
 Pictures = Sequence[LabelledPicture]
 
-FIGURES: dict[NetKind, str] = {"people": "ap50", "keypoints": "pck"}
+NET_METRICS: dict[NetKind, str] = {"people": "ap50", "keypoints": "pck"}
 """Metric of each net: AP50 of boxes, share of keypoints within 0.2 torsos."""
 MILD = AugmentationSettings(
     strength=0.4, recoloured=0.1, grey=0.0, fog=0.0, soft=0.1, coded=0.1, grain=0.3
@@ -89,26 +87,34 @@ def fine_tune(
     checkpoint = weights.with_suffix(".checkpoint")
     torch.manual_seed(training.seed)
     if kind == "people":
-        people = load_weights(start or EMBEDDED[0], PeopleNet())
-        before = people_figure(people, held_out, cache)
+        people = load_weights(start or BUNDLED_WEIGHTS[0], PeopleNet())
+        before = people_score(people, held_out, cache)
         checks = train_people_net(
-            *(people, learned, checked, cache, training),
+            people,
+            learned,
+            checked,
+            cache,
+            training,
             windows=PeopleWindows(looks=MILD),
             checkpoint=checkpoint,
             progress=progress,
         )
-        after = people_figure(people, held_out, cache)
+        after = people_score(people, held_out, cache)
         save_weights(weights, people)
     else:
-        keypoints = load_weights(start or EMBEDDED[1], KeypointNet())
-        before = keypoint_figure(keypoints, held_out, cache)
+        keypoints = load_weights(start or BUNDLED_WEIGHTS[1], KeypointNet())
+        before = keypoint_score(keypoints, held_out, cache)
         checks = train_keypoint_net(
-            *(keypoints, learned, checked, cache, training),
+            keypoints,
+            learned,
+            checked,
+            cache,
+            training,
             crops=KeypointCrops(looks=MILD),
             checkpoint=checkpoint,
             progress=progress,
         )
-        after = keypoint_figure(keypoints, held_out, cache)
+        after = keypoint_score(keypoints, held_out, cache)
         save_weights(weights, keypoints)
     checkpoint.unlink(missing_ok=True)
     better = after >= before + settings.gain and after > before
@@ -130,17 +136,17 @@ def split(
     chosen = held + max(round(settings.checked * count), 1)
     parts = []
     for name, places in (
-        ("learned from", order[chosen:]),
-        ("chosen by", order[held:chosen]),
-        ("judged by", order[:held]),
+        ("training", order[chosen:]),
+        ("validation", order[held:chosen]),
+        ("the test", order[:held]),
     ):
         part = [pictures[index] for place in sorted(places) for index in blocks[place]]
         if not any((~picture.ignored).any() for picture in part):
             raise InputError(
                 "labels",
-                expected="people in the pictures that are learned from, chosen by and judged by",
-                found=f"none in those {name}, of {len(pictures)} pictures in all",
-                todo="Label more pictures; 200 are a good beginning.",
+                expected="people in the images for training, for validation and for the test",
+                found=f"no people in the images for {name}, of {len(pictures)} images in all",
+                todo="Label more images; 200 are a good start.",
             )
         parts.append(part)
     return parts[0], parts[1], parts[2]

@@ -12,26 +12,25 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from data_contracts.arrays import Floats
-from data_contracts.conventions import COCO17
+from data_contracts.arrays import Flags, Floats, Image, Singles
+from data_contracts.conventions import COCO17_FLIP
 from data_contracts.records import Record
-from worldpose.detection.boxes import overlaps
-from worldpose.detection.bundled_crops import crops_of_boxes, cut, picture_from_crop
-from worldpose.detection.bundled_nets import CELL, CROP, KeypointNet, normalised, peaks
-from worldpose.detection.bundled_surroundings import CELL as AROUND
-from worldpose.detection.bundled_surroundings import MAPS, SAME, surroundings
-from worldpose.training.augmentation import AugmentationSettings, augment
-from worldpose.training.box_overlap import shared
-from worldpose.training.labels import LabelledPicture
-from worldpose.training.pictures import PictureCache
-
-MIRRORED: Final = np.array(
-    [
-        COCO17.index(name.replace("left", "*").replace("right", "left").replace("*", "right"))
-        for name in COCO17
-    ]
+from worldpose.detection.bundled_crops import (
+    MAP_CELL,
+    MAP_COUNT,
+    SAME_PERSON_IOU,
+    crops_around,
+    cut_crop,
+    frame_from_crop,
+    surroundings,
 )
-"""The same joint on the other side."""
+from worldpose.detection.bundled_nets import CELL, CROP, KeypointNet, normalize, peaks
+from worldpose.geometry.boxes import box_iou
+from worldpose.training.augmentation import AugmentationSettings, augment
+from worldpose.training.labels import LabelledPicture, PictureCache
+from worldpose.training.metrics import MAX_ERROR_SHARE
+from worldpose.training.people_training import box_overlap
+
 SPREAD: Final = 2.0
 """Standard deviation of the target around a joint [px of the crop]."""
 HIDDEN: Final = 0.4
@@ -42,8 +41,6 @@ MOST: Final = 24
 """Most people per crop that its box is compared with, the nearest."""
 HALF: Final = 0.5 * (np.array(CROP) - 1.0)
 """The centre of a crop [px of the crop]."""
-RIGHT: Final = 0.05
-"""A keypoint is correct within this share of the box's longer side [1], a fifth of a torso."""
 
 
 class KeypointCrops(Record):
@@ -51,8 +48,8 @@ class KeypointCrops(Record):
 
     crops: int = 16
     """Crops per batch."""
-    height: tuple[float, float] = (34.0, 260.0)
-    """Least height of people shown smaller [px]; no code uses the upper limit."""
+    min_height: float = 34.0
+    """Least height of people shown smaller [px]."""
     shift: float = 0.08
     """Largest shift of a box, as a share of its sides [1]: detectors err."""
     scale: float = 0.18
@@ -96,17 +93,17 @@ class KeypointBatch:
         ignored: (crops, most_people)
     """
 
-    crops: NDArray[np.uint8]
-    surroundings: NDArray[np.float32]
-    keypoints: NDArray[np.float32]
+    crops: Image
+    surroundings: Singles
+    keypoints: Singles
     visible: NDArray[np.int8]
-    tolerance: NDArray[np.float32]
-    boxes: NDArray[np.float32]
-    people: NDArray[np.float32]
-    ignored: NDArray[np.bool_]
+    tolerance: Singles
+    boxes: Singles
+    people: Singles
+    ignored: Flags
 
 
-def people_of(
+def labelled_people(
     pictures: Sequence[LabelledPicture], least: float = 0.0
 ) -> list[tuple[LabelledPicture, int]]:
     """Return all labelled people with at least two joints and at least `least` tall [px]."""
@@ -129,14 +126,15 @@ def keypoint_batch(
     """Return a batch; the same generator gives the same one.
 
     Args:
-        people: drawn with equal probability, from `people_of`.
+        people: drawn with equal probability, from `labelled_people`.
         cache: reads their images.
         settings: number and augmentation of the crops.
         rng: draws people, errors of boxes and augmentations.
     """
     count = settings.crops
     crops = np.empty((count, CROP[1], CROP[0], 3), dtype=np.uint8)
-    around = np.empty((count, MAPS, *(side // AROUND for side in reversed(CROP))), np.float32)
+    cells = (CROP[1] // MAP_CELL, CROP[0] // MAP_CELL)
+    around = np.empty((count, MAP_COUNT, *cells), np.float32)
     keypoints = np.empty((count, 17, 2), dtype=np.float32)
     visible = np.empty((count, 17), dtype=np.int8)
     tolerance = np.empty(count, dtype=np.float32)
@@ -155,19 +153,19 @@ def keypoint_batch(
         middle = 0.5 * (box[:2] + box[2:]) + off
         half = 0.5 * sides * np.exp(settings.scale * (0.5 + 0.5 * far) * rng.uniform(-1, 1))
         given = np.concatenate([middle - half, middle + half])
-        crop = crops_of_boxes(given[None], CROP)[0]
+        crop = crops_around(given[None], CROP)[0]
         mirrored = bool(rng.random() < 0.5)
         turned = bool(rng.random() < settings.turned)
         turn = settings.turn * rng.uniform(-1, 1) ** 3 if turned else 0.0
-        mapping = picture_from_crop(crop, CROP, turn, mirrored)
-        others = _told(labelled, -1 if beside else person, given, settings, rng)
+        mapping = frame_from_crop(crop, CROP, turn, mirrored)
+        others = _neighbour_boxes(labelled, -1 if beside else person, given, settings, rng)
         around[index] = surroundings(given, others, mapping, CROP)
         tall = float(sides.max())
         farther = 1.0
-        if rng.random() < settings.smaller and tall > settings.height[0]:
-            farther = tall / np.exp(rng.uniform(np.log(settings.height[0]), np.log(tall)))
-        seen = _seen(cache[labelled.path], mapping, crop[2] / farther)
-        order = MIRRORED if mirrored else slice(None)
+        if rng.random() < settings.smaller and tall > settings.min_height:
+            farther = tall / np.exp(rng.uniform(np.log(settings.min_height), np.log(tall)))
+        seen = _cut_shrunk(cache[labelled.path], mapping, crop[2] / farther)
+        order = np.array(COCO17_FLIP) if mirrored else slice(None)
         pixels = (labelled.keypoints[person][order] - mapping[:, 2]) @ np.linalg.inv(
             mapping[:, :2]
         ).T
@@ -185,11 +183,11 @@ def keypoint_batch(
             _cover(seen, crops[index - 1], pixels, sight, rng)
         crops[index] = augment(seen, settings.looks, rng)
         keypoints[index], visible[index] = pixels, sight
-        tolerance[index] = RIGHT * tall / crop[2]
+        tolerance[index] = MAX_ERROR_SHARE * tall / crop[2]
     return KeypointBatch(crops, around, keypoints, visible, tolerance, boxes, everybody, ignored)
 
 
-def _told(
+def _neighbour_boxes(
     labelled: LabelledPicture,
     person: int,
     given: Floats,
@@ -204,9 +202,11 @@ def _told(
     missing = np.where(ignored, 0.5, settings.overlooked)
     sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
     boxes = boxes + settings.misplaced * rng.uniform(-1, 1, boxes.shape) * sides
-    told = boxes[(rng.random(len(boxes)) >= missing) & (overlaps(boxes, given[None])[:, 0] <= SAME)]
+    is_other = box_iou(boxes, given[None])[:, 0] <= SAME_PERSON_IOU
+    told = boxes[(rng.random(len(boxes)) >= missing) & is_other]
     nobody = given + np.tile(rng.uniform(-1, 1, 2) * (given[2:] - given[:2]), 2)
-    if rng.random() < settings.imagined and overlaps(nobody[None], given[None])[0, 0] <= SAME:
+    is_other = box_iou(nobody[None], given[None])[:, 0] <= SAME_PERSON_IOU
+    if rng.random() < settings.imagined and is_other[0]:
         told = np.concatenate([told, nobody[None]])
     return np.empty((0, 4)) if untold else told
 
@@ -217,11 +217,11 @@ def boxes_in_crop(boxes: Floats, mapping: Floats) -> Floats:
     return np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1)
 
 
-def _seen(picture: NDArray[np.uint8], mapping: Floats, scale: float) -> NDArray[np.uint8]:
+def _cut_shrunk(picture: Image, mapping: Floats, scale: float) -> Image:
     """Return a crop at `scale` frame px per crop px: a person farther away covers fewer px."""
     coarse = float(np.sqrt(abs(np.linalg.det(mapping[:, :2])))) / scale
     if coarse <= 1.0:
-        return cut(picture, mapping, CROP)
+        return cut_crop(picture, mapping, CROP)
     share = 1.0 / coarse
     width, height = (max(round(side * share), 8) for side in CROP)
     across, down = CROP[0] / width, CROP[1] / height
@@ -229,14 +229,14 @@ def _seen(picture: NDArray[np.uint8], mapping: Floats, scale: float) -> NDArray[
     small_map = np.column_stack(
         [mapping[:, :2] @ grow[:, :2], mapping[:, :2] @ grow[:, 2] + mapping[:, 2]]
     )
-    small = cut(picture, small_map, (width, height))
+    small = cut_crop(picture, small_map, (width, height))
     shrink = np.array([[1 / across, 0.0, 0.5 / across - 0.5], [0.0, 1 / down, 0.5 / down - 0.5]])
-    return cut(small, shrink, CROP)
+    return cut_crop(small, shrink, CROP)
 
 
 def _cover(
-    crop: NDArray[np.uint8],
-    other: NDArray[np.uint8],
+    crop: Image,
+    other: Image,
     pixels: Floats,
     visible: NDArray[np.int8],
     rng: np.random.Generator,
@@ -263,7 +263,7 @@ def keypoint_loss(net: KeypointNet, batch: KeypointBatch) -> Tensor:
         for each in (batch.keypoints, batch.visible, batch.tolerance)
     )
     around = torch.from_numpy(batch.surroundings).to(device)
-    maps, doubt, box, fit = net(normalised(torch.from_numpy(batch.crops).to(device)), around)
+    maps, doubt, box, fit = net(normalize(torch.from_numpy(batch.crops).to(device)), around)
     rows, columns = maps.shape[-2:]
     labelled = (visible > 0) & torch.isfinite(keypoints).all(dim=-1)
     at = torch.where(labelled[..., None], keypoints, 0.0)
@@ -303,11 +303,11 @@ def box_loss(batch: KeypointBatch, said: Tensor, fit: Tensor) -> Tensor:
         for each in (batch.boxes, batch.people, batch.ignored)
     )
     mine = torch.isfinite(boxes).all(dim=-1)
-    _, general = shared(said, torch.where(mine[:, None], boxes, said.detach()))
+    _, general = box_overlap(said, torch.where(mine[:, None], boxes, said.detach()))
     off = (mine * (1.0 - general)).sum() / mine.sum().clamp(min=1)
     with torch.no_grad():
         there = torch.isfinite(people).all(dim=-1)
-        overlap, _ = shared(said[:, None], torch.nan_to_num(people))
+        overlap, _ = box_overlap(said[:, None], torch.nan_to_num(people))
         overlap = torch.where(there, overlap, 0.0)
         best = overlap.argmax(dim=1, keepdim=True)
         counted = there.any(dim=1) & ~ignored.gather(1, best)[:, 0]

@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+import tempfile
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.conventions import COCO17
+from worldpose.detection import DetectionSettings, Detector, People, PoseEstimator
+from worldpose.detection.suppression import combine_boxes, fuse
 from worldpose.errors import InputError
+
+SEEN: Final = 0.5
+"""Keypoints from this confidence on are proposed as visible, others as occluded [1]."""
 
 
 class _Given(BaseModel):
@@ -57,7 +65,7 @@ class LabelledPicture:
     boxes: Floats
     keypoints: Floats
     visible: NDArray[np.int8]
-    ignored: NDArray[np.bool_]
+    ignored: Flags
 
 
 def read_labels(annotations: Path, pictures: Path | None = None) -> list[LabelledPicture]:
@@ -100,7 +108,7 @@ def read_labels(annotations: Path, pictures: Path | None = None) -> list[Labelle
     read = [_picture(folder, image, people[image.id]) for image in images]
     for picture in read:
         if not picture.path.resolve().is_relative_to(folder.resolve()):
-            raise refusal("pictures within the data set's folder", str(picture.path))
+            raise refusal("images within the folder of the data set", str(picture.path))
     return read
 
 
@@ -158,3 +166,105 @@ def _picture(folder: Path, image: _Image, people: Sequence[_Person]) -> Labelled
         visible=visible,
         ignored=np.array([bool(person.iscrowd) for person in people], dtype=np.bool_),
     )
+
+
+def read_picture(path: Path) -> Image:
+    """Return an image (height, width, 3) in RGB.
+
+    Raises:
+        InputError: the file is no readable image.
+    """
+    data = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if data is None:
+        raise InputError(
+            str(path),
+            expected="a readable image",
+            found="a missing or unreadable file",
+            todo="Put the images of the data set where its annotations say.",
+        )
+    return np.ascontiguousarray(np.asarray(data, dtype=np.uint8)[..., ::-1])
+
+
+class PictureCache:
+    """Images by path, in a cache that evicts the least recently used.
+
+    Args:
+        most: largest size of the cache [byte].
+    """
+
+    def __init__(self, most: int = 3 << 30) -> None:
+        self._most, self._size = most, 0
+        self._kept: OrderedDict[Path, Image] = OrderedDict()
+
+    def __getitem__(self, path: Path) -> Image:
+        if path in self._kept:
+            self._kept.move_to_end(path)
+            return self._kept[path]
+        picture = read_picture(path)
+        self._kept[path] = picture
+        self._size += picture.nbytes
+        while self._size > self._most and len(self._kept) > 1:
+            _, gone = self._kept.popitem(last=False)
+            self._size -= gone.nbytes
+        return picture
+
+
+def propose_labels(
+    frames: Iterable[tuple[str, Image]],
+    detectors: list[Detector],
+    pose: PoseEstimator,
+    folder: Path,
+    settings: DetectionSettings | None = None,
+) -> list[LabelledPicture]:
+    """Write detections in frames as a COCO data set and return them.
+
+    The folder then holds pictures/<name>.png and labels.json, for any editor of COCO keypoints and
+    for `read_labels`. The write is atomic: a failure leaves nothing that prevents a retry.
+
+    Args:
+        frames: name and image of each, in the order of recording, all of one size.
+        detectors: an ensemble; its boxes of one person become one.
+        pose: estimator of the keypoints.
+        folder: absent or empty.
+        settings: thresholds of proposals; the defaults if None.
+    """
+    place = folder.resolve()
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{place.name}.", dir=place.parent) as workshop:
+        # One level down: a temporary folder is private, the labels have the usual rights.
+        draft = Path(workshop) / place.name
+        proposed = _write(frames, detectors, pose, draft, settings or DetectionSettings())
+        draft.rename(place)  # replaces an empty folder, fails on any other
+    return [replace(each, path=folder / each.path.relative_to(draft)) for each in proposed]
+
+
+def _write(
+    frames: Iterable[tuple[str, Image]],
+    detectors: list[Detector],
+    pose: PoseEstimator,
+    folder: Path,
+    settings: DetectionSettings,
+) -> list[LabelledPicture]:
+    (folder / "pictures").mkdir(parents=True)
+    proposed, size = [], (0, 0)
+    for name, picture in frames:
+        people = fuse([each.detect([picture])[0] for each in detectors], settings.nms_iou)
+        sure = people.scores >= settings.high_score_threshold
+        kept = People(people.boxes[sure], people.scores[sure])
+        poses = combine_boxes(kept, pose.estimate(picture, kept.boxes))
+        found = poses.confidence >= settings.min_keypoint_confidence
+        path = folder / "pictures" / f"{name}.png"
+        cv2.imwrite(str(path), picture[..., ::-1])
+        visible = np.where(poses.confidence >= SEEN, 2, 1) * found
+        proposed.append(
+            LabelledPicture(
+                path=path,
+                boxes=np.asarray(poses.boxes, dtype=np.float64),
+                keypoints=np.where(found[..., None], poses.keypoints, np.nan),
+                visible=visible.astype(np.int8),
+                ignored=np.zeros(len(poses.boxes), dtype=np.bool_),
+            )
+        )
+        size = (picture.shape[1], picture.shape[0])
+    write_labels(folder / "labels.json", proposed, size)
+    return proposed

@@ -8,19 +8,15 @@ from typing import Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Image, Singles
 from data_contracts.records import Record
-from worldpose.detection.bundled_crops import cut, picture_from_crop
-from worldpose.detection.bundled_nets import STRIDE, PeopleNet, normalised
-from worldpose.detection.bundled_peaks import cell_middles
+from worldpose.detection.bundled_crops import cut_crop, frame_from_crop
+from worldpose.detection.bundled_nets import STRIDE, PeopleNet, cell_centres, normalize
 from worldpose.training.augmentation import AugmentationSettings, augment
-from worldpose.training.box_overlap import shared
-from worldpose.training.labels import LabelledPicture
-from worldpose.training.pictures import PictureCache
+from worldpose.training.labels import LabelledPicture, PictureCache
 
 SPREAD: Final = 0.12
 """Standard deviation of the target around a centre, as a share of the box's sides [1]."""
@@ -28,7 +24,7 @@ NEAR: Final = 0.5
 """Cells with a target from this value on learn the box's sides [1]."""
 BOXES: Final = 4.0
 """Weight of the box loss, relative to that of the centres [1]: centres are learned sooner."""
-LEAST_SEEN: Final = 0.3
+MIN_SEEN: Final = 0.3
 """Share of a box within a window from which on the person is a target [1]."""
 
 
@@ -57,10 +53,10 @@ class PeopleBatch:
         boxes: (windows, 4, rows, columns) [px] of the person that a cell belongs to.
     """
 
-    pictures: NDArray[np.uint8]
-    target: NDArray[np.float32]
-    weight: NDArray[np.float32]
-    boxes: NDArray[np.float32]
+    pictures: Image
+    target: Singles
+    weight: Singles
+    boxes: Singles
 
 
 def people_batch(
@@ -86,8 +82,8 @@ def people_batch(
         labelled = pictures[int(rng.integers(len(pictures)))]
         picture = cache[labelled.path]
         crop = _window(labelled, picture.shape, settings, rng)
-        mapping = picture_from_crop(crop, (side, side), 0.0, bool(rng.random() < 0.5))
-        seen[index] = augment(cut(picture, mapping, (side, side)), settings.looks, rng)
+        mapping = frame_from_crop(crop, (side, side), 0.0, bool(rng.random() < 0.5))
+        seen[index] = augment(cut_crop(picture, mapping, (side, side)), settings.looks, rng)
         inside, ignored = boxes_in_window(labelled, picture.shape, mapping, side)
         draw_targets(inside, ignored, target[index], weight[index], boxes[index])
     return PeopleBatch(seen, target, weight, boxes)
@@ -131,16 +127,16 @@ def boxes_in_window(
     area = np.prod(whole[:, 2:] - whole[:, :2], axis=1)
     share = np.prod(clipped[:, 2:] - clipped[:, :2], axis=1) / np.maximum(area, 1e-9)
     there = share > 0.0
-    wanted = (share >= LEAST_SEEN) & ~labelled.ignored
+    wanted = (share >= MIN_SEEN) & ~labelled.ignored
     return clipped[there & wanted], clipped[there & ~wanted]
 
 
 def draw_targets(
     boxes: Floats,
     ignored: Floats,
-    target: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    sides: NDArray[np.float32],
+    target: Singles,
+    weight: Singles,
+    sides: Singles,
 ) -> None:
     """Write one window's target, weight and boxes, in place."""
     middles = np.arange(target.shape[0]) * STRIDE + 0.5 * (STRIDE - 1)
@@ -171,7 +167,7 @@ def people_loss(net: PeopleNet, batch: PeopleBatch) -> Tensor:
     target, weight, boxes = (
         torch.from_numpy(each).to(device) for each in (batch.target, batch.weight, batch.boxes)
     )
-    logits, sides = net(normalised(torch.from_numpy(batch.pictures).to(device)))
+    logits, sides = net(normalize(torch.from_numpy(batch.pictures).to(device)))
     chance = torch.sigmoid(logits)
     found = (1.0 - chance).square() * functional.logsigmoid(logits)
     empty = (1.0 - target) ** 4 * chance.square() * functional.logsigmoid(-logits)
@@ -179,8 +175,30 @@ def people_loss(net: PeopleNet, batch: PeopleBatch) -> Tensor:
     people = middle.sum().clamp(min=1)
     focal = -(weight * torch.where(middle, found, empty)).sum() / people
     near = torch.where(target >= NEAR, target, 0.0)
-    x = cell_middles(sides.shape[3], sides.device)[None, None, :]
-    y = cell_middles(sides.shape[2], sides.device)[None, :, None]
+    x = cell_centres(sides.shape[3], sides.device)[None, None, :]
+    y = cell_centres(sides.shape[2], sides.device)[None, :, None]
     said = torch.stack([x - sides[:, 0], y - sides[:, 1], x + sides[:, 2], y + sides[:, 3]], dim=-1)
-    _, overlap = shared(said, boxes.movedim(1, -1))
+    _, overlap = box_overlap(said, boxes.movedim(1, -1))
     return focal + BOXES * (near * (1.0 - overlap)).sum() / near.sum().clamp(min=1.0)
+
+
+def box_overlap(said: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
+    """Return intersection over union [1] of boxes, and the generalised one, which falls below 0.
+
+    Args:
+        said: (..., 4) x0, y0, x1, y1 [px].
+        true: (..., 4), broadcast against `said`.
+    """
+    low, high = (
+        torch.maximum(said[..., :2], true[..., :2]),
+        torch.minimum(said[..., 2:], true[..., 2:]),
+    )
+    first, last = (
+        torch.minimum(said[..., :2], true[..., :2]),
+        torch.maximum(said[..., 2:], true[..., 2:]),
+    )
+    both = (high - low).clamp(min=0).prod(dim=-1)
+    hull = (last - first).clamp(min=0).prod(dim=-1) + 1e-6
+    area = (said[..., 2:] - said[..., :2]).clamp(min=0).prod(dim=-1)
+    union = area + (true[..., 2:] - true[..., :2]).prod(dim=-1) - both + 1e-6
+    return both / union, both / union - (hull - union) / hull

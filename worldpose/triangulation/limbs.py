@@ -14,23 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from data_contracts.conventions import COCO17
+from data_contracts.conventions import COCO17, COCO17_LIMBS
 from worldpose.geometry import projection
 from worldpose.triangulation.observations import Rig
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.solving import Solution, solve
 
-LIMBS: Final = tuple(
-    (COCO17.index(f"{side}_{upper}"), COCO17.index(f"{side}_{lower}"))
-    for upper, lower in (
-        ("shoulder", "elbow"),
-        ("elbow", "wrist"),
-        ("hip", "knee"),
-        ("knee", "ankle"),
-    )
-    for side in ("left", "right")
-)
-"""Upper and lower ends, left before right."""
 SURE: Final = 3
 """Inlier views that both ends of a measured limb need; an end with no more may be accidental."""
 FEWEST: Final = 5
@@ -54,10 +43,10 @@ def limb_lengths(found: Solution) -> Floats:
         found: joints of frames sampled over the clip.
     """
     persons, joints = found.joints.shape[1:3]
-    lengths = np.full((persons, len(LIMBS)), np.nan)
+    lengths = np.full((persons, len(COCO17_LIMBS)), np.nan)
     if joints != len(COCO17):
         return lengths
-    for number, (upper, lower) in enumerate(LIMBS):
+    for number, (upper, lower) in enumerate(COCO17_LIMBS):
         there = np.linalg.norm(found.joints[:, :, upper] - found.joints[:, :, lower], axis=-1)
         sure = np.minimum(found.views[:, :, upper], found.views[:, :, lower]) >= SURE
         for person in range(persons):
@@ -99,10 +88,10 @@ def repair_limb_lengths(
     """
     if found.joints.shape[2] != len(COCO17):
         return
-    for number, (upper, middle) in enumerate(LIMBS):
+    for number, (upper, middle) in enumerate(COCO17_LIMBS):
         if number % 4 > 1:
             continue
-        chain = (upper, middle, LIMBS[number + 2][1])
+        chain = (upper, middle, COCO17_LIMBS[number + 2][1])
         long = lengths[:, number : number + 4 : 2]
         views = found.views[:, :, chain[1:]]
         seen = found.seen[..., chain[1:]].sum(axis=1)

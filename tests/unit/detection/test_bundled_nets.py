@@ -3,12 +3,20 @@ import pytest
 import torch
 from safetensors.torch import save
 
-from worldpose.detection.bundled import EmbeddedDetector, EmbeddedPose
-from worldpose.detection.bundled_crops import crops_of_boxes, cut, picture_from_crop
-from worldpose.detection.bundled_looks import Look
-from worldpose.detection.bundled_nets import CROP, KeypointNet, PeopleNet, edges, peaks
-from worldpose.detection.bundled_peaks import boxes_at_peaks
-from worldpose.detection.bundled_weights import FORMAT, load_weights, save_weights
+from worldpose.detection.bundled_crops import crops_around, cut_crop, frame_from_crop
+from worldpose.detection.bundled_detector import BundledDetector
+from worldpose.detection.bundled_nets import (
+    CROP,
+    FORMAT,
+    KeypointNet,
+    PeopleNet,
+    decode_boxes,
+    edges,
+    load_weights,
+    peaks,
+    save_weights,
+)
+from worldpose.detection.bundled_pose import BundledPoseEstimator, CropEstimates
 from worldpose.errors import InputError
 
 
@@ -27,8 +35,8 @@ def test_a_crop_shows_its_box_and_goes_back_to_the_picture():
     picture[50:150, 100:140] = 255
     box = np.array([[99.5, 49.5, 139.5, 149.5]])
     for turn, mirrored in ((0.0, False), (0.3, True)):
-        mapping = picture_from_crop(crops_of_boxes(box, CROP)[0], CROP, turn, mirrored)
-        crop = cut(picture, mapping, CROP, outside=0)
+        mapping = frame_from_crop(crops_around(box, CROP)[0], CROP, turn, mirrored)
+        crop = cut_crop(picture, mapping, CROP, outside=0)
         rows, columns = np.nonzero(crop[..., 0] > 127)
         middle = np.array([columns.mean(), rows.mean()])
         np.testing.assert_allclose(middle, (np.array(CROP) - 1) / 2, atol=0.05)
@@ -44,8 +52,8 @@ def test_a_crop_of_a_large_box_is_smooth_and_in_its_place():
     picture = np.zeros((900, 900, 3), dtype=np.uint8)
     picture[:, ::2] = 200  # stripes that every second pixel alone would make white or black
     picture[400:, :] = 100
-    mapping = picture_from_crop(np.array([450.0, 450.0, 7.3]), CROP)
-    crop = cut(picture, mapping, CROP)
+    mapping = frame_from_crop(np.array([450.0, 450.0, 7.3]), CROP)
+    crop = cut_crop(picture, mapping, CROP)
     edge = (399.5 - mapping[1, 2]) / mapping[1, 1]
     # Rows at both ends are outside of the picture; a crop pixel covers 7 stripes, one more or less.
     assert np.all(np.abs(crop[3 : int(edge) - 1, :, 0].astype(int) - 100) < 15)
@@ -77,11 +85,11 @@ def test_edges_are_read_along_their_own_axis():
 def test_boxes_stand_at_peaks_best_first():
     logits, sides = torch.full((8, 10), -9.0), torch.full((4, 8, 10), 5.0)
     logits[2, 3], logits[2, 4], logits[6, 8] = 1.0, 0.5, 2.0
-    boxes, scores = boxes_at_peaks(logits, sides, 0.05, 300)
+    boxes, scores = decode_boxes(logits, sides, 0.05, 300)
     # Cells of 4 px whose first middle is at 1.5; the neighbour of a better cell is no peak.
     np.testing.assert_allclose(boxes, [[28.5, 20.5, 38.5, 30.5], [8.5, 4.5, 18.5, 14.5]])
     np.testing.assert_allclose(scores, torch.sigmoid(torch.tensor([2.0, 1.0])))
-    assert len(boxes_at_peaks(logits, sides, 0.05, 1)[0]) == 1
+    assert len(decode_boxes(logits, sides, 0.05, 1)[0]) == 1
 
 
 def test_people_and_poses_do_not_depend_on_the_batch():
@@ -91,7 +99,7 @@ def test_people_and_poses_do_not_depend_on_the_batch():
     boxes = np.array(
         [[85.0, 5.0, 110.0, 80.0], [-8.0, 20.0, 40.0, 120.0], [90.0, 1.0, 112.0, 60.0]]
     )
-    pose = EmbeddedPose(shaken(KeypointNet()))
+    pose = BundledPoseEstimator(shaken(KeypointNet()))
     together, alone = pose.estimate(picture, boxes), pose.estimate(picture, boxes[1:2])
     np.testing.assert_array_equal(together.keypoints[1:2], alone.keypoints)
     np.testing.assert_array_equal(together.confidence[1:2], alone.confidence)
@@ -104,7 +112,7 @@ def test_people_and_poses_do_not_depend_on_the_batch():
     net = shaken(PeopleNet())
     with torch.no_grad():
         net.head[-1].bias[0] = 0.0
-    both = EmbeddedDetector(net).detect([picture, picture[::-1].copy()])
+    both = BundledDetector(net).detect([picture, picture[::-1].copy()])
     assert len(both[0].boxes) > 0
     inside = (both[0].boxes >= -0.5) & (both[0].boxes <= np.array([130, 90, 130, 90]) - 0.5)
     assert inside.all()
@@ -112,20 +120,22 @@ def test_people_and_poses_do_not_depend_on_the_batch():
 
 def looks(monkeypatch, seen_of):
     """A pose estimator that sees what `seen_of` makes of boxes, and what it was asked."""
-    pose, asked = EmbeddedPose(shaken(KeypointNet())), []
+    pose, asked = BundledPoseEstimator(shaken(KeypointNet())), []
 
     def look(picture, boxes, others):
         asked.append((boxes, others))
         places = np.full((len(boxes), 17, 4, 2), float(len(asked)))
         mass = np.tile([0.9, 0.0, 0.0, 0.0], (len(boxes), 17, 1))
-        return Look(places, mass, np.full(mass.shape, 0.9), seen_of(boxes), np.ones(len(boxes)))
+        return CropEstimates(
+            places, mass, np.full(mass.shape, 0.9), seen_of(boxes), np.ones(len(boxes))
+        )
 
-    monkeypatch.setattr(pose, "_look", look)
+    monkeypatch.setattr(pose, "_estimate_crops", look)
     return pose, asked
 
 
 def test_whose_box_is_another_than_the_one_given_is_looked_at_again(monkeypatch):
-    # Everybody fills his box from 40 px on; the keypoints tell how often it was looked at.
+    # Everybody fills his box from 40 px on; the keypoints tell how often it was estimates at.
     pose, asked = looks(
         monkeypatch, lambda b: np.concatenate([np.maximum(b[:, :1], 40.0), b[:, 1:]], axis=1)
     )

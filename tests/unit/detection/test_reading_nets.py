@@ -3,12 +3,20 @@
 import numpy as np
 import pytest
 
+from data_contracts.conventions import COCO17_FLIP
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection import DetectionSettings, load_detectors, weights_of
-from worldpose.detection.crops import crop_frames, cut_crops, in_picture
-from worldpose.detection.flip_test import SIDES, Mirrored
-from worldpose.detection.onnx_detectors import _corners, _grid, _multipose
-from worldpose.detection.onnx_pose import _read, from_heat_maps
+from worldpose.detection.onnx_nets import (
+    _read_corners,
+    _read_grid,
+    _read_keypoints,
+    _read_multipose,
+    cut_crops,
+    fit_crops,
+    from_heat_maps,
+    points_in_frame,
+)
+from worldpose.detection.views import FlipTest
 from worldpose.errors import InputError
 
 # A box whose outer edges are 10, 20, 30 and 60: pixels 10 to 29 and 20 to 59.
@@ -17,19 +25,19 @@ BOX = [9.5, 19.5, 29.5, 59.5]
 
 def test_yolo_boxes_are_people_with_a_good_score():
     version_8 = np.array([[20, 40, 20, 40, 0.9, 0.1], [80, 40, 20, 40, 0.01, 0.9]], float)
-    found = _grid(version_8, with_object=False)
+    found = _read_grid(version_8, with_object=False)
     np.testing.assert_allclose(found.boxes, [BOX])
     assert found.scores.tolist() == [0.9]
     version_5 = np.array([[20, 40, 20, 40, 0.5, 0.9, 0.1]], float)
-    assert _grid(version_5, with_object=True).scores.tolist() == [0.45]
+    assert _read_grid(version_5, with_object=True).scores.tolist() == [0.45]
     ended = np.array([[10, 20, 30, 60, 0.8, 0], [50, 20, 70, 60, 0.8, 32]], float)
-    np.testing.assert_allclose(_corners(ended).boxes, [BOX])
+    np.testing.assert_allclose(_read_corners(ended).boxes, [BOX])
 
 
 def test_movenet_s_box_stands_behind_its_keypoints():
     row = np.zeros((1, 56))
     row[0, 51:] = [20 / 96, 10 / 192, 60 / 96, 30 / 192, 0.7]
-    found = _multipose(row, (192, 96))
+    found = _read_multipose(row, (192, 96))
     np.testing.assert_allclose(found.boxes, [BOX])
     assert found.scores.tolist() == [0.7]
 
@@ -43,7 +51,7 @@ def test_a_crop_shows_the_box_and_its_points_come_back():
         picture[:] = 0
         picture[row - 6 : row + 7, column - 6 : column + 7] = 255  # a square around the point
         box = np.array([[x - size * 0.2, y - size / 2, x + size * 0.2, y + size / 2]])
-        frames = crop_frames(box, (48, 64), 1.25)
+        frames = fit_crops(box, (48, 64), 1.25)
         crop = cut_crops(picture, frames, (48, 64))[0, ..., 0].astype(float)
         middle = np.array(
             [
@@ -51,7 +59,7 @@ def test_a_crop_shows_the_box_and_its_points_come_back():
                 np.average(np.arange(64), weights=crop.sum(1)),
             ]
         )
-        back = in_picture(middle[None, None], frames)[0, 0]
+        back = points_in_frame(middle[None, None], frames)[0, 0]
         if crop[0].any() or crop[-1].any() or crop[:, 0].any() or crop[:, -1].any():
             continue  # the square reaches over the crop: its middle is another
         # A fifth of a crop's pixel: the square's hard edges are sampled twice.
@@ -60,7 +68,7 @@ def test_a_crop_shows_the_box_and_its_points_come_back():
 
 def test_a_crop_beyond_the_border_is_filled():
     picture = np.full((50, 60, 3), 200, dtype=np.uint8)
-    frames = crop_frames(np.array([[500.0, 500, 540, 580], [-20.0, 10, 20, 40]]), (48, 64), 1.25)
+    frames = fit_crops(np.array([[500.0, 500, 540, 580], [-20.0, 10, 20, 40]]), (48, 64), 1.25)
     crops = cut_crops(picture, frames, (48, 64), fill=7)
     assert (crops[0] == 7).all()
     assert {7, 200} <= set(np.unique(crops[1]))
@@ -70,12 +78,12 @@ def test_the_forms_of_pose_nets_give_the_same_point():
     size = (48, 64)
     single = np.zeros((1, 1, 17, 3))
     single[..., 0], single[..., 1], single[..., 2] = 20 / 64, 10 / 48, 0.8
-    points, confidence = _read([single], size)
+    points, confidence = _read_keypoints([single], size)
     np.testing.assert_allclose(points[0, 0], [10.0, 20.0])
     assert confidence[0, 0] == pytest.approx(0.8)
     across, down = np.zeros((1, 17, 96)), np.zeros((1, 17, 128))
     across[..., 20], down[..., 40] = 0.8, 0.9
-    points, confidence = _read([across, down], size)
+    points, confidence = _read_keypoints([across, down], size)
     np.testing.assert_allclose(points[0, 0], [10.0, 20.0])
     assert confidence[0, 0] == pytest.approx(0.8)
 
@@ -95,7 +103,9 @@ class Leaning:
     """Sees joint j at column 10 j of the box, `late` px too far right; no wrists to the left."""
 
     def estimate(self, picture, boxes):
-        columns = np.where(picture[0, 0, 0] == 1, 10.0 * np.arange(17), 10.0 * np.array(SIDES))
+        columns = np.where(
+            picture[0, 0, 0] == 1, 10.0 * np.arange(17), 10.0 * np.array(COCO17_FLIP)
+        )
         sign = 1.0 if picture[0, 0, 0] == 1 else -1.0  # the first column is marked
         start = boxes[:, 0] if sign > 0 else boxes[:, 2]
         x = start[:, None] + sign * columns + 2.0
@@ -110,7 +120,7 @@ def test_what_leans_to_one_side_is_set_right_by_the_mirror():
     picture = np.zeros((50, 300, 3), dtype=np.uint8)
     picture[0, 0] = 1
     boxes = np.array([[20.0, 5.0, 100.0, 45.0]])
-    poses = Mirrored(Leaning()).estimate(picture, boxes)
+    poses = FlipTest(Leaning()).estimate(picture, boxes)
     expected = 20.0 + 10.0 * np.arange(17) + (0.8 * 2.0 - 0.4 * 2.0) / 1.2
     expected[9] = 20.0 + 90.0 - 2.0  # seen in the mirror alone, and the other in the picture
     expected[10] = 20.0 + 100.0 + 2.0

@@ -182,7 +182,7 @@ def test_a_keypoint_below_the_least_confidence_was_not_found(least, found):
 
 
 def test_who_is_like_somebody_that_was_not_found_is_found_all_the_same():
-    # Four pixels from one to the next: the likeness of poses is 0.8, and 0.5 over eight.
+    # Four pixels from one to the next: the similarity of poses is 0.8, and 0.5 over eight.
     bodies = expected((0.0, 0.0), (0.08, 0.0), (0.16, 0.0), deviation=0.1)
     off = np.array([0.0, 0.2, 0.4])[:, None, None] * [1.0, 0.0]
     verdicts = judge(bodies, answer(bodies, 0, 1, 2, off=off), seek(bodies, 0, 1, 2))

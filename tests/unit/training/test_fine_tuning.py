@@ -3,8 +3,7 @@ import numpy as np
 import pytest
 import torch
 
-from worldpose.detection.bundled_nets import KeypointNet, PeopleNet
-from worldpose.detection.bundled_weights import load_weights, save_weights
+from worldpose.detection.bundled_nets import KeypointNet, PeopleNet, load_weights, save_weights
 from worldpose.errors import InputError
 from worldpose.training import FineTuningSettings, LabelledPicture, fine_tuning
 from worldpose.training.fine_tuning import MILD, fine_tune, split
@@ -39,9 +38,9 @@ def test_parts_share_nothing_and_neighbours_stay_together(tmp_path):
 
 
 def test_labels_of_nobody_are_refused(tmp_path):
-    with pytest.raises(InputError, match="none in those"):
+    with pytest.raises(InputError, match="no people in the images for"):
         split(pictures(tmp_path, 12, people=0), FineTuningSettings())
-    with pytest.raises(InputError, match="people in the pictures"):
+    with pytest.raises(InputError, match="people in the images for training"):
         split(pictures(tmp_path, 2), FineTuningSettings())
 
 

@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 import torch
 
-from worldpose.detection.boxes import overlaps
 from worldpose.detection.bundled_nets import CROP, KeypointNet, PeopleNet
+from worldpose.geometry.boxes import box_iou
 from worldpose.training import LabelledPicture, PictureCache
 from worldpose.training.augmentation import AugmentationSettings
-from worldpose.training.box_overlap import shared
 from worldpose.training.keypoint_training import (
     KeypointCrops,
     box_loss,
     keypoint_batch,
     keypoint_loss,
-    people_of,
+    labelled_people,
 )
 from worldpose.training.people_training import (
     PeopleWindows,
+    box_overlap,
     boxes_in_window,
     draw_targets,
     people_batch,
@@ -102,18 +102,18 @@ def test_shared_area_is_that_of_the_detection_stage_and_falls_with_distance():
     rng = np.random.default_rng(2)
     corners = rng.uniform(0, 40, (2, 30, 2))
     a, b = (np.concatenate([each, each + rng.uniform(5, 40, (30, 2))], axis=1) for each in corners)
-    share, general = shared(torch.from_numpy(a)[:, None], torch.from_numpy(b))
+    share, general = box_overlap(torch.from_numpy(a)[:, None], torch.from_numpy(b))
     # Areas are 25 px^2 and more, to which a millionth is added.
-    np.testing.assert_allclose(share, overlaps(a, b), atol=1e-6)
+    np.testing.assert_allclose(share, box_iou(a, b), atol=1e-6)
     # Nested boxes fill their hull: the two are equal but for rounding.
     assert torch.all(general <= share + 1e-9) and torch.all(general >= -1.0)
     # Two boxes of 10 x 10 px side by side, 10 px apart: none shared, a third of the hull empty.
     pair = torch.tensor([[0.0, 0.0, 10.0, 10.0], [20.0, 0.0, 30.0, 10.0]])
-    torch.testing.assert_close(shared(pair[0], pair[1])[1], torch.tensor(-1.0 / 3.0))
+    torch.testing.assert_close(box_overlap(pair[0], pair[1])[1], torch.tensor(-1.0 / 3.0))
 
 
 def test_the_box_is_learned_in_upright_crops_and_nothing_else_beside_people(labelled):
-    people, cache = people_of([labelled]), PictureCache()
+    people, cache = labelled_people([labelled]), PictureCache()
     for elsewhere in (0, 1):
         crops = KeypointCrops(crops=8, elsewhere=elsewhere, turned=0, smaller=0, looks=AS_IS)
         batch = keypoint_batch(people, cache, crops, np.random.default_rng(3))
@@ -133,7 +133,9 @@ def test_the_box_is_learned_in_upright_crops_and_nothing_else_beside_people(labe
 
 def test_the_fit_is_what_the_box_shares_with_anybody(labelled):
     crops = KeypointCrops(crops=2, elsewhere=0, turned=0, looks=AS_IS)
-    batch = keypoint_batch(people_of([labelled]), PictureCache(), crops, np.random.default_rng(3))
+    batch = keypoint_batch(
+        labelled_people([labelled]), PictureCache(), crops, np.random.default_rng(3)
+    )
     said = torch.from_numpy(batch.boxes)
     sure, denied = (box_loss(batch, said, torch.full((2,), logit)) for logit in (12.0, -12.0))
     # The true box: nothing is off, and a fit of all but 6e-6 costs as much.
@@ -149,7 +151,7 @@ def test_the_net_is_told_of_the_box_given_and_of_others_where_they_are(labelled)
     )
     exact = {"shift": 0, "scale": 0, "misplaced": 0, "overlooked": 0, "imagined": 0, "elsewhere": 0}
     crops = KeypointCrops(crops=8, turned=0, hidden=0, untold=0.5, looks=AS_IS, **exact)
-    people = people_of([two])
+    people = labelled_people([two])
     batch = keypoint_batch(people, PictureCache(), crops, np.random.default_rng(3))
     told = batch.surroundings[:, 1].any(axis=(1, 2))
     assert {True, False} == set(told.tolist())
@@ -178,7 +180,7 @@ def test_a_few_steps_on_one_batch_lower_both_losses(labelled):
     rng, cache = np.random.default_rng(1), PictureCache()
     people = people_batch([labelled], cache, PeopleWindows(windows=2, side=64, looks=AS_IS), rng)
     crops = KeypointCrops(crops=4, elsewhere=0, turned=0, looks=AS_IS)
-    persons = people_of([labelled])
+    persons = labelled_people([labelled])
     assert [index for _, index in persons] == [0]
     keypoints = keypoint_batch(persons, cache, crops, rng)
     assert keypoints.crops.shape[1:] == (CROP[1], CROP[0], 3)

@@ -45,4 +45,4 @@ def test_the_shipped_recipe_goes_on_where_it_was_killed_and_ends_with_the_same_w
         recipe.main(killed, [part], share)
         name = f"embedded_{part}.safetensors"
         assert (killed / name).read_bytes() == (undisturbed / name).read_bytes()
-    assert said.count("goes on after step 1") == 2
+    assert said.count("resumes after step 1") == 2

@@ -7,7 +7,7 @@ from torch import nn
 
 from worldpose.errors import InputError
 from worldpose.training import TrainingSettings
-from worldpose.training.loop import Training, train
+from worldpose.training.training_loop import Training, train
 
 SETTINGS = TrainingSettings(steps=12, check_every=4, rate=0.05, seed=3)
 
@@ -16,7 +16,7 @@ class InterruptedTrainingError(Exception):
     pass
 
 
-def line_fit(settings=SETTINGS, *, interrupted_after=None, figures=None):
+def line_fit(settings=SETTINGS, *, interrupted_after=None, scores=None):
     """A small net, in the memory layout of the shipped ones, that learns y = 2 x."""
     torch.manual_seed(settings.seed)
     net = nn.Sequential(nn.BatchNorm2d(2), nn.Conv2d(2, 2, 3, padding=1))
@@ -29,14 +29,14 @@ def line_fit(settings=SETTINGS, *, interrupted_after=None, figures=None):
             raise InterruptedTrainingError
         return torch.from_numpy(rng.standard_normal((8, 2, 4, 4)).astype(np.float32))
 
-    def figure(net):
-        if figures is not None:
-            return figures.pop(0)
+    def score(net):
+        if scores is not None:
+            return scores.pop(0)
         x = torch.linspace(-1, 1, 64).reshape(2, 2, 4, 4)
         with torch.no_grad():
             return -float((net(x) - 2 * x).square().mean())
 
-    return Training(net, batch, lambda net, x: (net(x) - 2 * x).square().mean(), figure, settings)
+    return Training(net, batch, lambda net, x: (net(x) - 2 * x).square().mean(), score, settings)
 
 
 def test_a_resumed_training_gives_the_weights_of_an_undisturbed_one(tmp_path):
@@ -47,9 +47,9 @@ def test_a_resumed_training_gives_the_weights_of_an_undisturbed_one(tmp_path):
         train(first, checkpoint)
     lines = []
     resumed = train(second, checkpoint, lines.append)
-    assert lines[0] == "goes on after step 4"
+    assert lines[0] == "resumes after step 4"
     # The loss before the first step is NaN.
-    assert [(c.step, c.figure) for c in resumed] == [(c.step, c.figure) for c in undisturbed]
+    assert [(c.step, c.score) for c in resumed] == [(c.step, c.score) for c in undisturbed]
     assert [c.loss for c in resumed[1:]] == [c.loss for c in undisturbed[1:]]
     theirs = second.net.state_dict()
     for name, value in whole.net.state_dict().items():
@@ -59,7 +59,7 @@ def test_a_resumed_training_gives_the_weights_of_an_undisturbed_one(tmp_path):
 def test_a_training_that_ends_early_has_the_weights_of_the_whole_at_that_step():
     # Without memory the mean is the weights of the step; the last check is the best.
     settings = SETTINGS.model_copy(update={"memory": 0.0})
-    whole, then = line_fit(settings, figures=[0.0, 1.0, 2.0, 3.0]), {}
+    whole, then = line_fit(settings, scores=[0.0, 1.0, 2.0, 3.0]), {}
 
     def say(line):
         if line.startswith("step 4 "):
@@ -67,7 +67,7 @@ def test_a_training_that_ends_early_has_the_weights_of_the_whole_at_that_step():
 
     train(whole, progress=say)
     settings = settings.model_copy(update={"steps": 4, "planned": 12})
-    early = line_fit(settings, figures=[0.0, 1.0])
+    early = line_fit(settings, scores=[0.0, 1.0])
     train(early)
     for name, value in early.net.state_dict().items():
         assert torch.equal(value, then[name]), name
@@ -77,7 +77,7 @@ def test_the_best_weights_are_kept_and_training_stops_early():
     # Without memory the mean is the weights of the step.
     changes = {"steps": 100, "check_every": 1, "patience": 2, "memory": 0.0}
     settings = SETTINGS.model_copy(update=changes)
-    training = line_fit(settings, figures=[0.1, 0.5, 0.4, 0.3, 0.9])
+    training = line_fit(settings, scores=[0.1, 0.5, 0.4, 0.3, 0.9])
     best = {}
 
     def say(line):
@@ -112,7 +112,7 @@ def test_the_mean_of_weights_remembers_more_and_more():
 
 
 def test_training_that_makes_a_net_worse_changes_nothing():
-    training = line_fit(figures=[0.9, 0.5, 0.4, 0.3])
+    training = line_fit(scores=[0.9, 0.5, 0.4, 0.3])
     before = {name: value.clone() for name, value in training.net.state_dict().items()}
     train(training)
     for name, value in training.net.state_dict().items():

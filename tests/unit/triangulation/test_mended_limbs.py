@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from data_contracts.conventions import COCO17
+from data_contracts.conventions import COCO17, COCO17_LIMBS
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
-from worldpose.triangulation.limbs import FEWEST, LIMBS, SLACK, _deviation, limb_lengths
+from worldpose.triangulation.limbs import FEWEST, SLACK, _deviation, limb_lengths
 from worldpose.triangulation.observations import Rig
 from worldpose.triangulation.solving import no_shift, solve
 
@@ -97,7 +97,7 @@ def test_lengths_need_five_frames(ring, seen, frames):
     keypoints, confidence, index = seen(camera, joints)
     found = solve(Rig.of(camera), keypoints, confidence, index, no_shift(), SETTINGS)
     lengths = limb_lengths(found)
-    assert lengths.shape == (1, len(LIMBS))
+    assert lengths.shape == (1, len(COCO17_LIMBS))
     if frames < FEWEST:
         assert np.isnan(lengths).all()
     else:
@@ -112,7 +112,7 @@ def test_limb_that_is_hardly_ever_as_long_tells_nothing(ring, seen):
     keypoints, confidence, index = seen(camera, joints)
     found = solve(Rig.of(camera), keypoints, confidence, index, no_shift(), SETTINGS)
     known = np.isfinite(limb_lengths(found)[0])
-    assert known.tolist() == [end[1] != ANKLE for end in LIMBS]
+    assert known.tolist() == [end[1] != ANKLE for end in COCO17_LIMBS]
 
 
 def test_frames_that_three_views_agree_in_tell_how_long_a_limb_is(ring, seen):
@@ -122,7 +122,7 @@ def test_frames_that_three_views_agree_in_tell_how_long_a_limb_is(ring, seen):
     # Two views alone put the ankle 2 cm lower in seven frames of twelve.
     found.joints[:7, 0, ANKLE, 2] -= 0.02
     found.views[:7, 0, ANKLE] = 2
-    shank = LIMBS.index((COCO17.index("left_knee"), ANKLE))
+    shank = COCO17_LIMBS.index((COCO17.index("left_knee"), ANKLE))
     assert limb_lengths(found)[0, shank] == pytest.approx(SHANK, abs=1e-6)
     # Four frames are too few: then all of them tell.
     found.views[7, 0, ANKLE] = 2

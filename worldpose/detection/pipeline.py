@@ -7,19 +7,17 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Image
+from data_contracts.arrays import Flags, Image
 from data_contracts.keypoints import KeypointDetections
-from worldpose.detection.boxes import areas, fuse, suppress
+from worldpose.detection.box_tracking import BoxCleaner, detect_strided
 from worldpose.detection.crowd import on_pitch
-from worldpose.detection.followed import Follower, looked_at
-from worldpose.detection.interfaces import Detector, People, PoseEstimator
-from worldpose.detection.oks_nms import suppress_poses
-from worldpose.detection.posed import find_poses
+from worldpose.detection.interfaces import Detector, FindsOccludedPeople, People, PoseEstimator
 from worldpose.detection.settings import DetectionSettings
-from worldpose.detection.views import Tiled
+from worldpose.detection.suppression import combine_boxes, fuse, suppress, suppress_poses
+from worldpose.detection.views import TiledDetector
 from worldpose.geometry import Camera
+from worldpose.geometry.boxes import box_areas
 from worldpose.pitch import PitchTemplate
 
 CHUNK: Final = 64
@@ -86,7 +84,7 @@ class PeopleFinder:
         self._detectors = [
             detector
             if detector.view_size is None
-            else Tiled(detector, settings.zooms, settings.view_overlap, settings.nms_iou)
+            else TiledDetector(detector, settings.zooms, settings.view_overlap, settings.nms_iou)
             for detector in detectors
         ]
         self._estimator, self._settings = estimator, settings
@@ -102,34 +100,34 @@ class PeopleFinder:
             place: camera and pitch; None keeps the crowd.
         """
         self.report = DetectionReport()
-        follower = Follower(self._settings)
-        looked = looked_at(
+        cleaner = BoxCleaner(self._settings)
+        detected_frames = detect_strided(
             frames,
-            lambda pictures: self._people(pictures, place),
+            lambda images: self._people(images, place),
             self._settings.stride,
             self._settings.batch,
         )
         rows: list[KeypointDetections] = []
         numbers: list[int] = []
-        for number, picture, people in follower.follow(looked):
+        for number, image, people in cleaner.clean(detected_frames):
             numbers.append(number)
-            if picture is None:
+            if image is None:
                 self.report.unreadable.append(number)
                 rows.append(KeypointDetections.empty())
             else:
-                rows.append(self._find_poses(picture, people, place))
+                rows.append(self._find_poses(image, people, place))
                 self.report.empty += not len(rows[-1].score)
             if len(rows) == CHUNK:
                 yield self._chunk(numbers, rows)
                 rows, numbers = [], []
         if rows:
             yield self._chunk(numbers, rows)
-        self.report.bridged, self.report.flickers = follower.bridged, follower.flickers
+        self.report.bridged, self.report.flickers = cleaner.bridged, cleaner.flickers
 
-    def _people(self, pictures: list[Image], place: Place | None) -> list[People]:
+    def _people(self, images: list[Image], place: Place | None) -> list[People]:
         """Return the people on the pitch in each frame."""
         settings = self._settings
-        found = [detector.detect(pictures) for detector in self._detectors]
+        found = [detector.detect(images) for detector in self._detectors]
         everybody = []
         for members in zip(*found, strict=True):
             if settings.fusion == "weighted":
@@ -140,32 +138,30 @@ class PeopleFinder:
                     np.concatenate([member.scores for member in members]),
                 )
                 people = suppress(together, settings.nms_iou)
-            kept = (people.scores >= settings.low_score_threshold) & (areas(people.boxes) > 0.0)
+            kept = (people.scores >= settings.low_score_threshold) & (box_areas(people.boxes) > 0.0)
             people = People(people.boxes[kept], people.scores[kept])
             if place is not None:
-                inside = self._inside(people, pictures[0], place)
+                inside = self._inside(people, images[0], place)
                 self.report.crowd += int(np.count_nonzero(~inside))
                 people = People(people.boxes[inside], people.scores[inside])
             everybody.append(people)
         return everybody
 
-    def _inside(self, people: People, picture: Image, place: Place) -> NDArray[np.bool_]:
+    def _inside(self, people: People, image: Image, place: Place) -> Flags:
         """Return whether people's feet are on the pitch or near it (people,)."""
-        size = (picture.shape[1], picture.shape[0])
+        size = (image.shape[1], image.shape[0])
         margin = self._settings.pitch_margin_m
         return on_pitch(people.boxes, place.camera, size, place.pitch, margin)
 
-    def _find_poses(
-        self, picture: Image, people: People, place: Place | None
-    ) -> KeypointDetections:
+    def _find_poses(self, image: Image, people: People, place: Place | None) -> KeypointDetections:
         """Return keypoints of people; drop those without any or with the pose of a better box."""
         settings = self._settings
         detected = len(people.scores)
-        found = find_poses(self._estimator, picture, people, settings)
+        found = find_poses(self._estimator, image, people, settings)
         self.report.beside += len(found.score) - detected
         if place is not None:
             # Detected people are on the pitch; a person they occlude may be a bystander.
-            inside = self._inside(People.from_detections(found), picture, place)
+            inside = self._inside(People.from_detections(found), image, place)
             found = found.select(inside | (np.arange(len(found.score)) < detected))
         distinct = suppress_poses(found, settings.min_keypoint_confidence, settings.oks_nms)
         self.report.unsure += len(found.score) - len(distinct.score)
@@ -189,3 +185,21 @@ class PeopleFinder:
             self.report.detections += count
         self.report.frames += len(rows)
         return chunk
+
+
+def find_poses(
+    estimator: PoseEstimator, image: Image, people: People, settings: DetectionSettings
+) -> KeypointDetections:
+    """Return the poses of people with the estimator's boxes, then of occluded people next to them.
+
+    Args:
+        estimator: of poses.
+        image: the whole frame.
+        people: detected people.
+        settings: of the stage.
+    """
+    poses = combine_boxes(people, estimator.estimate(image, people.boxes))
+    if not (settings.find_occluded and isinstance(estimator, FindsOccludedPeople)):
+        return poses
+    occluded = estimator.find_occluded(image, People.from_detections(poses))
+    return KeypointDetections.concatenate([poses, occluded])

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.detection.boxes import combine_boxes, fuse, overlaps, suppress
 from worldpose.detection.interfaces import People
-from worldpose.detection.views import Tiled
+from worldpose.detection.suppression import combine_boxes, fuse, suppress
+from worldpose.detection.views import TiledDetector
 
 
 def people(*rows):
@@ -14,18 +14,10 @@ def people(*rows):
     return People(rows[:, :4], rows[:, 4])
 
 
-def test_overlap_is_the_shared_part_of_the_union():
-    # Two squares of 4 that share 2: 2 of 6.
-    found = overlaps(np.array([[0.0, 0, 2, 2]]), np.array([[1.0, 0, 3, 2], [5, 5, 6, 6]]))
-    np.testing.assert_allclose(found, [[1 / 3, 0.0]])
-
-
-def test_nobody_and_empty_boxes_are_legal():
+def test_a_frame_without_people_is_legal():
     nobody = people()
     assert len(suppress(nobody, 0.5).scores) == 0
     assert len(fuse([nobody, nobody], 0.5).scores) == 0
-    flat = np.array([[1.0, 1, 1, 1]])
-    assert overlaps(flat, flat).tolist() == [[0.0]]
 
 
 def test_the_best_of_two_boxes_of_a_person_stays():
@@ -77,7 +69,7 @@ def test_everybody_is_found_once_and_whole_whichever_view_shows_them():
             x, y = 5 + 25 * column + rng.integers(0, 8), 5 + 36 * row + rng.integers(0, 8)
             picture[y : y + 12, x : x + 6] = 255
             true.append([x, y, x + 5, y + 11])
-    found = Tiled(Blobs(), (1.0,), view_overlap=0.4, overlap=0.3).detect([picture])[0]
+    found = TiledDetector(Blobs(), (1.0,), view_overlap=0.4, overlap=0.3).detect([picture])[0]
     whole = found.boxes[np.lexsort(found.boxes.T)]
     expected = np.array(true, dtype=np.float64)[np.lexsort(np.array(true).T)]
     # The whole picture in one view is blurred: it may find a box as well, never another person.
@@ -89,7 +81,7 @@ def test_everybody_is_found_once_and_whole_whichever_view_shows_them():
 def test_a_person_in_a_scaled_view_lies_where_the_picture_has_them(zoom):
     picture = np.zeros((90, 120, 3), dtype=np.uint8)
     picture[40:56, 60:70] = 255
-    found = Tiled(Blobs(), (zoom,), view_overlap=0.3, overlap=0.3).detect([picture])[0]
+    found = TiledDetector(Blobs(), (zoom,), view_overlap=0.3, overlap=0.3).detect([picture])[0]
     # An edge pixel that is half white counts as white or not.
     np.testing.assert_allclose(found.boxes, [[60, 40, 69, 55]], atol=1.0)
 

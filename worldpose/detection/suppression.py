@@ -1,4 +1,4 @@
-"""Bounding boxes of people: intersection over union, suppression and weighted boxes fusion."""
+"""One detection per person: suppression by box or pose overlap, and fusion of an ensemble."""
 
 from __future__ import annotations
 
@@ -9,33 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import AnyFloats, Floats
+from data_contracts.conventions import COCO17_SIGMAS
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.interfaces import People
+from worldpose.geometry.boxes import box_areas, box_iou
 
 SUREST: Final = 12
 """Number of surest keypoints that decide whether a box holds a person: others may be hidden."""
+MAX_SCORE_LOSS: Final = 0.5
+"""Share of its score that a box with the pose of a better box loses [1]."""
 
 
-def overlaps(a: AnyFloats, b: AnyFloats) -> Floats:
-    """Return the intersection over union of every pair of boxes (n, m), 0 for disjoint boxes.
-
-    Args:
-        a: (n, 4) x0, y0, x1, y1 [px].
-        b: (m, 4).
-    """
-    low = np.maximum(a[:, None, :2], b[None, :, :2])
-    high = np.minimum(a[:, None, 2:], b[None, :, 2:])
-    shared = np.prod(np.maximum(high - low, 0.0), axis=2)
-    union = areas(a)[:, None] + areas(b)[None, :] - shared
-    return np.asarray(np.divide(shared, union, out=np.zeros_like(shared), where=union > 0))
-
-
-def areas(boxes: AnyFloats) -> Floats:
-    """Return the areas of boxes (n,) [px^2]."""
-    return np.asarray(np.prod(np.maximum(boxes[:, 2:] - boxes[:, :2], 0.0), axis=1))
-
-
-def best_of(people: People, overlap: float) -> NDArray[np.intp]:
+def nms_indices(people: People, overlap: float) -> NDArray[np.intp]:
     """Return the indices of boxes that pass non-maximum suppression, best first.
 
     Args:
@@ -44,7 +29,7 @@ def best_of(people: People, overlap: float) -> NDArray[np.intp]:
     """
     order = _best_first(people)
     boxes = people.boxes[order]
-    close = overlaps(boxes, boxes) > overlap
+    close = box_iou(boxes, boxes) > overlap
     kept = np.zeros(len(boxes), dtype=np.bool_)
     for number in range(len(boxes)):
         kept[number] = not close[number, :number][kept[:number]].any()
@@ -53,7 +38,7 @@ def best_of(people: People, overlap: float) -> NDArray[np.intp]:
 
 def suppress(people: People, overlap: float) -> People:
     """Return the people after non-maximum suppression at `overlap` [1], best first."""
-    best = best_of(people, overlap)
+    best = nms_indices(people, overlap)
     return People(people.boxes[best], people.scores[best])
 
 
@@ -111,7 +96,7 @@ def fuse(members: list[People], overlap: float) -> People:
     fused, weight = np.empty((0, 4)), np.empty(0)
     joined: list[set[int]] = []
     for box, score, who in zip(boxes, scores, member, strict=True):
-        shared = overlaps(box[None], fused)[0]
+        shared = box_iou(box[None], fused)[0]
         shared[[who in cluster for cluster in joined]] = 0.0  # one box per member and person
         best = int(np.argmax(shared)) if len(shared) else -1
         if best >= 0 and shared[best] > overlap:
@@ -130,3 +115,46 @@ def fuse(members: list[People], overlap: float) -> People:
 def _best_first(people: People) -> NDArray[np.intp]:
     """Return the order by falling score, then by position, so that ties have a fixed order."""
     return np.lexsort((people.boxes[:, 1], people.boxes[:, 0], -people.scores))
+
+
+def object_keypoint_similarity(keypoints: AnyFloats, area: AnyFloats) -> Floats:
+    """Return COCO's object keypoint similarity of every pair of poses (people, people) [1].
+
+    Args:
+        keypoints: (people, 17, 2) [px]; NaN where not found.
+        area: (people,) of their boxes [px^2]; the smaller of a pair counts.
+    """
+    apart = np.square(keypoints[:, None] - keypoints[None]).sum(axis=3)
+    scale = 2.0 * np.minimum(area[:, None], area[None])[..., None]
+    alike = np.exp(-apart / (scale * (2.0 * np.array(COCO17_SIGMAS)) ** 2))
+    both = np.isfinite(apart)
+    count = both.sum(axis=2)
+    total = np.where(both, alike, 0.0).sum(axis=2)
+    return np.asarray(np.divide(total, count, out=np.zeros_like(total), where=count > 0))
+
+
+def suppress_poses(
+    detections: KeypointDetections, least_keypoint: float, same_pose: float
+) -> KeypointDetections:
+    """Return the people that have a pose different from that of every better box.
+
+    The more a pose resembles that of a better box, the lower its score falls (soft suppression,
+    Bodla, 2017): a person behind another stays, a duplicate ranks last.
+
+    Args:
+        detections: (people,) of one image.
+        least_keypoint: a keypoint below this confidence was not found [1].
+        same_pose: similarity of poses above which two boxes are of one person [1].
+    """
+    with np.errstate(invalid="ignore"):
+        found = detections.confidence >= least_keypoint
+        found &= np.isfinite(detections.keypoints).all(axis=2)
+    detections = detections.without(~found)
+    alike = object_keypoint_similarity(detections.keypoints, box_areas(detections.boxes))
+    kept = np.zeros(len(detections.score), dtype=np.bool_)
+    score = detections.score.copy()
+    for row in np.argsort(-detections.score, kind="stable"):
+        most = alike[row, kept].max(initial=0.0)
+        kept[row] = found[row].any() and most <= same_pose
+        score[row] *= 1.0 - MAX_SCORE_LOSS * most**2
+    return replace(detections, score=score).select(kept)

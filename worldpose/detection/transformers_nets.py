@@ -11,11 +11,10 @@ from types import ModuleType
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Image
+from data_contracts.arrays import Floats, Image
 from data_contracts.keypoints import KeypointDetections
-from worldpose.detection.interfaces import LEAST_SCORE, Detector, People, PoseEstimator
+from worldpose.detection.interfaces import MIN_SCORE, Detector, People, PoseEstimator
 from worldpose.errors import InputError
 
 DETECTORS: Final = ("rt_detr", "rt_detr_v2", "d_fine", "detr")
@@ -26,7 +25,7 @@ PERSON: Final = 0
 """Class of people where the checkpoint does not name its classes."""
 
 
-def transformers_detector(folder: Path, device: str = "cpu", half: bool = False) -> Detector:
+def load_transformers_detector(folder: Path, device: str = "cpu", half: bool = False) -> Detector:
     """Return a detector of people from a saved checkpoint.
 
     Args:
@@ -40,7 +39,7 @@ def transformers_detector(folder: Path, device: str = "cpu", half: bool = False)
     return _TransformersDetector(folder, device, half)
 
 
-def transformers_pose(folder: Path, device: str = "cpu", half: bool = False) -> PoseEstimator:
+def load_transformers_pose(folder: Path, device: str = "cpu", half: bool = False) -> PoseEstimator:
     """Return a ViTPose from a saved checkpoint; arguments and errors are those of the detector."""
     return _TransformersPose(folder, device, half)
 
@@ -69,16 +68,16 @@ class _TransformersDetector:
         """Size to which the processor scales images."""
         return self._size
 
-    def detect(self, pictures: Sequence[Image]) -> list[People]:
+    def detect(self, images: Sequence[Image]) -> list[People]:
         """Return the people in each image."""
         people = []
-        for picture in pictures:  # one by one: kernels for other batches round differently
-            given = _tensors(self._processor([picture], return_tensors="pt"), self)
+        for image in images:  # one by one: kernels for other batches round differently
+            given = _tensors(self._processor([image], return_tensors="pt"), self)
             with self._torch.inference_mode():
                 outputs = self._net(**given)
             outputs.logits, outputs.pred_boxes = outputs.logits.float(), outputs.pred_boxes.float()
             (found,) = self._processor.post_process_object_detection(
-                outputs, threshold=LEAST_SCORE, target_sizes=[picture.shape[:2]]
+                outputs, threshold=MIN_SCORE, target_sizes=[image.shape[:2]]
             )
             person = (found["labels"] == self._person).cpu().numpy()
             boxes = found["boxes"].cpu().numpy().astype(np.float64)[person] - 0.5
@@ -100,11 +99,11 @@ class _TransformersPose:
         experts = getattr(net.config.backbone_config, "num_experts", 1)
         self._expert = 0 if experts > 1 else None  # of ViTPose+, the one for COCO
 
-    def estimate(self, picture: Image, boxes: NDArray[np.float64]) -> KeypointDetections:
+    def estimate(self, image: Image, boxes: Floats) -> KeypointDetections:
         """Return the pose in each box."""
         if not len(boxes):
             return KeypointDetections.empty()
-        each = [self._one(picture, box) for box in boxes]
+        each = [self._one(image, box) for box in boxes]
         keypoints = np.stack([points for points, _ in each])
         confidence = np.stack([score for _, score in each])
         found = confidence > 0.0
@@ -113,12 +112,10 @@ class _TransformersPose:
             np.where(found, np.minimum(confidence, 1.0), np.nan),
         )
 
-    def _one(
-        self, picture: Image, box: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _one(self, image: Image, box: Floats) -> tuple[Floats, Floats]:
         x0, y0, x1, y1 = box
         corner = [[[float(x0), float(y0), float(x1 - x0), float(y1 - y0)]]]
-        given = _tensors(self._processor([picture], boxes=corner, return_tensors="pt"), self)
+        given = _tensors(self._processor([image], boxes=corner, return_tensors="pt"), self)
         if self._expert is not None:
             given["dataset_index"] = self._torch.tensor([self._expert], device=self._device)
         with self._torch.inference_mode():
@@ -150,7 +147,7 @@ def _kind(folder: Path, library: ModuleType, known: tuple[str, ...]) -> str:
             str(folder),
             expected=f"a checkpoint of kind {', '.join(known)}",
             found=kind,
-            todo="Name another folder.",
+            todo="Name the folder of such a checkpoint.",
         )
     return kind
 
@@ -163,7 +160,7 @@ def _loaded(folder: Path, named: Any, **further: bool) -> Any:  # noqa: ANN401
             str(folder),
             expected="a folder with config.json, preprocessor_config.json and model.safetensors",
             found=str(error).splitlines()[0][:200],
-            todo="Save the checkpoint with save_pretrained; processors too.",
+            todo="Save the checkpoint and its processors with save_pretrained.",
         ) from error
 
 
@@ -171,8 +168,8 @@ def _placed(net: Any, torch: ModuleType, folder: Path, device: str, half: bool) 
     if device == "cuda" and not torch.cuda.is_available():
         raise InputError(
             str(folder),
-            expected="a GPU, as detection.device says",
-            found="none",
+            expected="a GPU, because detection.device is cuda",
+            found="no GPU",
             todo="Set detection.device=cpu.",
         )
     net = net.eval().to(device)

@@ -8,7 +8,7 @@ import pytest
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection import DetectionSettings, People, PeopleFinder, Place
 from worldpose.detection.crowd import on_pitch
-from worldpose.detection.oks_nms import likeness, suppress_poses
+from worldpose.detection.suppression import object_keypoint_similarity, suppress_poses
 from worldpose.formats.calibration_files import build_camera
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
@@ -153,7 +153,9 @@ def test_two_poses_of_one_person_are_alike_and_those_of_two_are_not():
     person = np.stack([np.linspace(0, 30, 17), np.linspace(0, 80, 17)], axis=1)
     missing = np.full((17, 2), np.nan)
     area = np.full(4, 2400.0)
-    alike = likeness(np.stack([person, person + 1.0, person + [30.0, 0.0], missing]), area)
+    alike = object_keypoint_similarity(
+        np.stack([person, person + 1.0, person + [30.0, 0.0], missing]), area
+    )
     assert alike[0, 1] > 0.9
     assert alike[0, 2] < 0.3
     assert alike[0, 3] == alike[3, 3] == 0.0
@@ -169,6 +171,6 @@ def test_of_two_boxes_with_one_pose_the_better_stays_and_who_is_close_to_one_com
     people = KeypointDetections(keypoints, np.full((4, 17), 0.9), boxes, score)
     kept = suppress_poses(people, 0.05, 0.85)
     np.testing.assert_array_equal(kept.keypoints, keypoints[1:])
-    alike = likeness(keypoints[1:3], np.full(2, 2400.0))[0, 1]
+    alike = object_keypoint_similarity(keypoints[1:3], np.full(2, 2400.0))[0, 1]
     assert 0.3 < alike < 0.85
     np.testing.assert_allclose(kept.score, [0.7 * (1.0 - 0.5 * alike**2), 0.8, 0.5])

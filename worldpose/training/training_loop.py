@@ -1,4 +1,4 @@
-"""Training of a net: seeded, checkpointed, resumable, with early stopping at the best weights.
+"""Training of the bundled nets: seeded, checkpointed, resumable, with early stopping.
 
 Checks evaluate and keep the running mean of the weights (Polyak averaging), which is better at any
 step than the weights of the step. The seed and the step's number alone determine the batch of a
@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, Generic, TypeVar
@@ -22,17 +22,33 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from worldpose.detection.bundled_detector import BundledDetector
+from worldpose.detection.bundled_nets import KeypointNet, PeopleNet
+from worldpose.detection.bundled_pose import BundledPoseEstimator
 from worldpose.errors import InputError
+from worldpose.training.keypoint_training import (
+    KeypointCrops,
+    keypoint_batch,
+    keypoint_loss,
+    labelled_people,
+)
+from worldpose.training.labels import LabelledPicture, PictureCache
+from worldpose.training.metrics import detect_labelled, score_keypoints, score_people
+from worldpose.training.people_training import PeopleWindows, people_batch, people_loss
 from worldpose.training.settings import TrainingSettings
 
 Net = TypeVar("Net", bound=nn.Module)
 Batch = TypeVar("Batch")
 Tensors = dict[str, Tensor]
+Pictures = Sequence[LabelledPicture]
+Progress = Callable[[str], None]
 
 WARM_UP: Final = 0.04
 """Share of the steps in which the learning rate rises to its full value [1]."""
 LAST_RATE: Final = 0.02
 """Share of the full rate at the end [1]."""
+MIN_HEIGHT: Final = 34.0
+"""Shortest person for training and scoring of the keypoint net [px]: limbs are 2 px wide."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +58,12 @@ class Check:
     Attributes:
         step: steps done.
         loss: mean since the previous check.
-        figure: metric of the net on held-out frames; higher is better.
+        score: metric of the net on held-out frames; higher is better.
     """
 
     step: int
     loss: float
-    figure: float
+    score: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,14 +85,14 @@ class Training(Generic[Net, Batch]):
         net: changed in place.
         batch: draws a batch.
         loss: of the net on a batch.
-        figure: metric of the net on held-out frames; higher is better.
+        score: metric of the net on held-out frames; higher is better.
         settings: rate, steps and seed.
     """
 
     net: Net
     batch: Callable[[np.random.Generator], Batch]
     loss: Callable[[Net, Batch], Tensor]
-    figure: Callable[[Net], float]
+    score: Callable[[Net], float]
     settings: TrainingSettings
 
 
@@ -99,24 +115,24 @@ def train(
     """
     net, settings = training.net, training.settings
     optimizer = torch.optim.AdamW(net.parameters(), lr=settings.rate, weight_decay=settings.decay)
-    state = _State(mean=_copied(net.state_dict()))
+    state = _State(mean=_copy_tensors(net.state_dict()))
     if checkpoint is not None and checkpoint.is_file():
         state = _read(checkpoint, net, optimizer, settings)
-        progress(f"goes on after step {state.step}")
+        progress(f"resumes after step {state.step}")
     else:
-        state = _checked(training, state)
-    while state.step < settings.steps and not _settled(state, settings):
+        state = _check(training, state)
+    while state.step < settings.steps and not _has_settled(state, settings):
         loss = _step(training, optimizer, state.step)
         _blend(
             state.mean, net.state_dict(), min(settings.memory, (1 + state.step) / (10 + state.step))
         )
         state = replace(state, step=state.step + 1, losses=(*state.losses, loss))
         if state.step % settings.check_every == 0 or state.step == settings.steps:
-            state = _checked(training, state)
+            state = _check(training, state)
             last = state.checks[-1]
             progress(
                 f"step {last.step} of {settings.steps}: loss {last.loss:.4f}, "
-                f"held-out figure {last.figure:.4f}"
+                f"held-out score {last.score:.4f}"
             )
             if checkpoint is not None:
                 _write(checkpoint, net, optimizer, state, settings)
@@ -145,24 +161,24 @@ def _step(training: Training[Net, Batch], optimizer: torch.optim.Optimizer, step
     return float(loss.detach())
 
 
-def _checked(training: Training[Net, Batch], state: _State) -> _State:
+def _check(training: Training[Net, Batch], state: _State) -> _State:
     """Return the state after one more check."""
     mean = copy.deepcopy(training.net).eval()
     mean.load_state_dict(state.mean)
-    figure = training.figure(mean)
-    best = max((check.figure for check in state.checks), default=-math.inf)
+    score = training.score(mean)
+    best = max((check.score for check in state.checks), default=-math.inf)
     loss = float(np.mean(state.losses)) if state.losses else math.nan
     return replace(
         state,
-        checks=(*state.checks, Check(state.step, loss, figure)),
-        best=_copied(state.mean) if figure > best else state.best,
+        checks=(*state.checks, Check(state.step, loss, score)),
+        best=_copy_tensors(state.mean) if score > best else state.best,
         losses=(),
     )
 
 
-def _settled(state: _State, settings: TrainingSettings) -> bool:
-    figures = [check.figure for check in state.checks]
-    return len(figures) - 1 - figures.index(max(figures)) >= settings.patience
+def _has_settled(state: _State, settings: TrainingSettings) -> bool:
+    scores = [check.score for check in state.checks]
+    return len(scores) - 1 - scores.index(max(scores)) >= settings.patience
 
 
 @torch.no_grad()
@@ -175,7 +191,7 @@ def _blend(mean: Tensors, now: Tensors, kept: float) -> None:
             mean[name].copy_(value)
 
 
-def _copied(tensors: Tensors) -> Tensors:
+def _copy_tensors(tensors: Tensors) -> Tensors:
     return {name: value.detach().clone().contiguous() for name, value in tensors.items()}
 
 
@@ -187,15 +203,17 @@ def _write(
     settings: TrainingSettings,
 ) -> None:
     """Write a checkpoint atomically."""
-    tensors = {f"net.{name}": value for name, value in _copied(net.state_dict()).items()}
+    tensors = {f"net.{name}": value for name, value in _copy_tensors(net.state_dict()).items()}
     tensors |= {f"mean.{name}": value for name, value in state.mean.items()}
-    tensors |= {f"best.{name}": value for name, value in _copied(state.best).items()}
+    tensors |= {f"best.{name}": value for name, value in _copy_tensors(state.best).items()}
     for number, moments in optimizer.state_dict()["state"].items():
-        tensors |= {f"moment.{number}.{name}": value for name, value in _copied(moments).items()}
+        tensors |= {
+            f"moment.{number}.{name}": value for name, value in _copy_tensors(moments).items()
+        }
     about = {
         "settings": settings.model_dump_json(),
         "step": str(state.step),
-        "checks": json.dumps([[c.step, c.loss, c.figure] for c in state.checks]),
+        "checks": json.dumps([[c.step, c.loss, c.score] for c in state.checks]),
     }
     draft = path.with_suffix(".part")
     draft.write_bytes(save(tensors, about))
@@ -216,7 +234,7 @@ def _read(
             str(path),
             expected="a checkpoint of this training",
             found=found,
-            todo="Remove the file to begin anew, or train with the settings it was written with.",
+            todo="Remove the file to train from the start, or use the settings of the checkpoint.",
         )
 
     try:
@@ -242,3 +260,63 @@ def _read(
         return _State(parts["mean"], int(about["step"]), checks, parts["best"])
     except (RuntimeError, ValueError, KeyError) as error:
         raise refusal(f"{type(error).__name__}: {error}") from error
+
+
+def people_score(net: PeopleNet, pictures: Pictures, cache: PictureCache) -> float:
+    """Return AP50 [1] of a detector."""
+    found = detect_labelled(BundledDetector(copy.deepcopy(net)), pictures, cache)
+    return score_people(found, pictures)[0]
+
+
+def keypoint_score(net: KeypointNet, pictures: Pictures, cache: PictureCache) -> float:
+    """Return the share of visible keypoints [1] that a pose estimator puts within 0.2 torsos."""
+    estimator = BundledPoseEstimator(copy.deepcopy(net))
+    return score_keypoints(estimator, pictures, cache, (MIN_HEIGHT, float("inf"))).pck
+
+
+def train_people_net(
+    net: PeopleNet,
+    learned: Pictures,
+    checked: Pictures,
+    cache: PictureCache,
+    settings: TrainingSettings,
+    *,
+    windows: PeopleWindows | None = None,
+    checkpoint: Path | None = None,
+    progress: Progress = lambda line: None,
+) -> tuple[Check, ...]:
+    """Train a detector in place; arguments and result are those of `loop.train`."""
+    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    cut = windows or PeopleWindows()
+    training = Training(
+        net,
+        lambda rng: people_batch(learned, cache, cut, rng),
+        people_loss,
+        lambda net: people_score(net, checked, cache),
+        settings,
+    )
+    return train(training, checkpoint, progress)
+
+
+def train_keypoint_net(
+    net: KeypointNet,
+    learned: Pictures,
+    checked: Pictures,
+    cache: PictureCache,
+    settings: TrainingSettings,
+    *,
+    crops: KeypointCrops | None = None,
+    checkpoint: Path | None = None,
+    progress: Progress = lambda line: None,
+) -> tuple[Check, ...]:
+    """Train a pose estimator in place; arguments and result are those of `loop.train`."""
+    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    cut, people = crops or KeypointCrops(), labelled_people(learned, MIN_HEIGHT)
+    training = Training(
+        net,
+        lambda rng: keypoint_batch(people, cache, cut, rng),
+        keypoint_loss,
+        lambda net: keypoint_score(net, checked, cache),
+        settings,
+    )
+    return train(training, checkpoint, progress)

@@ -1,0 +1,276 @@
+"""2D tracking of the boxes of one camera (ByteTrack, Zhang et al. 2022)."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from data_contracts.arrays import Floats, Image, Integers
+from worldpose.detection.interfaces import People
+from worldpose.detection.settings import DetectionSettings
+from worldpose.geometry.boxes import box_iou
+
+SURE_OVERLAP: Final = 0.2
+"""A high-score box continues a track whose predicted box it overlaps more [1]: a small box moves by
+half of its width per frame."""
+DOUBTFUL_OVERLAP: Final = 0.5
+"""A low-score box must lie near the prediction."""
+PLACE_NOISE: Final = 1.0 / 20.0
+"""Standard deviation of a box's position and size, over its height [1]; ByteTrack's."""
+SPEED_NOISE: Final = 1.0 / 160.0
+"""Standard deviation of their change per frame, over the height [1/frame]; ByteTrack's."""
+
+_STEP = np.eye(8) + np.eye(8, k=4)
+"""Transition matrix: speeds move positions."""
+
+
+class BoxTracker:
+    """Tracks of one camera.
+
+    A Kalman filter per track estimates the centre, width and height of its box and their change
+    per frame. High-score boxes are assigned to tracks first. Low-score boxes only continue
+    unmatched tracks that were seen in the previous frame, and they begin none: a partly occluded
+    person keeps the track, and a flickering box in the crowd does not become one.
+    """
+
+    def __init__(self, high_score_threshold: float, track_buffer_frames: int) -> None:
+        """Begin without tracks.
+
+        Args:
+            high_score_threshold: score from which on a box may begin a track [1].
+            track_buffer_frames: frames after which an unseen track ends.
+        """
+        self._high_score = high_score_threshold
+        self._buffer = track_buffer_frames
+        self._mean: Floats = np.empty((0, 8))
+        self._covariance: Floats = np.empty((0, 8, 8))
+        self._id: Integers = np.empty(0, dtype=np.int64)
+        self._unseen: Integers = np.empty(0, dtype=np.int64)
+        self._next = 0
+
+    def update(self, boxes: Floats, scores: Floats, frames: int = 1) -> Integers:
+        """Return the track of each box (boxes,), -1 for low-score boxes that continue none.
+
+        Args:
+            boxes: (boxes, 4) x0, y0, x1, y1 [px] of the next frame in which people were detected.
+            scores: (boxes,).
+            frames: number of frames since the previous call's frame.
+        """
+        for _ in range(frames):
+            self._predict()
+        self._unseen += frames
+        track = np.full(len(boxes), -1, dtype=np.int64)
+        seen = np.zeros(len(self._id), dtype=np.bool_)
+        expected = _as_boxes(self._mean)
+        sure = scores >= self._high_score
+        for candidates, tracks, least in (
+            (np.flatnonzero(sure), np.ones_like(seen), SURE_OVERLAP),
+            (np.flatnonzero(~sure), self._unseen == frames, DOUBTFUL_OVERLAP),
+        ):
+            rows = np.flatnonzero(tracks & ~seen)
+            for row, box in _assign_boxes(expected[rows], boxes[candidates], least):
+                track[candidates[box]] = rows[row]
+                seen[rows[row]] = True
+        matched = track >= 0
+        self._update(track[matched], boxes[matched])
+        ids = np.where(matched, self._id[track] if len(self._id) else -1, -1)
+        self._unseen[seen] = 0
+        self._drop_old_tracks()
+        new = np.flatnonzero(sure & ~matched)
+        ids[new] = self._begin(boxes[new])
+        return np.asarray(ids, dtype=np.int64)
+
+    def _predict(self) -> None:
+        self._mean = self._mean @ _STEP.T
+        noise = self._noise(PLACE_NOISE, SPEED_NOISE)
+        self._covariance = _STEP @ self._covariance @ _STEP.T + noise
+
+    def _noise(self, place: float, speed: float) -> Floats:
+        scale = np.repeat([place, speed], 4) * np.maximum(self._mean[:, 3:4], 1.0)
+        return np.asarray(np.eye(8) * (scale**2)[:, None, :])
+
+    def _update(self, rows: Integers, boxes: Floats) -> None:
+        mean, covariance = self._mean[rows], self._covariance[rows]
+        spread = np.eye(4) * (PLACE_NOISE * np.maximum(mean[:, 3], 1.0))[:, None, None] ** 2
+        gain = covariance[:, :, :4] @ np.linalg.inv(covariance[:, :4, :4] + spread)
+        residual = _as_states(boxes) - mean[:, :4]
+        self._mean[rows] = mean + (gain @ residual[..., None])[..., 0]
+        self._covariance[rows] = covariance - gain @ covariance[:, :4, :]
+
+    def _drop_old_tracks(self) -> None:
+        kept = self._unseen <= self._buffer
+        self._mean, self._covariance = self._mean[kept], self._covariance[kept]
+        self._id, self._unseen = self._id[kept], self._unseen[kept]
+
+    def _begin(self, boxes: Floats) -> Integers:
+        states = _as_states(boxes)
+        ids = self._next + np.arange(len(boxes))
+        self._next += len(boxes)
+        scale = np.repeat([2.0 * PLACE_NOISE, 10.0 * SPEED_NOISE], 4) * states[:, 3:4]
+        self._mean = np.vstack([self._mean, np.hstack([states, np.zeros_like(states)])])
+        self._covariance = np.concatenate([self._covariance, np.eye(8) * (scale**2)[:, None, :]])
+        self._id = np.append(self._id, ids)
+        self._unseen = np.append(self._unseen, np.zeros(len(boxes), dtype=np.int64))
+        return ids
+
+
+def _assign_boxes(expected: Floats, boxes: Floats, least: float) -> list[tuple[int, int]]:
+    """Return pairs of rows that overlap by more than `least`, with the largest total overlap."""
+    shared = box_iou(expected, boxes)
+    # A forbidden pair has value 0, so that it never displaces an allowed one.
+    pairs = linear_sum_assignment(-np.where(shared > least, shared, 0.0))
+    return [(int(a), int(b)) for a, b in zip(*pairs, strict=True) if shared[a, b] > least]
+
+
+def _as_states(boxes: Floats) -> Floats:
+    """Return the centre x, y, width, height of boxes (n, 4)."""
+    size = np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0)
+    return np.hstack([(boxes[:, :2] + boxes[:, 2:]) / 2.0, size])
+
+
+def _as_boxes(means: Floats) -> Floats:
+    """Return x0, y0, x1, y1 of states (n, 8)."""
+    half = np.maximum(means[:, 2:4], 1.0) / 2.0
+    return np.hstack([means[:, :2] - half, means[:, :2] + half])
+
+
+@dataclass
+class _BufferedFrame:
+    """A buffered frame whose gaps may still be filled."""
+
+    number: int
+    image: Image | None
+    boxes: dict[int, tuple[Floats, float]] = field(default_factory=dict)
+
+
+@dataclass
+class _Track:
+    """Last frame, box and score of a track, and its number of sightings."""
+
+    number: int
+    box: Floats
+    score: float
+    sightings: int = 1
+
+
+class BoxCleaner:
+    """Cleans detections frame by frame, in bounded memory (D3)."""
+
+    def __init__(self, settings: DetectionSettings) -> None:
+        self._settings = settings
+        self._tracker = BoxTracker(settings.high_score_threshold, settings.track_buffer_frames)
+        self._held: deque[_BufferedFrame] = deque()
+        self._tracks: dict[int, _Track] = {}
+        self._searched = 0
+        self._last: int | None = None
+        self.bridged = self.flickers = 0
+
+    def clean(
+        self, frames: Iterable[tuple[int, Image | None, People | None]]
+    ) -> Iterator[tuple[int, Image | None, People]]:
+        """Yield each frame with the people in it.
+
+        Args:
+            frames: rising numbers, images, and detections; None where no detector ran.
+        """
+        settings = self._settings
+        lag = max(settings.max_gap_frames, settings.stride)
+        for number, image, people in frames:
+            self._held.append(_BufferedFrame(number, image))
+            if people is not None:
+                self._add_detections(number, people, lag)
+            while self._held and number - self._held[0].number >= lag:
+                yield self._release_frame()
+        while self._held:
+            yield self._release_frame()
+
+    def _add_detections(self, number: int, people: People, lag: int) -> None:
+        later = 1 if self._last is None else number - self._last
+        self._last = number
+        self._searched += 1
+        ids = self._tracker.update(people.boxes, people.scores, later)
+        for track, box, score in zip(ids, people.boxes, people.scores, strict=True):
+            if track < 0:
+                continue
+            self._held[-1].boxes[int(track)] = box, float(score)
+            before = self._tracks.get(int(track))
+            if before is None:
+                self._tracks[int(track)] = _Track(number, box, float(score))
+                continue
+            if 1 < number - before.number <= lag:
+                self._fill(int(track), before, number, box, float(score))
+            before.number, before.box, before.score = number, box, float(score)
+            before.sightings += 1
+
+    def _fill(self, track: int, before: _Track, number: int, box: Floats, score: float) -> None:
+        """Interpolate boxes linearly between two sightings of a track."""
+        for held in self._held:
+            if before.number < held.number < number and held.image is not None:
+                part = (held.number - before.number) / (number - before.number)
+                between = (1.0 - part) * before.box + part * box
+                held.boxes[track] = between, (1.0 - part) * before.score + part * score
+                self.bridged += 1
+
+    def _release_frame(self) -> tuple[int, Image | None, People]:
+        held = self._held.popleft()
+        least = min(self._settings.min_hits, self._searched)
+        kept = {
+            track: box
+            for track, box in sorted(held.boxes.items())
+            if self._tracks[track].sightings >= least
+        }
+        self.flickers += len(held.boxes) - len(kept)
+        gone = [
+            track
+            for track, last in self._tracks.items()
+            if held.number - last.number > self._settings.track_buffer_frames
+        ]
+        for track in gone:
+            del self._tracks[track]
+        boxes = [box for box, _ in kept.values()]
+        people = People(np.array(boxes).reshape(-1, 4), np.array([s for _, s in kept.values()]))
+        return held.number, held.image, people
+
+
+def detect_strided(
+    frames: Iterable[tuple[int, Image | None]],
+    detect: Callable[[list[Image]], list[People]],
+    stride: int,
+    batch: int,
+) -> Iterator[tuple[int, Image | None, People | None]]:
+    """Yield each frame with its detections; detectors run on every `stride`-th and the last one.
+
+    Args:
+        frames: rising numbers with images; None where there is none.
+        detect: detects people in images of one size.
+        stride: frames between runs of the detector.
+        batch: images per call of the detector.
+    """
+    waiting: list[tuple[int, Image | None]] = []
+    chosen: list[int] = []
+    due: int | None = None
+
+    def found() -> Iterator[tuple[int, Image | None, People | None]]:
+        images = [image for at in chosen if (image := waiting[at][1]) is not None]
+        people = dict(zip(chosen, detect(images) if images else [], strict=True))
+        for at, (number, image) in enumerate(waiting):
+            yield number, image, people.get(at)
+        waiting.clear()
+        chosen.clear()
+
+    for number, image in frames:
+        waiting.append((number, image))
+        if image is not None and (due is None or number >= due):
+            chosen.append(len(waiting) - 1)
+            due = number + stride
+        if len(chosen) == batch:
+            yield from found()
+    last = next((at for at in reversed(range(len(waiting))) if waiting[at][1] is not None), None)
+    if last is not None and last not in chosen:
+        chosen.append(last)  # so that boxes reach the last frame
+    yield from found()

@@ -1,0 +1,306 @@
+"""The pose estimator that ships with the project, small and fast on a CPU.
+
+Its training data are rendered matches alone (infra/embedded_detector). On real footage it is a
+fallback; fine-tuned or larger models serve better. The net takes crops with maps of the target box
+and its neighbours. People who occlude one another share out candidate joints, and the estimator
+also finds occluded people in crops shifted to the side of detected ones. Needs torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from data_contracts.arrays import Flags, Floats, Image
+from data_contracts.conventions import COCO17_FLIP
+from data_contracts.keypoints import KeypointDetections
+from worldpose.detection.bundled_crops import (
+    MAP_CELL,
+    MAP_COUNT,
+    SAME_PERSON_IOU,
+    crops_around,
+    cut_crop,
+    frame_from_crop,
+    surroundings,
+)
+from worldpose.detection.bundled_nets import (
+    CROP,
+    JOINTS,
+    KeypointNet,
+    decode_candidates,
+    normalize,
+    place_net,
+    precision,
+)
+from worldpose.detection.interfaces import People
+from worldpose.detection.suppression import nms_indices, suppress, surest_confidence
+from worldpose.geometry.boxes import box_iou
+
+MIN_AGREEING_IOU: Final = 0.8
+"""A crop is computed again if the given and the estimated box overlap less [1, intersection over
+union]."""
+MIN_CERTAIN_SCORE: Final = 0.25
+"""A product of fit and surest keypoints from which a person is certain [1]."""
+MIN_AGAIN_SCORE: Final = 0.1
+"""Below this product no crop is computed again [1]."""
+MIN_OVERLAP_IOU: Final = 0.05
+"""A person that overlaps a neighbour more gets a second crop [1, intersection over union]."""
+CANDIDATES: Final = 4
+"""Candidate positions per joint [1]."""
+BATCH: Final = 16
+"""Crops per batch, always the same number: kernels for other numbers round differently."""
+RIVALRY: Final = 2.0
+"""Cost of a candidate that certainly is another person's joint [nats]."""
+JOINT_SPREAD: Final = 0.03
+"""Standard deviation of the distance between two estimates of one joint, as a share of the longer
+side of the smaller box [1]."""
+MIN_RIVAL_IOU: Final = 0.02
+"""People whose boxes overlap more are rivals [1, intersection over union]."""
+MIN_CANDIDATE: Final = 0.01
+"""Candidates of less probability are dropped, except the first [1]."""
+PASSES: Final = 4
+"""Passes of assignment; few joints change after the second."""
+MIN_KNOWN_SCORE: Final = 0.25
+"""Score of a detection from which on its neighbourhood is searched [1]."""
+SIDE_STEP: Final = 0.35
+"""Shift to either side, as a share of the box's width [1], for people who are half occluded.
+Closer, the net shows the detected person; farther, detectors find the other without help."""
+MAX_ROOM_IOU: Final = 0.6
+"""If another detection overlaps the shifted box more, there is no room for a further person [1,
+intersection over union]."""
+KNOWN_PERSON_IOU: Final = 0.7
+"""A box that overlaps a detected person more is that person [1, intersection over union]."""
+MIN_SECOND_CROP_SCORE: Final = 0.15
+"""Below this product of fit and surest keypoints a result gets no second crop [1]."""
+MIN_OCCLUDED_SCORE: Final = 0.4
+"""From this product on a result is a person [1]. In scenes like those of training, one in five of
+the results kept is a new person; of detector boxes with such scores, one in four is."""
+ONE_PERSON_IOU: Final = 0.5
+"""Two occluded people that overlap more are one [1, intersection over union]."""
+UNSEEN_SCORE: Final = 0.3
+"""Replaces the score of the detector, which does not see these people [1]."""
+
+
+class BundledPoseEstimator:
+    """A net that estimates the joints of the person in a crop."""
+
+    def __init__(self, net: KeypointNet, device: str = "cpu", half: bool = False) -> None:
+        self._net, self._device, self._half = place_net(net, device), device, half
+
+    def estimate(self, image: Image, boxes: Floats) -> KeypointDetections:
+        """Return the pose in each box; confidence is the probability that a keypoint is correct.
+
+        A correct keypoint is within a twentieth of the box's longer side, about a fifth of a torso.
+        If the estimated box differs from the given one, a second crop shows the estimated box.
+        People with neighbours also get a second crop, because the positions of the neighbours are
+        then known. Candidate joints that the maps of two people share are assigned to one of them.
+        """
+        estimates = self._estimate_crops(image, boxes, [np.empty((0, 4))] * len(boxes))
+        seen = estimates.boxes
+        another = np.all(seen[:, 2:] - seen[:, :2] > 1.0, axis=1)
+        another &= np.diagonal(box_iou(seen, boxes)) < MIN_AGREEING_IOU
+        asked = np.where(another[:, None], seen, boxes)
+        score = estimates.score
+        known = suppress(
+            People(seen[score >= MIN_CERTAIN_SCORE], score[score >= MIN_CERTAIN_SCORE]),
+            SAME_PERSON_IOU,
+        ).boxes
+        shares = box_iou(asked, known)
+        others = [known[row <= SAME_PERSON_IOU] for row in shares]
+        again = ((shares > MIN_OVERLAP_IOU) & (shares <= SAME_PERSON_IOU)).any(axis=1) & (
+            score >= MIN_AGAIN_SCORE
+        )
+        again |= another
+        around = [others[index] for index in np.flatnonzero(again)]
+        estimates.update(again, self._estimate_crops(image, asked[again], around))
+        return estimates.poses(assign_joints(estimates.places, estimates.mass, estimates.boxes))
+
+    def find_occluded(self, image: Image, people: People) -> KeypointDetections:
+        """Return people partly occluded by the detected ones, with their poses."""
+        return find_occluded_people(
+            lambda boxes, others: self._estimate_crops(image, boxes, others), people
+        )
+
+    def _estimate_crops(
+        self, image: Image, boxes: Floats, others: Sequence[Floats]
+    ) -> CropEstimates:
+        """Return the net's output for a crop around each box.
+
+        Args:
+            image: the whole frame.
+            boxes: (people, 4) [px].
+            others: boxes (others, 4) of the neighbours of each person [px].
+        """
+        shape = (len(boxes), JOINTS, CANDIDATES)
+        estimates = CropEstimates(
+            places=np.full((*shape, 2), np.nan),
+            mass=np.full(shape, np.nan),
+            sure=np.full(shape, np.nan),
+            boxes=np.full((len(boxes), 4), np.nan),
+            fit=np.full(len(boxes), np.nan),
+        )
+        maps = [frame_from_crop(crop, CROP) for crop in crops_around(boxes, CROP)]
+        for start in range(0, len(maps), BATCH):
+            part = maps[start : start + BATCH]
+            end = start + len(part)
+            crops = np.zeros((BATCH, CROP[1], CROP[0], 3), dtype=np.uint8)
+            around = np.zeros(
+                (BATCH, MAP_COUNT, CROP[1] // MAP_CELL, CROP[0] // MAP_CELL), dtype=np.float32
+            )
+            for index, mapping in enumerate(part):
+                crops[index] = cut_crop(image, mapping, CROP)
+                who = start + index
+                around[index] = surroundings(boxes[who], others[who], mapping, CROP)
+            with torch.inference_mode(), precision(self._device, self._half):
+                given = normalize(torch.from_numpy(crops).to(self._device))
+                seen = self._net(given, torch.from_numpy(around).to(self._device))
+                at, mass = decode_candidates(seen.maps, CANDIDATES)
+                sure = torch.sigmoid(self._net.sureness(seen.doubt, mass))
+            pixels, corners = at.double().cpu().numpy(), seen.boxes.double().cpu().numpy()
+            for index, mapping in enumerate(part):
+                scale, corner = mapping[:, :2], mapping[:, 2]
+                estimates.places[start + index] = pixels[index] @ scale.T + corner
+                sides = corners[index].reshape(2, 2) @ scale.T + corner
+                estimates.boxes[start + index] = sides.ravel()
+            estimates.mass[start:end] = mass.double().cpu().numpy()[: len(part)]
+            estimates.sure[start:end] = np.clip(sure.double().cpu().numpy()[: len(part)], 1e-3, 1.0)
+            estimates.fit[start:end] = torch.sigmoid(seen.fit).double().cpu().numpy()[: len(part)]
+        height, width = image.shape[:2]
+        limits = np.array([width, height, width, height]) - 0.5
+        np.clip(estimates.boxes, -0.5, limits, out=estimates.boxes)
+        return estimates
+
+
+@dataclass(frozen=True, eq=False)
+class CropEstimates:
+    """Candidate joints, boxes and scores from crops around boxes.
+
+    Attributes:
+        places: (people, 17, count, 2) candidate positions of each joint, the likeliest first [px].
+        mass: (people, 17, count) probability around each position.
+        sure: (people, 17, count) probability that a position is correct.
+        boxes: (people, 4) [px].
+        fit: (people,) expected intersection over union of these and the true boxes [1].
+    """
+
+    places: Floats
+    mass: Floats
+    sure: Floats
+    boxes: Floats
+    fit: Floats
+
+    def select(self, which: Flags | NDArray[np.intp]) -> CropEstimates:
+        """Return the output for some people."""
+        return CropEstimates(*(getattr(self, field.name)[which] for field in fields(self)))
+
+    def update(self, which: Flags, other: CropEstimates) -> None:
+        """Overwrite the output of some people with that of another look."""
+        for field in fields(self):
+            getattr(self, field.name)[which] = getattr(other, field.name)
+
+    @property
+    def score(self) -> Floats:
+        """Return the confidence that a box holds a person (people,): fit times surest keypoints."""
+        return np.asarray(self.fit * surest_confidence(self.sure[..., 0]))
+
+    def poses(self, taken: NDArray[np.intp]) -> KeypointDetections:
+        """Return the poses whose joints are at the chosen candidates (people, 17)."""
+        one = taken[..., None]
+        return KeypointDetections(
+            np.take_along_axis(self.places, one[..., None], axis=2)[:, :, 0],
+            np.take_along_axis(self.sure, one, axis=2)[:, :, 0],
+            self.boxes,
+            self.fit,
+        )
+
+
+def assign_joints(places: Floats, mass: Floats, boxes: Floats) -> NDArray[np.intp]:
+    """Return the index of the chosen candidate for each joint (people, 17).
+
+    A map often shows the joints of a neighbour too. People choose their likeliest candidates in
+    turn, the most certain person first. A candidate costs more, the more certainly a neighbour has
+    the same joint, of either side, there.
+
+    Args:
+        places: (people, 17, count, 2) [px], the likeliest first.
+        mass: (people, 17, count) probabilities.
+        boxes: (people, 4) [px].
+
+    Note:
+        Li et al., CrowdPose, 2019: assigns candidate joints to people in crowds.
+    """
+    people, joints, _ = mass.shape
+    taken = np.zeros((people, joints), dtype=np.intp)
+    price = -np.log(np.maximum(mass, 1e-9))
+    price[..., 1:][mass[..., 1:] < MIN_CANDIDATE] = np.inf
+    near = box_iou(boxes, boxes) > MIN_RIVAL_IOU
+    np.fill_diagonal(near, False)
+    longer = np.max(boxes[:, 2:] - boxes[:, :2], axis=1)
+    order = np.argsort(-mass[..., 0].mean(axis=1), kind="stable")
+    other_side = np.array(COCO17_FLIP)
+    paired = other_side != np.arange(joints)
+    for _ in range(PASSES):
+        before = taken.copy()
+        for person in order[near[order].any(axis=1)]:
+            who = np.flatnonzero(near[person])
+            at = np.take_along_axis(places[who], taken[who][..., None, None], axis=2)
+            sure = np.take_along_axis(mass[who], taken[who][..., None], axis=2)
+            spread = JOINT_SPREAD * np.minimum(longer[who], longer[person])[:, None, None]
+            rival = _rivalry(places[person], at, sure, spread)
+            rival += paired[:, None] * _rivalry(
+                places[person], at[:, other_side], sure[:, other_side], spread
+            )
+            taken[person] = np.argmin(price[person] + RIVALRY * rival, axis=1)
+        if np.array_equal(before, taken):
+            break
+    return taken
+
+
+def _rivalry(places: Floats, at: Floats, sure: Floats, spread: Floats) -> Floats:
+    """Return the overlap (17, count) [1] of candidates with joints `at` (neighbours, 17, 1, 2)."""
+    apart = np.square(places - at).sum(axis=-1)
+    return np.asarray((sure * np.exp(-0.5 * apart / spread**2)).sum(axis=0))
+
+
+def find_occluded_people(
+    estimate: Callable[[Floats, Sequence[Floats]], CropEstimates], people: People
+) -> KeypointDetections:
+    """Return occluded people next to detected ones that the detector missed, with their poses.
+
+    The net takes a target box and the boxes of its neighbours. It first runs on boxes a step to
+    either side of every detected person, then a second time on the boxes that it returned.
+
+    Args:
+        estimate: returns the net's output for boxes (people, 4) [px], given the boxes of the
+            neighbours of each.
+        people: detected people, with the estimator's boxes.
+
+    Note:
+        Iterative detection conditioned on earlier detections: Rukhovich et al., IterDet, 2020.
+    """
+    sure = people.scores >= MIN_KNOWN_SCORE
+    known = suppress(People(people.boxes[sure], people.scores[sure]), KNOWN_PERSON_IOU).boxes
+    step = SIDE_STEP * (known[:, 2] - known[:, 0])[:, None] * [1.0, 0.0, 1.0, 0.0]
+    asked = np.concatenate([known - step, known + step])
+    shares = box_iou(asked, known)
+    shares[np.tile(np.eye(len(known), dtype=np.bool_), (2, 1))] = 0.0
+    asked = asked[shares.max(axis=1, initial=0.0) <= MAX_ROOM_IOU]
+    seen = estimate(asked, [known[row > 0.0] for row in box_iou(asked, known)])
+    boxes = seen.boxes[_show_others(seen, known, MIN_SECOND_CROP_SCORE)]
+    seen = estimate(boxes, [known[row <= KNOWN_PERSON_IOU] for row in box_iou(boxes, known)])
+    seen = seen.select(_show_others(seen, known, MIN_OCCLUDED_SCORE))
+    seen = seen.select(nms_indices(People(seen.boxes, seen.score), ONE_PERSON_IOU))
+    likeliest = np.zeros(seen.places.shape[:2], dtype=np.intp)
+    return replace(seen.poses(likeliest), score=np.cbrt(UNSEEN_SCORE * seen.score))
+
+
+def _show_others(seen: CropEstimates, known: Floats, least: float) -> Flags:
+    """Return whether a result shows a person other than the known ones (people,)."""
+    real = np.all(seen.boxes[:, 2:] - seen.boxes[:, :2] > 1.0, axis=1)
+    apart = box_iou(seen.boxes, known).max(axis=1, initial=0.0) < KNOWN_PERSON_IOU
+    return np.asarray(real & apart & (seen.score >= least))

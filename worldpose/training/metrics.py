@@ -1,0 +1,238 @@
+"""Metrics on labelled frames: AP50 of boxes, accuracy (PCK) and calibration of keypoints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from data_contracts.arrays import AnyFloats, Flags, Floats, Image, Integers
+from worldpose.detection.interfaces import Detector, People, PoseEstimator
+from worldpose.detection.pipeline import find_poses
+from worldpose.detection.settings import DetectionSettings
+from worldpose.detection.suppression import suppress_poses
+from worldpose.geometry.boxes import box_iou
+from worldpose.training.labels import LabelledPicture, PictureCache
+
+HEIGHTS = ((34.0, 46.0), (52.0, 70.0), (70.0, 160.0))
+"""Classes of people's heights [px]: of about 40, of about 60, and taller."""
+MIN_TRUE_IOU: Final = 0.5
+"""Least intersection over union of a true positive [1]."""
+MAX_ERROR_SHARE: Final = 0.05
+"""A keypoint is correct within this share of the box's longer side [1], a fifth of a torso."""
+TORSO_SHARE: Final = 0.2
+"""Share of the torso within which a keypoint is correct [1]."""
+
+
+@dataclass(frozen=True)
+class KeypointMetrics:
+    """Accuracy of keypoints in given boxes.
+
+    Attributes:
+        people: number of people.
+        pck: share of visible keypoints within a fifth of the torso [1].
+        hidden_pck: the same of occluded ones within the image [1]; NaN without.
+        median_error: of visible keypoints, as a share of the longer side of the box [1].
+        calibration: mean gap between confidence and share of correct keypoints [1].
+    """
+
+    people: int
+    pck: float
+    hidden_pck: float
+    median_error: float
+    calibration: float
+
+
+def detect_labelled(
+    detector: Detector,
+    pictures: Sequence[LabelledPicture],
+    cache: PictureCache,
+    estimator: PoseEstimator | None = None,
+    settings: DetectionSettings | None = None,
+) -> list[People]:
+    """Return the people in each image; with an estimator, as the stage stores them."""
+    found = [detector.detect([cache[picture.path]])[0] for picture in pictures]
+    if estimator is None:
+        return found
+    return [
+        stored_people(people, cache[picture.path], estimator, settings)
+        for people, picture in zip(found, pictures, strict=True)
+    ]
+
+
+def score_people(
+    found: Sequence[People],
+    pictures: Sequence[LabelledPicture],
+    heights: Sequence[tuple[float, float]] = HEIGHTS,
+) -> tuple[float, ...]:
+    """Return AP50 of all detections, and in each class of heights [px]."""
+    classes = [(0.0, np.inf), *heights]
+    return tuple(average_precision(found, pictures, each) for each in classes)
+
+
+def stored_people(
+    people: People,
+    picture: Image,
+    estimator: PoseEstimator,
+    settings: DetectionSettings | None = None,
+) -> People:
+    """Return the people in an image as the stage stores them, the crowd included."""
+    chosen = settings or DetectionSettings()
+    kept = people.scores >= chosen.low_score_threshold
+    people = People(people.boxes[kept], people.scores[kept])
+    found = find_poses(estimator, picture, people, chosen)
+    distinct = suppress_poses(found, chosen.min_keypoint_confidence, chosen.oks_nms)
+    return People.from_detections(distinct)
+
+
+def ignore_crowded(
+    pictures: Sequence[LabelledPicture], share: float = 0.3
+) -> list[LabelledPicture]:
+    """Return the images with people ignored whose box overlaps another's more than `share`.
+
+    Args:
+        pictures: with the truth.
+        share: intersection over union of two people's boxes [1].
+    """
+    kept = []
+    for picture in pictures:
+        common = box_iou(picture.boxes, picture.boxes)
+        np.fill_diagonal(common, 0.0)
+        crowded = (common > share).any(axis=1)
+        kept.append(replace(picture, ignored=picture.ignored | crowded))
+    return kept
+
+
+def score_keypoints(
+    estimator: PoseEstimator,
+    pictures: Sequence[LabelledPicture],
+    cache: PictureCache,
+    heights: tuple[float, float] = (0.0, np.inf),
+) -> KeypointMetrics:
+    """Return metrics of the people of some heights [px], each in the true box."""
+    correct, visible, error, confidence, right = [], [], [], [], []
+    for picture in pictures:
+        tall = picture.boxes[:, 3] - picture.boxes[:, 1]
+        asked = ~picture.ignored & (tall >= heights[0]) & (tall < heights[1])
+        if not asked.any():
+            continue
+        boxes, true = picture.boxes[asked], picture.keypoints[asked]
+        said = estimator.estimate(cache[picture.path], boxes)
+        off = np.linalg.norm(said.keypoints - true, axis=-1)
+        longer = np.max(boxes[:, 2:] - boxes[:, :2], axis=1)
+        correct.append(correct_keypoints(said.keypoints, true))
+        error.append(off / longer[:, None])
+        right.append(off <= MAX_ERROR_SHARE * longer[:, None])
+        visible.append(picture.visible[asked])
+        confidence.append(said.confidence)
+    if not correct:
+        return KeypointMetrics(0, *(np.nan,) * 4)
+    good, seen = np.concatenate(correct), np.concatenate(visible)
+    sure, fine = np.concatenate(confidence), np.concatenate(right)
+    counted = np.isfinite(good) & np.isfinite(sure)
+
+    def share(of: Flags) -> float:
+        return float(np.mean(good[of & np.isfinite(good)])) if of.any() else np.nan
+
+    return KeypointMetrics(
+        people=len(good),
+        pck=share(seen == 2),
+        hidden_pck=share(seen == 1),
+        median_error=float(np.nanmedian(np.concatenate(error)[seen == 2])),
+        calibration=calibration_error(sure[counted], fine[counted]),
+    )
+
+
+def average_precision(
+    found: Sequence[People],
+    labels: Sequence[LabelledPicture],
+    heights: tuple[float, float] = (0.0, np.inf),
+) -> float:
+    """Return the area under the curve of precision over recall [1]; NaN without wanted people.
+
+    As in COCO: the best boxes choose first, each the person it overlaps most. People who are
+    ignored or of other heights, and boxes on them, count neither as true nor as false positives;
+    nor do boxes of other heights that match no person. Precision is made to fall with recall, and
+    integrated at every step of recall instead of at COCO's 101 points.
+
+    Args:
+        found: detections in each image.
+        labels: the truth of the same images.
+        heights: range of wanted people, lower bound included, upper not [px].
+    """
+    scores, right = [], []
+    asked = 0
+    for people, picture in zip(found, labels, strict=True):
+        tall = picture.boxes[:, 3] - picture.boxes[:, 1]
+        wanted = ~picture.ignored & (tall >= heights[0]) & (tall < heights[1])
+        asked += int(wanted.sum())
+        order = np.argsort(-people.scores, kind="stable")
+        verdict = _match_boxes(people.boxes[order], picture.boxes, wanted)
+        own = people.boxes[order, 3] - people.boxes[order, 1]
+        stray = (verdict == 0) & ((own < heights[0]) | (own >= heights[1]))
+        counted = (verdict >= 0) & ~stray
+        scores.append(people.scores[order][counted])
+        right.append(verdict[counted] == 1)
+    if asked == 0:
+        return np.nan
+    order = np.argsort(-np.concatenate(scores), kind="stable")
+    hits = np.concatenate(right)[order]
+    precision = np.cumsum(hits) / np.arange(1, len(hits) + 1)
+    best = np.maximum.accumulate(precision[::-1])[::-1]
+    return float(best[hits].sum() / asked)
+
+
+def _match_boxes(boxes: Floats, true: Floats, wanted: Flags) -> Integers:
+    """Return per box, best first: 1 true positive, 0 false positive, -1 on an ignored person."""
+    verdict = np.zeros(len(boxes), dtype=np.int64)
+    if not len(true):
+        return verdict
+    overlap = box_iou(boxes, true)
+    free = wanted.copy()
+    for index, row in enumerate(overlap):
+        best = int(np.where(free, row, -1.0).argmax())
+        if free[best] and row[best] >= MIN_TRUE_IOU:
+            verdict[index], free[best] = 1, False
+        elif np.any(row[~wanted] >= MIN_TRUE_IOU):
+            verdict[index] = -1
+    return verdict
+
+
+def torso_sizes(keypoints: Floats) -> Floats:
+    """Return the longer diagonal from a shoulder to the other side's hip (people,) [px].
+
+    Args:
+        keypoints: (people, 17, 2) COCO-17 [px].
+    """
+    diagonals = keypoints[:, (5, 6)] - keypoints[:, (12, 11)]
+    return np.asarray(np.linalg.norm(diagonals, axis=-1).max(axis=-1))
+
+
+def correct_keypoints(found: AnyFloats, true: Floats, share: float = TORSO_SHARE) -> Floats:
+    """Return 1 for keypoints within a share of the torso, else 0 (people, 17); NaN without truth.
+
+    Args:
+        found: (people, 17, 2) [px]; a missing one is not correct.
+        true: (people, 17, 2) [px]; NaN where unknown.
+        share: of the torso [1].
+    """
+    error = np.linalg.norm(found - true, axis=-1)
+    torso = torso_sizes(true)
+    known = np.isfinite(true).all(axis=-1) & np.isfinite(torso)[:, None]
+    return np.where(known, error <= share * torso[:, None], np.nan)
+
+
+def calibration_error(confidence: Floats, right: Flags, classes: int = 10) -> float:
+    """Return the mean gap between confidence and share of correct ones [1], over equal bins.
+
+    Args:
+        confidence: (keypoints,) in (0, 1].
+        right: (keypoints,)
+        classes: bins of confidence, with equally many keypoints each.
+    """
+    order = np.argsort(confidence, kind="stable")
+    parts = np.array_split(order, min(classes, len(order)))
+    gaps = [abs(confidence[part].mean() - right[part].mean()) * len(part) for part in parts]
+    return float(np.sum(gaps) / len(order))
