@@ -11,9 +11,10 @@ from worldpose.ingest.footage import UnitFrames, read_unit, unit_frames
 from worldpose.ingest.importing import import_match, import_videos
 from worldpose.ingest.match_folder import MatchFolder, read_match, require_calibrated
 from worldpose.ingest.registration import register_match
-from worldpose.ingest.writing import write_match
+from worldpose.ingest.writing import MatchAnnotations, write_match
 
 __all__ = [
+    "MatchAnnotations",
     "MatchFolder",
     "UnitFrames",
     "import_match",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 
@@ -28,6 +29,16 @@ from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.ingest.validation import require_local
 
 
+@dataclass(frozen=True)
+class MatchAnnotations:
+    """Clicked markings of a match, written to `annotations/`."""
+
+    clicked: Mapping[str, ClickedMarkings] = field(default_factory=dict)
+    """Clicks in one image, by id of a static camera."""
+    key_frames: Mapping[str, KeyFrames] = field(default_factory=dict)
+    """Clicked key frames of the broadcast camera, by id of a clip."""
+
+
 def write_match(
     folder: Path,
     spec: MatchSpec,
@@ -35,9 +46,8 @@ def write_match(
     calibrations: Mapping[str, CameraCalibration],
     observations: Mapping[str, KeypointDetections],
     pitch: PitchSpec | None = None,
-    clicked: Mapping[str, ClickedMarkings] = MappingProxyType({}),
+    annotations: MatchAnnotations | None = None,
     stills: Mapping[str, NDArray[np.uint8]] = MappingProxyType({}),
-    key_frames: Mapping[str, KeyFrames] = MappingProxyType({}),
     further: Callable[[Path], None] | None = None,
 ) -> None:
     """Write a match folder that `read_match` accepts, atomically.
@@ -52,15 +62,16 @@ def write_match(
         observations: by id of a static camera or clip; `frame` is the camera's (or the broadcast
             clip's) own frame number, as in the files, not the match frame.
         pitch: written to the file named by `spec.pitch`, else to pitch.json.
-        clicked: clicked markings of static cameras, by id.
+        annotations: clicked markings of the cameras; None = no clicks.
         stills: images (height, width, 3), RGB, by camera id; written to the file named by the
             camera's `still`, else to stills/<camera>.png.
-        key_frames: clicked key frames of the broadcast camera, by clip.
         further: called with the temporary match folder, to add videos and `reference/`.
 
     Raises:
         InputError: the folder exists and is not empty, or the arguments contradict each other.
     """
+    annotations = annotations or MatchAnnotations()
+    clicked, key_frames = annotations.clicked, annotations.key_frames
     _require_known(spec, [*calibrations, *observations, *clicked, *stills, *key_frames])
     require_local(spec.pitch or "pitch.json", "match.yaml: pitch")
     for camera_id in stills:

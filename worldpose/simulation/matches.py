@@ -16,7 +16,7 @@ from worldpose.body import OPEN_BODY
 from worldpose.formats import write_archive, write_joints, write_moving_camera, write_static_camera
 from worldpose.formats.pose_file import write_poses
 from worldpose.geometry import Camera
-from worldpose.ingest import write_calibration_toml, write_match
+from worldpose.ingest import MatchAnnotations, write_calibration_toml, write_match
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.broadcast_rendering import render_broadcast
 from worldpose.simulation.clips import read_clip
@@ -167,9 +167,11 @@ def simulate_match(
         calibrations={name: camera.to_calibration(name) for name, camera in given.items()},
         observations={} if render else scene.observations,
         pitch=scene.surveyed,
-        clicked={name: clicks.markings for name, clicks in scene.clicks.items()},
+        annotations=MatchAnnotations(
+            clicked={name: clicks.markings for name, clicks in scene.clicks.items()},
+            key_frames=_key_frames(scenario, scene, seed) if video or render else {},
+        ),
         stills=pictures,
-        key_frames=_key_frames(scenario, scene, seed) if video or render else {},
         further=write_further,
     )
     return spec

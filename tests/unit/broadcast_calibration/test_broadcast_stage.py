@@ -20,7 +20,7 @@ from tasks.broadcast_calibration import broadcast_calibration
 from tasks.broadcast_pooling import broadcast_pooling
 from tasks.ingest import ingest
 from worldpose.geometry import Camera
-from worldpose.ingest import write_match
+from worldpose.ingest import MatchAnnotations, write_match
 from worldpose.simulation.broadcast_rendering import render_broadcast
 from worldpose.store import Store
 from worldpose.video import write_video
@@ -102,10 +102,12 @@ def folder(tmp_path_factory):
             "shot": observed(numbers, inside),
         },
         pitch=PitchSpec(),
-        key_frames={
-            "goal": KeyFrames(key_frames=(key, late)),
-            "shot": KeyFrames(key_frames=(other,)),
-        },
+        annotations=MatchAnnotations(
+            key_frames={
+                "goal": KeyFrames(key_frames=(key, late)),
+                "shot": KeyFrames(key_frames=(other,)),
+            }
+        ),
         further=video,
     )
     return path

@@ -14,7 +14,7 @@ from worldpose.errors import InputError
 from worldpose.ingest.footage import read_still
 from worldpose.ingest.match_folder import read_match, require_calibrated
 from worldpose.ingest.registration import register_match
-from worldpose.ingest.writing import write_match
+from worldpose.ingest.writing import MatchAnnotations, write_match
 
 CLICKED = ClickedMarkings(
     points=(
@@ -40,7 +40,7 @@ def clicked_folder(tmp_path, spec, make_people, make_camera):
                 "cam2": make_people(15, 6, seed=2),
                 "goal": make_people(0, 3, seed=3),
             },
-            clicked={"cam2": clicked},
+            annotations=MatchAnnotations(clicked={"cam2": clicked}),
             **keywords,
         )
         return folder

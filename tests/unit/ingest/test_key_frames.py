@@ -6,7 +6,7 @@ from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
 from worldpose.errors import InputError
 from worldpose.ingest.match_folder import read_match
-from worldpose.ingest.writing import write_match
+from worldpose.ingest.writing import MatchAnnotations, write_match
 
 
 def clicks(name="center_mark", xy=(640.0, 360.0)):
@@ -34,7 +34,7 @@ def write(tmp_path, spec, make_people, make_camera):
                 "cam2": make_people(15, 6, seed=2),
                 "goal": make_people(0, 3, seed=3),
             },
-            key_frames={clip: key_frames},
+            annotations=MatchAnnotations(key_frames={clip: key_frames}),
         )
         return folder
 

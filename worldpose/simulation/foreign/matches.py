@@ -11,7 +11,7 @@ import numpy as np
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from worldpose.formats import JointTracks, write_archive, write_joints, write_static_camera
-from worldpose.ingest import write_calibration_toml, write_match
+from worldpose.ingest import MatchAnnotations, write_calibration_toml, write_match
 from worldpose.simulation.foreign.recordings import read_recordings
 from worldpose.simulation.foreign.scenarios import ForeignScenario
 from worldpose.simulation.foreign.scenes import ForeignScene, simulate_foreign_scene
@@ -96,7 +96,7 @@ def simulate_foreign_match(
             for name, report in scene.reports.items()
         },
         pitch=None if scene.pitch is None else scene.pitch.stated,
-        clicked=scene.clicked,
+        annotations=MatchAnnotations(clicked=scene.clicked),
         further=lambda folder: _write_reference(folder / "reference", scene),
     )
     return spec
