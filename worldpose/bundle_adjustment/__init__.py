@@ -4,22 +4,21 @@ Input: calibrated cameras, tracked and triangulated people, clicked markings. Ou
 fit both, accepted only where they reduce the residuals of held-out people.
 """
 
-from worldpose.bundle_adjustment.adjusting import BundleAdjustment, adjust_cameras
-from worldpose.bundle_adjustment.clip import Clicks, Clip
-from worldpose.bundle_adjustment.directions import WeakDirection, weak_direction
-from worldpose.bundle_adjustment.frames import propose_frames
-from worldpose.bundle_adjustment.outliers import (
+from worldpose.bundle_adjustment.adjustment import BundleAdjustment, adjust_cameras
+from worldpose.bundle_adjustment.clip import Clicks, Clip, propose_frames
+from worldpose.bundle_adjustment.report import (
     ClickReview,
     KeypointOutliers,
+    adjustment_arrays,
     keypoint_outliers,
+    marking_errors,
     review_clicks,
 )
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, GivenCameraPrior
-from worldpose.bundle_adjustment.solving import Adjusted, Problem, SolverSettings, solve
-from worldpose.bundle_adjustment.stored import adjustment_arrays, marking_errors
+from worldpose.bundle_adjustment.solver import Problem, Solution, SolverSettings, solve
+from worldpose.bundle_adjustment.uncertainty import WeakDirection, weak_direction
 
 __all__ = [
-    "Adjusted",
     "BundleAdjustment",
     "BundleAdjustmentSettings",
     "ClickReview",
@@ -28,6 +27,7 @@ __all__ = [
     "GivenCameraPrior",
     "KeypointOutliers",
     "Problem",
+    "Solution",
     "SolverSettings",
     "WeakDirection",
     "adjust_cameras",

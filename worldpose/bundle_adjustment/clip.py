@@ -1,15 +1,14 @@
-"""Input of bundle adjustment: one clip, and the keypoints of some of its people."""
+"""Input of bundle adjustment: a clip, its most informative frames (B1), and their keypoints."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Integers
+from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
@@ -27,9 +26,9 @@ class Clicks:
     """
 
     names: tuple[str, ...]
-    points_world: NDArray[np.float64]
-    points_image: NDArray[np.float64]
-    inlier: NDArray[np.bool_]
+    points_world: Floats
+    points_image: Floats
+    inlier: Flags
 
     @classmethod
     def none(cls) -> Clicks:
@@ -60,27 +59,27 @@ class Clip:
     """
 
     cameras: Camera
-    covariance: NDArray[np.float64]
+    covariance: Floats
     clicks: tuple[Clicks, ...]
-    frame: NDArray[np.int64]
+    frame: Integers
     fps: float
-    keypoints: NDArray[np.float64]
-    confidence: NDArray[np.float64]
-    detection_index: NDArray[np.int64]
-    joints: NDArray[np.float64]
-    views: NDArray[np.int64]
+    keypoints: Floats
+    confidence: Floats
+    detection_index: Integers
+    joints: Floats
+    views: Integers
     triangulation: TriangulationSettings
     pitch: PitchTemplate | None = None
-    on_lines: NDArray[np.bool_] | None = None
+    on_lines: Flags | None = None
     names: tuple[str, ...] = ()
 
     @cached_property
-    def given(self) -> NDArray[np.bool_]:
+    def given(self) -> Flags:
         """Whether each camera (cameras,) comes from a file that states no covariance."""
         return np.asarray(~self.covariance.any(axis=(1, 2)))
 
     @cached_property
-    def distance(self) -> NDArray[np.float64]:
+    def distance(self) -> Floats:
         """Median depth (cameras,) of people in each camera [m]; NaN without people."""
         frame, camera, person = np.nonzero(self.detection_index >= 0)
         found = np.isfinite(self.joints[..., 0])
@@ -99,7 +98,7 @@ class Clip:
         return out
 
 
-class Observed(NamedTuple):
+class Observations(NamedTuple):
     """Keypoints of some people in some frames, sorted by point.
 
     A point is one joint of one person in one frame.
@@ -123,11 +122,11 @@ class Observed(NamedTuple):
     """(n,) stated standard deviation per axis [px]."""
 
 
-def keypoints_of(
-    keypoints: NDArray[np.float64],
-    confidence: NDArray[np.float64],
-    detection_index: NDArray[np.int64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def keypoints_by_person(
+    keypoints: Floats,
+    confidence: Floats,
+    detection_index: Integers,
+) -> tuple[Floats, Floats]:
     """Return keypoints (frames, cameras, persons, 17, 2) and their confidence, by person.
 
     NaN and 0 where the person is not seen.
@@ -147,9 +146,9 @@ def keypoints_of(
     )
 
 
-def observe(
-    clip: Clip, frames: Integers, people: NDArray[np.bool_], cameras: Camera, min_views: int
-) -> Observed:
+def select_observations(
+    clip: Clip, frames: Integers, people: Flags, cameras: Camera, min_views: int
+) -> Observations:
     """Return the keypoints of joints with enough inlier cameras.
 
     Args:
@@ -160,11 +159,11 @@ def observe(
         min_views: minimum inlier cameras of a joint.
     """
     index = clip.detection_index[frames]
-    image, confidence = keypoints_of(clip.keypoints[frames], clip.confidence[frames], index)
+    image, confidence = keypoints_by_person(clip.keypoints[frames], clip.confidence[frames], index)
     joints = clip.joints[frames]
     good = np.isfinite(joints[..., 0]) & (clip.views[frames] >= min_views)
     good &= np.broadcast_to(people, good.shape[:2])[..., None]
-    predicted, noise = predict(cameras, joints, confidence, clip.triangulation)
+    predicted, noise = project_joints(cameras, joints, confidence, clip.triangulation)
     seen = good[:, None] & (confidence > 0.0) & np.isfinite(predicted).all(axis=-1)
     # A joint that only one of these cameras can use carries no information.
     seen &= (seen.sum(axis=1) >= 2)[:, None]
@@ -172,7 +171,7 @@ def observe(
     frame, person, joint, camera = np.nonzero(by_point)
     used = by_point.any(axis=-1)
     number = np.cumsum(used).reshape(used.shape) - 1
-    return Observed(
+    return Observations(
         points=joints[used],
         point_of=number[frame, person, joint],
         camera_of=camera,
@@ -184,7 +183,7 @@ def observe(
     )
 
 
-def with_learned_noise(clip: Clip, frames: Integers) -> Clip:
+def learn_confidence(clip: Clip, frames: Integers) -> Clip:
     """Return the clip with the noise of its detector in its confidences.
 
     The variance of a keypoint is then the stated one over its confidence, and triangulation treats
@@ -196,30 +195,30 @@ def with_learned_noise(clip: Clip, frames: Integers) -> Clip:
     """
     settings = clip.triangulation
     if settings.learn_noise and len(frames):
-        seen = (clip.keypoints[frames], clip.confidence[frames])
+        keypoints, confidence = clip.keypoints[frames], clip.confidence[frames]
         index = clip.detection_index[frames].astype(np.int16)
-        noise = triangulate_joints(clip.cameras, *seen, index, settings).noise
+        noise = triangulate_joints(clip.cameras, keypoints, confidence, index, settings).noise
         precision = noise.precision(clip.confidence)
     else:
         precision = np.where(clip.confidence > 0.0, clip.confidence, 0.0)
-    most = max(float(precision.max(initial=0.0)), 1e-12)
+    max_precision = max(float(precision.max(initial=0.0)), 1e-12)
     exact = {
         "learn_noise": False,
         "offsets": "none",
-        "pixel_noise": settings.pixel_noise / np.sqrt(most),
-        "joint_noise": settings.joint_noise / np.sqrt(most),
+        "pixel_noise": settings.pixel_noise / np.sqrt(max_precision),
+        "joint_noise": settings.joint_noise / np.sqrt(max_precision),
     }
     return replace(
-        clip, confidence=precision / most, triangulation=settings.model_copy(update=exact)
+        clip, confidence=precision / max_precision, triangulation=settings.model_copy(update=exact)
     )
 
 
-def predict(
+def project_joints(
     cameras: Camera,
-    joints: NDArray[np.float64],
-    confidence: NDArray[np.float64],
+    joints: Floats,
+    confidence: Floats,
     settings: TriangulationSettings,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats]:
     """Return projections of joints, and the standard deviation of keypoints there per axis [px].
 
     Args:
@@ -244,4 +243,66 @@ def predict(
         variance = settings.pixel_noise**2 + (settings.joint_noise * size) ** 2
         noise = np.sqrt(variance / confidence)
     noise[~np.isfinite(noise)] = np.inf
-    return predicted.reshape(*shape, 2).swapaxes(0, 1), noise
+    return predicted.reshape((*shape, 2)).swapaxes(0, 1), noise
+
+
+_CELL: Final = 8.0
+"""Side of a pitch cell [m]: a quarter of the width that a static camera sees."""
+_SATURATION: Final = 17.0
+"""Keypoints of one cell in one camera after which further ones count half [1]: one person."""
+
+
+def propose_frames(
+    clip: Clip,
+    count: int,
+    gap: float,
+    min_views: int,
+    taken: Integers | None = None,
+) -> Integers:
+    """Return indices of the most informative frames for all cameras, ascending.
+
+    Each frame adds keypoints of joints with enough views to cells of the pitch, per camera; further
+    keypoints of a cell have diminishing value (the sum of logarithms). A greedy search takes the
+    frame that adds most, `gap` away from those before.
+
+    Args:
+        clip: cameras, joints and their detections.
+        count: maximum number of frames.
+        gap: minimum time between two of them [s].
+        min_views: minimum inlier cameras of a joint.
+        taken: (k,) indices to exclude.
+
+    Note:
+        B1.
+    """
+    offered = _count_keypoints(clip, min_views)
+    left: Flags = np.asarray(offered.any(axis=1))
+    left[[] if taken is None else taken] = False
+    collected = np.zeros(offered.shape[1])
+    chosen: list[int] = []
+    while len(chosen) < count and left.any():
+        rest = np.flatnonzero(left)
+        gain = np.log1p(offered[rest] / (_SATURATION + collected)).sum(axis=1)
+        best = int(rest[np.argmax(gain)])
+        chosen.append(best)
+        collected += offered[best]
+        near = np.abs(np.arange(len(left)) - best) < gap * clip.fps - 1e-9
+        left[near] = False
+        left[best] = False
+    return np.array(sorted(chosen), dtype=np.int64)
+
+
+def _count_keypoints(clip: Clip, min_views: int) -> Floats:
+    """Return keypoint counts (frames, cells) of every camera's cells; only cells with people."""
+    good = np.isfinite(clip.joints[..., 0]) & (clip.views >= min_views)
+    number = good.sum(axis=-1)
+    place = np.where(good[..., None], clip.joints, 0.0)[..., :2].sum(axis=-2)
+    place /= np.maximum(number, 1)[..., None]
+    cell = np.floor(place / _CELL).astype(np.int64)
+    _, cell_of = np.unique(cell.reshape(-1, 2), axis=0, return_inverse=True)
+    cell_of = cell_of.reshape(number.shape)
+    frames, cameras, _ = clip.detection_index.shape
+    offered = np.zeros((frames, cameras, int(cell_of.max(initial=0)) + 1))
+    f, c, p = np.nonzero(clip.detection_index >= 0)
+    np.add.at(offered, (f, c, cell_of[f, p]), number[f, p])
+    return offered.reshape(frames, -1)

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.bundle_adjustment.clip import Clip, keypoints_of, predict
+from data_contracts.arrays import Flags, Floats, Integers
+from worldpose.bundle_adjustment.clip import Clip, keypoints_by_person, project_joints
 from worldpose.bundle_adjustment.gauge import Similarity, align_points
+from worldpose.bundle_adjustment.problems import MEDIAN_SQUARED, camera_knowledge, known_covariance
+from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
+from worldpose.bundle_adjustment.solver import Problem, Solution, solve
+from worldpose.errors import InputError
 from worldpose.geometry import Camera
+from worldpose.static_calibration import PARAMETERS
 from worldpose.triangulation import triangulate_joints
+from worldpose.triangulation.calibration_errors import StatedErrors, stated_errors
 
-_PARTS: Final = 4
+_INTERVALS: Final = 4
 """Intervals of the time; the errors of a held-out person in one of them count as one
 observation."""
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOut:
+class HeldOutErrors:
     """Errors of held-out people's keypoints in every camera.
 
     Each joint is triangulated from the other cameras alone.
@@ -30,18 +37,18 @@ class HeldOut:
         joints: (frames, persons, 17, 3) [m], world, from all cameras; NaN without data.
     """
 
-    loss: NDArray[np.float64]
-    error: NDArray[np.float64]
-    joints: NDArray[np.float64]
+    loss: Floats
+    error: Floats
+    joints: Floats
 
 
-def held_out(
+def held_out_errors(
     clip: Clip,
     cameras: Camera,
-    frames: NDArray[np.int64],
-    people: NDArray[np.bool_],
+    frames: Integers,
+    people: Flags,
     robust_scale: float,
-) -> HeldOut:
+) -> HeldOutErrors:
     """Return the errors of keypoints against joints from the other cameras.
 
     Args:
@@ -56,10 +63,10 @@ def held_out(
     loss = np.full((*index.shape, keypoints.shape[-2]), np.nan)
     error = loss.copy()
     judges = np.flatnonzero(people.any(axis=0))
-    image, weight = keypoints_of(keypoints, confidence, index[:, :, judges].astype(np.int64))
+    image, weight = keypoints_by_person(keypoints, confidence, index[:, :, judges].astype(np.int64))
     for c in range(len(cameras.focal)):
-        joints = _without(clip, cameras, c, keypoints, confidence, index[:, :, judges])
-        predicted, noise = predict(
+        joints = _triangulate(clip, cameras, c, keypoints, confidence, index[:, :, judges])
+        predicted, noise = project_joints(
             cameras[c : c + 1], joints, weight[:, c : c + 1], clip.triangulation
         )
         length = np.linalg.norm(predicted[:, 0] - image[:, c], axis=-1)
@@ -68,13 +75,13 @@ def held_out(
         loss[:, c, judges] = robust_scale**2 * np.log1p(squared / robust_scale**2)
     loss[~np.isfinite(error)] = np.nan
     joints = np.full((len(frames), index.shape[2], *loss.shape[3:], 3), np.nan)
-    joints[:, judges] = _without(clip, cameras, None, keypoints, confidence, index[:, :, judges])
-    return HeldOut(loss, error, joints)
+    joints[:, judges] = _triangulate(
+        clip, cameras, None, keypoints, confidence, index[:, :, judges]
+    )
+    return HeldOutErrors(loss, error, joints)
 
 
-def joints_without(
-    clip: Clip, cameras: Camera, camera: int, frames: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def triangulate_without(clip: Clip, cameras: Camera, camera: int, frames: Integers) -> Floats:
     """Return joints (k, persons, 17, 3) from all cameras but one [m], world.
 
     Args:
@@ -84,17 +91,19 @@ def joints_without(
         frames: (k,) indices of frames.
     """
     index = clip.detection_index[frames].astype(np.int16)
-    return _without(clip, cameras, camera, clip.keypoints[frames], clip.confidence[frames], index)
+    return _triangulate(
+        clip, cameras, camera, clip.keypoints[frames], clip.confidence[frames], index
+    )
 
 
-def _without(
+def _triangulate(
     clip: Clip,
     cameras: Camera,
     camera: int | None,
-    keypoints: NDArray[np.float64],
-    confidence: NDArray[np.float64],
+    keypoints: Floats,
+    confidence: Floats,
     index: NDArray[np.int16],
-) -> NDArray[np.float64]:
+) -> Floats:
     others = index.copy()
     if camera is not None:
         others[:, camera] = -1
@@ -111,12 +120,12 @@ class Verdict:
         error: (cameras, 2) median length before and after [px]; NaN without keypoints.
     """
 
-    judges: NDArray[np.int64]
-    loss: NDArray[np.float64]
-    error: NDArray[np.float64]
+    judges: Integers
+    loss: Floats
+    error: Floats
 
 
-def verdict(before: HeldOut, after: HeldOut) -> Verdict:
+def compare_errors(before: HeldOutErrors, after: HeldOutErrors) -> Verdict:
     """Return the comparison per camera."""
     count = before.loss.shape[1]
     both = np.isfinite(before.loss) & np.isfinite(after.loss)
@@ -149,7 +158,7 @@ class Evidence:
     scale: float
 
 
-def all_evidence(before: HeldOut, after: HeldOut, cameras: NDArray[np.bool_]) -> Evidence:
+def pool_evidence(before: HeldOutErrors, after: HeldOutErrors, cameras: Flags) -> Evidence:
     """Return the result of all held-out people together.
 
     Args:
@@ -159,10 +168,10 @@ def all_evidence(before: HeldOut, after: HeldOut, cameras: NDArray[np.bool_]) ->
     """
     fall = (before.loss - after.loss)[:, cameras]
     told = np.isfinite(fall)
-    part = np.arange(len(fall)) * _PARTS // max(len(fall), 1)
+    part = np.arange(len(fall)) * _INTERVALS // max(len(fall), 1)
     groups = []
     for person in range(fall.shape[2]):
-        for each in range(_PARTS):
+        for each in range(_INTERVALS):
             inside = fall[part == each, :, person][told[part == each, :, person]]
             if len(inside):
                 groups.append(float(inside.mean()))
@@ -182,7 +191,134 @@ def all_evidence(before: HeldOut, after: HeldOut, cameras: NDArray[np.bool_]) ->
     return Evidence(gain, significance, shift, turn, moved.scale - 1.0)
 
 
-def common_motion(before: NDArray[np.float64], after: NDArray[np.float64]) -> Similarity:
+def common_motion(before: Floats, after: Floats) -> Similarity:
     """Return the common similarity transform of joints (..., 3)."""
     both = np.isfinite(before).all(axis=-1) & np.isfinite(after).all(axis=-1)
     return align_points(before[both], after[both])
+
+
+_SIZE: Final = len(PARAMETERS)
+_LIMIT: Final = 4.0
+"""Median squared error, over the stated variance of noise and calibration, from which the others'
+people place a camera [1]: twice the stated error, as for one correct camera in thirty."""
+_MIN_STEP: Final = 9.0
+"""Squared step to that place in stated standard deviations, per parameter, from which its
+calibration is distrusted [1]: three of them in every direction."""
+_VARIANCE_FACTOR: Final = 16.0
+"""Factor on the variances of a camera during this placement [1]: people outweigh the prior where
+they carry information; elsewhere the camera stays."""
+_SCALES: Final = (30.0, 3.0)
+"""Scales of the loss, one after the other [standard deviations]: the first allows a far step."""
+_MIN_KEYPOINTS: Final = 20
+"""Minimum keypoints for a contradiction [1]: one person, hardly more than once."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contradictions:
+    """Contradictions of cameras, found before adjustment.
+
+    Attributes:
+        variance_factor: (cameras,) factor on the variance that calibration states [1].
+        offset: (cameras, 12) steps of contradicting cameras to their place by the others' people.
+        other_people: (cameras,) bool, whether it shows other people.
+    """
+
+    variance_factor: Floats
+    offset: Floats
+    other_people: Flags
+
+    @classmethod
+    def none(cls, count: int) -> Contradictions:
+        """Return the result for cameras without contradictions."""
+        return cls(np.ones(count), np.zeros((count, _SIZE)), np.zeros(count, dtype=np.bool_))
+
+
+def find_contradictions(
+    clip: Clip,
+    frames: Integers,
+    held: HeldOutErrors,
+    settings: BundleAdjustmentSettings,
+) -> Contradictions:
+    """Return the cameras that disagree with all others far beyond their stated errors.
+
+    Args:
+        clip: cameras and people.
+        frames: (k,) indices of frames.
+        held: errors of people in every camera against joints from the other cameras.
+        settings: the prior of given cameras.
+    """
+    keypoints, confidence = clip.keypoints[frames], clip.confidence[frames]
+    image, weight = keypoints_by_person(keypoints, confidence, clip.detection_index[frames])
+    joints = clip.joints[frames]
+    _, noise = project_joints(clip.cameras, joints, weight, clip.triangulation)
+    known = known_covariance(clip, settings)
+    stated = stated_errors(clip.cameras, joints, clip.triangulation, known)
+    # Noise, and the error of the other cameras' joints in this image.
+    place = noise**2 + (stated.scale**2 * _joint_variance(stated))[..., None]
+    with np.errstate(invalid="ignore"):
+        squared = held.error**2 / (place + stated.variance[..., None])
+    found = Contradictions.none(len(known))
+    information, free = camera_knowledge(clip, settings)
+    for c in range(len(known)):
+        told = np.isfinite(squared[:, c])
+        if told.sum() < _MIN_KEYPOINTS or np.median(squared[:, c][told]) < _LIMIT * MEDIAN_SQUARED:
+            continue
+        points = triangulate_without(clip, clip.cameras, c, frames)
+        used = np.isfinite(points[..., 0]) & (weight[:, c] > 0.0)
+        used &= np.isfinite(place[:, c])
+        used &= np.isfinite(clip.cameras[c].project(points)).all(axis=-1)
+        number = int(used.sum())
+        if number < _MIN_KEYPOINTS:
+            found.other_people[c] = True
+            continue
+        problem = Problem(
+            cameras=clip.cameras[c : c + 1],
+            free=free[c : c + 1],
+            camera_information=information[c : c + 1] / _VARIANCE_FACTOR,
+            points=points[used],
+            point_information=np.full(number, np.inf),
+            point_of=np.arange(number),
+            camera_of=np.zeros(number, dtype=np.int64),
+            image=image[:, c][used],
+            weight=1.0 / place[:, c][used],
+            scale=np.full(number, np.inf),
+        )
+        placed = _place_camera(problem, settings)
+        if placed is None:
+            found.other_people[c] = True
+            continue
+        off = placed.cameras[0].project(problem.points) - problem.image
+        left = float(np.median((off**2).sum(axis=1) * problem.weight))
+        if left > _LIMIT * MEDIAN_SQUARED:
+            found.other_people[c] = True
+            continue
+        step = placed.offset[0]
+        squared_step = float(step @ information[c] @ step) / int(free[c].sum())
+        if squared_step > _MIN_STEP:
+            found.offset[c], found.variance_factor[c] = step, squared_step
+    return found
+
+
+def _place_camera(problem: Problem, settings: BundleAdjustmentSettings) -> Solution | None:
+    """Return the camera fitted to these points; None if it cannot image all of them."""
+    offset = None
+    for scale in _SCALES:
+        loss = np.full(len(problem.points), scale)
+        try:
+            placed = solve(replace(problem, scale=loss), settings.solver, offset, covariance=False)
+        except InputError:
+            return None
+        offset = placed.offset
+    return placed
+
+
+def _joint_variance(stated: StatedErrors) -> Floats:
+    """Return the joints' variance by the other calibrations (frames, cameras, persons) [m^2].
+
+    Per axis: n views of equal variance leave 3 / (2 n) of it, each seeing two of three axes.
+    """
+    there = stated.scale > 0.0
+    squared = np.where(there, stated.variance / np.where(there, stated.scale, 1.0) ** 2, 0.0)
+    others = there.sum(axis=1, keepdims=True) - there
+    total = squared.sum(axis=1, keepdims=True) - squared
+    return np.asarray(1.5 * total / np.maximum(others, 1) ** 2)

@@ -44,6 +44,19 @@ class Evidence(NamedTuple):
     """(n,) of Cauchy's loss, in standard deviations; infinite = plain squares."""
 
 
+class CameraEquations(NamedTuple):
+    """Arrays of the cameras' normal equations, which the elimination of points fills."""
+
+    columns: Integers
+    """(cameras, 12); columns of the parameters in Y, -1 = fixed parameter."""
+    rows: Floats
+    """(3 points, free parameters + 1): Y and, last, L^-1 times the gradient by the points."""
+    blocks: Floats
+    """(cameras, 12, 12); lower triangle."""
+    gradient: Floats
+    """(cameras, 12)"""
+
+
 @compiled
 def eliminate(
     cameras: Floats,
@@ -52,10 +65,7 @@ def eliminate(
     damping: float,
     first: int,
     last: int,
-    columns: Integers,
-    rows: Floats,
-    blocks: Floats,
-    gradient: Floats,
+    equations: CameraEquations,
 ) -> None:
     """Add the observations of points `first` to `last` to the cameras' system.
 
@@ -66,12 +76,11 @@ def eliminate(
         damping: Marquardt damping of the points.
         first: first point.
         last: last point, exclusive.
-        columns: (cameras, 12); columns of the parameters in Y, -1 = fixed parameter.
-        rows: (3 (last - first), free parameters + 1), written: Y and, last, L^-1 times the
-            gradient by the points.
-        blocks: (cameras, 12, 12), added to; lower triangle.
-        gradient: (cameras, 12), added to.
+        equations: of the cameras; `rows` is written, for these points alone, `blocks` and
+            `gradient` are added to.
     """
+    columns, rows = equations.columns, equations.rows
+    blocks, gradient = equations.blocks, equations.gradient
     rows[:] = 0.0
     by_camera = np.empty((2, STEPS))
     by_point = np.empty((2, 3))

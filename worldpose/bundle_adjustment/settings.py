@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from data_contracts.records import Frame, Record
-from worldpose.bundle_adjustment.solving import SolverSettings
+from worldpose.bundle_adjustment.solver import SolverSettings
 from worldpose.static_calibration.line_settings import SURVEY_ERROR
 
 

@@ -1,16 +1,22 @@
-"""People who had no part in it judge a camera's change."""
+"""Held-out people: comparison of cameras, and cameras that contradict all others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from worldpose.bundle_adjustment.held_out_validation import held_out, verdict
+from worldpose.bundle_adjustment import BundleAdjustmentSettings, adjust_cameras
+from worldpose.bundle_adjustment.held_out_validation import compare_errors, held_out_errors
 from worldpose.static_calibration import stepped
+from worldpose.triangulation import triangulate_joints
 
 
 def test_true_cameras_are_judged_by_the_noise_alone(clip):
     made, true, _ = clip(cameras=6, noise=1.0)
     frames = np.arange(24)
-    held = held_out(made, true, frames, np.ones((24, 6), dtype=bool), robust_scale=100.0)
+    held = held_out_errors(made, true, frames, np.ones((24, 6), dtype=bool), robust_scale=100.0)
     # Two axes of unit variance, and what the joint of five other views adds: 2 (1 + 3 / (2 x 5)).
     assert np.nanmean(held.loss) == pytest.approx(2.6, rel=0.05)
 
@@ -20,8 +26,10 @@ def test_a_turned_camera_is_seen_in_its_own_keypoints(clip):
     frames, everybody = np.arange(24), np.ones((24, 6), dtype=bool)
     step = np.zeros((6, 12))
     step[2, 1] = 5e-3  # 10 px
-    before = held_out(made, true, frames, everybody, 3.0)
-    said = verdict(before, held_out(made, stepped(true, step), frames, everybody, 3.0))
+    before = held_out_errors(made, true, frames, everybody, 3.0)
+    said = compare_errors(
+        before, held_out_errors(made, stepped(true, step), frames, everybody, 3.0)
+    )
     assert np.argmax(said.loss[:, 1] - said.loss[:, 0]) == 2
     assert said.error[2, 1] > 5.0 > said.error[2, 0]
     assert (said.judges == 24 * 6 * 17).all()
@@ -31,16 +39,16 @@ def test_only_the_judges_judge(clip):
     made, true, _ = clip()
     people = np.zeros((24, 6), dtype=bool)
     people[:, 4] = True
-    held = held_out(made, true, np.arange(24), people, 3.0)
+    held = held_out_errors(made, true, np.arange(24), people, 3.0)
     assert np.isfinite(held.loss[:, :, 4]).all()
     assert np.isnan(held.loss[:, :, :4]).all()
 
 
-def test_nobody_gives_no_verdict(clip):
+def test_nobody_gives_no_comparison(clip):
     made, true, _ = clip()
     nobody = np.zeros((24, 6), dtype=bool)
-    held = held_out(made, true, np.arange(24), nobody, 3.0)
-    said = verdict(held, held)
+    held = held_out_errors(made, true, np.arange(24), nobody, 3.0)
+    said = compare_errors(held, held)
     assert (said.judges == 0).all()
     assert np.isnan(said.loss).all()
 
@@ -50,8 +58,69 @@ def test_what_a_far_keypoint_costs_grows_with_the_logarithm_of_its_square(clip, 
     made, true, _ = clip(frames=2, persons=1, noise=0.0)
     made.keypoints[1, 2, 0, 4] += [3.6, 4.8]
     everybody = np.ones((2, 1), dtype=bool)
-    held = held_out(made, true, np.arange(2), everybody, robust_scale=scale)
+    held = held_out_errors(made, true, np.arange(2), everybody, robust_scale=scale)
     # 6 px at a noise of one: two and four scales, and the other four views are exact.
     assert held.error[1, 2, 0, 4] == pytest.approx(6.0, rel=1e-4)
     assert held.loss[1, 2, 0, 4] == pytest.approx(loss, rel=1e-4)
     assert held.loss[0].max() < 1e-4
+
+
+QUICK = BundleAdjustmentSettings(frames=8, folds=2)
+WRONG = 2
+
+
+def errors(cameras, true):
+    """Mean distance [px] by which cameras put people's places beside the true ones."""
+    places = np.array([[x, y, 1.0] for x in (-8.0, 0.0, 8.0) for y in (-8.0, 0.0, 8.0)])
+    return np.linalg.norm(cameras.project(places) - true.project(places), axis=-1).mean(axis=-1)
+
+
+def placed_again(clip):
+    """The clip with its people triangulated with the cameras that it has now."""
+    index = clip.detection_index.astype(np.int16)
+    placed = triangulate_joints(
+        clip.cameras, clip.keypoints, clip.confidence, index, clip.triangulation
+    )
+    return replace(clip, joints=placed.joints, views=placed.views.astype(np.int64))
+
+
+@pytest.fixture
+def honest(clip):
+    """A clip of eight cameras, the true ones, and the errors that adjustment leaves them."""
+    made, true, _ = clip(cameras=8, seed=3)
+    # Calibrations of a pixel, not of ten: three views or more agree about every joint.
+    covariance = 0.01 * made.covariance
+    spread = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    step = spread * np.random.default_rng(7).standard_normal((8, 12))
+    made = placed_again(replace(made, cameras=stepped(true, step), covariance=covariance))
+    adjusted = adjust_cameras(made, QUICK)
+    assert adjusted.accepted.all()
+    return made, true, errors(adjusted.cameras, true)
+
+
+def test_a_camera_calibrated_wrong_is_mended_and_the_others_hardly_feel_it(honest):
+    made, true, clean = honest
+    step = np.zeros((8, 12))
+    step[WRONG, 1] = 0.02  # 40 px, two hundred times what its calibration states
+    adjusted = adjust_cameras(
+        placed_again(replace(made, cameras=stepped(made.cameras, step))), QUICK
+    )
+    assert adjusted.accepted.all()
+    left = errors(adjusted.cameras, true)
+    # It had a say in where the world is: without it the others lose an eighth of their knowledge.
+    assert np.delete(left, WRONG).mean() < 1.25 * np.delete(clean, WRONG).mean()
+    # A hundredth of what it was, and more than the others': people alone place it.
+    assert left[WRONG] < 0.4
+
+
+def test_a_camera_that_shows_other_people_has_no_say(honest):
+    made, true, clean = honest
+    index = made.detection_index.copy()
+    index[:, WRONG] = np.roll(index[:, WRONG], 1, axis=-1)
+    adjusted = adjust_cameras(placed_again(replace(made, detection_index=index)), QUICK)
+    assert np.flatnonzero(~adjusted.accepted).tolist() == [WRONG]
+    assert "shows other people" in adjusted.reasons[WRONG]
+    np.testing.assert_array_equal(adjusted.cameras.numbers[WRONG], made.cameras.numbers[WRONG])
+    np.testing.assert_array_equal(adjusted.covariance[WRONG], made.covariance[WRONG])
+    left = errors(adjusted.cameras, true)
+    assert np.delete(left, WRONG).mean() < 1.25 * np.delete(clean, WRONG).mean()

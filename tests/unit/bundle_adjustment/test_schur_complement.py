@@ -7,6 +7,7 @@ import pytest
 
 from worldpose.bundle_adjustment.schur_complement import (
     STEPS,
+    CameraEquations,
     Evidence,
     cost,
     eliminate,
@@ -53,7 +54,7 @@ def dense_step(problem, points):
 
 
 def test_the_step_is_that_of_the_dense_normal_equations(scene):
-    from worldpose.bundle_adjustment.solving import _System
+    from worldpose.bundle_adjustment.solver import _System
 
     problem, _, points = scene(noise=2.0)
     start = points + np.where(np.isinf(problem.point_information), 0.0, 0.1)[:, None]
@@ -73,7 +74,8 @@ def test_the_gradient_is_the_slope_of_the_cost(scene, scale):
     numbers = problem.cameras.numbers
     rows, columns = np.zeros((3 * len(points), 1)), np.full((4, STEPS), -1)
     blocks, gradient = np.zeros((4, STEPS, STEPS)), np.zeros((4, STEPS))
-    eliminate(numbers, points, evidence, 0.0, 0, len(points), columns, rows, blocks, gradient)
+    equations = CameraEquations(columns, rows, blocks, gradient)
+    eliminate(numbers, points, evidence, 0.0, 0, len(points), equations)
     for parameter in range(STEPS):
         step = np.zeros((4, STEPS))
         step[1, parameter] = 1e-6

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worldpose.bundle_adjustment.survey import survey_response, with_shared_errors
+from worldpose.bundle_adjustment.uncertainty import add_shared_errors, survey_response
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import stepped
 from worldpose.static_calibration.line_adjustment import adjust
@@ -77,7 +77,7 @@ def test_lines_that_are_off_together_move_the_camera_with_them():
     pull_apart = 1e6  # what people tell: both are the same
     matrix = np.diag([1.0, 1.0]) + pull_apart * np.array([[1.0, -1.0], [-1.0, 1.0]])
     response = np.full((2, 1, 1), np.sqrt(0.5))
-    found = with_shared_errors(np.linalg.inv(matrix), information, response)
+    found = add_shared_errors(np.linalg.inv(matrix), information, response)
     # Of the mean of independent ones it would be a half; people's millionth is left.
     np.testing.assert_allclose(found[:, 0, 0], 0.75, rtol=1e-5)
 
@@ -85,6 +85,6 @@ def test_lines_that_are_off_together_move_the_camera_with_them():
 def test_cameras_that_share_nothing_stay_as_sure(lined):
     rng = np.random.default_rng(1)
     root = rng.standard_normal((24, 24))
-    found = with_shared_errors(root @ root.T, np.tile(np.eye(12), (2, 1, 1)), np.zeros((2, 12, 0)))
+    found = add_shared_errors(root @ root.T, np.tile(np.eye(12), (2, 1, 1)), np.zeros((2, 12, 0)))
     blocks = (root @ root.T).reshape(2, 12, 2, 12)
     np.testing.assert_allclose(found, blocks[[0, 1], :, [0, 1]])

@@ -6,12 +6,15 @@ camera's covariance includes them, but averaging over sixteen cameras does not r
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from data_contracts.arrays import Floats
 from worldpose.bundle_adjustment.clip import Clip
+from worldpose.geometry import Camera
+from worldpose.static_calibration import PARAMETERS, project_with_jacobian
 from worldpose.static_calibration.line_samples import sample_markings, see_lines, thinned
 from worldpose.static_calibration.line_settings import LineRefinementSettings
 
@@ -64,11 +67,11 @@ def survey_response(clip: Clip, survey_error: float) -> Floats:
         met = by_paint.T @ seen.by_camera / _NOISE
         moved = clip.covariance[c] @ np.linalg.solve(known, met).T
         response[c][:, unknowns[unknowns >= 0]] = moved[:, unknowns >= 0]
-        response[c] /= max(1.0, _share(clip.covariance[c], response[c]))
+        response[c] /= max(1.0, _explained_share(clip.covariance[c], response[c]))
     return response
 
 
-def with_shared_errors(covariance: Floats, information: Floats, response: Floats) -> Floats:
+def add_shared_errors(covariance: Floats, information: Floats, response: Floats) -> Floats:
     """Return the covariance (cameras, 12, 12) of each camera for correlated calibrations.
 
     The weights of the adjustment treat calibrations as independent; its errors follow from their
@@ -90,9 +93,58 @@ def with_shared_errors(covariance: Floats, information: Floats, response: Floats
     return np.asarray(own + together @ together.swapaxes(1, 2) - alone)
 
 
-def _share(covariance: Floats, response: Floats) -> float:
+def _explained_share(covariance: Floats, response: Floats) -> float:
     """Return the largest share of a camera's standard deviation that a response explains."""
     free = np.diag(covariance) > 0.0
     size = np.sqrt(np.diag(covariance)[free])
     factor = np.linalg.cholesky(covariance[np.ix_(free, free)] / np.outer(size, size))
     return float(np.linalg.norm(np.linalg.solve(factor, response[free] / size[:, None]), ord=2))
+
+
+_DISTANCE: Final = 60.0
+"""Distance of the points whose image motion makes parameters comparable [m]."""
+_NAMED: Final = 0.25
+"""Share of the largest component from which a parameter is named [1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class WeakDirection:
+    """Direction in which people and markings constrain a camera least.
+
+    Attributes:
+        step: (12,) one standard deviation along it, in the units of `PARAMETERS`.
+        about: parameters that move together, with their steps.
+    """
+
+    step: Floats
+    about: str
+
+
+def weak_direction(camera: Camera, covariance: Floats) -> WeakDirection:
+    """Return the direction of largest variance.
+
+    Parameters are scaled by the image motion of each alone; along a weak direction these motions
+    cancel.
+
+    Args:
+        camera: a single camera.
+        covariance: (12, 12) of a step.
+    """
+    width, height = camera.image_size
+    across, down = np.meshgrid(np.linspace(0, width - 1, 9), np.linspace(0, height - 1, 6))
+    rays = camera.unproject(np.stack([across, down], axis=-1).reshape(-1, 2))
+    seen = rays.origins + _DISTANCE * rays.directions
+    _, by_step = project_with_jacobian(camera, seen[np.isfinite(seen).all(axis=1)])
+    pixels = np.sqrt(np.nanmean((by_step**2).sum(axis=1), axis=0))
+    values, vectors = np.linalg.eigh(covariance * np.outer(pixels, pixels))
+    step = np.sqrt(max(values[-1], 0.0)) * vectors[:, -1] / pixels
+    if not step.any():
+        return WeakDirection(step, "not known")
+    moved = np.abs(vectors[:, -1])
+    named = np.flatnonzero(moved > _NAMED * moved.max())
+    named = named[np.argsort(-moved[named], kind="stable")]
+    parts = [f"{PARAMETERS[k]} {step[k]:+.2g}{_UNITS[k]}" for k in named]
+    return WeakDirection(step, ", ".join(parts))
+
+
+_UNITS: Final = (" rad",) * 3 + (" m",) * 3 + ("", " px", " px", "", "", "")

@@ -6,43 +6,51 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from worldpose.bundle_adjustment.building import (
+from data_contracts.arrays import Flags, Floats, Integers
+from worldpose.bundle_adjustment.clip import (
+    Clip,
+    Observations,
+    learn_confidence,
+    propose_frames,
+    select_observations,
+)
+from worldpose.bundle_adjustment.gauge import align_points, relative_covariance
+from worldpose.bundle_adjustment.held_out_validation import (
+    Contradictions,
+    Evidence,
+    HeldOutErrors,
+    Verdict,
+    compare_errors,
+    find_contradictions,
+    held_out_errors,
+    pool_evidence,
+)
+from worldpose.bundle_adjustment.problems import (
     MARKINGS_SOLVER,
     KeypointNoise,
     camera_knowledge,
+    estimate_noise,
+    estimate_variance_factor,
     markings_problem,
-    measured_doubt,
     players_problem,
 )
-from worldpose.bundle_adjustment.clip import Clip, Observed, observe, with_learned_noise
-from worldpose.bundle_adjustment.contradictions import Contradictions, find_contradictions
-from worldpose.bundle_adjustment.frames import propose_frames
-from worldpose.bundle_adjustment.gauge import align_points, relative_covariance
-from worldpose.bundle_adjustment.held_out_validation import (
-    Evidence,
-    HeldOut,
-    Verdict,
-    all_evidence,
-    held_out,
-    verdict,
-)
-from worldpose.bundle_adjustment.noise import measured_noise
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
-from worldpose.bundle_adjustment.solving import Adjusted, solve
-from worldpose.bundle_adjustment.survey import survey_response, with_shared_errors
+from worldpose.bundle_adjustment.solver import Solution, solve
+from worldpose.bundle_adjustment.uncertainty import add_shared_errors, survey_response
 from worldpose.geometry import Camera
 from worldpose.static_calibration import PARAMETERS, project_with_jacobian
 
-_STRANGER: Final = "refused: it shows other people than the other cameras do under the same ids"
-_ROUNDS: Final = 3
+_OTHER_PEOPLE: Final = (
+    "refused: this camera shows other people than the other cameras under the same ids"
+)
+_PASSES: Final = 3
 """Iterations of solution and noise estimation; the third changes little."""
-_LEAST_DOUBT: Final = 0.01
+_MIN_VARIANCE_FACTOR: Final = 0.01
 """Smallest factor on the prior variance of given cameras [1]: a tenth of its deviations."""
-_FEW: Final = 4
-"""Most cameras of a rig that needs significant evidence [1]: each joint of a held-out person then
-has at most three other views, whose errors do not average out."""
+_SMALL_RIG: Final = 4
+"""Maximum cameras of a rig that needs significant evidence [1]: each joint of a held-out person
+then has at most three other views, whose errors do not average out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,16 +79,16 @@ class BundleAdjustment:
 
     clip: Clip
     cameras: Camera
-    covariance: NDArray[np.float64]
-    accepted: NDArray[np.bool_]
+    covariance: Floats
+    accepted: Flags
     reasons: tuple[str, ...]
-    proposed: NDArray[np.int64]
-    used: NDArray[np.int64]
-    judged: NDArray[np.int64]
+    proposed: Integers
+    used: Integers
+    judged: Integers
     noise: KeypointNoise
     verdict: Verdict
     evidence: Evidence
-    motion: NDArray[np.float64]
+    motion: Floats
     refused: Camera
     iterations: int
     converged: bool
@@ -110,50 +118,51 @@ def adjust_cameras(
     used = used if settings.chosen_frames else proposed
     judged = propose_frames(clip, settings.frames, settings.frame_gap, settings.min_views, used)
     judged = judged if len(judged) else used
-    clip = with_learned_noise(clip, np.union1d(used, judged))
+    clip = learn_confidence(clip, np.union1d(used, judged))
     adjuster = _Adjuster(clip, settings, used, judged)
     count = len(clip.clicks)
-    everybody = adjuster.everybody
-    if settings.evidence == "markings_and_players" and not len(everybody.points):
-        return _nothing(clip, "nobody is seen by enough cameras", proposed, used, judged)
+    observed = adjuster.observations
+    if settings.evidence == "markings_and_players" and not len(observed.points):
+        return _refuse_all(clip, "no person has enough inlier cameras", proposed, used, judged)
     if settings.evidence == "markings" and not any(c.inlier.any() for c in clip.clicks):
-        return _nothing(clip, "nobody clicked a marking", proposed, used, judged)
-    before, stranger = adjuster.before, adjuster.stranger
-    standing = stranger.copy()
+        return _refuse_all(clip, "no camera has a clicked marking", proposed, used, judged)
+    before, other_people = adjuster.before, adjuster.other_people
+    fixed = other_people.copy()
     first: Verdict | None = None
     objection = ""
     while True:
-        after = adjuster.judgement(standing)
-        said = verdict(before, after)
-        first = first or said
-        evidence = all_evidence(before, after, ~stranger)
+        after = adjuster.held_out_errors(fixed)
+        comparison = compare_errors(before, after)
+        first = first or comparison
+        evidence = pool_evidence(before, after, ~other_people)
         with np.errstate(invalid="ignore"):
-            confirmed = (said.judges >= settings.min_judges) & (said.loss[:, 1] <= said.loss[:, 0])
-        if (confirmed | standing).all():
-            objection = "" if standing.all() else adjuster.objection(before, after, standing)
+            confirmed = comparison.judges >= settings.min_judges
+            confirmed &= comparison.loss[:, 1] <= comparison.loss[:, 0]
+        if (confirmed | fixed).all():
+            objection = "" if fixed.all() else adjuster.find_objection(before, after, fixed)
             if not objection:
                 break
             # Markings hold calibrated cameras, which may still change without the others.
-            confirmed = ~clip.given & (len(clip.given) > _FEW)
-        standing |= ~confirmed
-        if (~standing).sum() < 2:
-            standing[:] = True
+            confirmed = ~clip.given & (len(clip.given) > _SMALL_RIG)
+        fixed |= ~confirmed
+        if (~fixed).sum() < 2:
+            fixed[:] = True
             break
-    freely = adjuster.solved(stranger)
-    last = freely if standing.all() or (standing == stranger).all() else adjuster.solved(standing)
+    freely = adjuster.adjust(other_people)
+    last = freely if fixed.all() or (fixed == other_people).all() else adjuster.adjust(fixed)
     own = adjuster.uncertainty(last)
-    cameras = _where(~standing, last.cameras, clip.cameras)
-    motion = np.where(standing[:, None], 0.0, camera_motion(clip.cameras, cameras))
+    cameras = _merge_cameras(~fixed, last.cameras, clip.cameras)
+    motion = np.where(fixed[:, None], 0.0, camera_motion(clip.cameras, cameras))
     return BundleAdjustment(
         clip=clip,
         cameras=cameras,
-        covariance=np.where(standing[:, None, None], clip.covariance, own),
-        accepted=~standing,
+        covariance=np.where(fixed[:, None, None], clip.covariance, own),
+        accepted=~fixed,
         reasons=tuple(
-            _STRANGER
-            if stranger[c]
-            else _reason(first, c, not standing[c], settings, objection)
-            + ("" if standing[c] else _motion(motion[c]))
+            _OTHER_PEOPLE
+            if other_people[c]
+            else _explain_decision(first, c, not fixed[c], settings, objection)
+            + ("" if fixed[c] else _describe_motion(motion[c]))
             for c in range(count)
         ),
         proposed=clip.frame[proposed],
@@ -166,11 +175,11 @@ def adjust_cameras(
         refused=freely.cameras,
         iterations=last.iterations,
         converged=last.converged,
-        observations=len(everybody.image),
+        observations=len(observed.image),
     )
 
 
-def camera_motion(before: Camera, after: Camera) -> NDArray[np.float64]:
+def camera_motion(before: Camera, after: Camera) -> Floats:
     """Return the motion of cameras: (cameras, 3) of center [m], axes [rad], focal length [1].
 
     Args:
@@ -197,104 +206,119 @@ class _Adjuster:
         self,
         clip: Clip,
         settings: BundleAdjustmentSettings,
-        used: NDArray[np.int64],
-        judged: NDArray[np.int64],
+        used: Integers,
+        judged: Integers,
     ) -> None:
         self.clip, self.settings, self.used, self.judged = clip, settings, used, judged
         people = np.ones(clip.detection_index.shape[2], dtype=np.bool_)
-        self.everybody = observe(clip, used, people, clip.cameras, settings.min_views)
+        self.observations = select_observations(
+            clip, used, people, clip.cameras, settings.min_views
+        )
         self.noise = KeypointNoise()
-        self.before = self.judgement(None)
+        self.before = self.held_out_errors(None)
         found = Contradictions.none(len(clip.clicks))
         if settings.evidence == "markings_and_players":
             found = find_contradictions(clip, judged, self.before, settings)
-        self.stranger, self.doubt, self.offset = found.stranger, found.doubt, found.offset
+        self.other_people, self.variance_factor, self.offset = (
+            found.other_people,
+            found.variance_factor,
+            found.offset,
+        )
         if clip.given.all():
             # If no camera states a covariance, the wrong one cannot be identified.
-            self.doubt, self.offset = np.ones(len(self.doubt)), np.zeros_like(self.offset)
-        if settings.evidence == "markings_and_players" and len(self.everybody.points):
+            self.variance_factor, self.offset = (
+                np.ones(len(self.variance_factor)),
+                np.zeros_like(self.offset),
+            )
+        if settings.evidence == "markings_and_players" and len(self.observations.points):
             self._learn()
 
     def _learn(self) -> None:
         """Estimate the keypoint noise, and the factor on the stated variance of calibration."""
-        stranger, settings = self.stranger, self.settings
-        for _ in range(_ROUNDS):
-            observed = _only(self.everybody, ~stranger[self.everybody.camera_of])
+        other_people, settings = self.other_people, self.settings
+        for _ in range(_PASSES):
+            observed = _select_observations(
+                self.observations, ~other_people[self.observations.camera_of]
+            )
             if not len(observed.points):
                 return  # No person is in two consistent cameras.
             problem = players_problem(
-                self.clip, observed, self.noise, stranger, settings, self.doubt
+                self.clip, observed, self.noise, other_people, settings, self.variance_factor
             )
             rough = solve(problem, settings.solver, self.offset)
             # The next solution starts here and needs two or three steps.
-            self.offset, self.everybody = rough.offset, observed._replace(points=rough.points)
-            self.noise = measured_noise(
-                rough.cameras, rough.points, self.everybody, settings.robust_scale
+            self.offset, self.observations = rough.offset, observed._replace(points=rough.points)
+            self.noise = estimate_noise(
+                rough.cameras, rough.points, self.observations, settings.robust_scale
             )
         # A stated covariance never shrinks; the prior of given cameras may. Update only once: after
         # more updates, one camera that shows other people would free all the others.
-        least = np.where(self.clip.given, _LEAST_DOUBT, 1.0)
-        self.doubt = self.doubt * np.maximum(measured_doubt(problem, rough), least)
+        min_factor = np.where(self.clip.given, _MIN_VARIANCE_FACTOR, 1.0)
+        self.variance_factor = self.variance_factor * np.maximum(
+            estimate_variance_factor(problem, rough), min_factor
+        )
 
-    def objection(self, before: HeldOut, after: HeldOut, standing: NDArray[np.bool_]) -> str:
+    def find_objection(self, before: HeldOutErrors, after: HeldOutErrors, fixed: Flags) -> str:
         """Return the reason to refuse the whole change; empty without one.
 
-        Cameras with their own covariance, in a rig of more than `_FEW`, need only the verdict per
-        camera.
+        Cameras with their own covariance, in a rig of more than `_SMALL_RIG`, need only the
+        comparison per camera.
         """
-        changed = ~standing
+        changed = ~fixed
         given = self.clip.given & changed
-        if not given.any() and len(given) > _FEW:
+        if not given.any() and len(given) > _SMALL_RIG:
             return ""
         judged = given if given.any() else changed
-        evidence = all_evidence(before, after, judged)
+        evidence = pool_evidence(before, after, judged)
         settings = self.settings
         if evidence.significance < settings.min_significance:
             return (
                 f"the loss of all of them falls by {evidence.significance:.1f} standard errors, "
-                f"{settings.min_significance:g} are asked for"
+                f"at least {settings.min_significance:g} are required"
             )
         needed = settings.given.min_gain / max(len(given) - 1, 1)
         if given.any() and evidence.gain < needed:
             return (
                 f"the loss of all of them falls by {100.0 * evidence.gain:.1f} %, "
-                f"{100.0 * needed:.1f} % are asked for where {len(given)} cameras are given"
+                f"at least {100.0 * needed:.1f} % are required with {len(given)} given cameras"
             )
         if self.clip.given.all():
-            deviation = float(np.sqrt(np.median(self.doubt)) * np.nanmedian(self.clip.distance))
-            most = settings.given.center * deviation
-            if evidence.shift > most:
+            deviation = float(
+                np.sqrt(np.median(self.variance_factor)) * np.nanmedian(self.clip.distance)
+            )
+            max_shift = settings.given.center * deviation
+            if evidence.shift > max_shift:
                 return (
-                    f"left-out people move together by {1e3 * evidence.shift:.1f} mm, which no "
-                    f"keypoint can confirm; {1e3 * most:.1f} mm are allowed"
+                    f"held-out people move together by {1e3 * evidence.shift:.1f} mm, which no "
+                    f"keypoint can confirm; at most {1e3 * max_shift:.1f} mm are allowed"
                 )
         return ""
 
-    def solved(self, standing: NDArray[np.bool_], without: int | None = None) -> Adjusted:
+    def adjust(self, fixed: Flags, without: int | None = None) -> Solution:
         """Return the adjustment to all people, or to all but one group."""
         if self.settings.evidence == "markings":
-            return solve(markings_problem(self.clip, standing, self.settings), MARKINGS_SOLVER)
-        observed = self.everybody
+            return solve(markings_problem(self.clip, fixed, self.settings), MARKINGS_SOLVER)
+        observed = self.observations
         # A refused calibrated camera contributes nothing: its markings contradict people. A refused
         # given camera without contradictions is held fixed, and the others adapt to it.
-        say = ~standing | (self.clip.given & ~self.stranger)
-        kept = say[observed.camera_of]
+        trusted = ~fixed | (self.clip.given & ~self.other_people)
+        kept = trusted[observed.camera_of]
         if without is not None:
             groups = self._groups(len(self.used))
             row = np.searchsorted(self.used, observed.frame_of)
             kept &= groups[row, observed.person_of] != without
-        observed = _only(observed, kept)
+        observed = _select_observations(observed, kept)
         problem = players_problem(
-            self.clip, observed, self.noise, standing, self.settings, self.doubt
+            self.clip, observed, self.noise, fixed, self.settings, self.variance_factor
         )
         solution = solve(problem, self.settings.solver, self.offset, covariance=without is None)
-        if self.clip.given.all() and not (standing & ~self.stranger).any():
-            return self._where_people_were(solution, observed, standing)
+        if self.clip.given.all() and not (fixed & ~self.other_people).any():
+            return self._align_to_initial_people(solution, observed, fixed)
         return solution
 
-    def _where_people_were(
-        self, solution: Adjusted, observed: Observed, standing: NDArray[np.bool_]
-    ) -> Adjusted:
+    def _align_to_initial_people(
+        self, solution: Solution, observed: Observations, fixed: Flags
+    ) -> Solution:
         """Return the solution, aligned to the people as the given cameras had them.
 
         A similarity transform of all cameras and people changes no residual: only the given cameras
@@ -305,32 +329,34 @@ class _Adjuster:
         before = self.clip.joints[observed.frame_of[first], person, joint]
         found = np.isfinite(before).all(axis=1)
         back = align_points(solution.points[found], before[found])
-        cameras = _where(~standing, back.move_cameras(solution.cameras), solution.cameras)
+        cameras = _merge_cameras(~fixed, back.move_cameras(solution.cameras), solution.cameras)
         return replace(solution, cameras=cameras, points=back.move_points(solution.points))
 
-    def uncertainty(self, adjusted: Adjusted) -> NDArray[np.float64]:
+    def uncertainty(self, adjusted: Solution) -> Floats:
         """Return the covariance (cameras, 12, 12) of adjusted cameras.
 
         If only given cameras define the world frame, it is relative to all of them together: their
         common error shifts no person in one image against the others.
         """
         if self.clip.given.all() and self.settings.evidence == "markings_and_players":
-            points = self.everybody.points
+            points = self.observations.points
             weight = self._keypoint_information(adjusted.cameras)
             origin = np.median(points, axis=0)
             return relative_covariance(
                 adjusted.camera_covariance, adjusted.cameras, weight, origin
             )[0]
         information, _ = camera_knowledge(self.clip, self.settings)
-        doubt = self.doubt[:, None, None]
+        factor = self.variance_factor[:, None, None]
         response = survey_response(self.clip, self.settings.survey_error)
-        return with_shared_errors(
-            adjusted.camera_covariance, information / doubt, np.sqrt(doubt) * response
+        return add_shared_errors(
+            adjusted.camera_covariance,
+            information / factor,
+            np.sqrt(factor) * response,
         )
 
-    def _keypoint_information(self, cameras: Camera) -> NDArray[np.float64]:
+    def _keypoint_information(self, cameras: Camera) -> Floats:
         """Return keypoint information on a step of each camera (cameras, 12, 12), people fixed."""
-        observed = self.everybody
+        observed = self.observations
         count = len(cameras.focal)
         information = np.zeros((count, len(PARAMETERS), len(PARAMETERS)))
         for c in range(count):
@@ -342,23 +368,23 @@ class _Adjuster:
             information[c] = np.einsum("nai,naj->ij", by_step, by_step)
         return information
 
-    def judgement(self, standing: NDArray[np.bool_] | None) -> HeldOut:
+    def held_out_errors(self, fixed: Flags | None) -> HeldOutErrors:
         """Return held-out errors by cameras adjusted without each group; None = initial cameras."""
         robust = self.settings.robust_scale
         groups = self._groups(len(self.judged))
-        if standing is None or self.settings.evidence == "markings":
-            cameras = self.clip.cameras if standing is None else self.solved(standing).cameras
-            return held_out(self.clip, cameras, self.judged, groups >= 0, robust)
+        if fixed is None or self.settings.evidence == "markings":
+            cameras = self.clip.cameras if fixed is None else self.adjust(fixed).cameras
+            return held_out_errors(self.clip, cameras, self.judged, groups >= 0, robust)
         loss = error = joints = np.full((1, 1, 1, 1), np.nan)
         for group in np.unique(groups):
-            cameras = self.solved(standing, without=group).cameras
-            held = held_out(self.clip, cameras, self.judged, groups == group, robust)
+            cameras = self.adjust(fixed, without=group).cameras
+            held = held_out_errors(self.clip, cameras, self.judged, groups == group, robust)
             loss = np.where(np.isnan(loss), held.loss, loss)
             error = np.where(np.isnan(error), held.error, error)
             joints = np.where(np.isnan(joints), held.joints, joints)
-        return HeldOut(loss, error, joints)
+        return HeldOutErrors(loss, error, joints)
 
-    def _groups(self, frames: int) -> NDArray[np.int64]:
+    def _groups(self, frames: int) -> Integers:
         """Return the group (frames, persons) of each person; time intervals for a single person."""
         persons = self.clip.detection_index.shape[2]
         folds = self.settings.folds
@@ -367,7 +393,7 @@ class _Adjuster:
         return np.repeat((np.arange(frames) * folds // max(frames, 1))[:, None], persons, axis=1)
 
 
-def _only(observed: Observed, kept: NDArray[np.bool_]) -> Observed:
+def _select_observations(observed: Observations, kept: Flags) -> Observations:
     """Return the observations (n,) that are kept, with renumbered points.
 
     A point left with a single observation carries no information and is dropped.
@@ -376,52 +402,54 @@ def _only(observed: Observed, kept: NDArray[np.bool_]) -> Observed:
         np.bincount(observed.point_of[kept], minlength=len(observed.points))[observed.point_of] > 1
     )
     used, number = np.unique(observed.point_of[kept], return_inverse=True)
-    rows = {name: getattr(observed, name)[kept] for name in Observed._fields if name != "points"}
-    return Observed(points=observed.points[used], **(rows | {"point_of": number}))
+    rows = {
+        name: getattr(observed, name)[kept] for name in Observations._fields if name != "points"
+    }
+    return Observations(points=observed.points[used], **(rows | {"point_of": number}))
 
 
-def _where(changed: NDArray[np.bool_], new: Camera, old: Camera) -> Camera:
+def _merge_cameras(changed: Flags, new: Camera, old: Camera) -> Camera:
     """Return the batch of new cameras where they changed and of old ones elsewhere."""
     return Camera.stack([(new if take else old)[c] for c, take in enumerate(changed)])
 
 
-def _reason(
-    said: Verdict,
+def _explain_decision(
+    comparison: Verdict,
     c: int,
     accepted: bool,
     settings: BundleAdjustmentSettings,
     objection: str,
 ) -> str:
     """Return why a camera's change was accepted or refused, with the deciding numbers."""
-    judges = int(said.judges[c])
+    judges = int(comparison.judges[c])
     if judges < settings.min_judges:
-        return f"refused: {judges} left-out keypoints, {settings.min_judges} are asked for"
-    before, after = said.loss[c]
-    change = f"loss of {judges} left-out keypoints {before:.3f} to {after:.3f}"
+        return f"refused: {judges} held-out keypoints, at least {settings.min_judges} are required"
+    before, after = comparison.loss[c]
+    change = f"the loss of {judges} held-out keypoints goes from {before:.3f} to {after:.3f}"
     if accepted:
         return f"accepted: {change}"
     if after > before:
         return f"refused: {change}"
     if objection:
         return f"refused: {change}, but {objection}"
-    return f"refused: {change}, risen once other cameras were refused"
+    return f"refused: {change}, but it rose after other cameras were refused"
 
 
-def _motion(motion: NDArray[np.float64]) -> str:
+def _describe_motion(motion: Floats) -> str:
     """Return the description of a camera's motion."""
     center, rotation, focal = motion.tolist()
     return (
-        f"; moved {100.0 * center:.1f} cm and {np.degrees(rotation):.3f} degrees, focal length "
-        f"{100.0 * focal:+.2f} %"
+        f"; the camera moves {100.0 * center:.1f} cm and {np.degrees(rotation):.3f} degrees, "
+        f"the focal length changes {100.0 * focal:+.2f} %"
     )
 
 
-def _nothing(
+def _refuse_all(
     clip: Clip,
     reason: str,
-    proposed: NDArray[np.int64],
-    used: NDArray[np.int64],
-    judged: NDArray[np.int64],
+    proposed: Integers,
+    used: Integers,
+    judged: Integers,
 ) -> BundleAdjustment:
     """Return the clip's cameras unchanged, with one reason for all of them."""
     count = len(clip.clicks)

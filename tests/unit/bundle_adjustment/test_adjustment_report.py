@@ -1,4 +1,6 @@
-"""The review list against planted mistakes."""
+"""Report of an adjustment: stored arrays, outlier keypoints and clicks."""
+
+from __future__ import annotations
 
 from dataclasses import replace
 
@@ -12,11 +14,57 @@ from worldpose.bundle_adjustment import (
     adjust_cameras,
     adjustment_arrays,
     keypoint_outliers,
+    marking_errors,
     review_clicks,
+    weak_direction,
 )
-from worldpose.bundle_adjustment.building import KeypointNoise
+from worldpose.bundle_adjustment.problems import KeypointNoise
+from worldpose.geometry.stored import camera_from_arrays
 from worldpose.static_calibration import PARAMETERS
-from worldpose.store.groups import checked_arrays
+from worldpose.store.groups import checked_arrays, checked_attributes
+
+
+@pytest.mark.parametrize("evidence", ["markings_and_players", "markings"])
+def test_arrays_and_attributes_are_those_of_the_layout(clip, evidence):
+    made, *_ = clip(persons=3, frames=8)
+    settings = BundleAdjustmentSettings(evidence=evidence, folds=2)
+    adjusted = adjust_cameras(made, settings)
+    person = np.array([4, 7, 9], dtype=np.int32)
+    arrays, attributes = adjustment_arrays(adjusted, settings, person)
+    checked = checked_arrays(BUNDLE_ADJUSTMENT, arrays, {})
+    given = {"camera": list("abcde"), **attributes}
+    stored = checked_attributes(BUNDLE_ADJUSTMENT, checked, given)
+    assert set(checked["outlier_person"]) <= {4, 7, 9}
+    assert stored["used_frames"] == adjusted.used.tolist()
+    back = camera_from_arrays(checked)
+    np.testing.assert_array_equal(back.numbers, adjusted.cameras.numbers)
+
+
+def test_marking_errors_are_root_mean_squares_per_axis(clip):
+    made, true, _ = clip(clicked=400)
+    # 800 numbers of unit variance tell their root mean square to 2.5 %; three of that.
+    np.testing.assert_allclose(marking_errors(made, true), 1.0, atol=0.075)
+    none, *_ = clip(clicked=0)
+    assert np.isnan(marking_errors(none, true)).all()
+
+
+def test_focal_length_against_distance_is_named(clip):
+    _, true, _ = clip()
+    distance = true[0].cam_from_world.apply(np.array([[0.0, 0.0, 1.0]]))[0, 2]
+    together = np.zeros(12)
+    # Farther away and closer zoomed: 1 % of both.
+    together[5], together[6] = 0.01 * distance, 0.01
+    covariance = np.outer(together, together) + 1e-12 * np.eye(12)
+    weak = weak_direction(true[0], covariance)
+    assert {part.split()[0] for part in weak.about.split(", ")} == {"tz", "log_focal"}
+    np.testing.assert_allclose(np.abs(weak.step[5:7]), together[5:7], rtol=0.05)
+
+
+def test_a_given_camera_has_no_weak_direction(clip):
+    _, true, _ = clip()
+    weak = weak_direction(true[0], np.zeros((12, 12)))
+    assert weak.about == "not known"
+    assert not weak.step.any()
 
 
 def found(made, cameras, limit=4.2, longest=10_000):

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
 from scipy.linalg.blas import dsyrk
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.records import Record
 from worldpose.bundle_adjustment.schur_complement import (
     STEPS,
+    CameraEquations,
     Evidence,
     cost,
     eliminate,
@@ -26,7 +26,7 @@ from worldpose.static_calibration import stepped
 
 BLOCK: Final = 256
 """Points eliminated at a time: their rows for 18 cameras (1.3 MB) stay in the cache."""
-_MOVING: Final = 0.1
+_MIN_SHARE: Final = 0.1
 """Share of the weakest direction from which a message names a camera, relative to an equal share of
 all cameras [1]."""
 
@@ -64,20 +64,20 @@ class Problem:
     """
 
     cameras: Camera
-    free: NDArray[np.bool_]
-    camera_information: NDArray[np.float64]
-    points: NDArray[np.float64]
-    point_information: NDArray[np.float64]
-    point_of: NDArray[np.int64]
-    camera_of: NDArray[np.int64]
-    image: NDArray[np.float64]
-    weight: NDArray[np.float64]
-    scale: NDArray[np.float64]
+    free: Flags
+    camera_information: Floats
+    points: Floats
+    point_information: Floats
+    point_of: Integers
+    camera_of: Integers
+    image: Floats
+    weight: Floats
+    scale: Floats
     names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
-class Adjusted:
+class Solution:
     """Solution of a bundle adjustment problem.
 
     Attributes:
@@ -93,13 +93,13 @@ class Adjusted:
     """
 
     cameras: Camera
-    offset: NDArray[np.float64]
-    points: NDArray[np.float64]
+    offset: Floats
+    points: Floats
     cost: float
     start_cost: float
     iterations: int
     converged: bool
-    camera_covariance: NDArray[np.float64]
+    camera_covariance: Floats
 
 
 def solve(
@@ -107,7 +107,7 @@ def solve(
     settings: SolverSettings | None = None,
     offset: Floats | None = None,
     covariance: bool = True,
-) -> Adjusted:
+) -> Solution:
     """Return the cameras and points that fit all observations and priors best.
 
     Args:
@@ -152,7 +152,7 @@ def solve(
         else:
             damping *= 8.0
     spread = system.covariance(cameras, points) if covariance else np.empty((0, 0))
-    return Adjusted(cameras, offset, points, reached, start_cost, iteration, converged, spread)
+    return Solution(cameras, offset, points, reached, start_cost, iteration, converged, spread)
 
 
 def _require_two_views(problem: Problem) -> None:
@@ -199,23 +199,23 @@ class _System:
         self, cameras: Camera, points: Floats, damping: float, offset: Floats
     ) -> tuple[Floats, Floats]:
         """Return a damped step of the cameras (cameras, 12), and the points after it."""
-        matrix, diagonal, slope = self._assembled(cameras, points, damping)
+        matrix, diagonal, slope = self._assemble(cameras, points, damping)
         matrix[np.diag_indices_from(matrix)] += damping * diagonal
         slope += np.einsum("cij,cj->ci", self.prior, offset).ravel()[self.free]
         step = np.zeros(offset.shape)
-        step.ravel()[self.free] = -self._solved(matrix, slope)
+        step.ravel()[self.free] = -self._solve(matrix, slope)
         trial = np.empty_like(points)
         substitute(cameras.numbers, points, self.evidence, damping, step, trial)
         return step, trial
 
     def covariance(self, cameras: Camera, points: Floats) -> Floats:
         """Return the inverse of the undamped system, zero for fixed parameters."""
-        matrix, _, _ = self._assembled(cameras, points, 0.0)
+        matrix, _, _ = self._assemble(cameras, points, 0.0)
         covariance = np.zeros((self.columns.size, self.columns.size))
-        covariance[np.ix_(self.free, self.free)] = self._solved(matrix, np.eye(self.free.size))
+        covariance[np.ix_(self.free, self.free)] = self._solve(matrix, np.eye(self.free.size))
         return covariance
 
-    def _solved(self, matrix: Floats, right: Floats) -> Floats:
+    def _solve(self, matrix: Floats, right: Floats) -> Floats:
         """Return the solution, computed with scaling: units differ by many powers of 10.
 
         Raises:
@@ -229,16 +229,16 @@ class _System:
         try:
             factor = cho_factor(scaled, check_finite=False)
         except LinAlgError:
-            raise self._movable(scaled) from None
+            raise self._singularity_error(scaled) from None
         columns = scale if right.ndim == 1 else scale[:, None]
         return np.asarray(columns * cho_solve(factor, columns * right, check_finite=False))
 
-    def _movable(self, scaled: Floats) -> InputError:
+    def _singularity_error(self, scaled: Floats) -> InputError:
         """Return the error of a singular system, which names the cameras that can move."""
         weakest = np.linalg.eigh(scaled)[1][:, 0]
         share = np.zeros(self.columns.shape)
         share.ravel()[self.free] = weakest**2
-        moving = np.flatnonzero(share.sum(axis=1) > _MOVING / len(share))
+        moving = np.flatnonzero(share.sum(axis=1) > _MIN_SHARE / len(share))
         if len(moving) == len(share):
             found = "that all of them can move together without any residual"
         else:
@@ -252,7 +252,7 @@ class _System:
             todo="Add clicked markings of these cameras, or give their calibration.",
         )
 
-    def _assembled(
+    def _assemble(
         self, cameras: Camera, points: Floats, damping: float
     ) -> tuple[Floats, Floats, Floats]:
         """Return reduced matrix, diagonal before the reduction and slope of free parameters."""
@@ -264,10 +264,8 @@ class _System:
         for first in range(0, len(points), BLOCK):
             last = min(first + BLOCK, len(points))
             rows = self.rows[: 3 * (last - first)]
-            eliminate(
-                *(numbers, points, self.evidence, damping, first, last),
-                *(self.columns, rows, blocks, gradient),
-            )
+            target = CameraEquations(self.columns, rows, blocks, gradient)
+            eliminate(numbers, points, self.evidence, damping, first, last, target)
             loss = dsyrk(1.0, rows.T, beta=1.0, c=loss, overwrite_c=True)
         lost = loss[:width, :width]
         blocks = np.tril(blocks) + np.tril(blocks, -1).swapaxes(1, 2) + self.prior

@@ -10,7 +10,7 @@ from worldpose.bundle_adjustment import (
     Clicks,
     SolverSettings,
     adjust_cameras,
-    adjusting,
+    adjustment,
 )
 from worldpose.static_calibration import stepped
 from worldpose.triangulation import triangulate_joints
@@ -75,7 +75,7 @@ def test_markings_alone_are_refused_where_they_bend_the_camera(clip):
     assert not adjusted.accepted.any()
     np.testing.assert_array_equal(adjusted.cameras.numbers, made.cameras.numbers)
     np.testing.assert_array_equal(adjusted.covariance, made.covariance)
-    assert all(reason.startswith("refused: loss of") for reason in adjusted.reasons)
+    assert all(reason.startswith("refused: the loss of") for reason in adjusted.reasons)
 
 
 def test_people_taken_for_others_in_one_camera_spoil_little(clip):
@@ -128,14 +128,14 @@ def test_what_tells_nothing_leaves_cameras_as_they_were_and_says_why(clip, case)
         made, *_ = clip(cameras=2)
     else:
         made, *_ = clip(frames=6)
-    settings, reason = QUICK, "nobody is seen by enough cameras"
+    settings, reason = QUICK, "no person has enough inlier cameras"
     if case == "nobody":
         made = replace(made, joints=np.full_like(made.joints, np.nan))
     if case == "no markings":
         count = len(made.clicks)
         made = replace(made, clicks=(Clicks.none(),) * count)
         settings = QUICK.model_copy(update={"evidence": "markings"})
-        reason = "nobody clicked a marking"
+        reason = "no camera has a clicked marking"
     adjusted = adjust_cameras(made, settings)
     assert not adjusted.accepted.any()
     np.testing.assert_array_equal(adjusted.cameras.numbers, made.cameras.numbers)
@@ -165,14 +165,14 @@ def test_too_few_judges_refuse(clip):
     made, *_ = clip()
     adjusted = adjust_cameras(made, QUICK.model_copy(update={"min_judges": 10**6}))
     assert not adjusted.accepted.any()
-    assert "1000000 are asked for" in adjusted.reasons[0]
+    assert "at least 1000000 are required" in adjusted.reasons[0]
 
 
 def test_nothing_is_learned_where_every_camera_contradicts_the_others(clip, monkeypatch):
     made, _, _ = clip()
-    found = adjusting.Contradictions.none(len(made.clicks))
-    found = replace(found, stranger=np.ones(len(made.clicks), dtype=np.bool_))
-    monkeypatch.setattr(adjusting, "find_contradictions", lambda *_: found)
+    found = adjustment.Contradictions.none(len(made.clicks))
+    found = replace(found, other_people=np.ones(len(made.clicks), dtype=np.bool_))
+    monkeypatch.setattr(adjustment, "find_contradictions", lambda *_: found)
     adjusted = adjust_cameras(made, QUICK)
     assert not adjusted.accepted.any()
     np.testing.assert_array_equal(adjusted.cameras.numbers, made.cameras.numbers)

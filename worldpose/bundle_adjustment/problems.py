@@ -1,4 +1,4 @@
-"""Bundle adjustment problems from people and from markings (B2)."""
+"""Bundle adjustment problems from people and from markings (B2), and the keypoint noise."""
 
 from __future__ import annotations
 
@@ -6,22 +6,27 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from worldpose.bundle_adjustment.clip import Clip, Observed
+from data_contracts.arrays import Flags, Floats
+from worldpose.bundle_adjustment.clip import Clip, Observations
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
-from worldpose.bundle_adjustment.solving import Adjusted, Problem, SolverSettings
+from worldpose.bundle_adjustment.solver import Problem, Solution, SolverSettings
+from worldpose.geometry import Camera
 from worldpose.static_calibration import PARAMETERS
 
+MEDIAN_SQUARED: Final = 2.0 * np.log(2.0)
+"""Median squared length of a standard Gaussian in two dimensions [1]."""
 _SIZE: Final = len(PARAMETERS)
-_UNKNOWN: Final = 100.0 * np.array([1.0] * 3 + [100.0] * 3 + [1.0, 300.0, 300.0, 3.0, 30.0, 300.0])
+_UNINFORMATIVE: Final = 100.0 * np.array(
+    [1.0] * 3 + [100.0] * 3 + [1.0, 300.0, 300.0, 3.0, 30.0, 300.0]
+)
 """Standard deviations of an uninformative prior [rad, m, 1, px, 1]; they only keep the system
 regular. A hundredth of them would already constrain the lens."""
 MARKINGS_SOLVER: Final = SolverSettings(iterations=500, cost_change=1e-6)
 """For ill-conditioned directions as long and flat as those of a lens determined by six clicks."""
 
 
-_FAITH: Final = 10.0
+_MEDIAN_WEIGHT: Final = 10.0
 """Weight of the median over all cameras, in directions [1]: as many as one camera has."""
 
 
@@ -41,11 +46,11 @@ class KeypointNoise:
 
 def players_problem(
     clip: Clip,
-    observed: Observed,
+    observed: Observations,
     noise: KeypointNoise,
-    standing: NDArray[np.bool_],
+    fixed: Flags,
     settings: BundleAdjustmentSettings,
-    doubt: NDArray[np.float64] | float = 1.0,
+    variance_factor: Floats | float = 1.0,
 ) -> Problem:
     """Return the adjustment of cameras to people, with calibration as the prior.
 
@@ -57,17 +62,17 @@ def players_problem(
         clip: cameras with their covariance.
         observed: keypoints.
         noise: their scale and correlation.
-        standing: (cameras,) bool, fixed cameras.
+        fixed: (cameras,) bool, fixed cameras.
         settings: robust scale, and the prior of given cameras.
-        doubt: (cameras,) factor on the variance that calibration states [1].
+        variance_factor: (cameras,) factor on the variance that calibration states [1].
     """
     information, free = camera_knowledge(clip, settings)
-    information = information / np.reshape(doubt, (-1, 1, 1))
+    information = information / np.reshape(variance_factor, (-1, 1, 1))
     variance = (observed.noise * noise.scale) ** 2 * noise.correlation
     scale = settings.robust_scale / np.sqrt(noise.correlation)
     return Problem(
         cameras=clip.cameras,
-        free=free & ~standing[:, None],
+        free=free & ~fixed[:, None],
         camera_information=information,
         points=observed.points,
         point_information=np.zeros(len(observed.points)),
@@ -80,7 +85,7 @@ def players_problem(
     )
 
 
-def measured_doubt(problem: Problem, adjusted: Adjusted) -> NDArray[np.float64]:
+def estimate_variance_factor(problem: Problem, adjusted: Solution) -> Floats:
     """Return the factor (cameras,) on calibration's variances, estimated from an adjustment.
 
     People move a camera in the directions that they determine; where its step is longer than its
@@ -89,7 +94,7 @@ def measured_doubt(problem: Problem, adjusted: Adjusted) -> NDArray[np.float64]:
     of all cameras.
 
     Args:
-        problem: the solved problem, with the variances that the factor multiplies.
+        problem: the adjust problem, with the variances that the factor multiplies.
         adjusted: its solution.
     """
     count = len(problem.free)
@@ -101,17 +106,15 @@ def measured_doubt(problem: Problem, adjusted: Adjusted) -> NDArray[np.float64]:
     told = np.maximum(problem.free.sum(axis=1) - kept, 0.0)
     # Use the median: a camera that shows other people must not free all the others.
     overall = float(np.median((squared + 1.0) / (told + 1.0)))
-    return np.asarray((squared + _FAITH * overall) / (told + _FAITH))
+    return np.asarray((squared + _MEDIAN_WEIGHT * overall) / (told + _MEDIAN_WEIGHT))
 
 
-def markings_problem(
-    clip: Clip, standing: NDArray[np.bool_], settings: BundleAdjustmentSettings
-) -> Problem:
+def markings_problem(clip: Clip, fixed: Flags, settings: BundleAdjustmentSettings) -> Problem:
     """Return the adjustment of cameras to clicks alone, all parameters free, no prior (trap 1).
 
     Args:
         clip: cameras and clicks.
-        standing: (cameras,) bool, fixed cameras.
+        fixed: (cameras,) bool, fixed cameras.
         settings: noise of clicks.
     """
     clicked = [np.flatnonzero(clicks.inlier) for clicks in clip.clicks]
@@ -121,8 +124,8 @@ def markings_problem(
     has = np.array([len(i) > 0 for i in clicked])
     return Problem(
         cameras=clip.cameras,
-        free=np.repeat((has & ~standing)[:, None], _SIZE, axis=1),
-        camera_information=np.tile(np.diag(_UNKNOWN**-2.0), (len(has), 1, 1)),
+        free=np.repeat((has & ~fixed)[:, None], _SIZE, axis=1),
+        camera_information=np.tile(np.diag(_UNINFORMATIVE**-2.0), (len(has), 1, 1)),
         points=world,
         point_information=np.full(len(world), np.inf),
         point_of=np.arange(len(world)),
@@ -134,9 +137,7 @@ def markings_problem(
     )
 
 
-def camera_knowledge(
-    clip: Clip, settings: BundleAdjustmentSettings
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def camera_knowledge(clip: Clip, settings: BundleAdjustmentSettings) -> tuple[Floats, Flags]:
     """Return the prior information (cameras, 12, 12) on a step, and free parameters (cameras, 12).
 
     Args:
@@ -145,7 +146,7 @@ def camera_knowledge(
     """
     known = known_covariance(clip, settings)
     information = np.zeros_like(known)
-    free: NDArray[np.bool_] = np.diagonal(known, axis1=1, axis2=2) > 0.0
+    free: Flags = np.diagonal(known, axis1=1, axis2=2) > 0.0
     for c in range(len(known)):
         block = np.ix_(free[c], free[c])
         # Lens coefficients and meters differ by many powers of ten.
@@ -156,7 +157,7 @@ def camera_knowledge(
     return 0.5 * (information + information.swapaxes(1, 2)), free
 
 
-def known_covariance(clip: Clip, settings: BundleAdjustmentSettings) -> NDArray[np.float64]:
+def known_covariance(clip: Clip, settings: BundleAdjustmentSettings) -> Floats:
     """Return the prior covariance (cameras, 12, 12) of a step by the camera's source.
 
     Args:
@@ -179,3 +180,47 @@ def known_covariance(clip: Clip, settings: BundleAdjustmentSettings) -> NDArray[
         spread[:, :, None] ** 2 * np.eye(_SIZE),
         factor[:, None, None] ** 2 * clip.covariance,
     )
+
+
+def residuals(cameras: Camera, points: Floats, observed: Observations) -> Floats:
+    """Return projected minus observed (n, 2) in stated standard deviations [1].
+
+    Args:
+        cameras: (cameras,) batch.
+        points: (points, 3) [m], world.
+        observed: keypoints of these points.
+    """
+    off = np.empty_like(observed.image)
+    for c in range(len(cameras.focal)):
+        rows = observed.camera_of == c
+        off[rows] = cameras[c].project(points[observed.point_of[rows]]) - observed.image[rows]
+    return off / observed.noise[:, None]
+
+
+def estimate_noise(
+    cameras: Camera, points: Floats, observed: Observations, robust_scale: float
+) -> KeypointNoise:
+    """Return the scale and the correlation of the keypoints' errors.
+
+    The scale comes from the median; every point takes three degrees of freedom out of its
+    observations. The correlation is the squared length of the sum of a joint's residuals over time,
+    in one camera, over the sum of their squared lengths; 1 for independent residuals.
+
+    Args:
+        cameras: (cameras,) batch, adjusted.
+        points: (points, 3) [m], world, adjusted.
+        observed: keypoints of these points.
+        robust_scale: of Cauchy's loss [standard deviations].
+    """
+    off = residuals(cameras, points, observed)
+    views = np.bincount(observed.point_of, minlength=len(points))[observed.point_of]
+    squared = (off**2).sum(axis=1) / (1.0 - 1.5 / np.maximum(views, 2))
+    scale = (
+        float(np.sqrt(np.median(squared[views > 2]) / MEDIAN_SQUARED)) if (views > 2).any() else 1.0
+    )
+    pull = off / (1.0 + (off**2).sum(axis=1) / (robust_scale * scale) ** 2)[:, None]
+    series = (observed.camera_of * (observed.person_of.max() + 1) + observed.person_of) * 17
+    _, series = np.unique(series + observed.joint_of, return_inverse=True)
+    summed = np.stack([np.bincount(series, pull[:, axis]) for axis in range(2)])
+    correlation = float((summed**2).sum() / (pull**2).sum())
+    return KeypointNoise(scale, max(1.0, correlation))

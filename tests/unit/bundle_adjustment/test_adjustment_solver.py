@@ -54,12 +54,12 @@ def test_a_point_behind_its_camera_is_refused(scene):
 
 def test_exact_observations_give_back_the_truth(scene):
     problem, true, points = scene(joints=60)
-    solved = solve(disturbed(problem))
-    assert solved.converged
+    adjust = solve(disturbed(problem))
+    assert adjust.converged
     # 1e-8 of the cost at the start is left: far below a hundredth of a pixel.
-    np.testing.assert_allclose(solved.points, points, atol=1e-5)
-    np.testing.assert_allclose(solved.cameras.center, true.center, atol=1e-4)
-    np.testing.assert_allclose(solved.cameras.focal, true.focal, rtol=1e-6)
+    np.testing.assert_allclose(adjust.points, points, atol=1e-5)
+    np.testing.assert_allclose(adjust.cameras.center, true.center, atol=1e-4)
+    np.testing.assert_allclose(adjust.cameras.focal, true.focal, rtol=1e-6)
 
 
 def test_a_wrong_observation_hardly_counts_with_a_robust_loss(scene):
@@ -82,17 +82,17 @@ def test_fixed_parameters_and_fixed_points_stay(scene):
     free = problem.free.copy()
     free[:, PARAMETERS.index("cx") : PARAMETERS.index("cy") + 1] = False
     start = disturbed(replace(problem, free=free))
-    solved = solve(start)
-    np.testing.assert_array_equal(solved.cameras.principal_point, start.cameras.principal_point)
-    np.testing.assert_array_equal(solved.points[:24], start.points[:24])
+    adjust = solve(start)
+    np.testing.assert_array_equal(adjust.cameras.principal_point, start.cameras.principal_point)
+    np.testing.assert_array_equal(adjust.points[:24], start.points[:24])
 
 
 def test_prior_knowledge_of_a_camera_holds_where_observations_say_nothing(scene):
     problem, true, _ = scene(markings=0, noise=0.5)
     information = np.tile(np.diag(1.0 / np.maximum(DISTURBED, 1e-9) ** 2), (4, 1, 1))
     information[:2] *= 1e8  # two cameras are known: they fix the gauge
-    solved = solve(replace(disturbed(problem), cameras=true, camera_information=information))
-    np.testing.assert_allclose(solved.cameras.center[:2], true.center[:2], atol=1e-3)
+    adjust = solve(replace(disturbed(problem), cameras=true, camera_information=information))
+    np.testing.assert_allclose(adjust.cameras.center[:2], true.center[:2], atol=1e-3)
 
 
 def test_covariance_of_the_cameras_is_what_repetition_shows(scene):
@@ -102,9 +102,9 @@ def test_covariance_of_the_cameras_is_what_repetition_shows(scene):
         rng = np.random.default_rng(100 + seed)
         exact, *_ = scene(noise=0.0, seed=1)
         noisy = replace(problem, image=exact.image + rng.standard_normal(exact.image.shape))
-        solved = solve(noisy)
-        errors.append(solved.cameras.center[0] - true.center[0])
-        covariance = solved.camera_covariance
+        adjust = solve(noisy)
+        errors.append(adjust.cameras.center[0] - true.center[0])
+        covariance = adjust.camera_covariance
     rotation = true.cam_from_world.rotation[0]
     # A shift t in the camera's axes moves the center by -R^T t.
     stated = rotation.T @ covariance[3:6, 3:6] @ rotation
@@ -114,9 +114,9 @@ def test_covariance_of_the_cameras_is_what_repetition_shows(scene):
 
 def test_it_stops_when_told_and_says_so(scene):
     problem, *_ = scene(noise=1.0)
-    solved = solve(disturbed(problem), SolverSettings(iterations=1))
-    assert solved.iterations == 1
-    assert not solved.converged
+    adjust = solve(disturbed(problem), SolverSettings(iterations=1))
+    assert adjust.iterations == 1
+    assert not adjust.converged
 
 
 def test_a_camera_that_nothing_holds_is_named(scene):
@@ -152,11 +152,11 @@ def test_a_point_of_two_parallel_rays_stays_at_its_depth(scene):
         weight=problem.weight[kept],
         scale=problem.scale[kept],
     )
-    solved = solve(disturbed(twins))
-    assert np.isfinite(solved.camera_covariance).all()
-    np.testing.assert_allclose(solved.cameras.center, twin.center, atol=1e-4)
-    np.testing.assert_allclose(solved.points[:-1], points[:-1], atol=1e-4)
-    np.testing.assert_allclose(solved.cameras[0].project(solved.points[-1:]), image[-1:], atol=1e-3)
+    adjust = solve(disturbed(twins))
+    assert np.isfinite(adjust.camera_covariance).all()
+    np.testing.assert_allclose(adjust.cameras.center, twin.center, atol=1e-4)
+    np.testing.assert_allclose(adjust.points[:-1], points[:-1], atol=1e-4)
+    np.testing.assert_allclose(adjust.cameras[0].project(adjust.points[-1:]), image[-1:], atol=1e-3)
 
 
 def test_numbers_that_are_not_finite_are_no_fault_of_the_cameras(scene):

@@ -1,18 +1,107 @@
-"""Outlier keypoints and clicks after adjustment, for manual review (B3); nothing is removed."""
+"""Arrays and attributes of an adjustment, as in `data_contracts.bundle_adjustment`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.bundle_adjustment.building import KeypointNoise
-from worldpose.bundle_adjustment.clip import Clicks, Clip, keypoints_of, predict
+from data_contracts.arrays import Floats, Integers
+from worldpose.bundle_adjustment.adjustment import BundleAdjustment
+from worldpose.bundle_adjustment.clip import Clicks, Clip, keypoints_by_person, project_joints
+from worldpose.bundle_adjustment.problems import KeypointNoise
+from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
+from worldpose.bundle_adjustment.uncertainty import weak_direction
 from worldpose.geometry import Camera
+from worldpose.geometry.stored import camera_arrays
 from worldpose.static_calibration import image_problems, project_with_jacobian
 from worldpose.triangulation import triangulate_joints
+
+
+def adjustment_arrays(
+    adjusted: BundleAdjustment,
+    settings: BundleAdjustmentSettings,
+    person: NDArray[np.integer[Any]],
+) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Return the stored arrays and attributes of adjusted cameras, without the people.
+
+    Args:
+        adjusted: the adjustment.
+        settings: of the adjustment.
+        person: (persons,) ids.
+
+    Returns:
+        Arrays by name, and attributes by name, except the camera ids.
+    """
+    clip = adjusted.clip
+    outliers = keypoint_outliers(
+        clip, adjusted.cameras, adjusted.noise, settings.wrong_keypoint, settings.review
+    )
+    clicks = review_clicks(clip.clicks, adjusted.cameras, adjusted.covariance, settings.click_noise)
+    weak = [
+        weak_direction(adjusted.cameras[c], adjusted.covariance[c]) for c in range(len(clip.clicks))
+    ]
+    errors = [marking_errors(clip, cameras) for cameras in (clip.cameras, adjusted.cameras)]
+    arrays = {
+        **camera_arrays(adjusted.cameras),
+        "camera_covariance": adjusted.covariance,
+        "accepted": adjusted.accepted,
+        "moved_center": adjusted.motion[:, 0],
+        "moved_rotation": adjusted.motion[:, 1],
+        "moved_focal": adjusted.motion[:, 2],
+        "judges": adjusted.verdict.judges,
+        "held_out_loss": adjusted.verdict.loss,
+        "held_out_error": adjusted.verdict.error,
+        "marking_error": np.stack(errors, axis=1),
+        "weak_step": np.stack([direction.step for direction in weak]),
+        "outlier_frame": clip.frame[outliers.frame],
+        "outlier_camera": outliers.camera,
+        "outlier_person": person[outliers.person].astype(np.int64),
+        "outlier_joint": outliers.joint,
+        "outlier_surprise": outliers.surprise,
+        "click_camera": clicks.camera,
+        "click_residual": clicks.residual,
+        "click_surprise": np.where(np.isfinite(clicks.surprise), clicks.surprise, np.nan),
+        "click_wrong": clicks.surprise > settings.wrong_click,
+    }
+    attributes = {
+        "reasons": list(adjusted.reasons),
+        "held_out_gain": adjusted.evidence.gain,
+        "held_out_significance": adjusted.evidence.significance,
+        "people_shift": adjusted.evidence.shift,
+        "weak": [direction.about for direction in weak],
+        "proposed_frames": adjusted.proposed.tolist(),
+        "used_frames": adjusted.used.tolist(),
+        "judged_frames": adjusted.judged.tolist(),
+        "noise_scale": adjusted.noise.scale,
+        "noise_correlation": adjusted.noise.correlation,
+        "outliers_found": outliers.found,
+        "click": list(clicks.name),
+        "click_problem": list(clicks.problem),
+    }
+    return arrays, attributes
+
+
+def marking_errors(clip: Clip, cameras: Camera) -> Floats:
+    """Return the root mean square error per axis (cameras,) [px] of clicks used in calibration.
+
+    Args:
+        clip: its clicks.
+        cameras: (cameras,) batch.
+
+    Returns:
+        NaN for cameras without such clicks.
+    """
+    errors = np.full(len(clip.clicks), np.nan)
+    for c, clicks in enumerate(clip.clicks):
+        if clicks.inlier.any():
+            pixels = cameras[c].project(clicks.points_world[clicks.inlier])
+            off = pixels - clicks.points_image[clicks.inlier]
+            errors[c] = np.sqrt(np.mean(off**2))
+    return errors
+
 
 _WHOLE: Final = 0.5
 """Share of outliers among a person's keypoints in one image from which all are listed together [1]:
@@ -34,11 +123,11 @@ class KeypointOutliers:
         found: number of outliers, including those beyond the list.
     """
 
-    frame: NDArray[np.int64]
-    camera: NDArray[np.int64]
-    person: NDArray[np.int64]
-    joint: NDArray[np.int64]
-    surprise: NDArray[np.float64]
+    frame: Integers
+    camera: Integers
+    person: Integers
+    joint: Integers
+    surprise: Floats
     found: int
 
 
@@ -55,10 +144,10 @@ class ClickReview:
         problem: reason why the camera cannot image each point; empty where it can.
     """
 
-    camera: NDArray[np.int64]
+    camera: Integers
     name: tuple[str, ...]
-    residual: NDArray[np.float64]
-    surprise: NDArray[np.float64]
+    residual: Floats
+    surprise: Floats
     problem: tuple[str, ...]
 
 
@@ -75,7 +164,7 @@ def keypoint_outliers(
         longest: maximum number of entries.
     """
     parts = [
-        _of_block(
+        _find_outliers(
             clip, cameras, noise, limit, np.arange(first, min(first + _BLOCK, len(clip.frame)))
         )
         for first in range(0, len(clip.frame), _BLOCK)
@@ -86,17 +175,17 @@ def keypoint_outliers(
     return KeypointOutliers(frame, camera, person, joint, rows[order, 4], len(rows))
 
 
-def _of_block(
-    clip: Clip, cameras: Camera, noise: KeypointNoise, limit: float, frames: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def _find_outliers(
+    clip: Clip, cameras: Camera, noise: KeypointNoise, limit: float, frames: Integers
+) -> Floats:
     """Return rows (n, 5) of frame, camera, person, joint and Mahalanobis distance."""
     keypoints, confidence = clip.keypoints[frames], clip.confidence[frames]
     index = clip.detection_index[frames]
     joints = triangulate_joints(
         cameras, keypoints, confidence, index.astype(np.int16), clip.triangulation
     ).joints
-    image, weight = keypoints_of(keypoints, confidence, index)
-    predicted, stated = predict(cameras, joints, weight, clip.triangulation)
+    image, weight = keypoints_by_person(keypoints, confidence, index)
+    predicted, stated = project_joints(cameras, joints, weight, clip.triangulation)
     off = np.linalg.norm(predicted - image, axis=-1) / (noise.scale * stated)
     off[~np.isfinite(off)] = np.nan
     wrong = off > limit
@@ -111,7 +200,7 @@ def _of_block(
 def review_clicks(
     clicks: tuple[Clicks, ...],
     cameras: Camera,
-    covariance: NDArray[np.float64],
+    covariance: Floats,
     click_noise: float,
 ) -> ClickReview:
     """Return every clicked point's residual and its Mahalanobis distance.

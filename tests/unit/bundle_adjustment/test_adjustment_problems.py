@@ -6,25 +6,25 @@ import numpy as np
 import pytest
 
 from worldpose.bundle_adjustment import BundleAdjustmentSettings, GivenCameraPrior
-from worldpose.bundle_adjustment.building import (
+from worldpose.bundle_adjustment.clip import select_observations
+from worldpose.bundle_adjustment.problems import (
     KeypointNoise,
     camera_knowledge,
+    estimate_noise,
+    estimate_variance_factor,
     known_covariance,
     markings_problem,
-    measured_doubt,
     players_problem,
 )
-from worldpose.bundle_adjustment.clip import observe
-from worldpose.bundle_adjustment.noise import measured_noise
-from worldpose.bundle_adjustment.solving import solve
+from worldpose.bundle_adjustment.solver import solve
 from worldpose.static_calibration import PARAMETERS
 
 SETTINGS = BundleAdjustmentSettings()
 
 
-def everybody(made):
+def observations(made):
     people = np.ones(made.detection_index.shape[2], dtype=bool)
-    return observe(made, np.arange(len(made.frame)), people, made.cameras, 3)
+    return select_observations(made, np.arange(len(made.frame)), people, made.cameras, 3)
 
 
 def test_the_prior_is_the_inverse_of_what_calibration_knows(clip):
@@ -63,7 +63,7 @@ def test_observations_are_those_of_joints_that_enough_cameras_agree_on(clip):
     made, *_ = clip(cameras=4, persons=2, frames=3)
     made.views[:] = 4
     made.views[1, 0, 5] = 2
-    observed = everybody(made)
+    observed = observations(made)
     expected = int((np.isfinite(made.joints[..., 0]) & (made.views >= 3)).sum())
     assert expected > 50
     assert len(observed.points) == expected
@@ -81,10 +81,10 @@ def test_observations_are_those_of_joints_that_enough_cameras_agree_on(clip):
 
 def test_lasting_errors_count_as_one(clip):
     made, *_ = clip()
-    observed = everybody(made)
-    standing = np.zeros(5, dtype=bool)
-    once = players_problem(made, observed, KeypointNoise(1.0, 1.0), standing, SETTINGS)
-    lasting = players_problem(made, observed, KeypointNoise(2.0, 4.0), standing, SETTINGS)
+    observed = observations(made)
+    fixed = np.zeros(5, dtype=bool)
+    once = players_problem(made, observed, KeypointNoise(1.0, 1.0), fixed, SETTINGS)
+    lasting = players_problem(made, observed, KeypointNoise(2.0, 4.0), fixed, SETTINGS)
     np.testing.assert_allclose(lasting.weight, once.weight / 16.0)
     # Three standard deviations stay three: the weight has the correlation in it.
     np.testing.assert_allclose(lasting.scale, once.scale / 2.0)
@@ -93,9 +93,9 @@ def test_lasting_errors_count_as_one(clip):
 @pytest.mark.parametrize(("noise", "lasting"), [(1.0, 0.0), (0.6, 1.2)])
 def test_scale_and_correlation_of_errors_are_found(clip, noise, lasting):
     made, true, joints = clip(frames=20, noise=noise, lasting=lasting, seed=3)
-    observed = everybody(made)
+    observed = observations(made)
     points = joints[made.views >= 3]
-    found = measured_noise(true, points, observed, robust_scale=100.0)
+    found = estimate_noise(true, points, observed, robust_scale=100.0)
     # 10,200 observations about the truth: the views' share is taken off for nothing here, 1 in
     # 1 - 3 / (2 x 5) = 0.7; the rest is right to a per cent.
     expected = np.hypot(noise, lasting) / np.sqrt(0.7)
@@ -120,8 +120,8 @@ def test_calibration_that_claims_too_much_is_doubted_as_much(clip, claimed):
     made, *_ = clip(persons=8, seed=6)
     sure = replace(made, covariance=claimed**2 * made.covariance)
     nobody = np.zeros(5, dtype=bool)
-    problem = players_problem(sure, everybody(made), KeypointNoise(), nobody, SETTINGS)
-    doubt = measured_doubt(problem, solve(problem))
+    problem = players_problem(sure, observations(made), KeypointNoise(), nobody, SETTINGS)
+    variance_factor = estimate_variance_factor(problem, solve(problem))
     # Some 40 directions of five cameras tell a variance to a factor of 1.25; and one's own word
     # counts for another ten, which draws large factors down.
-    assert 0.4 / claimed**2 < doubt.mean() < 1.6 / claimed**2
+    assert 0.4 / claimed**2 < variance_factor.mean() < 1.6 / claimed**2
