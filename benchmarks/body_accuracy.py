@@ -27,13 +27,14 @@ from worldpose.body import BodyParameters, load_open_body
 from worldpose.body_fitting import (
     BodyFit,
     BodyFittingSettings,
-    find_sightings,
+    ClipEvidence,
+    constrain_to_rays,
+    find_ray_constraints,
     fit_bodies,
+    identify_people,
     place_monocular_poses,
-    recognise_people,
-    sight_people,
 )
-from worldpose.body_fitting.monocular import monocular_of
+from worldpose.body_fitting.monocular import parse_monocular
 from worldpose.evaluation import evaluate_joints
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
@@ -85,8 +86,8 @@ def whole(seed: int, duration: float) -> dict[str, float]:
     placed = reconstruct_joints(cameras, *arrays, index, scenario.fps, TRIANGULATION).triangulation
     ground = PitchTemplate.from_spec(scene.surveyed).height
     begin = time.process_time()
-    given = (BODY, placed.joints, placed.covariance, scenario.fps, SETTINGS, ground)
-    fit = fit_bodies(*given, common_bias=placed.common_bias)
+    evidence = ClipEvidence(placed.joints, placed.covariance, scenario.fps, placed.common_bias)
+    fit = fit_bodies(BODY, evidence, SETTINGS, ground)
     figures = {"seconds of one core": time.process_time() - begin}
     people = np.arange(index.shape[2])
     for label, joints in (("triangulated", placed.joints), ("fitted", fit.joints)):
@@ -153,17 +154,16 @@ def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
     placed = reconstruct_joints(cameras, *arrays, index, fps, TRIANGULATION).triangulation
     joints, covariance = placed.joints, placed.covariance
     right = unswap(seen.keypoints, index, placed.exchanged)
-    static = find_sightings(cameras, right, index, joints)
+    static = find_ray_constraints(cameras, right, index, joints)
     ground = PitchTemplate.from_spec(scene.surveyed).height
 
     def fitted(views: list, glimpses: object = None) -> BodyFit:
-        given = (BODY, joints, covariance, fps, SETTINGS, ground)
-        bias = placed.common_bias
-        return fit_bodies(*given, sightings=views, glimpses=glimpses, common_bias=bias)
+        evidence = ClipEvidence(joints, covariance, fps, placed.common_bias, views, glimpses)
+        return fit_bodies(BODY, evidence, SETTINGS, ground)
 
     first = fitted([static])
-    own = recognise_people(scene.broadcast, scene.observations["clip"].keypoints, first.joints)
-    moving = sight_people(scene.broadcast, own, first.joints)
+    own = identify_people(scene.broadcast, scene.observations["clip"].keypoints, first.joints)
+    moving = constrain_to_rays(scene.broadcast, own, first.joints)
     bodies = BodyParameters(
         *(
             np.swapaxes(getattr(scene.poses, name), 0, 1)
@@ -172,7 +172,7 @@ def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
     )
     rng = np.random.default_rng(seed)
     drawn = estimate_bodies(BODY, bodies, scene.broadcast, fps, MonocularErrors(), rng)
-    estimates = monocular_of(drawn, Path("estimates"))
+    estimates = parse_monocular(drawn, Path("estimates"))
     glimpses = place_monocular_poses(estimates, scene.broadcast, frames, first.joints)
     fits = {
         "static cameras alone": first,

@@ -28,9 +28,8 @@ from worldpose.body import BodyModel, BodyParameters, fold_keypoints, load_open_
 from worldpose.body.differentiable import DifferentiableBody
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body.skeletons import JOINT_OF_POINT, VERTEX_OF_POINT
-from worldpose.body_fitting import BodyFittingSettings, fit_bodies
-from worldpose.body_fitting.pose_space import SPREAD, load_pose_prior
-from worldpose.body_fitting.starting import start_poses
+from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, fit_bodies
+from worldpose.body_fitting.pose_space import SPREAD, load_pose_prior, start_poses
 
 NOISE = 0.02
 WEIGHT = 1e-4
@@ -74,11 +73,11 @@ def main() -> None:
     joints = exact + NOISE * np.random.default_rng(4).standard_normal(exact.shape)
     covariance = np.broadcast_to(NOISE**2 * np.eye(3), (*joints.shape, 3))
     settings = BodyFittingSettings()
-    fit_bodies(model, joints[:8, :1], covariance[:8, :1], 50.0, settings)
+    fit_bodies(model, ClipEvidence(joints[:8, :1], covariance[:8, :1], 50.0), settings)
 
     poses = options.persons * options.frames
     start, busy = time.perf_counter(), time.process_time()
-    fit = fit_bodies(model, joints, covariance, 50.0, settings)
+    fit = fit_bodies(model, ClipEvidence(joints, covariance, 50.0), settings)
     wall, busy = time.perf_counter() - start, time.process_time() - busy
     off = np.linalg.norm(fit.joints - exact, axis=-1).mean()
     print(f"fit_bodies     {poses} poses {wall:7.1f} s (cpu {busy:.1f} s), {1e3 * off:.1f} mm off")

@@ -15,7 +15,12 @@ import argparse
 import numpy as np
 
 from worldpose.body import find_body
-from worldpose.body_fitting import BodyFittingSettings, find_sightings, fit_bodies
+from worldpose.body_fitting import (
+    BodyFittingSettings,
+    ClipEvidence,
+    find_ray_constraints,
+    fit_bodies,
+)
 from worldpose.filtering import (
     FilteringSettings,
     Suspects,
@@ -70,16 +75,18 @@ def filtered(scenario: Scenario, seed: int) -> tuple[int, int, int, int]:
     placed = reconstruct_joints(*given, scenario.fps, settings).triangulation
     ground = PitchTemplate.from_spec(scene.surveyed).height
     right = unswap(keypoints, tracks.detection_index, placed.exchanged)
-    alone = find_sightings(cameras, right, tracks.detection_index, placed.joints)
+    alone = find_ray_constraints(cameras, right, tracks.detection_index, placed.joints)
     fit = fit_bodies(
         find_body(how.body_model),
-        placed.joints,
-        placed.covariance,
-        scenario.fps,
+        ClipEvidence(
+            placed.joints,
+            placed.covariance,
+            scenario.fps,
+            ray_constraints=[alone],
+            common_bias=placed.common_bias,
+        ),
         how,
         ground,
-        sightings=[alone],
-        common_bias=placed.common_bias,
     )
     sure = perceived_covariance(fit.covariance, placed.common_bias)
     views = view_bodies(cameras, perceived_joints(fit.joints, fit.offsets), sure)

@@ -19,12 +19,13 @@ from worldpose.body import BodyModel, digest_of_body, find_body
 from worldpose.body_fitting import (
     BodyFit,
     BodyFittingSettings,
+    ClipEvidence,
     MonocularPoses,
     Pictures,
+    RayConstraints,
     Shape,
-    Sightings,
     far_offsets,
-    find_sightings,
+    find_ray_constraints,
     fit_bodies,
     report_fit,
 )
@@ -88,7 +89,7 @@ def fit_people(
     people: ClipPeople,
     recipe: Recipe,
     *,
-    views: Sequence[Sightings] = (),
+    views: Sequence[RayConstraints] = (),
     glimpses: MonocularPoses | None = None,
     known: Mapping[int, Shape] | None = None,
 ) -> tuple[BodyModel, BodyFit]:
@@ -108,18 +109,20 @@ def fit_people(
         ground = PitchTemplate.from_spec(PitchSpec.model_validate(pitch)).height
     settings = BodyFittingSettings.model_validate(recipe.settings)
     model = _body(settings.body_model, sources["body_model_sha256"])
-    alone = find_sightings(people.clip.cameras, people.keypoints, people.index, people.joints)
+    alone = find_ray_constraints(people.clip.cameras, people.keypoints, people.index, people.joints)
     fit = fit_bodies(
         model,
-        people.joints,
-        people.covariance,
-        people.clip.fps,
+        ClipEvidence(
+            people.joints,
+            people.covariance,
+            people.clip.fps,
+            ray_constraints=[alone, *views],
+            monocular_poses=glimpses,
+            common_bias=people.common_bias,
+        ),
         settings,
         ground,
-        known=known,
-        sightings=[alone, *views],
-        glimpses=glimpses,
-        common_bias=people.common_bias,
+        known_shapes=known,
     )
     return model, fit
 

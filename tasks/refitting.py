@@ -17,14 +17,14 @@ from tasks.unit import open_input, require_registered, unit_task
 from worldpose.body_fitting import (
     BodyFittingSettings,
     MonocularPoses,
+    RayConstraints,
     Shape,
-    Sightings,
-    between_frames,
+    constrain_to_rays,
+    identify_people,
     place_monocular_poses,
     pool_shapes,
     read_monocular,
-    recognise_people,
-    sight_people,
+    shift_frames,
 )
 from worldpose.geometry import Camera
 from worldpose.geometry.stored import camera_from_arrays
@@ -46,7 +46,7 @@ def refitting(work: Work) -> str:
     with store.publishing(work) as result:
         people = open_people(store, work)
         joints = open_input(store, work, f"body_fitting/{unit}")["joints"].values
-        views: list[Sightings] = []
+        views: list[RayConstraints] = []
         glimpses: MonocularPoses | None = None
         if f"broadcast_calibration/{unit}" in work.recipe.inputs:
             pictures = _pictures(store, work, people.clip.frame)
@@ -107,19 +107,19 @@ def _pictures(store: Store, work: Work, frame: NDArray[np.int64]) -> _Pictures:
     )
 
 
-def _view(store: Store, work: Work, pictures: _Pictures, joints: Floats) -> Sightings:
+def _view(store: Store, work: Work, pictures: _Pictures, joints: Floats) -> RayConstraints:
     """Return the ray constraints of the broadcast camera's 2D poses."""
     sources: dict[str, Any] = work.recipe.sources
     first, count = sources["first_frame"], sources["frame_count"]
     seen = open_input(store, work, sources["seen_in_broadcast"]).sel(
         frame=np.arange(first, first + count)
     )
-    then = between_frames(joints, pictures.late)
+    then = shift_frames(joints, pictures.late)
     keypoints = seen["keypoints"].values.astype(np.float64)
-    own = recognise_people(pictures.camera, keypoints, then)
-    view = sight_people(pictures.camera, own, then)
-    return Sightings(
-        between_frames(view.points, -pictures.late), between_frames(view.across, -pictures.late)
+    own = identify_people(pictures.camera, keypoints, then)
+    view = constrain_to_rays(pictures.camera, own, then)
+    return RayConstraints(
+        shift_frames(view.points, -pictures.late), shift_frames(view.across, -pictures.late)
     )
 
 
@@ -131,10 +131,10 @@ def _glimpses(work: Work, pictures: _Pictures, joints: Floats) -> MonocularPoses
     path = Path(work.folder) / sources["estimates"]
     estimates = read_monocular(path)
     require_registered(path, sources["estimates_sha256"])
-    then = between_frames(joints, pictures.late)
+    then = shift_frames(joints, pictures.late)
     seen = place_monocular_poses(estimates, pictures.camera, pictures.number, then)
     whole = -round(pictures.late)
-    return MonocularPoses(between_frames(seen.orient, whole), between_frames(seen.angles, whole))
+    return MonocularPoses(shift_frames(seen.orient, whole), shift_frames(seen.angles, whole))
 
 
 def _known(

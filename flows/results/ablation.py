@@ -10,7 +10,7 @@ import numpy as np
 
 from data_contracts.static_calibration import ClickedPoint
 from worldpose.body import find_body
-from worldpose.body_fitting import BodyFittingSettings, fit_bodies
+from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, fit_bodies
 from worldpose.bundle_adjustment import (
     BundleAdjustmentSettings,
     Clicks,
@@ -216,8 +216,8 @@ def _score(
         how = BodyFittingSettings()
         floor = PitchTemplate.from_spec(scene.surveyed).height
         model = find_body(how.body_model)
-        given = (model, joints, placed.covariance, clip.fps, how, floor)
-        joints = fit_bodies(*given, common_bias=placed.common_bias).joints
+        evidence = ClipEvidence(joints, placed.covariance, clip.fps, placed.common_bias)
+        joints = fit_bodies(model, evidence, how, floor).joints
     people = np.arange(index.shape[2])
     found, _ = evaluate_joints(JointTracks(clip.frame, people, joints), scene.truth, fps=clip.fps)
     estimated = {name: cameras[c] for c, name in enumerate(names)}

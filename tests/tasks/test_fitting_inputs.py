@@ -10,8 +10,8 @@ from data_contracts.conventions import COCO17
 from tasks import body_fitting, refitting
 from tasks.clip_inputs import ClipInputs
 from worldpose.body_fitting.monocular import MonocularEstimates
-from worldpose.body_fitting.moving_view import sight_people
 from worldpose.body_fitting.pose_space import GATHER
+from worldpose.body_fitting.ray_constraints import constrain_to_rays
 from worldpose.geometry import Camera, Rigid
 from worldpose.geometry.stored import camera_arrays
 from worldpose.simulation.stadium import looking
@@ -130,7 +130,7 @@ def test_lines_of_pictures_that_are_late_are_those_of_the_frames(monkeypatch, la
     np.testing.assert_allclose(view.points[there], runner(frame)[there], atol=1e-6)
     # 7 mrad a frame along the picture, and what bends of it in between.
     own = camera.project(runner(frame)[:, 0])[:, None]
-    here = sight_people(camera, own, runner(frame)).across
+    here = constrain_to_rays(camera, own, runner(frame)).across
     np.testing.assert_allclose(view.across[there], here[there], atol=1e-4)
 
 

@@ -4,6 +4,7 @@ Input: triangulated joints with covariance, a body model, and the ground where k
 parameters, the bodies' keypoints with covariance, and the detector's systematic offsets.
 """
 
+from worldpose.body_fitting.body_fit import BodyFit, ClipEvidence, fit_bodies
 from worldpose.body_fitting.bones import (
     BoneLengths,
     Shape,
@@ -11,12 +12,20 @@ from worldpose.body_fitting.bones import (
     measure_bones,
     pool_shapes,
 )
-from worldpose.body_fitting.figures import BodyFittingReport, Pictures, report_fit
-from worldpose.body_fitting.fitting import BodyFit, fit_bodies
-from worldpose.body_fitting.monocular import MonocularEstimates, read_monocular
-from worldpose.body_fitting.monocular_poses import MonocularPoses, place_monocular_poses
-from worldpose.body_fitting.moving_view import between_frames, recognise_people, sight_people
-from worldpose.body_fitting.ray_constraints import Sightings, find_sightings
+from worldpose.body_fitting.monocular import (
+    MonocularEstimates,
+    MonocularPoses,
+    place_monocular_poses,
+    read_monocular,
+)
+from worldpose.body_fitting.ray_constraints import (
+    RayConstraints,
+    constrain_to_rays,
+    find_ray_constraints,
+    identify_people,
+    shift_frames,
+)
+from worldpose.body_fitting.report import BodyFittingReport, Pictures, report_fit
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shared_bias import far_offsets
 
@@ -25,21 +34,22 @@ __all__ = [
     "BodyFittingReport",
     "BodyFittingSettings",
     "BoneLengths",
+    "ClipEvidence",
     "MonocularEstimates",
     "MonocularPoses",
     "Pictures",
+    "RayConstraints",
     "Shape",
-    "Sightings",
-    "between_frames",
+    "constrain_to_rays",
     "far_offsets",
-    "find_sightings",
+    "find_ray_constraints",
     "fit_bodies",
     "fit_shape",
+    "identify_people",
     "measure_bones",
     "place_monocular_poses",
     "pool_shapes",
     "read_monocular",
-    "recognise_people",
     "report_fit",
-    "sight_people",
+    "shift_frames",
 ]

@@ -25,7 +25,7 @@ BONES: Final = (
 """Pairs of COCO-17 joints whose distance no pose changes."""
 LIMBS: Final = ((5, 7, 9), (6, 8, 10), (11, 13, 15), (12, 14, 16))
 """Arms and legs of COCO-17, outward."""
-MOST_NOISE: Final = 0.15
+MAX_SHORTENING: Final = 0.15
 """Maximum relative shortening of bones [1]: beyond it noise is not small."""
 DEFINITION: Final = 0.02
 """Distance between a detector's definition of a joint and the body model's [m]: no number of frames
@@ -52,13 +52,13 @@ class Shape:
     """(shapes, shapes)"""
 
 
-def measure_bones(joints: Floats, covariance: Floats, witnesses: float) -> BoneLengths:
+def measure_bones(joints: Floats, covariance: Floats, correlated_frames: float) -> BoneLengths:
     """Return bone lengths without the contribution of noise, robust over frames.
 
     Args:
         joints: (frames, 17, 3) [m].
         covariance: (frames, 17, 3, 3) [m^2], true to the joints' errors.
-        witnesses: frames with correlated errors, which count as one.
+        correlated_frames: frames with correlated errors, which count as one.
     """
     lengths, variances = np.full(len(BONES), np.nan), np.full(len(BONES), np.inf)
     for index, (a, b) in enumerate(BONES):
@@ -78,7 +78,7 @@ def measure_bones(joints: Floats, covariance: Floats, witnesses: float) -> BoneL
         kept = np.abs(square - middle) <= 4.0 * scale
         mean = float(square[kept].mean())
         lengths[index] = np.sqrt(max(mean, 1e-4))
-        count = max(kept.sum() / witnesses, 1.0)
+        count = max(kept.sum() / correlated_frames, 1.0)
         variances[index] = max(spread[kept].mean(), scale**2) / count / (4.0 * max(mean, 1e-2))
     return BoneLengths(lengths, variances)
 
@@ -102,7 +102,7 @@ def shorten_limbs(joints: Floats, covariance: Floats) -> Floats:
             across = np.trace(error, axis1=-2, axis2=-1) - np.einsum(
                 "fa,fab,fb->f", along, error, along
             )
-            longer = np.minimum(0.5 * across / np.maximum(length, 1e-9), MOST_NOISE * length)
+            longer = np.minimum(0.5 * across / np.maximum(length, 1e-9), MAX_SHORTENING * length)
             longer = np.where(np.isfinite(longer), longer, 0.0)
             along = np.where(np.isfinite(along), along, 0.0)
             for joint in moved:
@@ -143,9 +143,9 @@ def pool_shapes(shapes: Sequence[Shape], weight: float) -> Shape:
         shapes: of one person and body model, at least one.
         weight: of that prior in every one of them [1], `shape_weight` of the settings.
     """
-    anybody = weight * np.eye(len(shapes[0].betas))
+    prior_precision = weight * np.eye(len(shapes[0].betas))
     precisions = [np.linalg.inv(shape.covariance) for shape in shapes]
-    precision = sum(precisions, start=-(len(shapes) - 1.0) * anybody)
-    pulls = [own @ shape.betas for own, shape in zip(precisions, shapes, strict=True)]
+    precision = sum(precisions, start=-(len(shapes) - 1.0) * prior_precision)
+    weighted = [own @ shape.betas for own, shape in zip(precisions, shapes, strict=True)]
     covariance = np.linalg.inv(precision).astype(np.float64)
-    return Shape(covariance @ np.sum(pulls, axis=0), covariance)
+    return Shape(covariance @ np.sum(weighted, axis=0), covariance)

@@ -1,8 +1,12 @@
-"""Monocular SMPL estimates, read from the files of the methods that make them (S4).
+"""Monocular SMPL estimates: file formats, poses in the world, and terms in the objective (S4).
 
 4DHumans (HMR2) and HybrIK estimate a body in each image crop: useful joint rotations, at a guessed
 depth and size. Only the rotations and the image position are used. Every file is an npz of arrays;
 the methods' own array names are supported.
+
+With enough cameras on a person the fit without monocular poses is much more accurate, and their
+distance from it is their error. Its mean square, over all people, is their variance elsewhere. So
+an inaccurate method gets almost no weight, and an accurate one helps.
 """
 
 from __future__ import annotations
@@ -14,13 +18,15 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from data_contracts.arrays import Floats
 from worldpose.body.model import JOINTS
+from worldpose.body_fitting.pose_space import GATHER, SIZE, interpolate_gaps
 from worldpose.errors import InputError
-from worldpose.formats.archives import read_npz
-from worldpose.formats.files import require_file
-from worldpose.geometry import Rigid
+from worldpose.formats.npz_files import read_npz
+from worldpose.formats.text_files import require_file
+from worldpose.geometry import Camera, Rigid
 
 ESTIMATE_BYTES: Final = 1 << 30
 """Maximum size of the arrays of one file [byte]: 1.5 million bodies as matrices."""
@@ -67,30 +73,35 @@ def read_monocular(path: Path) -> MonocularEstimates:
         InputError: unreadable, or without rotations or positions.
     """
     require_file(path)
-    return monocular_of(read_npz(path, ESTIMATE_BYTES), path)
+    return parse_monocular(read_npz(path, ESTIMATE_BYTES), path)
 
 
-def monocular_of(arrays: Mapping[str, NDArray[Any]], where: Path) -> MonocularEstimates:
+def parse_monocular(arrays: Mapping[str, NDArray[Any]], where: Path) -> MonocularEstimates:
     """Return the bodies of arrays in the layout of such a file.
 
     Raises:
         InputError: arrays are missing or have wrong shapes; the error names `where`.
     """
-    whole = _first(arrays, WHOLE)
+    whole = _first_present(arrays, WHOLE)
     if whole is None:
-        root, rest = _first(arrays, ROOT), _first(arrays, REST)
+        root, rest = _first_present(arrays, ROOT), _first_present(arrays, REST)
         if root is None or rest is None:
             expected = f"{' or '.join(WHOLE)}; or {ROOT[0]} and {REST[0]}"
-            raise _wrong(where, expected, ", ".join(arrays) or "nothing")
-        parts = [_turns(root, where, ROOT[0], 1), _turns(rest, where, REST[0], JOINTS - 1)]
+            raise _format_error(where, expected, ", ".join(arrays) or "nothing")
+        parts = [
+            _rotation_matrices(root, where, ROOT[0], 1),
+            _rotation_matrices(rest, where, REST[0], JOINTS - 1),
+        ]
         if len(parts[0]) != len(parts[1]):
-            raise _wrong(where, "as many pelves as bodies", f"{len(parts[0])} and {len(parts[1])}")
+            raise _format_error(
+                where, "as many root rotations as bodies", f"{len(parts[0])} and {len(parts[1])}"
+            )
         rotations = np.concatenate(parts, axis=1)
     else:
-        rotations = _turns(whole, where, "turns", JOINTS)
+        rotations = _rotation_matrices(whole, where, "rotations", JOINTS)
     rows = len(rotations)
     frame = np.asarray(arrays.get("frame", arrays.get("frames", np.arange(rows)))).ravel()
-    crop, place = _first(arrays, CROPS), _first(arrays, PLACES)
+    crop, place = _first_present(arrays, CROPS), _first_present(arrays, PLACES)
     if crop is not None:
         crop = np.asarray(crop, dtype=np.float64)
         center = crop if crop.shape[1:] == (2,) else 0.5 * (crop[..., :2] + crop[..., 2:4])
@@ -102,33 +113,244 @@ def monocular_of(arrays: Mapping[str, NDArray[Any]], where: Path) -> MonocularEs
             center = focal * place[:, :2] / place[:, 2:] + 0.5 * (size - 1.0)
     else:
         expected = "a crop (box_center or bbox), or transl with focal_length and img_size"
-        raise _wrong(where, expected, ", ".join(arrays))
+        raise _format_error(where, expected, ", ".join(arrays))
     if len(frame) != rows or center.shape != (rows, 2):
-        raise _wrong(where, f"{rows} frames and places", f"{len(frame)} and {center.shape}")
+        raise _format_error(
+            where, f"{rows} frames and positions", f"{len(frame)} and {center.shape}"
+        )
     return MonocularEstimates(frame.astype(np.int64), rotations, center, crop is not None)
 
 
-def _first(arrays: Mapping[str, NDArray[Any]], names: tuple[str, ...]) -> NDArray[Any] | None:
+def _first_present(
+    arrays: Mapping[str, NDArray[Any]], names: tuple[str, ...]
+) -> NDArray[Any] | None:
     return next((arrays[name] for name in names if name in arrays), None)
 
 
-def _turns(given: NDArray[Any], where: Path, name: str, joints: int) -> Floats:
+def _rotation_matrices(given: NDArray[Any], where: Path, name: str, joints: int) -> Floats:
     """Return matrices (rows, joints, 3, 3) of axis-angle vectors or matrices of any shape."""
     values = np.asarray(given, dtype=np.float64)
     rows, numbers = values.shape[:1], int(np.prod(values.shape[1:]))
     if values.ndim > 1 and numbers == 9 * joints:
-        matrices: Floats = values.reshape(*rows, joints, 3, 3)
+        matrices: Floats = values.reshape((*rows, joints, 3, 3))
         return matrices
     if values.ndim > 1 and numbers == 3 * joints:
-        return Rigid.from_rotvec(values.reshape(*rows, joints, 3), np.zeros(3)).rotation
+        return Rigid.from_rotvec(values.reshape((*rows, joints, 3)), np.zeros(3)).rotation
     expected = f"{name} of {joints} joints, axis-angle vectors or matrices, for each row"
-    raise _wrong(where, expected, f"shape {values.shape}")
+    raise _format_error(where, expected, f"shape {values.shape}")
 
 
-def _wrong(where: Path, expected: str, found: str) -> InputError:
+def _format_error(where: Path, expected: str, found: str) -> InputError:
     return InputError(
         str(where),
         expected=expected,
         found=found,
-        todo="Save the method's arrays with numpy.savez, one row for each body and picture.",
+        todo="Save the method's arrays with numpy.savez, one row for each body and image.",
     )
+
+
+GATE: Final = 0.35
+"""Maximum image distance between an estimate and its person [person height]."""
+
+
+@dataclass(frozen=True, eq=False)
+class MonocularPoses:
+    """Poses of people, estimated from images of one camera."""
+
+    orient: Floats
+    """(frames, persons, 3, 3), world from body; NaN without an estimate."""
+    angles: Floats
+    """(frames, persons, 30) [rad], of `pose_space`; NaN without an estimate."""
+
+
+def place_monocular_poses(
+    estimates: MonocularEstimates, camera: Camera, frame: NDArray[np.int64], joints: Floats
+) -> MonocularPoses:
+    """Return the estimates of tracked people, in the world.
+
+    A method that sees a crop treats its center as straight ahead; the calibrated camera has a ray
+    there, and rotating the optical axis onto it rotates the body, by 10 degrees near the border of
+    a broadcast image. The assignment minimizes the distances to the middle of the projected joints,
+    frame by frame.
+
+    Args:
+        estimates: in images of the camera.
+        camera: batch (frames,).
+        frame: (frames,), frame numbers.
+        joints: (frames, persons, 17, 3) [m], world; gaps are interpolated.
+    """
+    frames, persons = joints.shape[:2]
+    orient = np.full((frames, persons, 3, 3), np.nan)
+    angles = np.full((frames, persons, GATHER.shape[0]), np.nan)
+    if not persons:
+        return MonocularPoses(orient, angles)
+    full = np.stack([interpolate_gaps(joints[:, person]) for person in range(persons)], axis=1)
+    image = camera.project(full.reshape(frames, -1, 3)).reshape(frames, persons, -1, 2)
+    known = np.isfinite(image)
+    low = np.where(known, image, np.inf).min(axis=2, initial=np.inf)
+    high = np.where(known, image, -np.inf).max(axis=2, initial=-np.inf)
+    middle, height = 0.5 * (low + high), high[..., 1] - low[..., 1]
+    for place in np.flatnonzero(np.isin(frame, estimates.frame)):
+        rows = np.flatnonzero(estimates.frame == frame[place])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            away = np.linalg.norm(estimates.center[rows, None] - middle[place], axis=-1)
+            away = away / height[place]
+        away = np.where(np.isfinite(away), away, np.inf)
+        row, person = linear_sum_assignment(np.minimum(away, GATE))
+        near = away[row, person] < GATE
+        row, person = rows[row[near]], person[near]
+        at = camera[int(place)]
+        turned = estimates.rotations[row, 0]
+        if estimates.cropped:
+            turned = _rotate_axis_to(at.normalize(estimates.center[row])) @ turned
+        orient[place, person] = at.cam_from_world.rotation.T @ turned
+        bend = Rigid(estimates.rotations[row, 1:], np.zeros(3)).rotvec
+        angles[place, person] = bend.reshape(len(row), GATHER.shape[1]) @ GATHER.T
+    bad = ~(np.isfinite(orient).all((-1, -2)) & np.isfinite(angles).all(-1))
+    orient[bad], angles[bad] = np.nan, np.nan
+    return MonocularPoses(orient, angles)
+
+
+def _rotate_axis_to(plane: Floats) -> Floats:
+    """Return the smallest rotations (n, 3, 3) from straight ahead to points (n, 2) at z = 1."""
+    ahead = np.concatenate([plane, np.ones((len(plane), 1))], axis=-1)
+    ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
+    across = np.cross([0.0, 0.0, 1.0], ahead)
+    sine = np.linalg.norm(across, axis=-1, keepdims=True)
+    angle = np.arctan2(sine, ahead[:, 2:])
+    return Rigid.from_rotvec(across / np.maximum(sine, 1e-12) * angle, np.zeros(3)).rotation
+
+
+PRIOR_SPREAD: Final = 0.25
+"""Prior standard deviation of an angle [rad]: 80 mm on a limb of 0.3 m."""
+PRIOR_WEIGHT: Final = 5.0
+"""Weight of that prior in independent estimates [1]."""
+TAIL: Final = 2.5
+"""Deviation, root mean square over the angles, at which an estimate has half its weight [standard
+deviations]: backs mistaken for fronts."""
+
+INDEPENDENT_SHARE: Final = 0.3
+"""Share of an estimate's variance that is independent from frame to frame [1]."""
+MAX_CORRELATION_TIMES: Final = 2.0
+"""Range of known errors in correlation times [1]: farther ones explain a fiftieth of the
+variance."""
+
+
+@dataclass(frozen=True, eq=False)
+class MonocularPrior:
+    """Monocular poses of one track, with precision."""
+
+    orient: Floats
+    """(frames, 3, 3), world from body."""
+    angles: Floats
+    """(frames, 30) [rad]."""
+    used: NDArray[np.bool_]
+    """(frames,), frames that count; poses of others may be NaN."""
+    precision: Floats
+    """(33, 33) [1/rad^2]: of rotations of the body about the world's axes, and angles."""
+    correlated_frames: float
+    """Frames with correlated errors, which count as one [1]."""
+    left: Floats | float = 1.0
+    """(frames,) share of the variance left after correction by known frames (`carry_errors`)
+    [1]."""
+
+    def normal_equations(self, orient: Floats, angles: Floats) -> tuple[Floats, Floats, float]:
+        """Return matrices (frames, 33, 33), gradient (frames, 33) and cost for a pose.
+
+        Args:
+            orient: (frames, 3) [rad].
+            angles: (frames, 30) [rad].
+        """
+        away = deviations(self.orient, self.angles, orient, angles)
+        away = np.where(self.used[:, None], away, 0.0)
+        surer = 1.0 / np.broadcast_to(self.left, len(away))
+        weighted = away @ self.precision * surer[:, None]
+        square = (weighted * away).sum(-1)
+        tail = TAIL**2 * len(self.precision)
+        weight = self.used / (1.0 + square / tail) / self.correlated_frames
+        by_pose = np.broadcast_to(np.eye(3 + SIZE), (len(away), 3 + SIZE, 3 + SIZE)).copy()
+        by_pose[:, :3, :3] = np.linalg.solve(left_jacobian(away[:, :3]), left_jacobian(orient))
+        held = by_pose.swapaxes(-1, -2) * weight[:, None, None]
+        cost = 0.5 * tail * float(np.log1p(square / tail).sum()) / self.correlated_frames
+        matrix = (held * surer[:, None, None]) @ self.precision @ by_pose
+        return matrix, (held @ weighted[..., None])[..., 0], cost
+
+
+def learn_precision(
+    glimpses: MonocularPoses,
+    orient: Floats,
+    angles: Floats,
+    sure: NDArray[np.bool_],
+    correlated_frames: float,
+) -> Floats:
+    """Return the precision (33, 33) [1/rad^2] of a monocular pose.
+
+    Args:
+        glimpses: monocular poses of one clip.
+        orient: (frames, persons, 3) [rad], of bodies fitted without monocular poses.
+        angles: (frames, persons, 30) [rad], of the same.
+        sure: (frames, persons), bodies much more accurate than monocular poses.
+        correlated_frames: frames with correlated errors, which count as one.
+    """
+    there = sure & np.isfinite(glimpses.angles[..., 0]) & np.isfinite(angles[..., 0])
+    away = deviations(glimpses.orient[there], glimpses.angles[there], orient[there], angles[there])
+    square = PRIOR_WEIGHT * PRIOR_SPREAD**2 + (away**2).sum(axis=0) / correlated_frames
+    return np.diag((PRIOR_WEIGHT + len(away) / correlated_frames) / square).astype(np.float64)
+
+
+def carry_errors(
+    known: Floats, known_angles: Floats, off: Floats, used: NDArray[np.bool_], lasting: float
+) -> tuple[Floats, Floats, Floats]:
+    """Return estimates of one person minus their expected errors.
+
+    The errors of a method for a person in an interval with few cameras mostly exist just before and
+    after it too, where the fit reveals them (simple kriging).
+
+    Args:
+        known: (frames, 3, 3), world from body.
+        known_angles: (frames, 30) [rad].
+        off: (frames, 33) [rad], from estimates to more accurate fits; NaN without one.
+        used: (frames,), estimates to correct.
+        lasting: correlation time of errors, to a factor e [frame].
+
+    Returns:
+        The first two arguments, corrected, and the share (frames,) of the variance that is left.
+    """
+    turn, angles, left = known.copy(), known_angles.copy(), np.ones(len(off))
+    there = np.flatnonzero(np.isfinite(off).all(axis=-1))
+    asked = np.flatnonzero(used)
+    reach = MAX_CORRELATION_TIMES * lasting
+    for block in np.unique(asked // reach):
+        at = asked[asked // reach == block]
+        near = there[(there >= at[0] - reach) & (there <= at[-1] + reach)]
+        if not len(near):
+            continue
+        apart = [np.abs(rows[:, None] - near) / lasting for rows in (near, at)]
+        alike = [(1.0 - INDEPENDENT_SHARE) * np.exp(-away) for away in apart]
+        share = np.linalg.solve(alike[0] + INDEPENDENT_SHARE * np.eye(len(near)), alike[1].T).T
+        expected = share @ off[near]
+        turn[at] = Rigid.from_rotvec(expected[:, :3], np.zeros(3)).rotation @ turn[at]
+        angles[at] += expected[:, 3:]
+        left[at] = 1.0 - (share * alike[1]).sum(axis=-1)
+    return turn, angles, left
+
+
+def deviations(known: Floats, known_angles: Floats, orient: Floats, angles: Floats) -> Floats:
+    """Return rotations about the world's axes and angles (frames, 33) [rad] from known poses."""
+    turned = Rigid.from_rotvec(orient, np.zeros(3)).rotation @ known.swapaxes(-1, -2)
+    safe = np.where(np.isfinite(turned), turned, np.eye(3))
+    return np.concatenate([Rigid(safe, np.zeros(3)).rotvec, angles - known_angles], axis=-1)
+
+
+def left_jacobian(vectors: Floats) -> Floats:
+    """Return the left Jacobians (frames, 3, 3) of axis-angle vectors (frames, 3)."""
+    angle = np.linalg.norm(vectors, axis=-1)[:, None, None]
+    axis = vectors / np.maximum(angle[..., 0], 1e-12)
+    cross = np.zeros((len(vectors), 3, 3))
+    for a, b, c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        cross[:, b, a], cross[:, a, b] = axis[:, c], -axis[:, c]
+    first = np.sinc(angle / np.pi)
+    half = 0.5 * angle * np.sinc(0.5 * angle / np.pi) ** 2
+    outer = axis[:, :, None] * axis[:, None, :]
+    jacobian: Floats = first * np.eye(3) + (1.0 - first) * outer + half * cross
+    return jacobian

@@ -1,4 +1,4 @@
-"""Objective of one person's track, and its normal equations (S3).
+"""Evidence about one person's track, and the objective with its normal equations (S3).
 
 Terms: triangulated joints, minus the detector's systematic offsets; small second differences of
 keypoints; pose prior and joint limits; monocular poses; standing ankles, and none below the ground.
@@ -8,26 +8,175 @@ order, so these are not counted a second time.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from worldpose.body import BodyParameters
+from data_contracts.conventions import COCO17_SIGMAS
+from worldpose.body import BodyModel, BodyParameters
 from worldpose.body.jacobian import ChainedKeypoints
-from worldpose.body_fitting.evidence import Evidence
-from worldpose.body_fitting.feet import ANKLES, Contacts
-from worldpose.body_fitting.monocular_prior import Guidance
-from worldpose.body_fitting.pose_space import HIGHEST, LOWEST, SIZE, SPREAD, PosePrior
+from worldpose.body_fitting.monocular import MonocularPrior
+from worldpose.body_fitting.pose_space import MAX_ANGLES, MIN_ANGLES, SIZE, SPREAD, PosePrior
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shared_bias import MIRRORED_OFFSETS, body_axes
 
+JOINT_SPREAD: Final = np.array(COCO17_SIGMAS) / 0.08
+"""Spread of each joint relative to an average one: COCO's sigmas over their mean of 0.08."""
+
+MIN_INFORMATION: Final = 1e-6
+"""Added to singular information [1/m^2]: one line leaves a direction undetermined."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Joints of one person with their information."""
+
+    joints: Floats
+    """(frames, 17, 3) [m]; NaN where unknown."""
+    information: Floats
+    """(frames, 17, 3, 3) [1/m^2], inverse covariance; 0 where unknown."""
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(frames, 17), joints with any information."""
+        return np.asarray(self.information.any(axis=(-1, -2)))
+
+    @classmethod
+    def of(
+        cls, joints: Floats, covariance: Floats, fps: float, settings: BodyFittingSettings
+    ) -> Evidence:
+        """Return the evidence of joints whose errors last for `noise_time`.
+
+        Args:
+            joints: (frames, 17, 3) [m], world.
+            covariance: (frames, 17, 3, 3) [m^2], as triangulation states it.
+            fps: [1/s].
+            settings: scale and correlation time of the noise.
+        """
+        seen = np.asarray(np.isfinite(joints).all(-1) & np.isfinite(covariance).all((-1, -2)))
+        stated = np.where(seen[..., None, None], covariance, np.eye(3))
+        spread = settings.noise_scale**2 * JOINT_SPREAD[:, None, None] ** 2 * stated
+        spread = spread + settings.joint_floor**2 * np.eye(3)
+        # Correlated frames count as one observation.
+        spread *= 1.0 + settings.noise_time * fps
+        information: Floats = (np.linalg.inv(spread) * seen[..., None, None]).astype(np.float64)
+        return cls(np.where(seen[..., None], joints, np.nan), information)
+
+    def add_rays(
+        self, points: Floats, across: Floats, fps: float, settings: BodyFittingSettings
+    ) -> Evidence:
+        """Return the evidence with lines of sight added.
+
+        Args:
+            points: (frames, 17, 3) [m], world, on the lines; NaN without.
+            across: (frames, 17, 3, 3) [1], projections across the lines; 0 without.
+            fps: [1/s].
+            settings: standard deviation of a joint from its line.
+        """
+        seen = np.asarray(np.isfinite(points).all(-1))
+        spread = (settings.sight_spread * JOINT_SPREAD) ** 2 + settings.joint_floor**2
+        spread *= 1.0 + settings.noise_time * fps
+        line = np.where(seen[..., None, None], across / spread[:, None, None], 0.0)
+        information = self.information + line
+        # From the point on the line towards the known joint; a lone line has no force along
+        # itself.
+        away = np.where(np.isfinite(self.joints), self.joints, points) - points
+        weighted = self.information @ np.nan_to_num(away)[..., None]
+        moved = np.linalg.solve(information + MIN_INFORMATION * np.eye(3), weighted)[..., 0]
+        return Evidence(np.where(seen[..., None], points + moved, self.joints), information)
+
+
+Ground = Callable[[Floats, Floats], Floats]
+"""Height of the ground [m] at x and y [m], world."""
+
+ANKLES: Final = (15, 16)
+"""Of COCO-17."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Standing feet of one person, and the height of a standing ankle."""
+
+    standing: Floats
+    """(frames, 2) 1 where an ankle stands, else 0."""
+    slipping: Floats
+    """(frames - 1, 2) 1 where it stands in this and the next frame."""
+    height: Floats
+    """(frames, 2) [m], world: a flat foot's ankle there, the minimum of any ankle."""
+
+    def of(self, seen: NDArray[np.bool_]) -> Contacts:
+        """Return the contacts of seen ankles (frames, 17); unseen ankles may stand or not."""
+        ankles = seen[:, ANKLES]
+        both = ankles[1:] & ankles[:-1]
+        return Contacts(self.standing * ankles, self.slipping * both, self.height)
+
+
+def find_contacts(
+    joints: Floats, ankle_height: float, ground: Ground, fps: float, settings: BodyFittingSettings
+) -> Contacts:
+    """Return contacts of ankles that are low and slow for at least two frames.
+
+    Args:
+        joints: (frames, 17, 3) [m], world, of a fit.
+        ankle_height: of this person's ankle above the sole [m].
+        ground: the surface.
+        fps: [1/s].
+        settings: limits of low and slow.
+    """
+    ankles = joints[:, ANKLES]
+    height = ground(ankles[..., 0], ankles[..., 1]) + ankle_height
+    if len(joints) < 2:
+        return Contacts(np.zeros(height.shape), np.zeros((0, 2)), height)
+    speed = np.linalg.norm(np.diff(ankles, axis=0), axis=-1) * fps
+    low = ankles[..., 2] - height < settings.contact_height
+    slipping = (speed < settings.contact_speed) & low[1:] & low[:-1]
+    standing = np.zeros(low.shape, dtype=bool)
+    standing[1:] |= slipping
+    standing[:-1] |= slipping
+    return Contacts(standing.astype(np.float64), slipping.astype(np.float64), height)
+
+
+def ankle_height(model: BodyModel, betas: Floats) -> float:
+    """Return the height of the ankles of an upright body above its soles [m]."""
+    lowest = int(model.template[:, 1].argmin())
+    sole = model.template[lowest, 1] + model.shape_directions[lowest, 1] @ betas
+    joints = model.joint_template + model.joint_directions @ betas
+    return float(joints[7:9, 1].mean() - sole)
+
+
+def level_feet(rotations: Floats, clear: Floats) -> Floats:
+    """Return rotations of feet relative to their shanks (frames, 3, 3): flat where they stand.
+
+    Args:
+        rotations: (frames, 3, 3) of the shank, world.
+        clear: (frames,) [m], height of the ankle above that of a flat foot; a foot 0.15 m up or on
+            a horizontal shank hangs as in the unposed body.
+    """
+    forward = rotations[..., 2].copy()
+    forward[..., 2] = 0.0
+    length = np.linalg.norm(forward, axis=-1, keepdims=True)
+    forward /= np.maximum(length, 1e-9)
+    up = np.broadcast_to([0.0, 0.0, 1.0], forward.shape)
+    flat = np.stack([np.cross(up, forward), up, forward], axis=-1)
+    upright = np.clip((rotations[:, 2, 1] - 0.25) / 0.35, 0.0, 1.0)
+    share = upright * np.clip(1.0 - clear / 0.15, 0.0, 1.0) * (length[:, 0] > 0.1)
+    mixed = share[:, None, None] * flat + (1.0 - share)[:, None, None] * rotations
+    u, _, vt = np.linalg.svd(mixed)
+    turned: Floats = rotations.swapaxes(-1, -2) @ u @ vt
+    return turned
+
+
 UNKNOWNS: Final = 6 + SIZE
 """Unknowns per frame: translation, orientation and angles."""
-LIVELINESS: Final = np.array([1, 1, 1, 1, 1, 1, 1, 2, 2, 3, 3, 1, 1, 5, 5, 5, 5], dtype=np.float64)
+ACCELERATION_SCALE: Final = np.array(
+    [1, 1, 1, 1, 1, 1, 1, 2, 2, 3, 3, 1, 1, 5, 5, 5, 5], dtype=np.float64
+)
 """Accelerations of joints as multiples of the hips'; averages of simulated players."""
-_LARGEST_TURN: Final = 0.6
+_MAX_ROTATION: Final = 0.6
 """Maximum change of an angle per step [rad]; beyond it the linear model is invalid."""
 
 
@@ -48,9 +197,9 @@ class Pose:
         """Return the bodies (frames,)."""
         return BodyParameters(self.betas, self.orient, self.angles @ SPREAD.T, self.transl)
 
-    def moved(self, step: Floats, betas: Floats | float = 0.0) -> Pose:
+    def apply_step(self, step: Floats, betas: Floats | float = 0.0) -> Pose:
         """Return the pose after a step (frames, 36), with rotations clipped to the linear range."""
-        turns = np.clip(step[:, 3:], -_LARGEST_TURN, _LARGEST_TURN)
+        turns = np.clip(step[:, 3:], -_MAX_ROTATION, _MAX_ROTATION)
         orient = self.orient + turns[:, :3]
         angle = np.linalg.norm(orient, axis=-1, keepdims=True)
         # The same rotation by the smaller angle.
@@ -91,7 +240,7 @@ class Track:
     pose_weight: float
     """Weight of the pose prior in each frame [1]."""
     contacts: Contacts | None = None
-    guidance: Guidance | None = None
+    monocular_prior: MonocularPrior | None = None
 
     def equations(self, pose: Pose, offsets: Floats, *, bordered: bool) -> NormalEquations:
         """Return the normal equations at a pose.
@@ -114,14 +263,14 @@ class Track:
         known = self.evidence.known
         seen_at = body.keypoints + np.einsum("fab,jb->fja", axes, offsets)
         residual = np.where(known[..., None], seen_at - self.evidence.joints, 0.0)
-        pulled = np.einsum("fjab,fjb->fja", self.evidence.information, residual)
-        deviation = np.einsum("fja,fja->fj", residual, pulled) / settings.tail**2
+        weighted = np.einsum("fjab,fjb->fja", self.evidence.information, residual)
+        deviation = np.einsum("fja,fja->fj", residual, weighted) / settings.tail**2
         cost = 0.5 * settings.tail**2 * float(np.log1p(deviation).sum())
         weight = 1.0 / (1.0 + deviation)
         information = weight[..., None, None] * self.evidence.information
-        pulled = weight[..., None] * pulled
+        weighted = weight[..., None] * weighted
 
-        bands, smooth_pull, smooth_cost = self._smoothness(body.keypoints)
+        bands, smooth_gradient, smooth_cost = self._smoothness(body.keypoints)
         turned = np.swapaxes(rows, 1, 2)
         blocks = np.zeros((3, frames, UNKNOWNS, UNKNOWNS))
         stiff = information.copy()
@@ -131,13 +280,15 @@ class Track:
             if frames > ahead:
                 scaled = np.repeat(bands[ahead][:-ahead], 3, axis=1)[..., None] * rows[:-ahead]
                 blocks[ahead, :-ahead] = turned[ahead:] @ scaled
-        gradient = (turned @ (pulled + smooth_pull).reshape(frames, 51, 1))[..., 0]
+        gradient = (turned @ (weighted + smooth_gradient).reshape(frames, 51, 1))[..., 0]
         cost += smooth_cost + self._add_angles(pose.angles, blocks[0], gradient)
-        if self.guidance is not None:
-            matrix, pull, guided_cost = self.guidance.pull(pose.orient, pose.angles)
+        if self.monocular_prior is not None:
+            matrix, slope, prior_cost = self.monocular_prior.normal_equations(
+                pose.orient, pose.angles
+            )
             blocks[0][:, 3:, 3:] += matrix
-            gradient[:, 3:] += pull
-            cost += guided_cost
+            gradient[:, 3:] += slope
+            cost += prior_cost
 
         width = shapes + MIRRORED_OFFSETS.shape[-1] if bordered else 0
         border, corner = np.zeros((frames, UNKNOWNS, width)), np.zeros((width, width))
@@ -150,11 +301,11 @@ class Track:
             held = (information @ by_shared).reshape(columns.shape)
             border = turned @ held
             corner = np.einsum("fka,fkb->ab", columns, held, optimize=True)
-            shared = np.einsum("fka,fk->a", columns, pulled.reshape(frames, 51))
+            shared = np.einsum("fka,fk->a", columns, weighted.reshape(frames, 51))
         equations = NormalEquations(blocks, gradient, border, corner, shared, cost)
         if self.contacts is None:
             return equations
-        return self._standing(equations, body.keypoints, by_frame, body.betas)
+        return self._add_contacts(equations, body.keypoints, by_frame, body.betas)
 
     def _smoothness(self, keypoints: Floats) -> tuple[list[Floats], Floats, float]:
         """Return weights (frames, 17) on the three diagonals, gradient (frames, 17, 3) and cost.
@@ -163,17 +314,17 @@ class Track:
         """
         settings, frames = self.settings, len(keypoints)
         bands = [np.zeros((frames, 17)) for _ in range(3)]
-        pull, cost = np.zeros_like(keypoints), 0.0
+        slope, cost = np.zeros_like(keypoints), 0.0
         if frames > 2:
-            spread = self.acceleration * LIVELINESS / self.fps**2
+            spread = self.acceleration * ACCELERATION_SCALE / self.fps**2
             second = keypoints[2:] - 2.0 * keypoints[1:-1] + keypoints[:-2]
             tail = 3.0 * settings.acceleration_tail**2
             deviation = (second**2).sum(-1) / spread**2 / tail
             cost = 0.5 * tail * float(np.log1p(deviation).sum())
             weight = 1.0 / (1.0 + deviation) / spread**2
-            pulled = weight[..., None] * second
+            weighted = weight[..., None] * second
             for start, factor in ((0, 1.0), (1, -2.0), (2, 1.0)):
-                pull[start : frames - 2 + start] += factor * pulled
+                slope[start : frames - 2 + start] += factor * weighted
                 bands[0][start : frames - 2 + start] += factor**2 * weight
             bands[1][:-2] -= 2.0 * weight
             bands[1][1:-1] -= 2.0 * weight
@@ -183,18 +334,18 @@ class Track:
             held = self.contacts.slipping / settings.slip_spread**2
             cost += 0.5 * float((held[..., None] * slip**2).sum())
             for side, ankle in enumerate(ANKLES):
-                pull[1:, ankle] += held[:, side, None] * slip[:, side]
-                pull[:-1, ankle] -= held[:, side, None] * slip[:, side]
+                slope[1:, ankle] += held[:, side, None] * slip[:, side]
+                slope[:-1, ankle] -= held[:, side, None] * slip[:, side]
                 bands[0][1:, ankle] += held[:, side]
                 bands[0][:-1, ankle] += held[:, side]
                 bands[1][:-1, ankle] -= held[:, side]
-        return bands, pull, cost
+        return bands, slope, cost
 
     def _add_angles(self, angles: Floats, blocks: Floats, gradient: Floats) -> float:
         """Add the pose prior and the joint limits; return their cost."""
         prior = self.pose_weight * self.prior.precision
         away = angles - self.prior.mean
-        beyond = np.maximum(angles - HIGHEST, 0.0) + np.minimum(angles - LOWEST, 0.0)
+        beyond = np.maximum(angles - MAX_ANGLES, 0.0) + np.minimum(angles - MIN_ANGLES, 0.0)
         stiff = 1.0 / self.settings.limit_spread**2
         gradient[:, 6:] += away @ prior + stiff * beyond
         blocks[:, 6:, 6:] += prior
@@ -202,7 +353,7 @@ class Track:
         blocks[:, places, places] += stiff * (beyond != 0.0)
         return 0.5 * float(((away @ prior) * away).sum() + stiff * (beyond**2).sum())
 
-    def _standing(
+    def _add_contacts(
         self, equations: NormalEquations, keypoints: Floats, by_frame: Floats, by_betas: Floats
     ) -> NormalEquations:
         """Return the equations with terms for the height of standing ankles, and none below it."""

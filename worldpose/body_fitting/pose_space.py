@@ -1,9 +1,13 @@
-"""Pose coordinates that keypoints determine, with joint limits and a pose prior.
+"""Pose coordinates that keypoints determine: joint limits, pose prior and initial poses (S2).
 
 COCO's 17 points leave many of a body's 69 angles undetermined: the bend of single spine joints,
 hands and feet. 30 coordinates remain: bend of the whole spine and of the whole neck, hips, knees,
 shoulders and elbows. The other angles follow from them (spine and neck share evenly) or from the
 ground (feet).
+
+Initial poses have limbs along the joints, frame by frame. Root alignment follows the paper:
+translation and orientation from hips and torso alone. Two-bone directions orient the limbs, which
+starts elbows and knees near the correct one of several minima.
 """
 
 from __future__ import annotations
@@ -16,8 +20,10 @@ from typing import Final
 import numpy as np
 
 from data_contracts.arrays import Floats
+from worldpose.body import BodyModel
 from worldpose.body.parameters import BODY_POSE
 from worldpose.body.skeletons import JOINT_NAMES
+from worldpose.geometry import Rigid
 
 COORDINATES: Final = (
     ("spine1", "spine2", "spine3"),
@@ -59,7 +65,7 @@ def _limits() -> tuple[Floats, Floats]:
     return low, high
 
 
-LOWEST, HIGHEST = _limits()
+MIN_ANGLES, MAX_ANGLES = _limits()
 
 
 def _spread() -> Floats:
@@ -100,3 +106,117 @@ def load_pose_prior() -> PosePrior:
     widening[12:18] = 0.1
     widening[24:30] = 0.1
     return PosePrior(mean, np.linalg.inv(covariance + np.diag(widening**2)))
+
+
+TORSO: Final = (5, 6, 11, 12)
+"""Shoulders and hips of COCO-17."""
+_KNEE: Final = (1.0, 0.0, 0.0)
+_FORWARD: Final = (0.0, 0.0, 1.0)
+_LIMBS: Final = (
+    # COCO's joints, the body's joints, slices of their coordinates, and the hinge of the second.
+    ((5, 7, 9), (16, 18, 20), (slice(18, 21), slice(24, 27)), "elbow"),
+    ((6, 8, 10), (17, 19, 21), (slice(21, 24), slice(27, 30)), "elbow"),
+    ((11, 13, 15), (1, 4, 7), (slice(6, 9), slice(12, 15)), "knee"),
+    ((12, 14, 16), (2, 5, 8), (slice(9, 12), slice(15, 18)), "knee"),
+)
+
+
+def interpolate_gaps(joints: Floats) -> Floats:
+    """Return joints (frames, joints, 3) without gaps: linear between observations, constant beyond.
+
+    A joint that is never seen stays NaN.
+    """
+    full = joints.copy()
+    frames = np.arange(len(joints))
+    for joint in range(joints.shape[1]):
+        seen = np.isfinite(joints[:, joint, 0])
+        if seen.any() and not seen.all():
+            for axis in range(3):
+                full[:, joint, axis] = np.interp(frames, frames[seen], joints[seen, joint, axis])
+    return full
+
+
+def align_root(rest: Floats, torso: Floats) -> tuple[Floats, Floats]:
+    """Return orientation (frames, 3, 3) and position of `rest`'s mean (frames, 3) [m] (S2).
+
+    Args:
+        rest: (4, 3) [m], shoulders and hips of the unposed body.
+        torso: (frames, 4, 3) [m], world; NaN points do not count. A frame with fewer than three
+            takes the orientation of the nearest frame that has them; upright without any.
+    """
+    seen = np.asarray(np.isfinite(torso[..., 0]))
+    weight = seen / np.maximum(seen.sum(-1, keepdims=True), 1)
+    known = np.where(seen[..., None], torso, 0.0)
+    target_mean = np.einsum("fp,fpc->fc", weight, known)
+    rest_mean = weight @ rest
+    centred = np.where(seen[..., None], torso - target_mean[:, None], 0.0)
+    spread = np.einsum("fpa,fpb->fab", centred, rest - rest_mean[:, None])
+    u, _, vt = np.linalg.svd(spread)
+    u[..., -1] *= np.sign(np.linalg.det(u @ vt))[:, None]
+    turns = u @ vt
+    sure = np.flatnonzero(seen.sum(-1) >= 3)
+    if len(sure):
+        frames = np.arange(len(torso))
+        nearest = sure[np.abs(frames[:, None] - sure).argmin(axis=1)]
+        turns = turns[nearest]
+    else:
+        turns = np.broadcast_to(
+            Rigid.from_rotvec([np.pi / 2, 0.0, 0.0], np.zeros(3)).rotation, turns.shape
+        )
+    place = target_mean + np.einsum("fab,fb->fa", turns, rest.mean(axis=0) - rest_mean)
+    return turns, place
+
+
+def start_poses(
+    model: BodyModel, betas: Floats, joints: Floats, prior: PosePrior
+) -> tuple[Floats, Floats, Floats]:
+    """Return `transl` (frames, 3), `global_orient` (frames, 3) and coordinates (frames, 30).
+
+    Args:
+        model: the body.
+        betas: (shapes,).
+        joints: (frames, 17, 3) [m], world, without gaps; a joint never seen is NaN.
+        prior: pose of limbs that no frame shows, and the bending direction of straight ones.
+    """
+    rest = model.joint_template + model.joint_directions @ betas
+    torso = rest[[16, 17, 1, 2]]
+    turns, place = align_root(torso, joints[:, TORSO])
+    # Without torso joints, the person is at the mean of the other joints.
+    shown = np.asarray(np.isfinite(joints[..., 0]))
+    center = np.where(shown[..., None], joints, 0.0).sum(1) / np.maximum(shown.sum(1), 1)[:, None]
+    some = np.asarray(shown[:, TORSO].any(-1))
+    place = np.where(some[:, None], place, center)
+    middle = joints[:, 11:13].mean(axis=1)
+    from_torso = place + turns @ (rest[1:3].mean(axis=0) - torso.mean(axis=0))
+    middle = np.where(np.isfinite(middle), middle, from_torso)
+    pelvis = middle - turns @ (rest[1:3].mean(axis=0) - rest[0])
+    coordinates = np.broadcast_to(prior.mean, (len(joints), SIZE)).copy()
+    for ends, bones, places, hinge in _LIMBS:
+        upper, lower = (joints[:, ends[k + 1]] - joints[:, ends[k]] for k in (0, 1))
+        if not (np.isfinite(upper).all() and np.isfinite(lower).all()):
+            continue
+        first, second = (rest[bones[k + 1]] - rest[bones[k]] for k in (0, 1))
+        axis = np.array(_KNEE) if hinge == "knee" else _unit(np.cross(first, _FORWARD))
+        usual = Rigid.from_rotvec(prior.mean[places[0]], np.zeros(3)).rotation @ axis
+        # The bend of the limb determines the hinge, with a weight that grows with the bend.
+        across = np.cross(_unit(upper), _unit(lower)) + 0.1 * (turns @ usual)
+        outer = turns
+        for bone, along, own in ((first, upper, places[0]), (second, lower, places[1])):
+            turned = _frame(along, across) @ _frame(bone, axis).T
+            local = np.swapaxes(outer, -1, -2) @ turned
+            coordinates[:, own] = Rigid(local, np.zeros(3)).rotvec
+            outer = turned
+    orient = Rigid(turns, np.zeros(3)).rotvec
+    return pelvis - rest[0], orient, coordinates
+
+
+def _unit(vectors: Floats) -> Floats:
+    unit: Floats = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
+    return unit
+
+
+def _frame(first: Floats, second: Floats) -> Floats:
+    """Return orthonormal columns (..., 3, 3): along the first, then towards the second."""
+    along = _unit(first)
+    third = _unit(np.cross(along, second))
+    return np.stack([along, np.cross(third, along), third], axis=-1)

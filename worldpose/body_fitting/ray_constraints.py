@@ -1,24 +1,27 @@
-"""Lines of sight of joints that only one camera sees.
+"""Ray constraints: lines of sight of joints that one camera alone sees (S4).
 
 All lines of a person in a frame count as parallel. Otherwise the image size would determine the
 person's distance, and a hundredth of it, less than any detector's bias, is 0.7 m at 70 m. Motion
-and feet on the ground determine the distance better.
+and feet on the ground determine the distance better. The moving camera is one more view: its
+detections are assigned to known people.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from data_contracts.arrays import Floats
-from worldpose.body_fitting.starting import bridged
+from worldpose.body_fitting.pose_space import interpolate_gaps
 from worldpose.geometry import Camera
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class RayConstraints:
     """Lines of sight of joints that are not triangulated."""
 
     points: Floats
@@ -34,12 +37,12 @@ class Sightings:
         return np.asarray(np.isfinite(self.points[..., 0]).any(-1))
 
 
-def find_sightings(
+def find_ray_constraints(
     cameras: Camera,
     keypoints: NDArray[np.floating],
     detection_index: NDArray[np.integer],
     joints: Floats,
-) -> Sightings:
+) -> RayConstraints:
     """Return the lines of sight of joints that exactly one camera sees.
 
     If several cameras see a joint and triangulation rejected it, they contradict each other, and
@@ -72,7 +75,7 @@ def find_sightings(
     return lines_of_sight(origins, directions, expected_joints(joints) if alone.any() else joints)
 
 
-def lines_of_sight(origins: Floats, directions: Floats, expected: Floats) -> Sightings:
+def lines_of_sight(origins: Floats, directions: Floats, expected: Floats) -> RayConstraints:
     """Return rays as lines of sight, parallel per person and frame.
 
     Args:
@@ -89,7 +92,7 @@ def lines_of_sight(origins: Floats, directions: Floats, expected: Floats) -> Sig
     length = np.linalg.norm(mean, axis=-1, keepdims=True)
     mean = mean / np.maximum(length, 1e-9)
     across = np.eye(3) - mean[..., :, None] * mean[..., None, :]
-    return Sightings(points, np.where(lost[..., None, None], 0.0, across))
+    return RayConstraints(points, np.where(lost[..., None, None], 0.0, across))
 
 
 def expected_joints(joints: Floats) -> Floats:
@@ -97,8 +100,75 @@ def expected_joints(joints: Floats) -> Floats:
 
     A joint is interpolated between observations; a joint never seen is in the middle of the others.
     """
-    full = np.stack([bridged(joints[:, person]) for person in range(joints.shape[1])], axis=1)
+    full = np.stack(
+        [interpolate_gaps(joints[:, person]) for person in range(joints.shape[1])], axis=1
+    )
     known = np.isfinite(full)
     middle = np.where(known, full, 0.0).sum(axis=2) / np.maximum(known.sum(axis=2), 1)
     middle[~known.any(axis=2)] = np.nan
     return np.where(known, full, middle[:, :, None])
+
+
+GATE: Final = 0.2
+"""Maximum mean distance between keypoints and their person's joints [person height]."""
+MIN_KEYPOINTS: Final = 6
+"""Minimum keypoints to identify people [1]."""
+
+
+def identify_people(camera: Camera, keypoints: NDArray[np.floating], joints: Floats) -> Floats:
+    """Return the keypoints (frames, persons, 17, 2) [px] of known people; NaN where not seen.
+
+    The assignment minimizes the mean distances to projected joints, frame by frame.
+
+    Args:
+        camera: batch (frames,).
+        keypoints: (frames, detections, 17, 2) [px]; NaN where not found.
+        joints: (frames, persons, 17, 3) [m], world, at the times of the images.
+    """
+    frames, persons = joints.shape[:2]
+    image = camera.project(joints.reshape(frames, -1, 3)).reshape(frames, persons, 17, 2)
+    known = np.isfinite(image[..., 1])
+    high = np.where(known, image[..., 1], -np.inf).max(-1, initial=-np.inf)
+    height = high - np.where(known, image[..., 1], np.inf).min(-1, initial=np.inf)
+    own = np.full((frames, persons, 17, 2), np.nan)
+    for frame in range(frames):
+        away = np.linalg.norm(image[frame, :, None] - keypoints[frame, None], axis=-1)
+        both = np.isfinite(away)
+        count = both.sum(-1)
+        mean = np.where(both, away, 0.0).sum(-1) / np.maximum(count, 1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean = np.where(count >= MIN_KEYPOINTS, mean / height[frame, :, None], np.inf)
+        mean = np.where(np.isfinite(mean), mean, np.inf)
+        person, detection = linear_sum_assignment(np.minimum(mean, GATE))
+        near = mean[person, detection] < GATE
+        own[frame, person[near]] = keypoints[frame, detection[near]]
+    return own
+
+
+def constrain_to_rays(camera: Camera, keypoints: Floats, joints: Floats) -> RayConstraints:
+    """Return the lines of sight of joints in a moving camera.
+
+    Args:
+        camera: batch (frames,).
+        keypoints: (frames, persons, 17, 2) [px] of each person; NaN where not seen.
+        joints: (frames, persons, 17, 3) [m], world; the lines' points are the nearest to these.
+    """
+    frames, persons = joints.shape[:2]
+    rays = camera.unproject(keypoints.reshape(frames, -1, 2))
+    shape = (frames, persons, 17, 3)
+    origins = np.broadcast_to(rays.origins, rays.directions.shape).reshape(shape)
+    return lines_of_sight(origins, rays.directions.reshape(shape), joints)
+
+
+def shift_frames(values: Floats, late: float) -> Floats:
+    """Return values (frames, ...) `late` frames later, linearly interpolated; NaN beyond ends."""
+    before = np.arange(len(values)) + int(np.floor(late))
+    share = late - np.floor(late)
+
+    def taken(places: NDArray[np.int64]) -> Floats:
+        out = np.full(values.shape, np.nan)
+        inside = (places >= 0) & (places < len(values))
+        out[inside] = values[places[inside]]
+        return out
+
+    return (1.0 - share) * taken(before) + share * taken(before + 1) if share else taken(before)

@@ -31,7 +31,7 @@ def _basis() -> Floats:
     return np.stack(columns, axis=-1)
 
 
-FAR: Final = 3.0
+MAX_OFFSET: Final = 3.0
 """Offsets beyond this are unusual for any detector [standard deviations]: one in 34."""
 MIRRORED_OFFSETS: Final = _basis()
 """(17, 3, 26)"""
@@ -65,9 +65,12 @@ def far_offsets(offsets: Floats, common_bias: Floats) -> dict[str, tuple[float, 
         By joint, left and right as one: length of the offset and its usual maximum [m].
     """
     length = np.linalg.norm(offsets, axis=-1)
-    far = (length > FAR * common_bias) & (common_bias > 0.0)
+    far = (length > MAX_OFFSET * common_bias) & (common_bias > 0.0)
     return {
-        COCO17[joint].removeprefix("left_"): (float(length[joint]), FAR * float(common_bias[joint]))
+        COCO17[joint].removeprefix("left_"): (
+            float(length[joint]),
+            MAX_OFFSET * float(common_bias[joint]),
+        )
         for joint in np.flatnonzero(far)
         if not COCO17[joint].startswith("right")
     }

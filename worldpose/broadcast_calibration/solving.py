@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Integers
-from worldpose.body_fitting.banded import BandedFactor
 from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence, bounds
 from worldpose.broadcast_calibration.flow_equations import add_flow
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.normal_equations import add_points
 from worldpose.broadcast_calibration.smoothness import add_smoothness
 from worldpose.errors import DegenerateError
+from worldpose.geometry.optimize.banded import BandedFactor
 
 _START_DAMPING: Final = 1e-4
 _MOST_DAMPING: Final = 1e9

@@ -8,13 +8,13 @@ from typing import Final
 import numpy as np
 
 from data_contracts.arrays import Floats, Integers
-from worldpose.body_fitting.banded import BandedFactor
 from worldpose.broadcast_calibration.evidence import CLICK, PLAYER
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE
 from worldpose.broadcast_calibration.normal_equations import point_row
 from worldpose.broadcast_calibration.solving import Problem, Solution
 from worldpose.compiled import compiled
 from worldpose.errors import DegenerateError
+from worldpose.geometry.optimize.banded import BandedFactor
 
 _LENS: Final = 3
 """Parameters of a frame's step before those of its lens."""

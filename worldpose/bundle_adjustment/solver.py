@@ -12,7 +12,9 @@ from scipy.linalg.blas import dsyrk
 
 from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.records import Record
-from worldpose.bundle_adjustment.schur_complement import (
+from worldpose.errors import InputError, InternalError
+from worldpose.geometry import Camera
+from worldpose.geometry.optimize.schur_complement import (
     STEPS,
     CameraEquations,
     Evidence,
@@ -20,8 +22,6 @@ from worldpose.bundle_adjustment.schur_complement import (
     eliminate,
     substitute,
 )
-from worldpose.errors import InputError, InternalError
-from worldpose.geometry import Camera
 from worldpose.static_calibration import stepped
 
 BLOCK: Final = 256

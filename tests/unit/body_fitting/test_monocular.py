@@ -1,11 +1,32 @@
 """Files of methods of one picture: their names, shapes and conventions."""
 
+from __future__ import annotations
+
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
-from worldpose.body_fitting.monocular import read_monocular
+from worldpose.body import BodyParameters
+from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, fit_bodies
+from worldpose.body_fitting.monocular import (
+    INDEPENDENT_SHARE,
+    PRIOR_SPREAD,
+    MonocularEstimates,
+    MonocularPoses,
+    MonocularPrior,
+    carry_errors,
+    learn_precision,
+    left_jacobian,
+    parse_monocular,
+    place_monocular_poses,
+    read_monocular,
+)
+from worldpose.body_fitting.pose_space import GATHER
 from worldpose.errors import InputError
-from worldpose.geometry import Rigid
+from worldpose.geometry import Camera, Rigid
+from worldpose.simulation.monocular import MonocularErrors, estimate_bodies
 
 VECTORS = np.random.default_rng(0).normal(0.0, 0.4, (3, 24, 3))
 MATRICES = Rigid.from_rotvec(VECTORS, np.zeros(3)).rotation
@@ -85,3 +106,297 @@ def test_pickled_objects_are_not_loaded(tmp_path):
     np.savez(path, poses=np.array([{"a": 1}], dtype=object))
     with pytest.raises(InputError, match="Python objects, which are never loaded"):
         read_monocular(path)
+
+
+EXACT = MonocularErrors(turn=0.0, facing=0.0, size=0.0, place=0.0, missed=0.0)
+
+
+def broadcast(frames):
+    """A camera 70 m beside the pitch, 15 m up, that pans past the origin."""
+    pan = np.linspace(-0.12, 0.12, frames)
+    down = np.arctan2(15.0, 70.0)
+    x = np.stack([np.cos(pan), np.sin(pan), 0.0 * pan], axis=-1)
+    ahead = np.stack([-np.sin(pan), np.cos(pan), 0.0 * pan], axis=-1)
+    z = np.cos(down) * ahead - np.sin(down) * np.array([0.0, 0.0, 1.0])
+    rotation = np.stack([x, np.cross(z, x), z], axis=-2)
+    center = np.array([0.0, -70.0, 15.0])
+    return Camera(
+        focal=np.array([4000.0, 4000.0]),
+        principal_point=np.array([959.5, 539.5]),
+        distortion=np.zeros(5),
+        cam_from_world=Rigid(rotation, -(rotation @ center)),
+        image_size=np.array([1920, 1080]),
+    )
+
+
+def crowd(frames):
+    """Three walkers 3 m apart (frames, 3)."""
+    rng = np.random.default_rng(3)
+    each = [walker(frames, rng) for _ in range(3)]
+    places = [[-3.0, 0.0, 0.0], [0.0, 4.0, 0.0], [4.0, -2.0, 0.0]]
+    return BodyParameters(
+        np.stack([one.betas for one in each], axis=1),
+        np.stack([one.global_orient for one in each], axis=1),
+        np.stack([one.body_pose for one in each], axis=1),
+        np.stack([one.transl + place for one, place in zip(each, places, strict=True)], axis=1),
+    )
+
+
+def estimates(bodies, camera, errors=EXACT, seed=0):
+    arrays = estimate_bodies(MODEL, bodies, camera, 50.0, errors, np.random.default_rng(seed))
+    return parse_monocular(arrays, "simulated")
+
+
+def test_exact_bodies_of_crops_come_back_in_the_world_at_their_persons():
+    bodies, camera = crowd(6), broadcast(6)
+    joints = KEYPOINTS(bodies)
+    found = place_monocular_poses(estimates(bodies, camera), camera, np.arange(6), joints)
+    true = Rigid.from_rotvec(bodies.global_orient, np.zeros(3)).rotation
+    np.testing.assert_allclose(found.orient, true, atol=1e-9)
+    np.testing.assert_allclose(found.angles, bodies.body_pose @ GATHER.T, atol=1e-9)
+
+
+def test_a_body_of_the_whole_picture_is_not_turned_to_its_ray():
+    bodies, camera = crowd(1), broadcast(1)
+    joints = KEYPOINTS(bodies)
+    true = Rigid.from_rotvec(bodies.global_orient, np.zeros(3)).rotation[0]
+    turned = camera.cam_from_world.rotation[0] @ true
+    rest = np.broadcast_to(np.eye(3), (3, 23, 3, 3))
+    image = camera[0].project(joints[0].reshape(-1, 3)).reshape(3, 17, 2)
+    center = 0.5 * (image.min(axis=1) + image.max(axis=1))
+    rotations = np.concatenate([turned[:, None], rest], axis=1)
+    whole = MonocularEstimates(np.zeros(3, dtype=np.int64), rotations, center, False)
+    found = place_monocular_poses(whole, camera, np.arange(1), joints)
+    np.testing.assert_allclose(found.orient[0], true, atol=1e-12)
+    crop = MonocularEstimates(whole.frame, rotations, center, True)
+    off = place_monocular_poses(crop, camera, np.arange(1), joints).orient[0] @ true.swapaxes(
+        -1, -2
+    )
+    # 7 degrees and less beside the middle of the picture.
+    ray = camera[0].normalize(center)
+    np.testing.assert_allclose(
+        np.linalg.norm(Rigid(off, np.zeros(3)).rotvec, axis=-1),
+        np.arctan(np.linalg.norm(ray, axis=-1)),
+        atol=1e-9,
+    )
+
+
+def test_people_whom_nobody_estimated_and_estimates_of_nobody_are_left_out():
+    bodies, camera = crowd(4), broadcast(4)
+    joints = KEYPOINTS(bodies)
+    found = place_monocular_poses(estimates(bodies, camera), camera, np.arange(4), joints[:, :1])
+    assert np.isfinite(found.angles).all()
+    later = place_monocular_poses(estimates(bodies, camera), camera, np.array([0, 1, 7, 8]), joints)
+    assert np.isfinite(later.angles[:2]).all() and np.isnan(later.angles[2:]).all()
+    nobody = place_monocular_poses(estimates(bodies, camera), camera, np.arange(4), joints[:, :0])
+    assert nobody.angles.shape == (4, 0, 30)
+    nowhere = place_monocular_poses(estimates(bodies, camera), camera, np.arange(4), joints + 50.0)
+    assert np.isnan(nowhere.angles).all() and np.isnan(nowhere.orient).all()
+
+
+def test_gaps_of_a_track_are_bridged_for_who_is_who():
+    bodies, camera = crowd(9), broadcast(9)
+    joints = KEYPOINTS(bodies)
+    joints[3:6, 1] = np.nan
+    found = place_monocular_poses(estimates(bodies, camera), camera, np.arange(9), joints)
+    true = Rigid.from_rotvec(bodies.global_orient, np.zeros(3)).rotation
+    np.testing.assert_allclose(found.orient, true, atol=1e-9)
+
+
+def test_simulated_methods_err_by_80_mm_after_alignment():
+    bodies, camera = crowd(200), broadcast(200)
+    found = estimates(bodies, camera, MonocularErrors(), seed=1)
+    vectors = Rigid(found.rotations, np.zeros(3)).rotvec
+    seen = KEYPOINTS(
+        BodyParameters(np.zeros(10), vectors[:, 0], vectors[:, 1:].reshape(-1, 69), np.zeros(3))
+    )
+    joints = KEYPOINTS(bodies)
+    image = camera.project(joints.reshape(200, -1, 3)).reshape(200, 3, 17, 2)
+    middle = 0.5 * (image.min(axis=2) + image.max(axis=2))
+    person = np.linalg.norm(middle[found.frame] - found.center[:, None], axis=-1).argmin(axis=1)
+    true = joints[found.frame, person]
+    a, b = (x - x.mean(axis=1, keepdims=True) for x in (seen, true))
+    u, values, vt = np.linalg.svd(np.einsum("nka,nkb->nab", b, a))
+    sign = np.linalg.det(u @ vt)
+    u[..., -1] *= sign[:, None]
+    values[:, -1] *= sign
+    scale = values.sum(-1) / (a**2).sum((1, 2))
+    away = scale[:, None, None] * np.einsum("nab,nkb->nka", u @ vt, a) - b
+    # Errors last 0.4 s: 4 s of three people are some thirty correlated_frames of 20 mm each.
+    assert np.linalg.norm(away, axis=-1).mean() == pytest.approx(0.08, abs=0.012)
+    # A tenth is missed.
+    assert len(found.frame) / 600 == pytest.approx(0.9, abs=0.04)
+
+
+def test_nobody_in_the_picture_gives_no_estimates():
+    bodies, camera = crowd(3), broadcast(3)
+    behind = BodyParameters(
+        bodies.betas, bodies.global_orient, bodies.body_pose, bodies.transl - [0.0, 200.0, 0.0]
+    )
+    assert len(estimates(behind, camera).frame) == 0
+
+
+RNG = np.random.default_rng(2)
+
+
+def rotation(vectors):
+    return Rigid.from_rotvec(vectors, np.zeros(3)).rotation
+
+
+def test_left_jacobian_agrees_with_finite_differences():
+    vectors = RNG.normal(0.0, 1.0, (6, 3))
+    vectors[0] = 0.0
+    exact = left_jacobian(vectors)
+    for axis in range(3):
+        step = 1e-6 * np.eye(3)[axis]
+        turned = rotation(vectors + step) @ rotation(vectors - step).swapaxes(-1, -2)
+        slope = Rigid(turned, np.zeros(3)).rotvec / 2e-6
+        # Central differences: 1e-12, over a step of 1e-6 rounding of 1e-10.
+        np.testing.assert_allclose(exact[:, :, axis], slope, atol=1e-8)
+
+
+def test_the_pull_is_the_gradient_of_its_cost():
+    orient, angles = RNG.normal(0.0, 0.8, (4, 3)), RNG.normal(0.0, 0.5, (4, 30))
+    known = rotation(orient + RNG.normal(0.0, 0.3, (4, 3)))
+    precision = np.diag(RNG.uniform(5.0, 50.0, 33))
+    used = np.array([True, True, False, True])
+    known_angles = angles + RNG.normal(0.0, 0.3, (4, 30))
+    known_angles[2] = np.nan
+    left = RNG.uniform(0.4, 1.0, 4)
+    guidance = MonocularPrior(known, known_angles, used, precision, 20.0, left)
+    step = RNG.standard_normal((4, 33))
+    gradient = guidance.normal_equations(orient, angles)[1]
+    costs = [
+        guidance.normal_equations(
+            orient + sign * 1e-6 * step[:, :3], angles + sign * 1e-6 * step[:, 3:]
+        )[2]
+        for sign in (1.0, -1.0)
+    ]
+    assert (gradient * step).sum() == pytest.approx((costs[0] - costs[1]) / 2e-6, rel=1e-6)
+    np.testing.assert_array_equal(gradient[2], 0.0)
+
+
+@pytest.mark.parametrize("error", [0.05, 0.6])
+def test_methods_are_believed_as_far_as_they_agree_where_the_truth_is_known(error):
+    orient, angles = RNG.normal(0.0, 0.5, (400, 1, 3)), RNG.normal(0.0, 0.5, (400, 1, 30))
+    off = error * RNG.standard_normal((400, 1, 33))
+    glimpses = MonocularPoses(rotation(off[..., :3]) @ rotation(orient), angles + off[..., 3:])
+    sure = np.ones((400, 1), dtype=bool)
+    spread = 1.0 / np.sqrt(np.diag(learn_precision(glimpses, orient, angles, sure, 1.0)))
+    # Five of 0.25 rad are counted with 400: 56 mrad for 50; 1 / sqrt(800) is 4 %, three of these.
+    expected = np.sqrt((5.0 * PRIOR_SPREAD**2 + 400.0 * error**2) / 405.0)
+    np.testing.assert_allclose(spread[3:], expected, rtol=0.12)
+    none = learn_precision(glimpses, orient, angles, ~sure, 1.0)
+    np.testing.assert_allclose(none, np.eye(33) / PRIOR_SPREAD**2)
+
+
+def people_in_a_gap(seed=5):
+    """A walker whose arms and legs nobody triangulates for a second, and his true bodies."""
+    rng = np.random.default_rng(seed)
+    truth = walker(100, rng)
+    joints, covariance = seen(truth, 0.01, rng)
+    joints[30:80, :, 7:11] = np.nan
+    joints[30:80, :, 13:17] = np.nan
+    return truth, joints, covariance
+
+
+def glimpsed(truth, error, rng):
+    orient = rotation(truth.global_orient)[:, None]
+    angles = (truth.body_pose @ GATHER.T)[:, None]
+    return MonocularPoses(orient, angles + error * rng.standard_normal(angles.shape))
+
+
+def test_right_glimpses_help_where_joints_are_missing_and_are_recorded():
+    truth, joints, covariance = people_in_a_gap()
+    settings = BodyFittingSettings()
+    glimpses = glimpsed(truth, 0.1, np.random.default_rng(1))
+    alone = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), settings)
+    guided = fit_bodies(
+        MODEL, ClipEvidence(joints, covariance, 50.0, monocular_poses=glimpses), settings
+    )
+    np.testing.assert_array_equal(np.flatnonzero(guided.guided[:, 0]), np.arange(30, 80))
+    assert not alone.guided.any()
+    exact = KEYPOINTS(truth)[:, None]
+    before, after = (
+        np.linalg.norm(x.joints - exact, axis=-1)[35:75].mean() for x in (alone, guided)
+    )
+    assert after < 0.8 * before
+
+
+def test_wrong_glimpses_harm_little():
+    truth, joints, covariance = people_in_a_gap()
+    settings = BodyFittingSettings()
+    glimpses = glimpsed(truth, 1.0, np.random.default_rng(1))
+    alone = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), settings)
+    guided = fit_bodies(
+        MODEL, ClipEvidence(joints, covariance, 50.0, monocular_poses=glimpses), settings
+    )
+    exact = KEYPOINTS(truth)[:, None]
+    before, after = (
+        np.linalg.norm(x.joints - exact, axis=-1)[35:75].mean() for x in (alone, guided)
+    )
+    # Angles wrong by a radian in every frame: noise, half of which averages away.
+    assert after < 1.5 * before
+
+
+def test_who_turned_unseen_is_found_from_pictures_that_miss_every_eighth_frame():
+    rng = np.random.default_rng(5)
+    truth = walker(100, rng)
+    about = np.zeros((100, 3))
+    about[:, 2] = np.radians(300.0) * np.clip((np.arange(100) - 30) / 40.0, 0.0, 1.0)
+    turned = Rigid(rotation(about) @ rotation(truth.global_orient), np.zeros(3)).rotvec
+    truth = replace(truth, global_orient=turned)
+    joints, covariance = seen(truth, 0.01, rng)
+    joints[30:70] = np.nan
+    glimpses = glimpsed(truth, 0.1, rng)
+    missed = (np.arange(100) % 8 == 0)[:, None, None]
+    glimpses = MonocularPoses(
+        np.where(missed[..., None], np.nan, glimpses.orient),
+        np.where(missed, np.nan, glimpses.angles),
+    )
+    fit = fit_bodies(
+        MODEL,
+        ClipEvidence(joints, covariance, 50.0, monocular_poses=glimpses),
+        BodyFittingSettings(),
+    )
+    away = rotation(fit.parameters.global_orient[30:70, 0]) @ rotation(turned[30:70]).swapaxes(1, 2)
+    # The shorter way round between the ends is the other way, 180 degrees off in the middle.
+    assert np.degrees(np.linalg.norm(Rigid(away, np.zeros(3)).rotvec, axis=-1)).max() < 20.0
+
+
+def test_what_pictures_get_wrong_before_and_after_is_taken_off_between():
+    spread, lasting = 0.1, 25.0
+    used = np.zeros(120, dtype=bool)
+    used[40:80] = True
+    keeps = np.exp(-1.0 / lasting)
+    squares, shares = [], []
+    for _ in range(100):
+        slow = RNG.standard_normal((120, 33))
+        for frame in range(1, 120):
+            slow[frame] = keeps * slow[frame - 1] + np.sqrt(1.0 - keeps**2) * slow[frame]
+        off = np.sqrt(1.0 - INDEPENDENT_SHARE) * slow + np.sqrt(
+            INDEPENDENT_SHARE
+        ) * RNG.standard_normal((120, 33))
+        off *= spread
+        estimated = rotation(-off[:, :3]), -off[:, 3:]
+        known = np.where(used[:, None], np.nan, off)
+        turn, angles, left = carry_errors(*estimated, known, used, lasting)
+        np.testing.assert_array_equal(turn[~used], estimated[0][~used])
+        wrong = np.concatenate([Rigid(turn, np.zeros(3)).rotvec, angles], axis=-1)
+        squares.append((wrong[used] ** 2).mean(axis=-1) / spread**2)
+        shares.append(left[used])
+    found, told = np.mean(squares, axis=0), np.mean(shares, axis=0)
+    # 3300 draws for each frame: 2.5 %, four of these. Turns that do not commute add less.
+    np.testing.assert_allclose(found, told, rtol=0.1)
+    assert told[0] < 0.75
+    assert told[-1] < 0.75
+    assert told[20] > told[0] + 0.1
+
+
+def test_nothing_is_taken_off_where_no_frame_tells():
+    orient, angles = rotation(RNG.normal(0.0, 0.5, (9, 3))), RNG.normal(0.0, 0.5, (9, 30))
+    nothing = np.full((9, 33), np.nan)
+    turn, bent, left = carry_errors(orient, angles, nothing, np.ones(9, dtype=bool), 12.5)
+    np.testing.assert_array_equal(turn, orient)
+    np.testing.assert_array_equal(bent, angles)
+    np.testing.assert_array_equal(left, 1.0)

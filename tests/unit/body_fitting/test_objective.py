@@ -5,9 +5,7 @@ import pytest
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body.jacobian import ChainedKeypoints
-from worldpose.body_fitting.evidence import Evidence
-from worldpose.body_fitting.feet import Contacts
-from worldpose.body_fitting.objective import Pose, Track
+from worldpose.body_fitting.objective import Contacts, Evidence, Pose, Track
 from worldpose.body_fitting.pose_space import GATHER, load_pose_prior
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shared_bias import MIRRORED_OFFSETS
@@ -38,7 +36,7 @@ def test_gradient_by_frames_and_betas_agrees_with_finite_differences(track):
         step, betas = rng.standard_normal((5, 36)), rng.standard_normal(MODEL.shapes)
         costs = [
             made.equations(
-                pose.moved(sign * small * step, sign * small * betas),
+                pose.apply_step(sign * small * step, sign * small * betas),
                 np.zeros((17, 3)),
                 bordered=True,
             ).cost
@@ -69,7 +67,7 @@ def test_the_gradient_by_frames_is_exact_without_offsets(track):
     at = made.equations(pose, np.zeros((17, 3)), bordered=False)
     step = np.random.default_rng(3).standard_normal((5, 36))
     costs = [
-        made.equations(pose.moved(sign * 1e-6 * step), np.zeros((17, 3)), bordered=False).cost
+        made.equations(pose.apply_step(sign * 1e-6 * step), np.zeros((17, 3)), bordered=False).cost
         for sign in (1.0, -1.0)
     ]
     assert (at.gradient * step).sum() == pytest.approx((costs[0] - costs[1]) / 2e-6, rel=1e-5)

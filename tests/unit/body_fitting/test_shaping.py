@@ -8,8 +8,7 @@ from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body_fitting.bones import Shape
 from worldpose.body_fitting.pose_space import load_pose_prior
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.body_fitting.shaping import fit_shapes
-from worldpose.body_fitting.solving import Solver
+from worldpose.body_fitting.solver import Solver, fit_shapes
 
 SETTINGS = BodyFittingSettings()
 SOLVER = Solver(ChainedKeypoints.of(KEYPOINTS), load_pose_prior(), SETTINGS, None)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worldpose.bundle_adjustment.schur_complement import (
+from worldpose.geometry.optimize.schur_complement import (
     STEPS,
     CameraEquations,
     Evidence,

@@ -15,33 +15,30 @@ from data_contracts.conventions import COCO17
 from worldpose.body import BodyModel, BodyParameters, fold_keypoints
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body.parameters import BODY_POSE
-from worldpose.body_fitting.banded import BandedFactor
 from worldpose.body_fitting.bones import Shape
-from worldpose.body_fitting.evidence import Evidence
-from worldpose.body_fitting.feet import Ground
-from worldpose.body_fitting.monocular_poses import MonocularPoses
-from worldpose.body_fitting.monocular_prior import (
-    Guidance,
+from worldpose.body_fitting.monocular import (
+    MonocularPoses,
+    MonocularPrior,
     carry_errors,
     deviations,
     learn_precision,
 )
-from worldpose.body_fitting.objective import Pose
+from worldpose.body_fitting.objective import Evidence, Ground, Pose
 from worldpose.body_fitting.pose_space import GATHER, SPREAD, load_pose_prior
-from worldpose.body_fitting.ray_constraints import Sightings
+from worldpose.body_fitting.ray_constraints import RayConstraints
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.body_fitting.shaping import Shapes, fit_shapes
 from worldpose.body_fitting.shared_bias import body_axes
-from worldpose.body_fitting.solving import Solver
+from worldpose.body_fitting.solver import Shapes, Solver, fit_shapes
 from worldpose.errors import InputError
+from worldpose.geometry.optimize.banded import BandedFactor
 
-SURE: Final = 0.035
+MAX_DEVIATION: Final = 0.035
 """Joints are well determined if their median standard deviation per axis is below this [m]: 16
 cameras leave 0.02 to 0.03, two 0.04 to 0.1."""
 KEPT_BIAS: Final = 0.01
 """Part of the joints' common bias that stays in their covariance per axis [m]; the shared offsets
 model the rest."""
-GLIMPSE_TIME: Final = 0.5
+MONOCULAR_TIME: Final = 0.5
 """Correlation time of monocular pose errors [s]: images hardly change."""
 
 
@@ -72,17 +69,50 @@ class BodyFit:
     offsets: Floats
 
 
+@dataclass(frozen=True, eq=False)
+class ClipEvidence:
+    """Evidence about the bodies of one clip.
+
+    Attributes:
+        joints: (frames, persons, 17, 3) [m], world, COCO-17; NaN where missing.
+        covariance: (frames, persons, 17, 3, 3) [m^2], of `joints`.
+        fps: [1/s].
+        common_bias: (17,) per axis, error that all views share [m]; `covariance` contains it. Body
+            fitting does not reduce it: on real people (Shelf) joints of bodies are as far from the
+            labels as triangulated joints. None = none.
+        ray_constraints: lines of sight of joints that are not triangulated, for the same frames and
+            persons; a person without joints is present as long as these last.
+        monocular_poses: poses of the same frames and persons, used where few joints are well
+            determined (S4).
+
+    Raises:
+        InputError: the shapes do not match.
+    """
+
+    joints: Floats
+    covariance: Floats
+    fps: float
+    common_bias: Floats | None = None
+    ray_constraints: Sequence[RayConstraints] = ()
+    monocular_poses: MonocularPoses | None = None
+
+    def __post_init__(self) -> None:
+        shape = self.joints.shape
+        if len(shape) != 4 or shape[2:] != (17, 3) or self.covariance.shape != (*shape, 3):
+            raise InputError(
+                "body fitting",
+                expected="joints (frames, persons, 17, 3), covariance (frames, persons, 17, 3, 3)",
+                found=f"{shape} and {self.covariance.shape}",
+                todo="Give triangulated joints with their covariance.",
+            )
+
+
 def fit_bodies(
     model: BodyModel,
-    joints: Floats,
-    covariance: Floats,
-    fps: float,
+    evidence: ClipEvidence,
     settings: BodyFittingSettings,
     ground: Ground | None = None,
-    known: Mapping[int, Shape] | None = None,
-    sightings: Sequence[Sightings] = (),
-    glimpses: MonocularPoses | None = None,
-    common_bias: Floats | None = None,
+    known_shapes: Mapping[int, Shape] | None = None,
 ) -> BodyFit:
     """Return the bodies that fit the triangulated joints of all persons (S1-S3).
 
@@ -92,33 +122,15 @@ def fit_bodies(
 
     Args:
         model: the body.
-        joints: (frames, persons, 17, 3) [m], world, COCO-17; NaN where missing.
-        covariance: (frames, persons, 17, 3, 3) [m^2], of `joints`.
-        fps: [1/s].
+        evidence: triangulated joints, and other observations of the same clip.
         settings: expected errors of detectors, bodies and motion.
         ground: height of the surface under the feet, in a world with z up; None where unknown.
-        known: shapes of people from other clips, by their index in `joints`.
-        sightings: lines of sight of joints that are not triangulated, for the same frames and
-            persons; a person without joints is present as long as these last.
-        glimpses: monocular poses of the same frames and persons, used where few joints are well
-            determined (S4).
-        common_bias: (17,) per axis, error that all views share [m]; `covariance` contains it. Body
-            fitting does not reduce it: on real people (Shelf) joints of bodies are as far from the
-            labels as triangulated joints. None = none.
-
-    Raises:
-        InputError: the shapes do not match.
+        known_shapes: shapes of people from other clips, by their index in the joints.
     """
-    if joints.ndim != 4 or joints.shape[2:] != (17, 3) or covariance.shape != (*joints.shape, 3):
-        raise InputError(
-            "body fitting",
-            expected="joints (frames, persons, 17, 3) and covariance (frames, persons, 17, 3, 3)",
-            found=f"{joints.shape} and {covariance.shape}",
-            todo="Give triangulated joints with their covariance.",
-        )
-    bias = np.zeros(17) if common_bias is None else common_bias
+    joints, fps = evidence.joints, evidence.fps
+    bias = np.zeros(17) if evidence.common_bias is None else evidence.common_bias
     modelled = np.maximum(bias**2 - KEPT_BIAS**2, 0.0)
-    covariance = covariance - modelled[:, None, None] * np.eye(3)
+    covariance = evidence.covariance - modelled[:, None, None] * np.eye(3)
     frames, persons = joints.shape[:2]
     solver = Solver(
         ChainedKeypoints.of(fold_keypoints(model, COCO17)), load_pose_prior(), settings, ground
@@ -130,78 +142,81 @@ def fit_bodies(
         for person in range(persons)
         if len(here := np.flatnonzero(seen[:, person]))
     }
-    evidence = {
+    by_person = {
         person: Evidence.of(joints[span, person], covariance[span, person], fps, settings)
         for person, span in spans.items()
     }
     there = seen
-    for view in sightings:
+    for view in evidence.ray_constraints:
         there = there | view.seen
         for person, span in spans.items():
-            lines = view.points[span, person], view.across[span, person]
-            evidence[person] = evidence[person].with_lines(*lines, fps, settings)
+            points, across = view.points[span, person], view.across[span, person]
+            by_person[person] = by_person[person].add_rays(points, across, fps, settings)
     shapes = fit_shapes(
         solver,
         {
             person: (joints[span, person], covariance[span, person])
             for person, span in spans.items()
         },
-        known or {},
+        known_shapes or {},
         fps,
     )
     result = _Result.empty(model, frames, persons, bias)
     for person, span in spans.items():
-        pose, factor = solver.poses(evidence[person], shapes.people[person], shapes.offsets, fps)
+        pose, factor = solver.solve_poses(
+            by_person[person], shapes.people[person], shapes.offsets, fps
+        )
         result.put(solver, person, span, pose, factor, shapes)
-    if glimpses is not None:
-        for person, guidance in _guide(
-            result, joint_seen, covariance, glimpses, spans, fps
-        ).items():
+    if evidence.monocular_poses is not None:
+        priors = _monocular_priors(
+            result, joint_seen, covariance, evidence.monocular_poses, spans, fps
+        )
+        for person, prior in priors.items():
             shape = shapes.people[person]
-            pose, factor = solver.poses(evidence[person], shape, shapes.offsets, fps, guidance)
+            pose, factor = solver.solve_poses(by_person[person], shape, shapes.offsets, fps, prior)
             result.put(solver, person, spans[person], pose, factor, shapes)
-            result.guided[spans[person], person] = guidance.used
+            result.guided[spans[person], person] = prior.used
     for person, span in spans.items():
         result.filled[span, person] = ~seen[span, person]
-        gone = _too_long(there[span, person], settings.max_gap_s * fps)
+        gone = _long_gaps(there[span, person], settings.max_gap_s * fps)
         result.drop(person, span, gone)
     return result.fit(shapes)
 
 
-def _guide(
+def _monocular_priors(
     result: _Result,
     joint_seen: NDArray[np.bool_],
     covariance: Floats,
-    glimpses: MonocularPoses,
+    estimates: MonocularPoses,
     spans: Mapping[int, slice],
     fps: float,
-) -> dict[int, Guidance]:
+) -> dict[int, MonocularPrior]:
     """Return monocular poses of persons for frames with few well-determined joints."""
     variance = np.trace(covariance[:, :, 5:], axis1=-2, axis2=-1) / 3.0
-    sure = np.median(np.where(joint_seen[:, :, 5:], variance, np.inf), axis=-1) < SURE**2
-    witnesses = 1.0 + GLIMPSE_TIME * fps
+    sure = np.median(np.where(joint_seen[:, :, 5:], variance, np.inf), axis=-1) < MAX_DEVIATION**2
+    correlated_frames = 1.0 + MONOCULAR_TIME * fps
     angles = result.body_pose @ GATHER.T
-    precision = learn_precision(glimpses, result.orient, angles, sure, witnesses)
-    there = np.isfinite(glimpses.angles[..., 0])
+    precision = learn_precision(estimates, result.orient, angles, sure, correlated_frames)
+    there = np.isfinite(estimates.angles[..., 0])
     guided = {}
     for person, span in spans.items():
         used = (there & ~sure)[span, person]
         if not used.any():
             continue
-        estimated = glimpses.orient[span, person], glimpses.angles[span, person]
-        off = deviations(*estimated, result.orient[span, person], angles[span, person])
+        orient, bend = estimates.orient[span, person], estimates.angles[span, person]
+        off = deviations(orient, bend, result.orient[span, person], angles[span, person])
         off[~(there & sure)[span, person]] = np.nan
-        turn, bent, left = carry_errors(*estimated, off, used, GLIMPSE_TIME * fps)
-        guided[person] = Guidance(turn, bent, used, precision, witnesses, left)
+        orient, bend, left = carry_errors(orient, bend, off, used, MONOCULAR_TIME * fps)
+        guided[person] = MonocularPrior(orient, bend, used, precision, correlated_frames, left)
     return guided
 
 
-def _too_long(seen: NDArray[np.bool_], most: float) -> NDArray[np.bool_]:
-    """Return the frames in gaps of more than `most` frames."""
+def _long_gaps(seen: NDArray[np.bool_], max_frames: float) -> NDArray[np.bool_]:
+    """Return the frames in gaps of more than `max_frames` frames."""
     places = np.flatnonzero(seen)
     long = np.zeros(len(seen), dtype=bool)
     for first, last in itertools.pairwise(places):
-        if last - first - 1 > most:
+        if last - first - 1 > max_frames:
             long[first + 1 : last] = True
     return long
 
@@ -251,12 +266,12 @@ class _Result:
         """Write the result of one person."""
         shape = shapes.people[person]
         body = solver.chained.differentiate(pose.parameters())
-        planted = solver.planted(pose)
+        plant_feet = solver.plant_feet(pose)
         self.betas[person] = shape.betas
         self.betas_covariance[person] = shape.covariance
-        self.orient[span, person] = planted.global_orient
-        self.body_pose[span, person] = planted.body_pose
-        self.transl[span, person] = planted.transl
+        self.orient[span, person] = plant_feet.global_orient
+        self.body_pose[span, person] = plant_feet.body_pose
+        self.transl[span, person] = plant_feet.transl
         self.joints[span, person] = body.keypoints
         pose_part = body.body_pose @ SPREAD
         by_frame = np.concatenate(
@@ -266,10 +281,10 @@ class _Result:
         spread = factor.inverse_blocks()[:, None]
         axes = body_axes(body.keypoints)[:, None]
         # A joint is the detector's joint minus the offset: the offset's covariance adds up.
-        habits = axes @ shapes.offsets_covariance @ axes.swapaxes(-1, -2)
+        shared = axes @ shapes.offsets_covariance @ axes.swapaxes(-1, -2)
         own = (solver.settings.own_bias**2 + self.common_bias**2)[:, None, None] * np.eye(3)
         turned = by_frame.swapaxes(-1, -2)
-        self.covariance[span, person] = by_frame @ spread @ turned + habits + own
+        self.covariance[span, person] = by_frame @ spread @ turned + shared + own
 
     def drop(self, person: int, span: slice, gone: NDArray[np.bool_]) -> None:
         """Remove a person from frames of a span."""

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from worldpose.body_fitting.banded import BandedFactor
 from worldpose.body_fitting.objective import UNKNOWNS
-from worldpose.body_fitting.solving import factor
+from worldpose.body_fitting.solver import factor
 from worldpose.errors import DegenerateError
+from worldpose.geometry.optimize.banded import BandedFactor
 
 
 def banded(frames, size, rng):

@@ -5,7 +5,7 @@ import pytest
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body import BodyParameters
-from worldpose.body_fitting import BodyFittingSettings, fit_bodies, report_fit
+from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, fit_bodies, report_fit
 from worldpose.body_fitting.shared_bias import MIRRORED_OFFSETS, body_axes
 from worldpose.errors import InputError
 
@@ -27,7 +27,7 @@ def test_a_noisy_walker_comes_out_nearer_than_the_joints_that_were_seen(upside_d
     rng = np.random.default_rng(7)
     truth = walker(60, rng, upside_down=upside_down)
     joints, covariance = seen(truth, 0.03, rng)
-    fit = fit_bodies(MODEL, joints, covariance, 50.0, SETTINGS)
+    fit = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), SETTINGS)
     exact = KEYPOINTS(truth)[:, None]
     before, after = (np.linalg.norm(x - exact, axis=-1).mean() for x in (joints, fit.joints))
     assert after < 0.7 * before
@@ -39,7 +39,7 @@ def test_a_noisy_walker_comes_out_nearer_than_the_joints_that_were_seen(upside_d
 def test_bones_of_a_fit_never_change():
     rng = np.random.default_rng(8)
     joints, covariance = seen(walker(20, rng), 0.03, rng)
-    fit = fit_bodies(MODEL, joints, covariance, 50.0, SETTINGS)
+    fit = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), SETTINGS)
     for a, b in ((5, 7), (7, 9), (11, 13), (13, 15)):
         length = np.linalg.norm(fit.joints[:, 0, a] - fit.joints[:, 0, b], axis=-1)
         assert np.ptp(length) < 1e-9
@@ -55,7 +55,7 @@ def test_what_a_detector_always_gets_wrong_is_found():
     joints = np.concatenate([part[0] for part in parts], axis=1)
     covariance = np.concatenate([part[1] for part in parts], axis=1)
     joints = joints + np.einsum("fpab,jb->fpja", body_axes(joints), offsets)
-    fit = fit_bodies(MODEL, joints, covariance, 50.0, SETTINGS)
+    fit = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), SETTINGS)
     moved = np.abs(offsets).max(axis=-1) > 0.0
     # A head is rigid, so that pose explains nothing of it, and shape and the prior but a part.
     np.testing.assert_allclose(fit.offsets[moved], offsets[moved], atol=0.02)
@@ -66,12 +66,12 @@ def test_gaps_are_filled_marked_and_less_sure():
     truth = walker(60, rng)
     joints, covariance = seen(truth, 0.01, rng)
     joints[25:35] = np.nan
-    fit = fit_bodies(MODEL, joints, covariance, 50.0, SETTINGS)
+    fit = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), SETTINGS)
     np.testing.assert_array_equal(np.flatnonzero(fit.filled[:, 0]), np.arange(25, 35))
     variance = np.trace(fit.covariance[:, 0, 0], axis1=-2, axis2=-1)
     assert variance[30] > 2.0 * variance[10]
     error = np.linalg.norm(fit.joints - KEYPOINTS(truth)[:, None], axis=-1)
-    # 0.2 s of a stride, bridged by its ends.
+    # 0.2 s of a stride, interpolate_gaps by its ends.
     assert error[25:35].mean() < 0.10
 
 
@@ -81,7 +81,7 @@ def test_stated_regions_hold_the_true_joints_in_sight_and_in_gaps():
     parts = [seen(truth, 0.03, rng) for truth in truths]
     joints, covariance = (np.concatenate([part[k] for part in parts], axis=1) for k in (0, 1))
     joints[30:42] = np.nan
-    fit = fit_bodies(MODEL, joints, covariance, 50.0, SETTINGS)
+    fit = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), SETTINGS)
     away = fit.joints - np.stack([KEYPOINTS(truth) for truth in truths], axis=1)
     square = np.einsum("fpja,fpjab,fpjb->fpj", away, np.linalg.inv(fit.covariance), away)
     # 95 % regions, stated rather too large: joints here have no bias of their own.
@@ -97,7 +97,7 @@ def test_frames_without_numbers_anywhere_do_no_harm():
     joints[::3] = np.nan
     covariance[1::6] = np.nan
     joints[20, 0, 4:9], joints[21, 0, 3, 1] = np.nan, np.nan
-    fit = fit_bodies(MODEL, joints, covariance, 50.0, SETTINGS, lambda x, y: 0.0 * x)
+    fit = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), SETTINGS, lambda x, y: 0.0 * x)
     inside = np.flatnonzero(np.isfinite(fit.joints[:, 0, 0, 0]))
     # From the first frame with a joint and its covariance to the last.
     np.testing.assert_array_equal(inside, np.arange(2, 48))
@@ -109,7 +109,7 @@ def test_longer_gaps_than_the_longest_stay_empty():
     joints, covariance = seen(walker(60, rng), 0.01, rng)
     joints[20:40] = np.nan
     settings = BodyFittingSettings(max_gap_s=0.3)
-    fit = fit_bodies(MODEL, joints, covariance, 50.0, settings)
+    fit = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), settings)
     assert np.isnan(fit.joints[20:40]).all() and np.isfinite(fit.joints[:20]).all()
     assert not fit.filled.any()
 
@@ -118,7 +118,7 @@ def test_arms_missing_for_a_second_do_not_explode():
     rng = np.random.default_rng(12)
     joints, covariance = seen(walker(75, rng), 0.02, rng)
     joints[10:60, :, 7:11] = np.nan
-    assert human(fit_bodies(MODEL, joints, covariance, 50.0, SETTINGS).joints)
+    assert human(fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), SETTINGS).joints)
 
 
 def test_a_t_pose_is_fitted():
@@ -126,7 +126,7 @@ def test_a_t_pose_is_fitted():
         np.zeros(10), np.tile([np.pi / 2, 0.0, 0.0], (5, 1)), np.zeros(69), np.zeros(3)
     )
     joints, covariance = seen(rest, 0.0, np.random.default_rng(0))
-    fit = fit_bodies(MODEL, joints, covariance, 50.0, SETTINGS)
+    fit = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), SETTINGS)
     # The prior, whose people let their arms hang, pulls by centimetres.
     assert np.linalg.norm(fit.joints - joints, axis=-1).max() < 0.06
 
@@ -136,18 +136,20 @@ def test_one_frame_and_few_joints_give_a_human_body(kept):
     joints, covariance = seen(walker(1, np.random.default_rng(1)), 0.02, np.random.default_rng(2))
     few = np.full_like(joints, np.nan)
     few[:, :, kept] = joints[:, :, kept]
-    fit = fit_bodies(MODEL, few, covariance, 50.0, SETTINGS, lambda x, y: 0.0 * x)
+    fit = fit_bodies(MODEL, ClipEvidence(few, covariance, 50.0), SETTINGS, lambda x, y: 0.0 * x)
     assert human(fit.joints)
     assert np.linalg.norm(fit.joints[few == few].mean() - few[few == few].mean()) < 0.5
 
 
 def test_people_without_any_joint_and_clips_without_people_are_missing():
     nobody = np.full((4, 1, 17, 3), np.nan)
-    fit = fit_bodies(MODEL, nobody, np.full((4, 1, 17, 3, 3), np.nan), 50.0, SETTINGS)
+    fit = fit_bodies(MODEL, ClipEvidence(nobody, np.full((4, 1, 17, 3, 3), np.nan), 50.0), SETTINGS)
     assert np.isnan(fit.joints).all() and np.isnan(fit.betas).all() and not fit.filled.any()
     report = report_fit(fit, nobody, 50.0)
     assert report.bodies == 0 and report.residual_m == (None,)
-    none = fit_bodies(MODEL, nobody[:, :0], np.empty((4, 0, 17, 3, 3)), 50.0, SETTINGS)
+    none = fit_bodies(
+        MODEL, ClipEvidence(nobody[:, :0], np.empty((4, 0, 17, 3, 3)), 50.0), SETTINGS
+    )
     assert none.joints.shape == (4, 0, 17, 3)
 
 
@@ -160,7 +162,9 @@ def test_feet_stand_still_and_not_below_the_ground():
     exact = KEYPOINTS(stands)
     sole = exact[0, 15:, 2].min() - 0.08
     joints, covariance = seen(stands, 0.02, rng)
-    fit = fit_bodies(MODEL, joints, covariance, 50.0, SETTINGS, lambda x, y: sole + 0.0 * x)
+    fit = fit_bodies(
+        MODEL, ClipEvidence(joints, covariance, 50.0), SETTINGS, lambda x, y: sole + 0.0 * x
+    )
     step = np.linalg.norm(np.diff(fit.joints[:, 0, 15:], axis=0), axis=-1)
     assert np.median(step) < 0.004
     report = report_fit(fit, joints, 50.0)
@@ -169,11 +173,15 @@ def test_feet_stand_still_and_not_below_the_ground():
 
 def test_the_same_joints_give_the_same_bits():
     joints, covariance = seen(walker(15, np.random.default_rng(3)), 0.02, np.random.default_rng(4))
-    one, two = (fit_bodies(MODEL, joints, covariance, 50.0, SETTINGS) for _ in range(2))
+    one, two = (
+        fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), SETTINGS) for _ in range(2)
+    )
     np.testing.assert_array_equal(one.joints, two.joints)
     np.testing.assert_array_equal(one.betas, two.betas)
 
 
 def test_arrays_that_do_not_fit_are_refused():
     with pytest.raises(InputError, match="body fitting"):
-        fit_bodies(MODEL, np.zeros((3, 1, 14, 3)), np.zeros((3, 1, 14, 3, 3)), 50.0, SETTINGS)
+        fit_bodies(
+            MODEL, ClipEvidence(np.zeros((3, 1, 14, 3)), np.zeros((3, 1, 14, 3, 3)), 50.0), SETTINGS
+        )

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.records import Record
+from worldpose.body_fitting.body_fit import BodyFit
 from worldpose.body_fitting.bones import BONES
-from worldpose.body_fitting.feet import ANKLES
-from worldpose.body_fitting.fitting import BodyFit
+from worldpose.body_fitting.objective import ANKLES
 from worldpose.body_fitting.shared_bias import body_axes
 from worldpose.geometry import Camera
 

@@ -7,7 +7,13 @@ import pytest
 from test_monocular_poses import broadcast
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
-from worldpose.body_fitting import BodyFittingSettings, Pictures, fit_bodies, report_fit
+from worldpose.body_fitting import (
+    BodyFittingSettings,
+    ClipEvidence,
+    Pictures,
+    fit_bodies,
+    report_fit,
+)
 
 
 def test_figures_of_every_person_are_those_of_his_joints():
@@ -15,7 +21,7 @@ def test_figures_of_every_person_are_those_of_his_joints():
     truth = walker(30, rng)
     joints, covariance = seen(truth, 0.01, rng)
     joints[10:12] = np.nan
-    fit = fit_bodies(MODEL, joints, covariance, 50.0, BodyFittingSettings())
+    fit = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), BodyFittingSettings())
     camera = broadcast(1)
     exact = KEYPOINTS(truth)
     keypoints = (camera.project(exact[:, None]) + [3.0, 4.0])[:, :, None]
@@ -37,13 +43,13 @@ def test_figures_of_every_person_are_those_of_his_joints():
 def test_without_pictures_there_is_no_reprojection():
     rng = np.random.default_rng(3)
     joints, covariance = seen(walker(5, rng), 0.01, rng)
-    fit = fit_bodies(MODEL, joints, covariance, 50.0, BodyFittingSettings())
+    fit = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), BodyFittingSettings())
     assert report_fit(fit, joints, 50.0).reprojection_px == (None,)
 
 
 def test_jerk_is_the_root_mean_square_of_third_derivatives():
     joints, covariance = seen(walker(6, np.random.default_rng(3)), 0.01, np.random.default_rng(3))
-    fit = fit_bodies(MODEL, joints, covariance, 50.0, BodyFittingSettings())
+    fit = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), BodyFittingSettings())
     # 6 times 2 m/s^3 of a cube of time; the nose alone stays.
     moved = np.tile(fit.joints[:1], (6, 1, 1, 1))
     moved[:, :, 1:, 0] += 2.0 * (np.arange(6) / 50.0)[:, None, None] ** 3

@@ -1,0 +1,332 @@
+"""Least squares over tracks: poses of all frames (S3), and shapes with shared offsets (S1).
+
+Many frames share a person's shape and the detector's systematic offsets, and each can compensate
+for the other: taller people, or a detector that sees all ankles too high. So no term may push along
+that direction frame by frame, because such terms add up while the two priors do not. Three terms
+would: a pose prior, whose unbent limbs have to be longer; noise, which lengthens bones; and a clip
+of many minutes, whose errors are less independent than its frames. So the pose prior has almost no
+weight while shapes are estimated, limbs are shortened by the contribution of noise, and only some
+seconds of each person are used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from data_contracts.arrays import Floats
+from worldpose.body import BodyParameters
+from worldpose.body.jacobian import ChainedKeypoints
+from worldpose.body.parameters import BODY_POSE
+from worldpose.body_fitting.bones import Shape, fit_shape, measure_bones, shorten_limbs
+from worldpose.body_fitting.monocular import MonocularPrior
+from worldpose.body_fitting.objective import (
+    ACCELERATION_SCALE,
+    JOINT_SPREAD,
+    UNKNOWNS,
+    Evidence,
+    Ground,
+    Pose,
+    Track,
+    ankle_height,
+    find_contacts,
+    level_feet,
+)
+from worldpose.body_fitting.pose_space import PosePrior, interpolate_gaps, start_poses
+from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.body_fitting.shared_bias import MIRRORED_OFFSETS, body_axes
+from worldpose.errors import DegenerateError
+from worldpose.geometry import Rigid
+from worldpose.geometry.optimize.banded import BandedFactor
+
+ACCELERATION_WEIGHT: Final = float((1.0 / ACCELERATION_SCALE**2).sum())
+"""Number of hip accelerations that equal independent accelerations of all keypoints [1]. But a body
+accelerates as one: the search may count them all, the covariance of its poses may not."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solver:
+    """Solver of poses, shared by the fits of all persons."""
+
+    chained: ChainedKeypoints
+    prior: PosePrior
+    settings: BodyFittingSettings
+    ground: Ground | None
+
+    def solve_poses(
+        self,
+        evidence: Evidence,
+        shape: Shape,
+        offsets: Floats,
+        fps: float,
+        monocular_prior: MonocularPrior | None = None,
+    ) -> tuple[Pose, BandedFactor]:
+        """Return one person's poses in all frames, and the factor of their information matrix.
+
+        With `monocular_prior` there are two searches. One starts from the monocular poses, and the
+        result of lower cost counts: steps from an interpolated start do not reach a body that
+        turned unseen, and the cost of a start says little about the cost of its result.
+        """
+        settings, model = self.settings, self.chained.model
+        track = Track(
+            self.chained,
+            evidence,
+            self.prior,
+            settings,
+            fps,
+            settings.acceleration,
+            settings.pose_weight,
+            monocular_prior=monocular_prior,
+        )
+        target = interpolate_gaps(evidence.joints)
+        with np.errstate(invalid="ignore"):
+            axes = body_axes(target)
+        moved = target - np.einsum("fab,jb->fja", axes, offsets)
+        target = np.where(np.isfinite(moved), moved, target)
+        pose = Pose(*start_poses(model, shape.betas, target, self.prior), shape.betas)
+        searched = self.search(track, pose, offsets)
+        if monocular_prior is not None:
+            guided = self.search(track, start_from_monocular(pose, monocular_prior), offsets)
+            # Compare the same terms: each search has its own standing ankles.
+            costs = [
+                track.equations(p, offsets, bordered=False).cost for p, _ in (searched, guided)
+            ]
+            searched = guided if costs[1] < costs[0] else searched
+        pose, track = searched
+        damped = replace(
+            track,
+            acceleration=track.acceleration * ACCELERATION_WEIGHT**0.5,
+            contacts=None if track.contacts is None else track.contacts.of(evidence.known),
+        )
+        return pose, factor(damped.equations(pose, offsets, bordered=False).blocks)
+
+    def search(self, track: Track, pose: Pose, offsets: Floats) -> tuple[Pose, Track]:
+        """Return the pose after Gauss-Newton steps, and the track with standing ankles."""
+        for step in range(self.settings.steps):
+            if self.ground is not None and step == self.settings.steps // 2:
+                track = self.find_standing_ankles(track, pose)
+            equations = track.equations(pose, offsets, bordered=False)
+            solution = factor(equations.blocks).solve(equations.gradient[..., None])
+            pose = pose.apply_step(-solution[..., 0])
+        return pose, track
+
+    def find_standing_ankles(self, track: Track, pose: Pose) -> Track:
+        """Return the track with the ankles that stand in a pose."""
+        assert self.ground is not None
+        joints = self.chained.differentiate(pose.parameters()).keypoints
+        height = ankle_height(self.chained.model, pose.betas)
+        contacts = find_contacts(joints, height, self.ground, track.fps, self.settings)
+        return replace(track, contacts=contacts)
+
+    def plant_feet(self, pose: Pose) -> BodyParameters:
+        """Return the bodies of a pose, with feet on the ground where they are near it."""
+        parameters = pose.parameters()
+        if self.ground is None:
+            return parameters
+        model = self.chained.model
+        body = model.articulate(parameters)
+        height = ankle_height(model, pose.betas)
+        angles = parameters.body_pose.reshape(-1, BODY_POSE // 3, 3).copy()
+        for shank, foot in ((4, 7), (5, 8)):
+            place = body.joints[:, foot] + parameters.transl
+            clear = place[:, 2] - self.ground(place[:, 0], place[:, 1]) - height
+            turned = level_feet(body.rotations[:, shank], np.maximum(clear, 0.0))
+            angles[:, foot - 1] = Rigid(turned, np.zeros(3)).rotvec
+        return replace(parameters, body_pose=angles.reshape(-1, BODY_POSE))
+
+
+def start_from_monocular(pose: Pose, monocular_prior: MonocularPrior) -> Pose:
+    """Return a pose with the monocular poses of the frames where they count.
+
+    Gaps between these, no longer than their errors last, take the pose of the nearest frame: no
+    step would remove a jump between poses of two sources.
+    """
+    frames, used = np.arange(len(monocular_prior.used)), np.flatnonzero(monocular_prior.used)
+    before = used[(np.searchsorted(used, frames, side="right") - 1).clip(min=0)]
+    after = used[np.searchsorted(used, frames).clip(max=len(used) - 1)]
+    inside = (before <= frames) & (frames <= after)
+    inside &= after - before <= monocular_prior.correlated_frames
+    nearest = np.where(frames - before <= after - frames, before, after)
+    known = Rigid(monocular_prior.orient[nearest], np.zeros(3)).rotvec
+    return replace(
+        pose,
+        orient=np.where(inside[:, None], known, pose.orient),
+        angles=np.where(inside[:, None], monocular_prior.angles[nearest], pose.angles),
+    )
+
+
+def factor(blocks: Floats) -> BandedFactor:
+    """Return the factor of blocks with a little damping.
+
+    Raises:
+        DegenerateError: rounding leaves no positive definite system.
+    """
+    places = np.arange(UNKNOWNS)
+    blocks[0][:, places, places] *= 1.0 + 1e-4
+    # 10 m and 10 rad: only a lone joint leaves a direction that uncertain.
+    blocks[0][:, places, places] += 0.01
+    solved = BandedFactor.of(blocks)
+    if not solved.determined:
+        raise DegenerateError(
+            "body fitting: the weights of the joints differ by more than double precision can "
+            "hold. Give the settings of body_fitting and triangulation values nearer to their "
+            "defaults."
+        )
+    return solved
+
+
+Joints = tuple[Floats, Floats]
+
+PIECE: Final = 1.0
+"""Length of the intervals sampled from long tracks [s]."""
+BIAS_PRIOR_WEIGHT: Final = 8.0
+"""Weight of `bias_spread` as a prior, in squared offsets [1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """Betas and offsets of one clip."""
+
+    people: dict[int, Shape]
+    offsets: Floats
+    """(17, 3) [m] forward, left and up: from a body's joints to the detector's."""
+    offsets_covariance: Floats
+    """(17, 3, 3) [m^2]."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """An interval of a person's track, with its current bodies."""
+
+    person: int
+    track: Track
+    pose: Pose
+
+
+def fit_shapes(
+    solver: Solver, people: Mapping[int, Joints], known: Mapping[int, Shape], fps: float
+) -> Shapes:
+    """Return all persons' betas and the detector's offsets, by Gauss-Newton over poses as well.
+
+    Args:
+        solver: body, prior, settings and ground.
+        people: joints (frames, 17, 3) [m] and covariance (frames, 17, 3, 3) [m^2] of each.
+        known: shapes of some persons from other clips; the others start from the prior.
+        fps: [1/s].
+    """
+    settings, count = solver.settings, solver.chained.model.shapes
+    prior_shape = Shape(np.zeros(count), np.eye(count) / settings.shape_weight)
+    prior_shapes = {person: known.get(person, prior_shape) for person in people}
+    pieces = [
+        piece
+        for person, (joints, covariance) in people.items()
+        for piece in _sample_pieces(solver, person, joints, covariance, fps)
+    ]
+    found = dict(prior_shapes)
+    unknowns = np.zeros(MIRRORED_OFFSETS.shape[-1])
+    spread = settings.bias_spread**2 * np.eye(len(unknowns))
+    expected = settings.bias_spread**2
+    # A posterior of limited precision (Miller and Dunson 2019): errors of the model push the same
+    # way in the frames of all persons.
+    seconds = sum(len(piece.pose.transl) / piece.track.fps for piece in pieces)
+    firmness = max(1.0, seconds / settings.bias_time)
+    for step in range(settings.shape_steps if pieces else 0):
+        if solver.ground is not None and step == settings.shape_steps // 2:
+            pieces = [
+                replace(p, track=solver.find_standing_ankles(p.track, p.pose)) for p in pieces
+            ]
+        offsets = MIRRORED_OFFSETS @ unknowns
+        inner, corners, gradients = [], {}, {}
+        for person, shape in prior_shapes.items():
+            own = np.linalg.inv(shape.covariance)
+            corners[person] = np.zeros((count + len(unknowns),) * 2)
+            corners[person][:count, :count] = own
+            gradients[person] = np.zeros(count + len(unknowns))
+            betas = next((p.pose.betas for p in pieces if p.person == person), shape.betas)
+            gradients[person][:count] = own @ (betas - shape.betas)
+        for piece in pieces:
+            equations = piece.track.equations(piece.pose, offsets, bordered=True)
+            sides = np.concatenate([equations.border, equations.gradient[..., None]], axis=-1)
+            inner.append(factor(equations.blocks).solve(sides))
+            flat = equations.border.reshape(-1, len(equations.corner)).T
+            reduced = flat @ inner[-1].reshape(flat.shape[1], -1)
+            corners[piece.person] += equations.corner - reduced[:, :-1]
+            gradients[piece.person] += equations.border_gradient - reduced[:, -1]
+        matrix = firmness / expected * np.eye(len(unknowns))
+        right = matrix @ unknowns
+        inverses, ways = {}, {}
+        for person, corner in corners.items():
+            inverses[person] = np.linalg.inv(corner[:count, :count])
+            ways[person] = inverses[person] @ corner[:count, count:]
+            matrix = matrix + corner[count:, count:] - corner[count:, :count] @ ways[person]
+            right = right + gradients[person][count:] - ways[person].T @ gradients[person][:count]
+        spread = np.linalg.inv(matrix).astype(np.float64)
+        change = -spread @ right
+        unknowns = unknowns + change
+        # Learn the spread of offsets together with the offsets (expectation-maximisation).
+        if step >= settings.shape_steps // 2:
+            size = float(unknowns @ unknowns + np.trace(spread))
+            prior = BIAS_PRIOR_WEIGHT * settings.bias_spread**2
+            expected = (size + prior) / (len(unknowns) + BIAS_PRIOR_WEIGHT)
+        betas_change = {
+            # Large steps of the first, roughest linearisation leave the range of human shapes.
+            person: np.clip(-inverses[person] @ slope[:count] - ways[person] @ change, -1.0, 1.0)
+            for person, slope in gradients.items()
+        }
+        moved = []
+        for piece, solved in zip(pieces, inner, strict=True):
+            shared = np.concatenate([betas_change[piece.person], change])
+            pose_step = -solved[..., -1] - solved[..., :-1] @ shared
+            moved.append(
+                replace(piece, pose=piece.pose.apply_step(pose_step, betas_change[piece.person]))
+            )
+        pieces = moved
+        for piece in pieces:
+            way = ways[piece.person]
+            covariance = inverses[piece.person] + way @ spread @ way.T
+            found[piece.person] = Shape(piece.pose.betas, covariance)
+    by_joint = np.einsum("jau,uv,jbv->jab", MIRRORED_OFFSETS, spread, MIRRORED_OFFSETS)
+    return Shapes(found, MIRRORED_OFFSETS @ unknowns, by_joint)
+
+
+def _sample_pieces(
+    solver: Solver, person: int, joints: Floats, covariance: Floats, fps: float
+) -> list[_Piece]:
+    """Return intervals of a person's track for shape estimation, with initial bodies."""
+    settings, model = solver.settings, solver.chained.model
+    stride = max(1, int(fps / settings.shape_rate))
+    rate = fps / stride
+    scale = (settings.noise_scale * JOINT_SPREAD[:, None, None]) ** 2
+    bones = measure_bones(joints, scale * covariance, 1.0 + settings.noise_time * fps)
+    betas = fit_shape(model, bones).betas
+    pieces = []
+    for part in _spread_intervals(len(joints), fps, settings):
+        some, sure = joints[part][::stride], covariance[part][::stride]
+        if not (np.isfinite(some).all(-1) & np.isfinite(sure).all((-1, -2))).any():
+            continue
+        some = shorten_limbs(some, scale * sure)
+        track = Track(
+            solver.chained,
+            Evidence.of(some, sure, rate, settings),
+            solver.prior,
+            settings,
+            rate,
+            settings.shape_acceleration,
+            settings.shape_pose_weight,
+        )
+        pose = Pose(*start_poses(model, betas, interpolate_gaps(some), solver.prior), betas)
+        pieces.append(_Piece(person, track, pose))
+    return pieces
+
+
+def _spread_intervals(frames: int, fps: float, settings: BodyFittingSettings) -> list[slice]:
+    """Return evenly spread intervals of `frames`, `shape_time` in total; all frames if fewer."""
+    if frames <= settings.shape_time * fps:
+        return [slice(0, frames)]
+    length = max(3, round(PIECE * fps))
+    count = max(1, round(settings.shape_time / PIECE))
+    starts = np.linspace(0, frames - length, count).astype(np.int64)
+    return [slice(int(start), int(start) + length) for start in starts]

@@ -1,0 +1,1 @@
+"""Nonlinear least squares: one Levenberg-Marquardt loop, linear solvers, robust losses."""
