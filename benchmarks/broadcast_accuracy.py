@@ -26,14 +26,15 @@ from scipy.stats import chi2
 from data_contracts.arrays import Floats
 from worldpose.broadcast_calibration import (
     BroadcastCalibrationSettings,
+    BroadcastClip,
     MovingCamera,
     People,
     calibrate_broadcast,
 )
 from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE
 from worldpose.broadcast_calibration.normal_equations import point_row
+from worldpose.broadcast_calibration.priors import roughness
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
-from worldpose.broadcast_calibration.weights import roughness
 from worldpose.formats import read_camera, read_joints
 from worldpose.geometry import Rigid
 from worldpose.ingest import MatchFolder, read_match, read_unit
@@ -109,11 +110,8 @@ def distances(
     feet, inside = feet_in_picture(true, joints)
     pixel, rows, places = np.empty(2), np.empty((2, 12)), []
     for t in range(0, len(found), 5):
-        lens = found.focal[t], found.distortion[t]
         for place in feet[t, inside[t]]:
-            point_row(
-                found.rotation[t], found.center, found.principal_point, *lens, place, pixel, rows
-            )
+            point_row(found.rotation[t], found.center, found.lens(t), place, pixel, rows)
             off = true.camera[t].project(place[None])[0] - pixel
             places.append(off @ np.linalg.solve(rows @ known.frame[t] @ rows.T, off))
     return {
@@ -155,12 +153,14 @@ def main() -> None:
             begin = time.perf_counter()
             found = calibrate_broadcast(
                 PitchTemplate.from_spec(match.pitch),
-                chosen,
-                pictures,
-                match.spec.fps,
-                people=None if options.without_players else people,
-                boxes=people.boxes,
-                settings=settings,
+                BroadcastClip(
+                    chosen,
+                    pictures,
+                    match.spec.fps,
+                    people=None if options.without_players else people,
+                    boxes=people.boxes,
+                ),
+                settings,
             )
             spent = time.perf_counter() - begin
             print(f"{folder.name}: {len(true)} frames, {count} key frames, {spent:.0f} s")

@@ -21,13 +21,16 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix, lil_matrix, vstack
 
 from data_contracts.arrays import Floats
-from worldpose.broadcast_calibration.adam import descend
-from worldpose.broadcast_calibration.evidence import PLAYER, FlowEvidence, PointEvidence
+from worldpose.broadcast_calibration.evidence import (
+    PLAYER,
+    FlowEvidence,
+    ObservedPoints,
+    PointEvidence,
+)
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
-from worldpose.broadcast_calibration.priors import prior_of
+from worldpose.broadcast_calibration.priors import build_prior, second_differences
 from worldpose.broadcast_calibration.settings import BroadcastPrior
-from worldpose.broadcast_calibration.smoothness import second_differences
-from worldpose.broadcast_calibration.solving import Problem, equations_at, solve
+from worldpose.broadcast_calibration.solver import Problem, descend, equations_at, solve
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.broadcast import film
 from worldpose.simulation.settings import BroadcastSettings
@@ -64,14 +67,16 @@ def evidence(camera: MovingCamera, where: Floats, rng: np.random.Generator) -> P
     inside &= rng.random(inside.shape) > 0.1
     frame, _ = np.nonzero(inside)
     return PointEvidence.at_points(
-        frame,
-        world[inside],
-        image[inside],
+        ObservedPoints(
+            frame=frame,
+            world=world[inside],
+            image=image[inside],
+            kind=PLAYER,
+            source=np.zeros(len(frame), dtype=np.int64),
+        ),
         np.full(len(frame), NOISE),
         1.0,
         LOSS,
-        PLAYER,
-        np.zeros(len(frame), dtype=np.int64),
     )
 
 
@@ -169,11 +174,11 @@ def main() -> None:
     true, where = true_camera(options.frames, rng)
     points = evidence(true, where, rng)
     start = start_of(true, rng)
-    prior = prior_of(BroadcastPrior(), start.focal, start.image_size)
+    prior = build_prior(BroadcastPrior(), start.focal, start.image_size)
     problem = Problem(points, FlowEvidence.none(), prior, SMOOTH)
     # Exclude compilation from the measurement.
     some = replace(problem, points=points[points.frame < 5])
-    few = replace(some, prior=prior_of(BroadcastPrior(), start.focal[:5], start.image_size))
+    few = replace(some, prior=build_prior(BroadcastPrior(), start.focal[:5], start.image_size))
     solve(start.frames(slice(0, 5)), few, 2)
     none = np.zeros((0, 4))
     print(f"{options.frames} frames, {len(points)} observations, one thread")

@@ -26,14 +26,18 @@ from worldpose.broadcast_calibration import BroadcastCalibrationSettings, Moving
 from worldpose.broadcast_calibration.evidence import (
     MARKING,
     FlowEvidence,
+    ObservedPoints,
     PointEvidence,
     together,
 )
 from worldpose.broadcast_calibration.players import match, player_evidence
-from worldpose.broadcast_calibration.priors import prior_of
-from worldpose.broadcast_calibration.solving import Problem, solve
-from worldpose.broadcast_calibration.uncertainty import uncertainty_of
-from worldpose.broadcast_calibration.weights import lasting_of, smoothness_of
+from worldpose.broadcast_calibration.priors import (
+    build_prior,
+    correlation_time,
+    estimate_smoothness,
+)
+from worldpose.broadcast_calibration.solver import Problem, solve
+from worldpose.broadcast_calibration.uncertainty import compute_uncertainty
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
@@ -68,16 +72,18 @@ def lines_of(
         pixels = camera.project(world + hung.sum(axis=1)) + shift
         parts.append(
             PointEvidence.across_lines(
-                np.full(len(index), frame),
-                world,
-                pixels + NOISE * rng.standard_normal(pixels.shape),
+                ObservedPoints(
+                    frame=np.full(len(index), frame),
+                    world=world,
+                    image=pixels + NOISE * rng.standard_normal(pixels.shape),
+                    kind=MARKING,
+                    source=samples.marking[index],
+                    ends=ends,
+                    shares=shares,
+                ),
                 seen.normals[index],
                 np.full(len(index), np.hypot(NOISE, settings.line_noise)),
                 settings.loss,
-                MARKING,
-                samples.marking[index],
-                ends,
-                shares,
             )
         )
     return together(parts)
@@ -104,12 +110,14 @@ def judged(name: str, seed: int, seconds: float, fps: float) -> dict[str, Floats
     problem = Problem(
         points=together([lines, players]),
         flow=FlowEvidence.none(),
-        prior=prior_of(settings.prior, true.focal, true.image_size),
-        smoothness=smoothness_of(true, fps),
+        prior=build_prior(settings.prior, true.focal, true.image_size),
+        smoothness=estimate_smoothness(true, fps),
     )
     solution = solve(true, problem, settings.iterations)
-    shifts = settings.line_shift, settings.player_shift
-    known = uncertainty_of(solution, problem, *shifts, lasting_of(true, fps))
+    lasting = correlation_time(true, fps)
+    known = compute_uncertainty(
+        solution, problem, settings.line_shift, settings.player_shift, lasting
+    )
     print(f"{name} {seed}: {errors(solution.camera, true, joints)}", flush=True)
     return distances(solution.camera, known, true, joints)
 

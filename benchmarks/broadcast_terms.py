@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from worldpose.broadcast_calibration import BroadcastCalibrationSettings
-from worldpose.broadcast_calibration.calibrating import refine, track
+from worldpose.broadcast_calibration.calibration import BroadcastClip, refine, track
 from worldpose.broadcast_calibration.evidence import together
-from worldpose.broadcast_calibration.fit import misses
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, follow_lines
 from worldpose.broadcast_calibration.players import match as match_players
 from worldpose.broadcast_calibration.players import player_evidence
+from worldpose.broadcast_calibration.report import median_residuals
 from worldpose.formats import JointTracks, read_joints
 from worldpose.ingest import read_match
 from worldpose.pitch import PitchTemplate
@@ -64,13 +64,12 @@ def rows_of(
             yield from (picture for _, picture in video.frames(grey=True))
 
     keys = match.key_frames[clip].key_frames
-    tracked = track(pitch, keys, pictures, people.boxes, whole, str(folder))
+    given = BroadcastClip(keys, pictures, match.spec.fps, people, where=str(folder))
+    tracked = track(pitch, given, whole)
     fits = {}
     for name, changes in TERMS.items():
         settings = whole.model_copy(update=changes)
-        fits[name] = refine(
-            pitch, tracked, pictures, match.spec.fps, people, people.boxes, settings
-        )
+        fits[name] = refine(pitch, given, tracked, settings)
     found = {
         "frame by frame": fits["all"].before,
         **{name: fit.camera for name, fit in fits.items()},
@@ -85,7 +84,9 @@ def rows_of(
     rows = {}
     for name, each in found.items():
         off = np.linalg.norm(each.camera.project(feet) - at, axis=-1)[inside]
-        rows[name] = np.array([*misses(each, evidence), np.median(off), np.percentile(off, 95.0)])
+        rows[name] = np.array(
+            [*median_residuals(each, evidence), np.median(off), np.percentile(off, 95.0)]
+        )
     if picture is not None:
         before, after = fits["all"].before.camera, fits["all"].camera.camera
         number = np.arange(joints.shape[1])

@@ -16,6 +16,7 @@ from tasks.static_calibration import clicked_markings
 from tasks.unit import open_input, require_registered, unit_task
 from worldpose.broadcast_calibration import (
     BroadcastCalibrationSettings,
+    BroadcastClip,
     BroadcastReport,
     People,
     broadcast_arrays,
@@ -44,17 +45,19 @@ def broadcast_calibration(work: Work) -> str:
     with store.publishing(work) as result:
         calibration = calibrate_broadcast(
             PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"])),
-            [
-                KeyFrame(frame=int(frame), markings=clicked_markings(markings))
-                for frame, markings in clicked.items()
-                if start <= int(frame) < start + count
-            ],
-            pictures,
-            float(sources["fps"]),
-            people=_people(store, work),
-            settings=BroadcastCalibrationSettings.model_validate(work.recipe.settings),
-            where=file,
-            first=start,
+            BroadcastClip(
+                [
+                    KeyFrame(frame=int(frame), markings=clicked_markings(markings))
+                    for frame, markings in clicked.items()
+                    if start <= int(frame) < start + count
+                ],
+                pictures,
+                float(sources["fps"]),
+                people=_people(store, work),
+                where=file,
+                first=start,
+            ),
+            BroadcastCalibrationSettings.model_validate(work.recipe.settings),
         )
         require_registered(path, sources["video_sha256"])
         result.write(

@@ -48,7 +48,7 @@ def clips(
     if take is not None and out is not None:
         _take(programme, take, out, as_json=as_json)
         return
-    from worldpose.broadcast_calibration.programme import find_shots
+    from worldpose.broadcast_calibration.shots import find_shots
     from worldpose.video import index_frames
 
     index = index_frames(programme)

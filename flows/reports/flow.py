@@ -9,8 +9,7 @@ from flows.results.best_results import clip_title
 from flows.stage import Match
 from flows.stages.detection import seen_in_broadcast
 from worldpose.broadcast_calibration import BroadcastCalibrationSettings
-from worldpose.broadcast_calibration.optical_flow import follow
-from worldpose.broadcast_calibration.turning import modified_z_scores
+from worldpose.broadcast_calibration.tracking import follow, modified_z_scores
 from worldpose.geometry import Camera
 from worldpose.ingest import unit_frames
 from worldpose.reports import CaptionedImage

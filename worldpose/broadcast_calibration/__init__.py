@@ -4,15 +4,14 @@ Input: clicks in key frames, the clip's frames, people of the static cameras. Ou
 frame with one center, its covariance, and a report.
 """
 
-from worldpose.broadcast_calibration.calibrating import (
+from worldpose.broadcast_calibration.calibration import (
     BroadcastCalibration,
+    BroadcastClip,
     calibrate_broadcast,
+    follow_given_lens,
 )
-from worldpose.broadcast_calibration.feed_offset import FeedOffset, estimate_feed_offset
-from worldpose.broadcast_calibration.given_lens import follow_given_lens
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
-from worldpose.broadcast_calibration.players import People
-from worldpose.broadcast_calibration.pooling import PooledCenter, drawn_to, pool_centers
+from worldpose.broadcast_calibration.players import FeedOffset, People, estimate_feed_offset
 from worldpose.broadcast_calibration.report import BroadcastReport
 from worldpose.broadcast_calibration.settings import (
     BroadcastCalibrationSettings,
@@ -25,10 +24,12 @@ from worldpose.broadcast_calibration.stored import (
     moving_arrays,
     moving_from_arrays,
 )
+from worldpose.broadcast_calibration.uncertainty import PooledCenter, drawn_to, pool_centers
 
 __all__ = [
     "BroadcastCalibration",
     "BroadcastCalibrationSettings",
+    "BroadcastClip",
     "BroadcastPrior",
     "BroadcastReport",
     "FeedOffset",

@@ -9,12 +9,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Integers
+from worldpose.broadcast_calibration.normal_equations import Points
 
 ENDS = 2
 """Maximum template points that define a place: the ends of its line, or the center of its arc, or
 itself."""
 CLICK, MARKING, PLAYER = 0, 1, 2
 """Kinds of `PointEvidence`: clicked points and drawn markings, painted lines, players' joints."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedPoints:
+    """Pixels of known world points, without their noise.
+
+    Attributes:
+        frame: (n,) index of the frame, rising.
+        world: (n, 3) [m], world.
+        image: (n, 2) [px].
+        kind: CLICK, MARKING or PLAYER.
+        source: (n,) index of the marking or person, -1 for clicks.
+        ends: (n, 2) indices of the template's points that define the place, -1 = none; None = no
+            survey error.
+        shares: (n, 2) [m] displacement of the place per standard deviation of these points' survey
+            error; with `ends`.
+    """
+
+    frame: Integers
+    world: Floats
+    image: Floats
+    kind: int
+    source: Integers
+    ends: Integers | None = None
+    shares: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,72 +92,65 @@ class PointEvidence:
 
     @classmethod
     def across_lines(
-        cls,
-        frame: Integers,
-        world: Floats,
-        image: Floats,
-        normals: Floats,
-        deviation: Floats,
-        loss: float,
-        kind: int,
-        source: Integers,
-        ends: Integers | None = None,
-        shares: Floats | None = None,
+        cls, observed: ObservedPoints, normals: Floats, deviation: Floats, loss: float
     ) -> PointEvidence:
         """Return evidence that constrains places only across a line.
 
         Args:
-            frame: (n,), rising.
-            world: (n, 3) [m], world.
-            image: (n, 2) [px].
+            observed: pixels and places.
             normals: (n, 2) unit vectors across the line.
             deviation: (n,) standard deviation [px].
             loss: scale of the loss [standard deviations].
-            kind: CLICK or MARKING.
-            source: (n,) index of the marking.
-            ends: (n, 2) points of the template that define the places; None = no survey error.
-            shares: (n, 2) [m], with `ends`.
         """
-        whitening = np.zeros((len(frame), 2, 2))
+        whitening = np.zeros((len(observed.frame), 2, 2))
         whitening[:, 0] = normals / deviation[:, None]
-        ones = np.ones(len(frame))
-        kinds = np.full(len(frame), kind)
-        hung = _hung(len(frame), ends, shares)
-        return cls(frame, world, image, whitening, ones, loss * ones, kinds, source, *hung)
+        return cls._whitened(observed, whitening, 1.0, loss)
 
     @classmethod
     def at_points(
-        cls,
-        frame: Integers,
-        world: Floats,
-        image: Floats,
-        deviation: Floats,
-        weight: float,
-        loss: float,
-        kind: int,
-        source: Integers,
-        ends: Integers | None = None,
-        shares: Floats | None = None,
+        cls, observed: ObservedPoints, deviation: Floats, weight: float, loss: float
     ) -> PointEvidence:
         """Return evidence with equal noise in both image directions.
 
         Args:
-            frame: (n,), rising.
-            world: (n, 3) [m], world.
-            image: (n, 2) [px].
+            observed: pixels and places.
             deviation: (n,) standard deviation, each axis [px].
             weight: factor on the loss [1].
             loss: scale of the loss [standard deviations].
-            kind: CLICK, MARKING or PLAYER.
-            source: (n,) index of the person.
-            ends: (n, 2) points of the template that define the places; None = no survey error.
-            shares: (n, 2) [m], with `ends`.
         """
-        ones = np.ones(len(frame))
-        whitening = np.eye(2) / deviation[:, None, None]
-        kinds = np.full(len(frame), kind)
-        hung = _hung(len(frame), ends, shares)
-        return cls(frame, world, image, whitening, weight * ones, loss * ones, kinds, source, *hung)
+        return cls._whitened(observed, np.eye(2) / deviation[:, None, None], weight, loss)
+
+    @classmethod
+    def _whitened(
+        cls, observed: ObservedPoints, whitening: Floats, weight: float, loss: float
+    ) -> PointEvidence:
+        count = len(observed.frame)
+        ones = np.ones(count)
+        ends, shares = observed.ends, observed.shares
+        if ends is None or shares is None:
+            ends, shares = np.full((count, ENDS), -1), np.zeros((count, ENDS))
+        return cls(
+            frame=observed.frame,
+            world=observed.world,
+            image=observed.image,
+            whitening=whitening,
+            weight=weight * ones,
+            loss=loss * ones,
+            kind=np.full(count, observed.kind),
+            source=observed.source,
+            ends=ends,
+            shares=shares,
+        )
+
+    def arrays(self, ends: Integers) -> Points:
+        """Return the arrays for compiled kernels.
+
+        Args:
+            ends: (n, 2) rows of the paint errors that define a point; -1 = none.
+        """
+        return Points(
+            self.world, self.image, self.whitening, self.weight, self.loss, ends, self.shares
+        )
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -171,13 +190,6 @@ class FlowEvidence:
 
     def __getitem__(self, index: Integers | NDArray[np.bool_]) -> FlowEvidence:
         return FlowEvidence(*(getattr(self, name)[index] for name in _FLOW_PARTS))
-
-
-def _hung(count: int, ends: Integers | None, shares: Floats | None) -> tuple[Integers, Floats]:
-    """Return `ends` and `shares`, or empty ones where not given."""
-    if ends is None or shares is None:
-        return np.full((count, ENDS), -1), np.zeros((count, ENDS))
-    return ends, shares
 
 
 _POINT_PARTS = (

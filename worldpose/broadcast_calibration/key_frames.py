@@ -13,14 +13,15 @@ from data_contracts.broadcast_calibration import KeyFrame
 from worldpose.broadcast_calibration.evidence import (
     CLICK,
     FlowEvidence,
+    ObservedPoints,
     PointEvidence,
     together,
 )
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, find_lines
 from worldpose.broadcast_calibration.moving_camera import MovingCamera, joined
-from worldpose.broadcast_calibration.priors import prior_of
+from worldpose.broadcast_calibration.priors import build_prior
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
-from worldpose.broadcast_calibration.solving import Problem, solve
+from worldpose.broadcast_calibration.solver import Problem, solve
 from worldpose.errors import DegenerateError, InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import CameraEstimate, StaticCalibration, calibrate
@@ -111,7 +112,7 @@ def calibrate_keys(
         problem = Problem(
             points=together([clicks, *lines]),
             flow=FlowEvidence.none(),
-            prior=prior_of(settings.prior, camera.focal, camera.image_size),
+            prior=build_prior(settings.prior, camera.focal, camera.image_size),
         )
         camera = solve(camera, problem, settings.iterations).camera
     return Keys(np.array(list(found)), camera, clicks, refused, wrong)
@@ -193,16 +194,18 @@ def _clicks(
     own = np.array([[template[point.name], -1] for point in points], dtype=np.int64).reshape(-1, 2)
     parts = [
         PointEvidence.at_points(
-            np.full(len(points), index),
-            pitch.positions([point.name for point in points]),
-            np.array([point.xy for point in points]).reshape(-1, 2),
+            ObservedPoints(
+                frame=np.full(len(points), index),
+                world=pitch.positions([point.name for point in points]),
+                image=np.array([point.xy for point in points]).reshape(-1, 2),
+                kind=CLICK,
+                source=np.full(len(points), -1),
+                ends=own,
+                shares=np.where(own >= 0, settings.survey_error, 0.0),
+            ),
             np.full(len(points), settings.click_noise),
             settings.field_weight,
             settings.loss,
-            CLICK,
-            np.full(len(points), -1),
-            own,
-            np.where(own >= 0, settings.survey_error, 0.0),
         )
     ]
     numbers = camera.camera[0].numbers
@@ -224,16 +227,18 @@ def _clicks(
         names, shares = _hung(pitch, marking.name, place[known])
         parts.append(
             PointEvidence.across_lines(
-                np.full(int(known.sum()), index),
-                place[known],
-                pixels[known],
+                ObservedPoints(
+                    frame=np.full(int(known.sum()), index),
+                    world=place[known],
+                    image=pixels[known],
+                    kind=CLICK,
+                    source=np.full(int(known.sum()), -1),
+                    ends=np.tile([template[name] for name in names], (int(known.sum()), 1)),
+                    shares=settings.survey_error * shares,
+                ),
                 normal[known],
                 np.full(int(known.sum()), settings.key_frame.drawn_noise),
                 settings.loss,
-                CLICK,
-                np.full(int(known.sum()), -1),
-                np.tile([template[name] for name in names], (int(known.sum()), 1)),
-                settings.survey_error * shares,
             )
         )
     return together(parts)

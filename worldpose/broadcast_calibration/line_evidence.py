@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats, Image
 from worldpose.broadcast_calibration.evidence import (
     MARKING,
+    ObservedPoints,
     PointEvidence,
     bounds,
     together,
 )
 from worldpose.broadcast_calibration.moving_camera import MovingCamera, joined
-from worldpose.broadcast_calibration.normal_equations import add_points
+from worldpose.broadcast_calibration.normal_equations import add_points, empty_equations
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.bar_fits import fit_bars
@@ -148,16 +149,18 @@ def _look(
     found = np.isfinite(exact)
     deviation = np.sqrt(variances[found] + settings.line_noise**2)
     return PointEvidence.across_lines(
-        np.zeros(int(found.sum()), dtype=np.int64),
-        lines.points_world[index][found],
-        (places + exact[:, None] * normals)[found],
+        ObservedPoints(
+            frame=np.zeros(int(found.sum()), dtype=np.int64),
+            world=lines.points_world[index][found],
+            image=(places + exact[:, None] * normals)[found],
+            kind=MARKING,
+            source=lines.marking[index][found],
+            ends=lines.ends[index][found],
+            shares=settings.survey_error * lines.shares[index][found],
+        ),
         normals[found],
         deviation,
         settings.loss,
-        MARKING,
-        lines.marking[index][found],
-        lines.ends[index][found],
-        settings.survey_error * lines.shares[index][found],
     )
 
 
@@ -186,31 +189,12 @@ def _corrected(camera: MovingCamera, lines: PointEvidence) -> MovingCamera:
     gone = np.zeros(4)
     across = lines.whitening / np.linalg.norm(lines.whitening, axis=(1, 2))[:, None, None]
     for scale in _SCALES:
-        blocks, right = np.zeros((3, 1, 7, 7)), np.zeros((1, 7))
-        border, corner, rest = np.zeros((1, 7, 5)), np.zeros((5, 5)), np.zeros(5)
-        add_points(
-            camera.center,
-            camera.principal_point,
-            camera.focal,
-            camera.rotation,
-            camera.distortion,
-            edges,
-            lines.world,
-            lines.image,
-            across / scale,
-            lines.weight,
-            np.ones(len(lines)),
-            np.full_like(lines.ends, -1),
-            lines.shares,
-            np.zeros((0, 3)),
-            blocks,
-            border,
-            corner,
-            right,
-            rest,
-        )
-        normal = blocks[0, 0, :4, :4] + np.diag(1.0 / _HOLD**2)
-        gone = gone - np.linalg.solve(normal, right[0, :4] + gone / _HOLD**2)
+        equations = empty_equations(1, 5)
+        scaled = replace(lines, whitening=across / scale, loss=np.ones(len(lines)))
+        points = scaled.arrays(np.full_like(lines.ends, -1))
+        add_points(camera.arrays, edges, points, np.zeros((0, 3)), equations)
+        normal = equations.blocks[0, 0, :4, :4] + np.diag(1.0 / _HOLD**2)
+        gone = gone - np.linalg.solve(normal, equations.right[0, :4] + gone / _HOLD**2)
         camera = begin.stepped(np.append(gone, np.zeros(3))[None], np.zeros(5))
     return camera
 

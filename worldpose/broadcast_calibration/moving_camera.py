@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from data_contracts.arrays import Floats
+from worldpose.broadcast_calibration.normal_equations import Cameras, Lens
 from worldpose.geometry import Camera, Rigid
 
 FRAME_SIZE = 7
@@ -74,6 +75,17 @@ class MovingCamera:
             cam_from_world=Rigid(self.rotation, -self.rotation @ self.center),
             image_size=self.image_size,
         )
+
+    @property
+    def arrays(self) -> Cameras:
+        """Arrays for compiled kernels."""
+        return Cameras(
+            self.center, self.principal_point, self.focal, self.rotation, self.distortion
+        )
+
+    def lens(self, frame: int) -> Lens:
+        """Return the lens of a frame for compiled kernels."""
+        return Lens(self.principal_point, self.focal[frame], self.distortion[frame])
 
     def frames(self, index: NDArray[np.int64] | slice) -> MovingCamera:
         """Return some of the frames."""

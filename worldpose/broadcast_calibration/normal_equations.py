@@ -6,6 +6,9 @@ template's points; the matrix is an arrow: a band of frame blocks, and a border 
 
 from __future__ import annotations
 
+import math
+from typing import Final, NamedTuple
+
 import numpy as np
 
 from data_contracts.arrays import Floats, Integers
@@ -15,25 +18,107 @@ _NEAR = 0.5
 """Minimum depth of a point [m]: a camera in the stands sees none nearer."""
 
 
+class Lens(NamedTuple):
+    """Projection of one frame."""
+
+    principal_point: Floats
+    """(2,) [px]"""
+    focal: float
+    """[px]"""
+    distortion: Floats
+    """(3,) k1, k2, k3."""
+
+
+class Cameras(NamedTuple):
+    """Cameras of all frames."""
+
+    center: Floats
+    """(3,) [m], world."""
+    principal_point: Floats
+    """(2,) [px]"""
+    focal: Floats
+    """(frames,) [px]"""
+    rotation: Floats
+    """(frames, 3, 3)"""
+    distortion: Floats
+    """(frames, 3)"""
+
+
+class Points(NamedTuple):
+    """Pixels of known world points; see `PointEvidence`."""
+
+    world: Floats
+    """(n, 3) [m]"""
+    image: Floats
+    """(n, 2) [px]"""
+    whitening: Floats
+    """(n, 2, 2) [1/px]"""
+    weight: Floats
+    """(n,)"""
+    loss: Floats
+    """(n,) scale of the Geman-McClure loss; infinite = squares."""
+    ends: Integers
+    """(n, 2) rows of the paint errors that define a point; -1 = none."""
+    shares: Floats
+    """(n, 2) [m] displacement of the point per unit of these."""
+
+
+class Flow(NamedTuple):
+    """Points followed to the next frame; see `FlowEvidence`."""
+
+    start: Floats
+    """(n, 2) [px]"""
+    end: Floats
+    """(n, 2) [px]"""
+    deviation: Floats
+    """(n,) [px]"""
+    weight: float
+    """Factor on all their losses."""
+    loss: float
+    """Scale of the Geman-McClure loss [standard deviations]."""
+
+
+class NormalEquations(NamedTuple):
+    """Arrow matrix and gradient, which the terms of the cost are added to."""
+
+    blocks: Floats
+    """(3, frames, 7, 7) band, see `BandedFactor`."""
+    border: Floats
+    """(frames, 7, 5 + 3 painted)"""
+    corner: Floats
+    """(5 + 3 painted, the same)"""
+    right: Floats
+    """(frames, 7) gradient by the frames' steps."""
+    right_corner: Floats
+    """(5 + 3 painted,) gradient by the clip's step and the paint errors."""
+
+
+def empty_equations(frames: int, shared: int) -> NormalEquations:
+    """Return normal equations without any term.
+
+    Args:
+        frames: number of frames.
+        shared: number of unknowns that all frames share.
+    """
+    return NormalEquations(
+        blocks=np.zeros((3, frames, 7, 7)),
+        border=np.zeros((frames, 7, shared)),
+        corner=np.zeros((shared, shared)),
+        right=np.zeros((frames, 7)),
+        right_corner=np.zeros(shared),
+    )
+
+
 @compiled
 def point_row(
-    r: Floats,
-    center: Floats,
-    principal: Floats,
-    focal: float,
-    k: Floats,
-    world: Floats,
-    image: Floats,
-    jacobian: Floats,
+    r: Floats, center: Floats, lens: Lens, world: Floats, image: Floats, jacobian: Floats
 ) -> bool:
     """Write the pixel (2,) of a point and its derivatives (2, 12); return whether it exists.
 
     Args:
         r: (3, 3) rotation.
         center: (3,) [m], world.
-        principal: (2,) [px].
-        focal: [px].
-        k: (3,) distortion.
+        lens: of the frame.
         world: (3,) [m].
         image: (2,), written.
         jacobian: (2, 12), written: by a frame's step, then by the clip's.
@@ -44,22 +129,15 @@ def point_row(
     z = r[2, 0] * d0 + r[2, 1] * d1 + r[2, 2] * d2
     if not z > _NEAR:
         return False
-    return direction_row(x, y, z, r, principal, focal, k, image, jacobian)
+    return direction_row(x, y, z, r, lens, image, jacobian)
 
 
 @compiled
 def direction_row(
-    x: float,
-    y: float,
-    z: float,
-    r: Floats,
-    principal: Floats,
-    focal: float,
-    k: Floats,
-    image: Floats,
-    jacobian: Floats,
+    x: float, y: float, z: float, r: Floats, lens: Lens, image: Floats, jacobian: Floats
 ) -> bool:
     """Write the pixel of a point in camera axes and its derivatives, as `point_row`."""
+    principal, focal, k = lens.principal_point, lens.focal, lens.distortion
     a, b = x / z, y / z
     s = a * a + b * b
     radial = 1.0 + s * (k[0] + s * (k[1] + s * k[2]))
@@ -88,57 +166,31 @@ def direction_row(
 
 @compiled
 def add_points(
-    center: Floats,
-    principal: Floats,
-    focal: Floats,
-    rotation: Floats,
-    distortion: Floats,
-    bounds: Integers,
-    world: Floats,
-    image: Floats,
-    whitening: Floats,
-    weight: Floats,
-    loss: Floats,
-    ends: Integers,
-    shares: Floats,
-    beside: Floats,
-    blocks: Floats,
-    border: Floats,
-    corner: Floats,
-    right: Floats,
-    right_corner: Floats,
+    cameras: Cameras, bounds: Integers, points: Points, beside: Floats, equations: NormalEquations
 ) -> float:
     """Add points to the normal equations and return their cost, half a sum of losses.
 
     Args:
-        center: (3,) [m], world.
-        principal: (2,) [px].
-        focal: (frames,) [px].
-        rotation: (frames, 3, 3).
-        distortion: (frames, 3).
+        cameras: of all frames.
         bounds: (frames + 1,) of the points.
-        world: (n, 3) [m].
-        image: (n, 2) [px].
-        whitening: (n, 2, 2) [1/px].
-        weight: (n,).
-        loss: (n,) scale of the Geman-McClure loss; infinite = squares.
-        ends: (n, 2) rows of `beside` that define a point; -1 = none.
-        shares: (n, 2) [m] displacement of the point per unit of these.
+        points: sorted by frame.
         beside: (painted, 3) paint errors of the template's points [standard deviations].
-        blocks: (3, frames, 7, 7), the diagonal added to.
-        border: (frames, 7, 5 + 3 painted), added to.
-        corner: (5 + 3 painted, 5 + 3 painted), added to.
-        right: (frames, 7) gradient, added to.
-        right_corner: (5 + 3 painted,), added to.
+        equations: added to.
     """
+    center, rotation = cameras.center, cameras.rotation
+    world, image, whitening = points.world, points.image, points.whitening
+    weight, loss, ends, shares = points.weight, points.loss, points.ends, points.shares
+    blocks, border, corner = equations.blocks, equations.border, equations.corner
+    right, right_corner = equations.right, equations.right_corner
     cost = 0.0
     pixel, rows = np.empty(2), np.empty((2, 12))
     place, moved = np.empty(3), np.empty(6)
     normal, gradient = np.empty((12, 12)), np.empty(12)
     white = np.empty(12)
-    for t in range(len(focal)):
+    for t in range(len(rotation)):
         normal[:] = 0.0
         gradient[:] = 0.0
+        lens = Lens(cameras.principal_point, cameras.focal[t], cameras.distortion[t])
         for i in range(bounds[t], bounds[t + 1]):
             limit = loss[i] * loss[i]
             place[:] = world[i]
@@ -146,10 +198,7 @@ def add_points(
                 if ends[i, end] >= 0:
                     for j in range(3):
                         place[j] += shares[i, end] * beside[ends[i, end], j]
-            seen = point_row(
-                rotation[t], center, principal, focal[t], distortion[t], place, pixel, rows
-            )
-            if not seen:
+            if not point_row(rotation[t], center, lens, place, pixel, rows):
                 # The maximum of the loss.
                 cost += 0.5 * weight[i] * min(limit, 1e12)
                 continue
@@ -158,11 +207,11 @@ def add_points(
             for axis in range(2):
                 e = whitening[i, axis, 0] * u + whitening[i, axis, 1] * v
                 squared += e * e
-            pull = weight[i]
+            factor = weight[i]
             if limit < np.inf:
                 share = limit / (limit + squared)
                 cost += 0.5 * weight[i] * squared * share
-                pull *= share * share
+                factor *= share * share
             else:
                 cost += 0.5 * weight[i] * squared
             for axis in range(2):
@@ -173,7 +222,7 @@ def add_points(
                 for j in range(12):
                     white[j] = p * rows[0, j] + q * rows[1, j]
                 for j in range(12):
-                    value = pull * white[j]
+                    value = factor * white[j]
                     gradient[j] += value * e
                     for m in range(j + 1):
                         normal[j, m] += value * white[m]
@@ -185,7 +234,7 @@ def add_points(
                     if ends[i, one // 3] < 0:
                         continue
                     row = 5 + 3 * ends[i, one // 3] + one % 3
-                    value = pull * moved[one]
+                    value = factor * moved[one]
                     right_corner[row] += value * e
                     for j in range(7):
                         border[t, j, row] += value * white[j]
@@ -210,4 +259,154 @@ def add_points(
                 corner[j, m] += normal[7 + j, 7 + m]
                 if m < j:
                     corner[m, j] += normal[7 + j, 7 + m]
+    return cost
+
+
+_UNDISTORT: Final = 30
+"""Maximum Newton steps; a lens that displaces the corner by a twentieth takes three or four."""
+
+
+@compiled
+def undistorted(xd: float, yd: float, k: Floats) -> tuple[float, float, bool]:
+    """Return the undistorted point on the plane z = 1 of (xd, yd), and whether it exists."""
+    far = math.sqrt(xd * xd + yd * yd)
+    radius = far
+    for _ in range(_UNDISTORT):
+        s = radius * radius
+        value = radius * (1.0 + s * (k[0] + s * (k[1] + s * k[2]))) - far
+        slope = 1.0 + s * (3.0 * k[0] + s * (5.0 * k[1] + 7.0 * s * k[2]))
+        if not slope > 0.0:
+            return 0.0, 0.0, False
+        step = value / slope
+        radius -= step
+        if abs(step) < 1e-14 * (1.0 + radius):
+            break
+    scale = radius / far if far > 0.0 else 1.0
+    return xd * scale, yd * scale, True
+
+
+@compiled
+def flow_row(
+    principal: Floats,
+    focal: Floats,
+    rotation: Floats,
+    distortion: Floats,
+    start: Floats,
+    image: Floats,
+    jacobian: Floats,
+) -> bool:
+    """Write the pixel in the second of two frames of a point in the first, and derivatives (2, 16).
+
+    The point is a direction from the center, which both frames share.
+
+    Args:
+        principal: (2,) [px].
+        focal: (2,) [px].
+        rotation: (2, 3, 3).
+        distortion: (2, 3).
+        start: (2,) [px].
+        image: (2,), written.
+        jacobian: (2, 16), written: by the first frame's step, the second's, the principal point.
+    """
+    xd, yd = (start[0] - principal[0]) / focal[0], (start[1] - principal[1]) / focal[0]
+    k = distortion[0]
+    a, b, known = undistorted(xd, yd, k)
+    if not known:
+        return False
+    # Rotation from the first camera's axes to the second's.
+    turn = rotation[1] @ rotation[0].T
+    x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2]
+    y = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2]
+    z = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2]
+    if not z > 0.0:
+        return False
+    full = np.empty((2, 12))
+    lens = Lens(principal, focal[1], distortion[1])
+    if not direction_row(x, y, z, turn, lens, image, full):
+        return False
+    s = a * a + b * b
+    radial = 1.0 + s * (k[0] + s * (k[1] + s * k[2]))
+    slope = 2.0 * (k[0] + s * (2.0 * k[1] + 3.0 * s * k[2]))
+    gxx, gxy, gyy = radial + slope * a * a, slope * a * b, radial + slope * b * b
+    determinant = gxx * gyy - gxy * gxy
+    for axis in range(2):
+        row, second = jacobian[axis], full[axis]
+        # `direction_row` gave minus the derivative by the direction in the first camera's axes.
+        ha, hb, hc = -second[7], -second[8], -second[9]
+        # Derivatives by the undistorted place, then by the distorted one.
+        da, db = ha, hb
+        pa = (gyy * da - gxy * db) / determinant
+        pb = (gxx * db - gxy * da) / determinant
+        row[0] = -(b * hc - hb)
+        row[1] = -(ha - a * hc)
+        row[2] = -(a * hb - b * ha)
+        row[3] = -(pa * xd + pb * yd)
+        bent = -(pa * a + pb * b) * s
+        row[4], row[5], row[6] = bent, bent * s, bent * s * s
+        for j in range(7):
+            row[7 + j] = second[j]
+        row[14] = second[10] - pa / focal[0]
+        row[15] = second[11] - pb / focal[0]
+    return True
+
+
+@compiled
+def add_flow(cameras: Cameras, bounds: Integers, flow: Flow, equations: NormalEquations) -> float:
+    """Add followed points to the normal equations and return their cost; see `add_points`.
+
+    Args:
+        cameras: of all frames.
+        bounds: (frames + 1,) of the points by their first frame.
+        flow: followed points, sorted by frame.
+        equations: added to.
+    """
+    principal, focal = cameras.principal_point, cameras.focal
+    rotation, distortion = cameras.rotation, cameras.distortion
+    start, end, deviation = flow.start, flow.end, flow.deviation
+    weight, loss = flow.weight, flow.loss
+    blocks, border, corner = equations.blocks, equations.border, equations.corner
+    right, right_corner = equations.right, equations.right_corner
+    cost = 0.0
+    limit = loss * loss
+    pixel, rows = np.empty(2), np.empty((2, 16))
+    normal, gradient = np.empty((16, 16)), np.empty(16)
+    for t in range(len(focal) - 1):
+        if bounds[t] == bounds[t + 1]:
+            continue
+        normal[:] = 0.0
+        gradient[:] = 0.0
+        two = slice(t, t + 2)
+        for i in range(bounds[t], bounds[t + 1]):
+            if not flow_row(
+                principal, focal[two], rotation[two], distortion[two], start[i], pixel, rows
+            ):
+                cost += 0.5 * weight * min(limit, 1e12)
+                continue
+            scale = 1.0 / deviation[i]
+            u, v = scale * (pixel[0] - end[i, 0]), scale * (pixel[1] - end[i, 1])
+            squared = u * u + v * v
+            share = limit / (limit + squared) if limit < np.inf else 1.0
+            cost += 0.5 * weight * squared * share
+            factor = weight * share * share * scale
+            for j in range(16):
+                p, q = factor * rows[0, j], factor * rows[1, j]
+                gradient[j] += p * u + q * v
+                p, q = scale * p, scale * q
+                for m in range(j + 1):
+                    normal[j, m] += p * rows[0, m] + q * rows[1, m]
+        for j in range(7):
+            right[t, j] += gradient[j]
+            right[t + 1, j] += gradient[7 + j]
+            for m in range(7):
+                high, low = max(j, m), min(j, m)
+                blocks[0, t, j, m] += normal[high, low]
+                blocks[0, t + 1, j, m] += normal[7 + high, 7 + low]
+                blocks[1, t, j, m] += normal[7 + j, m]
+            for m in range(2):
+                border[t, j, 3 + m] += normal[14 + m, j]
+                border[t + 1, j, 3 + m] += normal[14 + m, 7 + j]
+        for j in range(2):
+            right_corner[3 + j] += gradient[14 + j]
+            for m in range(2):
+                corner[3 + j, 3 + m] += normal[14 + max(j, m), 14 + min(j, m)]
     return cost

@@ -11,22 +11,20 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Integers
 from data_contracts.broadcast_calibration import FRAME_STATUS
-from worldpose.broadcast_calibration.chain import Chain
 from worldpose.broadcast_calibration.evidence import (
     MARKING,
     PLAYER,
     FlowEvidence,
     PointEvidence,
 )
-from worldpose.broadcast_calibration.feed_offset import FeedOffset
-from worldpose.broadcast_calibration.fit import misses, pixels_off
 from worldpose.broadcast_calibration.key_frames import Keys
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.normal_equations import point_row
-from worldpose.broadcast_calibration.players import Matches
+from worldpose.broadcast_calibration.players import FeedOffset, Matches
+from worldpose.broadcast_calibration.priors import Weights
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
+from worldpose.broadcast_calibration.tracking import Chain
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
-from worldpose.broadcast_calibration.weights import Weights
 from worldpose.pitch import PitchTemplate
 
 _FEW_LINES: Final = 30
@@ -88,55 +86,78 @@ class BroadcastReport:
     reasons: tuple[str, ...]
 
 
-def report_of(
-    camera: MovingCamera,
-    before: MovingCamera,
-    uncertainty: Uncertainty,
-    points: PointEvidence,
-    flow: FlowEvidence,
-    keys: Keys,
-    links: Chain,
-    matches: Matches | None,
-    weights: Weights,
+@dataclass(frozen=True, eq=False)
+class TrackedClip:
+    """A clip before refinement: its key frames, and the chain of cameras between them.
+
+    Attributes:
+        keys: calibrated key frames.
+        chain: an initial camera for every frame.
+        flow: followed points consistent with the chain.
+    """
+
+    keys: Keys
+    chain: Chain
+    flow: FlowEvidence
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """The joint fit of all frames, and what it rests on.
+
+    Attributes:
+        camera: all frames.
+        before: all frames before players and the joint fit.
+        uncertainty: covariance of `camera`.
+        points: evidence of the fit.
+        matches: players; None without.
+        weights: of the terms.
+        feed_offset: the clip's clock offset; None without people.
+    """
+
+    camera: MovingCamera
+    before: MovingCamera
+    uncertainty: Uncertainty
+    points: PointEvidence
+    matches: Matches | None
+    weights: Weights
+    feed_offset: FeedOffset | None
+
+
+def report_calibration(
+    tracked: TrackedClip,
+    fit: JointFit,
     pitch: PitchTemplate,
     settings: BroadcastCalibrationSettings,
-    offset: FeedOffset | None,
     first: int,
 ) -> BroadcastReport:
     """Return the report of a calibrated clip.
 
     Args:
-        camera: all frames.
-        before: all frames before players and the joint fit.
-        uncertainty: covariance of `camera`.
-        points: evidence of the fit.
-        flow: followed points of the fit.
-        keys: its key frames.
-        links: the chain of tracked cameras.
-        matches: players; None without.
-        weights: of the terms.
+        tracked: key frames, tracked cameras and followed points.
+        fit: the joint fit.
         pitch: the template.
         settings: thresholds.
-        offset: the clip's clock offset; None without people.
         first: number of the clip's first frame in its video, for messages.
     """
+    camera, points, keys, links = fit.camera, fit.points, tracked.keys, tracked.chain
     frames = len(camera)
     off, across = _residuals(camera, points)
     lines, players = points.kind == MARKING, points.kind == PLAYER
     agree = across < points.loss
     line_count = np.bincount(points.frame[lines & agree], minlength=frames)
     player_count = np.zeros(frames, dtype=np.int64)
-    if matches is not None:
-        player_count = np.bincount(matches.frame, minlength=frames)
-    flow_count = np.bincount(flow.frame, minlength=frames)
-    expected = expected_errors(camera, uncertainty, pitch)
+    if fit.matches is not None:
+        player_count = np.bincount(fit.matches.frame, minlength=frames)
+    flow_count = np.bincount(tracked.flow.frame, minlength=frames)
+    expected = expected_errors(camera, fit.uncertainty, pitch)
     status = np.full(frames, FRAME_STATUS.index("bridged"), dtype=np.uint8)
     linked = np.append(links.determined, False) | np.append(False, links.determined)
     status[linked] = FRAME_STATUS.index("followed")
     status[player_count >= _FEW_PLAYERS] = FRAME_STATUS.index("players")
     status[line_count >= _FEW_LINES] = FRAME_STATUS.index("lines")
     status[keys.frames] = FRAME_STATUS.index("key_frame")
-    earlier, later = misses(before, points), misses(camera, points)
+    earlier, later = median_residuals(fit.before, points), median_residuals(camera, points)
     reasons = []
     share = float(np.mean(expected > settings.weak_error))
     if share > 0.05:
@@ -154,11 +175,11 @@ def report_of(
         for frame, names in keys.wrong.items()
     ]
     decisions = [
-        f"a followed point counts {weights.flow_share:.2g} of its loss, as tracking drifts",
-        f"errors of a person last {weights.player_frames:.1f} frames",
+        f"a followed point counts {fit.weights.flow_share:.2g} of its loss, as tracking drifts",
+        f"errors of a person last {fit.weights.player_frames:.1f} frames",
     ]
-    if offset is not None:
-        clock, late = _said_of(offset, settings)
+    if fit.feed_offset is not None:
+        clock, late = _describe_offset(fit.feed_offset, settings)
         decisions += [] if late else [clock]
         reasons += [clock] if late else []
     return BroadcastReport(
@@ -173,9 +194,9 @@ def report_of(
         refused=keys.refused,
         wrong=keys.wrong,
         drift=links.drift,
-        feed_offset=offset,
-        weights=weights,
-        pick_next=_picks(expected),
+        feed_offset=fit.feed_offset,
+        weights=fit.weights,
+        pick_next=_select_picks(expected),
         markings_off=(earlier[0], later[0]),
         players_off=(earlier[1], later[1]),
         decisions=tuple(decisions),
@@ -198,48 +219,41 @@ def expected_errors(camera: MovingCamera, uncertainty: Uncertainty, pitch: Pitch
     with np.errstate(invalid="ignore"):
         inside = np.asarray(((seen >= 0.0) & (seen <= [width - 1.0, height - 1.0])).all(axis=-1))
     for frame in np.flatnonzero(inside.any(axis=1)):
-        total, count = 0.0, 0
+        total, count, lens = 0.0, 0, camera.lens(int(frame))
         # A dozen places suffice for a frame's mean.
         chosen = np.flatnonzero(inside[frame])
         for place in places[chosen[:: max(1, len(chosen) // 12)]]:
-            if point_row(
-                camera.rotation[frame],
-                camera.center,
-                camera.principal_point,
-                camera.focal[frame],
-                camera.distortion[frame],
-                place,
-                pixel,
-                rows,
-            ):
+            if point_row(camera.rotation[frame], camera.center, lens, place, pixel, rows):
                 total += float(np.trace(rows @ uncertainty.frame[frame] @ rows.T))
                 count += 1
         expected[frame] = np.sqrt(total / max(count, 1))
     return expected
 
 
-def _said_of(offset: FeedOffset, settings: BroadcastCalibrationSettings) -> tuple[str, bool]:
+def _describe_offset(
+    offset: FeedOffset, settings: BroadcastCalibrationSettings
+) -> tuple[str, bool]:
     """Return a sentence on the clip's clock offset, and whether a person must review it."""
     if not offset.determined:
-        return "the feed's offset in time cannot be told from how people move", False
-    said = (
-        f"the pictures show people as they are {abs(offset.frames):.2f} frames "
-        f"{'later' if offset.frames > 0.0 else 'earlier'} in the static cameras, to "
-        f"{offset.standard_error:.2f} frames"
+        return "the motion of people does not determine the clock offset of the feed", False
+    sentence = (
+        f"the clip shows people as they are {abs(offset.frames):.2f} frames "
+        f"{'later' if offset.frames > 0.0 else 'earlier'} in the static cameras, with a standard "
+        f"error of {offset.standard_error:.2f} frames"
     )
     if settings.feed_offset == "correct":
-        return f"{said}: corrected", False
+        return f"{sentence}: corrected", False
     beyond = abs(offset.frames) - 2.0 * offset.standard_error > _LATE
     todo = (
         f": lower the clip's broadcast_offset_frames by {offset.frames:.2f}, or set "
         "broadcast_calibration.feed_offset=correct"
     )
-    return said + (todo if beyond else ""), beyond
+    return sentence + (todo if beyond else ""), beyond
 
 
 def _residuals(camera: MovingCamera, points: PointEvidence) -> tuple[Floats, Floats]:
     """Return residuals (n,) in pixels (lines: across them) and in standard deviations (n,)."""
-    off = np.clip(pixels_off(camera, points), -1e6, 1e6)
+    off = np.clip(pixel_residuals(camera, points), -1e6, 1e6)
     white = np.linalg.norm(np.einsum("nij,nj->ni", points.whitening, off), axis=-1)
     scale = np.linalg.norm(points.whitening[:, 0], axis=-1)
     return white / np.maximum(scale, 1e-12), white
@@ -251,7 +265,7 @@ def _rms(off: Floats, points: PointEvidence, chosen: NDArray[np.bool_], frames: 
     return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
 
 
-def _picks(expected: Floats) -> tuple[int, ...]:
+def _select_picks(expected: Floats) -> tuple[int, ...]:
     """Return the frames of largest expected error, at a distance from one another."""
     left = np.where(np.isfinite(expected), expected, -1.0)
     apart = max(1, len(expected) // (2 * _PICKS))
@@ -261,3 +275,43 @@ def _picks(expected: Floats) -> tuple[int, ...]:
         picks.append(best)
         left[max(0, best - apart) : best + apart + 1] = -1.0
     return tuple(picks)
+
+
+def pixel_residuals(camera: MovingCamera, points: PointEvidence) -> Floats:
+    """Return projected minus observed pixels (n, 2); infinite where there is no projection."""
+    off = np.full((len(points), 2), np.inf)
+    for frame in np.unique(points.frame):
+        mine = np.flatnonzero(points.frame == frame)
+        single = camera.frames(slice(int(frame), int(frame) + 1)).camera[0]
+        off[mine] = single.project(points.world[mine]) - points.image[mine]
+    return np.where(np.isfinite(off), off, np.inf)
+
+
+def median_residuals(camera: MovingCamera, points: PointEvidence) -> tuple[float, float]:
+    """Return the median residuals of markings and of people [px]; NaN without any.
+
+    Residuals of painted lines are distances across them, of inliers. Residuals of people are means
+    over a person's keypoints per frame, which average out keypoint errors but not camera errors.
+
+    Args:
+        camera: all frames.
+        points: the evidence.
+    """
+    off = pixel_residuals(camera, points)
+    lines = points.kind == MARKING
+    with np.errstate(invalid="ignore"):
+        white = np.abs(np.einsum("nj,nj->n", points.whitening[lines, 0], off[lines]))
+    across = white / np.linalg.norm(points.whitening[lines, 0], axis=-1)
+    across = across[white < points.loss[lines]]
+    people = np.flatnonzero((points.kind == PLAYER) & np.isfinite(off).all(axis=-1))
+    # Keypoints with gross errors say nothing about the camera.
+    far = np.linalg.norm(off[people] * points.whitening[people][:, [0, 1], [0, 1]], axis=-1)
+    people = people[far < 2.0 * points.loss[people]]
+    key = np.column_stack([points.frame[people], points.source[people]])
+    _, person, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(person.ravel(), off[people, axis]) for axis in range(2)], axis=-1)
+    beside = np.linalg.norm(sums[: len(count)] / count[:, None], axis=-1)
+    return (
+        float(np.median(across)) if len(across) else float("nan"),
+        float(np.median(beside)) if len(beside) else float("nan"),
+    )

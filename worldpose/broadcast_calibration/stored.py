@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from data_contracts.broadcast_calibration import FRAME_STATUS
-from worldpose.broadcast_calibration.calibrating import BroadcastCalibration
+from worldpose.broadcast_calibration.calibration import BroadcastCalibration
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
 from worldpose.geometry import Camera

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
+from scipy.special import chdtri
 
 from data_contracts.arrays import Floats, Integers
 from worldpose.broadcast_calibration.evidence import CLICK, PLAYER
-from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE
-from worldpose.broadcast_calibration.normal_equations import point_row
-from worldpose.broadcast_calibration.solving import Problem, Solution
+from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
+from worldpose.broadcast_calibration.normal_equations import Cameras, Lens, Points, point_row
+from worldpose.broadcast_calibration.solver import Problem, Solution
 from worldpose.compiled import compiled
 from worldpose.errors import DegenerateError
 from worldpose.geometry.optimize.banded import BandedFactor
@@ -41,7 +43,7 @@ class Uncertainty:
         return np.asarray(self.frame[0, FRAME_SIZE:, FRAME_SIZE:])
 
 
-def uncertainty_of(
+def compute_uncertainty(
     solution: Solution,
     problem: Problem,
     line_shift: float = 0.0,
@@ -70,7 +72,7 @@ def uncertainty_of(
     Raises:
         DegenerateError: the system is singular.
     """
-    system = solution.equations
+    system = solution.equations.system
     factor = BandedFactor.of(system.blocks)
     if not factor.determined:
         raise DegenerateError(
@@ -85,10 +87,10 @@ def uncertainty_of(
     whole = np.empty((len(by_shared), FRAME_SIZE + CLIP_SIZE, FRAME_SIZE + CLIP_SIZE))
     whole[:, :FRAME_SIZE, :FRAME_SIZE] = factor.inverse_blocks()
     whole[:, :FRAME_SIZE, :FRAME_SIZE] += by_shared @ shared @ np.swapaxes(by_shared, -1, -2)
-    pulls, rest = _left_pulls(solution, problem, count, line_shift, player_shift)
-    bent = _bends(problem, len(by_shared), smooth_frames)
+    gradients, rest = _lasting_gradients(solution, problem, count, line_shift, player_shift)
+    bent = _lens_gradients(problem, len(by_shared), smooth_frames)
     rest = np.concatenate([rest, np.zeros((count, bent.shape[2]))], axis=1)
-    own = factor.solve(np.concatenate([pulls, bent], axis=2))
+    own = factor.solve(np.concatenate([gradients, bent], axis=2))
     rest = shared @ (rest - flat.T @ own.reshape(len(flat), -1))
     moved = np.concatenate(
         [own - by_shared @ rest, np.broadcast_to(rest, (len(own), *rest.shape))], axis=1
@@ -105,7 +107,7 @@ def uncertainty_of(
     return Uncertainty(0.5 * (whole + np.swapaxes(whole, -1, -2)))
 
 
-def _left_pulls(
+def _lasting_gradients(
     solution: Solution, problem: Problem, shared: int, line_shift: float, player_shift: float
 ) -> tuple[Floats, Floats]:
     """Return the gradients (frames, 7, n) and (shared, n) of each lasting error at the solution.
@@ -124,27 +126,14 @@ def _left_pulls(
     people = points.kind[chosen] == PLAYER
     deviation = 1.0 / np.maximum(np.linalg.norm(points.whitening[chosen, 0], axis=-1), 1e-12)
     shift = np.where(people, player_shift * deviation, line_shift)
-    _add_pulls(
-        camera.center,
-        camera.principal_point,
-        camera.focal,
-        camera.rotation,
-        camera.distortion,
+    clusters = _Clusters(
         points.frame[chosen],
-        points.world[chosen],
-        points.image[chosen],
-        points.whitening[chosen],
-        points.weight[chosen],
-        points.loss[chosen],
-        problem.ends[chosen],
-        points.shares[chosen],
-        solution.beside,
         cluster.astype(np.int64).ravel(),
         shift,
         len(sources) + 2 * people.astype(np.int64),
-        by_frame,
-        by_shared,
     )
+    evidence = points[chosen].arrays(problem.ends[chosen])
+    _add_gradients(camera.arrays, evidence, solution.beside, clusters, by_frame, by_shared)
     together = np.flatnonzero(sources[:, 0] == PLAYER)
     by_frame, by_shared = (
         np.concatenate([each, each[..., together].sum(axis=-1, keepdims=True)], axis=-1)
@@ -155,7 +144,7 @@ def _left_pulls(
     return by_frame, by_shared
 
 
-def _bends(problem: Problem, frames: int, lasting: float) -> Floats:
+def _lens_gradients(problem: Problem, frames: int, lasting: float) -> Floats:
     """Return the gradients (frames, 7, n) of common errors of second differences.
 
     One column per lens parameter and interval of about `lasting` frames, for an error of one
@@ -180,32 +169,32 @@ def _bends(problem: Problem, frames: int, lasting: float) -> Floats:
     return bends.reshape(frames, FRAME_SIZE, -1)
 
 
+class _Clusters(NamedTuple):
+    """Assignment of points to lasting errors."""
+
+    frame: Integers
+    """(n,) frame of each point."""
+    column: Integers
+    """(n,) column of the point's own error."""
+    shift: Floats
+    """(n,) common shift [px]."""
+    shift_column: Integers
+    """(n,) column of a shift along x; the next is along y."""
+
+
 @compiled
-def _add_pulls(
-    center: Floats,
-    principal: Floats,
-    focal: Floats,
-    rotation: Floats,
-    distortion: Floats,
-    frame: Integers,
-    world: Floats,
-    image: Floats,
-    whitening: Floats,
-    weight: Floats,
-    loss: Floats,
-    ends: Integers,
-    shares: Floats,
+def _add_gradients(
+    cameras: Cameras,
+    points: Points,
     beside: Floats,
-    cluster: Integers,
-    shift: Floats,
-    common: Integers,
+    clusters: _Clusters,
     by_frame: Floats,
     by_shared: Floats,
 ) -> None:
-    """Add every point's gradient to its cluster's columns; arguments as `add_points`.
-
-    The columns `common` (n,) and the next get a shift [px] of the points (n,) along x and y.
-    """
+    """Add every point's gradient to the columns of its lasting errors; see `add_points`."""
+    world, image, whitening = points.world, points.image, points.whitening
+    weight, loss, ends, shares = points.weight, points.loss, points.ends, points.shares
+    frame, shift = clusters.frame, clusters.shift
     pixel, rows, place = np.empty(2), np.empty((2, 12)), np.empty(3)
     for i in range(len(frame)):
         t = frame[i]
@@ -213,25 +202,24 @@ def _add_pulls(
         for end in range(2):
             if ends[i, end] >= 0:
                 place += shares[i, end] * beside[ends[i, end]]
-        if not point_row(
-            rotation[t], center, principal, focal[t], distortion[t], place, pixel, rows
-        ):
+        lens = Lens(cameras.principal_point, cameras.focal[t], cameras.distortion[t])
+        if not point_row(cameras.rotation[t], cameras.center, lens, place, pixel, rows):
             continue
         u, v = pixel[0] - image[i, 0], pixel[1] - image[i, 1]
         one = whitening[i, 0, 0] * u + whitening[i, 0, 1] * v
         two = whitening[i, 1, 0] * u + whitening[i, 1, 1] * v
-        pull = weight[i] / (1.0 + (one * one + two * two) / loss[i] ** 2) ** 2
+        factor = weight[i] / (1.0 + (one * one + two * two) / loss[i] ** 2) ** 2
         for source in range(3):
             # The residual, or a shift along x, or along y, in standard deviations.
             if source == 0:
-                column, e, f = cluster[i], one, two
+                column, e, f = clusters.column[i], one, two
             else:
-                column = common[i] + source - 1
+                column = clusters.shift_column[i] + source - 1
                 e = shift[i] * whitening[i, 0, source - 1]
                 f = shift[i] * whitening[i, 1, source - 1]
             # Gradient by the pixel, x and y.
-            x = pull * (e * whitening[i, 0, 0] + f * whitening[i, 1, 0])
-            y = pull * (e * whitening[i, 0, 1] + f * whitening[i, 1, 1])
+            x = factor * (e * whitening[i, 0, 0] + f * whitening[i, 1, 0])
+            y = factor * (e * whitening[i, 0, 1] + f * whitening[i, 1, 1])
             for j in range(7):
                 by_frame[t, j, column] += x * rows[0, j] + y * rows[1, j]
             for j in range(5):
@@ -241,3 +229,65 @@ def _add_pulls(
                     for j in range(3):
                         moved = -(x * rows[0, 7 + j] + y * rows[1, 7 + j]) * shares[i, end]
                         by_shared[5 + 3 * ends[i, end] + j, column] += moved
+
+
+_UNLIKELY = 1e-3
+"""Significance level of the test that clips have one center [1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class PooledCenter:
+    """Common camera center of several clips.
+
+    Attributes:
+        center: (3,) [m], world; NaN if the clips are inconsistent.
+        covariance: (3, 3) [m^2].
+        agree: whether one center explains all clips.
+        distance: (clips,) Mahalanobis distance of each clip from the common center.
+    """
+
+    center: Floats
+    covariance: Floats
+    agree: bool
+    distance: Floats
+
+
+def pool_centers(centers: Sequence[Floats], covariances: Sequence[Floats]) -> PooledCenter:
+    """Return the covariance-weighted mean of several clips' centers.
+
+    Args:
+        centers: (3,) each [m], world.
+        covariances: (3, 3) each [m^2].
+    """
+    information = [np.linalg.inv(covariance) for covariance in covariances]
+    whole = np.linalg.inv(np.sum(information, axis=0))
+    middle = whole @ np.sum([i @ c for i, c in zip(information, centers, strict=True)], axis=0)
+    squared = np.array(
+        [(c - middle) @ i @ (c - middle) for c, i in zip(centers, information, strict=True)]
+    )
+    freedom = 3 * (len(centers) - 1)
+    agree = freedom == 0 or bool(squared.sum() < chdtri(freedom, _UNLIKELY))
+    nothing = np.full(3, np.nan)
+    return PooledCenter(middle if agree else nothing, np.asarray(whole), agree, np.sqrt(squared))
+
+
+def drawn_to(
+    camera: MovingCamera, uncertainty: Uncertainty, pooled: PooledCenter
+) -> tuple[MovingCamera, Uncertainty]:
+    """Return a clip's cameras conditioned on the pooled center, and their covariance.
+
+    Rotation, focal length and distortion follow the center by their covariance with it.
+
+    Args:
+        camera: all frames of the clip.
+        uncertainty: its covariance.
+        pooled: common center of consistent clips, this clip included.
+    """
+    known = uncertainty.frame
+    place = slice(FRAME_SIZE, FRAME_SIZE + 3)
+    along = known[:, :, place] @ np.linalg.inv(known[:, place, place])
+    step = along @ (pooled.center - camera.center)
+    moved = camera.stepped(step[:, :FRAME_SIZE], step[0, FRAME_SIZE:])
+    gained = known[:, place, place] - pooled.covariance
+    left = known - along @ gained @ np.swapaxes(along, -1, -2)
+    return moved, Uncertainty(0.5 * (left + np.swapaxes(left, -1, -2)))

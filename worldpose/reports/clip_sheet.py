@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.broadcast_calibration.programme import Shot
+from worldpose.broadcast_calibration.shots import Shot
 
 _SHOWN: Final = 5
 """Frames per clip, in order and evenly spaced."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from worldpose.broadcast_calibration import MovingCamera, People, calibrate_broadcast
+from worldpose.broadcast_calibration import BroadcastClip, MovingCamera, People, calibrate_broadcast
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.broadcast_rendering import render_broadcast
 from worldpose.simulation.key_frames import click_key_frames
@@ -45,10 +45,7 @@ def test_a_clip_with_lines_and_players_is_known_to_centimetres_and_pixels(name):
     )
     found = calibrate_broadcast(
         PitchTemplate.from_spec(scene.surveyed),
-        keys,
-        lambda: iter(pictures),
-        scenario.fps,
-        people=people,
+        BroadcastClip(keys, lambda: iter(pictures), scenario.fps, people=people),
     )
     true = MovingCamera.of(truth, truth.center[0], truth.principal_point[0])
     camera = found.camera

@@ -7,21 +7,17 @@ import pytest
 import turning_clip as clip
 
 from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence
-from worldpose.broadcast_calibration.flow_equations import flow_row, undistorted
-from worldpose.broadcast_calibration.normal_equations import point_row
-from worldpose.broadcast_calibration.priors import prior_of
+from worldpose.broadcast_calibration.normal_equations import flow_row, point_row, undistorted
+from worldpose.broadcast_calibration.priors import build_prior
 from worldpose.broadcast_calibration.settings import BroadcastPrior
-from worldpose.broadcast_calibration.solving import Problem, equations_at
+from worldpose.broadcast_calibration.solver import Problem, equations_at
 
 POINT = np.array([6.0, -9.0, 1.2])
 
 
 def pixel_and_rows(camera, point=POINT):
     image, rows = np.empty(2), np.empty((2, 12))
-    lens = camera.focal[0], camera.distortion[0]
-    assert point_row(
-        camera.rotation[0], camera.center, camera.principal_point, *lens, point, image, rows
-    )
+    assert point_row(camera.rotation[0], camera.center, camera.lens(0), point, image, rows)
     return image, rows
 
 
@@ -37,10 +33,7 @@ def test_a_point_behind_the_camera_has_no_pixel():
     camera = clip.moving(2)
     image, rows = np.empty(2), np.empty((2, 12))
     behind = camera.center - camera.rotation[0, 2]
-    lens = camera.focal[0], camera.distortion[0]
-    assert not point_row(
-        camera.rotation[0], camera.center, camera.principal_point, *lens, behind, image, rows
-    )
+    assert not point_row(camera.rotation[0], camera.center, camera.lens(0), behind, image, rows)
 
 
 @pytest.mark.parametrize("number", range(12))
@@ -104,7 +97,7 @@ def test_the_gradient_is_the_slope_of_the_cost():
     problem = Problem(
         robust,
         flow,
-        prior_of(BroadcastPrior(), true.focal, true.image_size),
+        build_prior(BroadcastPrior(), true.focal, true.image_size),
         np.array([np.inf] * 3 + [1e-3, 1e-2, 1e-2, 1e-2]),
         0.7,
         2.0,
@@ -119,16 +112,18 @@ def test_the_gradient_is_the_slope_of_the_cost():
         equations_at(camera.stepped(by * step, by * shared), beside + by * paint, problem).cost
         for by in (size, -size)
     )
-    slope = float((here.right * step).sum() + here.right_corner @ [*shared, *paint.ravel()])
+    slope = float(
+        (here.system.right * step).sum() + here.system.right_corner @ [*shared, *paint.ravel()]
+    )
     # Differences of a cost of 1e3 known to 1e-13, over 2e-8; the slope is 1e5.
     assert (ahead - behind) / (2.0 * size) == pytest.approx(slope, rel=1e-5)
 
 
 def test_evidence_of_nothing_costs_nothing():
     camera = clip.moving(3)
-    prior = prior_of(BroadcastPrior(), camera.focal, camera.image_size)
+    prior = build_prior(BroadcastPrior(), camera.focal, camera.image_size)
     problem = Problem(PointEvidence.none(), FlowEvidence.none(), prior)
     bare = equations_at(camera, np.zeros((0, 3)), problem)
     # What is left is the prior's: 5 numbers of the clip, 4 of each frame.
-    assert np.count_nonzero(bare.blocks[0].diagonal(axis1=1, axis2=2)) == 3 * 4
-    assert not bare.border.any()
+    assert np.count_nonzero(bare.system.blocks[0].diagonal(axis1=1, axis2=2)) == 3 * 4
+    assert not bare.system.border.any()

@@ -7,14 +7,18 @@ import pytest
 import turning_clip as clip
 from scipy.optimize import least_squares
 
-from worldpose.broadcast_calibration.adam import descend
-from worldpose.broadcast_calibration.evidence import PLAYER, FlowEvidence, PointEvidence, together
+from worldpose.broadcast_calibration.evidence import (
+    PLAYER,
+    FlowEvidence,
+    ObservedPoints,
+    PointEvidence,
+    together,
+)
 from worldpose.broadcast_calibration.normal_equations import point_row
-from worldpose.broadcast_calibration.priors import prior_of
+from worldpose.broadcast_calibration.priors import build_prior, correlation_time
 from worldpose.broadcast_calibration.settings import BroadcastPrior
-from worldpose.broadcast_calibration.solving import Problem, solve
-from worldpose.broadcast_calibration.uncertainty import uncertainty_of
-from worldpose.broadcast_calibration.weights import lasting_of
+from worldpose.broadcast_calibration.solver import Problem, descend, solve
+from worldpose.broadcast_calibration.uncertainty import compute_uncertainty
 from worldpose.errors import DegenerateError
 
 SMOOTH = np.array([np.inf] * 3 + [1e-4, 1e-3, 1e-2, 1e-2])
@@ -24,7 +28,7 @@ def problem_of(true, rng, frames=None, noise=0.3, smooth=SMOOTH):
     points = clip.ground_points(true, rng, noise=noise)
     if frames is not None:
         points = points[np.isin(points.frame, frames)]
-    prior = prior_of(BroadcastPrior(), true.focal, true.image_size)
+    prior = build_prior(BroadcastPrior(), true.focal, true.image_size)
     return Problem(points, clip.followed_points(true, rng), prior, smooth, 1.0, np.inf)
 
 
@@ -58,7 +62,7 @@ def test_noisy_evidence_gives_the_camera_within_its_covariance():
         rng = np.random.default_rng(seed)
         problem = problem_of(true, rng)
         solution = solve(off(true, rng), problem, 40)
-        covariance = uncertainty_of(solution, problem).clip[:3, :3]
+        covariance = compute_uncertainty(solution, problem).clip[:3, :3]
         gone = solution.camera.center - true.center
         ratios.append(gone @ np.linalg.solve(covariance, gone) / 3.0)
     # Errors that do not last: the covariance is too wide by two. Chi-square of 36 over 36 lies
@@ -69,10 +73,7 @@ def test_noisy_evidence_gives_the_camera_within_its_covariance():
 def place_covariance(camera, uncertainty, place, frame=10):
     """Covariance of a place in one frame's picture [px^2]."""
     pixel, rows = np.empty(2), np.empty((2, 12))
-    lens = camera.focal[frame], camera.distortion[frame]
-    point_row(
-        camera.rotation[frame], camera.center, camera.principal_point, *lens, place, pixel, rows
-    )
+    point_row(camera.rotation[frame], camera.center, camera.lens(frame), place, pixel, rows)
     return rows @ uncertainty.frame[frame] @ rows.T
 
 
@@ -83,7 +84,7 @@ def test_a_shift_of_all_lines_moves_what_the_camera_shows_by_as_much():
     solution = solve(true, problem, 20)
     place = np.array([1.0, -3.0, 0.0])
     exact, shifted = (
-        place_covariance(solution.camera, uncertainty_of(solution, problem, shift), place)
+        place_covariance(solution.camera, compute_uncertainty(solution, problem, shift), place)
         for shift in (0.0, 0.2)
     )
     # The camera goes along with its lines; priors hold it back by some percent.
@@ -100,7 +101,7 @@ def test_a_shift_of_all_keypoints_moves_what_the_camera_shows_by_as_much():
     solution = solve(true, problem, 20)
     place = np.array([1.0, -3.0, 0.0])
     exact, shifted = (
-        place_covariance(solution.camera, uncertainty_of(solution, problem, 0.0, shift), place)
+        place_covariance(solution.camera, compute_uncertainty(solution, problem, 0.0, shift), place)
         for shift in (0.0, 0.25)
     )
     deviation = 1.0 / np.linalg.norm(people.whitening[0, 0])
@@ -115,9 +116,9 @@ def test_a_lens_that_bends_evenly_widens_the_region_by_what_its_stretches_carry(
     problem = replace(problem_of(true, rng), flow=FlowEvidence.none())
     solution = solve(true, problem, 20)
     by_chance, evenly = (
-        uncertainty_of(solution, problem, smooth_frames=length).frame for length in (1.0, 3.0)
+        compute_uncertainty(solution, problem, smooth_frames=length).frame for length in (1.0, 3.0)
     )
-    system = solution.equations
+    system = solution.equations.system
     whole = np.zeros((61, 61))
     for below in range(3):
         for t in range(8 - below):
@@ -147,11 +148,11 @@ def test_bends_last_as_long_as_zooming_does():
     waves = np.exp(0.3 * np.sin(2.0 * np.pi * np.arange(1000) / 200.0))
     zooming = replace(true, focal=2000.0 * waves)
     # The autocorrelation of a wave of 200 frames falls to nothing in 50: twice 200 over 2 pi.
-    assert lasting_of(zooming, 50.0) == pytest.approx(64.0, rel=0.1)
+    assert correlation_time(zooming, 50.0) == pytest.approx(64.0, rel=0.1)
     jitter = 1.0 + 1e-4 * np.random.default_rng(14).standard_normal(1000)
     # Jitter is evened over 10 frames, and its second differences turn about within these.
-    assert lasting_of(replace(true, focal=2000.0 * jitter), 50.0) < 10.0
-    assert lasting_of(true.frames(slice(0, 20)), 50.0) == 1.0
+    assert correlation_time(replace(true, focal=2000.0 * jitter), 50.0) < 10.0
+    assert correlation_time(true.frames(slice(0, 20)), 50.0) == 1.0
 
 
 def test_people_who_all_err_alike_widen_the_region():
@@ -165,11 +166,22 @@ def test_people_who_all_err_alike_widen_the_region():
         pixels = [true.camera[t].project(world[frame == t]) for t in range(20)]
         image = np.concatenate(pixels) + rng.standard_normal((1200, 2)) + [0.0, bias]
         people = PointEvidence.at_points(
-            frame, world, image, np.ones(1200), 1.0, np.inf, PLAYER, np.arange(1200) % 60 // 10
+            ObservedPoints(
+                frame=frame,
+                world=world,
+                image=image,
+                kind=PLAYER,
+                source=np.arange(1200) % 60 // 10,
+            ),
+            np.ones(1200),
+            1.0,
+            np.inf,
         )
         problem = replace(problem, points=together([problem.points, people]))
         solution = solve(true, problem, 20)
-        covariance = place_covariance(solution.camera, uncertainty_of(solution, problem), place)
+        covariance = place_covariance(
+            solution.camera, compute_uncertainty(solution, problem), place
+        )
         off = solution.camera.camera[10].project(place[None]) - true.camera[10].project(place[None])
         spreads.append(float(np.sqrt(covariance[1, 1])))
         # Four deviations: the place errs by a part of the bias, and the lines say so.
@@ -261,7 +273,7 @@ def test_what_is_held_is_known_exactly_and_the_rest_within_its_covariance():
         solution = solve(
             true.stepped(1e-3 * rng.standard_normal((12, 7)) * ~held, np.zeros(5)), problem, 30
         )
-        uncertainty = uncertainty_of(solution, problem)
+        uncertainty = compute_uncertainty(solution, problem)
         variance = np.diagonal(uncertainty.frame, axis1=1, axis2=2)
         np.testing.assert_array_equal(
             variance == 0.0, np.pad(held, ((0, 0), (0, 5)), constant_values=True)
@@ -288,6 +300,6 @@ def test_adam_goes_down_the_same_cost_and_stays_above():
 
 def test_a_frame_with_neither_evidence_nor_prior_is_named_as_undetermined():
     true = clip.moving(4)
-    prior = prior_of(BroadcastPrior(), true.focal, true.image_size)
+    prior = build_prior(BroadcastPrior(), true.focal, true.image_size)
     with pytest.raises(DegenerateError, match="neither evidence nor prior"):
         solve(true, Problem(PointEvidence.none(), FlowEvidence.none(), prior), 5)

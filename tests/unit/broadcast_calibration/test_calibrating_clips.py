@@ -14,6 +14,7 @@ from data_contracts.broadcast_calibration import (
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
 from worldpose.broadcast_calibration import (
     BroadcastCalibrationSettings,
+    BroadcastClip,
     People,
     broadcast_arrays,
     broadcast_attributes,
@@ -86,7 +87,9 @@ def place_errors(camera, true):
 @pytest.fixture(scope="module")
 def calibrated(true, pictures):
     keys = [clicks(true, 3), clicks(true, 12)]
-    return calibrate_broadcast(clip.PITCH, keys, lambda: iter(pictures), FPS, settings=SETTINGS)
+    return calibrate_broadcast(
+        clip.PITCH, BroadcastClip(keys, lambda: iter(pictures), FPS), SETTINGS
+    )
 
 
 def test_two_key_frames_give_every_frame(calibrated, true):
@@ -133,7 +136,7 @@ def test_a_stored_camera_comes_back_with_its_covariance(calibrated):
 
 def test_one_key_frame_is_still_usable(true, pictures):
     found = calibrate_broadcast(
-        clip.PITCH, [clicks(true, 8)], lambda: iter(pictures), FPS, settings=SETTINGS
+        clip.PITCH, BroadcastClip([clicks(true, 8)], lambda: iter(pictures), FPS), SETTINGS
     )
     assert np.median(place_errors(found.camera, true)) < 1.0
 
@@ -141,7 +144,7 @@ def test_one_key_frame_is_still_usable(true, pictures):
 def test_frames_without_lines_are_carried_by_what_stands_still(true, pictures, bare):
     mixed = [*pictures[:5], *bare[5:12], *pictures[12:]]
     keys = [clicks(true, 3), clicks(true, 13)]
-    found = calibrate_broadcast(clip.PITCH, keys, lambda: iter(mixed), FPS, settings=SETTINGS)
+    found = calibrate_broadcast(clip.PITCH, BroadcastClip(keys, lambda: iter(mixed), FPS), SETTINGS)
     names = {FRAME_STATUS[status] for status in found.report.status[6:11]}
     assert names == {"followed"}
     assert np.percentile(place_errors(found.camera, true), 95.0) < 3.0
@@ -153,7 +156,9 @@ def test_frames_without_lines_are_carried_by_what_stands_still(true, pictures, b
 
 def test_a_point_under_a_wrong_name_is_left_out_and_named(true, pictures):
     keys = [clicks(true, 3, renamed="penalty_mark_left"), clicks(true, 12)]
-    found = calibrate_broadcast(clip.PITCH, keys, lambda: iter(pictures), FPS, settings=SETTINGS)
+    found = calibrate_broadcast(
+        clip.PITCH, BroadcastClip(keys, lambda: iter(pictures), FPS), SETTINGS
+    )
     assert "penalty_mark_left" in found.report.wrong[3]
     assert any("penalty_mark_left" in reason for reason in found.report.reasons)
     assert np.median(place_errors(found.camera, true)) < 0.5
@@ -168,7 +173,7 @@ def test_a_key_frame_that_tells_nothing_is_refused_under_its_number_and_the_othe
     )
     keys = [empty, clicks(true, 8).model_copy(update={"frame": 108})]
     found = calibrate_broadcast(
-        clip.PITCH, keys, lambda: iter(pictures), FPS, settings=SETTINGS, first=100
+        clip.PITCH, BroadcastClip(keys, lambda: iter(pictures), FPS, first=100), SETTINGS
     )
     stored = broadcast_attributes("clip", found, 100)
     assert list(stored["refused_key_frames"]) == ["102"]
@@ -195,11 +200,13 @@ def test_a_feed_beside_the_static_cameras_is_said_and_corrected_on_request(true,
     said, corrected = (
         calibrate_broadcast(
             clip.PITCH,
-            [clicks(true, 8)],
-            lambda: iter(pictures),
-            FPS,
-            people=people,
-            settings=SETTINGS.model_copy(update={"feed_offset": what}),
+            BroadcastClip(
+                [clicks(true, 8)],
+                lambda: iter(pictures),
+                FPS,
+                people=people,
+            ),
+            SETTINGS.model_copy(update={"feed_offset": what}),
         )
         for what in ("report", "correct")
     )
@@ -218,13 +225,15 @@ def test_no_usable_key_frame_is_an_error_with_each_reason(pictures):
         markings=ClickedMarkings(points=(ClickedPoint(name="center_mark", xy=(400.0, 300.0)),)),
     )
     with pytest.raises(InputError, match="frame 2"):
-        calibrate_broadcast(clip.PITCH, [empty], lambda: iter(pictures), FPS, settings=SETTINGS)
+        calibrate_broadcast(
+            clip.PITCH, BroadcastClip([empty], lambda: iter(pictures), FPS), SETTINGS
+        )
 
 
 def test_the_same_key_frame_twice_is_refused(true, pictures):
     twice = [clicks(true, 8), clicks(true, 8)]
     with pytest.raises(InputError, match="every key frame once"):
-        calibrate_broadcast(clip.PITCH, twice, lambda: iter(pictures), FPS, settings=SETTINGS)
+        calibrate_broadcast(clip.PITCH, BroadcastClip(twice, lambda: iter(pictures), FPS), SETTINGS)
 
 
 def test_without_any_paint_players_hold_the_camera(true, bare):
@@ -240,7 +249,7 @@ def test_without_any_paint_players_hold_the_camera(true, bare):
     keys = [clicks(true, 3), clicks(true, 12)]
     alone, held = (
         calibrate_broadcast(
-            clip.PITCH, keys, lambda: iter(bare), FPS, people=who, settings=SETTINGS
+            clip.PITCH, BroadcastClip(keys, lambda: iter(bare), FPS, people=who), SETTINGS
         )
         for who in (None, people)
     )
@@ -253,7 +262,7 @@ def test_without_any_paint_players_hold_the_camera(true, bare):
 def test_adam_can_be_chosen_and_is_no_better(true, pictures, calibrated):
     slow = SETTINGS.model_copy(update={"solver": "adam", "adam_iterations": 30})
     keys = [clicks(true, 3), clicks(true, 12)]
-    found = calibrate_broadcast(clip.PITCH, keys, lambda: iter(pictures), FPS, settings=slow)
+    found = calibrate_broadcast(clip.PITCH, BroadcastClip(keys, lambda: iter(pictures), FPS), slow)
     best = np.median(place_errors(calibrated.camera, true))
     assert np.median(place_errors(found.camera, true)) > best
 
@@ -261,7 +270,9 @@ def test_adam_can_be_chosen_and_is_no_better(true, pictures, calibrated):
 def test_a_key_frame_beyond_the_clip_is_refused(true, pictures):
     late = clicks(true, 8).model_copy(update={"frame": 400})
     with pytest.raises(InputError, match="key frames from 0 to 15"):
-        calibrate_broadcast(clip.PITCH, [late], lambda: iter(pictures), FPS, settings=SETTINGS)
+        calibrate_broadcast(
+            clip.PITCH, BroadcastClip([late], lambda: iter(pictures), FPS), SETTINGS
+        )
 
 
 def test_a_cut_is_found_and_refused(true, pictures):
@@ -270,7 +281,7 @@ def test_a_cut_is_found_and_refused(true, pictures):
     cut = [*pictures[:8], *other, *pictures[8:12]]
     with pytest.raises(InputError, match=r"cuts before frame 8, 11 of 0 to 14"):
         calibrate_broadcast(
-            clip.PITCH, [clicks(true, 2)], lambda: iter(cut), FPS, settings=SETTINGS
+            clip.PITCH, BroadcastClip([clicks(true, 2)], lambda: iter(cut), FPS), SETTINGS
         )
 
 

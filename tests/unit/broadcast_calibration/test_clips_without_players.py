@@ -6,6 +6,7 @@ import turning_clip as clip
 from test_calibrating_clips import FPS, LOOK, SETTINGS, clicks, grey
 
 from worldpose.broadcast_calibration import (
+    BroadcastClip,
     People,
     broadcast_arrays,
     broadcast_attributes,
@@ -24,11 +25,8 @@ def test_without_anybody_the_camera_is_what_lines_alone_say():
     alone, held = (
         calibrate_broadcast(
             clip.PITCH,
-            [clicks(true, 2)],
-            lambda: iter(pictures),
-            FPS,
-            people=who,
-            settings=SETTINGS,
+            BroadcastClip([clicks(true, 2)], lambda: iter(pictures), FPS, people=who),
+            SETTINGS,
         )
         for who in (None, nobody)
     )

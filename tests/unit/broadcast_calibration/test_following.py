@@ -4,10 +4,14 @@ import numpy as np
 import pytest
 import turning_clip as clip
 
-from worldpose.broadcast_calibration.chain import chain
-from worldpose.broadcast_calibration.cuts import find_cuts
-from worldpose.broadcast_calibration.optical_flow import Followed, follow
-from worldpose.broadcast_calibration.turning import modified_z_scores, turn
+from worldpose.broadcast_calibration.shots import find_cuts
+from worldpose.broadcast_calibration.tracking import (
+    Followed,
+    chain,
+    follow,
+    modified_z_scores,
+    turn,
+)
 
 SHIFT = np.array([3.0, -2.0])
 

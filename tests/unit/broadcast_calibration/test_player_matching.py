@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import turning_clip as clip
 
-from worldpose.broadcast_calibration.feed_offset import estimate_feed_offset
 from worldpose.broadcast_calibration.players import (
     BONES,
     People,
     boxes_of,
+    estimate_feed_offset,
     match,
     player_evidence,
     similarity,

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from worldpose.broadcast_calibration.programme import find_shots, grass_and_people
+from worldpose.broadcast_calibration.shots import find_shots, grass_and_people
 from worldpose.errors import InputError
 from worldpose.geometry import Camera, Rigid
 from worldpose.pitch import PitchTemplate

@@ -2,7 +2,12 @@
 
 import numpy as np
 
-from worldpose.broadcast_calibration.evidence import MARKING, FlowEvidence, PointEvidence
+from worldpose.broadcast_calibration.evidence import (
+    MARKING,
+    FlowEvidence,
+    ObservedPoints,
+    PointEvidence,
+)
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.stadium import looking
@@ -45,14 +50,16 @@ def ground_points(camera, rng, each=40, noise=0.3):
     frame, which, image = (np.concatenate(part) for part in (frame, which, image))
     turn = rng.uniform(0.0, np.pi, len(frame))
     return PointEvidence.across_lines(
-        frame,
-        places[which],
-        image + noise * rng.standard_normal(image.shape),
+        ObservedPoints(
+            frame=frame,
+            world=places[which],
+            image=image + noise * rng.standard_normal(image.shape),
+            kind=MARKING,
+            source=np.zeros(len(frame), dtype=np.int64),
+        ),
         np.stack([np.cos(turn), np.sin(turn)], axis=-1),
         np.full(len(frame), noise),
         np.inf,
-        MARKING,
-        np.zeros(len(frame), dtype=np.int64),
     )
 
 

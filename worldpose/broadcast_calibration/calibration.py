@@ -9,36 +9,47 @@ import numpy as np
 
 from data_contracts.arrays import Floats, Image
 from data_contracts.broadcast_calibration import KeyFrame
-from worldpose.broadcast_calibration.adam import descend
-from worldpose.broadcast_calibration.chain import Chain, chain
-from worldpose.broadcast_calibration.cuts import require_one_shot
 from worldpose.broadcast_calibration.evidence import (
     FlowEvidence,
     PointEvidence,
     together,
 )
-from worldpose.broadcast_calibration.feed_offset import FeedOffset, estimate_feed_offset
-from worldpose.broadcast_calibration.key_frames import Keys, calibrate_keys
+from worldpose.broadcast_calibration.key_frames import calibrate_keys
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, follow_lines
-from worldpose.broadcast_calibration.moving_camera import MovingCamera
-from worldpose.broadcast_calibration.optical_flow import Followed, follow
+from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.players import (
+    FeedOffset,
     People,
     PlayerNoise,
+    estimate_feed_offset,
     match,
     player_evidence,
 )
-from worldpose.broadcast_calibration.priors import prior_of
-from worldpose.broadcast_calibration.report import BroadcastReport, report_of
-from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
-from worldpose.broadcast_calibration.solving import Problem, Solution, solve
-from worldpose.broadcast_calibration.uncertainty import Uncertainty, uncertainty_of
-from worldpose.broadcast_calibration.weights import (
+from worldpose.broadcast_calibration.priors import (
     Weights,
-    flow_share_of,
-    lasting_of,
-    smoothness_of,
+    build_prior,
+    correlation_time,
+    estimate_flow_share,
+    estimate_smoothness,
 )
+from worldpose.broadcast_calibration.report import (
+    BroadcastReport,
+    JointFit,
+    TrackedClip,
+    report_calibration,
+)
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
+from worldpose.broadcast_calibration.shots import require_one_shot
+from worldpose.broadcast_calibration.solver import Problem, Solution, descend, solve
+from worldpose.broadcast_calibration.tracking import (
+    Chain,
+    Followed,
+    chain,
+    follow,
+    modified_z_scores,
+    turn_only,
+)
+from worldpose.broadcast_calibration.uncertainty import Uncertainty, compute_uncertainty
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 
@@ -67,31 +78,42 @@ class BroadcastCalibration:
 
 
 @dataclass(frozen=True, eq=False)
-class Tracked:
-    """A clip before refinement: its key frames, and the chain of cameras between them.
+class BroadcastClip:
+    """Images, key frames and people of one clip.
 
     Attributes:
-        keys: calibrated key frames.
-        chain: an initial camera for every frame.
-        flow: followed points consistent with the chain.
+        key_frames: clicks in one frame or more.
+        pictures: starts a new pass over the clip's grey frames: one to track, and one per
+            iteration.
+        fps: frames per second.
+        people: joints of the static cameras, and keypoints in the clip; None = markings alone.
+        boxes: (frames, detections, 4) x0 y0 x1 y1 [px] of moving people in the frames; those of
+            `people` if None.
+        where: clip or file, for messages.
+        first: number of the clip's first frame in its video; key frames and messages use the
+            numbers of the video.
     """
 
-    keys: Keys
-    chain: Chain
-    flow: FlowEvidence
+    key_frames: Sequence[KeyFrame]
+    pictures: Pictures
+    fps: float
+    people: People | None = None
+    boxes: Floats | None = None
+    where: str = "broadcast clip"
+    first: int = 0
+
+    @property
+    def moving_boxes(self) -> Floats | None:
+        """Boxes (frames, detections, 4) [px] of moving people; None without any."""
+        if self.boxes is None and self.people is not None:
+            return self.people.boxes
+        return self.boxes
 
 
 def calibrate_broadcast(
     pitch: PitchTemplate,
-    key_frames: Sequence[KeyFrame],
-    pictures: Pictures,
-    fps: float,
-    *,
-    people: People | None = None,
-    boxes: Floats | None = None,
+    clip: BroadcastClip,
     settings: BroadcastCalibrationSettings = BroadcastCalibrationSettings(),  # noqa: B008
-    where: str = "broadcast clip",
-    first: int = 0,
 ) -> BroadcastCalibration:
     """Return the calibrated camera of every frame.
 
@@ -101,17 +123,8 @@ def calibrate_broadcast(
 
     Args:
         pitch: the stadium's template.
-        key_frames: clicks in one frame or more.
-        pictures: starts a new pass over the clip's grey frames: one to track, and one per
-            iteration.
-        fps: frames per second.
-        people: joints of the static cameras, and keypoints in the clip; None = markings alone.
-        boxes: (frames, detections, 4) x0 y0 x1 y1 [px] of moving people in the frames; those of
-            `people` if None.
+        clip: images, key frames and people.
         settings: weights, noise and gates.
-        where: clip or file, for messages.
-        first: number of the clip's first frame in its video; key frames and messages use the
-            numbers of the video.
 
     Raises:
         InputError: the clip has cuts, or no key frame is usable.
@@ -120,22 +133,14 @@ def calibrate_broadcast(
     Note:
         M1 to M6; paper section "Broadcasting Camera Calibration" and its supplement.
     """
-    if boxes is None and people is not None:
-        boxes = people.boxes
-    tracked = track(pitch, key_frames, pictures, boxes, settings, where, first)
-    return refine(pitch, tracked, pictures, fps, people, boxes, settings, first)
+    return refine(pitch, clip, track(pitch, clip, settings), settings)
 
 
 def track(
-    pitch: PitchTemplate,
-    key_frames: Sequence[KeyFrame],
-    pictures: Pictures,
-    boxes: Floats | None,
-    settings: BroadcastCalibrationSettings,
-    where: str,
-    first: int = 0,
-) -> Tracked:
+    pitch: PitchTemplate, clip: BroadcastClip, settings: BroadcastCalibrationSettings
+) -> TrackedClip:
     """Return cameras from key frames and followed points (M2); see `calibrate_broadcast`."""
+    key_frames, where, first = clip.key_frames, clip.where, clip.first
     wanted = {key.frame - first for key in key_frames}
     if len(wanted) < len(key_frames):
         raise InputError(
@@ -145,7 +150,9 @@ def track(
             todo="Put all clicks of a frame into one entry.",
         )
     kept: dict[int, Image] = {}
-    followed = follow(_keeping(pictures(), wanted, kept), boxes, settings.flow_points)
+    followed = follow(
+        _keep_frames(clip.pictures(), wanted, kept), clip.moving_boxes, settings.flow_points
+    )
     missing = sorted(wanted - set(kept))
     if missing:
         raise InputError(
@@ -158,35 +165,32 @@ def track(
     height, width = next(iter(kept.values())).shape
     keys = calibrate_keys(pitch, key_frames, (width, height), kept, settings, where, first)
     links = chain([int(n) for n in keys.frames], keys.camera, followed, settings.flow_outlier)
-    return Tracked(keys, links, _flow(followed, links, settings))
+    return TrackedClip(keys, links, _select_flow(followed, links, settings))
 
 
 def refine(
     pitch: PitchTemplate,
-    tracked: Tracked,
-    pictures: Pictures,
-    fps: float,
-    people: People | None,
-    boxes: Floats | None,
+    clip: BroadcastClip,
+    tracked: TrackedClip,
     settings: BroadcastCalibrationSettings,
-    first: int = 0,
 ) -> BroadcastCalibration:
     """Return the joint fit of all frames (M3 to M6); see `calibrate_broadcast`."""
+    people, boxes, fps = clip.people, clip.moving_boxes, clip.fps
     samples = FieldSamples.of(pitch)
     camera = tracked.chain.camera
-    spread = smoothness_of(camera, fps)
+    spread = estimate_smoothness(camera, fps)
     if not settings.smooth:
         # Smoothness of the rotation still bridges frames without evidence.
         spread[3:] = np.inf
     clicks = replace(tracked.keys.clicks, frame=tracked.keys.frames[tracked.keys.clicks.frame])
     deviation = float(tracked.flow.deviation[0]) if len(tracked.flow) else 0.0
-    share = flow_share_of(tracked.chain, tracked.keys.frames, deviation, settings.flow_drift)
+    share = estimate_flow_share(tracked.chain, tracked.keys.frames, deviation, settings.flow_drift)
     noise, matches = PlayerNoise(0.0, 0.0), None
     solution: Solution | None = None
     offset: FeedOffset | None = None
     points, before = clicks, camera
     for number in range(settings.rounds):
-        lines = follow_lines(camera, samples, pictures(), boxes, settings)
+        lines = follow_lines(camera, samples, clip.pictures(), boxes, settings)
         before = lines.camera if number == 0 else before
         parts = [clicks, lines.evidence]
         if people is not None and settings.player_weight > 0.0:
@@ -205,9 +209,10 @@ def refine(
     assert solution is not None  # settings require one iteration or more
     if settings.solver == "adam":
         solution = descend(tracked.chain.camera, problem, settings.adam_iterations)
-    lasting = lasting_of(tracked.chain.camera, fps)
-    shifts = settings.line_shift, settings.player_shift
-    uncertainty = uncertainty_of(solution, problem, *shifts, lasting)
+    lasting = correlation_time(tracked.chain.camera, fps)
+    uncertainty = compute_uncertainty(
+        solution, problem, settings.line_shift, settings.player_shift, lasting
+    )
     weights = Weights(
         flow_deviation_px=deviation,
         flow_share=share,
@@ -218,10 +223,8 @@ def refine(
         player_share=noise.share,
         player_frames=noise.frames,
     )
-    report = report_of(
-        solution.camera, before, uncertainty, points, tracked.flow, tracked.keys, tracked.chain,
-        matches, weights, pitch, settings, offset, first,
-    )  # fmt: skip
+    fit = JointFit(solution.camera, before, uncertainty, points, matches, weights, offset)
+    report = report_calibration(tracked, fit, pitch, settings, clip.first)
     return BroadcastCalibration(solution.camera, uncertainty, report, tracked.chain.camera, before)
 
 
@@ -236,14 +239,14 @@ def _problem(
     return Problem(
         points=points,
         flow=flow,
-        prior=prior_of(settings.prior, camera.focal, camera.image_size),
+        prior=build_prior(settings.prior, camera.focal, camera.image_size),
         smoothness=spread,
         flow_weight=share * settings.flow_weight,
         flow_loss=settings.loss,
     )
 
 
-def _flow(
+def _select_flow(
     followed: Sequence[Followed], links: Chain, settings: BroadcastCalibrationSettings
 ) -> FlowEvidence:
     """Return the followed points consistent with the camera, with their measured deviation."""
@@ -265,7 +268,7 @@ def _stacked(parts: Sequence[Floats]) -> Floats:
     return np.concatenate([np.empty((0, 2)), *parts])
 
 
-def _keeping(
+def _keep_frames(
     pictures: Iterator[Image], wanted: set[int], kept: dict[int, Image]
 ) -> Iterator[Image]:
     """Yield all frames, and store the wanted ones in `kept`."""
@@ -278,3 +281,82 @@ def _keeping(
 def _number(value: float) -> float:
     """Return a spread for a record, which cannot hold infinity: 0 means none."""
     return float(value) if np.isfinite(value) else 0.0
+
+
+def follow_given_lens(
+    camera: MovingCamera,
+    pictures: Callable[[], Iterator[Image]],
+    *,
+    pitch: PitchTemplate | None = None,
+    boxes: Floats | None = None,
+    settings: BroadcastCalibrationSettings = BroadcastCalibrationSettings(),  # noqa: B008
+    where: str = "broadcast clip",
+) -> tuple[MovingCamera, Uncertainty]:
+    """Return the rotations of a clip from its focal lengths, distortion and first pose.
+
+    This is the setting of the public challenge: K and k for every frame, R and t of the first one.
+
+    Args:
+        camera: all frames; the function uses the first frame's rotation and every frame's lens.
+        pictures: starts a new pass over the clip's grey frames.
+        pitch: also detect its painted lines; None = followed points alone.
+        boxes: (frames, detections, 4) [px] of moving people in the frames; None = no people.
+        settings: weights and noise.
+        where: clip or file, for messages.
+
+    Raises:
+        InputError: the clip has cuts, or its frame count differs from the camera's.
+    """
+    followed = follow(pictures(), boxes, settings.flow_points)
+    if len(followed) + 1 != len(camera):
+        raise InputError(
+            where,
+            expected=f"{len(camera)} frames, as the lens is known for",
+            found=f"{len(followed) + 1}",
+            todo="Give the clip that the cameras belong to.",
+        )
+    require_one_shot(followed, settings.cut_share, where)
+    rotation = camera.rotation.copy()
+    pairs, starts, ends, off = [], [], [], []
+    for pair, points in enumerate(followed):
+        two = replace(camera, rotation=rotation).frames(slice(pair, pair + 2))
+        turned = turn_only(two, points)
+        rotation[pair + 1] = turned.camera.rotation[1]
+        with np.errstate(invalid="ignore"):
+            kept = modified_z_scores(turned.residual) < settings.flow_outlier
+        pairs.append(np.full(int(kept.sum()), pair))
+        starts.append(points.start[kept])
+        ends.append(points.end[kept])
+        off.append(turned.residual[kept])
+    tracked = replace(camera, rotation=rotation)
+    residual = np.concatenate([np.empty((0, 2)), *off])
+    seen = 1.4826 * float(np.median(np.abs(residual))) if len(residual) else 0.0
+    flow = FlowEvidence(
+        np.concatenate([np.empty(0, dtype=np.int64), *pairs]),
+        np.concatenate([np.empty((0, 2)), *starts]),
+        np.concatenate([np.empty((0, 2)), *ends]),
+        np.full(len(residual), max(seen, settings.flow_noise)),
+    )
+    lines = PointEvidence.none()
+    if pitch is not None:
+        found = follow_lines(tracked, FieldSamples.of(pitch), pictures(), boxes, settings)
+        lines = found.evidence
+        # Keep the given lens.
+        tracked = replace(tracked, rotation=found.camera.rotation)
+    known = np.zeros((len(camera), FRAME_SIZE), dtype=np.bool_)
+    known[0] = True
+    tracked = replace(tracked, rotation=np.concatenate([camera.rotation[:1], tracked.rotation[1:]]))
+    independent = seen * np.sqrt(4.0 / max(settings.flow_points, 1))
+    problem = Problem(
+        points=lines,
+        flow=flow,
+        prior=build_prior(settings.prior, camera.focal, camera.image_size),
+        smoothness=np.append(np.full(3, 2e-3), np.full(FRAME_SIZE - 3, np.inf)),
+        flow_weight=min(1.0, (independent / settings.flow_drift) ** 2),
+        flow_loss=settings.loss,
+        free_frame=np.arange(FRAME_SIZE) < 3,
+        free_clip=np.zeros(CLIP_SIZE, dtype=np.bool_),
+        known=known,
+    )
+    solution = solve(tracked, problem, settings.iterations)
+    return solution.camera, compute_uncertainty(solution, problem, settings.line_shift)

@@ -11,10 +11,15 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Integers
 from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence, bounds
-from worldpose.broadcast_calibration.flow_equations import add_flow
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
-from worldpose.broadcast_calibration.normal_equations import add_points
-from worldpose.broadcast_calibration.smoothness import add_smoothness
+from worldpose.broadcast_calibration.normal_equations import (
+    Flow,
+    NormalEquations,
+    add_flow,
+    add_points,
+    empty_equations,
+)
+from worldpose.broadcast_calibration.priors import Prior, add_smoothness
 from worldpose.errors import DegenerateError
 from worldpose.geometry.optimize.banded import BandedFactor
 
@@ -22,31 +27,6 @@ _START_DAMPING: Final = 1e-4
 _MOST_DAMPING: Final = 1e9
 _SETTLED: Final = 1e-7
 """Relative decrease of the cost that ends the iterations."""
-
-
-@dataclass(frozen=True, eq=False)
-class Prior:
-    """Gaussian prior of a clip's camera.
-
-    Attributes:
-        center: (3,) [m], world.
-        center_information: (3, 3) [1/m^2].
-        principal_point: (2,) [px].
-        principal_spread: (2,) [px].
-        log_focal: (frames,); with `focal_spread`.
-        focal_spread: standard deviation of the logarithm.
-        distortion: (frames, 3).
-        distortion_spread: (frames, 3).
-    """
-
-    center: Floats
-    center_information: Floats
-    principal_point: Floats
-    principal_spread: Floats
-    log_focal: Floats
-    focal_spread: float
-    distortion: Floats
-    distortion_spread: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,19 +81,11 @@ class Equations:
 
     Attributes:
         cost: half the sum of losses and squares.
-        blocks: (3, frames, 7, 7) band, see `BandedFactor`.
-        border: (frames, 7, 5 + 3 painted).
-        corner: (5 + 3 painted, the same).
-        right: (frames, 7) gradient by the frames' steps.
-        right_corner: (5 + 3 painted,) gradient by the clip's step and the painted points' places.
+        system: matrix and gradient.
     """
 
     cost: float
-    blocks: Floats
-    border: Floats
-    corner: Floats
-    right: Floats
-    right_corner: Floats
+    system: NormalEquations
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,46 +118,23 @@ def equations_at(camera: MovingCamera, beside: Floats, problem: Problem) -> Equa
     """
     frames = len(camera)
     shared = CLIP_SIZE + beside.size
-    blocks = np.zeros((3, frames, FRAME_SIZE, FRAME_SIZE))
-    border = np.zeros((frames, FRAME_SIZE, shared))
+    system = empty_equations(frames, shared)
     # Prior of the paint errors, in standard deviations.
-    corner = np.diag(np.append(np.zeros(CLIP_SIZE), np.ones(beside.size)))
-    right = np.zeros((frames, FRAME_SIZE))
-    right_corner = np.append(np.zeros(CLIP_SIZE), beside.ravel())
-    points = problem.points
-    system = (blocks, border, corner, right, right_corner)
-    flow = problem.flow
-    lens = (camera.principal_point, camera.focal, camera.rotation, camera.distortion)
-    cost = add_points(
-        camera.center,
-        *lens,
-        bounds(points.frame, frames),
-        points.world,
-        points.image,
-        points.whitening,
-        points.weight,
-        points.loss,
-        problem.ends,
-        points.shares,
-        beside,
-        *system,
-    )
+    system.corner[range(CLIP_SIZE, shared), range(CLIP_SIZE, shared)] = 1.0
+    system.right_corner[CLIP_SIZE:] = beside.ravel()
+    points, flow = problem.points, problem.flow
+    edges = bounds(points.frame, frames)
+    cost = add_points(camera.arrays, edges, points.arrays(problem.ends), beside, system)
     if len(flow) and problem.flow_weight > 0.0:
-        cost += add_flow(
-            *lens,
-            bounds(flow.frame, frames),
-            flow.start,
-            flow.end,
-            flow.deviation,
-            problem.flow_weight,
-            problem.flow_loss,
-            *system,
+        followed = Flow(
+            flow.start, flow.end, flow.deviation, problem.flow_weight, problem.flow_loss
         )
+        cost += add_flow(camera.arrays, bounds(flow.frame, frames), followed, system)
     cost += 0.5 * float((beside**2).sum())
-    cost += add_smoothness(camera, problem.smoothness, blocks, right)
-    cost += _add_prior(camera, problem.prior, *system)
-    _fix(problem, blocks, border, corner, right, right_corner)
-    return Equations(float(cost), blocks, border, corner, right, right_corner)
+    cost += add_smoothness(camera, problem.smoothness, system.blocks, system.right)
+    cost += _add_prior(camera, problem.prior, system)
+    _remove_fixed(problem, system)
+    return Equations(float(cost), system)
 
 
 def solve(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
@@ -203,7 +152,7 @@ def solve(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
     here = equations_at(camera, beside, problem)
     damping, costs = _START_DAMPING, [here.cost]
     for _ in range(iterations):
-        frame, clip = _step(here, damping)
+        frame, clip = _step(here.system, damping)
         trial = camera.stepped(frame, clip[:CLIP_SIZE])
         moved = beside + clip[CLIP_SIZE:].reshape(beside.shape)
         there = equations_at(trial, moved, problem)
@@ -221,7 +170,7 @@ def solve(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
     return Solution(camera, beside, here.cost, tuple(costs), here)
 
 
-def _step(system: Equations, damping: float) -> tuple[Floats, Floats]:
+def _step(system: NormalEquations, damping: float) -> tuple[Floats, Floats]:
     """Return the damped Gauss-Newton step of the frames (frames, 7) and of shared parameters."""
     blocks = system.blocks.copy()
     blocks[0][:, range(FRAME_SIZE), range(FRAME_SIZE)] *= 1.0 + damping
@@ -241,16 +190,10 @@ def _step(system: Equations, damping: float) -> tuple[Floats, Floats]:
     return solved[..., 0] - solved[..., 1:] @ clip, np.asarray(clip)
 
 
-def _add_prior(
-    camera: MovingCamera,
-    prior: Prior,
-    blocks: Floats,
-    border: Floats,
-    corner: Floats,
-    right: Floats,
-    right_corner: Floats,
-) -> float:
+def _add_prior(camera: MovingCamera, prior: Prior, system: NormalEquations) -> float:
     """Add the priors and return their cost."""
+    blocks, corner = system.blocks, system.corner
+    right, right_corner = system.right, system.right_corner
     off = camera.center - prior.center
     corner[:3, :3] += prior.center_information
     right_corner[:3] += prior.center_information @ off
@@ -269,15 +212,10 @@ def _add_prior(
     return cost + 0.5 * float((gone**2).sum())
 
 
-def _fix(
-    problem: Problem,
-    blocks: Floats,
-    border: Floats,
-    corner: Floats,
-    right: Floats,
-    right_corner: Floats,
-) -> None:
+def _remove_fixed(problem: Problem, system: NormalEquations) -> None:
     """Remove fixed parameters from the system, in place."""
+    blocks, border, corner = system.blocks, system.border, system.corner
+    right, right_corner = system.right, system.right_corner
     fixed = problem.held(len(right))
     if fixed.any():
         for below in range(3):
@@ -292,3 +230,43 @@ def _fix(
     corner[held, :] = corner[:, held] = 0.0
     corner[held, held] = 1.0
     right_corner[held] = 0.0
+
+
+RATE = 1e-3
+"""Learning rate of every parameter [its unit; thousands of pixels for the principal point] (M5)."""
+_DECAY = (0.9, 0.999)
+_SMALL = 1e-8
+
+
+def descend(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
+    """Return the camera after some iterations of Adam (Kingma and Ba) at a rate of 1e-3.
+
+    Parameters are those of the solver: rotations in radians, logarithms of focal lengths,
+    distortion, metres. The principal point is in units of 1,000 px.
+
+    Args:
+        camera: the start.
+        problem: evidence, smoothness and priors.
+        iterations: number of iterations.
+    """
+    frames = len(camera) * FRAME_SIZE
+    beside = np.zeros((len(problem.painted), 3))
+    size = frames + CLIP_SIZE + beside.size
+    unit = np.ones(size)
+    unit[frames + 3 : frames + CLIP_SIZE] = 1e3
+    mean, square = np.zeros(size), np.zeros(size)
+    here = equations_at(camera, beside, problem)
+    costs = [here.cost]
+    for iteration in range(1, iterations + 1):
+        gradient = unit * np.concatenate([here.system.right.ravel(), here.system.right_corner])
+        mean = _DECAY[0] * mean + (1.0 - _DECAY[0]) * gradient
+        square = _DECAY[1] * square + (1.0 - _DECAY[1]) * gradient**2
+        first = mean / (1.0 - _DECAY[0] ** iteration)
+        second = square / (1.0 - _DECAY[1] ** iteration)
+        step = -RATE * unit * first / (np.sqrt(second) + _SMALL)
+        shared = step[frames:]
+        camera = camera.stepped(step[:frames].reshape(-1, FRAME_SIZE), shared[:CLIP_SIZE])
+        beside = beside + shared[CLIP_SIZE:].reshape(beside.shape)
+        here = equations_at(camera, beside, problem)
+        costs.append(here.cost)
+    return Solution(camera, beside, here.cost, tuple(costs), here)

@@ -1,0 +1,356 @@
+"""Tracking: followed points, the rotation between two frames, cameras of all frames (M2, M6)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.arrays import Floats, Image
+from worldpose.broadcast_calibration.moving_camera import MovingCamera, joined
+from worldpose.broadcast_calibration.normal_equations import (
+    Flow,
+    add_flow,
+    empty_equations,
+    flow_row,
+)
+from worldpose.compiled import compiled
+from worldpose.geometry import Rigid
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """Initial cameras of all frames, tracked from key frames.
+
+    Attributes:
+        camera: all frames.
+        kept: inlier mask (n,) of the followed points, per pair of neighbours.
+        residual: residuals (n, 2) [px] of the followed points, per pair.
+        determined: (frames - 1,) whether the pair's points determine the motion.
+        drift: (gaps,) tracking error from one key frame to the next, root mean square over the
+            image [px].
+    """
+
+    camera: MovingCamera
+    kept: list[NDArray[np.bool_]]
+    residual: list[Floats]
+    determined: NDArray[np.bool_]
+    drift: Floats
+
+
+def chain(
+    key_frames: Sequence[int], keys: MovingCamera, followed: Sequence[Followed], outlier: float
+) -> Chain:
+    """Return cameras tracked between key frames, with the drift distributed linearly.
+
+    Args:
+        key_frames: indices of the key frames, rising.
+        keys: cameras of the key frames, in that order.
+        followed: points between all neighbouring frames.
+        outlier: maximum modified z-score of an inlier.
+    """
+    frames = len(followed) + 1
+    cameras: list[MovingCamera | None] = [None] * frames
+    kept = [np.zeros(len(pair.start), dtype=np.bool_) for pair in followed]
+    residual = [np.full((len(pair.start), 2), np.nan) for pair in followed]
+    determined = np.zeros(frames - 1, dtype=np.bool_)
+
+    def advance(camera: MovingCamera, pair: int, backwards: bool) -> MovingCamera:
+        points = followed[pair]
+        if backwards:
+            points = replace(points, start=points.end, end=points.start)
+        moved = turn(camera, points)
+        with np.errstate(invalid="ignore"):
+            kept[pair] = modified_z_scores(moved.residual) < outlier
+        residual[pair] = moved.residual
+        determined[pair] = moved.determined
+        return moved.camera.frames(slice(1, 2))
+
+    first = key_frames[0]
+    cameras[first] = keys.frames(slice(0, 1))
+    for frame in range(first - 1, -1, -1):
+        cameras[frame] = advance(_there(cameras[frame + 1]), frame, True)
+    drift = []
+    for number, (begin, end) in enumerate(pairwise(key_frames)):
+        for frame in range(begin, end):
+            cameras[frame + 1] = advance(_there(cameras[frame]), frame, False)
+        reached, key = _there(cameras[end]), keys.frames(slice(number + 1, number + 2))
+        drift.append(_apart(reached, key))
+        for frame in range(begin + 1, end + 1):
+            share = (frame - begin) / (end - begin)
+            cameras[frame] = _toward(_there(cameras[frame]), reached, key, share)
+    for frame in range(key_frames[-1], frames - 1):
+        cameras[frame + 1] = advance(_there(cameras[frame]), frame, False)
+    whole = joined([_there(camera) for camera in cameras])
+    return Chain(whole, kept, residual, determined, np.array(drift))
+
+
+def _there(camera: MovingCamera | None) -> MovingCamera:
+    assert camera is not None  # tracking reaches every frame from its neighbour
+    return camera
+
+
+def _toward(
+    camera: MovingCamera, reached: MovingCamera, key: MovingCamera, share: float
+) -> MovingCamera:
+    """Return a camera after a share of the step from one camera to another."""
+    way = Rigid(key.rotation @ np.swapaxes(reached.rotation, -1, -2), np.zeros(3)).rotvec
+    step = np.concatenate(
+        [way, np.log(key.focal / reached.focal)[:, None], key.distortion - reached.distortion],
+        axis=1,
+    )
+    return camera.stepped(share * step, np.zeros(5))
+
+
+def _apart(one: MovingCamera, other: MovingCamera) -> float:
+    """Return the root mean square pixel distance of equal directions in two single cameras [px]."""
+    width, height = one.image_size - 1.0
+    grid = np.stack(np.meshgrid([0.1, 0.5, 0.9], [0.1, 0.5, 0.9]), axis=-1).reshape(-1, 2)
+    pixels = grid * [width, height]
+    rays = one.camera[0].unproject(pixels)
+    off = other.camera[0].project(rays.origins + 100.0 * rays.directions) - pixels
+    return float(np.sqrt(np.nanmean((off**2).sum(axis=-1)))) if np.isfinite(off).any() else np.inf
+
+
+_SCALES: Final = (20.0, 5.0, 1.5, 0.6, 0.6)
+"""Decreasing scales of the loss [px]."""
+_LENS: Final = np.array([1.6, 1.0, 1.0])
+"""Powers of the focal length that k1, k2 and k3 of a zoom lens grow with."""
+_FEW: Final = 8
+"""Minimum points for rotation and zoom [1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Turned:
+    """The camera of the second of two frames.
+
+    Attributes:
+        camera: two frames: the given one, and the next.
+        residual: (n, 2) of the followed points, predicted minus observed [px]; NaN where there is
+            no prediction.
+        determined: whether the points determine the motion.
+    """
+
+    camera: MovingCamera
+    residual: Floats
+    determined: bool
+
+
+def turn(camera: MovingCamera, followed: Followed) -> Turned:
+    """Return the next frame's rotation, zoom and lens from one frame's camera.
+
+    Args:
+        camera: a single frame.
+        followed: its points in the next frame.
+    """
+    both = replace(
+        camera,
+        rotation=np.repeat(camera.rotation, 2, axis=0),
+        focal=np.repeat(camera.focal, 2),
+        distortion=np.repeat(camera.distortion, 2, axis=0),
+    )
+    return _fitted(both, followed, 4)
+
+
+def turn_only(both: MovingCamera, followed: Followed) -> Turned:
+    """Return the second of two frames with a fitted rotation and its given lens.
+
+    Args:
+        both: two frames; the second's rotation is ignored.
+        followed: points of the first in the second.
+    """
+    both = replace(both, rotation=np.repeat(both.rotation[:1], 2, axis=0))
+    return _fitted(both, followed, 3)
+
+
+def flow_residuals(both: MovingCamera, followed: Followed) -> Floats:
+    """Return predicted minus observed pixels of followed points (n, 2)."""
+    residual = np.full((len(followed.start), 2), np.nan)
+    _residuals(
+        both.principal_point,
+        both.focal,
+        both.rotation,
+        both.distortion,
+        followed.start,
+        followed.end,
+        residual,
+    )
+    return residual
+
+
+def modified_z_scores(residual: Floats) -> Floats:
+    """Return each point's modified z-score (n,), the larger of both axes (M6).
+
+    0.6745 times the distance from the median over the median of these distances (Iglewicz and
+    Hoaglin, 1993); NaN where the residual is missing.
+
+    Args:
+        residual: (n, 2) [px].
+    """
+    if not np.isfinite(residual).any():
+        return np.full(len(residual), np.nan)
+    off = np.abs(residual - np.nanmedian(residual, axis=0))
+    spread = np.maximum(np.nanmedian(off, axis=0), 1e-6)
+    return np.asarray((0.6745 * off / spread).max(axis=-1))
+
+
+def _fitted(both: MovingCamera, followed: Followed, count: int) -> Turned:
+    """Return the second of two frames with fitted rotation and, if `count` is 4, zoom."""
+    if len(followed.start) < _FEW:
+        return Turned(both, np.full((len(followed.start), 2), np.nan), False)
+    bounds = np.array([0, len(followed.start), len(followed.start)])
+    ones = np.ones(len(followed.start))
+    # The median motion is a robust start.
+    x, y = np.median(followed.end - followed.start, axis=0) / float(both.focal[0])
+    both = _moved(both, np.array([-y, x, 0.0, 0.0])[:count])
+    for scale in _SCALES:
+        equations = empty_equations(2, 5)
+        flow = Flow(followed.start, followed.end, scale * ones, 1.0, 1.0)
+        add_flow(both.arrays, bounds, flow, equations)
+        normal = equations.blocks[0, 1, :count, :count]
+        normal = normal + 1e-9 * np.diag(np.diag(normal))
+        if not np.linalg.cond(normal) < 1e12:
+            return Turned(both, flow_residuals(both, followed), False)
+        both = _moved(both, np.asarray(-np.linalg.solve(normal, equations.right[1, :count])))
+    return Turned(both, flow_residuals(both, followed), True)
+
+
+def _moved(both: MovingCamera, step: Floats) -> MovingCamera:
+    """Return both frames after a step of the second: rotation (3,), or with log focal (4,)."""
+    whole = np.zeros((2, 7))
+    whole[1, : len(step)] = step
+    moved = both.stepped(whole, np.zeros(5))
+    if len(step) == 3:
+        return moved
+    growth = (moved.focal[1] / moved.focal[0]) ** _LENS
+    lens = np.stack([both.distortion[0], both.distortion[0] * growth])
+    return replace(moved, distortion=lens)
+
+
+@compiled
+def _residuals(
+    principal: Floats,
+    focal: Floats,
+    rotation: Floats,
+    distortion: Floats,
+    start: Floats,
+    end: Floats,
+    residual: Floats,
+) -> None:
+    """Write residuals (n, 2) of followed points; rows without a prediction stay unchanged."""
+    pixel, rows = np.empty(2), np.empty((2, 16))
+    for i in range(len(start)):
+        if flow_row(principal, focal, rotation, distortion, start[i], pixel, rows):
+            residual[i, 0] = pixel[0] - end[i, 0]
+            residual[i, 1] = pixel[1] - end[i, 1]
+
+
+_WINDOW: Final = (21, 21)
+_LEVELS: Final = 4
+"""Levels of the pyramid: motion up to 150 px per frame."""
+_RETURN: Final = 0.3
+"""Maximum forward-backward error [px]."""
+_CELLS: Final = (16, 9)
+"""Columns and rows of cells, each with its share of the points."""
+_QUALITY: Final = 0.002
+"""Minimum strength of a corner, relative to the strongest in the frame [1]."""
+_AWAY: Final = 0.15
+"""Margin around a person's box, relative to its height [1]."""
+_CONSISTENT: Final = 1.5
+"""Maximum inlier distance of a homography [px]."""
+_TELLING: Final = 12
+"""Minimum points to decide on a cut [1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """Points followed from one frame to the next.
+
+    Attributes:
+        start: (n, 2) [px].
+        end: (n, 2) [px].
+        together: share of the searched points that are inliers of one homography [1]; NaN with too
+            few points.
+    """
+
+    start: Floats
+    end: Floats
+    together: float
+
+
+def follow(pictures: Iterable[Image], boxes: Floats | None, points: int) -> list[Followed]:
+    """Return the points followed between all neighbouring frames.
+
+    The function selects new corners in every frame, evenly over the image, so that errors do not
+    accumulate along a track. Pyramidal Lucas-Kanade runs forward and backward; points with a large
+    forward-backward error are dropped.
+
+    Args:
+        pictures: grey (height, width), in order.
+        boxes: (frames, detections, 4) x0 y0 x1 y1 [px] of people, which move; NaN = missing.
+        points: approximate number of points.
+    """
+    followed: list[Followed] = []
+    before: Image | None = None
+    for number, picture in enumerate(pictures):
+        if before is not None:
+            people = None if boxes is None else boxes[number - 1]
+            followed.append(_follow(before, picture, people, points))
+        before = picture
+    return followed
+
+
+def _follow(before: Image, after: Image, people: Floats | None, points: int) -> Followed:
+    start = _corners(before, people, points)
+    if len(start) < _TELLING:
+        return Followed(np.empty((0, 2)), np.empty((0, 2)), float("nan"))
+    end, found, _ = cv2.calcOpticalFlowPyrLK(
+        before, after, start, start.copy(), winSize=_WINDOW, maxLevel=_LEVELS
+    )
+    home, back, _ = cv2.calcOpticalFlowPyrLK(
+        after, before, end, end.copy(), winSize=_WINDOW, maxLevel=_LEVELS
+    )
+    size = np.array([before.shape[1], before.shape[0]])
+    # Near the border the window extends beyond the image.
+    inside = ((end > _WINDOW[0] / 2) & (end < size - 1 - _WINDOW[0] / 2)).all(axis=-1)
+    same = np.linalg.norm(home - start, axis=-1) < _RETURN
+    kept = (found[:, 0] == 1) & (back[:, 0] == 1) & same & inside
+    one, two = start[kept].astype(np.float64), end[kept].astype(np.float64)
+    looked = float(inside.sum())
+    if len(one) < _TELLING or looked < _TELLING:
+        return Followed(one, two, 0.0 if looked >= _TELLING else float("nan"))
+    _, agree = cv2.findHomography(one, two, cv2.RANSAC, _CONSISTENT)
+    together = 0.0 if agree is None else float(agree.sum()) / looked
+    return Followed(one, two, together)
+
+
+def _corners(picture: Image, people: Floats | None, points: int) -> NDArray[np.float32]:
+    """Return corners (n, 2) [px], the strongest of each image cell, outside people's boxes."""
+    half = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    strength = cv2.cornerMinEigenVal(half, 5)
+    margin = _WINDOW[0] // 2
+    strength[:margin] = strength[-margin:] = 0.0
+    strength[:, :margin] = strength[:, -margin:] = 0.0
+    for x0, y0, x1, y1 in np.empty((0, 4)) if people is None else people:
+        if np.isfinite(x0 + y0 + x1 + y1):
+            away = _AWAY * (y1 - y0) + margin
+            left, right = max(0.5 * (x0 - away), 0.0), max(0.5 * (x1 + away), 0.0)
+            top, bottom = max(0.5 * (y0 - away), 0.0), max(0.5 * (y1 + away), 0.0)
+            strength[int(top) : int(bottom) + 1, int(left) : int(right) + 1] = 0.0
+    peaks = strength == cv2.dilate(strength, np.ones((7, 7), np.uint8))
+    peaks &= strength > max(_QUALITY * float(strength.max()), 1e-7)
+    v, u = np.nonzero(peaks)
+    height, width = half.shape
+    cell = (u * _CELLS[0] // width) + _CELLS[0] * (v * _CELLS[1] // height)
+    order = np.lexsort((-strength[v, u], cell))
+    cell = cell[order]
+    first = np.searchsorted(cell, cell)
+    each = max(1, round(points / (_CELLS[0] * _CELLS[1])))
+    chosen = order[np.arange(len(cell)) - first < each]
+    # The center of a half-resolution pixel is between two full-resolution pixels.
+    return np.stack([2 * u[chosen] + 0.5, 2 * v[chosen] + 0.5], axis=-1).astype(np.float32)
