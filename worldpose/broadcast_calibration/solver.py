@@ -22,9 +22,10 @@ from worldpose.broadcast_calibration.normal_equations import (
 from worldpose.broadcast_calibration.priors import Prior, add_smoothness
 from worldpose.errors import DegenerateError
 from worldpose.geometry.optimize.banded import BandedFactor
+from worldpose.geometry.optimize.levenberg_marquardt import Schedule, minimize
 
 _START_DAMPING: Final = 1e-4
-_MOST_DAMPING: Final = 1e9
+_MAX_DAMPING: Final = 1e9
 _SETTLED: Final = 1e-7
 """Relative decrease of the cost that ends the iterations."""
 
@@ -148,29 +149,42 @@ def solve(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
     Raises:
         DegenerateError: the matrix is singular: a parameter has neither evidence nor prior.
     """
+
+    def step(state: _State, damping: float) -> _State:
+        frame, shared = _solve_step(state.equations.system, damping)
+        camera = state.camera.stepped(frame, shared[:CLIP_SIZE])
+        beside = state.beside + shared[CLIP_SIZE:].reshape(state.beside.shape)
+        return _State(camera, beside, equations_at(camera, beside, problem))
+
     beside = np.zeros((len(problem.painted), 3))
-    here = equations_at(camera, beside, problem)
-    damping, costs = _START_DAMPING, [here.cost]
-    for _ in range(iterations):
-        frame, clip = _step(here.system, damping)
-        trial = camera.stepped(frame, clip[:CLIP_SIZE])
-        moved = beside + clip[CLIP_SIZE:].reshape(beside.shape)
-        there = equations_at(trial, moved, problem)
-        if there.cost < here.cost:
-            fall = here.cost - there.cost
-            camera, beside, here = trial, moved, there
-            damping = max(damping / 6.0, 1e-10)
-            costs.append(here.cost)
-            if fall < _SETTLED * here.cost:
-                break
-        else:
-            damping *= 8.0
-            if damping > _MOST_DAMPING:
-                break
-    return Solution(camera, beside, here.cost, tuple(costs), here)
+    start = _State(camera, beside, equations_at(camera, beside, problem))
+    schedule = Schedule(
+        damping=_START_DAMPING,
+        decrease=6.0,
+        min_damping=1e-10,
+        max_damping=_MAX_DAMPING,
+        iterations=iterations,
+        converged=lambda before, after: 0.0 < before - after < _SETTLED * after,
+    )
+    found = minimize(start, step, schedule)
+    last = found.state
+    return Solution(last.camera, last.beside, last.cost, found.costs, last.equations)
 
 
-def _step(system: NormalEquations, damping: float) -> tuple[Floats, Floats]:
+@dataclass(frozen=True, eq=False)
+class _State:
+    """A camera and paint errors (painted, 3), with the equations there."""
+
+    camera: MovingCamera
+    beside: Floats
+    equations: Equations
+
+    @property
+    def cost(self) -> float:
+        return self.equations.cost
+
+
+def _solve_step(system: NormalEquations, damping: float) -> tuple[Floats, Floats]:
     """Return the damped Gauss-Newton step of the frames (frames, 7) and of shared parameters."""
     blocks = system.blocks.copy()
     blocks[0][:, range(FRAME_SIZE), range(FRAME_SIZE)] *= 1.0 + damping

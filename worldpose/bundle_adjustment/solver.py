@@ -14,6 +14,7 @@ from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.records import Record
 from worldpose.errors import InputError, InternalError
 from worldpose.geometry import Camera
+from worldpose.geometry.optimize.levenberg_marquardt import Schedule, minimize
 from worldpose.geometry.optimize.schur_complement import (
     STEPS,
     CameraEquations,
@@ -127,32 +128,47 @@ def solve(
     points = problem.points
     offset = np.zeros(problem.free.shape) if offset is None else np.where(problem.free, offset, 0.0)
     cameras = stepped(problem.cameras, offset) if offset.any() else problem.cameras
-    start_cost = system.cost(cameras, points, offset)
-    if np.isnan(start_cost):
+    start = _State(cameras, points, offset, system.cost(cameras, points, offset))
+    if np.isnan(start.cost):
         raise InternalError("bundle adjustment: start", "a cost that is no number")
-    if not np.isfinite(start_cost):
+    if not np.isfinite(start.cost):
         raise InputError(
             "bundle adjustment: start",
             expected="every point in front of the cameras that see it",
             found="points behind a camera, or beyond its lens model",
             todo="Give cameras and points that project near their observations.",
         )
-    reached, damping, converged, iteration = start_cost, settings.damping, False, 0
-    while iteration < settings.iterations and not converged:
-        iteration += 1
-        step, trial = system.step(cameras, points, damping, offset)
-        moved = stepped(cameras, step)
-        tried = system.cost(moved, trial, offset + step)
-        gain = reached - tried
+    schedule = Schedule(
+        damping=settings.damping,
+        decrease=5.0,
+        min_damping=1e-9,
+        iterations=settings.iterations,
         # A gain below rounding error means convergence, too.
-        converged = abs(gain) <= settings.cost_change * reached
-        if gain > 0.0:
-            cameras, points, offset, reached = moved, trial, offset + step, tried
-            damping = max(damping / 5.0, 1e-9)
-        else:
-            damping *= 8.0
-    spread = system.covariance(cameras, points) if covariance else np.empty((0, 0))
-    return Solution(cameras, offset, points, reached, start_cost, iteration, converged, spread)
+        converged=lambda before, after: abs(before - after) <= settings.cost_change * before,
+    )
+    found = minimize(start, system.step, schedule)
+    last = found.state
+    spread = system.covariance(last.cameras, last.points) if covariance else np.empty((0, 0))
+    return Solution(
+        cameras=last.cameras,
+        offset=last.offset,
+        points=last.points,
+        cost=last.cost,
+        start_cost=start.cost,
+        iterations=found.iterations,
+        converged=found.converged,
+        camera_covariance=spread,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Cameras and points, with the cameras' steps (cameras, 12) from the start and the cost."""
+
+    cameras: Camera
+    points: Floats
+    offset: Floats
+    cost: float
 
 
 def _require_two_views(problem: Problem) -> None:
@@ -195,7 +211,13 @@ class _System:
         known = float(np.einsum("ci,cij,cj->", offset, self.prior, offset))
         return cost(cameras.numbers, points, self.evidence) + known
 
-    def step(
+    def step(self, state: _State, damping: float) -> _State:
+        """Return the state after a damped step."""
+        step, points = self.solve_step(state.cameras, state.points, damping, state.offset)
+        cameras, offset = stepped(state.cameras, step), state.offset + step
+        return _State(cameras, points, offset, self.cost(cameras, points, offset))
+
+    def solve_step(
         self, cameras: Camera, points: Floats, damping: float, offset: Floats
     ) -> tuple[Floats, Floats]:
         """Return a damped step of the cameras (cameras, 12), and the points after it."""

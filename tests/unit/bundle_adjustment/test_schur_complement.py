@@ -58,7 +58,7 @@ def test_the_step_is_that_of_the_dense_normal_equations(scene):
 
     problem, _, points = scene(noise=2.0)
     start = points + np.where(np.isinf(problem.point_information), 0.0, 0.1)[:, None]
-    step, trial = _System(problem).step(problem.cameras, start, 0.0, np.zeros((4, STEPS)))
+    step, trial = _System(problem).solve_step(problem.cameras, start, 0.0, np.zeros((4, STEPS)))
     expected, moves = dense_step(problem, start)
     # Condition numbers near 1e6 leave ten digits of the largest entries.
     scale = np.abs(expected).max(axis=0) + 1e-12
