@@ -24,8 +24,8 @@ from data_contracts.arrays import Floats
 from worldpose.body.model import JOINTS
 from worldpose.body_fitting.pose_space import GATHER, SIZE, interpolate_gaps
 from worldpose.errors import InputError
-from worldpose.formats.npz_files import read_npz
-from worldpose.formats.text_files import require_file
+from worldpose.formats.archives import read_npz
+from worldpose.formats.files import require_file
 from worldpose.geometry import Camera, Rigid
 
 ESTIMATE_BYTES: Final = 1 << 30

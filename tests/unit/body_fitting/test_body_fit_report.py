@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_monocular_poses import broadcast
+from test_monocular import broadcast
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body_fitting import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_monocular_poses import broadcast, crowd
+from test_monocular import broadcast, crowd
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body import BodyParameters
