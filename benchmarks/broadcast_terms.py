@@ -31,7 +31,7 @@ from worldpose.broadcast_calibration.report import median_residuals
 from worldpose.formats import JointTracks, read_joints
 from worldpose.ingest import read_match
 from worldpose.pitch import PitchTemplate
-from worldpose.reports.broadcast import before_after_picture, largest_pose_changes
+from worldpose.reports.broadcast import largest_pose_changes, plot_before_after
 from worldpose.simulation import SCENARIOS, simulate_match
 from worldpose.video import VideoReader
 
@@ -95,7 +95,7 @@ def rows_of(
         with VideoReader(match.videos[clip]) as video:
             still = video.frame(frame)
         seen = people.keypoints[frame, :, :, :2]
-        drawn = before_after_picture(
+        drawn = plot_before_after(
             before[frame], after[frame], tracks, frame, person,
             still=still, seen=seen, pitch=match.pitch,
         )  # fmt: skip

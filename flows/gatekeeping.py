@@ -11,7 +11,7 @@ from data_contracts.run import GatePolicy, ResultManifest, WaitingUnit
 from flows.gates import Gate
 from flows.method import GATES
 from flows.stage import Match
-from worldpose.review import Journal, decision_on, requests_by_id, say
+from worldpose.review import Journal, last_decision, requests_by_id, say
 from worldpose.store import Store
 
 ALWAYS = "every result is asked about"
@@ -45,7 +45,7 @@ class Gatekeeper:
             if name.partition("/")[0] != stage:
                 continue
             manifest = self._manifest(name, key)
-            decision = decision_on(self.match.journal.questions, name, manifest.content)
+            decision = last_decision(self.match.journal.questions, name, manifest.content)
             if decision is None:
                 reasons = self._reasons(gate, manifest)
                 if reasons:

@@ -126,7 +126,7 @@ def evaluate(
             todo="Name what is scored and the truth, or ask for --ablation 10.",
         )
     from flows.results.evaluation import score
-    from worldpose.reports.score_names import score_rows
+    from worldpose.reports.run_report import score_rows
 
     scores = score(
         prediction,

@@ -56,7 +56,7 @@ def clips(
     proposed = [shot for shot in shots if not shot.unfit]
     if sheet is not None:
         from worldpose.formats import whole_file
-        from worldpose.reports.clip_sheet import programme_sheet
+        from worldpose.reports.broadcast import programme_sheet
 
         with whole_file(sheet) as draft:
             draft.write_bytes(programme_sheet(proposed))

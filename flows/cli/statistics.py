@@ -40,10 +40,10 @@ def statistics(
     found = count(folders, fps=fps)
     if picture is not None:
         from worldpose.formats.files import whole_file
-        from worldpose.reports.data_set import statistics_picture
+        from worldpose.reports.data_set import plot_statistics
 
         with whole_file(picture) as draft:
-            draft.write_bytes(statistics_picture(found))
+            draft.write_bytes(plot_statistics(found))
     if page is not None:
         from flows.results.checking import check
         from worldpose.formats.files import whole_file

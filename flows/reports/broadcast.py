@@ -25,12 +25,12 @@ from worldpose.geometry.stored import camera_from_arrays
 from worldpose.ingest import unit_frames
 from worldpose.reports import CaptionedImage
 from worldpose.reports.broadcast import (
-    angles_of,
-    before_after_picture,
-    course_picture,
+    camera_angles,
     largest_pose_changes,
+    plot_before_after,
+    plot_camera_course,
 )
-from worldpose.reports.clips import camera_picture
+from worldpose.reports.clips import plot_camera_view
 from worldpose.reports.html_page import Table
 from worldpose.reports.overlay_video import overlay_frames
 from worldpose.store import Run
@@ -54,7 +54,7 @@ def broadcast_pictures(run: Run, match: Match) -> list[CaptionedImage]:
             CaptionedImage(
                 f"{clip_title(clip)}: the broadcast camera over its frames, smoothed (blue, with "
                 "bands of two standard deviations) and each frame on its own (orange).",
-                course_picture(
+                plot_camera_course(
                     frame,
                     camera,
                     run[broadcast_unit(run, clip)]["covariance"].values,
@@ -78,7 +78,7 @@ def broadcast_pictures(run: Run, match: Match) -> list[CaptionedImage]:
                     f"{clip_title(clip)}, frame {number}, {video_number} of its video, among those "
                     f"where the broadcast camera is known least ({expected[place]:.2g} px): "
                     "markings and people as it projects them.",
-                    camera_picture(
+                    plot_camera_view(
                         camera[place],
                         f"broadcast camera, frame {number}",
                         tracks,
@@ -119,7 +119,7 @@ def _before_and_after(
             f"{clip_title(clip)}, frame {number}: before and after players and all frames "
             "together. Crosses: keypoints that were seen. In the median, markings are "
             f"{markings} px off, people {players} px.",
-            before_after_picture(
+            plot_before_after(
                 before[place],
                 after[place],
                 shared,
@@ -217,7 +217,7 @@ def broadcast_tables(run: Run, match: Match) -> list[Table]:
 def _motion(run: Run, clip: str, fps: float) -> list[tuple[str, str]]:
     """Return the clip's duration and pan range as table rows."""
     camera = broadcast_cameras(run)[clip]
-    pan, _, _ = angles_of(camera)
+    pan, _, _ = camera_angles(camera)
     return [
         ("length [s]", f"{len(pan) / fps:.1f}"),
         ("pan, from leftmost to rightmost [deg]", f"{np.nanmax(pan) - np.nanmin(pan):.1f}"),

@@ -17,8 +17,8 @@ from worldpose.reports.static_cameras import (
     NEAR,
     Click,
     ErrorMap,
-    calibration_picture,
-    paint_picture,
+    plot_calibration,
+    plot_paint,
 )
 from worldpose.store import Run, Store
 
@@ -99,7 +99,7 @@ def paint_pictures(run: Run, match: Match, cameras: Mapping[str, Camera]) -> lis
     name = max(counts, key=lambda each: counts[each])
     still = still_of(match, name)
     assert still is not None, "only cameras with a still are counted"
-    png, share = paint_picture(cameras[name], still, match.folder.pitch)
+    png, share = plot_paint(cameras[name], still, match.folder.pitch)
     return [
         CaptionedImage(
             f"Camera {name}: paint in its picture, and how far every pixel is from it, with the "
@@ -116,7 +116,7 @@ def camera_evidence(store: Store, run: Run, match: Match, name: str, camera: Cam
     assert match.folder.pitch is not None, "nothing is clicked without a pitch"
     result = run[f"static_calibration/{name}"]
     inlier = dict(zip(_names(run, name), result["point_inlier"].values.tolist(), strict=True))
-    return calibration_picture(
+    return plot_calibration(
         camera,
         f"camera {name}",
         match.folder.pitch,

@@ -19,10 +19,15 @@ from flows.stages.redetection import seen_in
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
 from worldpose.reports import CaptionedImage, Scene
-from worldpose.reports.bodies import bodies_picture
-from worldpose.reports.body_rendering import BodyTracks
-from worldpose.reports.clips import camera_picture, paths_picture, stadium_picture
-from worldpose.reports.detections import detections_picture
+from worldpose.reports.bodies import BodyTracks, plot_bodies
+from worldpose.reports.clips import (
+    ImageDetections,
+    ReconstructedPeople,
+    plot_camera_view,
+    plot_detections,
+    plot_paths,
+    plot_stadium,
+)
 from worldpose.store import Run, Store
 
 
@@ -45,19 +50,19 @@ def clip_pictures(
             CaptionedImage(
                 f"{here}, from camera {widest}: markings and people as the found cameras and "
                 f"joints put them{beneath}.",
-                camera_picture(
+                plot_camera_view(
                     cameras[widest], f"camera {widest}", tracks, 0, still=still, pitch=pitch
                 ),
             ),
             CaptionedImage(
                 f"{here}, from above. The more cameras see a place, the darker it is.",
-                stadium_picture(cameras, "", tracks, 0, pitch=pitch),
+                plot_stadium(cameras, "", tracks, 0, pitch=pitch),
             ),
         ]
         bodies = body_tracks(run, clip)
         if bodies is not None:
             pictures.append(_bodies(bodies, match, clip, widest, cameras[widest]))
-    above = paths_picture(tracks, truth=truth, cameras=cameras, pitch=pitch)
+    above = plot_paths(tracks, truth=truth, cameras=cameras, pitch=pitch)
     pictures.append(CaptionedImage(f"{clip_title(clip)}: everybody's way.", above))
     return pictures
 
@@ -67,7 +72,7 @@ def _bodies(
 ) -> CaptionedImage:
     """Draw the bodies of a clip's first frame on a camera's still."""
     frame, still = int(bodies.frames[0]), still_of(match, camera_id)
-    png = bodies_picture(
+    png = plot_bodies(
         camera,
         f"camera {camera_id}, frame {frame}",
         bodies.model.vertices(bodies.poses[0]),
@@ -99,22 +104,24 @@ def detection_pictures(store: Store, run: Run, match: Match, clip: str) -> list[
     still = frame_picture(store, match, name, number)
     if still is None and frame == 0:
         still = still_of(match, name)
-    png = detections_picture(
+    png = plot_detections(
         cameras[name],
-        boxes=detected["boxes"].values,
-        keypoints=detected["keypoints"].values,
-        used=tracked[tracked >= 0],
-        joints=tracks.joints[frame],
-        person_ids=tracks.person_ids,
-        seen=placed["inliers"].values[frame, index].any(-1),
+        ImageDetections(
+            detected["boxes"].values, detected["keypoints"].values, tracked[tracked >= 0]
+        ),
+        ReconstructedPeople(
+            tracks.joints[frame],
+            tracks.person_ids,
+            placed["inliers"].values[frame, index].any(-1),
+        ),
         still=still,
         pitch=match.folder.pitch,
     )
     return [
         CaptionedImage(
-            f"Camera {name}, frame {number}, before: what its detector said; orange belongs to "
-            "nobody. After: people of all cameras as this one sees them; dashed boxes are those "
-            "that its own detector does not carry.",
+            f"Camera {name}, frame {number}. Left: its detections; orange detections belong to no "
+            "track. Right: the people that all cameras reconstruct, projected into this camera; a "
+            "dashed box marks a person without a detection in this camera.",
             png,
         )
     ]

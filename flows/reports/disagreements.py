@@ -13,7 +13,7 @@ from flows.stage import Match
 from flows.stages.redetection import seen_in
 from worldpose.formats import JointTracks
 from worldpose.reports import CaptionedImage
-from worldpose.reports.detections import detections_picture
+from worldpose.reports.clips import ImageDetections, ReconstructedPeople, plot_detections
 from worldpose.store import Run, Store
 
 SHOWN: Final = 2
@@ -73,14 +73,12 @@ def disagreement_pictures(store: Store, run: Run, match: Match, clip: str) -> li
             still = still_of(match, name)
         pixels = camera.project(tracks.joints[row, person])
         side = _AROUND * float(np.ptp(pixels[:, 1])) * np.array([1.6, 1.0])
-        png = detections_picture(
+        png = plot_detections(
             camera,
-            boxes=detected["boxes"].values,
-            keypoints=detected["keypoints"].values,
-            used=index[index >= 0],
-            joints=tracks.joints[row],
-            person_ids=tracks.person_ids,
-            seen=index >= 0,
+            ImageDetections(
+                detected["boxes"].values, detected["keypoints"].values, index[index >= 0]
+            ),
+            ReconstructedPeople(tracks.joints[row], tracks.person_ids, index >= 0),
             still=still,
             pitch=match.folder.pitch,
             part=(pixels.mean(axis=0) - 0.5 * side, side),

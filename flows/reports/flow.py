@@ -13,7 +13,7 @@ from worldpose.broadcast_calibration.tracking import follow, modified_z_scores
 from worldpose.geometry import Camera
 from worldpose.ingest import unit_frames
 from worldpose.reports import CaptionedImage
-from worldpose.reports.broadcast import flow_picture
+from worldpose.reports.broadcast import plot_flow
 from worldpose.store import Run
 from worldpose.video import open_video
 
@@ -51,7 +51,7 @@ def flow_pictures(run: Run, match: Match, clip: str, camera: Camera) -> list[Cap
     told = np.isfinite(predicted).all(-1)
     start, end, predicted = followed.start[told], followed.end[told], predicted[told]
     rejected = modified_z_scores(predicted - end) >= settings.flow_outlier
-    png = flow_picture(stills[0], start, end, rejected, predicted)
+    png = plot_flow(stills[0], start, end, rejected, predicted)
     return [
         CaptionedImage(
             f"{clip_title(clip)}, frame {number}, where the camera turns most from one frame to "

@@ -8,7 +8,7 @@ import xarray as xr
 from data_contracts.conventions import COCO17
 from flows.results.best_results import ADJUSTED, bodies_unit, clip_title
 from worldpose.reports.html_page import Table
-from worldpose.reports.score_names import shown_number
+from worldpose.reports.run_report import format_number
 from worldpose.store import Run
 
 MOST = 20
@@ -127,4 +127,4 @@ def _of_body(name: str, value: float | None) -> str:
 
 
 def _number(value: float) -> str:
-    return shown_number(value) if np.isfinite(value) else "-"
+    return format_number(value) if np.isfinite(value) else "-"

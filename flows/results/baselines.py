@@ -13,7 +13,7 @@ from flows.results.evaluation import cameras_of, reference_side
 from worldpose.body import OPEN_BODY, find_body
 from worldpose.errors import UsageError
 from worldpose.evaluation import EvaluationSettings, evaluate_joints
-from worldpose.evaluation.method_table import meaningful
+from worldpose.evaluation.method_table import select_defined_scores
 from worldpose.formats import JointTracks
 from worldpose.formats.baselines import MethodResult, find_method, resample_result
 from worldpose.formats.camera_file import RELEASE_SIZE
@@ -108,7 +108,7 @@ def score_methods(
                 match_in=match_in,
                 first_frame=first,
                 settings=settings.model_dump(mode="json"),
-                evaluation=meaningful(evaluation, result.world),
+                evaluation=select_defined_scores(evaluation, result.world),
             )
         )
     return tuple(scores)

@@ -13,7 +13,7 @@ from worldpose.errors import UsageError, WorldposeError
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
 from worldpose.geometry.stored import camera_from_arrays
-from worldpose.reports.body_rendering import BodyTracks
+from worldpose.reports.bodies import BodyTracks
 from worldpose.store import Run
 
 if TYPE_CHECKING:

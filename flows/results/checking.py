@@ -7,8 +7,13 @@ from pathlib import Path
 from data_contracts.release import CheckReport, Finding
 from worldpose.body import OPEN_BODY, find_body
 from worldpose.dataset.check import check_clip
-from worldpose.dataset.manifest import changed_files, frame_rate_of, read_frame_rates, read_manifest
-from worldpose.dataset.reading import clips_in, read_clip
+from worldpose.dataset.contents import list_clips, read_clip
+from worldpose.dataset.manifest import (
+    changed_files,
+    clip_frame_rate,
+    read_frame_rates,
+    read_manifest,
+)
 from worldpose.dataset.settings import CheckSettings
 
 USUAL_FPS = 50.0
@@ -21,10 +26,10 @@ def stated_rates(folder: Path, fps: float | None = None) -> dict[str, float | No
     Raises:
         InputError: a file cannot be read.
     """
-    clips, manifest = clips_in(folder), read_manifest(folder)
+    clips, manifest = list_clips(folder), read_manifest(folder)
     said = fps or (None if manifest is None else manifest.fps)
     rates = read_frame_rates(folder)
-    return {clip: said or frame_rate_of(rates, clip) for clip in clips}
+    return {clip: said or clip_frame_rate(rates, clip) for clip in clips}
 
 
 def check(

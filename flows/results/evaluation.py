@@ -18,14 +18,15 @@ from flows.results.best_results import (
 )
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation import CameraScore, PersonScore, evaluate_cameras, evaluate_joints
-from worldpose.evaluation.marker_files import (
+from worldpose.evaluation.marker_reference import (
     SUFFIXES,
-    joints_of_markers,
+    ReferenceAlignment,
+    align_reference,
+    map_marker_names,
     marker_joints,
     read_marker_map,
     read_markers,
 )
-from worldpose.evaluation.marker_reference import ReferenceAlignment, lay_over
 from worldpose.formats import JointTracks, read_camera, read_joints
 from worldpose.geometry import Camera
 from worldpose.ingest import MatchFolder, read_match
@@ -133,8 +134,8 @@ def _laid_over(
             todo="Name a prediction with joints, and give --fps where it belongs to no match.",
         )
     markers = read_markers(path)
-    people = joints_of_markers(markers.names) if marker_map is None else read_marker_map(marker_map)
-    return lay_over(prediction, marker_joints(markers, people), markers.rate, fps)
+    people = map_marker_names(markers.names) if marker_map is None else read_marker_map(marker_map)
+    return align_reference(prediction, marker_joints(markers, people), markers.rate, fps)
 
 
 def load_reference(name: str) -> JointTracks:

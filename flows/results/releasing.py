@@ -13,12 +13,14 @@ from data_contracts.release import ReleasedClip, ReleaseManifest
 from flows.results.best_results import bodies_unit, joint_tracks, static_cameras
 from flows.results.formats import EXPORTS, Origin
 from worldpose.dataset.manifest import (
+    ORIGINS,
+    origins_of,
     read_manifest,
     released_files,
     write_frame_rates,
     write_manifest,
+    write_origins,
 )
-from worldpose.dataset.origins import ORIGINS, origins_of, write_origins
 from worldpose.errors import UsageError
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.store import Store, pin_run

@@ -10,8 +10,8 @@ from data_contracts.review import Acceptance
 from flows.review.detections import results_of, stored_people
 from flows.stage import Match
 from worldpose.review import say
-from worldpose.review.acceptance import OpenDetections, open_detections
 from worldpose.review.detections import DETECTION_EDITS
+from worldpose.review.evidence import OpenDetections, open_detections
 from worldpose.store import Store
 
 

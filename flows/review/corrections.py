@@ -18,11 +18,11 @@ from worldpose.ingest import MatchFolder
 from worldpose.review import (
     Journal,
     Replay,
+    add_previous_value,
     append,
+    current_value,
     read_journal,
     replay_corrections,
-    value_now,
-    with_was,
 )
 from worldpose.review.detections import DETECTION_EDITS
 from worldpose.review.identities import IDENTITY_EDITS
@@ -92,7 +92,7 @@ def new_corrections(
         )
     folder, said = match.folder, []
     for number, given in enumerate(edits):
-        edit = with_was(folder, given)
+        edit = add_previous_value(folder, given)
         _require_unchanged(folder, standing, edit)
         correction = Correction(
             id=ids[number] if ids else f"{edit.kind}.{uuid.uuid4().hex[:12]}",
@@ -158,7 +158,7 @@ def keep_edits(
 
 def _require_unchanged(folder: MatchFolder, standing: Sequence[Correction], edit: Edit) -> None:
     """Refuse an edit whose `was` differs from the current value; name the author of the change."""
-    if not isinstance(edit, MovedPoint | RedrawnMarking) or value_now(folder, edit) == edit.was:
+    if not isinstance(edit, MovedPoint | RedrawnMarking) or current_value(folder, edit) == edit.was:
         return
     place = (edit.camera, edit.frame, edit.marking)
     last = [
@@ -167,7 +167,7 @@ def _require_unchanged(folder: MatchFolder, standing: Sequence[Correction], edit
         if isinstance(each.edit, MovedPoint | RedrawnMarking)
         and (each.edit.camera, each.edit.frame, each.edit.marking) == place
     ][-1:]
-    now = value_now(folder, edit)
+    now = current_value(folder, edit)
     found = f"{now or 'not there'}" + "".join(f", by {each.who}" for each in last)
     error = StaleEditError(
         f"{edit.marking} in {edit.camera}",

@@ -18,7 +18,7 @@ from worldpose.errors import InputError
 from worldpose.review.detections import (
     DETECTION_EDITS,
     DetectionEdit,
-    objection_to,
+    find_objection,
     replay_detections,
 )
 from worldpose.store import Store, recipe_key
@@ -61,7 +61,9 @@ def require_seen(store: Store, match: Match, edits: Sequence[Edit]) -> None:
         place = (edit.camera, edit.frame)
         if place not in found:
             found[place] = detections_now(store, match, *place)
-        objection = objection_to(found[place], edit) if len(found[place].frame) else "no such frame"
+        objection = (
+            find_objection(found[place], edit) if len(found[place].frame) else "no such frame"
+        )
         if objection is not None:
             raise _stale(edit, objection)
         found[place] = replay_detections(found[place], [edit]).observations

@@ -14,7 +14,7 @@ from worldpose.review.identities import (
     IDENTITY_EDITS,
     Identities,
     IdentityReplay,
-    objection_to,
+    find_objection,
     replay_identities,
     stored_identities,
 )
@@ -50,7 +50,7 @@ def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> None:
             continue
         if edit.clip not in found:
             found[edit.clip] = identities_now(store, match, edit.clip).identities
-        objection = objection_to(found[edit.clip], edit)
+        objection = find_objection(found[edit.clip], edit)
         if objection is not None:
             error = StaleEditError(
                 f"clip {edit.clip}, {edit.kind}",

@@ -16,7 +16,7 @@ from flows.review.edit_conflicts import StaleEditError
 from flows.run_record import latest_run
 from flows.stage import Match
 from worldpose.errors import InputError
-from worldpose.review import Journal, decision_on, requests_by_id, say, unit_origins
+from worldpose.review import Journal, last_decision, requests_by_id, say, unit_origins
 from worldpose.store import Store
 
 State = Literal["waits", "approve", "reject", "superseded"]
@@ -64,7 +64,7 @@ def _reviews(journal: Journal, latest: RunRecord | None) -> list[Review]:
     results = {} if latest is None else latest.results
     found = []
     for request in requests_by_id(journal.questions).values():
-        decisions = [decision_on(journal.questions, *each) for each in request.contents.items()]
+        decisions = [last_decision(journal.questions, *each) for each in request.contents.items()]
         is_current = any(results.get(unit) == key for unit, key in request.keys.items())
         found.append(Review(request, decisions[0] if decisions else None, is_current))
     return found
@@ -215,7 +215,7 @@ def origins_of(store: Store, match: Match, record: RunRecord) -> dict[str, Origi
         stage, _, unit = name.partition("/")
         manifest = store.manifest(match.match_id, stage, unit, key)
         made_from[name] = tuple(manifest.recipe.inputs)
-        decision = decision_on(match.journal.questions, name, manifest.content)
+        decision = last_decision(match.journal.questions, name, manifest.content)
         if decision is not None and decision.verdict == "reject":
             rejected.add(name)
     return unit_origins(made_from, match.corrections, rejected)

@@ -12,7 +12,7 @@ from data_contracts.run import ResultManifest, RunRecord
 from flows.method import GATES, METHOD
 from flows.run_record import latest_run
 from worldpose.errors import WorldposeError
-from worldpose.review import decision_on, read_journal, requests_by_id
+from worldpose.review import last_decision, read_journal, requests_by_id
 from worldpose.store import Store
 
 UnitState = Literal["done", "waiting", "failed", "blocked"]
@@ -140,7 +140,7 @@ class Overview:
         asked: Mapping[str, ReviewRequest],
     ) -> UnitGlance:
         manifest = self._manifest(run.match_id, name, run.results[name])
-        decision = decision_on(records, name, manifest.content)
+        decision = last_decision(records, name, manifest.content)
         is_approved = decision is not None and decision.verdict == "approve"
         gate = {each.stage: each for each in GATES}.get(name.partition("/")[0])
         objections = () if gate is None or is_approved else gate.objections(manifest.figures)

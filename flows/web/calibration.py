@@ -23,7 +23,7 @@ from flows.web.app_context import Desk
 from worldpose.errors import InputError, WorldposeError
 from worldpose.ingest.footage import read_still
 from worldpose.pitch import PitchTemplate
-from worldpose.review.preview import PitchDrawing, Preview, preview
+from worldpose.review.evidence import PitchDrawing, Preview, preview
 from worldpose.static_calibration import StaticCalibrationSettings
 from worldpose.video import open_video
 

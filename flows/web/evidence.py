@@ -26,10 +26,10 @@ from flows.stage import Match
 from flows.web.app_context import Desk
 from worldpose.formats import JointTracks
 from worldpose.reports import CaptionedImage
-from worldpose.reports.clips import paths_picture
+from worldpose.reports.clips import plot_paths
 from worldpose.reports.html_page import Table
 from worldpose.review import requests_by_id
-from worldpose.review.curves import Curve, clip_curves
+from worldpose.review.evidence import Curve, clip_curves
 from worldpose.store import Run, Store, open_run
 
 KEPT: Final = 16
@@ -141,7 +141,7 @@ def _identities(store: Store, run: Run, match: Match, clip: str) -> Evidence:
         joints=result["joints"].values.astype(np.float64),
     )
     cameras = static_cameras(run, match.folder.spec, "triangulation")
-    png = paths_picture(tracks, cameras=cameras, pitch=match.folder.pitch)
+    png = plot_paths(tracks, cameras=cameras, pitch=match.folder.pitch)
     rows = tuple(
         (
             str(join["before"]),

@@ -14,7 +14,7 @@ from flows.review.identities import identities_now
 from flows.stage import Match
 from flows.web.app_context import Desk
 from worldpose.ingest import unit_frames
-from worldpose.review.identities import Identities, sighting_of
+from worldpose.review.identities import Identities, find_sighting
 from worldpose.store import Store, open_run
 from worldpose.video import open_video
 
@@ -78,7 +78,7 @@ def _person(found: Identities, person: int, step: int) -> dict[str, Any]:
     views = np.count_nonzero(found.detection_index[:, :, k] >= 0, axis=1)
     bounds = np.flatnonzero(np.diff(np.concatenate([[0], views > 0, [0]])))
     first = int(found.frame[0])
-    seen = sighting_of(found, person)
+    seen = find_sighting(found, person)
     return {
         "id": person,
         "name": found.names.get(person),

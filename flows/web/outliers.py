@@ -15,7 +15,7 @@ from flows.results.best_results import ADJUSTED
 from flows.stage import Match
 from flows.stages.detection import seen_by
 from flows.web.app_context import Desk
-from worldpose.review import requests_by_id, value_now
+from worldpose.review import current_value, requests_by_id
 from worldpose.store import Run, open_run
 
 MOST: Final = 60
@@ -61,7 +61,7 @@ def _clicks(run: Run, match: Match) -> Iterator[Outlier]:
             str(result["click"].values[k]),
         )
         edit = MovedPoint(camera=camera, marking=marking, xy=None)
-        was = value_now(match.folder, edit)
+        was = current_value(match.folder, edit)
         surprise = float(result["click_surprise"].values[k])
         yield surprise, "click", edit.model_copy(update={"was": was}), was is None
 

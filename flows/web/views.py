@@ -18,7 +18,7 @@ from flows.stage import Match
 from flows.web.app_context import Desk
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
-from worldpose.review.other_views import check_views, epipolar_curves
+from worldpose.review.evidence import check_views, epipolar_curves
 from worldpose.store import open_run
 
 KEPT: Final = 8

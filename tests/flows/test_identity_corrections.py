@@ -13,7 +13,7 @@ from flows.review.verdicts import origins_of
 from flows.run_record import latest_run
 from tasks.tracking import tracking
 from worldpose.review import standing_corrections
-from worldpose.review.identities import sighting_of
+from worldpose.review.identities import find_sighting
 from worldpose.store import ResultId, Store
 
 
@@ -42,7 +42,7 @@ def test_a_split_and_a_merge_are_in_the_tracks_and_replayed_to_the_same_bytes(st
     clip = before.recipe.unit
     found = identities_now(store, open_match(store, TINY), clip).identities
     middle = int(found.frame[len(found.frame) // 2])
-    seen = sighting_of(found, 0)
+    seen = find_sighting(found, 0)
     say(store, a=SplitTrack(clip=clip, person=0, seen=seen, first_frame_of_new=middle))
     after = planned(store)
     assert before.published
@@ -76,7 +76,7 @@ def test_an_edit_of_somebody_who_is_another_by_now_is_refused(store):
     clip = planned(store).recipe.unit
     found = identities_now(store, open_match(store, TINY), clip).identities
     middle = int(found.frame[len(found.frame) // 2])
-    seen = sighting_of(found, 0, first=middle)
+    seen = find_sighting(found, 0, first=middle)
     split = SplitTrack(clip=clip, person=0, seen=seen, first_frame_of_new=middle)
     say(store, a=split)
     say(store, a=split)  # the same edit sent again is kept once

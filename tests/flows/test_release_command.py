@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from command_line import TINY, succeed, worldpose
 
-from worldpose.dataset.origins import read_origins
+from worldpose.dataset.manifest import read_origins
 from worldpose.errors import InputError
 from worldpose.simulation.bvh import read_bvh
 from worldpose.store import Store, list_pins

@@ -3,22 +3,180 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from typing import Final
 
+import numpy as np
+
+from data_contracts.arrays import Floats
 from data_contracts.release import ClipFigures, Finding
 from worldpose.dataset.contents import PointSource, ShippedClip, View
-from worldpose.dataset.faults import Fault
-from worldpose.dataset.moving_cameras import is_blind, sight_findings, turning_findings
+from worldpose.dataset.faults import (
+    SOUND,
+    Agreement,
+    Fault,
+    agreement_findings,
+    axis_orders,
+    compare_view,
+)
 from worldpose.dataset.plausibility import (
+    BONES,
     body_findings,
     camera_findings,
     ground_findings,
+    is_blind,
     pitch_findings,
     plausible_share,
+    turning_findings,
+    visibility_findings,
     world_fault,
 )
-from worldpose.dataset.reprojection import SOUND, Agreement, agreement, agreement_findings
 from worldpose.dataset.settings import CheckSettings
-from worldpose.dataset.skeletons import box_findings, skeleton_findings
+from worldpose.formats.camera_file import CameraRows
+from worldpose.geometry.boxes import box_iou
+
+_BODIES: Final = 400
+"""Maximum number of sampled bodies."""
+_OVERLAP: Final = 0.35
+"""Minimum median intersection over union of valid boxes and those around 2D skeletons [1]:
+bodies extend beyond joints, so 0.5 to 0.7 is normal."""
+_AS_SHIPPED: Final = "the camera's x, y, z"
+
+
+def box_findings(boxes: Floats, skel_2d: Floats, clip: str) -> Iterator[Finding]:
+    """Yield boxes without their skeletons, and whether another number order explains it.
+
+    Args:
+        boxes: (frames, persons, 4) as in the file.
+        skel_2d: (frames, persons, points, 2) [px].
+        clip: its name.
+    """
+    shipped = _overlap(boxes, skel_2d)
+    if shipped >= _OVERLAP:
+        return
+    start, rest = boxes[..., :2], boxes[..., 2:]
+    others = {
+        "x y width height": np.concatenate([start, start + rest], axis=-1),
+        "the middle's x y, width height": np.concatenate(
+            [start - 0.5 * rest, start + 0.5 * rest], axis=-1
+        ),
+        "y0 x0 y1 x1": boxes[..., [1, 0, 3, 2]],
+    }
+    overlaps = {name: _overlap(other, skel_2d) for name, other in others.items()}
+    best = max(overlaps, key=lambda name: overlaps[name])
+    known = overlaps[best] >= _OVERLAP
+    yield Finding(
+        fault="box_format" if known else "boxes",
+        kind="convention" if known else "damage",
+        where=(f"boxes of {clip}",),
+        says=f"boxes are {best} and not x0 y0 x1 y1"
+        if known
+        else "boxes are not around the 2D skeletons",
+        figures={"overlap": shipped, "explained_overlap": overlaps[best]},
+    )
+
+
+def skeleton_findings(
+    skel_3d: Floats,
+    skel_2d: Floats,
+    skeleton: tuple[str, ...],
+    rows: CameraRows,
+    clip: str,
+    settings: CheckSettings,
+) -> Iterator[Finding]:
+    """Yield 3D skeletons in camera axes that no translation brings onto their 2D.
+
+    Every body is translated to minimize its 2D residual; the remaining residual indicates other
+    axes. The residual does not depend on body size, so units are checked by thigh lengths.
+
+    Args:
+        skel_3d: (frames, persons, points, 3) as in the file.
+        skel_2d: (frames, persons, points, 2) [px].
+        skeleton: names of the points.
+        rows: the clip's camera; a frame without a pose has K and k.
+        clip: its name.
+        settings: thresholds for an explanation.
+    """
+    where = (f"skel_3d of {clip}",)
+    count = len(rows.intrinsics) if len(rows.intrinsics) > 1 else len(skel_3d)
+    known = np.isfinite(skel_3d[:count]).all((-1, -2)) & np.isfinite(skel_2d[:count]).all((-1, -2))
+    frame, person = np.nonzero(known)
+    if not len(frame):
+        return
+    picked = np.unique(np.linspace(0, len(frame) - 1, _BODIES).round().astype(np.int64))
+    frame, person = frame[picked], person[picked]
+    bodies, pixels = skel_3d[frame, person], skel_2d[frame, person]
+    upper, lower = (skeleton.index(f"left_{name}") for name in BONES["thighs"])
+    thigh = float(np.median(np.linalg.norm(bodies[:, upper] - bodies[:, lower], axis=-1)))
+    for unit, size in (("millimetres", 1000.0), ("centimetres", 100.0)):
+        if settings.bones[0] <= thigh / size <= settings.bones[1]:
+            yield Finding(
+                fault=unit,
+                kind="convention",
+                where=where,
+                says=f"skeletons are in {unit} and not in metres",
+                figures={"thigh": thigh},
+            )
+            bodies = bodies / size
+    row = frame if len(rows.intrinsics) > 1 else np.zeros_like(frame)
+    lens = rows.lens()[row]
+    plane, focal = lens.normalize(pixels), lens.focal
+    told = np.isfinite(plane).all((-1, -2))
+    if not told.any():
+        return
+    row, bodies, plane, focal = row[told], bodies[told], plane[told], focal[told]
+    guesses = {_AS_SHIPPED: bodies}
+    for name, axes in axis_orders():
+        guesses[f"the camera's {name}"] = bodies @ axes
+    turned = rows.rotation[row]
+    posed = np.isfinite(turned).all((-1, -2))
+    left = {name: _left(guess, plane, focal) for name, guess in guesses.items()}
+    if posed.any():
+        in_world = np.einsum("nab,njb->nja", turned[posed], bodies[posed])
+        left["the world's x, y, z"] = _left(in_world, plane[posed], focal[posed])
+    best = min(left, key=lambda name: left[name])
+    shipped, least = left[_AS_SHIPPED], left[best]
+    if shipped - least > settings.least_gain_px and least < settings.explained * shipped:
+        yield Finding(
+            fault="skeleton_axes",
+            kind="convention",
+            where=where,
+            says=f"x, y, z of the skeletons are {best} and not the camera's",
+            figures={"shipped_median_px": min(shipped, 1e6), "explained_median_px": least},
+        )
+
+
+def _overlap(boxes: Floats, skel_2d: Floats) -> float:
+    """Return the median intersection over union with boxes around the 2D points; 1 without any."""
+    known = np.isfinite(skel_2d).all((-1, -2)) & np.isfinite(boxes).all(-1)
+    if not np.any(known):
+        return 1.0
+    points = skel_2d[known]
+    around = np.concatenate([points.min(1), points.max(1)], axis=-1)
+    return float(np.median(box_iou(boxes[known][:, None], around[:, None])))
+
+
+def _left(bodies: Floats, plane: Floats, focal: Floats) -> float:
+    """Return the median 2D residual [px] of bodies after optimal translation.
+
+    Args:
+        bodies: (n, points, 3) [m], camera axes.
+        plane: (n, points, 2), the undistorted 2D at depth 1.
+        focal: (n, 2) [px].
+    """
+    # x (Z + tz) = X + tx, and the same for y: linear in the translation.
+    ones, zeros = np.ones_like(plane[..., 0]), np.zeros_like(plane[..., 0])
+    across = np.stack([ones, zeros, -plane[..., 0]], axis=-1)
+    down = np.stack([zeros, ones, -plane[..., 1]], axis=-1)
+    rows = np.concatenate([across, down], axis=1)
+    deep = plane * bodies[..., 2:] - bodies[..., :2]
+    given = np.concatenate([deep[..., 0], deep[..., 1]], axis=1)
+    normal = np.einsum("nki,nkj->nij", rows, rows)
+    place = np.linalg.solve(normal, np.einsum("nki,nk->ni", rows, given)[..., None])
+    seen = bodies + place.swapaxes(-1, -2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        away = (seen[..., :2] / seen[..., 2:] - plane) * focal[:, None]
+    far = np.linalg.norm(away, axis=-1)
+    return float(np.median(np.where(seen[..., 2] > 0.0, far, np.inf)))
 
 
 def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures, list[Finding]]:
@@ -33,7 +191,7 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
         found
         for source in clip.sources
         for view in clip.views
-        if (found := agreement(source, view, settings)) is not None
+        if (found := compare_view(source, view, settings)) is not None
     ]
     named = {one.source for one in agreements if one.fault is not SOUND}
     slips = [
@@ -53,7 +211,7 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
     faults = {one.view: one.fault for one in agreements if one.fault.camera is not None}
     shares = []
     for source in clip.sources:
-        repaired = _repaired(source, agreements)
+        repaired = _repair_source(source, agreements)
         if not clip.pitch:
             findings += body_findings(repaired, clip.fps, settings)
             continue
@@ -74,12 +232,12 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
         findings += body_findings(repaired, clip.fps, settings)
         findings += pitch_findings(repaired, settings)
         blind = [view for view in blind if is_blind(repaired, view.rows, settings)]
-        for finding, reason in sight_findings(repaired, blind, settings):
+        for finding, reason in visibility_findings(repaired, blind, settings):
             findings.append(finding)
             if reason is not None:
                 faults |= {place.removeprefix("cameras/"): reason for place in finding.where}
     for view in clip.views:
-        findings += camera_findings(_mended(view, faults.get(view.name, SOUND)), settings)
+        findings += camera_findings(_repair_view(view, faults.get(view.name, SOUND)), settings)
     seen = [one.median_px for one in agreements]
     worst = max(seen) if seen and max(seen) < float("inf") else None
     figures = ClipFigures(
@@ -91,7 +249,7 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
         reprojection_median_px=worst,
         plausible_share=min(shares) if shares else None,
     )
-    return figures, list(_merged(findings))
+    return figures, list(_merge_findings(findings))
 
 
 def _challenge_findings(clip: ShippedClip, settings: CheckSettings) -> Iterator[Finding]:
@@ -101,11 +259,17 @@ def _challenge_findings(clip: ShippedClip, settings: CheckSettings) -> Iterator[
     yield from box_findings(clip.given.boxes, clip.given.skel_2d, clip.name)
     for view in clip.views:
         if view.name == clip.name:
-            both = clip.given.skel_3d, clip.given.skel_2d
-            yield from skeleton_findings(*both, view.skeleton, view.rows, clip.name, settings)
+            yield from skeleton_findings(
+                clip.given.skel_3d,
+                clip.given.skel_2d,
+                view.skeleton,
+                view.rows,
+                clip.name,
+                settings,
+            )
 
 
-def _repaired(source: PointSource, agreements: Iterable[Agreement]) -> PointSource:
+def _repair_source(source: PointSource, agreements: Iterable[Agreement]) -> PointSource:
     """Repair the source for the fault that its 2D data indicates most often."""
     faults = [a.fault for a in agreements if a.source == source.name and a.fault.points is not None]
     if not faults:
@@ -115,7 +279,7 @@ def _repaired(source: PointSource, agreements: Iterable[Agreement]) -> PointSour
     return source if points is None else source.moved(points)
 
 
-def _mended(view: View, fault: Fault) -> View:
+def _repair_view(view: View, fault: Fault) -> View:
     if fault.camera is None:
         return view
     return View(view.name, fault.camera(view.rows), view.pixels, view.skeleton)
@@ -131,7 +295,7 @@ def _world_finding(source: PointSource, fault: Fault, before: float, after: floa
     )
 
 
-def _merged(findings: Iterable[Finding]) -> Iterator[Finding]:
+def _merge_findings(findings: Iterable[Finding]) -> Iterator[Finding]:
     """Merge findings of the same fault and text into one, with all places."""
     groups: dict[tuple[str, str], list[Finding]] = {}
     for finding in findings:

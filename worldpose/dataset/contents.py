@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from data_contracts.release import Finding
-from worldpose.formats.camera_file import CameraRows
-from worldpose.formats.challenge import ChallengeClip
+from data_contracts.conventions import COCO17
+from data_contracts.release import Finding, ReleaseManifest
+from worldpose.body import BODY25, CHALLENGE15, BodyModel, BodyParameters, fold_keypoints
+from worldpose.errors import InputError
+from worldpose.formats.archives import wrong
+from worldpose.formats.camera_file import CameraRows, read_camera_rows
+from worldpose.formats.challenge import (
+    ChallengeClip,
+    read_challenge,
+    read_submission,
+    submission_clips,
+)
+from worldpose.formats.joints_file import read_joints
+from worldpose.formats.pose_file import read_poses
+from worldpose.geometry import Rigid
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,3 +116,228 @@ def absent_rows(name: str, arrays: Mapping[str, NDArray[Any]]) -> tuple[Floats, 
         )
     gone: Floats = missing | zeros
     return gone, findings
+
+
+SUBMISSIONS = ("submission.zip", "submission.npz")
+_FRAMES = 200
+"""Maximum number of frames, with all people, posed per chunk."""
+ONLY = "clip"
+"""Name of the one clip of a data set without clip names."""
+
+
+def list_clips(folder: Path) -> tuple[str, ...]:
+    """Return the names of the clips of a data set.
+
+    Raises:
+        InputError: the folder has neither poses, joints nor a submission.
+    """
+    names = {path.stem for path in (folder / "poses").glob("*.npz")}
+    names |= {path.name.removesuffix(".joints.npz") for path in folder.glob("*.joints.npz")}
+    for name in SUBMISSIONS:
+        if (folder / name).is_file():
+            names |= set(submission_clips(folder / name))
+    if not names and (folder / "joints.npz").is_file():
+        names = {ONLY}
+    if not names:
+        raise InputError(
+            str(folder),
+            expected="an exported data set: poses/<clip>.npz, joints.npz, <clip>.joints.npz or "
+            "submission.zip",
+            found=", ".join(sorted(path.name for path in folder.iterdir())[:8])
+            if folder.is_dir()
+            else "no such folder",
+            todo="Give the folder that worldpose export wrote, or one of the same layout.",
+        )
+    return tuple(sorted(names))
+
+
+def read_clip(
+    folder: Path,
+    clip: str,
+    clips: tuple[str, ...],
+    body: Callable[[str | None], BodyModel],
+    manifest: ReleaseManifest | None,
+    fps: float,
+    pitch: bool = True,
+) -> ShippedClip:
+    """Read all data of one clip.
+
+    Args:
+        folder: the data set.
+        clip: one of `clips`.
+        clips: all of the data set; a camera with none of their names is static.
+        body: returns the body model for a name, or for a file without one.
+        manifest: of the release, if it is one.
+        fps: frames per second.
+        pitch: whether the ground is z = 0.
+
+    Raises:
+        InputError: a file is damaged.
+    """
+    sources, findings, ids = _sources(folder, clip, clips, body)
+    if manifest is not None and clip in manifest.clips:
+        ids = manifest.clips[clip].person_ids
+    names = (path.stem for path in sorted((folder / "cameras").glob("*.npz")))
+    rows = {
+        name: read_camera_rows(folder / "cameras" / f"{name}.npz")
+        for name in names
+        if name == clip or name not in clips
+    }
+    frames = max((len(source.points) for source in sources), default=0)
+    coco = folder if len(clips) == 1 else folder / clip
+    views = []
+    for name, camera in rows.items():
+        file = coco / f"{name}.json"
+        pixels = read_coco(file, ids, frames) if file.is_file() else None
+        views.append(View(name, camera, pixels, COCO17))
+    given = None
+    if _has_challenge(folder):
+        given = read_challenge(folder, clip).get(clip)
+        if given is not None:
+            arrays = {"boxes": given.boxes, "skel_2d": given.skel_2d, "skel_3d": given.skel_3d}
+            gone, more = absent_rows(f"boxes and skeletons of {clip}", arrays)
+            findings += more
+            pixels = np.where(gone[..., None, None], np.nan, given.skel_2d)
+            skeleton = BODY25 if pixels.shape[2] == len(BODY25) else CHALLENGE15
+            views = [
+                View(view.name, view.rows, pixels, skeleton) if view.name == clip else view
+                for view in views
+            ]
+            sources, swapped = _rows_of_boxes(sources, clip, pixels.shape[:2])
+            findings += swapped
+    return ShippedClip(clip, fps, tuple(sources), tuple(views), pitch, tuple(findings), given)
+
+
+def read_coco(path: Path, ids: tuple[int, ...], frames: int) -> Floats:
+    """Read 2D points (frames, persons, 17, 2) [px] of a COCO file; NaN if v is 0.
+
+    Args:
+        path: the file.
+        ids: people in the order of the person dimension; others are left out.
+        frames: number of frames; the first image is frame 0.
+
+    Raises:
+        InputError: it is not a COCO keypoints file.
+    """
+    pixels = np.full((frames, len(ids), len(COCO17), 2), np.nan)
+    person_of = {person: place for place, person in enumerate(ids)}
+    try:
+        dataset: Mapping[str, Any] = json.loads(path.read_bytes())
+        numbers = sorted(int(image["id"]) for image in dataset["images"])
+        frame_of = {number: place for place, number in enumerate(numbers)}
+        for row in dataset["annotations"]:
+            frame, person = frame_of[row["image_id"]], person_of.get(row["track_id"])
+            if person is None or frame >= frames:
+                continue
+            points = np.array(row["keypoints"], dtype=np.float64).reshape(len(COCO17), 3)
+            pixels[frame, person] = np.where(points[:, 2:] > 0, points[:, :2], np.nan)
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        raise wrong(str(path), "COCO keypoints with track_id", f"{error!r}") from error
+    return pixels
+
+
+def _sources(
+    folder: Path, clip: str, clips: tuple[str, ...], body: Callable[[str | None], BodyModel]
+) -> tuple[list[PointSource], list[Finding], tuple[int, ...]]:
+    """Return the 3D points of every file of a clip, the reader's findings, and person ids."""
+    sources: list[PointSource] = []
+    findings: list[Finding] = []
+    ids: tuple[int, ...] = ()
+    poses = folder / "poses" / f"{clip}.npz"
+    if poses.is_file():
+        source, more = _posed(poses, f"poses/{clip}.npz", body)
+        sources.append(source)
+        findings += more
+        ids = tuple(range(source.points.shape[1]))
+    for name in (f"{clip}.joints.npz", *(["joints.npz"] if len(clips) == 1 else [])):
+        if (folder / name).is_file():
+            tracks = read_joints(folder / name)
+            gone, more = absent_rows(name, {"joints": tracks.joints.swapaxes(0, 1)})
+            findings += [each for each in more if each.fault == "zeros_for_missing"]
+            zeros = (tracks.joints == 0.0).all((-1, -2))
+            joints = np.where(zeros[..., None, None], np.nan, tracks.joints)
+            sources.append(PointSource(name, COCO17, joints))
+            ids = tuple(tracks.person_ids.tolist())
+    for name in SUBMISSIONS:
+        if (folder / name).is_file() and clip in (found := read_submission(folder / name, (clip,))):
+            gone, more = absent_rows(f"{name}: {clip}", {"joints": found[clip]})
+            findings += [each for each in more if each.fault == "zeros_for_missing"]
+            joints = np.where(gone[..., None, None], np.nan, found[clip]).swapaxes(0, 1)
+            sources.append(PointSource(f"{name}: {clip}", CHALLENGE15, joints))
+    return sources, findings, ids
+
+
+def _posed(
+    path: Path, name: str, body: Callable[[str | None], BodyModel]
+) -> tuple[PointSource, list[Finding]]:
+    """Return the points of a pose file's bodies, and their values under other conventions."""
+    poses, model_name = read_poses(path)
+    model = body(model_name)
+    gone, findings = absent_rows(
+        name,
+        {
+            "transl": poses.transl,
+            "global_orient": poses.global_orient,
+            "body_pose": poses.body_pose,
+        },
+    )
+    place = np.where(gone[..., None], np.nan, poses.transl)
+    poses = BodyParameters(poses.betas, poses.global_orient, poses.body_pose, place)
+    pelvis = model.joint_template[0] + poses.betas @ model.joint_directions[0].T
+    turned = (Rigid.from_rotvec(poses.global_orient, np.zeros(3)).rotation @ pelvis[..., None])[
+        ..., 0
+    ]
+    in_degrees = None
+    # An angle far beyond a full turn is not a plausible axis-angle value.
+    angles = np.concatenate([poses.global_orient, poses.body_pose], axis=-1)
+    if np.nanmax(np.abs(angles), initial=0.0) > 7.0:
+        converted = BodyParameters(
+            poses.betas, np.radians(poses.global_orient), np.radians(poses.body_pose), place
+        )
+        in_degrees = _points(model, converted)
+    source = PointSource(
+        name,
+        BODY25,
+        _points(model, poses),
+        place.swapaxes(0, 1),
+        np.asarray(turned - pelvis).swapaxes(0, 1),
+        in_degrees,
+    )
+    return source, findings
+
+
+def _points(model: BodyModel, poses: BodyParameters) -> Floats:
+    """Return BODY25 (frames, persons, 25, 3) [m] of bodies (persons, frames), in bounded memory."""
+    keypoints = fold_keypoints(model, BODY25)
+    persons, frames = poses.batch_shape
+    points = np.empty((frames, persons, len(BODY25), 3))
+    for start in range(0, frames, _FRAMES):
+        part = slice(start, min(start + _FRAMES, frames))
+        points[part] = keypoints(poses[:, part]).swapaxes(0, 1)
+    return points
+
+
+def _has_challenge(folder: Path) -> bool:
+    return (folder / "boxes.npz").is_file() or (folder / "boxes").is_dir()
+
+
+def _rows_of_boxes(
+    sources: list[PointSource], clip: str, shape: tuple[int, ...]
+) -> tuple[list[PointSource], list[Finding]]:
+    """Return sources with the boxes' frames and persons, and findings on swapped dimensions."""
+    kept, findings = [], []
+    for source in sources:
+        swapped = source.points.shape[:2] == shape[::-1] and shape[0] != shape[1]
+        if not swapped:
+            kept.append(source)
+            continue
+        kept.append(source.moved(source.points.swapaxes(0, 1)))
+        findings.append(
+            Finding(
+                fault="frames_before_persons",
+                kind="convention",
+                where=(source.name,),
+                says="the first dimension is the frames; a submission has persons first",
+            )
+        )
+    return kept, findings

@@ -34,7 +34,7 @@ def read_places(folder: Path, clip: str) -> Floats:
 
     Args:
         folder: the data set.
-        clip: one of `clips_in`.
+        clip: one of `list_clips`.
 
     Raises:
         InputError: a file is damaged, or the clip has no positions.

@@ -58,8 +58,8 @@ def align(source: ArrayLike, target: ArrayLike, *, with_scale: bool) -> Similari
     )
     common = np.isfinite(a).all(-1) & np.isfinite(b).all(-1)
     count = common.sum(-1)
-    a_mean, a_offset = _centred(a, common, count)
-    b_mean, b_offset = _centred(b, common, count)
+    a_mean, a_offset = _center(a, common, count)
+    b_mean, b_offset = _center(b, common, count)
     u, s, v = np.linalg.svd(np.swapaxes(b_offset, -1, -2) @ a_offset)
     handed = np.ones_like(s)
     handed[..., 2] = np.where(np.linalg.det(u) * np.linalg.det(v) < 0.0, -1.0, 1.0)
@@ -76,7 +76,7 @@ def align(source: ArrayLike, target: ArrayLike, *, with_scale: bool) -> Similari
     return Similarity(scale=scale, rotation=rotation, translation=b_mean - moved)
 
 
-def _centred(
+def _center(
     points: NDArray[np.float64], common: NDArray[np.bool_], count: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the mean of the common points and their offsets from it; 0 for other points."""

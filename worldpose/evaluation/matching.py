@@ -8,8 +8,63 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from worldpose.errors import InputError
+from worldpose.evaluation.alignment import Similarity, align
+from worldpose.evaluation.settings import EvaluationSettings
+from worldpose.geometry import Camera
+from worldpose.geometry.boxes import box_iou
+
+
+def joint_boxes(joints: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """Return boxes around projected joints (frames, persons, 4) x0 y0 x1 y1 [px].
+
+    NaN where no joint is in front of the camera. Boxes are not clipped to the image.
+
+    Args:
+        joints: (frames, persons, joints, 3) [m], world; NaN where missing.
+        camera: one camera, or one per frame.
+    """
+    frames, persons, count, _ = joints.shape
+    image = camera.project(joints.reshape(frames, persons * count, 3))
+    image = image.reshape(frames, persons, count, 2)
+    known = np.isfinite(image)
+    low = np.where(known, image, np.inf).min(axis=-2, initial=np.inf)
+    high = np.where(known, image, -np.inf).max(axis=-2, initial=-np.inf)
+    boxes = np.concatenate([low, high], axis=-1)
+    return np.where(np.isfinite(boxes), boxes, np.nan)
+
+
+def box_overlaps(predicted: NDArray[np.float64], true: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return intersection over union of all pairs (frames, true, predicted) [0..1].
+
+    NaN where a box is missing; 0 for boxes without area.
+
+    Args:
+        predicted: (frames, predicted persons, 4) x0 y0 x1 y1 [px].
+        true: (frames, true persons, 4) [px].
+    """
+    missing = np.isnan(true[:, :, None]).any(axis=-1) | np.isnan(predicted[:, None]).any(axis=-1)
+    return np.where(missing, np.nan, box_iou(true, predicted))
+
+
 _CHUNK: Final = 64
 """Frames per batch of distances: tens of megabytes for 25 people on either side."""
+
+
+def select_frames(
+    rows: NDArray[np.float64], own_frames: NDArray[np.int64], frames: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return rows at the given frames (frames, ...), NaN in frames without a row.
+
+    Args:
+        rows: (own frames, ...).
+        own_frames: (own frames,) frame of each row, each once.
+        frames: (frames,) wanted frames, each once.
+    """
+    selected = np.full((len(frames), *rows.shape[1:]), np.nan)
+    _, own, places = np.intersect1d(own_frames, frames, assume_unique=True, return_indices=True)
+    selected[places] = rows[own]
+    return selected
 
 
 def joint_distances(
@@ -103,7 +158,7 @@ def merge_tracks(pairs: NDArray[np.int64], cost: NDArray[np.float64]) -> NDArray
     return np.where(known, cheapest, -1)
 
 
-def taken(people: NDArray[np.float64], match: NDArray[np.int64]) -> NDArray[np.float64]:
+def take_matched(people: NDArray[np.float64], match: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return predicted people in the order of the true ones (frames, true, joints, 3).
 
     Args:
@@ -114,3 +169,148 @@ def taken(people: NDArray[np.float64], match: NDArray[np.int64]) -> NDArray[np.f
         return np.full((*match.shape, *people.shape[2:]), np.nan)
     chosen = np.take_along_axis(people, np.maximum(match, 0)[..., None, None], axis=1)
     return np.where((match >= 0)[..., None, None], chosen, np.nan)
+
+
+_FRAMES: Final = 48
+"""Sample frames, evenly spread: enough to distinguish paths."""
+_PAIRS: Final = 400
+"""Maximum pairs of people to try, by falling number of common joints: all of 20 against 20."""
+_ROUNDS: Final = 3
+"""Iterations of matching and alignment, enough to converge."""
+
+
+def register_world(
+    predicted: NDArray[np.float64], true: NDArray[np.float64], gate: float
+) -> Similarity | None:
+    """Return the similarity that matches most predicted people to true ones, None without a match.
+
+    Every pair of a predicted and a true person gives a candidate, from their whole paths. The
+    candidate with the least sum of distances from true to predicted people, each clipped at the
+    gate, wins; a fit to all its matches refines it.
+
+    Args:
+        predicted: (frames, predicted persons, joints, 3) [m]; NaN where missing.
+        true: (frames, true persons, joints, 3) [m]; NaN where missing.
+        gate: maximum distance of a match, after the motion [m].
+    """
+    shared = np.flatnonzero(_any_joint(predicted) & _any_joint(true))
+    if not len(shared):
+        return None
+    frames = shared[np.unique(np.linspace(0, len(shared) - 1, _FRAMES).round().astype(int))]
+    predicted, true = predicted[frames], true[frames]
+    rows, columns = _pairs(predicted, true)
+    if not len(rows):
+        return None
+    joints = true.shape[0] * true.shape[2]
+    motions = align(
+        np.swapaxes(predicted, 0, 1).reshape(-1, joints, 3)[columns],
+        np.swapaxes(true, 0, 1).reshape(-1, joints, 3)[rows],
+        with_scale=True,
+    )
+    middles, targets = _middles(predicted), _middles(true)
+    left = [
+        _unmatched_distance(_one(motions, index).apply(middles), targets, gate)
+        for index in range(len(rows))
+    ]
+    motion = _one(motions, int(np.argmin(left)))
+    for _ in range(_ROUNDS):
+        distances = joint_distances(motion.apply(_flat(predicted)).reshape(predicted.shape), true)
+        found = take_matched(predicted, match_people(distances, gate))
+        if not np.isfinite(found).any():
+            break
+        motion = align(found.reshape(-1, 3), true.reshape(-1, 3), with_scale=True)
+    return motion
+
+
+def _any_joint(people: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return the mask of frames with at least one person (frames,)."""
+    return np.asarray(np.isfinite(people[..., 0]).any((-1, -2)))
+
+
+def _flat(people: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return people reshaped to (frames, persons * joints, 3)."""
+    return people.reshape(len(people), -1, 3)
+
+
+def _pairs(
+    predicted: NDArray[np.float64], true: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return true and predicted persons of the pairs with most common joints."""
+    known_true = np.isfinite(np.swapaxes(true[..., 0], 0, 1)).reshape(true.shape[1], -1)
+    known = np.isfinite(np.swapaxes(predicted[..., 0], 0, 1)).reshape(predicted.shape[1], -1)
+    common = known_true.astype(np.int64) @ known.astype(np.int64).T
+    order = np.argsort(-common, axis=None, kind="stable")[:_PAIRS]
+    order = order[common.ravel()[order] >= true.shape[2]]
+    rows, columns = np.divmod(order, predicted.shape[1])
+    return rows, columns
+
+
+def _middles(people: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean joint of every person (frames, persons, 3), NaN without joints."""
+    known = np.isfinite(people).all(-1, keepdims=True)
+    count = known.sum(-2)
+    total = np.where(known, people, 0.0).sum(-2)
+    middles = np.full(total.shape, np.nan)
+    np.divide(total, count, out=middles, where=count > 0)
+    return middles
+
+
+def _unmatched_distance(
+    predicted: NDArray[np.float64], true: NDArray[np.float64], gate: float
+) -> float:
+    """Return the summed distance of true people to the nearest predicted one, clipped at gate."""
+    distance = np.linalg.norm(predicted[:, None] - true[:, :, None], axis=-1)
+    nearest = np.where(np.isnan(distance), gate, distance).min(axis=-1)
+    return float(np.minimum(nearest, gate).sum())
+
+
+def _one(motions: Similarity, index: int) -> Similarity:
+    return Similarity(motions.scale[index], motions.rotation[index], motions.translation[index])
+
+
+def match_tracks(
+    people: NDArray[np.float64],
+    true: NDArray[np.float64],
+    distances: NDArray[np.float64],
+    match: NDArray[np.int64],
+    camera: Camera | None,
+    boxes: NDArray[np.float64] | None,
+    settings: EvaluationSettings,
+) -> NDArray[np.int64]:
+    """Return the predicted person of each true one (frames, true), by whole tracks (E3).
+
+    Args:
+        people: (frames, predicted persons, 17, 3) [m]; NaN where missing.
+        true: (frames, true persons, 17, 3) [m]; NaN where missing.
+        distances: (frames, true persons, predicted persons) [m] of all pairs.
+        match: (frames, true persons), matches by these distances.
+        camera: compares boxes in its image; None = match by distance.
+        boxes: (frames, predicted persons, 4) [px] of the prediction there; None = of its joints.
+        settings: minimum overlap, gate, and threshold for registration.
+
+    Raises:
+        InputError: camera and truth have different numbers of frames.
+    """
+    if camera is not None:
+        if camera.batch_shape not in ((), (1,), (len(true),)):
+            raise InputError(
+                "camera to match in",
+                expected=f"one row, or {len(true)}: one for each frame of the reference",
+                found=f"{camera.batch_shape}",
+                todo="Name the camera of the clip that the reference belongs to.",
+            )
+        found = joint_boxes(people, camera) if boxes is None else boxes
+        overlap = box_overlaps(found, joint_boxes(true, camera))
+        cost = np.where(np.isnan(overlap), np.inf, 1.0 - overlap)
+        return merge_tracks(match_boxes(overlap, settings.min_overlap), cost)
+    possible = min(
+        int(np.isfinite(side[..., 0]).any(-1).sum())
+        for side in (people, true[np.isfinite(people[..., 0]).any((-1, -2))])
+    )
+    if (match >= 0).sum() < settings.min_matched_share * possible:
+        motion = register_world(people, true, settings.match_gate)
+        if motion is not None:
+            moved = motion.apply(people.reshape(len(people), -1, 3)).reshape(people.shape)
+            distances = joint_distances(moved, true)
+            match = match_people(distances, settings.match_gate)
+    return merge_tracks(match, distances)

@@ -33,7 +33,7 @@ _ALONE: Final = (
 _KEPT: Final = {"camera": _LOCAL, "own": _ALONE}
 
 
-def meaningful(evaluation: Evaluation, world: str) -> Evaluation:
+def select_defined_scores(evaluation: Evaluation, world: str) -> Evaluation:
     """Return the scores that are defined in a method's world.
 
     Args:
@@ -74,7 +74,8 @@ def table_latex(scores: Sequence[MethodScore]) -> str:
     for group in _groups(scores):
         lines.append("  \\midrule")
         lines += [
-            f"  {_escaped(row[0])} & {' & '.join(map(_spaced, row[1:]))} \\\\" for row in group
+            f"  {_escape(row[0])} & {' & '.join(map(_space_thousands, row[1:]))} \\\\"
+            for row in group
         ]
     return "\n".join([*lines, "  \\bottomrule", "\\end{tabular}"]) + "\n"
 
@@ -99,10 +100,10 @@ def _row(title: str, score: MethodScore, instead: dict[str, str]) -> tuple[str, 
     return (title, *cells)
 
 
-def _spaced(cell: str) -> str:
+def _space_thousands(cell: str) -> str:
     """Return a number with thin spaces between thousands."""
     return cell if cell == _ABSENT else f"{float(cell):,.1f}".replace(",", "\\,")
 
 
-def _escaped(text: str) -> str:
+def _escape(text: str) -> str:
     return "".join(f"\\{sign}" if sign in "&%_#$" else sign for sign in text)

@@ -3,26 +3,255 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.conventions import COCO17
 from data_contracts.evaluation import Evaluation
 from data_contracts.records import Record
+from worldpose.evaluation.alignment import align
 from worldpose.evaluation.identity import identity_scores
-from worldpose.evaluation.limbs import correct_limbs, limb_ends
-from worldpose.evaluation.matching import joint_distances, match_people, taken
-from worldpose.evaluation.settings import EvaluationSettings
-from worldpose.evaluation.tracks import match_tracks
-from worldpose.evaluation.trajectories import (
-    acceleration_errors,
-    aligned_errors,
-    challenge_errors,
-    drift_per_meter,
-    path_lengths,
+from worldpose.evaluation.matching import (
+    joint_distances,
+    match_people,
+    match_tracks,
+    select_frames,
+    take_matched,
 )
+from worldpose.evaluation.settings import EvaluationSettings
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
+
+LIMBS: Final = {
+    "left upper arm": ((5,), (7,)),
+    "left lower arm": ((7,), (9,)),
+    "right upper arm": ((6,), (8,)),
+    "right lower arm": ((8,), (10,)),
+    "left upper leg": ((11,), (13,)),
+    "left lower leg": ((13,), (15,)),
+    "right upper leg": ((12,), (14,)),
+    "right lower leg": ((14,), (16,)),
+    "torso": ((11, 12), (5, 6)),
+    "head": ((5, 6), (3, 4)),
+}
+"""Each end is the mean of the named COCO-17 joints: torso from mid-hip to mid-shoulder, head from
+mid-shoulder to the middle of the ears."""
+
+
+def limb_ends(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return both ends of every limb, NaN where a joint is missing.
+
+    Args:
+        joints: (..., 17, 3) [m].
+
+    Returns:
+        (..., 10, 2, 3) [m], in the order of `LIMBS`.
+    """
+    return np.stack(
+        [
+            np.stack([joints[..., list(end), :].mean(axis=-2) for end in ends], axis=-2)
+            for ends in LIMBS.values()
+        ],
+        axis=-3,
+    )
+
+
+def correct_limbs(
+    predicted: NDArray[np.float64], true: NDArray[np.float64], alpha: float
+) -> NDArray[np.bool_]:
+    """Return a mask of correct limbs (..., 10): mean error of ends at most alpha times length.
+
+    Args:
+        predicted: (..., 17, 3) [m]; a limb with a missing joint is wrong.
+        true: (..., 17, 3) [m].
+        alpha: share of the true length.
+
+    Note:
+        Burenius et al., CVPR 2013, in the form used for Shelf and Campus: the mean of both errors
+        is below the bound, not each error as in the original form.
+    """
+    true_ends = limb_ends(true)
+    error = np.linalg.norm(limb_ends(predicted) - true_ends, axis=-1).mean(axis=-1)
+    length = np.linalg.norm(true_ends[..., 0, :] - true_ends[..., 1, :], axis=-1)
+    correct: NDArray[np.bool_] = error <= alpha * length
+    return correct
+
+
+LIMB_JOINTS: Final = COCO17[5:]
+"""Shoulders, elbows, wrists, hips, knees and ankles, left before right."""
+
+
+def paper_joints(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the joints of E4 (..., 14, 3) [m], NaN where missing.
+
+    Args:
+        joints: (..., 17, 3) [m], COCO-17.
+    """
+    neck = joints[..., 5:7, :].mean(axis=-2, keepdims=True)
+    return np.concatenate([joints[..., :1, :], neck, joints[..., 5:, :]], axis=-2)
+
+
+def challenge_joints(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the joints that the challenge and COCO-17 share (..., 13, 3) [m].
+
+    Args:
+        joints: (..., 17, 3) [m], COCO-17.
+    """
+    return np.concatenate([joints[..., :1, :], joints[..., 5:, :]], axis=-2)
+
+
+def mid_hip(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the middle of the hips (..., 3) [m], NaN if one is missing.
+
+    Args:
+        joints: (..., 17, 3) [m], COCO-17.
+    """
+    middle: NDArray[np.float64] = joints[..., 11:13, :].mean(axis=-2)
+    return middle
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedErrors:
+    """Joint distances after alignment; NaN where a joint is missing on either side.
+
+    Distances are (frames, persons, 14) [m], on the joints of E4.
+    """
+
+    shared: NDArray[np.float64]
+    """One alignment for all people's whole trajectories (E1)."""
+    per_person: NDArray[np.float64]
+    """One alignment for each person's whole trajectory (E2)."""
+    per_frame: NDArray[np.float64]
+    """One alignment for each person in each frame (E1)."""
+    scale: float
+    """Scale of the shared alignment: true over predicted size; 1 if rigid, NaN without common
+    joints."""
+
+
+def aligned_errors(
+    predicted: NDArray[np.float64],
+    true: NDArray[np.float64],
+    *,
+    with_scale: bool,
+    min_joints: int,
+) -> AlignedErrors:
+    """Return joint errors after the three alignments of the paper.
+
+    Args:
+        predicted: (frames, persons, 17, 3) [m], in the order of the true people; NaN = missing.
+        true: (frames, persons, 17, 3) [m]; NaN where missing or not counted.
+        with_scale: similarities if true, rigid motions if not.
+        min_joints: minimum common joints of a person for the alignment per frame.
+    """
+    source, target = paper_joints(predicted), paper_joints(true)
+    frames, persons, joints, _ = target.shape
+    common = np.isfinite(source[..., 0]) & np.isfinite(target[..., 0])
+    source = np.where(common[..., None], source, np.nan)
+
+    everything = (frames * persons * joints, 3)
+    shared = align(source.reshape(everything), target.reshape(everything), with_scale=with_scale)
+    own_source, own_target = (
+        np.swapaxes(points, 0, 1).reshape(persons, frames * joints, 3)
+        for points in (source, target)
+    )
+    own = align(own_source, own_target, with_scale=with_scale)
+    per_person = np.linalg.norm(own.apply(own_source) - own_target, axis=-1)
+    enough = common.sum(-1) >= min_joints
+    body = np.where(enough[..., None, None], source, np.nan)
+    per_frame = align(body, target, with_scale=with_scale).apply(body) - target
+    return AlignedErrors(
+        shared=np.linalg.norm(
+            shared.apply(source.reshape(everything)).reshape(target.shape) - target, axis=-1
+        ),
+        per_person=np.swapaxes(per_person.reshape(persons, frames, joints), 0, 1),
+        per_frame=np.linalg.norm(per_frame, axis=-1),
+        scale=float(shared.scale),
+    )
+
+
+def path_lengths(true: NDArray[np.float64], compared: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the length of every true person's path (persons,) [m].
+
+    The path of the mid-hip through the compared frames, with straight lines across gaps.
+
+    Args:
+        true: (frames, persons, 17, 3) [m]; NaN where missing.
+        compared: (frames, persons) whether both sides have the person.
+    """
+    hips = mid_hip(true)
+    used = compared & np.isfinite(hips[..., 0])
+    lengths = np.zeros(true.shape[1])
+    for person in range(true.shape[1]):
+        steps = np.diff(hips[used[:, person], person], axis=0)
+        lengths[person] = np.linalg.norm(steps, axis=-1).sum()
+    return lengths
+
+
+def drift_per_meter(
+    errors: NDArray[np.float64], lengths: NDArray[np.float64], min_length: float
+) -> float | None:
+    """Return the mean over people of mean error over path length [1], None without long paths.
+
+    Args:
+        errors: (frames, persons, joints) [m]; NaN where missing.
+        lengths: (persons,) path lengths [m].
+        min_length: minimum path length of a person [m].
+
+    Note:
+        E1. The ratio of the published columns does not give the published drift, so that the drift
+        is no ratio of means over all people; this function averages the ratio of each trajectory.
+    """
+    known = np.isfinite(errors)
+    count = known.sum((0, 2))
+    far = (lengths >= min_length) & (count > 0)
+    if not far.any():
+        return None
+    total = np.where(known, errors, 0.0).sum((0, 2))
+    return float((total[far] / count[far] / lengths[far]).mean())
+
+
+def challenge_errors(
+    predicted: NDArray[np.float64], true: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return global and local joint errors (frames, persons, 13) [m], without any alignment.
+
+    Local errors are relative to the mid-hip of each side.
+
+    Args:
+        predicted: (frames, persons, 17, 3) [m], in the order of the true people; NaN = missing.
+        true: (frames, persons, 17, 3) [m]; NaN where missing.
+    """
+    offset = challenge_joints(predicted) - challenge_joints(true)
+    roots = (mid_hip(predicted) - mid_hip(true))[..., None, :]
+    return np.linalg.norm(offset, axis=-1), np.linalg.norm(offset - roots, axis=-1)
+
+
+def acceleration_errors(
+    predicted: NDArray[np.float64],
+    true: NDArray[np.float64],
+    frames: NDArray[np.int64],
+    fps: float,
+) -> NDArray[np.float64]:
+    """Return errors of joint acceleration (frames - 2, persons, 14) [m/s^2], NaN where unknown.
+
+    Second differences of three successive frames at the minimum step, on the joints of E4.
+
+    Args:
+        predicted: (frames, persons, 17, 3) [m], in the order of the true people; NaN = missing.
+        true: (frames, persons, 17, 3) [m]; NaN where missing.
+        frames: (frames,) match frames, rising.
+        fps: match frames per second [1/s].
+    """
+    offset = paper_joints(predicted) - paper_joints(true)
+    steps = np.diff(frames)
+    if len(steps) < 2:
+        return np.empty((0, *offset.shape[1:-1]))
+    step = steps.min()
+    regular = (steps[1:] == step) & (steps[:-1] == step)
+    errors = np.linalg.norm(np.diff(offset, n=2, axis=0), axis=-1) * (fps / step) ** 2
+    return np.where(regular[:, None, None], errors, np.nan)
 
 
 class PersonScore(Record):
@@ -78,7 +307,7 @@ def evaluate_joints(
         InputError: camera and reference have different numbers of frames.
     """
     settings = settings or EvaluationSettings()
-    people = _in_frames(prediction, reference.frames, prediction.joints)
+    people = select_frames(prediction.joints, prediction.frames, reference.frames)
     distances = joint_distances(people, reference.joints)
     match = match_people(distances, settings.match_gate)
     counts = _counting_joints(reference, settings)
@@ -91,12 +320,12 @@ def evaluate_joints(
     idle[frame, match[frame, person]] = True
 
     true = np.where(counts[..., None], reference.joints, np.nan)
-    tally = _tally(taken(people, match), true, present, settings.pcp_alpha)
+    tally = _tally(take_matched(people, match), true, present, settings.pcp_alpha)
     identity = identity_scores(distances, present, exists & ~idle, settings.match_gate)
-    around = None if boxes is None else _in_frames(prediction, reference.frames, boxes)
+    around = None if boxes is None else select_frames(boxes, prediction.frames, reference.frames)
     tracks = match_tracks(people, reference.joints, distances, match, camera, around, settings)
     figures, persons = _track_figures(
-        taken(people, tracks), true, present, reference.frames, fps, settings
+        take_matched(people, tracks), true, present, reference.frames, fps, settings
     )
     minutes = _minutes(reference.frames, fps)
     evaluation = Evaluation(
@@ -175,18 +404,6 @@ def _mean(values: NDArray[np.float64], factor: float = 1.0) -> float | None:
     """Return the mean of finite values times a factor, None without any."""
     known = np.isfinite(values)
     return _ratio(factor * np.where(known, values, 0.0).sum(), int(known.sum()))
-
-
-def _in_frames(
-    prediction: JointTracks, frames: NDArray[np.int64], rows: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return predicted rows at the given frames, NaN in frames that the prediction lacks."""
-    people = np.full((len(frames), *rows.shape[1:]), np.nan)
-    _, own, places = np.intersect1d(
-        prediction.frames, frames, assume_unique=True, return_indices=True
-    )
-    people[places] = rows[own]
-    return people
 
 
 def _counting_joints(reference: JointTracks, settings: EvaluationSettings) -> NDArray[np.bool_]:

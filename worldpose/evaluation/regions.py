@@ -10,7 +10,7 @@ from scipy.special import chdtri
 from data_contracts.arrays import Flags
 from data_contracts.conventions import COCO17
 from worldpose.errors import InputError
-from worldpose.evaluation.matching import joint_distances, match_people, taken
+from worldpose.evaluation.matching import joint_distances, match_people, select_frames, take_matched
 from worldpose.evaluation.settings import EvaluationSettings
 from worldpose.formats import JointTracks
 
@@ -47,17 +47,14 @@ def region_counts(
         raise InputError(
             "prediction",
             expected="joints with covariance",
-            found="joints without",
-            todo="Export the joints of a run, or leave regions out.",
+            found="joints without covariance",
+            todo="Export the joints of a run, or evaluate without confidence regions.",
         )
-    rows = np.searchsorted(prediction.frames, reference.frames)
-    rows = np.minimum(rows, len(prediction.frames) - 1)
-    there: Flags = np.asarray(prediction.frames[rows] == reference.frames)
-    joints = np.where(there[:, None, None, None], prediction.joints[rows], np.nan)
-    stated = np.where(there[:, None, None, None, None], prediction.covariance[rows], np.nan)
+    joints = select_frames(prediction.joints, prediction.frames, reference.frames)
+    stated = select_frames(prediction.covariance, prediction.frames, reference.frames)
     match = match_people(joint_distances(joints, reference.joints), settings.match_gate)
-    error = taken(joints, match) - reference.joints
-    flat = taken(stated.reshape(*stated.shape[:3], 9), match)
+    error = take_matched(joints, match) - reference.joints
+    flat = take_matched(stated.reshape(*stated.shape[:3], 9), match)
     covariance = flat.reshape(*flat.shape[:3], 3, 3)
     known = np.isfinite(error).all(axis=-1) & np.isfinite(covariance).all(axis=(-1, -2))
     counts: Flags = np.asarray(known)

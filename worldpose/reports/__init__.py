@@ -3,8 +3,7 @@
 Drawing modules import matplotlib; `html_page` and `run_report` do not.
 """
 
-from worldpose.reports.html_page import CaptionedImage, Section, Table
+from worldpose.reports.html_page import CaptionedImage, Scene, Section, Table
 from worldpose.reports.run_report import CameraSummary, report_page
-from worldpose.reports.scene import Scene
 
 __all__ = ["CameraSummary", "CaptionedImage", "Scene", "Section", "Table", "report_page"]

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
+import cv2
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.pitch import PitchSpec
+from worldpose.broadcast_calibration.shots import Shot
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry import Camera
 from worldpose.reports.drawing import (
@@ -27,7 +30,7 @@ _STEP: Final = {"rx": 0, "ry": 1, "rz": 2, "log_focal": 3, "k1": 4, "k2": 5}
 """Indices into the covariance of a frame's step."""
 
 
-def course_picture(
+def plot_camera_course(
     frame: NDArray[np.int64],
     camera: Camera,
     covariance: Floats,
@@ -77,7 +80,7 @@ def course_picture(
 
 
 def _curves(camera: Camera) -> dict[str, Floats]:
-    pan, tilt, roll = angles_of(camera)
+    pan, tilt, roll = camera_angles(camera)
     return {
         "focal length [px]": camera.focal[:, 0],
         "pan [deg]": pan,
@@ -112,7 +115,7 @@ def largest_pose_changes(before: Camera, after: Camera, tracks: JointTracks) -> 
     return (int(frame), int(person)) if apart.max() >= 0.0 else (0, 0)
 
 
-def before_after_picture(
+def plot_before_after(
     before: Camera,
     after: Camera,
     tracks: JointTracks,
@@ -160,7 +163,7 @@ def before_after_picture(
     return png(figure)
 
 
-def angles_of(camera: Camera) -> tuple[Floats, Floats, Floats]:
+def camera_angles(camera: Camera) -> tuple[Floats, Floats, Floats]:
     """Return pan, tilt and roll (frames,) of a camera [deg].
 
     Pan is from the world's y axis towards x, tilt from the horizon upwards, roll clockwise about
@@ -176,7 +179,7 @@ def angles_of(camera: Camera) -> tuple[Floats, Floats, Floats]:
     return pan, tilt, roll
 
 
-def flow_picture(
+def plot_flow(
     still: NDArray[np.uint8],
     start: Floats,
     end: Floats,
@@ -224,3 +227,34 @@ def flow_picture(
     axes.legend(loc="lower right", framealpha=0.85, fontsize=11)
     axes.set_title(f"motion, {stretch:.0f} times as long", color=INK, loc="left", fontsize=12)
     return png(figure)
+
+
+_SHOWN: Final = 5
+"""Frames per clip, in order and evenly spaced."""
+_BAR: Final = 24
+"""Height of the title line above them [px]."""
+
+
+def programme_sheet(shots: Sequence[Shot]) -> bytes:
+    """Return a PNG with a row of frames per clip, under its argument for `--take`."""
+    rows = [_row(shot) for shot in shots]
+    if not rows:
+        rows = [_text(np.zeros((_BAR, 5 * 320, 3), np.uint8), "no clip is proposed")]
+    width = max(row.shape[1] for row in rows)
+    rows = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows]
+    _, coded = cv2.imencode(".png", cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))
+    return coded.tobytes()
+
+
+def _row(shot: Shot) -> NDArray[np.uint8]:
+    places = np.linspace(0, len(shot.pictures) - 1, _SHOWN).round().astype(int)
+    pictures = np.hstack([shot.pictures[place] for place in places])
+    bar = np.zeros((_BAR, pictures.shape[1], 3), np.uint8)
+    said = f"{shot.first}:{shot.first + shot.count}   {shot.seconds:.1f} s, pan {shot.pan:.2f}"
+    return np.vstack([_text(bar, said), pictures])
+
+
+def _text(bar: NDArray[np.uint8], said: str) -> NDArray[np.uint8]:
+    white = (255, 255, 255)
+    cv2.putText(bar, said, (6, _BAR - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.5, white, 1, cv2.LINE_AA)
+    return bar

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.pitch import PitchSpec
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry import Camera
+from worldpose.reports.bodies import crowded_part
 from worldpose.reports.drawing import (
     GRASS,
     HIPS,
     INK,
     LINE,
     PALE,
+    PALETTE,
     TEMPLATE,
     draw_label,
     draw_pitch,
@@ -30,7 +35,7 @@ from worldpose.reports.drawing import (
 )
 
 
-def paths_picture(
+def plot_paths(
     tracks: JointTracks,
     *,
     truth: JointTracks | None = None,
@@ -79,7 +84,7 @@ def paths_picture(
         for x, y in last:
             draw_label(detail, f"{person_id}", (x, y), (7, 7), color)
     for name, center in centers.items():
-        overview.plot(*center, "^", color=INK, markersize=8.0, zorder=5)
+        overview.plot(center[0], center[1], "^", color=INK, markersize=8.0, zorder=5)
         draw_label(overview, name, (center[0], center[1]), (6, 6), INK)
     (x0, y0), (x1, y1) = close
     overview.add_patch(
@@ -114,7 +119,7 @@ REACH: Final = 130.0
 """Length of a drawn field of view [m]: a little more than a pitch's length."""
 
 
-def camera_picture(
+def plot_camera_view(
     camera: Camera,
     title: str,
     tracks: JointTracks,
@@ -152,7 +157,7 @@ def camera_picture(
     return png(figure)
 
 
-def stadium_picture(
+def plot_stadium(
     cameras: Mapping[str, Camera],
     title: str,
     tracks: JointTracks,
@@ -196,7 +201,7 @@ def stadium_picture(
         )
     for name, camera in cameras.items():
         shade = axes.fill(
-            *ground_seen(camera).T, color="#4a7fb5", alpha=0.06, linewidth=0, zorder=1
+            *visible_ground(camera).T, color="#4a7fb5", alpha=0.06, linewidth=0, zorder=1
         )[0]
         if ground is not None:
             shade.set_clip_path(ground)
@@ -206,18 +211,26 @@ def stadium_picture(
         for x, y in sides.directions[:, :2]:  # short lines along both sides show the direction
             toward = 18.0 * np.array([x, y]) / np.hypot(x, y)
             axes.plot(*np.stack([center, center + toward]).T, color=PALE, linewidth=1.2)
-        axes.plot(*center, "^", color=INK, markersize=8.0, zorder=5)
+        axes.plot(center[0], center[1], "^", color=INK, markersize=8.0, zorder=5)
         draw_label(axes, name, (center[0], center[1]), (6, 6), INK)
     for person_id, place in zip(tracks.person_ids, hips, strict=True):
         if np.isfinite(place).all():
             color = person_color(int(person_id))
-            axes.plot(*place, "o", color=color, markersize=8.0, markeredgecolor="white", zorder=5)
+            axes.plot(
+                place[0],
+                place[1],
+                "o",
+                color=color,
+                markersize=8.0,
+                markeredgecolor="white",
+                zorder=5,
+            )
             draw_label(axes, f"{person_id}", (place[0], place[1]), (5, 5), color)
     axes.set_title(title, color=INK, loc="left", fontsize=12)
     return png(figure)
 
 
-def ground_seen(camera: Camera) -> NDArray[np.float64]:
+def visible_ground(camera: Camera) -> NDArray[np.float64]:
     """Return corners (n, 2) [m] of the ground in a camera's field of view, up to `REACH` away.
 
     The ground is the plane z = 0, world.
@@ -235,3 +248,116 @@ def ground_seen(camera: Camera) -> NDArray[np.float64]:
         # Rays that go up never meet the ground: clip them to the drawn length.
         distance = np.where((directions[:, 2] < 0.0) & (distance < REACH), distance, REACH)
         return np.asarray(camera.center[:2] + directions[:, :2] / flat[:, None] * distance[:, None])
+
+
+USED: Final = PALETTE[5]
+LEFT_OUT: Final = PALETTE[1]
+
+
+@dataclass(frozen=True, eq=False)
+class ImageDetections:
+    """Detections of one camera in one frame."""
+
+    boxes: NDArray[np.floating]
+    """(detections, 4) x0 y0 x1 y1 [px]; NaN where missing."""
+    keypoints: NDArray[np.floating]
+    """(detections, 17, 2) [px]."""
+    used: NDArray[np.integer]
+    """Indices of the detections assigned to a person."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReconstructedPeople:
+    """People of one frame, as all cameras together found them."""
+
+    joints: Floats
+    """(persons, 17, 3) [m], world; NaN where missing."""
+    person_ids: NDArray[np.int64]
+    """(persons,)."""
+    seen: NDArray[np.bool_]
+    """(persons,) whether the drawn camera's own detections support any joint of the person."""
+
+
+def plot_detections(
+    camera: Camera,
+    detections: ImageDetections,
+    people: ReconstructedPeople,
+    *,
+    still: NDArray[np.uint8] | None = None,
+    pitch: PitchSpec | None = None,
+    part: tuple[Floats, Floats] | None = None,
+) -> bytes:
+    """Return a PNG of a part of an image: detections on the left, reconstruction on the right.
+
+    Args:
+        camera: a single camera.
+        detections: its detections, on the left.
+        people: the reconstruction, on the right, with one colour per person.
+        still: background image (height, width, 3), RGB; None = plain ground.
+        pitch: draw its markings on the right; None without a pitch.
+        part: corner and side lengths (2,) [px] of the part; None = the part with most people.
+    """
+    boxes, joints = detections.boxes, people.joints
+    whole = joints[np.isfinite(joints).all((-1, -2))]
+    corner, side = crowded_part(camera, whole) if part is None else part
+    shape = side[1] / side[0]
+    figure = Figure(figsize=(14.0, 7.0 * shape + 0.5), dpi=110, facecolor="white")
+    figure.set_layout_engine("constrained")
+    before, after = figure.subplots(1, 2)
+    there = np.isfinite(boxes).all(-1)
+    found = np.isfinite(joints).any((-1, -2))
+    titles = ("detections", "reconstruction")
+    if part is None:
+        titles = (
+            f"detections: {int(there.sum())}",
+            f"reconstruction: {int(found.sum())} people",
+        )
+    for axes, title in zip((before, after), titles, strict=True):
+        axes.set(
+            xlim=(corner[0], corner[0] + side[0]),
+            ylim=(corner[1] + side[1], corner[1]),
+            aspect="equal",
+            xticks=[],
+            yticks=[],
+        )
+        axes.set_facecolor(GRASS if pitch is not None else "#f6f6f6")
+        style(axes)
+        if still is not None:
+            axes.imshow(still, zorder=0)
+        axes.set_title(title, color=INK, loc="left", fontsize=12)
+    for number in np.flatnonzero(there):
+        color = USED if number in detections.used else LEFT_OUT
+        _box(before, boxes[number], color, dashed=False)
+        draw_skeleton(before, detections.keypoints[number], color, 1.6, zorder=3)
+    line_color = LINE if still is None else TEMPLATE
+    for line in markings(pitch) if pitch is not None else ():
+        after.plot(*camera.project(line).T, color=line_color, linewidth=1.2, zorder=1)
+    for person in np.flatnonzero(found):
+        color = person_color(int(people.person_ids[person]))
+        pixels = camera.project(joints[person])
+        draw_skeleton(after, pixels, color, 1.6, zorder=3)
+        pixels = pixels[np.isfinite(pixels).all(-1)]
+        if not len(pixels):
+            continue
+        (left, top), (right, bottom) = pixels.min(0), pixels.max(0)
+        margin = 0.08 * (bottom - top)
+        around = np.array([left - margin, top - margin, right + margin, bottom + margin])
+        _box(after, around, color, dashed=not people.seen[person])
+        draw_label(after, f"{people.person_ids[person]}", (left, top - margin), (0, 3), color)
+    return png(figure)
+
+
+def _box(axes: Axes, box: NDArray[np.floating], color: str, *, dashed: bool) -> None:
+    x0, y0, x1, y1 = (float(value) for value in box)
+    axes.add_patch(
+        Rectangle(
+            (x0, y0),
+            x1 - x0,
+            y1 - y0,
+            fill=False,
+            color=color,
+            linewidth=1.3,
+            linestyle="--" if dashed else "-",
+            zorder=2,
+        )
+    )

@@ -34,7 +34,7 @@ def data_set_page(title: str, found: DataSetStatistics, checks: Mapping[str, Che
         ("passed" if not wrong else f"{wrong} wrong", "check of cameras, poses and 2D"),
     )
     about = f"Data set of {', '.join(checks)}"
-    return whole_page(title, about, (counted_section(found), _checked(checks)), tiles=tiles)
+    return whole_page(title, about, (counted_section(found), _check_section(checks)), tiles=tiles)
 
 
 def counted_section(found: DataSetStatistics) -> Section:
@@ -61,7 +61,7 @@ def counted_section(found: DataSetStatistics) -> Section:
     )
     blocks: list[Table | CaptionedImage] = [Table("", columns, (row,))]
     blocks.append(
-        CaptionedImage("How far people go, and how long clips are.", statistics_picture(found))
+        CaptionedImage("How far people go, and how long clips are.", plot_statistics(found))
     )
     if len(found.clips) > 1:
         rows = tuple(
@@ -85,7 +85,7 @@ def counted_section(found: DataSetStatistics) -> Section:
     return Section("How much there is", tuple(blocks), lead)
 
 
-def _checked(checks: Mapping[str, CheckReport]) -> Section:
+def _check_section(checks: Mapping[str, CheckReport]) -> Section:
     """Return the findings, then the metrics of every clip."""
     findings = tuple(
         (folder, Failure(finding.fault), finding.says, ", ".join(finding.where))
@@ -123,7 +123,7 @@ BINS = 20
 _BAR = "#3d6fa3"
 
 
-def statistics_picture(statistics: DataSetStatistics) -> bytes:
+def plot_statistics(statistics: DataSetStatistics) -> bytes:
     """Return a PNG with the histograms of trajectory lengths and of clip lengths."""
     ways = [way for clip in statistics.clips.values() for way in clip.trajectories_m]
     lengths = [clip.seconds for clip in statistics.clips.values()]

@@ -14,7 +14,7 @@ from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry import Camera
-from worldpose.reports.body_rendering import BodyTracks, paint_bodies, zoomed
+from worldpose.reports.bodies import BodyTracks, paint_bodies, zoom_camera
 from worldpose.reports.drawing import TEMPLATE, markings, person_color
 
 _PARTS: Final = 16
@@ -52,7 +52,7 @@ def overlay_frames(
         # Video encoding requires even sides.
         even = small[: small.shape[0] & ~1, : small.shape[1] & ~1]
         canvas = np.asarray(even, dtype=np.uint8, order="C")
-        half = zoomed(camera[place], np.full(2, -0.5), 0.5, (canvas.shape[1], canvas.shape[0]))
+        half = zoom_camera(camera[place], np.full(2, -0.5), 0.5, (canvas.shape[1], canvas.shape[0]))
         for line in lines:
             _draw(canvas, half.project(line), _rgb(TEMPLATE))
         if frame in rows:

@@ -64,7 +64,7 @@ class ErrorMap:
     expected: NDArray[np.float64]
 
 
-def calibration_picture(
+def plot_calibration(
     camera: Camera,
     title: str,
     pitch: PitchSpec,
@@ -127,7 +127,7 @@ def _draw_error_map(figure: SubFigure, error_map: ErrorMap, pitch: PitchSpec) ->
         error_map.x,
         error_map.y,
         np.ma.masked_invalid(error_map.expected),
-        norm=LogNorm(*ERROR_RANGE),
+        norm=LogNorm(ERROR_RANGE[0], ERROR_RANGE[1]),
         cmap="viridis_r",
         shading="nearest",
         zorder=0,
@@ -155,7 +155,7 @@ NEAR: Final = 12.0
 """Maximum distance of samples to paint [px]; beyond, they are occluded, or their paint is faint."""
 
 
-def paint_of(still: Image) -> NDArray[np.bool_]:
+def detect_paint(still: Image) -> NDArray[np.bool_]:
     """Return the mask (height, width) of pixels as bright as paint against both sides.
 
     Args:
@@ -203,7 +203,7 @@ def marking_distances(
     return np.asarray(found[found < NEAR])
 
 
-def paint_picture(camera: Camera, still: Image, pitch: PitchSpec) -> tuple[bytes, float]:
+def plot_paint(camera: Camera, still: Image, pitch: PitchSpec) -> tuple[bytes, float]:
     """Return a PNG of paint and of distances to it, and the share of markings on paint [1].
 
     Args:
@@ -211,7 +211,7 @@ def paint_picture(camera: Camera, still: Image, pitch: PitchSpec) -> tuple[bytes
         still: its image (height, width, 3), RGB.
         pitch: pitch with the markings.
     """
-    paint = paint_of(still)
+    paint = detect_paint(still)
     distance = distance_to(paint)
     off = marking_distances(camera, pitch, distance)
     height, width = paint.shape

@@ -77,17 +77,19 @@ def replay_corrections(folder: MatchFolder, corrections: Iterable[Correction]) -
         reason = _objection(folder, template, pictures, edit)
         if reason is None:
             picture = (edit.camera, edit.frame)
-            pictures[picture] = _edited(pictures.get(picture, ClickedMarkings()), edit)
+            pictures[picture] = _apply_edit(pictures.get(picture, ClickedMarkings()), edit)
             applied.append(correction)
         else:
             stale.append((correction, reason))
     if not any(isinstance(each.edit, MovedPoint | RedrawnMarking) for each in applied):
         return Replay(folder, tuple(applied), tuple(stale))
-    corrected = replace(folder, clicked=_clicked(folder, pictures), key_frames=_picked(pictures))
+    corrected = replace(
+        folder, clicked=_clicks_in(folder, pictures), key_frames=_key_frames(pictures)
+    )
     return Replay(corrected, tuple(applied), tuple(stale))
 
 
-def with_was(folder: MatchFolder, edit: Edit) -> Edit:
+def add_previous_value(folder: MatchFolder, edit: Edit) -> Edit:
     """Return the edit with the current value as `was`, unless it has one.
 
     Args:
@@ -96,10 +98,10 @@ def with_was(folder: MatchFolder, edit: Edit) -> Edit:
     """
     if not isinstance(edit, MovedPoint | RedrawnMarking) or "was" in edit.model_fields_set:
         return edit
-    return edit.model_copy(update={"was": value_now(folder, edit)})
+    return edit.model_copy(update={"was": current_value(folder, edit)})
 
 
-def value_now(
+def current_value(
     folder: MatchFolder, edit: MovedPoint | RedrawnMarking
 ) -> Pixel | tuple[Pixel, ...] | None:
     """Return the current value of an edit's point or marking: None or empty without a click.
@@ -206,7 +208,7 @@ def _now(
     return {marking.name: marking.xy for marking in clicked.drawn}.get(edit.marking, ())
 
 
-def _edited(clicked: ClickedMarkings, edit: MovedPoint | RedrawnMarking) -> ClickedMarkings:
+def _apply_edit(clicked: ClickedMarkings, edit: MovedPoint | RedrawnMarking) -> ClickedMarkings:
     if isinstance(edit, MovedPoint):
         points = {point.name: point for point in clicked.points}
         points.pop(edit.marking, None)
@@ -220,7 +222,7 @@ def _edited(clicked: ClickedMarkings, edit: MovedPoint | RedrawnMarking) -> Clic
     return clicked.model_copy(update={"drawn": tuple(drawn.values())})
 
 
-def _clicked(
+def _clicks_in(
     folder: MatchFolder, pictures: dict[Picture, ClickedMarkings]
 ) -> dict[str, ClickedMarkings]:
     """Return the clicks of the static cameras, in their order."""
@@ -228,7 +230,7 @@ def _clicked(
     return {camera: pictures[camera, None] for camera in cameras if (camera, None) in pictures}
 
 
-def _picked(pictures: dict[Picture, ClickedMarkings]) -> dict[str, KeyFrames]:
+def _key_frames(pictures: dict[Picture, ClickedMarkings]) -> dict[str, KeyFrames]:
     """Return the key frames of the clips, without frames that have no clicks."""
     picked: dict[str, list[KeyFrame]] = {}
     for (clip, frame), markings in pictures.items():

@@ -52,7 +52,7 @@ def replay_detections(found: KeypointDetections, edits: Iterable[DetectionEdit])
     )
     objections = []
     for edit in edits:
-        objection = objection_to(changed, edit)
+        objection = find_objection(changed, edit)
         objections.append(objection)
         if objection is not None:
             continue
@@ -74,7 +74,7 @@ def replay_detections(found: KeypointDetections, edits: Iterable[DetectionEdit])
     return DetectionReplay(changed, tuple(objections))
 
 
-def objection_to(found: KeypointDetections, edit: DetectionEdit) -> str | None:
+def find_objection(found: KeypointDetections, edit: DetectionEdit) -> str | None:
     """Return why an edit does not apply to a camera's detections; None if it does."""
     place = f"detection {edit.detection} of {edit.camera} in frame {edit.frame}"
     row = _row(found, edit.frame)

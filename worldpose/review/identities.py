@@ -104,14 +104,14 @@ def replay_identities(found: Identities, edits: Iterable[IdentityEdit]) -> Ident
     """
     objections = []
     for edit in edits:
-        objection = objection_to(found, edit)
+        objection = find_objection(found, edit)
         objections.append(objection)
         if objection is None:
             found = _apply(found, edit)
     return IdentityReplay(found, tuple(objections))
 
 
-def objection_to(found: Identities, edit: IdentityEdit) -> str | None:
+def find_objection(found: Identities, edit: IdentityEdit) -> str | None:
     """Return why an edit does not apply to these identities; None if it does."""
     if isinstance(edit, MergedTracks):
         people: Sequence[tuple[int, Sighting | None]] = (
@@ -147,7 +147,7 @@ def objection_to(found: Identities, edit: IdentityEdit) -> str | None:
     return None
 
 
-def sighting_of(
+def find_sighting(
     found: Identities, person: int, first: int | None = None, last: int | None = None
 ) -> Sighting | None:
     """Return the detection with the smallest ray distance of a person, None without detections.
@@ -187,14 +187,14 @@ def _is_seen(found: Identities, person: int, seen: Sighting) -> bool:
 
 def _apply(found: Identities, edit: IdentityEdit) -> Identities:
     if isinstance(edit, MergedTracks):
-        return _merged(found, edit.kept, edit.merged)
+        return _merge(found, edit.kept, edit.merged)
     if isinstance(edit, SplitTrack):
         return _split(found, edit.person, edit.first_frame_of_new)
     names = {n: name for n, name in found.names.items() if n != edit.person}
     return replace(found, names=names if edit.name is None else {**names, edit.person: edit.name})
 
 
-def _merged(found: Identities, kept: int, merged: int) -> Identities:
+def _merge(found: Identities, kept: int, merged: int) -> Identities:
     ids = found.person.tolist()
     a, b = ids.index(kept), ids.index(merged)
     index, distance = found.detection_index.copy(), found.ray_distance.copy()

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
@@ -127,7 +127,7 @@ def read_journal(store: Store, match_id: str) -> Journal:
         found = _contents(store, match_id, numbers)
         while (data := store.blobs.read(_path(match_id, _last(journal, found) + 1))) is not None:
             found.append((_last(journal, found) + 1, data))
-        journal = _extended(journal, found, f"{store.url}/{folder}")
+        journal = _extend(journal, found, f"{store.url}/{folder}")
         known.last_data = found[-1][1] if found else known.last_data
         known.journal = journal
         return journal
@@ -172,7 +172,7 @@ def _last(journal: Journal, found: Sequence[tuple[int, bytes]]) -> int:
     return found[-1][0] if found else journal.last
 
 
-def _extended(journal: Journal, found: Sequence[tuple[int, bytes]], folder: str) -> Journal:
+def _extend(journal: Journal, found: Sequence[tuple[int, bytes]], folder: str) -> Journal:
     """Return the journal with further entries, given as numbers and bytes."""
     if not found:
         return journal
@@ -247,3 +247,40 @@ def say(
 
 def _path(match_id: str, number: int) -> str:
     return f"reviews/{checked_name(match_id)}/{number:06d}.json"
+
+
+def requests_by_id(records: Iterable[ReviewRecord]) -> dict[str, ReviewRequest]:
+    """Return all review requests by id, first to last."""
+    asked = (record for record in records if isinstance(record, ReviewRequest))
+    return {request.id: request for request in asked}
+
+
+def last_decision(
+    records: Iterable[ReviewRecord], unit: str, content: str
+) -> ReviewDecision | None:
+    """Return the last verdict on a result's bytes, None without a decision.
+
+    Args:
+        records: records of the journal, in order.
+        unit: as `stage/unit`.
+        content: digest of the result's files; its key may differ from that at the decision.
+    """
+    about: set[str] = set()
+    last = None
+    for record in records:
+        if isinstance(record, ReviewRequest) and record.contents.get(unit) == content:
+            about.add(record.id)
+        elif isinstance(record, ReviewDecision) and record.request in about:
+            last = record
+    return last
+
+
+def standing_corrections(records: Iterable[ReviewRecord]) -> tuple[Correction, ...]:
+    """Return the corrections in the order they were made, without withdrawn ones."""
+    standing: dict[str, Correction] = {}
+    for record in records:
+        if isinstance(record, Correction):
+            standing[record.id] = record
+        elif isinstance(record, Withdrawal):
+            standing.pop(record.correction, None)
+    return tuple(standing.values())

@@ -3,7 +3,7 @@
 import numpy as np
 
 from worldpose.dataset.check import CheckSettings, check_clip
-from worldpose.dataset.reading import clips_in, read_clip
+from worldpose.dataset.contents import list_clips, read_clip
 from worldpose.geometry import Camera, Rigid
 
 FRAMES, PERSONS, FPS = 40, 6, 50.0
@@ -28,7 +28,7 @@ def looking(center, target, focal, distortion=(0.0,) * 5):
 
 
 def findings(folder, model, pitch=True):
-    clips = clips_in(folder)
+    clips = list_clips(folder)
     clip = read_clip(folder, clips[0], clips, lambda name: model, None, FPS, pitch)
     return check_clip(clip, CheckSettings())
 

@@ -22,7 +22,7 @@ from faulty_data_sets import (
     zeros_for_missing,
 )
 
-from worldpose.dataset.reading import clips_in
+from worldpose.dataset.contents import list_clips
 from worldpose.errors import InputError
 from worldpose.formats.camera_file import write_static_camera
 from worldpose.formats.challenge import read_submission, write_submission
@@ -192,4 +192,4 @@ def test_what_is_implausible_is_named(data_set, model, fault):
 
 def test_a_folder_without_data_is_refused(tmp_path):
     with pytest.raises(InputError, match="an exported data set"):
-        clips_in(tmp_path)
+        list_clips(tmp_path)

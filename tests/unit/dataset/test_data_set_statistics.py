@@ -16,14 +16,14 @@ from flows.cli.app import app
 from flows.results.checking import check
 from flows.results.statistics import count
 from worldpose.body import BodyParameters
-from worldpose.dataset.manifest import frame_rate_of, read_frame_rates, write_frame_rates
+from worldpose.dataset.manifest import clip_frame_rate, read_frame_rates, write_frame_rates
 from worldpose.dataset.statistics import clip_statistics, data_set_statistics
 from worldpose.errors import InputError, UsageError
 from worldpose.formats import JointTracks, write_joints, write_moving_camera
 from worldpose.formats.challenge import write_submission
 from worldpose.formats.pose_file import write_poses
 from worldpose.geometry import Camera, Rigid
-from worldpose.reports.data_set import bin_edges, statistics_picture
+from worldpose.reports.data_set import bin_edges, plot_statistics
 
 
 def test_definitions_give_the_papers_own_arithmetic():
@@ -109,7 +109,7 @@ def test_ten_made_clips_are_counted_as_plain_loops_count_them(tmp_path):
     assert found.longest_trajectory_m == pytest.approx(max(ways))
     assert found.camera == "M+Z"
     assert [found.clips[f"C_{n}"].camera for n in range(3)] == ["S", "M", "M+Z"]
-    picture = imread(io.BytesIO(statistics_picture(found)))
+    picture = imread(io.BytesIO(plot_statistics(found)))
     assert picture.shape[:2] == (462, 1540)
 
 
@@ -162,7 +162,7 @@ def test_joints_and_submissions_count_like_poses(tmp_path):
 def test_nothing_at_all_is_counted_as_nothing(tmp_path):
     found = data_set_statistics({})
     assert (found.frames, found.subjects_per_frame, found.speed_m_s) == (0, None, None)
-    statistics_picture(found)
+    plot_statistics(found)
     with pytest.raises(InputError, match="no such folder"):
         count([tmp_path / "nowhere"])
 
@@ -192,7 +192,7 @@ def test_clips_of_several_exports_keep_their_frame_rates(tmp_path):
     write_frame_rates(tmp_path, {"A": 25.0})
     write_frame_rates(tmp_path, {"B": 50.0})
     rates = read_frame_rates(tmp_path)
-    assert [frame_rate_of(rates, clip) for clip in ("A", "B", "clip")] == [25.0, 50.0, None]
+    assert [clip_frame_rate(rates, clip) for clip in ("A", "B", "clip")] == [25.0, 50.0, None]
     (tmp_path / "frame_rates.json").write_text('{"A": "fast"}')
     with pytest.raises(InputError, match=r"frame_rates\.json"):
         read_frame_rates(tmp_path)

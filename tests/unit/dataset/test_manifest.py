@@ -7,8 +7,16 @@ import pytest
 from pydantic import ValidationError
 
 from data_contracts.release import ReleasedClip, ReleaseManifest
-from worldpose.dataset.manifest import changed_files, read_manifest, released_files, write_manifest
-from worldpose.dataset.origins import ORIGINS, origins_of, read_origins, write_origins
+from worldpose.dataset.manifest import (
+    ORIGINS,
+    changed_files,
+    origins_of,
+    read_manifest,
+    read_origins,
+    released_files,
+    write_manifest,
+    write_origins,
+)
 from worldpose.errors import InputError
 from worldpose.formats import JointTracks
 

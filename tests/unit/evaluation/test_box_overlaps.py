@@ -1,6 +1,6 @@
 import numpy as np
 
-from worldpose.evaluation.boxes import box_overlaps, joint_boxes
+from worldpose.evaluation.matching import box_overlaps, joint_boxes
 from worldpose.geometry import Camera, Rigid
 
 DOWN_Z = Camera(

@@ -1,6 +1,6 @@
 import numpy as np
 
-from worldpose.evaluation.limbs import LIMBS, correct_limbs, limb_ends
+from worldpose.evaluation.metrics import LIMBS, correct_limbs, limb_ends
 
 NAMES = list(LIMBS)
 

@@ -7,13 +7,14 @@ from scipy.spatial.transform import Rotation
 
 from data_contracts.conventions import COCO17
 from worldpose.errors import DegenerateError, InputError
-from worldpose.evaluation.marker_files import (
-    joints_of_markers,
+from worldpose.evaluation.marker_reference import (
+    align_reference,
+    map_marker_names,
     marker_joints,
     read_marker_map,
     read_markers,
+    sample_joints,
 )
-from worldpose.evaluation.marker_reference import lay_over, sampled
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats import JointTracks
 from worldpose.formats.motion_capture import Y_UP, write_markers
@@ -69,7 +70,7 @@ def test_c3d_gives_the_points_that_were_written(tmp_path, markers):
     write_c3d(tmp_path / "a.c3d", markers, missing=[(3, 5)])
     found = read_markers(tmp_path / "a.c3d")
     assert (found.rate, len(found.names)) == (RATE, 34)
-    joints = marker_joints(found, joints_of_markers(found.names))
+    joints = marker_joints(found, map_marker_names(found.names))
     assert np.isnan(joints[3, 0, 5]).all()
     joints[3, 0, 5] = markers[3, 0, 5]
     # Single precision millimetres at 40 m.
@@ -80,7 +81,7 @@ def test_trc_that_we_write_is_read_back(tmp_path):
     tracks = JointTracks(np.arange(3), np.array([1]), people_at(np.arange(3) / FPS)[:, :1])
     write_markers(tmp_path / "a.trc", tracks, 0, FPS)
     found = read_markers(tmp_path / "a.trc")
-    joints = marker_joints(found, joints_of_markers(found.names))
+    joints = marker_joints(found, map_marker_names(found.names))
     # Micrometres, y up.
     np.testing.assert_allclose(joints @ Y_UP, tracks.joints, atol=1e-6)
 
@@ -104,7 +105,7 @@ def test_joints_are_means_of_markers_as_the_map_says(tmp_path):
 
 
 def test_time_place_and_people_are_found_again(tmp_path, markers, prediction):
-    reference, found = lay_over(prediction, markers, RATE, FPS)
+    reference, found = align_reference(prediction, markers, RATE, FPS)
     # Straight between samples of a curve: 2 m/s^2 for 5 ms leaves micrometres.
     assert found.offset == pytest.approx(OFFSET, abs=2e-4)
     np.testing.assert_allclose(found.motion.rotation, TURN.as_matrix(), atol=1e-3)
@@ -121,7 +122,7 @@ def test_known_error_stays(markers, prediction):
     joints = prediction.joints.copy()
     joints[:, :, 9, 2] += 0.05
     wrong = JointTracks(prediction.frames, prediction.person_ids, joints)
-    reference, _ = lay_over(wrong, markers, RATE, FPS)
+    reference, _ = align_reference(wrong, markers, RATE, FPS)
     scores, _ = evaluate_joints(wrong, reference)
     # A shift of everybody by 1/17 of it takes the mean from the others: (48 + ...) / 17 of 50.
     assert scores.mpjpe_mm == pytest.approx((16 / 17 * 50 + 16 * 50 / 17) / 17, rel=0.1)
@@ -131,13 +132,15 @@ def test_samples_are_straight_between_neighbours_and_missing_beyond():
     joints = np.zeros((3, 1, 17, 3))
     joints[1:, ..., 0] = 1.0
     joints[2, ..., 0] = np.nan
-    found = sampled(joints, 10.0, np.array([-0.01, 0.0, 0.05, 0.1, 0.15, 0.2, 0.3]))[:, 0, 0, 0]
+    found = sample_joints(joints, 10.0, np.array([-0.01, 0.0, 0.05, 0.1, 0.15, 0.2, 0.3]))[
+        :, 0, 0, 0
+    ]
     np.testing.assert_array_equal(found, [np.nan, 0.0, 0.5, 1.0, np.nan, np.nan, np.nan])
 
 
 def test_reference_without_people_is_refused(prediction):
     with pytest.raises(DegenerateError, match="matches the prediction nowhere"):
-        lay_over(prediction, np.full((50, 1, 17, 3), np.nan), RATE, FPS)
+        align_reference(prediction, np.full((50, 1, 17, 3), np.nan), RATE, FPS)
 
 
 @pytest.mark.parametrize("name", ["a.c3d", "a.trc"])

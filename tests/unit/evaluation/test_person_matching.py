@@ -5,7 +5,7 @@ from worldpose.evaluation.matching import (
     match_boxes,
     match_people,
     merge_tracks,
-    taken,
+    take_matched,
 )
 
 
@@ -104,8 +104,8 @@ def test_a_track_that_is_never_paired_belongs_to_nobody():
 
 def test_people_are_taken_into_the_places_of_the_true_ones():
     predicted = people(1.0, 2.0)[None]
-    found = taken(predicted, np.array([[1, -1, 0]]))
+    found = take_matched(predicted, np.array([[1, -1, 0]]))
     assert found[0, 0, 0, 0] == 2.0
     assert np.isnan(found[0, 1]).all()
     assert found[0, 2, 0, 0] == 1.0
-    assert np.isnan(taken(predicted[:, :0], np.array([[-1]]))).all()
+    assert np.isnan(take_matched(predicted[:, :0], np.array([[-1]]))).all()

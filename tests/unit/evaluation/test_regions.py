@@ -65,6 +65,13 @@ def test_missing_joints_frames_and_unseen_joints_do_not_count():
     assert count == 3 * 2 * 17 - 2
 
 
+@pytest.mark.parametrize(("predicted", "true"), [(0, 3), (3, 0), (0, 0)])
+def test_without_common_frames_no_joint_counts(predicted, true):
+    prediction, _ = people(frames=predicted, persons=2)
+    _, truth = people(frames=true, persons=2)
+    assert set(region_counts(prediction, truth).values()) == {(0, 0)}
+
+
 def test_joints_without_covariance_are_refused():
     prediction, truth = people(frames=2)
     plain = JointTracks(prediction.frames, prediction.person_ids, prediction.joints)

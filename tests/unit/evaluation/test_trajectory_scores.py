@@ -8,7 +8,7 @@ from people_samples import crowd, e4, person, score, tracks
 
 from worldpose.errors import InputError
 from worldpose.evaluation import evaluate_joints
-from worldpose.evaluation.trajectories import path_lengths
+from worldpose.evaluation.metrics import path_lengths
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera, Rigid
 

@@ -8,8 +8,7 @@ import pytest
 
 from worldpose.body import BodyParameters, load_open_body
 from worldpose.geometry import Camera, Rigid
-from worldpose.reports.bodies import bodies_picture, crowded_part
-from worldpose.reports.body_rendering import paint_bodies, zoomed
+from worldpose.reports.bodies import crowded_part, paint_bodies, plot_bodies, zoom_camera
 
 
 def camera_at(height=10.0, away=40.0):
@@ -39,7 +38,7 @@ FACES = np.array([[0, 1, 2], [0, 2, 3]])
 def test_a_part_enlarged_shows_the_same_places():
     camera = camera_at()
     points = np.random.default_rng(1).uniform(-5.0, 5.0, (20, 3))
-    near = zoomed(camera, np.array([99.5, 49.5]), 3.0, (900, 600))
+    near = zoom_camera(camera, np.array([99.5, 49.5]), 3.0, (900, 600))
     # Pixel 100 is the first of the part: its left border is the new picture's.
     expected = (camera.project(points) - np.array([99.5, 49.5])) * 3.0 - 0.5
     np.testing.assert_allclose(near.project(points), expected, atol=1e-9)
@@ -114,7 +113,7 @@ def test_a_missing_person_is_left_out_of_the_picture(with_still):
         np.zeros((2, 3)),
     )
     still = np.full((720, 1280, 3), 90, dtype=np.uint8) if with_still else None
-    picture = bodies_picture(
+    picture = plot_bodies(
         camera_at(), "camera", model.vertices(poses), model.faces, (1, 4), still=still
     )
     pixels = matplotlib.image.imread(io.BytesIO(picture))

@@ -10,11 +10,11 @@ import pytest
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera, Rigid
 from worldpose.reports.broadcast import (
-    angles_of,
-    before_after_picture,
-    course_picture,
-    flow_picture,
+    camera_angles,
     largest_pose_changes,
+    plot_before_after,
+    plot_camera_course,
+    plot_flow,
 )
 from worldpose.reports.drawing import PALETTE
 
@@ -48,7 +48,7 @@ def cameras(*rotations, missing=()):
     ("pan", "tilt", "roll"), [(0, 0, 0), (20, 0, 0), (0, -15, 0), (0, 0, 3), (-40, -12, 1.5)]
 )
 def test_angles_are_those_that_the_camera_was_turned_by(pan, tilt, roll):
-    found = np.concatenate(angles_of(cameras(turned(pan, tilt, roll))))
+    found = np.concatenate(camera_angles(cameras(turned(pan, tilt, roll))))
     np.testing.assert_allclose(found, [pan, tilt, roll], atol=1e-9)
 
 
@@ -61,7 +61,7 @@ def test_the_course_is_drawn_also_where_frames_have_no_camera():
     moving = cameras(*(turned(pan) for pan in range(5)), missing=[2])
     covariance = np.tile(1e-6 * np.eye(7), (5, 1, 1))
     covariance[2] = np.nan
-    picture = course_picture(np.arange(5), moving, covariance)
+    picture = plot_camera_course(np.arange(5), moving, covariance)
     assert matplotlib.image.imread(io.BytesIO(picture)).shape[:2] == (704, 1540)
 
 
@@ -82,7 +82,7 @@ def test_whom_a_refinement_moves_most_is_shown_before_and_after():
     assert largest_pose_changes(before, after, tracks) == (1, 1)
     still = np.full((1080, 1920, 3), 90, np.uint8)
     seen = after[1].project(tracks.joints[1])
-    picture = before_after_picture(before[1], after[1], tracks, 1, 1, still=still, seen=seen)
+    picture = plot_before_after(before[1], after[1], tracks, 1, 1, still=still, seen=seen)
     shown = matplotlib.image.imread(io.BytesIO(picture))[..., :3]
     # Skeletons are coloured on grey, and lie elsewhere in the two halves.
     colored = np.ptp(shown, axis=-1) > 0.3
@@ -90,7 +90,7 @@ def test_whom_a_refinement_moves_most_is_shown_before_and_after():
     assert left.any() and right.any()
     assert abs(np.nonzero(left)[0].mean() - np.nonzero(right)[0].mean()) > 50.0
     unseen = np.full_like(seen, np.nan)
-    bare = before_after_picture(before[1], after[1], tracks, 1, 1, still=still, seen=unseen)
+    bare = plot_before_after(before[1], after[1], tracks, 1, 1, still=still, seen=unseen)
     crosses = np.abs(shown - matplotlib.image.imread(io.BytesIO(bare))[..., :3]).max(axis=-1) > 0.1
     # They are where the right half has its skeleton, and at the same place in the left one.
     rows = [np.nonzero(half)[0].mean() for half in (crosses[:, :770], crosses[:, 770:], right)]
@@ -114,7 +114,7 @@ def test_the_course_without_smoothing_lies_beneath_the_smoothed_one():
     rough = cameras(*(turned(pan + 0.3 * (-1) ** pan) for pan in range(5)))
     covariance = np.tile(1e-6 * np.eye(7), (5, 1, 1))
     alone, both = (
-        painted(course_picture(np.arange(5), moving, covariance, before), PALETTE[1])
+        painted(plot_camera_course(np.arange(5), moving, covariance, before), PALETTE[1])
         for before in (None, rough)
     )
     assert alone == 0
@@ -127,7 +127,7 @@ def test_motion_is_drawn_with_what_was_rejected():
     still = np.full((90, 160, 3), 40, np.uint8)
     counts = [
         [
-            painted(flow_picture(still, start, end, np.array(rejected), end), color)
+            painted(plot_flow(still, start, end, np.array(rejected), end), color)
             for color in (PALETTE[5], PALETTE[1])
         ]
         for rejected in ([False] * 3, [False, True, True])

@@ -6,14 +6,20 @@ import pytest
 
 from data_contracts.pitch import PitchSpec
 from worldpose.geometry import Camera, Rigid
-from worldpose.reports.detections import LEFT_OUT, USED, detections_picture
+from worldpose.reports.clips import (
+    LEFT_OUT,
+    USED,
+    ImageDetections,
+    ReconstructedPeople,
+    plot_detections,
+)
 from worldpose.reports.drawing import PALETTE, markings
 from worldpose.reports.static_cameras import (
     NEAR,
+    detect_paint,
     distance_to,
     marking_distances,
-    paint_of,
-    paint_picture,
+    plot_paint,
 )
 
 
@@ -48,14 +54,10 @@ def pixels_of(png, color):
 
 def drawn(camera, used, joints, keypoints):
     boxes = np.stack([np.r_[k.min(0) - 3, k.max(0) + 3] for k in keypoints])
-    return detections_picture(
+    return plot_detections(
         camera,
-        boxes=boxes,
-        keypoints=keypoints,
-        used=np.array(used),
-        joints=joints,
-        person_ids=np.arange(len(joints)),
-        seen=np.ones(len(joints), dtype=bool),
+        ImageDetections(boxes, keypoints, np.array(used)),
+        ReconstructedPeople(joints, np.arange(len(joints)), np.ones(len(joints), dtype=bool)),
         pitch=PitchSpec(),
     )
 
@@ -78,14 +80,12 @@ def test_detections_are_on_the_left_by_use_and_people_on_the_right(camera):
 
 def test_nobody_detected_and_nobody_found_is_still_a_picture(camera):
     gone = np.full((1, 17, 3), np.nan)
-    png = detections_picture(
+    png = plot_detections(
         camera,
-        boxes=np.full((2, 4), np.nan),
-        keypoints=np.full((2, 17, 2), np.nan),
-        used=np.empty(0, dtype=int),
-        joints=gone,
-        person_ids=np.array([4]),
-        seen=np.zeros(1, dtype=bool),
+        ImageDetections(
+            np.full((2, 4), np.nan), np.full((2, 17, 2), np.nan), np.empty(0, dtype=int)
+        ),
+        ReconstructedPeople(gone, np.array([4]), np.zeros(1, dtype=bool)),
     )
     assert cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR) is not None
 
@@ -103,10 +103,10 @@ def painted(camera):
 
 def test_paint_is_found_and_the_camera_puts_markings_on_it(camera):
     still = painted(camera)
-    paint = paint_of(still)
+    paint = detect_paint(still)
     truly = (still > 200).all(-1)
     assert (paint & truly).sum() > 0.9 * paint.sum()
-    _, share = paint_picture(camera, still, PitchSpec())
+    _, share = plot_paint(camera, still, PitchSpec())
     assert share > 0.95
     # Turned by 6 px, lines of 5 px are beside themselves but near.
     beside = Camera(
@@ -124,5 +124,5 @@ def test_a_wide_bright_stripe_and_specks_are_no_paint():
     still = np.full((200, 300, 3), 60, dtype=np.uint8)
     still[:, 100:160] = 230
     still[20:25, 20:25] = 230
-    assert not paint_of(still).any()
-    assert np.isinf(distance_to(paint_of(still))).all()
+    assert not detect_paint(still).any()
+    assert np.isinf(distance_to(detect_paint(still))).all()

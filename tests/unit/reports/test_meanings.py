@@ -1,7 +1,7 @@
 import pytest
 
 from data_contracts.evaluation import CameraErrors, CameraEvaluation, Evaluation
-from worldpose.reports.score_names import CAMERA_MEANINGS, MEANINGS, SHARES, score_rows
+from worldpose.reports.run_report import CAMERA_MEANINGS, MEANINGS, SHARES, score_rows
 
 
 def test_every_score_has_a_meaning():

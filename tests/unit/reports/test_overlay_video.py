@@ -7,7 +7,7 @@ from data_contracts.pitch import PitchSpec
 from worldpose.body import BodyParameters, fold_keypoints, load_open_body
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
-from worldpose.reports.body_rendering import BodyTracks
+from worldpose.reports.bodies import BodyTracks
 from worldpose.reports.overlay_video import overlay_frames
 from worldpose.simulation.stadium import looking
 

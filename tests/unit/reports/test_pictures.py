@@ -5,7 +5,7 @@ import pytest
 from data_contracts.pitch import PitchSpec
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera, Rigid
-from worldpose.reports.clips import paths_picture
+from worldpose.reports.clips import plot_paths
 from worldpose.reports.drawing import PALETTE
 
 
@@ -42,7 +42,7 @@ def camera():
 
 
 def test_from_above_y_points_up_and_both_people_are_there(camera):
-    image = decoded(paths_picture(walkers(), cameras={"south": camera}, pitch=PitchSpec()))
+    image = decoded(plot_paths(walkers(), cameras={"south": camera}, pitch=PitchSpec()))
     close_up = image[:, image.shape[1] // 2 :]
     rows = [np.median(pixels_of(close_up, color)[:, 0]) for color in PALETTE[:2]]
     assert rows[0] < rows[1] - 100
@@ -54,7 +54,7 @@ def test_from_above_a_metre_is_as_long_up_as_across():
     joints[1, 0, :, 0] = 4.0  # person 0 goes 4 m along x
     joints[:, 1, :, 0] = -3.0
     joints[1, 1, :, 1] = 4.0  # person 1 goes 4 m along y
-    image = decoded(paths_picture(JointTracks(np.arange(2), tracks.person_ids, joints)))
+    image = decoded(plot_paths(JointTracks(np.arange(2), tracks.person_ids, joints)))
     close_up = image[:, image.shape[1] // 2 :]
     across, up = pixels_of(close_up, PALETTE[0]), pixels_of(close_up, PALETTE[1])
     # The extents hold the same dots and labels; a glyph may differ by a few pixels.
@@ -64,17 +64,17 @@ def test_from_above_a_metre_is_as_long_up_as_across():
 
 def test_truth_is_drawn_beneath(camera):
     tracks = walkers()
-    alone, with_truth = (decoded(paths_picture(tracks, truth=t)) for t in (None, tracks))
+    alone, with_truth = (decoded(plot_paths(tracks, truth=t)) for t in (None, tracks))
     assert len(pixels_of(with_truth, "#cfcfcf")) > len(pixels_of(alone, "#cfcfcf")) + 100
 
 
 def test_pictures_have_the_same_bytes_every_time(camera):
     tracks = walkers()
-    assert paths_picture(tracks, truth=tracks) == paths_picture(tracks, truth=tracks)
+    assert plot_paths(tracks, truth=tracks) == plot_paths(tracks, truth=tracks)
 
 
 def test_nobody_at_all_is_still_a_picture(camera):
     nobody = JointTracks(np.arange(0), np.arange(0), np.empty((0, 0, 17, 3)))
-    assert decoded(paths_picture(nobody)).shape[2] == 3
+    assert decoded(plot_paths(nobody)).shape[2] == 3
     gone = JointTracks(np.arange(3), np.arange(1), np.full((3, 1, 17, 3), np.nan))
-    assert decoded(paths_picture(gone, cameras={"south": camera})).shape[2] == 3
+    assert decoded(plot_paths(gone, cameras={"south": camera})).shape[2] == 3

@@ -12,9 +12,8 @@ from data_contracts.evaluation import Evaluation
 from data_contracts.run import RunRecord, UnitFailure
 from worldpose.formats import JointTracks
 from worldpose.reports import CameraSummary, CaptionedImage, Scene, Section, report_page
-from worldpose.reports.html_page import small_enough
-from worldpose.reports.run_report import camera_table
-from worldpose.reports.score_names import MEANINGS
+from worldpose.reports.html_page import compress_image
+from worldpose.reports.run_report import MEANINGS, camera_table
 
 PNG = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJg"
@@ -171,9 +170,9 @@ def test_photographs_are_made_smaller_and_curves_stay_as_they_are():
     rng = np.random.default_rng(0)
     photograph = rng.integers(0, 255, (400, 300, 3)).astype(np.uint8)
     large = cv2.imencode(".png", photograph)[1].tobytes()
-    kind, content, size = small_enough(large)
+    kind, content, size = compress_image(large)
     assert (kind, size) == ("webp", (300, 400))
     assert len(content) < len(large) / 2
     shown = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
     assert shown.shape == photograph.shape
-    assert small_enough(PNG) == ("png", PNG, (1, 1))
+    assert compress_image(PNG) == ("png", PNG, (1, 1))

@@ -10,7 +10,7 @@ import pytest
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera, Rigid
 from worldpose.reports import Scene
-from worldpose.reports.scene import MISSING, NUMBERS, UNIT, scene_html
+from worldpose.reports.html_page import MISSING, NUMBERS, UNIT, scene_html
 
 
 def shown(scene):

@@ -5,9 +5,9 @@ import pytest
 from data_contracts.pitch import PitchSpec
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera, Rigid
-from worldpose.reports.clips import REACH, camera_picture, ground_seen, stadium_picture
+from worldpose.reports.clips import REACH, plot_camera_view, plot_stadium, visible_ground
 from worldpose.reports.drawing import PALETTE
-from worldpose.reports.static_cameras import ACCEPTED, REFUSED, Click, ErrorMap, calibration_picture
+from worldpose.reports.static_cameras import ACCEPTED, REFUSED, Click, ErrorMap, plot_calibration
 
 
 def decoded(png):
@@ -44,13 +44,13 @@ def people():
 
 def test_straight_down_the_ground_is_the_picture_s_rectangle():
     # 20 m up, focal length 960 px: a pixel is 20 / 960 m.
-    corners = ground_seen(looking(np.pi / 2))
+    corners = visible_ground(looking(np.pi / 2))
     np.testing.assert_allclose(corners.min(axis=0), [-20.0, -50.0 - 11.25], atol=1e-9)
     np.testing.assert_allclose(corners.max(axis=0), [20.0, -50.0 + 11.25], atol=1e-9)
 
 
 def test_over_the_horizon_the_ground_ends_at_the_reach():
-    corners = ground_seen(looking(0.0))
+    corners = visible_ground(looking(0.0))
     assert np.isfinite(corners).all()
     far = np.linalg.norm(corners - (0.0, -50.0), axis=-1)
     assert far.max() == pytest.approx(REACH)
@@ -59,7 +59,7 @@ def test_over_the_horizon_the_ground_ends_at_the_reach():
 
 
 def test_from_above_people_are_where_they_are_and_near_is_below(people):
-    png = stadium_picture({"south": looking(0.3)}, "frame 0", people, 0, pitch=PitchSpec())
+    png = plot_stadium({"south": looking(0.3)}, "frame 0", people, 0, pitch=PitchSpec())
     far, near = (pixels_of(decoded(png), color).mean(axis=0) for color in PALETTE[:2])
     assert far[0] < near[0] - 100  # rows run down
     assert far[1] < near[1] - 100
@@ -67,8 +67,8 @@ def test_from_above_people_are_where_they_are_and_near_is_below(people):
 
 def test_a_camera_s_picture_has_its_still_beneath(people):
     still = np.full((1080, 1920, 3), (10, 200, 30), dtype=np.uint8)
-    with_still = decoded(camera_picture(looking(0.3), "south", people, 0, still=still))
-    without = decoded(camera_picture(looking(0.3), "south", people, 0, pitch=PitchSpec()))
+    with_still = decoded(plot_camera_view(looking(0.3), "south", people, 0, still=still))
+    without = decoded(plot_camera_view(looking(0.3), "south", people, 0, pitch=PitchSpec()))
     assert len(pixels_of(with_still, "#0ac81e")) > 0.8 * with_still[..., 0].size
     assert len(pixels_of(without, "#0ac81e")) == 0
     for image in (with_still, without):
@@ -79,8 +79,8 @@ def test_a_camera_s_picture_has_its_still_beneath(people):
 
 def test_nobody_and_no_pitch_are_still_pictures():
     nobody = JointTracks(np.arange(1), np.arange(0), np.empty((1, 0, 17, 3)))
-    assert decoded(stadium_picture({"a": looking(0.3)}, "", nobody, 0)).shape[2] == 3
-    assert decoded(camera_picture(looking(0.3), "", nobody, 0)).shape[2] == 3
+    assert decoded(plot_stadium({"a": looking(0.3)}, "", nobody, 0)).shape[2] == 3
+    assert decoded(plot_camera_view(looking(0.3), "", nobody, 0)).shape[2] == 3
 
 
 def test_wrong_clicks_are_marked_where_they_were_made():
@@ -88,7 +88,7 @@ def test_wrong_clicks_are_marked_where_they_were_made():
         Click("corner_left_far", np.array([480.0, 270.0]), inlier=True),
         Click("corner_right_near", np.array([1440.0, 810.0]), inlier=False),
     ]
-    image = decoded(calibration_picture(looking(0.3), "south", PitchSpec(), clicks=clicks))
+    image = decoded(plot_calibration(looking(0.3), "south", PitchSpec(), clicks=clicks))
     accepted = pixels_of(image, ACCEPTED).mean(axis=0)
     refused = np.median(pixels_of(image, REFUSED), axis=0)
     assert accepted[1] / image.shape[1] == pytest.approx(0.25, abs=0.02)
@@ -102,7 +102,7 @@ def test_the_coverage_map_is_added_below_and_has_the_same_bytes_every_time():
     expected[:, :3] = np.nan
     error_map = ErrorMap(x, y, expected)
     pictures = [
-        calibration_picture(looking(0.3), "south", PitchSpec(), error_map=each)
+        plot_calibration(looking(0.3), "south", PitchSpec(), error_map=each)
         for each in (None, error_map, error_map)
     ]
     heights = [decoded(png).shape[0] for png in pictures]

@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from data_contracts.review import Acceptance, DeletedDetection
-from worldpose.review.acceptance import open_detections
+from worldpose.review.evidence import open_detections
 
 FRAME = np.arange(10, 13)
 SCORE = np.array([[0.9, 0.2, np.nan], [0.5, np.nan, np.nan], [0.7, 0.2, 0.6]], dtype=np.float32)

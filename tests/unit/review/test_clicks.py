@@ -25,11 +25,11 @@ from data_contracts.review import (
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
 from worldpose.ingest import MatchFolder
 from worldpose.review import (
+    add_previous_value,
     append,
     read_journal,
     replay_corrections,
     standing_corrections,
-    with_was,
 )
 from worldpose.store import Store
 from worldpose.store.blobs import Entry
@@ -230,11 +230,11 @@ def test_key_frames_of_a_clip_are_corrected_picked_and_dropped(folder):
 
 def test_what_a_person_does_not_say_is_taken_from_what_they_see(folder):
     edit = MovedPoint(camera="a", marking=CORNER, xy=(9.0, 9.0))
-    assert with_was(folder, edit).was == (1.0, 2.0)
+    assert add_previous_value(folder, edit).was == (1.0, 2.0)
     drawn = RedrawnMarking(camera="a", marking=LINE, xy=())
-    assert with_was(folder, drawn).was == ((5.0, 6.0),)
+    assert add_previous_value(folder, drawn).was == ((5.0, 6.0),)
     # What is said stays: two people may look at different states.
-    assert with_was(folder, moved((9.0, 9.0), None)).was is None
+    assert add_previous_value(folder, moved((9.0, 9.0), None)).was is None
 
 
 places = st.tuples(st.integers(0, 99), st.integers(0, 49)).map(lambda xy: tuple(map(float, xy)))
@@ -246,7 +246,7 @@ def test_edits_of_one_who_sees_the_present_all_apply(folder, moves):
     state, corrections = folder, []
     model = {name: points(folder.clicked[name]) for name in "ab"}
     for camera, xy in moves:
-        edit = with_was(state, MovedPoint(camera=camera, marking=CORNER, xy=xy))
+        edit = add_previous_value(state, MovedPoint(camera=camera, marking=CORNER, xy=xy))
         corrections += made(edit)
         state = replay_corrections(folder, corrections).folder
         model[camera].pop(CORNER, None)

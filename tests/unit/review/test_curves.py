@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from worldpose.review.curves import clip_curves
+from worldpose.review.evidence import clip_curves
 
 
 def test_each_frame_is_counted_on_its_own():

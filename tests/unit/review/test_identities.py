@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from data_contracts.review import MergedTracks, NamedTrack, Sighting, SplitTrack
 from data_contracts.tracking import Join
-from worldpose.review.identities import Identities, replay_identities, sighting_of
+from worldpose.review.identities import Identities, find_sighting, replay_identities
 
 FIRST = 100
 """Match frame of the clip's first."""
@@ -123,10 +123,10 @@ def test_what_does_not_apply_says_why_and_changes_nothing(edit, reason):
 
 
 def test_a_sighting_is_the_detection_that_fits_best():
-    seen = sighting_of(identities(), 0)
+    seen = find_sighting(identities(), 0)
     assert seen == Sighting(camera="b", frame=FIRST + 1, detection=0)
     assert replay_identities(identities(), [merge(0, 1, kept_seen=seen)]).objections == (None,)
-    assert sighting_of(identities(), 0, first=FIRST + 3) is None
+    assert find_sighting(identities(), 0, first=FIRST + 3) is None
 
 
 @given_that(

@@ -11,7 +11,7 @@ from data_contracts.review import Correction, MovedPoint, ReviewDecision, Review
 from worldpose.errors import CorruptionError, InputError, StoreError
 from worldpose.review import (
     append,
-    decision_on,
+    last_decision,
     read_journal,
     requests_by_id,
     say,
@@ -295,13 +295,13 @@ def test_the_last_verdict_on_the_same_bytes_counts(store):
     say(store, "m", lambda _: [request("q1", one)])
     say(store, "m", lambda _: [decision("q1", "reject")])
     records = tuple(read_journal(store, "m").records)
-    assert decision_on(records, "tracking/clip", one).verdict == "reject"
-    assert decision_on(records, "tracking/clip", other) is None
-    assert decision_on(records, "tracking/other", one) is None
+    assert last_decision(records, "tracking/clip", one).verdict == "reject"
+    assert last_decision(records, "tracking/clip", other) is None
+    assert last_decision(records, "tracking/other", one) is None
     # The same bytes under another key are another question, and the later verdict is the one.
     say(store, "m", lambda _: [request("q2", one), decision("q2", "approve")])
     records = tuple(read_journal(store, "m").records)
-    assert decision_on(records, "tracking/clip", one).verdict == "approve"
+    assert last_decision(records, "tracking/clip", one).verdict == "approve"
     assert list(requests_by_id(records)) == ["q1", "q2"]
 
 

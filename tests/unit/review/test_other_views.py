@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldpose.geometry import Camera, Rigid
-from worldpose.review.other_views import check_views, epipolar_curves
+from worldpose.review.evidence import check_views, epipolar_curves
 
 SIZE = np.array([1920, 1080])
 

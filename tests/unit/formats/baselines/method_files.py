@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from data_contracts.conventions import COCO17
 from worldpose.body import BodyParameters, fold_keypoints, load_open_body
-from worldpose.evaluation.boxes import joint_boxes
+from worldpose.evaluation.matching import joint_boxes
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera, Rigid
 

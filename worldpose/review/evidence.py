@@ -1,0 +1,381 @@
+"""Evidence for a reviewer: open detections, metrics per frame, other views, calibration preview.
+
+Other views check a correction in one image against all (D4, D6): the epipolar curve contains the
+possible pixels of a keypoint in another camera, the prediction is its pixel if the other keypoints
+are correct. The preview shows the pitch as clicks calibrate it, and proposes next clicks (C7).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from data_contracts.arrays import Floats
+from data_contracts.review import Acceptance
+from data_contracts.static_calibration import ClickedMarkings
+from worldpose.geometry import Camera, Rays, intersect_rays
+from worldpose.pitch import PitchTemplate
+from worldpose.review.detections import DetectionEdit
+from worldpose.static_calibration import (
+    CalibrationReport,
+    StaticCalibrationSettings,
+    calibrate,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class OpenDetections:
+    """Detections without acceptance or correction, by rising confidence.
+
+    Attributes:
+        frame: (n,) match frames.
+        detection: (n,) indices of the detections in the frame.
+        score: (n,) the detector's confidence [1].
+        people: number of all detections, reviewed or not.
+    """
+
+    frame: NDArray[np.int64]
+    detection: NDArray[np.int64]
+    score: NDArray[np.float64]
+    people: int
+
+
+def open_detections(
+    frame: NDArray[np.int64],
+    score: NDArray[np.floating],
+    acceptances: Iterable[Acceptance],
+    edits: Iterable[DetectionEdit],
+) -> OpenDetections:
+    """Return the detections of one camera's result that await review.
+
+    Args:
+        frame: (frames,) match frames, rising without gaps.
+        score: (frames, detections) without corrections; NaN = no detection.
+        acceptances: of this result.
+        edits: of this camera; a corrected detection counts as reviewed.
+    """
+    there = np.isfinite(score)
+    waits = there.copy()
+    first = int(frame[0]) if len(frame) else 0
+    looked_at = [(edit.frame, edit.detection) for edit in edits]
+    for acceptance in acceptances:
+        looked_at += acceptance.people
+        if acceptance.at_least is not None:
+            # The store has scores in single precision, and a person enters the displayed value.
+            waits &= ~(score >= np.float32(acceptance.at_least))
+    for number, detection in looked_at:
+        row = number - first
+        if 0 <= row < score.shape[0] and 0 <= detection < score.shape[1]:
+            waits[row, detection] = False
+    rows, places = np.nonzero(waits)
+    values = score[rows, places].astype(np.float64)
+    order = np.argsort(values, kind="stable")
+    return OpenDetections(
+        frame=frame[rows[order]],
+        detection=places[order].astype(np.int64),
+        score=values[order],
+        people=int(np.count_nonzero(there)),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One metric over the frames of a clip.
+
+    Attributes:
+        title: name with unit.
+        values: (frames,); NaN where undefined.
+    """
+
+    title: str
+    values: Floats
+
+
+def clip_curves(
+    bodies: Floats, covariance: Floats, filled: NDArray[np.bool_], placed: Floats
+) -> tuple[Curve, ...]:
+    """Return the number of people and their uncertainty per frame.
+
+    Args:
+        bodies: (frames, persons, 17, 3) keypoints of the fitted bodies [m], world; NaN = no body.
+        covariance: (frames, persons, 17, 3, 3) of these keypoints [m^2].
+        filled: (frames, persons) bodies from the motion model alone.
+        placed: (frames, persons, 17, 3) triangulated joints [m] of the same people; NaN where
+            missing.
+    """
+    there = np.isfinite(bodies).all(axis=-1)
+    people = there.any(axis=-1)
+    variance = np.einsum("...ii", covariance) / 3.0
+    square = ((bodies - placed) ** 2).sum(axis=-1) / 3.0
+    measured = np.isfinite(square)
+    total = np.where(measured, square, 0.0).sum(axis=(1, 2))
+    count = measured.sum(axis=(1, 2))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        apart = np.sqrt(total / count)
+        share = (filled & people).sum(axis=1) / people.sum(axis=1)
+    return (
+        Curve("people", people.sum(axis=1).astype(np.float64)),
+        Curve("share filled by motion alone [1]", share),
+        Curve("standard deviation of a joint along an axis, median [m]", _medians(variance) ** 0.5),
+        Curve("bodies from the joints that cameras placed, rms along an axis [m]", apart),
+    )
+
+
+def _medians(values: Floats) -> Floats:
+    """Return the median of finite values per frame; NaN without any."""
+    found = np.full(len(values), np.nan)
+    for frame, row in enumerate(values):
+        there = row[np.isfinite(row)]
+        if len(there):
+            found[frame] = np.median(there)
+    return found
+
+
+HEIGHTS: Final = (-0.3, 3.2)
+"""Range of joint heights above the ground [m]: the ground may be lower at its edges, and arms are
+raised in a jump."""
+DISTANCES: Final = (0.5, 300.0)
+"""Range of distances of people from a camera [m]: across the largest stadium."""
+BEGIN: Final = 33
+"""Initial samples along a ray."""
+APART: Final = 12.0
+"""Maximum spacing of a curve's points [px]: arc and chord differ by less than a hundredth of a
+pixel in a lens that bends a line by 10 px over 400."""
+HALVINGS: Final = 8
+"""Maximum number of subdivisions."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewCheck:
+    """Multi-view consistency of one person's keypoints.
+
+    Attributes:
+        joints: (joints, 3) [m], world: triangulated from all views; NaN with fewer than two.
+        expected: (cameras, joints, 2) [px]: prediction in each camera of the joint triangulated
+            from the others; NaN with fewer than two others.
+        error: (cameras, joints) [px]: from each keypoint to the joint from all views.
+    """
+
+    joints: Floats
+    expected: Floats
+    error: Floats
+
+
+def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Floats]:
+    """Return the epipolar curves in `target` of a pixel in `source`.
+
+    The function projects the part of the pixel's ray where joints can be into the other image, with
+    lens distortion, and clips it to the image.
+
+    Args:
+        source: one camera.
+        target: another camera.
+        pixel: (2,) in the image of `source` [px].
+
+    Returns:
+        Polylines (n, 2) [px] within the image of `target`; none if the ray is not visible.
+    """
+    rays = source.unproject(np.asarray(pixel, dtype=np.float64)[None])
+    span = _span(rays)
+    if span is None:
+        return []
+    origin, direction = rays.origins[0], rays.directions[0]
+
+    def project_along(along: Floats) -> Floats:
+        return target.project(origin + along[:, None] * direction)
+
+    along = np.linspace(span[0], span[1], BEGIN)
+    places = project_along(along)
+    for _ in range(HALVINGS):
+        gap = np.linalg.norm(np.diff(places, axis=0), axis=1)
+        inside = _is_inside(places, target)
+        wide = np.flatnonzero((gap > APART) & (inside[1:] | inside[:-1]))
+        # One end may be behind the camera, or outside the valid range of its lens model.
+        cut = np.flatnonzero(np.isfinite(places[1:, 0]) != np.isfinite(places[:-1, 0]))
+        halved = np.union1d(wide, cut)
+        if not len(halved):
+            break
+        middle = (along[halved] + along[halved + 1]) / 2
+        along = np.insert(along, halved + 1, middle)
+        places = np.insert(places, halved + 1, project_along(middle), axis=0)
+    inside = _is_inside(places, target)
+    bounds = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
+    runs = [places[begin:end] for begin, end in zip(bounds[::2], bounds[1::2], strict=True)]
+    return [run for run in runs if len(run) > 1]
+
+
+def check_views(cameras: Camera, keypoints: ArrayLike) -> ViewCheck:
+    """Return the multi-view consistency of one person in one frame.
+
+    A joint is the nearest point to its rays, with weights from the size of a pixel at its distance.
+
+    Args:
+        cameras: a batch (cameras,).
+        keypoints: (cameras, joints, 2) [px]; NaN where not seen.
+    """
+    places = np.asarray(keypoints, dtype=np.float64)
+    rays = cameras.unproject(places)
+    count = len(places)
+    joints = _joints(cameras, rays, np.ones((1, count)))[0]
+    without = _joints(cameras, rays, 1.0 - np.eye(count))
+    expected = cameras.project(without)
+    error = np.linalg.norm(cameras.project(np.broadcast_to(joints, without.shape)) - places, axis=2)
+    return ViewCheck(joints, expected, error)
+
+
+def _joints(cameras: Camera, rays: Rays, chosen: Floats) -> Floats:
+    """Return joints (choices, joints, 3) [m] from the cameras of each choice (choices, cameras)."""
+    bundles = Rays(
+        origins=np.broadcast_to(rays.origins, rays.directions.shape).swapaxes(0, 1),
+        directions=rays.directions.swapaxes(0, 1),
+        status=rays.status.swapaxes(0, 1),
+    )
+    share = np.broadcast_to(chosen[:, None, :], (len(chosen), *bundles.status.shape))
+    many = Rays(
+        origins=np.broadcast_to(bundles.origins, (*share.shape, 3)),
+        directions=np.broadcast_to(bundles.directions, (*share.shape, 3)),
+        status=np.broadcast_to(bundles.status, share.shape),
+    )
+    near, _ = intersect_rays(many, share)
+    distance = np.linalg.norm(near[..., None, :] - cameras.center, axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weight = share * (cameras.focal.mean(axis=-1) / distance) ** 2
+    return intersect_rays(many, np.nan_to_num(weight, posinf=0.0))[0]
+
+
+def _span(rays: Rays) -> tuple[float, float] | None:
+    """Return the interval of possible joints along the ray [m]; None if empty."""
+    if not rays.valid[0]:
+        return None
+    height, slope = float(rays.origins[0, 2]), float(rays.directions[0, 2])
+    low, high = HEIGHTS
+    if abs(slope) < 1e-9:
+        return DISTANCES if low <= height <= high else None
+    ends = sorted(((low - height) / slope, (high - height) / slope))
+    span = max(ends[0], DISTANCES[0]), min(ends[1], DISTANCES[1])
+    return span if span[0] < span[1] else None
+
+
+def _is_inside(places: Floats, camera: Camera) -> NDArray[np.bool_]:
+    with np.errstate(invalid="ignore"):
+        inside = (places >= -0.5) & (places <= camera.image_size - 0.5)
+    return np.asarray(inside.all(axis=1), dtype=np.bool_)
+
+
+SPACING = 0.5
+"""Spacing of points along a drawn marking [m]: the chords of a curved marking are only a few pixels
+long."""
+MARGIN = 0.25
+"""Margin beyond the image for drawn markings, relative to its size [1]: far outside, unconstrained
+distortion may fold them back."""
+
+
+@dataclass(frozen=True, eq=False)
+class PitchDrawing:
+    """A pitch with cached sample points for repeated drawing.
+
+    Attributes:
+        template: the stadium's template.
+    """
+
+    template: PitchTemplate
+
+    @cached_property
+    def markings(self) -> dict[str, NDArray[np.float64]]:
+        """Points (n, 3) [m], world, along every marking, by name."""
+        names = self.template.marking_names
+        return {name: self.template.marking_points(name, SPACING) for name in names}
+
+    @cached_property
+    def points(self) -> NDArray[np.float64]:
+        """The named points (n, 3) [m], world."""
+        return self.template.positions(tuple(self.template.points))
+
+    def drawn(self, camera: Camera) -> dict[str, list[NDArray[np.float64]]]:
+        """Return polylines (n, 2) [px] of every marking in or near the image, by name."""
+        stacked = camera.project(np.concatenate(list(self.markings.values())))
+        found, begin = {}, 0
+        for name, points in self.markings.items():
+            end = begin + len(points)
+            pieces = _pieces(stacked[begin:end], camera.image_size)
+            begin = end
+            if pieces:
+                found[name] = pieces
+        return found
+
+    def placed(self, camera: Camera) -> dict[str, NDArray[np.float64]]:
+        """Return the projections of the named points inside the image (2,) [px], by name."""
+        pixels = camera.project(self.points)
+        inside = _is_in_or_near(pixels, camera.image_size, 0.0)
+        names = self.template.points
+        return {name: pixels[k] for k, name in enumerate(names) if inside[k]}
+
+
+@dataclass(frozen=True, eq=False)
+class Preview:
+    """Camera, report and projected pitch from the current clicks.
+
+    Attributes:
+        camera: the camera.
+        report: its accuracy and warnings.
+        markings: polylines (n, 2) [px] by name.
+        points: projections of the named points (2,) [px], by name.
+    """
+
+    camera: Camera
+    report: CalibrationReport
+    markings: Mapping[str, list[NDArray[np.float64]]]
+    points: Mapping[str, NDArray[np.float64]]
+
+
+def preview(
+    drawing: PitchDrawing,
+    clicked: ClickedMarkings,
+    image_size: tuple[int, int],
+    *,
+    picture: NDArray[np.uint8] | None = None,
+    settings: StaticCalibrationSettings = StaticCalibrationSettings(),  # noqa: B008
+) -> Preview:
+    """Return the camera from the current clicks, and the projected pitch.
+
+    Args:
+        drawing: the pitch.
+        clicked: the current clicks.
+        image_size: width, height [px].
+        picture: (height, width, 3); if given, the calibration refines the camera on the painted
+            lines, which takes seconds and not milliseconds.
+        settings: as for the stage `static_calibration`.
+
+    Raises:
+        InputError: the clicks do not determine a camera; the message says which clicks to add.
+    """
+    found = calibrate(
+        drawing.template, clicked, image_size, picture=picture, settings=settings, where="so far"
+    )
+    camera = found.estimate.camera
+    return Preview(camera, found.report, drawing.drawn(camera), drawing.placed(camera))
+
+
+def _pieces(
+    pixels: NDArray[np.float64], image_size: NDArray[np.int64]
+) -> list[NDArray[np.float64]]:
+    """Return the runs of two points or more in or near the image."""
+    near = _is_in_or_near(pixels, image_size, MARGIN)
+    bounds = np.flatnonzero(np.diff(np.concatenate([[False], near, [False]])))
+    runs = zip(bounds[::2], bounds[1::2], strict=True)
+    return [pixels[begin:end] for begin, end in runs if end - begin > 1]
+
+
+def _is_in_or_near(
+    pixels: NDArray[np.float64], image_size: NDArray[np.int64], margin: float
+) -> NDArray[np.bool_]:
+    """Return a mask (n,) of pixels (n, 2) in the image or within a margin relative to its size."""
+    room = margin * np.asarray(image_size)
+    with np.errstate(invalid="ignore"):
+        inside = (pixels >= -0.5 - room) & (pixels <= image_size - 0.5 + room)
+    return np.asarray(inside.all(axis=1))
