@@ -40,7 +40,7 @@ class CameraEvaluation(Record):
 
 
 class Evaluation(Record):
-    """Scores of a prediction against a reference (definitions: docs/metrics.md)."""
+    """Scores of a prediction against a reference (definitions: docs/reference/metrics.md)."""
 
     mpjpe_mm: Amount | None = None
     """Mean distance of matched joints without any alignment [mm]."""

@@ -7,7 +7,10 @@ from typing import Annotated, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 CONTRACT_VERSION: Final[Literal[1]] = 1
-"""Version of all contracts in this package; readers refuse any other (docs/conventions.md)."""
+"""Version of all contracts in this package; readers refuse any other.
+
+See docs/reference/conventions.md.
+"""
 
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 """An id that is safe as a file and object name: cameras, clips, matches."""

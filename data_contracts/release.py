@@ -83,7 +83,7 @@ class Finding(Record):
     """One thing that is wrong with a data set."""
 
     fault: str
-    """Its name, such as `transposed_rotation`; docs/formats.md lists them."""
+    """Its name, such as `transposed_rotation`; docs/reference/formats.md lists them."""
     kind: Literal["convention", "damage", "plausibility"]
     where: tuple[str, ...]
     """Files or clips, and cameras."""

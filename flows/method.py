@@ -1,7 +1,7 @@
 """The method: its stages in the paper's order, and its review gates.
 
-See docs/architecture.md. Only the stages of this tuple exist; the comments mark the places of
-planned ones, with their units and checklist ids.
+See docs/explanation/architecture.md. Only the stages of this tuple exist; the comments mark the
+places of planned ones, with their units and checklist ids.
 """
 
 from __future__ import annotations

@@ -66,8 +66,8 @@ def evaluate(
         typer.Option(
             "--method",
             metavar="NAME=PATH",
-            help="Score another method's result (docs/methods.md) instead of --prediction; may be "
-            "given more than once for one table.",
+            help="Score another method's result (docs/how-to/baselines.md) instead of "
+            "--prediction; may be given more than once for one table.",
         ),
     ] = None,
     body: Annotated[
@@ -96,7 +96,7 @@ def evaluate(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Score joints and cameras against a reference; definitions in docs/metrics.md.
+    """Score joints and cameras against a reference; definitions in docs/reference/metrics.md.
 
     Example: worldpose evaluate --prediction tiny-1 --reference matches/tiny/reference
     """

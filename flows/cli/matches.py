@@ -147,7 +147,7 @@ def _refuse_options(what: str, options: dict[str, bool]) -> None:
                 option,
                 expected=f"an option of {what}",
                 found=f"{option}, which it does not have",
-                todo="Leave the option out, or see docs/synthetic.md for what replaces it.",
+                todo="Leave the option out; docs/explanation/synthetic.md says what replaces it.",
             )
 
 

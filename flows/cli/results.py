@@ -28,7 +28,7 @@ def export(
         typer.Option(
             "--format",
             help="joints, coco, worldpose, trc, bvh, challenge, challenge-2025, tracks, "
-            "slahmr-cameras or rerun (docs/formats.md); more than one may be given.",
+            "slahmr-cameras or rerun (docs/reference/formats.md); more than one may be given.",
         ),
     ],
     out: Annotated[Path, typer.Option("--out", help="Folder to write into.")],

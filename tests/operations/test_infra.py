@@ -336,7 +336,7 @@ def test_the_image_is_made_of_what_is_there():
 
 
 def test_every_line_of_the_threat_model_names_tests_that_are_there():
-    text = (INFRA.parent / "docs" / "security.md").read_text()
+    text = (INFRA.parent / "docs" / "explanation" / "security.md").read_text()
     tests = "".join(file.read_text() for file in (INFRA.parent / "tests").rglob("test_*.py"))
     rows = [line for line in text.splitlines() if line.startswith("|")]
     named = {name for row in rows for name in re.findall(r"`([a-z_]{25,})`", row)}

@@ -23,7 +23,7 @@ from worldpose.errors import InputError, UsageError
 from worldpose.pickles import plain, read_notes
 
 OPEN_BODY: Final = "open-neutral/2"
-"""The body that ships with worldpose: SMPL's layout, not SMPL (docs/body_model.md)."""
+"""The body that ships with worldpose: SMPL's layout, not SMPL (docs/reference/body_model.md)."""
 
 KEYS: Final = (
     "v_template",

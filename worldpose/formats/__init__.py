@@ -1,7 +1,7 @@
 """Exchange file formats, written from plain arrays and read back.
 
 Joints, cameras, body poses, COCO keypoints, the FIFA skeletal tracking challenge, motion capture
-(TRC, BVH); docs/formats.md describes each of them.
+(TRC, BVH); docs/reference/formats.md describes each of them.
 """
 
 from worldpose.formats.archives import Member, read_archive, write_archive

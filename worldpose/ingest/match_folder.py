@@ -75,8 +75,8 @@ def _read_match(folder: Path) -> MatchFolder:
             str(file),
             expected="a file",
             found="nothing",
-            todo="docs/match_folder.md describes a match folder; worldpose import makes one from a "
-            "calibration.",
+            todo="docs/reference/match_folder.md describes a match folder; worldpose import makes "
+            "one from a calibration.",
         )
     spec = validate_record(MatchSpec, read_yaml(file), str(file))
     if not spec.static_cameras:

@@ -78,7 +78,7 @@ def play(
     Every person steers for a target that moves: players for their place in a formation that shifts
     with the ball, the nearest of each team for the ball, a sprinter for open space, the referee
     for a place near play, assistants along the touch lines. Targets need not be smooth: people
-    accelerate within human bounds (docs/synthetic.md).
+    accelerate within human bounds (docs/explanation/synthetic.md).
 
     Args:
         crowd: number of people and of officials among them.

@@ -124,7 +124,7 @@ def stride_cycle(path: GroundPath, phase: float) -> Floats:
     """Return strides made (samples,): whole at mid-stance of the left foot, half at the right's.
 
     Strides get longer and faster with speed: 0.9 per second at 1 m/s, 1.4 at 4 m/s, 2.2 at 9 m/s.
-    Sources are in docs/synthetic.md.
+    Sources are in docs/explanation/synthetic.md.
     A standing person rests a quarter of the way between the two, with both feet on the ground.
 
     Args:

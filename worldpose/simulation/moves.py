@@ -19,7 +19,7 @@ def jump(rise: float, *, hurdle: bool = False) -> Motion:
 
     Args:
         rise: of the mid-hip in flight [m]; footballers reach 0.35 to 0.45 with a countermovement
-            (docs/synthetic.md).
+            (docs/explanation/synthetic.md).
         hurdle: knees come up and the head stays down, as over a sliding player.
     """
     climb = float(np.sqrt(2.0 * GRAVITY * rise))

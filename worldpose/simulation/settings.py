@@ -19,7 +19,7 @@ class ActionRates(Record):
     """Rates of actions that people perform while they move or stand.
 
     Shares are of the ball's touches, 18 per minute. Rates and measurements in matches:
-    docs/synthetic.md.
+    docs/explanation/synthetic.md.
     """
 
     headers: float = Field(default=0.12, ge=0, le=1)

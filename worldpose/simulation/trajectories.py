@@ -87,7 +87,7 @@ def _unusable(path: Path, found: str) -> InputError:
         str(path),
         expected="npz with xy (T, N, 2), and time (T,) or fps",
         found=found,
-        todo="See docs/synthetic.md for the layout.",
+        todo="See docs/explanation/synthetic.md for the layout.",
     )
 
 

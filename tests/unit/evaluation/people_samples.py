@@ -1,4 +1,4 @@
-"""The person of docs/metrics.md, and tracks of such people."""
+"""The person of docs/reference/metrics.md, and tracks of such people."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Cases T to X of docs/metrics.md, and what must hold for any camera."""
+"""Cases T to X of docs/reference/metrics.md, and what must hold for any camera."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Cases P to S of docs/metrics.md, and what must hold for any input."""
+"""Cases P to S of docs/reference/metrics.md, and what must hold for any input."""
 
 import numpy as np
 import pytest

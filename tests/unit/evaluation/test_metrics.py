@@ -1,4 +1,4 @@
-"""The cases of docs/metrics.md, under the same letters, and what must hold for any input."""
+"""The cases of docs/reference/metrics.md, under the same letters, and properties for any input."""
 
 from dataclasses import replace
 

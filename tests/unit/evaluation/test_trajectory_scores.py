@@ -1,4 +1,4 @@
-"""Cases H to O of docs/metrics.md: whole trajectories, moved in ways that can be solved by hand."""
+"""Cases H to O of docs/reference/metrics.md: whole trajectories with motions solved by hand."""
 
 from dataclasses import replace
 

@@ -111,7 +111,7 @@ def test_a_folder_of_videos_alone_is_told_what_a_match_folder_is(tmp_path):
     (tmp_path / "videos").mkdir()
     (tmp_path / "videos" / "cam1.mp4").write_bytes(b"video")
     error = refusal(tmp_path)
-    assert "docs/match_folder.md" in error.todo and "worldpose import" in error.todo
+    assert "docs/reference/match_folder.md" in error.todo and "worldpose import" in error.todo
 
 
 def test_a_video_in_its_usual_place_is_footage(match_folder):

@@ -227,7 +227,7 @@ def test_a_goalkeeper_in_waiting_bends_his_knees_by_about_60_degrees():
     hip, knee, ankle = (joints[middle, J[f"left_{part}"]] for part in ("hip", "knee", "ankle"))
     thigh, shank = hip - knee, ankle - knee
     cosine = thigh @ shank / np.linalg.norm(thigh) / np.linalg.norm(shank)
-    # 62 +- 18 degrees were measured in elite goalkeepers (docs/synthetic.md).
+    # 62 +- 18 degrees were measured in elite goalkeepers (docs/explanation/synthetic.md).
     assert np.degrees(np.pi - np.arccos(cosine)) == pytest.approx(62.0, abs=18.0)
 
 

@@ -111,5 +111,5 @@ def _refusal(path: Path, form: Format | None, found: str) -> InputError:
         str(path),
         expected=known if form is None else _CODECS[form].name,
         found=found,
-        todo="Export it again from the annotator; docs/review.md says how.",
+        todo="Export it again from the annotator; docs/how-to/review.md says how.",
     )

@@ -279,7 +279,7 @@ def read_smpl(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
     """Return the people of a file with `betas`, `global_orient`, `body_pose` and `transl`.
 
     Args:
-        path: npz file, persons first, NaN where a person is missing (docs/formats.md).
+        path: npz file, persons first, NaN where a person is missing (docs/reference/formats.md).
         model: body model to pose; betas of another body model are not used.
 
     Raises:

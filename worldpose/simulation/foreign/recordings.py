@@ -114,7 +114,7 @@ def read_recordings(folder: Path) -> Recordings:
             str(folder),
             expected="npz files with joints, joint_names and fps, or with xy and time or fps",
             found="none",
-            todo="See docs/synthetic.md for the layouts.",
+            todo="See docs/explanation/synthetic.md for the layouts.",
         )
     return Recordings(tuple(motions), tuple(tracks))
 
