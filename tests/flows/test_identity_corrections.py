@@ -81,7 +81,7 @@ def test_an_edit_of_somebody_who_is_another_by_now_is_refused(store):
     say(store, a=split)
     say(store, a=split)  # the same edit sent again is kept once
     assert len(open_match(store, TINY).corrections) == 1
-    with pytest.raises(StaleEditError, match="person 0 is not who was seen"):
+    with pytest.raises(StaleEditError, match="person 0 is not the person that was seen"):
         say(store, b=split)
     latest = latest_run(store, TINY)
     origins = origins_of(store, open_match(store, TINY), latest)

@@ -110,7 +110,8 @@ def absent_rows(name: str, arrays: Mapping[str, NDArray[Any]]) -> tuple[Floats, 
                 fault="zeros_for_missing",
                 kind="convention",
                 where=(name,),
-                says=f"{', '.join(flat)} are exactly zero where nobody stands; missing is NaN",
+                says=f"{', '.join(flat)} are exactly zero where a person is missing; "
+                "missing values are NaN",
                 figures={"share_of_rows": float(zeros.mean())},
             )
         )

@@ -302,7 +302,9 @@ def agreement_findings(found: Iterable[Agreement], settings: CheckSettings) -> I
         )
 
 
-_UNEXPLAINED = "3D points are not where the 2D has them, and no known convention explains it"
+_UNEXPLAINED = (
+    "the projected 3D points differ from the 2D points, and no known convention explains it"
+)
 
 
 def _candidates(moving: bool) -> Iterator[Fault]:

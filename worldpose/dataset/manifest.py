@@ -56,7 +56,7 @@ def read_manifest(folder: Path) -> ReleaseManifest | None:
             str(path),
             expected=f"the manifest of a release, contract {CONTRACT_VERSION}",
             found=str(error.errors()[0]["msg"]),
-            todo="Take the release anew from its origin.",
+            todo="Download or copy the release again from its origin.",
         ) from error
 
 
@@ -100,7 +100,7 @@ def read_frame_rates(folder: Path) -> dict[str, float]:
     except ValidationError as error:
         raise InputError(
             str(path),
-            expected="clips and their frames a second",
+            expected="clips and their frames per second",
             found=str(error.errors()[0]["msg"]),
             todo="Export the data set again.",
         ) from error

@@ -338,7 +338,7 @@ def _finding(
         fault="sees_nobody" if fault is None else fault.name,
         kind="damage" if fault is None else "convention",
         where=tuple(f"cameras/{name}" for name in named),
-        says="the camera shows nobody of the clip"
+        says="the camera shows no person of the clip"
         if fault is None
         else f"{fault.says}: so the camera shows people",
         figures={"explained_share_seen": float(share[which].min())},

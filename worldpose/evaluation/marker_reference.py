@@ -59,7 +59,7 @@ def read_markers(path: Path) -> Markers:
         rate, names, points, unit = _read_trc(path)
     # A truncated file lacks lines, cells or keys; text may be no number or no UTF-8.
     except (OSError, LookupError, ValueError) as error:
-        raise _wrong(path, "a whole C3D or TRC file", f"{error!r}") from error
+        raise _wrong(path, "a complete C3D or TRC file", f"{error!r}") from error
     return _checked(path, rate, names, points, unit)
 
 
@@ -143,7 +143,7 @@ def _read_c3d(path: Path) -> Markers:
     except MemoryError:
         raise
     except Exception as error:  # c3d documents no closed list for damaged files
-        raise _wrong(path, "a whole C3D or TRC file", f"{error!r}") from error
+        raise _wrong(path, "a complete C3D or TRC file", f"{error!r}") from error
     values = np.array(rows, dtype=np.float64).reshape(len(rows), -1, 4)
     points = np.where(values[..., 3:] < 0.0, np.nan, values[..., :3])
     return _checked(path, rate, names[: points.shape[1]], points, unit)
@@ -182,7 +182,7 @@ def _checked(
 
 def _wrong(where: object, expected: str, found: str) -> InputError:
     return InputError(
-        str(where), expected=expected, found=found, todo="Export it anew, or name another file."
+        str(where), expected=expected, found=found, todo="Export it again, or name another file."
     )
 
 

@@ -145,7 +145,7 @@ def plot_before_after(
     tall = max(float(np.ptp(shown[np.isfinite(shown[:, 1]), 1])), 30.0)
     gone = shown - before.project(tracks.joints[frame, person])
     moved = float(np.nanmean(np.linalg.norm(gone, axis=-1)))
-    titles = ("before", f"after, {moved:.1f} px beside")
+    titles = ("before", f"after: moved by {moved:.1f} px")
     figure = Figure(figsize=(14.0, 5.6), dpi=110, layout="constrained", facecolor="white")
     for axes, camera, title in zip(figure.subplots(1, 2), (before, after), titles, strict=True):
         axes.imshow(still, zorder=0, interpolation="nearest")
@@ -221,11 +221,13 @@ def plot_flow(
             zorder=3,
         )
     goes = start + (predicted - start) * stretch
-    axes.plot(*goes.T, "o", color=TEMPLATE, markersize=2.6, label="found camera", zorder=2)
+    axes.plot(*goes.T, "o", color=TEMPLATE, markersize=2.6, label="estimated camera", zorder=2)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
     style(axes)
     axes.legend(loc="lower right", framealpha=0.85, fontsize=11)
-    axes.set_title(f"motion, {stretch:.0f} times as long", color=INK, loc="left", fontsize=12)
+    axes.set_title(
+        f"optical flow, lengthened {stretch:.0f} times", color=INK, loc="left", fontsize=12
+    )
     return png(figure)
 
 

@@ -90,7 +90,7 @@ def plot_paths(
     overview.add_patch(
         Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, color=PALE, linewidth=1.0, linestyle=":")
     )
-    overview.set_title("The whole place, cameras as triangles", color=INK, loc="left", fontsize=12)
+    overview.set_title("Overview; triangles are cameras", color=INK, loc="left", fontsize=12)
     shown = "dots: found, grey: true" if truth is not None else "a dot a frame"
     detail.set_title(
         f"People close up ({shown}, id at the end)", color=INK, loc="left", fontsize=12

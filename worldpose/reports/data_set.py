@@ -61,7 +61,9 @@ def counted_section(found: DataSetStatistics) -> Section:
     )
     blocks: list[Table | CaptionedImage] = [Table("", columns, (row,))]
     blocks.append(
-        CaptionedImage("How far people go, and how long clips are.", plot_statistics(found))
+        CaptionedImage(
+            "Histograms of trajectory lengths and of clip lengths.", plot_statistics(found)
+        )
     )
     if len(found.clips) > 1:
         rows = tuple(
@@ -80,9 +82,9 @@ def counted_section(found: DataSetStatistics) -> Section:
         blocks.append(Table("Clips", titles, rows))
     lead = (
         "Camera: S stands still, M turns, M+Z also zooms. A pose is one person in one frame. "
-        "Distances are those over the ground, from frame to frame."
+        "Distances are path lengths over the ground, summed from frame to frame."
     )
-    return Section("How much there is", tuple(blocks), lead)
+    return Section("Statistics", tuple(blocks), lead)
 
 
 def _check_section(checks: Mapping[str, CheckReport]) -> Section:
@@ -105,7 +107,7 @@ def _check_section(checks: Mapping[str, CheckReport]) -> Section:
         for name, clip in report.clips.items()
     )
     titles = ("clip", ">people", ">cameras", ">2D points", ">reprojection px", ">plausible %")
-    found = Table("What is wrong", ("folder", "fault", "what it says", "where"), findings)
+    found = Table("Faults", ("folder", "fault", "description", "where"), findings)
     lead = (
         "3D is projected into the cameras and compared with the 2D, where there is any; people "
         "must be of human size and speed, stand on the pitch and be in sight."

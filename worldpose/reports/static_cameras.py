@@ -140,7 +140,7 @@ def _draw_error_map(figure: SubFigure, error_map: ErrorMap, pitch: PitchSpec) ->
     bar = figure.colorbar(shades, ax=axes, extend="both", shrink=0.9)
     bar.set_label("expected ground error [m]", color=INK)
     bar.set_ticks([0.01, 0.03, 0.1, 0.3, 1.0], labels=["0.01", "0.03", "0.1", "0.3", "1"])
-    axes.set_title("Grey: not in the picture", color=INK, loc="left", fontsize=11)
+    axes.set_title("Grey: outside the image", color=INK, loc="left", fontsize=11)
 
 
 CONTRAST: Final = 18
@@ -223,7 +223,10 @@ def plot_paint(camera: Camera, still: Image, pitch: PitchSpec) -> tuple[bytes, f
     right.imshow(np.sqrt(np.minimum(distance, LONGEST)), cmap="gray", vmin=0.0)
     for line in markings(pitch):
         right.plot(*camera.project(line).T, color=TEMPLATE, linewidth=0.8)
-    for axes, title in ((left, "paint"), (right, "distance to it: the brighter, the farther")):
+    for axes, title in (
+        (left, "detected paint"),
+        (right, "distance to the paint: brighter is farther"),
+    ):
         axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
         style(axes)
         axes.set_title(title, color=INK, loc="left", fontsize=12)

@@ -134,7 +134,7 @@ def _objection(
         return "the match has no pitch"
     size = _picture_size(folder, edit)
     if size is None:
-        return f"there is no picture {place}"
+        return f"there is no image {place}"
     if edit.frame is None and edit.camera in folder.calibrations:
         return f"camera {edit.camera} is given, so that its clicks decide nothing"
     is_point = isinstance(edit, MovedPoint)
@@ -142,7 +142,7 @@ def _objection(
         return f"the pitch has no {'point' if is_point else 'marking'} {edit.marking}"
     for pixel in _pixels(edit.xy):
         if not _is_inside(pixel, size):
-            return f"{list(pixel)} is outside of the picture {place}"
+            return f"{list(pixel)} is outside of the image {place}"
     now = _now(pictures, edit)
     if now != edit.was:
         was, found = (", ".join(map(str, _pixels(it))) or "not there" for it in (edit.was, now))
@@ -167,11 +167,11 @@ def _unknown(folder: MatchFolder, edit: DetectionEdit) -> str | None:
     elif isinstance(edit, AddedDetection):
         x0, y0, x1, y1 = edit.box
         if not (x0 < x1 and y0 < y1 and x0 < size[0] and y0 < size[1] and x1 > 0 and y1 > 0):
-            return f"{list(edit.box)} is no box in the picture {edit.camera}"
+            return f"{list(edit.box)} is not a box inside the image of {edit.camera}"
         placed = edit.keypoints
     for xy in placed:
         if xy is not None and not _is_inside(xy, size):
-            return f"{list(xy)} is outside of the picture {edit.camera}"
+            return f"{list(xy)} is outside of the image of {edit.camera}"
     return None
 
 

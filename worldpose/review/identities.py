@@ -125,7 +125,10 @@ def find_objection(found: Identities, edit: IdentityEdit) -> str | None:
         if person not in ids:
             return f"clip {edit.clip} has no person {person}"
         if seen is not None and not _is_seen(found, person, seen):
-            return f"person {person} is not who was seen in {seen.camera}, frame {seen.frame}"
+            return (
+                f"person {person} is not the person that was seen in {seen.camera}, frame "
+                f"{seen.frame}"
+            )
     if isinstance(edit, MergedTracks):
         if edit.kept == edit.merged:
             return f"person {edit.kept} is one person already"

@@ -192,8 +192,8 @@ def _extend(journal: Journal, found: Sequence[tuple[int, bytes]], folder: str) -
             before = [*journal.entries[-1:], *entries[-1:]]
             whole = f"entries up to {before[-1].number}" if before else "no entries"
             raise CorruptionError(
-                f"{where} builds on an entry that is gone or damaged; {whole} before it are "
-                f"whole. Restore the folder {folder} from a copy."
+                f"{where} builds on an entry that is missing or damaged; {whole} before it are "
+                f"intact. Restore the folder {folder} from a copy."
             )
         entries.append(entry)
         tip = read_checksum(data)

@@ -147,7 +147,7 @@ def test_reference_without_people_is_refused(prediction):
 def test_damaged_files_are_named(tmp_path, name):
     pytest.importorskip("c3d")
     (tmp_path / name).write_bytes(b"nothing at all\n" * 3)
-    with pytest.raises(InputError, match=f"{name}: expected a whole C3D or TRC file"):
+    with pytest.raises(InputError, match=f"{name}: expected a complete C3D or TRC file"):
         read_markers(tmp_path / name)
     with pytest.raises(InputError, match="found nothing"):
         read_markers(tmp_path / "none" / name)
