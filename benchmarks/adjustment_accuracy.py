@@ -19,6 +19,7 @@ from scipy.stats import chi2
 from static_accuracy import SHARES, ground_errors
 
 from data_contracts.arrays import Floats
+from data_contracts.keypoints import TrackedDetections
 from worldpose.bundle_adjustment import Clicks, Clip, adjust_cameras
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
@@ -52,7 +53,7 @@ def as_clip(scene: Scene, fps: float, known: dict[str, StaticCalibration]) -> Cl
     covariance = np.stack([each.estimate.covariance for each in known.values()])
     arrays = (seen.keypoints, seen.confidence)
     index = track_people(cameras, *arrays, fps, TrackingSettings()).detection_index
-    placed = triangulate_joints(cameras, *arrays, index, settings, covariance)
+    placed = triangulate_joints(cameras, TrackedDetections(*arrays, index), settings, covariance)
     surveyed = PitchTemplate.from_spec(scene.surveyed)
     clicks = []
     for name, each in known.items():

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
+from data_contracts.keypoints import TrackedDetections
 from worldpose.body import BodyParameters, load_open_body
 from worldpose.body_fitting import (
     BodyFit,
@@ -83,7 +84,9 @@ def whole(seed: int, duration: float) -> dict[str, float]:
     cameras = Camera.stack(list(scene.given.values()))
     arrays = (seen.keypoints, seen.confidence)
     index = track_people(cameras, *arrays, scenario.fps, TrackingSettings()).detection_index
-    placed = reconstruct_joints(cameras, *arrays, index, scenario.fps, TRIANGULATION).triangulation
+    placed = reconstruct_joints(
+        cameras, TrackedDetections(*arrays, index), scenario.fps, TRIANGULATION
+    ).triangulation
     ground = PitchTemplate.from_spec(scene.surveyed).height
     begin = time.process_time()
     evidence = ClipEvidence(placed.joints, placed.covariance, scenario.fps, placed.common_bias)
@@ -146,12 +149,16 @@ def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
     cameras = Camera.stack(list(scene.cameras.values()))
     arrays = (seen.keypoints, seen.confidence)
     index = track_people(cameras, *arrays, fps, TrackingSettings()).detection_index
-    full = reconstruct_joints(cameras, *arrays, index, fps, TRIANGULATION).triangulation.joints
+    full = reconstruct_joints(
+        cameras, TrackedDetections(*arrays, index), fps, TRIANGULATION
+    ).triangulation.joints
     who, away = nearest(full, scene.truth.joints)
     index = index[:, :, away < 0.5].copy()
     who = who[away < 0.5]
     dark = thinned(scene, index, left, seed)
-    placed = reconstruct_joints(cameras, *arrays, index, fps, TRIANGULATION).triangulation
+    placed = reconstruct_joints(
+        cameras, TrackedDetections(*arrays, index), fps, TRIANGULATION
+    ).triangulation
     joints, covariance = placed.joints, placed.covariance
     right = unswap(seen.keypoints, index, placed.exchanged)
     static = find_ray_constraints(cameras, right, index, joints)

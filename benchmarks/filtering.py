@@ -14,6 +14,7 @@ import argparse
 
 import numpy as np
 
+from data_contracts.keypoints import TrackedDetections
 from worldpose.body import find_body
 from worldpose.body_fitting import (
     BodyFittingSettings,
@@ -23,9 +24,9 @@ from worldpose.body_fitting import (
 )
 from worldpose.filtering import (
     FilteringSettings,
-    Suspects,
+    TriangulatedDetections,
     judge_detections,
-    learn_from,
+    learn_keypoint_spread,
     perceived_covariance,
     perceived_joints,
     view_bodies,
@@ -71,8 +72,8 @@ def filtered(scenario: Scenario, seed: int) -> tuple[int, int, int, int]:
     cameras = Camera.stack(list(scene.given.values()))
     tracks = track_people(cameras, keypoints, confidence, scenario.fps, TrackingSettings())
     settings, how = TriangulationSettings(), BodyFittingSettings()
-    given = (cameras, keypoints, confidence, tracks.detection_index)
-    placed = reconstruct_joints(*given, scenario.fps, settings).triangulation
+    detections = TrackedDetections(keypoints, confidence, tracks.detection_index)
+    placed = reconstruct_joints(cameras, detections, scenario.fps, settings).triangulation
     ground = PitchTemplate.from_spec(scene.surveyed).height
     right = unswap(keypoints, tracks.detection_index, placed.exchanged)
     alone = find_ray_constraints(cameras, right, tracks.detection_index, placed.joints)
@@ -90,7 +91,7 @@ def filtered(scenario: Scenario, seed: int) -> tuple[int, int, int, int]:
     )
     sure = perceived_covariance(fit.covariance, placed.common_bias)
     views = view_bodies(cameras, perceived_joints(fit.joints, fit.offsets), sure)
-    suspects = Suspects(
+    suspects = TriangulatedDetections(
         keypoints,
         confidence,
         tracks.detection_index,
@@ -99,7 +100,7 @@ def filtered(scenario: Scenario, seed: int) -> tuple[int, int, int, int]:
         np.zeros(seen.person.shape, dtype=bool),
         settings.noise,
     )
-    spread = learn_from(views, suspects)
+    spread = learn_keypoint_spread(views, suspects)
     rejected = judge_detections(views, suspects, spread, FilteringSettings()).rejected
     there = np.isfinite(confidence) & (seen.person >= 0)[..., None]
     wrong, others = there & seen.displaced, there & ~seen.displaced

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from data_contracts.keypoints import TrackedDetections
 from worldpose.geometry import Camera, Rigid
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, reconstruct_joints
@@ -115,9 +116,8 @@ def measure(
         tracks = track_people(*given, 25.0, settings)
         found = np.empty((0, 8, 3))
         if len(tracks.person):
-            placed = reconstruct_joints(
-                *given, tracks.detection_index, 25.0, TriangulationSettings()
-            )
+            detections = TrackedDetections(image[..., :2], image[..., 2], tracks.detection_index)
+            placed = reconstruct_joints(cameras, detections, 25.0, TriangulationSettings())
             found = placed.triangulation.joints[0][:, COCO].astype(np.float64)
         off = np.linalg.norm(truth[:, None] - found, axis=-1)
         known = np.isfinite(off)

@@ -19,6 +19,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
+from data_contracts.keypoints import TrackedDetections
 from worldpose.geometry import Camera, Rigid
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
@@ -95,7 +96,9 @@ def main() -> None:
     index = np.broadcast_to(index, (options.frames, CAMERAS, PEOPLE)).copy()
 
     def ours(confidence: np.ndarray, settings: TriangulationSettings) -> np.ndarray:
-        result = triangulate_joints(cameras, keypoints, confidence, index, settings)
+        result = triangulate_joints(
+            cameras, TrackedDetections(keypoints, confidence, index), settings
+        )
         return result.joints.reshape(-1, 3)
 
     def undistorted(count: int) -> np.ndarray:

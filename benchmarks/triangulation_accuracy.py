@@ -15,6 +15,7 @@ import argparse
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.keypoints import TrackedDetections
 from worldpose.evaluation import evaluate_joints
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
@@ -60,9 +61,7 @@ def scored(scene: Scene, cameras: Camera, fps: float) -> NDArray[np.float64]:
     for way in WAYS:
         placed = triangulate_joints(
             cameras,
-            seen.keypoints,
-            seen.confidence,
-            tracks.detection_index,
+            TrackedDetections(seen.keypoints, seen.confidence, tracks.detection_index),
             TriangulationSettings(offsets=way),
         )
         found = JointTracks(scene.truth.frames, np.asarray(tracks.person), placed.joints)

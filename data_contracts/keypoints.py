@@ -128,6 +128,32 @@ class KeypointDetections:
         }
 
 
+@dataclass(frozen=True, eq=False)
+class TrackedDetections:
+    """Detected keypoints of all cameras in some frames, and which detection is which person.
+
+    Attributes:
+        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
+        confidence: (frames, cameras, detections, 17) in (0, 1]; NaN, 0 or less leaves a keypoint
+            out.
+        index: (frames, cameras, persons), index of each person's detection; -1 = not seen.
+    """
+
+    keypoints: AnyFloats
+    confidence: AnyFloats
+    index: NDArray[np.integer]
+
+    def __getitem__(self, frames: slice | NDArray[np.integer]) -> TrackedDetections:
+        """Return some frames."""
+        return TrackedDetections(
+            self.keypoints[frames], self.confidence[frames], self.index[frames]
+        )
+
+    def select_person(self, person: int) -> TrackedDetections:
+        """Return the same detections with one person alone."""
+        return replace(self, index=self.index[:, :, person : person + 1])
+
+
 KEYPOINT_LABELS: dict[str, tuple[str, ...]] = {
     "joint": COCO17,
     "axis": ("x", "y"),

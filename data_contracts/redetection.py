@@ -38,10 +38,10 @@ REDETECTION = GroupLayout(
 )
 
 
-def again_of(seen: str) -> str:
+def redetection_name(detections: str) -> str:
     """The name of the result with those found again, by that of whom a camera saw.
 
     Of given ones there is none.
     """
-    stage, _, unit = seen.partition("/")
+    stage, _, unit = detections.partition("/")
     return f"redetection/{unit}" if stage == "detection" else ""

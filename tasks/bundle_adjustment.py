@@ -13,7 +13,7 @@ from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
 from data_contracts.pitch import PitchSpec
 from data_contracts.work import Work
 from tasks.clip_inputs import open_frames
-from tasks.triangulation import settings_before
+from tasks.triangulation import load_triangulation_settings
 from tasks.unit import open_input, unit_task
 from worldpose.bundle_adjustment import (
     BundleAdjustment,
@@ -130,7 +130,7 @@ def _open_clip(store: Store, work: Work, people: _People) -> Clip:
         detection_index=people.detection_index,
         joints=people.joints,
         views=people.views,
-        triangulation=settings_before(store, work, next(iter(sources["clips"]))),
+        triangulation=load_triangulation_settings(store, work, next(iter(sources["clips"]))),
         pitch=template,
         on_lines=np.array([camera.attrs["origin"] == "lines" for camera in known]),
         names=tuple(opened.camera_ids),

@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from data_contracts.arrays import ClipArray
-from data_contracts.redetection import again_of
+from data_contracts.redetection import redetection_name
 from data_contracts.work import Work
 from tasks.unit import open_input
 from worldpose.geometry import Camera
@@ -25,8 +25,8 @@ PAGES = 4
 """Cached pages: a chunk with its margins fits into four."""
 
 
-class StoredClip:
-    """One array of all cameras' detections, padded to the same number, read on access.
+class StoredDetections:
+    """One array of all cameras' detections, padded to the same number and read in pages.
 
     Rejected keypoints count as not detected. Filtering results of a detection index do not apply to
     people redetected at that index since.
@@ -42,7 +42,7 @@ class StoredClip:
         rejected: xr.DataArray | None = None,
         shift: xr.DataArray | None = None,
         *,
-        found_again: bool = True,
+        redetected: bool = True,
     ) -> None:
         """Open the arrays.
 
@@ -51,7 +51,7 @@ class StoredClip:
             name: name of the array.
             rejected: (frames, cameras, detections, 17), keypoints to leave out.
             shift: (frames, cameras, detections, 17, 2) [px], systematic error to subtract.
-            found_again: include redetected people.
+            redetected: include redetected people.
         """
         arrays = [clip[name] for clip in clips]
         detections = max(1, *(array.sizes["detection"] for array in arrays))
@@ -59,7 +59,7 @@ class StoredClip:
         self.shape: tuple[int, ...] = (frames, len(arrays), detections, *rest)
         self._arrays = arrays
         self._clips = clips
-        self._found_again = found_again
+        self._redetected = redetected
         self._rejected = rejected
         self._shift = shift
         self._page = lru_cache(PAGES)(self._read)
@@ -81,37 +81,37 @@ class StoredClip:
             page[:, camera, : array.sizes["detection"]] = array[start:stop].values
         rows = slice(start, stop)
         if self._shift is not None:
-            page -= said_of(self._clips, self._shift, page.shape, rows)
+            page -= _align_results(self._clips, self._shift, page.shape, rows)
             for camera, clip in enumerate(self._clips):
                 if "shift" in clip:
                     page[:, camera, : clip.sizes["detection"]] -= clip["shift"][rows].values
         if self._rejected is not None:
-            page[said_of(self._clips, self._rejected, page.shape[:4], rows)] = np.nan
-        if not self._found_again:
-            page[_found_again(self._clips, page.shape[:3], rows)] = np.nan
+            page[_align_results(self._clips, self._rejected, page.shape[:4], rows)] = np.nan
+        if not self._redetected:
+            page[_mark_redetected(self._clips, page.shape[:3], rows)] = np.nan
         return page
 
 
-def said_of(
-    clips: Sequence[xr.Dataset], said: xr.DataArray, shape: tuple[int, ...], rows: slice
+def _align_results(
+    clips: Sequence[xr.Dataset], results: xr.DataArray, shape: tuple[int, ...], rows: slice
 ) -> NDArray[Any]:
     """Return filtering results of the previous iteration for current detections; zero for new ones.
 
     Args:
         clips: detections of each camera.
-        said: (frames, cameras, previous detections, ...).
+        results: (frames, cameras, previous detections, ...).
         shape: (rows, cameras, detections, ...) of the result.
         rows: slice of the frames.
     """
-    before = said[rows].values
+    before = results[rows].values
     out = np.zeros(shape, dtype=before.dtype)
     both = min(shape[2], before.shape[2])
     out[:, :, :both] = before[:, :, :both]
-    out[_found_again(clips, shape[:3], rows)] = 0
+    out[_mark_redetected(clips, shape[:3], rows)] = 0
     return out
 
 
-def _found_again(
+def _mark_redetected(
     clips: Sequence[xr.Dataset], shape: tuple[int, ...], rows: slice
 ) -> NDArray[np.bool_]:
     """Return a mask (rows, cameras, detections) of redetected people."""
@@ -157,7 +157,7 @@ def open_clip(
     *,
     filtered: bool = True,
     shifted: bool = True,
-    found_again: bool = True,
+    redetected: bool = True,
 ) -> ClipInputs:
     """Open the clip of `work`; its detections are read on access.
 
@@ -166,27 +166,30 @@ def open_clip(
         work: the current work order.
         filtered: leave out keypoints that the previous iteration rejected.
         shifted: subtract the systematic errors of keypoints.
-        found_again: include redetected people.
+        redetected: include redetected people.
     """
     sources: dict[str, Any] = work.recipe.sources
     first, count = sources["first_frame"], sources["frame_count"]
     where = slice(first, first + count - 1)
-    seen = _seen(store, work, where)
-    said = _said_before(store, work, {work.recipe.unit: where})
-    rejected, shift = said["rejected"] if filtered else None, said["shift"] if shifted else None
+    seen = _open_cameras(store, work, where)
+    filtered_before = _load_filtering_results(store, work, {work.recipe.unit: where})
+    rejected = filtered_before["rejected"] if filtered else None
+    shift = filtered_before["shift"] if shifted else None
     frame = np.arange(first, first + count)
-    return _open(store, work, frame, seen, rejected, shift, found_again=found_again)
+    return _make_inputs(store, work, frame, seen, rejected, shift, redetected=redetected)
 
 
-def dropped_before(store: Store, work: Work) -> NDArray[np.bool_] | None:
+def load_dropped_boxes(store: Store, work: Work) -> NDArray[np.bool_] | None:
     """Return boxes dropped by the previous iteration (frames, cameras, detections), if any."""
     before = f"filtering/{work.recipe.unit}"
     if before not in work.recipe.inputs:
         return None
     dropped = open_input(store, work, before)["dropped"]
-    seen = _seen(store, work, slice(dropped["frame"].values[0], dropped["frame"].values[-1]))
+    seen = _open_cameras(
+        store, work, slice(dropped["frame"].values[0], dropped["frame"].values[-1])
+    )
     detections = max(1, *(clip.sizes["detection"] for clip in seen))
-    return said_of(seen, dropped, (*dropped.shape[:2], detections), slice(None))
+    return _align_results(seen, dropped, (*dropped.shape[:2], detections), slice(None))
 
 
 def open_frames(store: Store, work: Work, frames: Mapping[str, NDArray[np.int64]]) -> ClipInputs:
@@ -194,29 +197,36 @@ def open_frames(store: Store, work: Work, frames: Mapping[str, NDArray[np.int64]
     sources: dict[str, Any] = work.recipe.sources
     names = sources["seen"]
     seen = [
-        _together([_people(store, work, names[clip][c]).sel(frame=frames[clip]) for clip in frames])
+        _concatenate_clips(
+            [
+                _open_detections(store, work, names[clip][c]).sel(frame=frames[clip])
+                for clip in frames
+            ]
+        )
         for c in range(len(sources["cameras"]))
     ]
     frame = np.concatenate(list(frames.values()))
-    said = _said_before(store, work, frames)
-    some = _open(store, work, frame, seen, said["rejected"], said["shift"])
+    filtered_before = _load_filtering_results(store, work, frames)
+    some = _make_inputs(
+        store, work, frame, seen, filtered_before["rejected"], filtered_before["shift"]
+    )
     keypoints, confidence = some.keypoints[: len(frame)], some.confidence[: len(frame)]
     return replace(some, keypoints=keypoints, confidence=confidence)
 
 
-def _seen(store: Store, work: Work, where: slice) -> list[xr.Dataset]:
+def _open_cameras(store: Store, work: Work, where: slice) -> list[xr.Dataset]:
     """Return each camera's detections in the clip of `work`."""
     sources: dict[str, Any] = work.recipe.sources
-    return [_people(store, work, name).sel(frame=where) for name in sources["seen"]]
+    return [_open_detections(store, work, name).sel(frame=where) for name in sources["seen"]]
 
 
-def _people(store: Store, work: Work, name: str) -> xr.Dataset:
+def _open_detections(store: Store, work: Work, name: str) -> xr.Dataset:
     """Return a camera's detections, with redetected people if `work` has them as input."""
-    again = again_of(name)
-    return open_input(store, work, again if again in work.recipe.inputs else name)
+    redetected = redetection_name(name)
+    return open_input(store, work, redetected if redetected in work.recipe.inputs else name)
 
 
-def _together(clips: Sequence[xr.Dataset]) -> xr.Dataset:
+def _concatenate_clips(clips: Sequence[xr.Dataset]) -> xr.Dataset:
     """Concatenate one camera's detections over clips, padded to the same number."""
     most = max(clip.sizes["detection"] for clip in clips)
     padded = []
@@ -227,7 +237,7 @@ def _together(clips: Sequence[xr.Dataset]) -> xr.Dataset:
     return xr.concat(padded, dim="frame")
 
 
-def _said_before(
+def _load_filtering_results(
     store: Store, work: Work, frames: Mapping[str, NDArray[np.int64] | slice]
 ) -> dict[str, xr.DataArray | None]:
     """Return the previous filtering results of keypoints by frame; None in the first iteration."""
@@ -238,7 +248,7 @@ def _said_before(
     ]
     if not clips:
         return {"rejected": None, "shift": None}
-    together = clips[0]
+    merged = clips[0]
     if len(clips) > 1:
         most = max(clip.sizes["detection"] for clip in clips)
         nothing = {"rejected": False, "shift": 0.0}
@@ -246,11 +256,11 @@ def _said_before(
             clip.pad(detection=(0, most - clip.sizes["detection"]), constant_values=nothing)
             for clip in clips
         ]
-        together = xr.concat(padded, dim="frame")
-    return {"rejected": together["rejected"], "shift": together["shift"]}
+        merged = xr.concat(padded, dim="frame")
+    return {"rejected": merged["rejected"], "shift": merged["shift"]}
 
 
-def _open(
+def _make_inputs(
     store: Store,
     work: Work,
     frame: NDArray[np.int64],
@@ -258,7 +268,7 @@ def _open(
     rejected: xr.DataArray | None,
     shift: xr.DataArray | None,
     *,
-    found_again: bool = True,
+    redetected: bool = True,
 ) -> ClipInputs:
     """Open match frames with each camera's detections.
 
@@ -266,19 +276,19 @@ def _open(
     """
     sources: dict[str, Any] = work.recipe.sources
     camera_ids = tuple(sources["cameras"])
-    cameras, covariance = _cameras(store, work, camera_ids)
+    cameras, covariance = _load_cameras(store, work, camera_ids)
     return ClipInputs(
         camera_ids=camera_ids,
         cameras=cameras,
         camera_covariance=covariance,
         frame=frame,
-        keypoints=StoredClip(seen, "keypoints", rejected, shift, found_again=found_again),
-        confidence=StoredClip(seen, "confidence", rejected, found_again=found_again),
+        keypoints=StoredDetections(seen, "keypoints", rejected, shift, redetected=redetected),
+        confidence=StoredDetections(seen, "confidence", rejected, redetected=redetected),
         fps=float(sources["fps"]),
     )
 
 
-def _cameras(
+def _load_cameras(
     store: Store, work: Work, camera_ids: tuple[str, ...]
 ) -> tuple[Camera, NDArray[np.float64] | None]:
     """Return the cameras in order, and their covariances if known for all."""

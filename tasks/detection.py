@@ -18,7 +18,7 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from data_contracts.work import Work
 from tasks.spool import Spool, spooling
-from tasks.unit import open_input, require_registered, unit_task
+from tasks.unit import open_input, open_uncorrected, require_registered, unit_task
 from worldpose.detection import (
     DetectionSettings,
     PeopleFinder,
@@ -32,7 +32,7 @@ from worldpose.geometry.stored import camera_from_arrays
 from worldpose.ingest.footage import stretches
 from worldpose.pitch import PitchTemplate
 from worldpose.review.detections import DetectionEdit, replay_detections
-from worldpose.store import Store, recipe_key
+from worldpose.store import Store
 from worldpose.video import FrameIndex, open_video
 
 
@@ -42,18 +42,18 @@ def detection(work: Work) -> str:
     store = Store.open(work.project)
     edits = TypeAdapter(list[DetectionEdit]).validate_python(work.recipe.sources.get("edits") or [])
     with store.publishing(work) as result, spooling(store) as spool:
-        found = _published(store, work) if edits else None
-        found = found or _detected(store, work, spool)
+        found = _open_uncorrected(store, work) if edits else None
+        found = found or _detect_people(store, work, spool)
         result.figures |= found.figures
-        observations = found.observations
+        detections = found.detections
         if edits:
-            replay = replay_detections(observations, edits)
-            observations = replay.observations
+            replay = replay_detections(detections, edits)
+            detections = replay.observations
             result.figures["corrections_refused"] = float(sum(map(bool, replay.objections)))
         result.write(
             DETECTION,
-            arrays=observations.arrays(),
-            coordinates={"frame": observations.frame},
+            arrays=detections.arrays(),
+            coordinates={"frame": detections.frame},
             attributes={
                 "camera_id": work.recipe.sources["camera"],
                 "unreadable": found.unreadable,
@@ -67,43 +67,34 @@ class _Found:
     """Output of the detection nets.
 
     Attributes:
-        observations: detected people.
+        detections: detected people.
         unreadable: [first, last] of each interval of frames without an image.
         figures: metrics.
     """
 
-    observations: KeypointDetections
+    detections: KeypointDetections
     unreadable: list[list[int]]
     figures: dict[str, float]
 
 
-def _published(store: Store, work: Work) -> _Found | None:
-    """Return the published detections without corrections; None if there are none.
-
-    New detections would be the same bytes.
-    """
-    recipe = work.recipe
-    sources = {name: each for name, each in recipe.sources.items() if name != "edits"}
-    plain = recipe_key(recipe.model_copy(update={"sources": sources}))
-    unit = (recipe.match_id, recipe.stage, recipe.unit, plain)
-    if not store.has(*unit):
+def _open_uncorrected(store: Store, work: Work) -> _Found | None:
+    """Return the published detections without corrections; None if there are none."""
+    published = open_uncorrected(store, work, "edits")
+    if published is None:
         return None
-    stored = store.open_result(*unit)
-    return _Found(
-        KeypointDetections.from_arrays(stored),
-        stored.attrs["unreadable"],
-        dict(store.manifest(*unit).figures),
-    )
+    stored, manifest = published
+    detections = KeypointDetections.from_arrays(stored)
+    return _Found(detections, stored.attrs["unreadable"], dict(manifest.figures))
 
 
-def _detected(store: Store, work: Work, spool: Spool) -> _Found:
+def _detect_people(store: Store, work: Work, spool: Spool) -> _Found:
     """Run the detection nets."""
     sources: dict[str, Any] = work.recipe.sources
     settings = DetectionSettings.model_validate(work.recipe.settings)
     finder = PeopleFinder(load_detectors(settings), load_pose(settings), settings)
     require_weights(settings, sources["weights"])
     most = 0
-    for chunk in finder.find(_pictures(store, work), _place(store, work)):
+    for chunk in finder.find(_read_frames(store, work), _open_place(store, work)):
         spool.add(chunk.arrays())
         most = max(most, int(np.isfinite(chunk.score).sum(axis=1).max()))
     require_registered(Path(work.folder) / sources["video"], sources["video_sha256"])
@@ -130,7 +121,7 @@ def _detected(store: Store, work: Work, spool: Spool) -> _Found:
     )
 
 
-def _pictures(store: Store, work: Work) -> Iterator[tuple[int, Image | None]]:
+def _read_frames(store: Store, work: Work) -> Iterator[tuple[int, Image | None]]:
     """Yield every match frame of the clip with its image, decoded once and in order."""
     sources: dict[str, Any] = work.recipe.sources
     first, count = sources["first_frame"], sources["frame_count"]
@@ -155,15 +146,16 @@ def footage_index(footage: xr.Dataset) -> FrameIndex:
     video = footage.attrs["video"]
     width, height = video["size"]
     base = video["time_base"]
+    time_base = None if base is None else Fraction(base[0], base[1])
     return FrameIndex(
         footage["picture_stamp"].values,
         footage["picture_key"].values,
-        None if base is None else Fraction(*base),
+        time_base,
         (width, height),
     )
 
 
-def _place(store: Store, work: Work) -> Place | None:
+def _open_place(store: Store, work: Work) -> Place | None:
     """Return the camera on the pitch, if it is known and there is a pitch."""
     sources: dict[str, Any] = work.recipe.sources
     if sources["pitch"] is None:

@@ -9,19 +9,20 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from data_contracts.filtering import FILTERING
+from data_contracts.keypoints import TrackedDetections
 from data_contracts.work import Work
-from tasks.clip_inputs import ClipInputs, dropped_before, open_clip
+from tasks.clip_inputs import ClipInputs, load_dropped_boxes, open_clip
 from tasks.spool import spooling
-from tasks.triangulation import settings_before
+from tasks.triangulation import load_triangulation_settings
 from tasks.unit import open_input, unit_task
 from worldpose.filtering import (
     BodyMotion,
     BodyViews,
     FilteringSettings,
     Judgement,
-    Suspects,
+    TriangulatedDetections,
     judge_detections,
-    learn_from,
+    learn_keypoint_spread,
     learn_systematic_errors,
     measure_held_out,
     perceived_covariance,
@@ -30,7 +31,7 @@ from worldpose.filtering import (
     watch_motion,
 )
 from worldpose.store import Store
-from worldpose.triangulation import TriangulationSettings
+from worldpose.triangulation import ClipDetections, TriangulationSettings
 
 PART = 128
 """Frames per chunk: 200 MB with 25 people and 16 cameras."""
@@ -56,17 +57,17 @@ def filtering(work: Work) -> str:
         )
         held = np.zeros(len(case.clip.camera_ids))
         if case.first:
-            held = systematic.late_in_offsets(suspects.offsets, motion)
-        placed = suspects.less_clocks(held, motion.way)
-        spread = learn_from(views, placed.without(systematic.shift(motion, views)))
+            held = systematic.clock_offsets_in(suspects.offsets, motion)
+        placed = suspects.subtract_clock_offsets(held, motion.image_motion)
+        spread = learn_keypoint_spread(views, placed.subtract(systematic.shift(motion, views)))
         counts = np.zeros(5)
         rejected = np.zeros((2, len(case.clip.camera_ids)))
         for first in range(0, len(case.clip.frame), PART):
             frames = np.arange(first, min(first + PART, len(case.clip.frame)))
             views, motion, suspects = case.at(frames)
             shift = systematic.shift(motion, views)
-            placed = suspects.less_clocks(held, motion.way)
-            judged = judge_detections(views, placed.without(shift), spread, settings)
+            placed = suspects.subtract_clock_offsets(held, motion.image_motion)
+            judged = judge_detections(views, placed.subtract(shift), spread, settings)
             counts += _counts(judged, suspects)
             rejected += [
                 judged.rejected.sum(axis=(0, 2, 3)),
@@ -75,11 +76,11 @@ def filtering(work: Work) -> str:
             spool.add(
                 {
                     "rejected": judged.rejected,
-                    "surprise": judged.surprise,
+                    "surprise": judged.mahalanobis_distance,
                     "dropped": judged.dropped,
                     "fits": judged.fits,
                     "similarity": judged.similarity,
-                    "shift": suspects.by_detection(shift).astype(np.float32),
+                    "shift": suspects.assign_to_detections(shift).astype(np.float32),
                 }
             )
         result.write(
@@ -131,18 +132,18 @@ class _Case:
         """Whether this is the first iteration, without shifted keypoints."""
         return self.dropped is None
 
-    def at(self, frames: NDArray[np.int64]) -> tuple[BodyViews, BodyMotion, Suspects]:
+    def at(self, frames: NDArray[np.int64]) -> tuple[BodyViews, BodyMotion, TriangulatedDetections]:
         """Project the bodies into all images; return views, motion, and the detections to test."""
         motion = watch_motion(self.clip.cameras, self.joints[frames], self.step[frames])
         views = view_bodies(self.clip.cameras, self.joints[frames], self.covariance[frames])
-        keypoints, confidence = _taken(self.clip, frames)
+        detections = _read_frames(self.clip, self.index, frames)
         placed = self.placed.isel(frame=frames)
-        boxes = confidence.shape[:3]
+        boxes = detections.confidence.shape[:3]
         before = np.zeros(boxes, dtype=np.bool_) if self.dropped is None else self.dropped[frames]
-        suspects = Suspects(
-            keypoints,
-            confidence,
-            self.index[frames],
+        suspects = TriangulatedDetections(
+            detections.keypoints,
+            detections.confidence,
+            detections.index,
             placed["offsets"].values.astype(np.float64),
             placed["exchanged"].values,
             before,
@@ -169,19 +170,19 @@ def _open(store: Store, work: Work) -> _Case:
         step=np.gradient(joints, axis=0) if len(joints) > 1 else np.zeros_like(joints),
         covariance=perceived_covariance(bodies["covariance"].values, placed["common_bias"].values),
         placed=placed,
-        dropped=dropped_before(store, work),
-        triangulation=settings_before(store, work, unit),
+        dropped=load_dropped_boxes(store, work),
+        triangulation=load_triangulation_settings(store, work, unit),
     )
 
 
-def _counts(judged: Judgement, suspects: Suspects) -> list[float]:
+def _counts(judged: Judgement, suspects: TriangulatedDetections) -> list[float]:
     """Count keypoints tested and rejected; boxes dropped, reassigned, and newly assigned."""
     frame, camera, person = np.nonzero(suspects.index >= 0)
     taken = np.full(judged.fits.shape, -1)
     taken[frame, camera, suspects.index[frame, camera, person]] = person
     moved = (judged.fits >= 0) & (judged.fits != taken)
     return [
-        float(np.isfinite(judged.surprise).sum()),
+        float(np.isfinite(judged.mahalanobis_distance).sum()),
         float(judged.rejected.sum()),
         float(judged.dropped.sum()),
         float((moved & (taken >= 0)).sum()),
@@ -196,12 +197,11 @@ def _held_out(store: Store, work: Work, case: _Case, frames: NDArray[np.int64]) 
     evaluated, so that iterations are comparable.
     """
     clip = open_clip(store, work)
-    whole = open_clip(store, work, filtered=False, found_again=False)
+    whole = open_clip(store, work, filtered=False, redetected=False)
     found = measure_held_out(
         clip.cameras,
-        _taken(clip, frames),
-        _taken(whole, frames)[0],
-        case.index[frames].astype(np.int16),
+        _read_frames(clip, case.index.astype(np.int16), frames),
+        _read_frames(whole, case.index, frames).keypoints,
         case.triangulation,
     )
     if found is None:
@@ -214,15 +214,13 @@ def _evenly(frames: int, most: int) -> NDArray[np.int64]:
     return np.unique(np.linspace(0, frames - 1, min(frames, most)).astype(np.int64))
 
 
-def _taken(
-    clip: ClipInputs, frames: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return keypoints and confidence of some frames."""
+def _read_frames(
+    clip: ClipInputs, index: NDArray[np.integer], frames: NDArray[np.int64]
+) -> TrackedDetections:
+    """Return the detections of some frames; `index` is that of the whole clip."""
     first, last = int(frames[0]), int(frames[-1]) + 1
     if last - first == len(frames):
-        return clip.keypoints[first:last], clip.confidence[first:last]
-    each = [slice(frame, frame + 1) for frame in frames.tolist()]
-    return (
-        np.concatenate([clip.keypoints[frame] for frame in each]),
-        np.concatenate([clip.confidence[frame] for frame in each]),
-    )
+        return TrackedDetections(
+            clip.keypoints[first:last], clip.confidence[first:last], index[first:last]
+        )
+    return ClipDetections(clip.keypoints, clip.confidence, index).read_frames(frames)

@@ -18,16 +18,16 @@ from data_contracts.redetection import REDETECTION
 from data_contracts.work import Recipe, Work
 from tasks.clip_inputs import ADJUSTED
 from tasks.detection import footage_index, require_weights
-from tasks.triangulation import settings_before
+from tasks.triangulation import load_triangulation_settings
 from tasks.unit import open_input, require_registered, unit_task
 from worldpose.detection import DetectionSettings, Place, load_pose
 from worldpose.filtering import (
     BodyViews,
     Spread,
-    Suspects,
     SystematicErrors,
+    TriangulatedDetections,
     ViewBias,
-    learn_from,
+    learn_keypoint_spread,
     perceived_covariance,
     perceived_joints,
     view_bodies,
@@ -38,13 +38,13 @@ from worldpose.geometry.stored import camera_from_arrays
 from worldpose.pitch import PitchTemplate
 from worldpose.redetection import (
     Expected,
+    MissingPeople,
     RedetectionSettings,
-    Sought,
     Verdicts,
-    judge_answers,
-    look_again,
-    who_is_seen,
-    whom_to_seek,
+    find_detected_people,
+    judge_search_results,
+    search_missing_people,
+    select_missing_people,
 )
 from worldpose.store import Store
 from worldpose.video import open_video
@@ -62,9 +62,9 @@ def redetection(work: Work) -> str:
     settings = RedetectionSettings.model_validate(work.recipe.settings)
     with store.publishing(work) as result:
         case = _open(store, work)
-        sought = case.sought(settings)
+        sought = case.select_missing_people(settings)
         found = _search(store, work, case, sought)
-        verdicts = judge_answers(
+        verdicts = judge_search_results(
             found,
             sought,
             case.expected,
@@ -111,14 +111,14 @@ class _Case:
     spread: Spread
     noise: tuple[float, float]
 
-    def sought(self, settings: RedetectionSettings) -> Sought:
+    def select_missing_people(self, settings: RedetectionSettings) -> MissingPeople:
         """Return visible people without a detection; none if disabled."""
         pitch = self.detection.sources["pitch"]
         place = None
         if pitch is not None:
             place = Place(self.camera, PitchTemplate.from_spec(PitchSpec.model_validate(pitch)))
         width, height = (int(side) for side in self.camera.image_size)
-        return whom_to_seek(
+        return select_missing_people(
             self.expected,
             self.seen | (not settings.enabled),
             (width, height),
@@ -159,11 +159,11 @@ def _open(store: Store, work: Work) -> _Case:
     count = detected.score.shape[1]  # indices from here on: earlier redetections
     index = tracks["detection_index"].values[:, place]
     fits, dropped = (said[name].values[:, place, :count] for name in ("fits", "dropped"))
-    seen = who_is_seen(index, fits, dropped)
+    seen = find_detected_people(index, fits, dropped)
     edits: Any = manifest.recipe.sources.get("edits", [])
     seen[np.isin(detected.frame, [edit["frame"] for edit in edits])] = True
-    noise = settings_before(store, work, clip).noise
-    suspects = Suspects(
+    noise = load_triangulation_settings(store, work, clip).noise
+    suspects = TriangulatedDetections(
         detected.keypoints[:, None].astype(np.float64),
         detected.confidence[:, None].astype(np.float64),
         np.where(index < count, index, -1)[:, None],
@@ -180,19 +180,19 @@ def _open(store: Store, work: Work) -> _Case:
         expected=Expected.of(views, beside, float(camera.focal.mean())),
         shift=np.nan_to_num(shift[:, 0]),
         seen=seen,
-        spread=_spread(views, suspects.without(shift)),
+        spread=_spread(views, suspects.subtract(shift)),
         noise=noise,
     )
 
 
-def _spread(views: BodyViews, suspects: Suspects) -> Spread:
+def _spread(views: BodyViews, suspects: TriangulatedDetections) -> Spread:
     """Estimate the keypoint spread around bodies; the stated one if there are too few keypoints."""
     if np.count_nonzero(suspects.index >= 0) * len(COCO17) < FEW:
         return Spread(np.ones(len(COCO17)), np.empty(0), np.ones(1))
-    return learn_from(views, suspects)
+    return learn_keypoint_spread(views, suspects)
 
 
-def _search(store: Store, work: Work, case: _Case, sought: Sought) -> KeypointDetections:
+def _search(store: Store, work: Work, case: _Case, sought: MissingPeople) -> KeypointDetections:
     """Run the pose net of `detection` where people are expected."""
     settings = DetectionSettings.model_validate(case.detection.settings)
     sources: dict[str, Any] = case.detection.sources
@@ -200,7 +200,7 @@ def _search(store: Store, work: Work, case: _Case, sought: Sought) -> KeypointDe
         return KeypointDetections.empty()
     require_weights(settings, sources["weights"])
     shown = _pictures(store, work, case, np.unique(sought.frame))
-    found = look_again(
+    found = search_missing_people(
         shown,
         sought,
         load_pose(settings),
@@ -229,7 +229,7 @@ def _pictures(
 
 
 def _arrays(
-    case: _Case, sought: Sought, answers: KeypointDetections, verdicts: Verdicts
+    case: _Case, sought: MissingPeople, results: KeypointDetections, verdicts: Verdicts
 ) -> dict[str, NDArray[Any]]:
     """Return all detections at their indices, followed by the redetected people."""
     before = case.detected.arrays()
@@ -251,10 +251,10 @@ def _arrays(
     arrays["shift"] = np.zeros((*shape, len(COCO17), 2), dtype=np.float32)
     at = frame, count + behind
     wrong = verdicts.rejected[found]
-    arrays["keypoints"][at] = np.where(wrong[..., None], np.nan, answers.keypoints[found])
-    arrays["confidence"][at] = np.where(wrong, np.nan, answers.confidence[found])
-    arrays["boxes"][at] = answers.boxes[found]
-    arrays["score"][at] = answers.score[found]
+    arrays["keypoints"][at] = np.where(wrong[..., None], np.nan, results.keypoints[found])
+    arrays["confidence"][at] = np.where(wrong, np.nan, results.confidence[found])
+    arrays["boxes"][at] = results.boxes[found]
+    arrays["score"][at] = results.score[found]
     arrays["found_again"][at] = case.person[sought.person[found]]
     arrays["shift"][at] = case.shift[frame, sought.person[found]]
     return arrays

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from data_contracts.retriangulation import RETRIANGULATION
 from data_contracts.work import Work
-from tasks.triangulation import place_joints, settings_before
+from tasks.triangulation import load_triangulation_settings, write_joints
 from tasks.unit import unit_task
 from worldpose.store import Store
 
@@ -14,6 +14,6 @@ def retriangulation(work: Work) -> str:
     """Publish joints with covariance; return the key."""
     store = Store.open(work.project)
     with store.publishing(work) as result:
-        settings = settings_before(store, work, work.recipe.unit)
-        place_joints(store, work, settings, result, RETRIANGULATION)
+        settings = load_triangulation_settings(store, work, work.recipe.unit)
+        write_joints(store, work, settings, result, RETRIANGULATION)
     return work.key

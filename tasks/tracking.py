@@ -10,14 +10,14 @@ from pydantic import TypeAdapter
 from data_contracts.tracking import TRACKING
 from data_contracts.work import Work
 from tasks.clip_inputs import open_clip
-from tasks.unit import figures_of, unit_task
+from tasks.unit import figures_of, open_uncorrected, unit_task
 from worldpose.review.identities import (
     Identities,
     IdentityEdit,
     replay_identities,
     stored_identities,
 )
-from worldpose.store import Store, recipe_key
+from worldpose.store import Store
 from worldpose.tracking import (
     TrackingSettings,
     describe_doubts,
@@ -31,9 +31,9 @@ def tracking(work: Work) -> str:
     """Publish the person of each detection, with people's corrections; return the key."""
     store = Store.open(work.project)
     with store.publishing(work) as result:
-        said = work.recipe.sources.get("identities") or []
-        edits = TypeAdapter(list[IdentityEdit]).validate_python(said)
-        found, figures, warnings = _automatic(store, work) if edits else _tracked(store, work)
+        corrections = work.recipe.sources.get("identities") or []
+        edits = TypeAdapter(list[IdentityEdit]).validate_python(corrections)
+        found, figures, warnings = (_open_uncorrected if edits else _track_people)(store, work)
         result.warnings += warnings
         replay = replay_identities(found, edits)
         corrected = replay.identities
@@ -63,29 +63,25 @@ Tracked = tuple[Identities, dict[str, float], tuple[str, ...]]
 """The tracker's output, its metrics, and its warnings."""
 
 
-def _automatic(store: Store, work: Work) -> Tracked:
-    """Return the published tracks without corrections; if there are none, track.
-
-    Both are the same bytes.
-    """
-    recipe = work.recipe
-    sources = {name: each for name, each in recipe.sources.items() if name != "identities"}
-    plain = recipe.model_copy(update={"sources": sources})
-    unit = (recipe.match_id, recipe.stage, recipe.unit, recipe_key(plain))
-    if not store.has(*unit):
-        return _tracked(store, work)
-    manifest = store.manifest(*unit)
-    return stored_identities(store.open_result(*unit)), dict(manifest.figures), manifest.warnings
+def _open_uncorrected(store: Store, work: Work) -> Tracked:
+    """Return the published tracks without corrections; if there are none, track."""
+    published = open_uncorrected(store, work, "identities")
+    if published is None:
+        return _track_people(store, work)
+    stored, manifest = published
+    return stored_identities(stored), dict(manifest.figures), manifest.warnings
 
 
-def _tracked(store: Store, work: Work) -> Tracked:
+def _track_people(store: Store, work: Work) -> Tracked:
     sources: dict[str, Any] = work.recipe.sources
     clip = open_clip(store, work)
     settings = TrackingSettings.model_validate(work.recipe.settings)
-    given = (clip.keypoints, clip.confidence, clip.fps, settings)
     tracks = track_people(
         clip.cameras,
-        *given,
+        clip.keypoints,
+        clip.confidence,
+        clip.fps,
+        settings,
         pitch_size=sources["pitch_size"],
         people=sources["people"],
     )
@@ -104,7 +100,10 @@ def _tracked(store: Store, work: Work) -> Tracked:
         reason = diagnose_no_people(
             clip.cameras,
             clip.camera_ids,
-            *given,
+            clip.keypoints,
+            clip.confidence,
+            clip.fps,
+            settings,
             ground=sources["pitch_size"] is not None,
             births=tracks.report.births,
         )

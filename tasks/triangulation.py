@@ -33,18 +33,18 @@ def triangulation(work: Work) -> str:
     store = Store.open(work.project)
     with store.publishing(work) as result:
         settings = TriangulationSettings.model_validate(work.recipe.settings)
-        place_joints(store, work, settings, result, TRIANGULATION)
+        write_joints(store, work, settings, result, TRIANGULATION)
     return work.key
 
 
-def settings_before(store: Store, work: Work, clip: str) -> TriangulationSettings:
+def load_triangulation_settings(store: Store, work: Work, clip: str) -> TriangulationSettings:
     """Return the settings of the first triangulation of a clip."""
     match_id, key = work.recipe.match_id, work.recipe.inputs[f"triangulation/{clip}"]
     recipe = store.manifest(match_id, "triangulation", clip, key).recipe
     return TriangulationSettings.model_validate(recipe.settings)
 
 
-def place_joints(
+def write_joints(
     store: Store,
     work: Work,
     settings: TriangulationSettings,
@@ -56,11 +56,12 @@ def place_joints(
     tracks = open_input(store, work, f"tracking/{work.recipe.unit}")
     index = tracks["detection_index"].values
     detections = ClipDetections(clip.keypoints, clip.confidence, index)
-    given = (clip.fps, settings, camera_errors(work, clip))
-    model, detections = learn_clip(clip.cameras, detections, *given)
+    covariance = camera_errors(work, clip)
+    model, detections = learn_clip(clip.cameras, detections, clip.fps, settings, covariance)
     agreements, changes = [], []
     with spooling(store) as spool:
-        for part in reconstruct_chunks(clip.cameras, detections, model, *given):
+        chunks = reconstruct_chunks(clip.cameras, detections, model, clip.fps, settings, covariance)
+        for part in chunks:
             spool.add(part_arrays(part.triangulation, part.smoothing))
             agreements.append(part.triangulation.agreement)
             changes.append(part.smoothing.changes)

@@ -21,6 +21,7 @@ from prefect.logging.handlers import APILogWorker
 from prefect.settings import PREFECT_API_URL
 
 from data_contracts.records import Record
+from data_contracts.run import ResultManifest
 from data_contracts.work import Work
 from tasks.watchdog import kill_on_timeout
 from worldpose.errors import (
@@ -33,7 +34,7 @@ from worldpose.errors import (
     require_memory,
 )
 from worldpose.ingest.registration import digest_of_files
-from worldpose.store import Store, code_version, libraries
+from worldpose.store import Store, code_version, libraries, recipe_key
 
 RETRIES: Final = 2
 RETRY_SECONDS: Final = 1.0
@@ -132,6 +133,27 @@ def open_input(store: Store, work: Work, name: str) -> xr.Dataset:
     """
     stage, _, unit = name.partition("/")
     return store.open_result(work.recipe.match_id, stage, unit, work.recipe.inputs[name])
+
+
+def open_uncorrected(
+    store: Store, work: Work, corrections: str
+) -> tuple[xr.Dataset, ResultManifest] | None:
+    """Return the published result of the same recipe without corrections; None if there is none.
+
+    A new computation would give the same bytes.
+
+    Args:
+        store: the store.
+        work: the current work order.
+        corrections: name of the source with people's corrections.
+    """
+    recipe = work.recipe
+    sources = {name: each for name, each in recipe.sources.items() if name != corrections}
+    key = recipe_key(recipe.model_copy(update={"sources": sources}))
+    if not store.has(recipe.match_id, recipe.stage, recipe.unit, key):
+        return None
+    result = store.open_result(recipe.match_id, recipe.stage, recipe.unit, key)
+    return result, store.manifest(recipe.match_id, recipe.stage, recipe.unit, key)
 
 
 def require_registered(path: Path, sha256: str) -> None:

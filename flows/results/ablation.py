@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from data_contracts.keypoints import TrackedDetections
 from data_contracts.static_calibration import ClickedPoint
 from worldpose.body import find_body
 from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, fit_bodies
@@ -165,7 +166,9 @@ def _clip(
     cameras = Camera.stack([known.estimate.camera for known in calibrations.values()])
     fps = SCENARIOS[SCENARIO].fps
     tracks = track_people(cameras, keypoints, confidence, fps, TrackingSettings())
-    placed = triangulate_joints(cameras, keypoints, confidence, tracks.detection_index, _OURS)
+    placed = triangulate_joints(
+        cameras, TrackedDetections(keypoints, confidence, tracks.detection_index), _OURS
+    )
     return Clip(
         cameras=cameras,
         covariance=np.stack([known.estimate.covariance for known in calibrations.values()]),
@@ -209,8 +212,8 @@ def _score(
 ) -> Score:
     """Score cameras and the joints triangulated with them, or bodies fitted to these joints."""
     index = clip.detection_index.astype(np.int16)
-    seen = (cameras, clip.keypoints, clip.confidence, index)
-    placed = triangulate_joints(*seen, settings, covariance)
+    detections = TrackedDetections(clip.keypoints, clip.confidence, index)
+    placed = triangulate_joints(cameras, detections, settings, covariance)
     joints = placed.joints
     if bodies:
         how = BodyFittingSettings()

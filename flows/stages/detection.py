@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import JsonValue
 
 from data_contracts.detection import detection_unit
-from data_contracts.redetection import again_of
+from data_contracts.redetection import redetection_name
 from flows.stage import Match, Stage, once_a_match
 from flows.stages import ingest
 from worldpose.detection import DetectionSettings, weights_of
@@ -26,7 +26,7 @@ def seen_by_cameras(match: Match, clip_id: str) -> tuple[str, ...]:
 
 def again(match: Match, camera_id: str, clip_id: str) -> tuple[str, ...]:
     """Return the result with a camera's redetected people, if its video is searched again."""
-    name = again_of(seen_by(match, camera_id, clip_id))
+    name = redetection_name(seen_by(match, camera_id, clip_id))
     return (name,) if name else ()
 
 

@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.keypoints import TrackedDetections
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
@@ -195,9 +196,12 @@ def learn_confidence(clip: Clip, frames: Integers) -> Clip:
     """
     settings = clip.triangulation
     if settings.learn_noise and len(frames):
-        keypoints, confidence = clip.keypoints[frames], clip.confidence[frames]
-        index = clip.detection_index[frames].astype(np.int16)
-        noise = triangulate_joints(clip.cameras, keypoints, confidence, index, settings).noise
+        detections = TrackedDetections(
+            clip.keypoints[frames],
+            clip.confidence[frames],
+            clip.detection_index[frames].astype(np.int16),
+        )
+        noise = triangulate_joints(clip.cameras, detections, settings).noise
         precision = noise.precision(clip.confidence)
     else:
         precision = np.where(clip.confidence > 0.0, clip.confidence, 0.0)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.keypoints import TrackedDetections
 from worldpose.bundle_adjustment.clip import Clip, keypoints_by_person, project_joints
 from worldpose.bundle_adjustment.gauge import Similarity, align_points
 from worldpose.bundle_adjustment.problems import MEDIAN_SQUARED, camera_knowledge, known_covariance
@@ -18,7 +19,7 @@ from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.static_calibration import PARAMETERS
 from worldpose.triangulation import triangulate_joints
-from worldpose.triangulation.calibration_errors import StatedErrors, stated_errors
+from worldpose.triangulation.person_offsets import StatedErrors, stated_errors
 
 _INTERVALS: Final = 4
 """Intervals of the time; the errors of a held-out person in one of them count as one
@@ -107,7 +108,9 @@ def _triangulate(
     others = index.copy()
     if camera is not None:
         others[:, camera] = -1
-    return triangulate_joints(cameras, keypoints, confidence, others, clip.triangulation).joints
+    return triangulate_joints(
+        cameras, TrackedDetections(keypoints, confidence, others), clip.triangulation
+    ).joints
 
 
 @dataclass(frozen=True, eq=False)

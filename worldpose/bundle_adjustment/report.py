@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Integers
+from data_contracts.keypoints import TrackedDetections
 from worldpose.bundle_adjustment.adjustment import BundleAdjustment
 from worldpose.bundle_adjustment.clip import Clicks, Clip, keypoints_by_person, project_joints
 from worldpose.bundle_adjustment.problems import KeypointNoise
@@ -182,7 +183,9 @@ def _find_outliers(
     keypoints, confidence = clip.keypoints[frames], clip.confidence[frames]
     index = clip.detection_index[frames]
     joints = triangulate_joints(
-        cameras, keypoints, confidence, index.astype(np.int16), clip.triangulation
+        cameras,
+        TrackedDetections(keypoints, confidence, index.astype(np.int16)),
+        clip.triangulation,
     ).joints
     image, weight = keypoints_by_person(keypoints, confidence, index)
     predicted, stated = project_joints(cameras, joints, weight, clip.triangulation)

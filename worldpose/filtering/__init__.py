@@ -5,7 +5,12 @@ out and corrections to subtract in the next iteration, and prediction errors in 
 """
 
 from worldpose.filtering.held_out import HeldOut, measure_held_out
-from worldpose.filtering.judging import Judgement, Suspects, judge_detections, learn_from
+from worldpose.filtering.judging import (
+    Judgement,
+    TriangulatedDetections,
+    judge_detections,
+    learn_keypoint_spread,
+)
 from worldpose.filtering.settings import FilteringSettings
 from worldpose.filtering.spread import Spread
 from worldpose.filtering.systematic_errors import (
@@ -29,11 +34,11 @@ __all__ = [
     "HeldOut",
     "Judgement",
     "Spread",
-    "Suspects",
     "SystematicErrors",
+    "TriangulatedDetections",
     "ViewBias",
     "judge_detections",
-    "learn_from",
+    "learn_keypoint_spread",
     "learn_systematic_errors",
     "measure_held_out",
     "perceived_covariance",

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import AnyFloats, Floats
+from data_contracts.keypoints import TrackedDetections
 from worldpose.geometry import Camera
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
@@ -36,9 +36,8 @@ class HeldOut:
 
 def measure_held_out(
     cameras: Camera,
-    used: tuple[NDArray[np.floating], NDArray[np.floating]],
-    detected: NDArray[np.floating],
-    detection_index: NDArray[np.int16],
+    used: TrackedDetections,
+    detected: AnyFloats,
     settings: TriangulationSettings,
     camera_covariance: Floats | None = None,
 ) -> HeldOut | None:
@@ -52,10 +51,8 @@ def measure_held_out(
 
     Args:
         cameras: batch (cameras,).
-        used: keypoints (frames, cameras, detections, 17, 2) [px] and confidence for triangulation;
-            NaN where rejected.
+        used: detections for triangulation; NaN where rejected.
         detected: (frames, cameras, detections, 17, 2) [px], all keypoints; NaN where not found.
-        detection_index: (frames, cameras, persons), index of the detection; -1 = not seen.
         settings: of triangulation.
         camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
     """
@@ -65,10 +62,9 @@ def measure_held_out(
     fold = np.arange(count) % FOLDS
     total, keypoints = 0.0, 0
     for left_out in range(min(FOLDS, count)):
-        index = np.where((fold == left_out)[:, None], np.int16(-1), detection_index)
-        placed = triangulate_joints(
-            cameras, *used, index.astype(np.int16), settings, camera_covariance
-        )
+        index = np.where((fold == left_out)[:, None], np.int16(-1), used.index)
+        others = replace(used, index=index.astype(np.int16))
+        placed = triangulate_joints(cameras, others, settings, camera_covariance)
         for camera in np.flatnonzero(fold == left_out):
             seen = np.asarray(detected[:, camera], dtype=np.float64)
             away = _distances(cameras[int(camera)], seen, placed.joints)

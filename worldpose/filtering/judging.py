@@ -1,4 +1,4 @@
-"""Detections beside the bodies: what fits whom, and which keypoints do not belong (R2)."""
+"""Comparison of detections with bodies: matches, and keypoints that contradict them (R2)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import AnyFloats, Flags, Floats
+from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17, COCO17_BONES
+from data_contracts.keypoints import TrackedDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.filtering.residuals import Residuals
 from worldpose.filtering.settings import FilteringSettings
@@ -23,53 +24,54 @@ _PARTS: Final = tuple(EXCHANGED_PARTS.values())
 
 
 @dataclass(frozen=True, eq=False)
-class Suspects:
-    """What a stretch of frames holds to be judged.
+class TriangulatedDetections(TrackedDetections):
+    """Tracked detections in some frames, with the results of their triangulation.
 
     Attributes:
-        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
-        confidence: (frames, cameras, detections, 17).
-        index: (frames, cameras, persons), place among the detections; -1 = not seen.
-        offsets: (frames, cameras, persons, 2) [px], by how much the camera sees a person beside
-            where all cameras put him.
-        exchanged: (frames, cameras, persons, 3), parts whose left and right were put right.
-        dropped: (frames, cameras, detections), boxes that the iteration before dropped.
-        noise: what keypoints are stated to err by, [px] and [m].
+        offsets: (frames, cameras, persons, 2) [px], offset of a person's detection in an image from
+            the person's position by all cameras.
+        exchanged: (frames, cameras, persons, 3), body parts with a corrected left-right swap.
+        dropped: (frames, cameras, detections), boxes that the previous iteration dropped.
+        noise: stated standard deviation of keypoints, [px] and [m].
     """
 
-    keypoints: AnyFloats
-    confidence: AnyFloats
-    index: NDArray[np.integer]
     offsets: Floats
     exchanged: Flags
     dropped: Flags
     noise: tuple[float, float]
 
-    def without(self, shift: Floats) -> Suspects:
-        """Return the same with the keypoints of people less what they are beside their bodies by.
+    def subtract(self, shift: Floats) -> TriangulatedDetections:
+        """Return the detections with the systematic errors of their keypoints subtracted.
 
         Args:
             shift: (frames, cameras, persons, 17, 2) [px], of the bodies' joints; NaN = unknown.
         """
-        return replace(self, keypoints=self.keypoints - self.by_detection(shift))
+        return replace(self, keypoints=self.keypoints - self.assign_to_detections(shift))
 
-    def less_clocks(self, late: Floats, way: Floats) -> Suspects:
-        """Return the same with offsets less what of them is a camera's lateness.
+    def subtract_clock_offsets(
+        self, clock_offsets: Floats, image_motion: Floats
+    ) -> TriangulatedDetections:
+        """Return the detections with the effect of clock offsets subtracted from `offsets`.
 
         Args:
-            late: (cameras,) [frame].
-            way: (frames, cameras, persons, 17, 2) [px], of joints in a frame; NaN = unknown.
+            clock_offsets: (cameras,) [frame].
+            image_motion: (frames, cameras, persons, 17, 2) [px], of joints per frame; NaN =
+                unknown.
         """
-        part = late[:, None, None] * np.nan_to_num(way.mean(axis=-2))
+        part = clock_offsets[:, None, None] * np.nan_to_num(image_motion.mean(axis=-2))
         return replace(self, offsets=self.offsets - part)
 
-    def by_detection(self, shift: Floats) -> Floats:
-        """Return the same shift (frames, cameras, detections, 17, 2) [px]; 0 = of nobody, unknown.
+    def assign_to_detections(self, shift: Floats) -> Floats:
+        """Return the shift of each detection (frames, cameras, detections, 17, 2) [px].
 
-        Where sides are exchanged, that of the joint which the keypoint is.
+        It is 0 for a detection of no person, and where it is unknown. In a left-right swap, a
+        keypoint gets the shift of the joint that it shows.
+
+        Args:
+            shift: (frames, cameras, persons, 17, 2) [px], of the bodies' joints; NaN = unknown.
         """
         frame, camera, person = np.nonzero(self.index >= 0)
-        order = _order(self.exchanged[frame, camera, person])
+        order = _order_joints(self.exchanged[frame, camera, person])
         own = np.zeros((len(frame), *shift.shape[3:]))
         np.put_along_axis(own, order[..., None], shift[frame, camera, person], axis=1)
         out = np.zeros(self.keypoints.shape)
@@ -79,36 +81,36 @@ class Suspects:
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What the bodies say of every detection; (frames, cameras, detections) each.
+    """Comparison of every detection with the bodies; (frames, cameras, detections) each.
 
     Attributes:
-        fits: int16, place among the persons of the body that it fits; -1 = none, or not judged.
-        similarity: float32, mean cosine between its bones and that body's, or its person's where
-            it fits none; NaN where not judged.
-        surprise: (..., 17) float32, distance of keypoints to that body in standard deviations; NaN
-            where not judged.
+        fits: int16, index of the person whose body it fits; -1 = none, or not judged.
+        similarity: float32, mean cosine between its bones and that body's, or its tracked person's
+            if it fits none; NaN where not judged.
+        mahalanobis_distance: (..., 17) float32, distance of keypoints to that body in standard
+            deviations; NaN where not judged.
         rejected: (..., 17) bool, keypoints to leave out.
-        dropped: bool, boxes all of whose keypoints are rejected, for they were taken for somebody,
-            now or in an iteration before, and fit nobody.
+        dropped: bool, boxes without a single accepted keypoint: a person had them, now or in an
+            earlier iteration, and they fit no body.
     """
 
     fits: NDArray[np.int16]
     similarity: NDArray[np.float32]
-    surprise: NDArray[np.float32]
+    mahalanobis_distance: NDArray[np.float32]
     rejected: Flags
     dropped: Flags
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
-    """Detections beside one body each, as it would see them."""
+class _Pairs:
+    """Pairs of a detection and a body, with the keypoints in the body's order."""
 
     image: Floats
-    """(n, 17, 2) where the body should be seen [px]."""
+    """(n, 17, 2) projected joints of the body [px]."""
     pixels: Floats
-    """(n, 17, 2) where it was seen, sides and offsets put right [px]."""
+    """(n, 17, 2) keypoints without left-right swaps and offsets [px]."""
     stated: Floats
-    """(n, 17) variance that keypoints are stated to have per axis [px^2]."""
+    """(n, 17) stated variance of the keypoints per axis [px^2]."""
     known: Floats
     """(n, 17) variance of the body's joints per axis [px^2]."""
     confidence: Floats
@@ -118,46 +120,50 @@ class _Rows:
     def squared(self) -> Floats:
         return np.asarray(((self.pixels - self.image) ** 2).sum(-1))
 
-    def surprise(self, spread: Spread) -> Floats:
+    def mahalanobis_distance(self, spread: Spread) -> Floats:
         variance = spread.factor(self.confidence) * self.stated + self.known
         return np.asarray(np.sqrt(self.squared / variance))
 
     def similarity(self) -> Floats:
-        """Mean cosine between bones; NaN without any."""
-        seen, meant = (
+        """Return the mean cosine between bones (n,); NaN without any."""
+        detected, projected = (
             each[:, _BONES[:, 1]] - each[:, _BONES[:, 0]] for each in (self.pixels, self.image)
         )
         with np.errstate(invalid="ignore", divide="ignore"):
-            cosine = (seen * meant).sum(-1)
-            cosine /= np.linalg.norm(seen, axis=-1) * np.linalg.norm(meant, axis=-1)
+            cosine = (detected * projected).sum(-1)
+            cosine /= np.linalg.norm(detected, axis=-1) * np.linalg.norm(projected, axis=-1)
         there = np.isfinite(cosine)
         count = there.sum(-1)
         total = np.where(there, cosine, 0.0).sum(-1)
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def learn_from(views: BodyViews, suspects: Suspects) -> Spread:
-    """Return the spread of keypoints about the bodies of those they were taken for."""
-    rows, _, _ = _own(views, suspects)
+def learn_keypoint_spread(views: BodyViews, suspects: TriangulatedDetections) -> Spread:
+    """Return the spread of keypoints around the bodies of their tracked persons."""
+    rows, _, _ = _pair_with_bodies(views, suspects)
     return learn_spread(rows.squared, rows.stated, rows.known, rows.confidence)
 
 
 def body_residuals(
-    views: BodyViews, suspects: Suspects, judged: Judgement, spread: Spread, repeated: float
+    views: BodyViews,
+    suspects: TriangulatedDetections,
+    judged: Judgement,
+    spread: Spread,
+    repeated: float,
 ) -> Residuals:
-    """Return by how much keypoints miss the bodies of those they were taken for, if these fit.
+    """Return the residuals of keypoints against the bodies of their tracked persons, if these fit.
 
-    What a camera sees people beside of is not taken off: clocks are in it.
+    The offsets of people in an image are not subtracted, because they contain clock offsets.
 
     Args:
-        views: the bodies in all pictures.
-        suspects: what was detected there.
-        judged: the same, judged; what is rejected does not count.
-        spread: of keypoints about bodies.
-        repeated: detections of a person that err alike, so that they count as one.
+        views: the bodies in all images.
+        suspects: detections in these images.
+        judged: their judgement; rejected keypoints do not count.
+        spread: of keypoints around bodies.
+        repeated: detections of a person with correlated errors, which count as one.
     """
-    whole = replace(suspects, offsets=np.zeros_like(suspects.offsets))
-    rows, (frame, camera, person), order = _own(views, whole)
+    unshifted = replace(suspects, offsets=np.zeros_like(suspects.offsets))
+    rows, (frame, camera, person), order = _pair_with_bodies(views, unshifted)
     place = suspects.index[frame, camera, person]
     wrong = np.take_along_axis(judged.rejected[frame, camera, place], order, axis=1)
     wrong |= (judged.fits[frame, camera, place] != person)[:, None]
@@ -167,19 +173,19 @@ def body_residuals(
 
 
 def judge_detections(
-    views: BodyViews, suspects: Suspects, spread: Spread, settings: FilteringSettings
+    views: BodyViews, suspects: TriangulatedDetections, spread: Spread, settings: FilteringSettings
 ) -> Judgement:
-    """Return what the bodies say of a stretch of frames.
+    """Return the comparison of detections with bodies in an interval of frames.
 
-    A detection is judged by the body of the person it was taken for, unless it does not fit that
-    and does fit another. One that was taken for somebody and fits nobody is dropped, and stays so
-    until it fits somebody; another that was taken for nobody is judged only where it fits a body.
+    A detection is judged by the body of its tracked person, unless it does not fit that body and
+    fits another. A detection of a tracked person that fits no body is dropped, and stays dropped
+    until it fits one. A detection of no tracked person is judged only if it fits a body.
 
     Args:
-        views: the bodies in all pictures.
-        suspects: what was detected there.
-        spread: of keypoints about bodies, learned in the same clip.
-        settings: what counts as a contradiction.
+        views: the bodies in all images.
+        suspects: detections in these images.
+        spread: of keypoints around bodies, learned in the same clip.
+        settings: limits of agreement.
 
     Note:
         Paper, supplement, "SMPL Fitting", last paragraph; its similarity of bones (M4).
@@ -187,21 +193,21 @@ def judge_detections(
     shape = suspects.confidence.shape
     fits = np.full(shape[:3], -1, dtype=np.int16)
     similarity = np.full(shape[:3], np.nan, dtype=np.float32)
-    surprise = np.full(shape, np.nan, dtype=np.float32)
+    distance = np.full(shape, np.nan, dtype=np.float32)
     dropped = np.zeros(shape[:3], dtype=np.bool_)
 
-    rows, (frame, camera, person), order = _own(views, suspects)
+    rows, (frame, camera, person), order = _pair_with_bodies(views, suspects)
     place = suspects.index[frame, camera, person].astype(np.int64)
-    away = rows.surprise(spread)
+    away = rows.mahalanobis_distance(spread)
     alike = rows.similarity()
-    count, fitting = _counts(away, settings)
+    count, fitting = _count_fitting(away, settings)
     judged = count >= settings.min_keypoints
     good = judged & _is_fit(count, fitting, alike, settings)
     at = frame, camera, place
     fits[at] = np.where(good, person, -1)
     similarity[at] = alike
     np.put_along_axis(ordered := np.full(away.shape, np.nan), order, away, axis=1)
-    surprise[at] = ordered
+    distance[at] = ordered
     dropped[at] = judged & ~good
 
     taken = np.zeros(shape[:3], dtype=np.bool_)
@@ -209,21 +215,23 @@ def judge_detections(
     open_ = dropped | ~taken
     open_ &= np.isfinite(suspects.keypoints[..., 0]).sum(-1) >= settings.min_keypoints
     for n in np.unique(np.nonzero(open_)[0]):
-        _look_for_others(n, open_[n], views, suspects, spread, settings, fits, similarity, surprise)
+        others = _find_best_bodies(n, open_[n], views, suspects, spread, settings)
+        at = n, others.camera, others.detection
+        fits[at], similarity[at], distance[at] = others.fits, others.similarity, others.distance
     dropped = (dropped | suspects.dropped) & (fits < 0)
     with np.errstate(invalid="ignore"):
-        rejected = surprise > settings.max_deviation
+        rejected = distance > settings.max_deviation
     rejected |= dropped[..., None] & np.isfinite(suspects.confidence)
-    return Judgement(fits, similarity, surprise, rejected, dropped)
+    return Judgement(fits, similarity, distance, rejected, dropped)
 
 
-def _own(
-    views: BodyViews, suspects: Suspects
-) -> tuple[_Rows, tuple[Places, Places, Places], Places]:
-    """Detections beside the bodies of those they were taken for, and the order of their joints."""
+def _pair_with_bodies(
+    views: BodyViews, suspects: TriangulatedDetections
+) -> tuple[_Pairs, tuple[Places, Places, Places], Places]:
+    """Return detections with the bodies of their tracked persons, and the order of their joints."""
     frame, camera, person = np.nonzero(suspects.index >= 0)
     place = suspects.index[frame, camera, person]
-    order = _order(suspects.exchanged[frame, camera, person])
+    order = _order_joints(suspects.exchanged[frame, camera, person])
     pixels = (
         suspects.keypoints[frame, camera, place] - suspects.offsets[frame, camera, person, None]
     )
@@ -231,22 +239,22 @@ def _own(
     pixels = np.take_along_axis(pixels, order[..., None], axis=1)
     confidence = np.take_along_axis(confidence, order, axis=1)
     at = frame, camera, person
-    return _rows(views, at, pixels, confidence, suspects.noise), at, order
+    return _compare(views, at, pixels, confidence, suspects.noise), at, order
 
 
-def _rows(
+def _compare(
     views: BodyViews,
     at: tuple[Places, Places, Places],
     pixels: Floats,
     confidence: Floats,
     noise: tuple[float, float],
-) -> _Rows:
+) -> _Pairs:
     stated = noise[0] ** 2 + (views.scale[at] * noise[1]) ** 2
-    return _Rows(views.image[at], pixels, stated, views.variance[at], confidence)
+    return _Pairs(views.image[at], pixels, stated, views.variance[at], confidence)
 
 
-def _order(exchanged: Flags) -> Places:
-    """Which of a detection's joints each joint of a body is (n, 17), sides put right."""
+def _order_joints(exchanged: Flags) -> Places:
+    """Return the index of the keypoint that shows each joint (n, 17), swaps undone."""
     order = np.tile(np.arange(len(COCO17)), (len(exchanged), 1))
     for part, names in enumerate(_PARTS):
         for name in names:
@@ -256,10 +264,11 @@ def _order(exchanged: Flags) -> Places:
     return order
 
 
-def _counts(surprise: Floats, settings: FilteringSettings) -> tuple[Places, Places]:
+def _count_fitting(distance: Floats, settings: FilteringSettings) -> tuple[Places, Places]:
+    """Return the numbers of keypoints, and of those within the limit (n,)."""
     with np.errstate(invalid="ignore"):
-        fitting = (surprise <= settings.max_deviation).sum(-1)
-    return np.isfinite(surprise).sum(-1), fitting
+        fitting = (distance <= settings.max_deviation).sum(-1)
+    return np.isfinite(distance).sum(-1), fitting
 
 
 def _is_fit(
@@ -271,37 +280,53 @@ def _is_fit(
     return np.asarray(enough & alike)
 
 
-def _look_for_others(
+@dataclass(frozen=True, eq=False)
+class _BestBodies:
+    """Detections of one frame that fit a body, and the best body of each; (n,) each.
+
+    Attributes:
+        camera: index of the camera.
+        detection: index among the camera's detections.
+        fits: index of the person.
+        similarity: of bones [1].
+        distance: (n, 17) in standard deviations.
+    """
+
+    camera: Places
+    detection: Places
+    fits: Places
+    similarity: Floats
+    distance: Floats
+
+
+def _find_best_bodies(
     n: int,
     open_: Flags,
     views: BodyViews,
-    suspects: Suspects,
+    suspects: TriangulatedDetections,
     spread: Spread,
     settings: FilteringSettings,
-    fits: NDArray[np.int16],
-    similarity: NDArray[np.float32],
-    surprise: NDArray[np.float32],
-) -> None:
-    """Give a frame's open detections (cameras, detections) to the bodies that they fit best."""
+) -> _BestBodies:
+    """Return the bodies that a frame's open detections (cameras, detections) fit best."""
     camera, place = np.nonzero(open_)
     persons = views.image.shape[2]
     if not persons:
-        return
+        none = np.empty(0, dtype=np.int64)
+        return _BestBodies(none, none, none, np.empty(0), np.empty((0, len(COCO17))))
     cameras, people = np.repeat(camera, persons), np.tile(np.arange(persons), len(camera))
     places = np.repeat(place, persons)
-    rows = _rows(
+    rows = _compare(
         views,
         (np.full(len(people), n), cameras, people),
         suspects.keypoints[n, cameras, places],
         suspects.confidence[n, cameras, places],
         suspects.noise,
     )
-    away, alike = rows.surprise(spread), rows.similarity()
-    count, fitting = _counts(away, settings)
+    away, alike = rows.mahalanobis_distance(spread), rows.similarity()
+    count, fitting = _count_fitting(away, settings)
     good = _is_fit(count, fitting, alike, settings).reshape(-1, persons)
     share = (fitting / np.maximum(count, 1)).reshape(-1, persons)
     best = np.where(good, share + 1e-3 * alike.reshape(-1, persons), -np.inf).argmax(axis=1)
     found = np.flatnonzero(good.any(axis=1))
     row = found * persons + best[found]
-    at = n, camera[found], place[found]
-    fits[at], similarity[at], surprise[at] = best[found], alike[row], away[row]
+    return _BestBodies(camera[found], place[found], best[found], alike[row], away[row])

@@ -2,6 +2,10 @@
 
 Both are learned from all people of a clip together. The next iteration subtracts them from each
 keypoint; they contain no error of a single person.
+
+Cameras that were adjusted to people have absorbed much of their clock offsets, since people who all
+run one way look shifted. So clocks and cameras are estimated together here, with every joint free
+to follow both.
 """
 
 from __future__ import annotations
@@ -10,14 +14,21 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from worldpose.filtering.clock_offsets import ClockEquations
-from worldpose.filtering.judging import Suspects, body_residuals, judge_detections, learn_from
+from worldpose.filtering.judging import (
+    TriangulatedDetections,
+    body_residuals,
+    judge_detections,
+    learn_keypoint_spread,
+)
+from worldpose.filtering.residuals import Places, Residuals
 from worldpose.filtering.settings import FilteringSettings
 from worldpose.filtering.view_bias import ViewBias, find_azimuths, learn_view_bias
 from worldpose.filtering.views import BodyViews
 from worldpose.geometry import Camera
+from worldpose.static_calibration.parameters import by_step
 
 LASTING: Final = 0.3
 """Correlation time of a detector's error, to a factor e [s]."""
@@ -25,6 +36,17 @@ ROUNDS: Final = 2
 """Passes of judging and learning: the second judges with the result of the first."""
 TURNS: Final = 3
 """Alternations between view bias and clock offsets within a pass."""
+STEP: Final = 7
+"""Parameters of a camera's step: rotation, shift and focal length."""
+EXPECTED: Final = np.array([*(0.003,) * 3, *(0.5,) * 3, 0.005])
+"""Standard deviation of a camera's rotation [rad], shift [m] and focal length [1]: ten times the
+error of careful calibration."""
+MIN_INFORMATION: Final = 1e-6
+"""Added to the information of a point [1/m^2]."""
+SPREAD_ROUNDS: Final = 40
+"""Iterations to learn the spread of clock offsets: exact clocks then come out 0.02 frames apart."""
+MIN_SPREAD: Final = 0.005
+"""Minimum spread of clock offsets [frame]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,21 +73,21 @@ class SystematicErrors:
         NaN where a body, or its motion, is unknown.
         """
         sides = self.view_bias.shift(motion.azimuth, _scale(views))
-        return np.asarray(sides + self.late[:, None, None, None] * motion.way)
+        return np.asarray(sides + self.late[:, None, None, None] * motion.image_motion)
 
-    def late_in_offsets(self, offsets: Floats, motion: BodyMotion) -> Floats:
+    def clock_offsets_in(self, offsets: Floats, motion: BodyMotion) -> Floats:
         """Return the part of the clock offsets that people's offsets contain (cameras,) [frame].
 
         People's offsets belong to joints triangulated without clock offsets, so a camera seems to
         see people displaced along their motion.
 
         Args:
-            offsets: (frames, cameras, persons, 2) [px], as of `Suspects`.
+            offsets: (frames, cameras, persons, 2) [px], as of `TriangulatedDetections`.
             motion: of the bodies.
         """
-        way = np.nan_to_num(motion.way.mean(axis=-2))
-        along = (np.nan_to_num(offsets) * way).sum(axis=(0, 2, 3))
-        held = along / np.maximum((way**2).sum(axis=(0, 2, 3)), 1e-12)
+        image_motion = np.nan_to_num(motion.image_motion.mean(axis=-2))
+        along = (np.nan_to_num(offsets) * image_motion).sum(axis=(0, 2, 3))
+        held = along / np.maximum((image_motion**2).sum(axis=(0, 2, 3)), 1e-12)
         return np.asarray(np.clip(held, np.minimum(self.late, 0.0), np.maximum(self.late, 0.0)))
 
 
@@ -75,7 +97,7 @@ class BodyMotion:
 
     azimuth: Floats
     """(frames, cameras, persons) of the camera, seen from the body [rad]."""
-    way: Floats
+    image_motion: Floats
     """(frames, cameras, persons, 17, 2) motion of joints per frame [px]."""
 
 
@@ -100,7 +122,7 @@ def learn_systematic_errors(
     joints: Floats,
     views: BodyViews,
     motion: BodyMotion,
-    suspects: Suspects,
+    suspects: TriangulatedDetections,
     settings: FilteringSettings,
     fps: float,
 ) -> SystematicErrors:
@@ -118,21 +140,125 @@ def learn_systematic_errors(
     systematic = SystematicErrors.none(cameras.batch_shape[0])
     repeated = max(1.0, 2.0 * LASTING * fps)
     for _ in range(ROUNDS):
-        corrected = suspects.without(systematic.shift(motion, views))
-        spread = learn_from(views, corrected)
+        corrected = suspects.subtract(systematic.shift(motion, views))
+        spread = learn_keypoint_spread(views, corrected)
         judged = judge_detections(views, corrected, spread, settings)
         residuals = body_residuals(views, suspects, judged, spread, repeated)
         at = residuals.frame, residuals.camera, residuals.person
-        azimuth, way, scale = motion.azimuth[at], motion.way[at], _scale(views)[at]
-        clocks = ClockEquations.of(cameras, joints, way, residuals)
+        azimuth, image_motion, scale = (
+            motion.azimuth[at],
+            motion.image_motion[at],
+            _scale(views)[at],
+        )
+        clocks = ClockEquations.from_residuals(cameras, joints, image_motion, residuals)
         for _ in range(TURNS):
             late = systematic.late[residuals.camera, None, None]
-            bias = learn_view_bias(residuals.less(late * np.nan_to_num(way)), azimuth, scale)
+            bias = learn_view_bias(
+                residuals.less(late * np.nan_to_num(image_motion)), azimuth, scale
+            )
             sides = np.nan_to_num(bias.shift(azimuth, scale))
-            systematic = SystematicErrors(bias, clocks.learn_lateness(residuals.less(sides)))
+            systematic = SystematicErrors(bias, clocks.learn_clock_offsets(residuals.less(sides)))
     return systematic
 
 
 def _scale(views: BodyViews) -> Floats:
     """Return the image scale at a body's hips (frames, cameras, persons) [px/m]."""
     return np.asarray(views.scale[..., (11, 12)].mean(axis=-1))
+
+
+@dataclass(frozen=True, eq=False)
+class _CameraEquations:
+    """Observations of one camera, one entry per joint of each row that counts."""
+
+    row: Places
+    joint: Places
+    place: Places
+    """Index of the point."""
+    held: Floats
+    """(n, 2, 1 + STEP) weighted derivative of the keypoint by the camera's unknowns."""
+    held_points: Floats
+    """(n, 2, 3) weighted derivative by the point."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClockEquations:
+    """Normal equations of clocks and cameras, with joints eliminated (Schur complement)."""
+
+    seen: tuple[_CameraEquations, ...]
+    """By camera."""
+    used: NDArray[np.bool_]
+    """(points,) bool, points with observations."""
+    follow: Floats
+    """(3 used, cameras (1 + STEP)) motion of these points with the unknowns."""
+    matrix: Floats
+    """(cameras (1 + STEP), cameras (1 + STEP))."""
+
+    @classmethod
+    def from_residuals(
+        cls, cameras: Camera, joints: Floats, image_motion: Floats, residuals: Residuals
+    ) -> ClockEquations:
+        """Return the equations; they use the weights of `residuals`, not its values.
+
+        Args:
+            cameras: batch (cameras,).
+            joints: (frames, persons, 17, 3) [m], world, of bodies.
+            image_motion: (n, 17, 2) [px], of each row's joints per frame; NaN = unknown.
+            residuals: of these joints; `frame` indexes the first axis of `joints`.
+        """
+        persons, joint_count = joints.shape[1:3]
+        count, width = cameras.batch_shape[0], 1 + STEP
+        points = joints.reshape(-1, 3)
+        weight = residuals.weight * np.isfinite(image_motion).all(axis=-1)
+        normal = np.tile(MIN_INFORMATION * np.eye(3), (len(points), 1, 1))
+        mixed = np.zeros((len(points), 3, count, width))
+        matrix = np.zeros((count, width, count, width))
+        seen = []
+        for camera in range(count):
+            row, joint = np.nonzero((weight > 0.0) & (residuals.camera == camera)[:, None])
+            place = (residuals.frame[row] * persons + residuals.person[row]) * joint_count + joint
+            by_points = cameras[camera].project_with_jacobians(points[place])
+            by_camera = by_step(cameras[camera], by_points)[..., :STEP]
+            by_all = np.concatenate([image_motion[row, joint][..., None], by_camera], axis=-1)
+            held = weight[row, joint, None, None] * by_all
+            held_points = weight[row, joint, None, None] * by_points.d_points
+            matrix[camera, :, camera] = np.einsum("nak,nal->kl", held, by_all)
+            # A camera sees a joint of a person at most once per frame.
+            normal[place] += np.einsum("nai,naj->nij", held_points, by_points.d_points)
+            mixed[place, :, camera] = np.einsum("nai,nak->nik", held_points, by_all)
+            seen.append(_CameraEquations(row, joint, place, held, held_points))
+        used = normal[:, 0, 0] > MIN_INFORMATION
+        flat = mixed[used].reshape(-1, 3, count * width)
+        follow = np.asarray(np.linalg.solve(normal[used], flat), np.float64)
+        follow = follow.reshape(-1, count * width)
+        reduced = matrix.reshape(count * width, -1) - flat.reshape(-1, count * width).T @ follow
+        return cls(tuple(seen), used, follow, reduced)
+
+    def learn_clock_offsets(self, residuals: Residuals) -> Floats:
+        """Return clock offsets relative to the mean (cameras,) [frame]; positive = later time.
+
+        Args:
+            residuals: remaining residuals of the keypoints in the equations.
+        """
+        right = np.zeros((len(self.seen), 1 + STEP))
+        pulled = np.zeros((len(self.used), 3))
+        for camera, seen in enumerate(self.seen):
+            missed = residuals.missed[seen.row, seen.joint]
+            right[camera] = np.einsum("nak,na->k", seen.held, missed)
+            pulled[seen.place] += np.einsum("nai,na->ni", seen.held_points, missed)
+        side = right.reshape(-1) - self.follow.T @ pulled[self.used].reshape(-1)
+        return _solve_clock_offsets(self.matrix, side, len(self.seen))
+
+
+def _solve_clock_offsets(matrix: Floats, right: Floats, count: int) -> Floats:
+    """Return each camera's first unknown; expectation-maximisation learns their spread.
+
+    If nothing separates clocks from cameras, or all clocks agree, the offsets come out equal.
+    """
+    spread = 1.0
+    for _ in range(SPREAD_ROUNDS):
+        prior = np.tile(np.concatenate([[spread**-2], EXPECTED**-2]), count)
+        inverse = np.linalg.inv(matrix + np.diag(prior))
+        late = (inverse @ right).reshape(count, -1)[:, 0]
+        variance = np.diagonal(inverse).reshape(count, -1)[:, 0]
+        spread = max(MIN_SPREAD, float(np.sqrt(np.mean(late**2 + variance))))
+    return np.asarray(late - late.mean())

@@ -4,18 +4,26 @@ Input: bodies of the previous iteration in one camera's frames, its detections, 
 Output: the people searched for, the estimator's results, and the accepted ones.
 """
 
-from worldpose.redetection.answers import Verdicts, judge_answers, look_again
 from worldpose.redetection.expected import Expected
+from worldpose.redetection.missing_people import (
+    MissingPeople,
+    find_detected_people,
+    select_missing_people,
+)
+from worldpose.redetection.search_results import (
+    Verdicts,
+    judge_search_results,
+    search_missing_people,
+)
 from worldpose.redetection.settings import RedetectionSettings
-from worldpose.redetection.sought import Sought, who_is_seen, whom_to_seek
 
 __all__ = [
     "Expected",
+    "MissingPeople",
     "RedetectionSettings",
-    "Sought",
     "Verdicts",
-    "judge_answers",
-    "look_again",
-    "who_is_seen",
-    "whom_to_seek",
+    "find_detected_people",
+    "judge_search_results",
+    "search_missing_people",
+    "select_missing_people",
 ]

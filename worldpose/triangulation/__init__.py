@@ -6,14 +6,15 @@ Inputs: cameras, detected keypoints, and the detection of each person in each vi
 
 from worldpose.triangulation.chunking import (
     Chunk,
-    ClipDetections,
     ClipModel,
+    Reconstruction,
     learn_clip,
     reconstruct_chunks,
+    reconstruct_joints,
 )
-from worldpose.triangulation.clocks import CameraClocks, estimate_clocks, moved_in_time
+from worldpose.triangulation.clocks import CameraClocks, estimate_clocks
+from worldpose.triangulation.detections import ClipDetections, shift_in_time
 from worldpose.triangulation.left_right_swaps import unswap
-from worldpose.triangulation.reconstruction import Reconstruction, reconstruct_joints
 from worldpose.triangulation.reports import TriangulationReport
 from worldpose.triangulation.robust import Triangulation, triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
@@ -31,9 +32,9 @@ __all__ = [
     "TriangulationSettings",
     "estimate_clocks",
     "learn_clip",
-    "moved_in_time",
     "reconstruct_chunks",
     "reconstruct_joints",
+    "shift_in_time",
     "smooth_joints",
     "triangulate_joints",
     "unswap",

@@ -6,7 +6,6 @@ smoothed together with a margin on either side.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -14,13 +13,15 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import ClipArray, Floats
+from data_contracts.arrays import Floats
+from data_contracts.keypoints import TrackedDetections
 from worldpose.geometry import Camera
 from worldpose.triangulation.batched_gauss_newton import LANES
-from worldpose.triangulation.clocks import CameraClocks, Moved, estimate_clocks, moved_in_time
+from worldpose.triangulation.clocks import CameraClocks, estimate_clocks
+from worldpose.triangulation.detections import CHUNK, ClipDetections, check_shapes
 from worldpose.triangulation.left_right_swaps import undo_swaps
 from worldpose.triangulation.motion_model import MotionModel, choose_stretches, learn_motion
-from worldpose.triangulation.observations import Rig, person_observations
+from worldpose.triangulation.observations import PersonTrack, Rig, observe_person
 from worldpose.triangulation.robust import (
     DetectorModel,
     Triangulation,
@@ -31,8 +32,6 @@ from worldpose.triangulation.robust import (
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.smoothing import Smoothing, smooth_joints
 
-PART: Final = 512
-"""Frames per chunk: some hundred megabytes with 25 people in 16 cameras."""
 MARGIN: Final = 2.0
 """Margin on either side for smoothing [s]: frames farther away move a joint by less than the step
 that ends the iteration, across gaps too."""
@@ -68,54 +67,6 @@ class Chunk:
     smoothing: Smoothing
 
 
-@dataclass(frozen=True, eq=False)
-class ClipDetections:
-    """Detections of tracked people, loaded one chunk of frames at a time.
-
-    Attributes:
-        keypoints: (frames, cameras, detections, 17, 2) [px].
-        confidence: (frames, cameras, detections, 17).
-        detection_index: (frames, cameras, persons).
-        late: (cameras,) [frame], clock offsets to correct; None = no correction.
-    """
-
-    keypoints: ClipArray
-    confidence: ClipArray
-    detection_index: ClipArray
-    late: Floats | None = None
-
-    @property
-    def frames(self) -> int:
-        """Number of frames."""
-        return self.confidence.shape[0]
-
-    def between(self, first: int, last: int) -> Moved:
-        """Return keypoints, confidence and index of the frames from `first` to before `last`."""
-        late = np.zeros(1) if self.late is None else np.nan_to_num(self.late)
-        reach = math.ceil(float(np.abs(late).max(initial=0.0)))
-        start = max(0, first - reach)
-        wide = slice(start, last + reach)
-        arrays = (self.keypoints[wide], self.confidence[wide], self.detection_index[wide])
-        if reach:
-            arrays = moved_in_time(*arrays, late)
-        inner = slice(first - start, last - start)
-        return arrays[0][inner], arrays[1][inner], arrays[2][inner]
-
-    def at(self, frames: NDArray[np.int64]) -> Moved:
-        """Return keypoints, confidence and index of single frames."""
-        each = [self.between(frame, frame + 1) for frame in frames.tolist()]
-        keypoints, confidence, index = zip(*each, strict=True)
-        return np.concatenate(keypoints), np.concatenate(confidence), np.concatenate(index)
-
-    def seen(self, views: int) -> NDArray[np.bool_]:
-        """Return whether at least `views` cameras saw each person (frames, persons)."""
-        parts = [
-            (self.detection_index[start : start + PART] >= 0).sum(axis=1) >= views
-            for start in range(0, max(1, self.frames), PART)
-        ]
-        return np.concatenate(parts)
-
-
 def learn_clip(
     cameras: Camera,
     detections: ClipDetections,
@@ -132,27 +83,25 @@ def learn_clip(
         settings: of the stage.
         camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
     """
-    given = (detections.keypoints, detections.confidence, detections.detection_index)
-    clocks = estimate_clocks(cameras, *given, fps, settings)
+    clocks = estimate_clocks(cameras, detections, fps, settings)
     if settings.correct_clocks:
         detections = replace(detections, late=clocks.late)
     joints = detections.confidence.shape[-1]
     chosen = sample_frames(detections.detection_index.shape, joints)
-    some = detections.at(chosen) if len(chosen) else detections.between(0, 0)
-    detector = learn_detector(cameras, *some, settings, camera_covariance)
-    rig = Rig.of(cameras)
+    sample = detections.read_frames(chosen)
+    detector = learn_detector(cameras, sample, settings, camera_covariance)
 
-    def stretch(person: int, frames: slice) -> tuple[Floats, Floats, Floats]:
-        keypoints, confidence, index = detections.between(frames.start, frames.stop)
-        alone = (keypoints, confidence, index[:, :, person : person + 1])
-        known = detector.of_person(person)
-        raw = triangulate_joints(cameras, *alone, settings, camera_covariance, known)
-        keypoints, confidence = undo_swaps(*alone, raw.exchanged)
-        arrays = (keypoints, raw.noise.precision(confidence), alone[2], raw.offsets)
-        return (*person_observations(arrays, 0), raw.joints[:, 0])
+    def read_track(person: int, frames: slice) -> PersonTrack:
+        alone = detections.read(frames.start, frames.stop).select_person(person)
+        known = detector.select_person(person)
+        raw = triangulate_joints(cameras, alone, settings, camera_covariance, known)
+        unswapped = undo_swaps(alone, raw.exchanged)
+        precision = raw.noise.precision(unswapped.confidence)
+        return observe_person(unswapped, precision, raw.offsets, raw.joints, person=0)
 
-    stretches = choose_stretches(detections.seen(settings.min_views), fps)
-    motion = learn_motion(rig, (stretch(*each) for each in stretches), joints, fps, settings)
+    intervals = choose_stretches(detections.have_views(settings.min_views), fps)
+    tracks = (read_track(person, frames) for person, frames in intervals)
+    motion = learn_motion(Rig.from_cameras(cameras), tracks, joints, fps, settings)
     return ClipModel(clocks, detector, motion), detections
 
 
@@ -163,7 +112,7 @@ def reconstruct_chunks(
     fps: float,
     settings: TriangulationSettings,
     camera_covariance: Floats | None = None,
-    length: int = PART,
+    length: int = CHUNK,
 ) -> Iterator[Chunk]:
     """Yield a clip's joints, one chunk of `length` frames at a time.
 
@@ -186,8 +135,11 @@ def reconstruct_chunks(
     ]
     triangulated = (
         triangulate_joints(
-            *(cameras, *detections.between(part.start, part.stop), settings),
-            *(camera_covariance, model.detector),
+            cameras,
+            detections.read(part.start, part.stop),
+            settings,
+            camera_covariance,
+            model.detector,
         )
         for part in parts
     )
@@ -196,15 +148,20 @@ def reconstruct_chunks(
         after = next(triangulated, None)
         first, last = max(0, part.start - margin), min(frames, part.stop + margin)
         smooth = smooth_joints(
-            *(cameras, *detections.between(first, last), _around(before, here, after, margin)),
-            *(fps, settings, model.motion, slice(part.start - first, part.stop - first)),
+            cameras,
+            detections.read(first, last),
+            _add_margins(before, here, after, margin),
+            fps,
+            settings,
+            model.motion,
+            slice(part.start - first, part.stop - first),
         )
         yield Chunk(part, here, smooth)
         if after is not None:
             before, here = here, after
 
 
-def _around(
+def _add_margins(
     before: Triangulation | None, here: Triangulation, after: Triangulation | None, margin: int
 ) -> Triangulation:
     """Return the triangulation of a chunk with `margin` frames on either side."""
@@ -224,3 +181,45 @@ def _around(
         exchanged=joined("exchanged"),
         offsets=joined("offsets"),
     )
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Joints and clock offsets of one clip.
+
+    Attributes:
+        triangulation: each frame on its own.
+        smoothing: whole tracks.
+        clocks: clock offsets; corrected if the settings say so.
+    """
+
+    triangulation: Triangulation
+    smoothing: Smoothing
+    clocks: CameraClocks
+
+
+def reconstruct_joints(
+    cameras: Camera,
+    detections: TrackedDetections,
+    fps: float,
+    settings: TriangulationSettings,
+    camera_covariance: NDArray[np.float64] | None = None,
+) -> Reconstruction:
+    """Return a clip's triangulated and smoothed joints, and its cameras' clock offsets.
+
+    Args:
+        cameras: batch (cameras,).
+        detections: of all tracked people.
+        fps: frames per second [1/s].
+        settings: of the stage.
+        camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
+
+    Raises:
+        InputError: the shapes do not match.
+    """
+    check_shapes(cameras, detections, camera_covariance)
+    clip = ClipDetections(detections.keypoints, detections.confidence, detections.index)
+    model, clip = learn_clip(cameras, clip, fps, settings, camera_covariance)
+    length = len(detections.keypoints)
+    (chunk,) = reconstruct_chunks(cameras, clip, model, fps, settings, camera_covariance, length)
+    return Reconstruction(chunk.triangulation, chunk.smoothing, model.clocks)

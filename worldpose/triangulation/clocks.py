@@ -12,15 +12,15 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import ClipArray, Floats
+from data_contracts.arrays import Floats
+from data_contracts.keypoints import TrackedDetections
 from data_contracts.records import Record
 from worldpose.geometry import Camera, projection
+from worldpose.triangulation.detections import ClipDetections, shift_in_time
 from worldpose.triangulation.noise_model import NoiseModel
-from worldpose.triangulation.observations import Rig
+from worldpose.triangulation.observations import Observations, Rig
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.solving import no_shift, solve
-
-Moved = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.int16]]
+from worldpose.triangulation.solving import solve_joints
 
 GATES: Final = (10.0, 10.0, 5.0, 3.5, 3.5, 3.5, 3.5)
 """Deviations accepted in each pass: clocks three frames apart put a runner's rays half a metre
@@ -77,9 +77,7 @@ class CameraClocks:
 
 def estimate_clocks(
     cameras: Camera,
-    keypoints: ClipArray,
-    confidence: ClipArray,
-    detection_index: ClipArray,
+    detections: ClipDetections,
     fps: float,
     settings: TriangulationSettings,
 ) -> CameraClocks:
@@ -91,22 +89,20 @@ def estimate_clocks(
 
     Args:
         cameras: batch (cameras,).
-        keypoints: (frames, cameras, detections, 17, 2) [px].
-        confidence: (frames, cameras, detections, 17).
-        detection_index: (frames, cameras, persons).
+        detections: of the clip, as detected.
         fps: frames per second [1/s].
         settings: noise, and the standard error below which an offset is determined.
     """
-    rig = Rig.of(cameras)
+    rig = Rig.from_cameras(cameras)
     count = len(rig.cameras)
     late, error = np.zeros(count), np.full(count, UNKNOWN)
-    parts = _stretches(detection_index.shape, max(3, round(WINDOW * fps)))
+    parts = _choose_intervals(detections.detection_index.shape, max(3, round(WINDOW * fps)))
     for gate in GATES if parts else ():
         loose = settings.model_copy(update={"max_deviation": gate})
-        arrays = [
-            (keypoints[part], confidence[part], detection_index[part], late) for part in parts
+        sums = [
+            _sum_equations(rig, detections.read(part.start, part.stop), late, fps, loose)
+            for part in parts
         ]
-        sums = [_regression(rig, *each, fps, loose) for each in arrays]
         information = np.concatenate([each.information for each in sums])
         score = np.concatenate([each.score for each in sums])
         # A common offset moves people along their path and changes no residual.
@@ -135,52 +131,7 @@ def estimate_clocks(
     return CameraClocks(np.where(determined, late, np.nan), error, determined)
 
 
-def moved_in_time(
-    keypoints: NDArray[np.floating],
-    confidence: NDArray[np.floating],
-    detection_index: NDArray[np.int16],
-    late: Floats,
-) -> Moved:
-    """Return the observations shifted to the common clock.
-
-    Keypoints are interpolated linearly between two frames and are missing unless both have them.
-
-    Args:
-        keypoints: (frames, cameras, detections, joints, 2) [px].
-        confidence: (frames, cameras, detections, joints).
-        detection_index: (frames, cameras, persons).
-        late: (cameras,) [frame]; NaN or 0 leaves a camera as it is.
-
-    Returns:
-        The same three arrays by person: keypoints (frames, cameras, persons, joints, 2),
-        confidence, and the matching index.
-    """
-    frames, _, persons = detection_index.shape
-    at = np.maximum(detection_index, 0).astype(np.int64)[..., None]
-    there = (detection_index >= 0)[..., None]
-    pixels = np.take_along_axis(keypoints, at[..., None], axis=2).astype(np.float64)
-    weights = np.take_along_axis(confidence, at, axis=2).astype(np.float64)
-    weights = np.where(there & np.isfinite(pixels).all(axis=-1), weights, np.nan)
-    for camera in np.flatnonzero(np.nan_to_num(late)):
-        time = np.arange(frames) - late[camera]
-        before = np.floor(time).astype(np.int64)
-        share = time - before
-        # A whole number of frames needs one frame only.
-        after = np.where(share > 0.0, before + 1, before)
-        outside = (before < 0) | (after >= frames)
-        before, after = np.clip(before, 0, frames - 1), np.clip(after, 0, frames - 1)
-        for array, spread in ((pixels, 3), (weights, 2)):
-            part = share.reshape(-1, *(1,) * spread)
-            of = array[:, camera]
-            moved = (1.0 - part) * of[before] + part * of[after]
-            moved[outside] = np.nan
-            array[:, camera] = moved
-    seen = np.isfinite(weights).any(axis=-1)
-    index = np.where(seen, np.arange(persons), -1).astype(np.int16)
-    return pixels, weights, index
-
-
-def _stretches(shape: tuple[int, ...], length: int) -> list[slice]:
+def _choose_intervals(shape: tuple[int, ...], length: int) -> list[slice]:
     """Return intervals of frames spread over the clip, with enough person-frames in total."""
     frames, _, persons = shape
     starts = np.arange(0, max(1, frames - length + 1), length)
@@ -218,19 +169,18 @@ def _common_score(sums: list[_Sums]) -> Floats:
     return np.asarray(along * usual)
 
 
-def _regression(
+def _sum_equations(
     rig: Rig,
-    keypoints: NDArray[np.floating],
-    confidence: NDArray[np.floating],
-    detection_index: NDArray[np.int16],
+    detections: TrackedDetections,
     late: Floats,
     fps: float,
     settings: TriangulationSettings,
 ) -> _Sums:
     """Return the normal equations from the residuals of an interval of frames."""
-    pixels, weights, index = moved_in_time(keypoints, confidence, detection_index, late)
-    precision = NoiseModel.stated(weights.shape[-1]).precision(weights)
-    joints = solve(rig, pixels, precision, index, no_shift(), settings).joints
+    common = shift_in_time(detections, late)
+    pixels, index = common.keypoints, common.index
+    precision = NoiseModel.stated(pixels.shape[-2]).precision(common.confidence)
+    joints = solve_joints(Observations.from_rig(rig, pixels, precision, index), settings).joints
     half = max(1, round(VELOCITY_TIME * fps))
     velocity = (joints[2 * half :] - joints[: -2 * half]) / (2.0 * half)
     here = slice(half, len(joints) - half)
@@ -245,7 +195,7 @@ def _regression(
     information, score = np.zeros((persons, count, count)), np.zeros((persons, count))
     aside, misses, scale = np.zeros(count), np.zeros(count), np.zeros(count)
     for camera in range(count):
-        image, jacobian = _seen(rig.cameras[camera], at)
+        image, jacobian = _project_with_jacobian(rig.cameras[camera], at)
         miss = pixels[here, camera][known] - image
         depth = at @ rig.depths[camera, :3] + rig.depths[camera, 3]
         with np.errstate(divide="ignore"):
@@ -280,7 +230,7 @@ def _regression(
     return _Sums(information, score, aside, misses, scale)
 
 
-def _seen(camera: Floats, points: Floats) -> tuple[Floats, Floats]:
+def _project_with_jacobian(camera: Floats, points: Floats) -> tuple[Floats, Floats]:
     """Return pixels (n, 2) of points and their derivatives (n, 2, 3)."""
     image, jacobian = np.empty((1, len(points), 2)), np.empty((1, len(points), 2, 18))
     status = np.empty((1, len(points)), np.uint8)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Flags, Floats
+from data_contracts.arrays import Flags
 from data_contracts.conventions import COCO17
+from data_contracts.keypoints import TrackedDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.compiled import compiled
 from worldpose.geometry.projection import project_point
-from worldpose.triangulation.observations import Rig
+from worldpose.triangulation.observations import Observations
 from worldpose.triangulation.solving import Solution
 
 PAIRS: Final = np.array(
@@ -37,11 +39,7 @@ PART: Final = 2.0 * math.log(150.0)
 
 
 def find_swaps(
-    rig: Rig,
-    keypoints: NDArray[np.floating],
-    precision: Floats,
-    index: NDArray[np.integer],
-    shift: Floats,
+    observations: Observations,
     noise: tuple[float, float],
     limit: float,
     found: Solution,
@@ -53,40 +51,29 @@ def find_swaps(
     at least two outlier keypoints are tested.
 
     Args:
-        rig: the cameras.
-        keypoints: (frames, cameras, detections, joints, 2) [px].
-        precision: (frames, cameras, detections, joints), 0 or NaN = no observation.
-        index: (frames, cameras, persons), index of the detection; -1 = not seen.
-        shift: (frames, cameras, persons, 3) as in `solve`.
+        observations: of all tracked people.
         noise: [px], [m].
         limit: largest squared error of an inlier [variances].
         found: the joints from the unchanged detections.
     """
-    exchanged = np.zeros((*index.shape, len(EXCHANGED_PARTS)), np.bool_)
-    if precision.shape[-1] == len(COCO17):
-        _find(
-            *(keypoints, precision, index, shift, rig.cameras, noise, limit),
-            *(found.joints, found.covariance, found.seen, found.inliers, PAIRS, PART_OF),
-            exchanged,
-        )
+    exchanged = np.zeros((*observations.detection_index.shape, len(EXCHANGED_PARTS)), np.bool_)
+    if observations.precision.shape[-1] == len(COCO17):
+        _find_swaps(observations, noise, limit, found, PAIRS, PART_OF, exchanged)
     return exchanged
 
 
-def undo_swaps(
-    keypoints: NDArray[np.floating],
-    confidence: NDArray[np.floating],
-    index: NDArray[np.integer],
-    exchanged: Flags,
-) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Return keypoints and confidence with left-right swaps undone.
+def undo_swaps(detections: TrackedDetections, exchanged: Flags) -> TrackedDetections:
+    """Return detections with left-right swaps undone.
 
     Args:
-        keypoints: (frames, cameras, detections, 17, 2) [px]; not changed.
-        confidence: (frames, cameras, detections, 17); not changed.
-        index: (frames, cameras, persons).
+        detections: as detected; not changed.
         exchanged: (frames, cameras, persons, parts).
     """
-    return unswap(keypoints, index, exchanged), unswap(confidence, index, exchanged)
+    return replace(
+        detections,
+        keypoints=unswap(detections.keypoints, detections.index, exchanged),
+        confidence=unswap(detections.confidence, detections.index, exchanged),
+    )
 
 
 def unswap(
@@ -111,23 +98,20 @@ def unswap(
 
 
 @compiled
-def _find(
-    keypoints: NDArray[np.floating],
-    precision: Floats,
-    index: NDArray[np.integer],
-    shift: Floats,
-    cameras: Floats,
+def _find_swaps(
+    observations: Observations,
     noise: tuple[float, float],
     limit: float,
-    joints: Floats,
-    covariance: Floats,
-    seen: Flags,
-    inliers: Flags,
+    found: Solution,
     pairs: NDArray[np.int64],
     part_of: NDArray[np.int64],
     exchanged: Flags,
 ) -> None:
-    """Write `exchanged`."""
+    """Write `exchanged` (frames, cameras, persons, parts)."""
+    keypoints, precision = observations.keypoints, observations.precision
+    index, shift, cameras = observations.detection_index, observations.shift, observations.cameras
+    joints, covariance = found.joints, found.covariance
+    seen, inliers = found.seen, found.inliers
     frames, count, persons = index.shape
     joint_count = precision.shape[3]
     image, base, doubt = np.empty((2, 2)), np.empty(2), np.empty(2)

@@ -12,9 +12,14 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from worldpose.geometry import projection
-from worldpose.triangulation.observations import Rig
+from worldpose.triangulation.observations import PersonTrack, Rig
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.track_solver import held_out_cost, prepare, solve_segment
+from worldpose.triangulation.track_solver import (
+    TrackCosts,
+    held_out_cost,
+    prepare_tiles,
+    solve_segment,
+)
 
 ACCELERATIONS: Final = (3.0, 6.0, 12.0, 25.0, 50.0, 100.0, 200.0)
 """Candidates [m/s^2]: from a stroller's trunk to a kicking foot."""
@@ -43,7 +48,7 @@ class MotionModel:
 
 def learn_motion(
     rig: Rig,
-    stretches: Iterable[tuple[Floats, Floats, Floats]],
+    tracks: Iterable[PersonTrack],
     joints: int,
     fps: float,
     settings: TriangulationSettings,
@@ -57,8 +62,7 @@ def learn_motion(
 
     Args:
         rig: the cameras.
-        stretches: intervals of one person each: pixels (17, cameras, frames, 2) and precision as in
-            `person_observations`, and triangulated joints (frames, 17, 3) [m].
+        tracks: intervals of one person each.
         joints: number of joints per person.
         fps: frames per second [1/s].
         settings: noise and inlier limit.
@@ -70,7 +74,8 @@ def learn_motion(
     lag = max(1, round(REPEAT * fps))
     correlation, energy = np.zeros(lag + 1), 0.0
     odd = np.arange(len(rig.cameras)) % 2 == 1
-    for pixels, weights, points in stretches:
+    for track in tracks:
+        pixels, weights, points = track.pixels, track.precision, track.joints
         for joint in range(joints):
             given = np.ascontiguousarray(points[:, joint])
             if not np.isfinite(given).all():
@@ -80,10 +85,10 @@ def learn_motion(
                 hidden = np.where(left_out[:, None], weights[joint], 0.0)
                 if ((seen > 0.0).sum(axis=0) < settings.min_views).any():
                     continue
-                tiles = prepare(pixels[joint], hidden, rig.cameras)
+                tiles = prepare_tiles(pixels[joint], hidden, rig)
                 for n, acceleration in enumerate(ACCELERATIONS):
-                    penalty = (fps**2 / acceleration) ** 2
-                    x, _ = solve_segment(pixels[joint], seen, given, rig, noise, limit, penalty)
+                    costs = TrackCosts(noise, limit, (fps**2 / acceleration) ** 2)
+                    x, _ = solve_segment(pixels[joint], seen, given, rig, costs)
                     cost[n, joint] += held_out_cost(tiles, rig.depths, noise, limit, x)
             error = _whitened(pixels[joint], weights[joint], given, rig, noise, limit)
             energy += float(np.nansum(error * error))

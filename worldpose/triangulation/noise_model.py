@@ -1,4 +1,9 @@
-"""Detector noise by joint and by confidence, learned from residuals between views of a clip."""
+"""Errors of a detector: noise by joint and by confidence, and the bias that all views share.
+
+The noise is learned from residuals between the views of a clip. No residual shows the common bias
+(T3). But it makes bones of all persons longer or shorter for the whole clip, while human
+proportions are known.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
+from data_contracts.conventions import COCO17
+from data_contracts.keypoints import TrackedDetections
 from worldpose.compiled import compiled
 from worldpose.triangulation.batched_gauss_newton import (
     EXTRA,
@@ -23,7 +30,7 @@ from worldpose.triangulation.batched_gauss_newton import (
     weigh,
 )
 from worldpose.triangulation.consensus import consensus
-from worldpose.triangulation.observations import Rig, gather, linearize
+from worldpose.triangulation.observations import Observations, Rig, gather, linearize
 
 BINS: Final = 8
 """Confidence classes with equally many observations."""
@@ -70,9 +77,7 @@ class NoiseModel:
 
 def learn_noise(
     rig: Rig,
-    keypoints: NDArray[np.floating],
-    confidence: NDArray[np.floating],
-    index: NDArray[np.integer],
+    detections: TrackedDetections,
     shift: Floats,
     noise: tuple[float, float],
     limit: float,
@@ -81,7 +86,15 @@ def learn_noise(
 
     A residual is smaller than the error that causes it, because the point follows its observations:
     sums of squares are divided by degrees of freedom, two per observation minus its leverage.
+
+    Args:
+        rig: the cameras.
+        detections: in the sample.
+        shift: of the observations, as in `Observations`.
+        noise: stated, [px] and [m].
+        limit: largest squared error of an inlier [variances].
     """
+    confidence, index = detections.confidence, detections.index
     count, joints = index.shape[1], confidence.shape[-1]
     model = NoiseModel.stated(joints)
     place = np.maximum(index, 0).astype(np.int64)[..., None]
@@ -106,24 +119,31 @@ def learn_noise(
     for _ in range(ROUNDS):
         precision = model.precision(confidence)
         _residuals(
-            *(keypoints, precision, index, shift, rig.cameras, rig.depths, noise, limit),
-            *(squares.reshape(-1, count), known.reshape(-1, count), freedom.reshape(-1, count)),
+            Observations.from_rig(rig, detections.keypoints, precision, index, shift),
+            noise,
+            limit,
+            squares.reshape(-1, count),
+            known.reshape(-1, count),
+            freedom.reshape(-1, count),
         )
         used = freedom > 0.0
         joint = model.joint
         by_bin, by_joint = bin_of[used], joint_of[used]
         excess = np.maximum(squares[used] - known[used] * freedom[used], 0.0)
-        expected = (excess / factor[by_bin] / joint[by_joint], freedom[used])
-        factor = np.maximum(factor * _ratio(by_bin, len(factor), *expected), LEAST)
-        expected = (excess / factor[by_bin] / joint[by_joint], freedom[used])
-        joint = joint * _ratio(by_joint, joints, *expected)
+        expected = excess / factor[by_bin] / joint[by_joint]
+        ratio = _variance_ratio(by_bin, len(factor), expected, freedom[used])
+        factor = np.maximum(factor * ratio, LEAST)
+        expected = excess / factor[by_bin] / joint[by_joint]
+        joint = joint * _variance_ratio(by_joint, joints, expected, freedom[used])
         # The factor must not rise with confidence: take the running minimum.
         factor = np.minimum.accumulate(factor)
         model = NoiseModel(joint, model.confidence, 1.0 / factor)
     return model
 
 
-def _ratio(group: NDArray[np.int64], groups: int, squares: Floats, freedom: Floats) -> Floats:
+def _variance_ratio(
+    group: NDArray[np.int64], groups: int, squares: Floats, freedom: Floats
+) -> Floats:
     """Return variance over assumed variance, (groups,), shrunk towards the overall ratio."""
     overall = (squares.sum() + PRIOR) / (freedom.sum() + PRIOR)
     total = np.bincount(group, squares, groups) + PRIOR * overall
@@ -133,12 +153,7 @@ def _ratio(group: NDArray[np.int64], groups: int, squares: Floats, freedom: Floa
 
 @compiled
 def _residuals(
-    keypoints: NDArray[np.floating],
-    precision: NDArray[np.floating],
-    index: NDArray[np.integer],
-    shift: Floats,
-    cameras: Floats,
-    depths: Floats,
+    observations: Observations,
     noise: tuple[float, float],
     limit: float,
     squares: Floats,
@@ -149,10 +164,11 @@ def _residuals(
 
     The first two are in units of the stated variance; all are 0 where a view is not used.
     """
+    cameras, depths = observations.cameras, observations.depths
     tiles, state = np.empty((len(cameras), ROWS * LANES)), np.empty(STATE * LANES)
     total = len(squares)
     for first in range(0, total, LANES):
-        gather(keypoints, precision, index, shift, first, cameras, tiles)
+        gather(observations, first, tiles)
         for camera in range(len(cameras)):
             linearize(tiles[camera], cameras[camera])
         consensus(tiles, depths, noise, limit, state)
@@ -204,3 +220,137 @@ def _precision(
             share = min(1.0, max(0.0, share))
             value = values[k - 1] + share * (values[k] - values[k - 1])
             out[row, joint] = value * weight[joint]
+
+
+BY_JOINT: Final = np.array(
+    [
+        next(
+            (
+                factor
+                for part, factor in (("elbow", 1.1), ("wrist", 1.1), ("hip", 1.35))
+                if part in name
+            ),
+            0.9 if "knee" in name or "ankle" in name else 1.0,
+        )
+        for name in COCO17
+    ]
+)
+"""Common bias of each joint relative to the average one (17,) [1].
+
+Errors against the labels of real people (Shelf, frames 300 to 510, five cameras), root mean square
+per axis: shoulders 27 mm, elbows 30, wrists 31, hips 43, knees 23, ankles 23. Against markers hips
+and knees are 30 to 50 mm off, ankles 1 to 15 (Needham et al., Scientific Reports 11, 2021). No such
+measurement of the face is available."""
+
+
+@dataclass(frozen=True)
+class Proportion:
+    """Body length that hardly depends on the pose.
+
+    Attributes:
+        ends: one or two pairs of ends; an end is the mean of its joints.
+        share: of stature [1].
+        spread: relative standard deviation of published values of the share [1].
+        offsets: variance of the length for joint biases of variance 1 per axis, mirrored left to
+            right [1].
+    """
+
+    ends: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
+    share: float
+    spread: float
+    offsets: float
+
+
+def _limb(upper: str, lower: str, share: float) -> Proportion:
+    sides = ("left", "right")
+    pairs = [tuple(COCO17.index(f"{side}_{name}") for name in (upper, lower)) for side in sides]
+    offsets = float((BY_JOINT[list(pairs[0])] ** 2).sum())
+    return Proportion(tuple(((a,), (b,)) for a, b in pairs), share, 0.03, offsets)
+
+
+def _breadth(name: str, share: float, spread: float) -> Proportion:
+    left, right = COCO17.index(f"left_{name}"), COCO17.index(f"right_{name}")
+    # Both ends move outward together.
+    return Proportion((((left,), (right,)),), share, spread, 4.0 * float(BY_JOINT[left]) ** 2)
+
+
+PROPORTIONS: Final = (
+    _limb("shoulder", "elbow", 0.162),
+    _limb("elbow", "wrist", 0.154),
+    _limb("hip", "knee", 0.2425),
+    _limb("knee", "ankle", 0.249),
+    _breadth("shoulder", 0.205, 0.07),
+    _breadth("hip", 0.098, 0.08),
+    Proportion((((5, 6), (11, 12)),), 0.294, 0.05, float((BY_JOINT[[5, 11]] ** 2).sum())),
+)
+"""Limbs and trunk between joint centres of men after P. de Leva, Journal of Biomechanics 29, 1996;
+published breadths between the centres of shoulders and hips agree less."""
+STATURE: Final = (1.72, 0.12)
+"""Stature of people, mean and standard deviation per clip [m]: men, women or children."""
+PERSONAL: Final = 0.035
+"""Standard deviation of a person's proportion relative to the mean [1] (Drillis, Contini 1966)."""
+PRIOR_DEGREES_OF_FREEDOM: Final = 8.0
+"""Degrees of freedom of the inverse chi-square prior of the bias variance [1]. Proportions that fit
+by chance barely lower the estimate, proportions that do not fit raise it."""
+MIN_FRAMES: Final = 5
+"""Frames needed to estimate the length of a person's bone."""
+
+
+def learn_common_bias(joints: Floats, covariance: Floats, usual: float) -> float:
+    """Return the estimated common bias per axis of an average joint [m].
+
+    Lengths are medians over people of medians over frames, minus the contribution of noise. The
+    bias is normal; the result is the root of the posterior mean of its variance.
+
+    Args:
+        joints: (frames, persons, 17, 3) [m].
+        covariance: (frames, persons, 17, 3, 3) [m^2], of `joints` without common bias.
+        usual: expected bias of detectors per axis [m].
+    """
+    if usual <= 0.0:
+        return 0.0
+    measured = [_length(joints, covariance, each) for each in PROPORTIONS]
+    known = [index for index, (length, _, _) in enumerate(measured) if length > 0.0]
+    factors = np.geomspace(0.2, 5.0, 121)
+    posterior = -PRIOR_DEGREES_OF_FREEDOM * (np.log(factors) + 0.5 / factors**2)
+    if known:
+        length, variance, people = np.array([measured[index] for index in known]).T
+        some = [PROPORTIONS[index] for index in known]
+        share = np.array([each.share for each in some])
+        spread = np.array([each.spread for each in some])
+        own = (share * STATURE[0]) ** 2 * (spread**2 + PERSONAL**2 / people) + variance
+        tall = STATURE[1] ** 2 * np.outer(share, share)
+        offsets = usual**2 * np.array([each.offsets for each in some])
+        off = length - share * STATURE[0]
+        for index, factor in enumerate(factors):
+            total = tall + np.diag(own + factor**2 * offsets)
+            posterior[index] -= 0.5 * (
+                off @ np.linalg.solve(total, off) + np.linalg.slogdet(total)[1]
+            )
+    weight = np.exp(posterior - posterior.max())
+    return usual * float(np.sqrt((weight * factors**2).sum() / weight.sum()))
+
+
+def _length(joints: Floats, covariance: Floats, what: Proportion) -> tuple[float, float, int]:
+    """Return a length [m], its noise variance [m^2] and the number of people; zeros without any."""
+    squares, traces = [], []
+    for ends in what.ends:
+        first, second = (joints[:, :, list(end)].mean(axis=2) for end in ends)
+        trace = np.zeros(first.shape[:2])
+        for end in ends:
+            noise = np.einsum("...ii", covariance[:, :, list(end)])
+            trace = trace + noise.sum(axis=-1) / len(end) ** 2
+        squares.append(((first - second) ** 2).sum(axis=-1) - trace)
+        traces.append(trace)
+    square, trace = np.concatenate(squares), np.concatenate(traces)
+    lengths, noises = [], []
+    for person in range(square.shape[1]):
+        there = np.isfinite(square[:, person])
+        middle = float(np.median(square[there, person])) if there.sum() >= MIN_FRAMES else 0.0
+        if middle > 0.0:
+            lengths.append(np.sqrt(middle))
+            # Detector errors persist over many frames, so all frames count as one observation.
+            noises.append(float(np.median(trace[there, person])) / 3.0)
+    if not lengths:
+        return 0.0, 0.0, 0
+    return float(np.median(lengths)), float(np.mean(noises)) / len(lengths), len(lengths)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import AnyFloats, Floats
+from data_contracts.keypoints import TrackedDetections
 from worldpose.compiled import compiled
 from worldpose.geometry import Camera, fold_radius, projection
 from worldpose.geometry.distortion import distort
@@ -44,7 +45,7 @@ class Rig:
     centers: Floats
 
     @classmethod
-    def of(cls, cameras: Camera) -> Rig:
+    def from_cameras(cls, cameras: Camera) -> Rig:
         """Return the rig of a batch (cameras,)."""
         pose = cameras.cam_from_world
         parts = (
@@ -63,55 +64,112 @@ class Rig:
         return cls(rows, depths, np.ascontiguousarray(cameras.center))
 
 
-def person_observations(
-    arrays: tuple[NDArray[np.floating], Floats, NDArray[np.integer], Floats],
+def no_shift() -> Floats:
+    """Return the empty shift, which moves no observation."""
+    return np.zeros((0, 0, 0, 3))
+
+
+class Observations(NamedTuple):
+    """Weighted observations of tracked people by all cameras, as solvers and kernels take them.
+
+    Attributes:
+        keypoints: (frames, cameras, detections, joints, 2) [px].
+        precision: (frames, cameras, detections, joints), inverse of the factor on the stated
+            variance; 0 or NaN = no observation.
+        detection_index: (frames, cameras, persons), index of the detection; -1 = not seen.
+        shift: (frames, cameras, persons, 3), subtracted from pixels [px], and additional variance
+            [px^2]; no frames = no shift.
+        cameras: (cameras, 22) as in `Rig`.
+        depths: (cameras, 4) as in `Rig`.
+        centers: (cameras, 3) as in `Rig`.
+    """
+
+    keypoints: AnyFloats
+    precision: Floats
+    detection_index: NDArray[np.integer]
+    shift: Floats
+    cameras: Floats
+    depths: Floats
+    centers: Floats
+
+    @classmethod
+    def from_rig(
+        cls,
+        rig: Rig,
+        keypoints: AnyFloats,
+        precision: Floats,
+        index: NDArray[np.integer],
+        shift: Floats | None = None,
+    ) -> Observations:
+        """Return the observations of a rig; arguments as the attributes, by default unshifted."""
+        return cls(
+            keypoints=keypoints,
+            precision=precision,
+            detection_index=index,
+            shift=no_shift() if shift is None else shift,
+            cameras=rig.cameras,
+            depths=rig.depths,
+            centers=rig.centers,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PersonTrack:
+    """Observations of one person over an interval of frames.
+
+    Attributes:
+        pixels: (joints, cameras, frames, 2) [px], offsets subtracted.
+        precision: (joints, cameras, frames) as in `Observations`.
+        joints: (frames, joints, 3) [m], triangulated; NaN where unknown.
+    """
+
+    pixels: Floats
+    precision: Floats
+    joints: Floats
+
+
+def observe_person(
+    detections: TrackedDetections,
+    precision: Floats,
+    offsets: Floats,
+    joints: Floats,
     person: int,
     frames: slice = slice(None),
-) -> tuple[Floats, Floats]:
-    """Return one person's pixels (joints, cameras, frames, 2) and precision without the last.
+) -> PersonTrack:
+    """Return one person's observations.
 
     Args:
-        arrays: keypoints (frames, cameras, detections, joints, 2), precision (the same without
-            the last), index (frames, cameras, persons), offsets (frames, cameras, persons, 2).
+        detections: of all people.
+        precision: (frames, cameras, detections, joints) of the keypoints.
+        offsets: (frames, cameras, persons, 2) [px] to subtract.
+        joints: (frames, persons, joints, 3) [m], triangulated.
         person: index of the person.
         frames: frames to include.
     """
-    keypoints, precision = arrays[0][frames], arrays[1][frames]
-    index, offsets = arrays[2][frames], arrays[3][frames]
-    there = index[:, :, person] >= 0
-    at = np.maximum(index[:, :, person], 0).astype(np.int64)[:, :, None, None]
-    pixels = np.take_along_axis(keypoints, at[..., None], axis=2)[:, :, 0]
-    weights = np.take_along_axis(precision, at, axis=2)[:, :, 0]
-    pixels = pixels - offsets[:, :, person, None]
-    weights = np.where(there[..., None], weights, np.nan)
-    return (
-        np.ascontiguousarray(pixels.transpose(2, 1, 0, 3)),
-        np.ascontiguousarray(weights.transpose(2, 1, 0)),
+    index = detections.index[frames, :, person]
+    at = np.maximum(index, 0).astype(np.int64)[:, :, None, None]
+    pixels = np.take_along_axis(detections.keypoints[frames], at[..., None], axis=2)[:, :, 0]
+    weights = np.take_along_axis(precision[frames], at, axis=2)[:, :, 0]
+    pixels = pixels - offsets[frames, :, person, None]
+    weights = np.where((index >= 0)[..., None], weights, np.nan)
+    return PersonTrack(
+        pixels=np.ascontiguousarray(pixels.transpose(2, 1, 0, 3)),
+        precision=np.ascontiguousarray(weights.transpose(2, 1, 0)),
+        joints=joints[frames, person],
     )
 
 
 @compiled
-def gather(
-    keypoints: NDArray[np.floating],
-    precision: NDArray[np.floating],
-    index: NDArray[np.integer],
-    shift: Floats,
-    first: int,
-    cameras: Floats,
-    tiles: Floats,
-) -> None:
+def gather(observations: Observations, first: int, tiles: Floats) -> None:
     """Write pixels, precision and additional variance of 64 joints.
 
     Args:
-        keypoints: (frames, cameras, detections, joints, 2) [px].
-        precision: (frames, cameras, detections, joints), 0 or NaN = no observation.
-        index: (frames, cameras, persons), index of the detection; -1 = not seen.
-        shift: (frames, cameras, persons, 3), subtracted from pixels [px], and variance [px^2]; no
-            frames = no shift.
+        observations: of all joints.
         first: the first joint, counted over frames, persons, joints.
-        cameras: (cameras, 22).
         tiles: (cameras, ROWS x LANES); pixels go to the first rows of `A` and `B`.
     """
+    keypoints, precision = observations.keypoints, observations.precision
+    index, shift, cameras = observations.detection_index, observations.shift, observations.cameras
     frames, count, persons = index.shape
     joints = precision.shape[3]
     last = min(LANES, frames * persons * joints - first)

@@ -9,20 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
+from data_contracts.keypoints import TrackedDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.geometry import Camera
-from worldpose.triangulation.array_checks import check_arrays
-from worldpose.triangulation.calibration_errors import stated_errors
-from worldpose.triangulation.common_bias import BY_JOINT, learn_common_bias
+from worldpose.triangulation.detections import check_shapes
 from worldpose.triangulation.left_right_swaps import find_swaps, undo_swaps
-from worldpose.triangulation.limbs import limb_lengths, repair_limb_lengths
-from worldpose.triangulation.midhip import midhip_shift
-from worldpose.triangulation.noise_model import NoiseModel, learn_noise
-from worldpose.triangulation.observations import Rig
-from worldpose.triangulation.offsets import estimate_offsets, learn_factor
+from worldpose.triangulation.limb_lengths import limb_lengths, repair_limb_lengths
+from worldpose.triangulation.noise_model import BY_JOINT, NoiseModel, learn_common_bias, learn_noise
+from worldpose.triangulation.observations import Observations, Rig, no_shift
+from worldpose.triangulation.person_offsets import (
+    estimate_midhip_shift,
+    estimate_offsets,
+    learn_factor,
+    stated_errors,
+)
 from worldpose.triangulation.reports import Agreement, Histogram, TriangulationReport
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.solving import Solution, no_shift, solve
+from worldpose.triangulation.solving import Solution, solve_joints
 
 SAMPLE: Final = 6000
 """Joints in the sample for detector and calibration errors: a confidence class then has thousands
@@ -46,7 +49,7 @@ class DetectorModel:
     lengths: Floats
     common_bias: Floats
 
-    def of_person(self, person: int) -> DetectorModel:
+    def select_person(self, person: int) -> DetectorModel:
         """Return the model for one person alone."""
         return replace(self, lengths=self.lengths[person : person + 1])
 
@@ -97,9 +100,7 @@ class Triangulation:
 
 def triangulate_joints(
     cameras: Camera,
-    keypoints: NDArray[np.floating],
-    confidence: NDArray[np.floating],
-    detection_index: NDArray[np.int16],
+    detections: TrackedDetections,
     settings: TriangulationSettings,
     camera_covariance: Floats | None = None,
     model: DetectorModel | None = None,
@@ -112,10 +113,7 @@ def triangulate_joints(
 
     Args:
         cameras: batch (cameras,).
-        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
-        confidence: (frames, cameras, detections, 17) in (0, 1]; NaN, 0 or less leaves a keypoint
-            out.
-        detection_index: (frames, cameras, persons), index of the detection; -1 = not seen.
+        detections: of all tracked people.
         settings: noise, inlier limit and minimum views.
         camera_covariance: (cameras, 12, 12) of steps in the order of
             `static_calibration.parameters.PARAMETERS`; None = not known.
@@ -129,19 +127,17 @@ def triangulate_joints(
         T3, T4. Residuals are pixels to first order in their length: the lens is linearised at the
         observation, accurate enough for any inlier residual.
     """
-    check_arrays(cameras, keypoints, confidence, detection_index, camera_covariance)
-    arrays = (keypoints, confidence, detection_index)
+    check_shapes(cameras, detections, camera_covariance)
     if model is None and (
         settings.learn_noise or settings.offsets == "body" or settings.repair_limb_lengths
     ):
-        chosen = sample_frames(detection_index.shape, confidence.shape[-1])
-        some = (keypoints[chosen], confidence[chosen], detection_index[chosen])
-        model = learn_detector(cameras, *some, settings, camera_covariance)
-    passes = _passes(cameras, arrays, settings, camera_covariance, model)
+        chosen = sample_frames(detections.index.shape, detections.confidence.shape[-1])
+        model = learn_detector(cameras, detections[chosen], settings, camera_covariance)
+    passes = _run_passes(cameras, detections, settings, camera_covariance, model)
     solution, shift, noise = passes.solution, passes.shift, passes.model.noise[-1]
     bias = passes.model.common_bias
     lasting = np.broadcast_to(
-        passes.further + bias[:, None, None] ** 2 * np.eye(3), solution.covariance.shape
+        passes.offset_covariance + bias[:, None, None] ** 2 * np.eye(3), solution.covariance.shape
     )
     covariance = solution.covariance + lasting
     return Triangulation(
@@ -152,11 +148,11 @@ def triangulate_joints(
         reprojection_error=solution.reprojection_error,
         inliers=solution.inliers,
         exchanged=passes.exchanged,
-        offsets=shift[..., :2] if len(shift) else np.zeros((*detection_index.shape, 2)),
+        offsets=shift[..., :2] if len(shift) else np.zeros((*detections.index.shape, 2)),
         calibration_covariance=lasting,
         common_bias=bias,
         noise=noise,
-        agreement=_agreement(passes, covariance, detection_index),
+        agreement=_count_agreement(passes, covariance, detections.index),
     )
 
 
@@ -169,15 +165,12 @@ def sample_frames(shape: tuple[int, ...], joints: int) -> NDArray[np.int64]:
 
 def learn_detector(
     cameras: Camera,
-    keypoints: NDArray[np.floating],
-    confidence: NDArray[np.floating],
-    detection_index: NDArray[np.int16],
+    detections: TrackedDetections,
     settings: TriangulationSettings,
     camera_covariance: Floats | None = None,
 ) -> DetectorModel:
     """Return the error model from sample frames; arguments as in `triangulate_joints`."""
-    arrays = (keypoints, confidence, detection_index)
-    return _passes(cameras, arrays, settings, camera_covariance, None).model
+    return _run_passes(cameras, detections, settings, camera_covariance, None).model
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,48 +180,49 @@ class _Passes:
     solution: Solution
     exchanged: NDArray[np.bool_]
     shift: Floats
-    further: Floats | float
+    offset_covariance: Floats | float
     model: DetectorModel
     misplaced: tuple[Histogram, ...]
 
 
-def _passes(
+def _run_passes(
     cameras: Camera,
-    arrays: tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.int16]],
+    detections: TrackedDetections,
     settings: TriangulationSettings,
     camera_covariance: Floats | None,
     known: DetectorModel | None,
 ) -> _Passes:
     """Solve, and solve again with the learned calibration variance and offsets."""
-    keypoints, confidence, index = arrays
-    rig, limit = Rig.of(cameras), settings.max_deviation**2
+    rig, limit = Rig.from_cameras(cameras), settings.max_deviation**2
     models: list[NoiseModel] = []
 
-    def solved(shift: Floats) -> Solution:
+    def observe(shift: Floats) -> Observations:
+        precision = models[-1].precision(detections.confidence)
+        return Observations.from_rig(rig, detections.keypoints, precision, detections.index, shift)
+
+    def observe_in_next_pass(shift: Floats) -> Observations:
         if known is not None:
             models.append(known.noise[len(models)])
         elif settings.learn_noise:
-            at = (rig, keypoints, confidence, index, shift)
-            models.append(learn_noise(*at, settings.noise, limit))
+            models.append(learn_noise(rig, detections, shift, settings.noise, limit))
         else:
-            models.append(NoiseModel.stated(confidence.shape[-1]))
-        precision = models[-1].precision(confidence)
-        return solve(rig, keypoints, precision, index, shift, settings)
+            models.append(NoiseModel.stated(detections.confidence.shape[-1]))
+        return observe(shift)
 
     shift = no_shift()
     if settings.offsets == "midhip":
-        shift = midhip_shift(rig, keypoints, confidence, index, settings)
-    solution = solved(shift)
+        shift = estimate_midhip_shift(rig, detections, settings)
+    observations = observe_in_next_pass(shift)
+    solution = solve_joints(observations, settings)
     calibration = None if settings.offsets == "midhip" else camera_covariance
-    exchanged = np.zeros((*index.shape, len(EXCHANGED_PARTS)), np.bool_)
+    exchanged = np.zeros((*detections.index.shape, len(EXCHANGED_PARTS)), np.bool_)
     if settings.undo_swaps:
-        seen = (rig, keypoints, models[-1].precision(confidence), index, shift)
-        exchanged = find_swaps(*seen, settings.noise, limit, solution)
-        keypoints, confidence = undo_swaps(keypoints, confidence, index, exchanged)
+        exchanged = find_swaps(observations, settings.noise, limit, solution)
+        detections = undo_swaps(detections, exchanged)
+        observations = observe(shift)
         if exchanged.any() and calibration is None:
-            precision = models[-1].precision(confidence)
-            solution = solve(rig, keypoints, precision, index, shift, settings)
-    further: Floats | float = 0.0
+            solution = solve_joints(observations, settings)
+    offset_covariance: Floats | float = 0.0
     misplaced = (Histogram.of(np.empty(0)),) * len(rig.cameras)
     factor = 1.0 if known is None else known.factor
     if calibration is not None:
@@ -236,31 +230,32 @@ def _passes(
         # Calibration errors are not detector noise, nor a reason to reject a view.
         shift = np.zeros((*stated.variance.shape, 3))
         shift[..., 2] = stated.variance
-        solution = solved(shift)
+        observations = observe_in_next_pass(shift)
+        solution = solve_joints(observations, settings)
     if settings.offsets == "body":
         stated = stated_errors(cameras, solution.joints, settings, camera_covariance)
-        at = (rig, keypoints, models[-1].precision(confidence), index, settings.noise, solution)
         if known is None and camera_covariance is None:
-            factor = learn_factor(*at, stated.variance)
-        found = estimate_offsets(*at, factor * stated.variance)
-        shift, further = found.shift, found.covariance
+            factor = learn_factor(observations, settings.noise, solution, stated.variance)
+        variance = factor * stated.variance
+        found = estimate_offsets(observations, settings.noise, solution, variance)
+        shift, offset_covariance = found.shift, found.covariance
         misplaced = stated.misplaced(factor)
-        solution = solved(shift)
+        observations = observe_in_next_pass(shift)
+        solution = solve_joints(observations, settings)
     lengths = limb_lengths(solution) if known is None else known.lengths
     if settings.repair_limb_lengths:
-        seen = (rig, keypoints, models[-1].precision(confidence), index, shift)
-        repair_limb_lengths(*seen, settings, solution, lengths)
-    bias = np.full(confidence.shape[-1], settings.common_bias)
+        repair_limb_lengths(observations, settings, solution, lengths)
+    bias = np.full(detections.confidence.shape[-1], settings.common_bias)
     if known is not None:
         bias = known.common_bias
     elif settings.learn_noise and len(bias) == len(BY_JOINT):
-        seen_noise = solution.covariance + further
+        seen_noise = solution.covariance + offset_covariance
         bias = BY_JOINT * learn_common_bias(solution.joints, seen_noise, settings.common_bias)
     model = DetectorModel(tuple(models), factor, lengths, bias)
-    return _Passes(solution, exchanged, shift, further, model, misplaced)
+    return _Passes(solution, exchanged, shift, offset_covariance, model, misplaced)
 
 
-def _agreement(passes: _Passes, covariance: Floats, index: NDArray[np.int16]) -> Agreement:
+def _count_agreement(passes: _Passes, covariance: Floats, index: NDArray[np.integer]) -> Agreement:
     """Return the agreement between the views of some frames."""
     solution = passes.solution
     views, seen = solution.views, solution.seen

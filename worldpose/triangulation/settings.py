@@ -29,7 +29,7 @@ class TriangulationSettings(Record):
     common_bias: float = Field(default=0.024, ge=0, le=1)
     """Usual standard deviation per axis of the error that all views of a joint share [m]: a
     detector's labels mean another point than the joint's centre. No residual shows it; it is added
-    to the covariance. With `learn_noise` every joint has a factor (`common_bias.BY_JOINT`), and the
+    to the covariance. With `learn_noise` every joint has a factor (`noise_model.BY_JOINT`), and the
     proportions of a clip's people determine the size of the bias. Joints of real people are 27 mm
     per axis from hand-made labels (Shelf); 10 of these are noise of the views."""
     max_deviation: float = Field(default=3.5, ge=1e-6, le=1e6)

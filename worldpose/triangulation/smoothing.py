@@ -8,14 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
+from data_contracts.keypoints import TrackedDetections
 from worldpose.geometry import Camera
 from worldpose.triangulation.left_right_swaps import undo_swaps
 from worldpose.triangulation.motion_model import MotionModel, choose_stretches, learn_motion
-from worldpose.triangulation.observations import Rig, person_observations
+from worldpose.triangulation.observations import Rig, observe_person
 from worldpose.triangulation.reports import Changes, Histogram, SmoothingReport
 from worldpose.triangulation.robust import Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.track_solver import solve_segment
+from worldpose.triangulation.track_solver import TrackCosts, solve_segment
 
 
 @dataclass(frozen=True)
@@ -44,9 +45,7 @@ class Smoothing:
 
 def smooth_joints(
     cameras: Camera,
-    keypoints: NDArray[np.floating],
-    confidence: NDArray[np.floating],
-    detection_index: NDArray[np.int16],
+    detections: TrackedDetections,
     raw: Triangulation,
     fps: float,
     settings: TriangulationSettings,
@@ -60,40 +59,36 @@ def smooth_joints(
 
     Args:
         cameras: batch (cameras,).
-        keypoints: (frames, cameras, detections, 17, 2) [px].
-        confidence: (frames, cameras, detections, 17).
-        detection_index: (frames, cameras, persons).
-        raw: triangulation of the same arrays; its noise, offsets and left-right swaps are used.
+        detections: of all tracked people.
+        raw: triangulation of the same detections; its noise, offsets and left-right swaps are used.
         fps: frames per second [1/s].
         settings: noise and the longest gap.
         motion: motion prior of the clip of these frames; None = these frames are the clip.
         core: frames to return; the others only support them.
     """
-    rig = Rig.of(cameras)
-    keypoints, confidence = undo_swaps(keypoints, confidence, detection_index, raw.exchanged)
-    precision = raw.noise.precision(confidence)
+    rig = Rig.from_cameras(cameras)
+    detections = undo_swaps(detections, raw.exchanged)
+    precision = raw.noise.precision(detections.confidence)
     joints, covariance = np.full_like(raw.joints, np.nan), np.full_like(raw.covariance, np.nan)
-    arrays = (keypoints, precision, detection_index, raw.offsets)
     if motion is None:
         chosen = choose_stretches(np.asarray(raw.views.any(axis=-1)), fps)
-        stretches = (
-            (*person_observations(arrays, person, part), raw.joints[part, person])
+        tracks = (
+            observe_person(detections, precision, raw.offsets, raw.joints, person, part)
             for person, part in chosen
         )
-        motion = learn_motion(rig, stretches, raw.joints.shape[2], fps, settings)
+        motion = learn_motion(rig, tracks, raw.joints.shape[2], fps, settings)
     penalty = (fps**2 / motion.acceleration) ** 2
     gap = round(settings.max_gap * fps)
     limit = settings.max_deviation**2
     for person in range(raw.joints.shape[1]):
-        pixels, weights = person_observations(arrays, person)
-        weights = weights / motion.repeated
+        track = observe_person(detections, precision, raw.offsets, raw.joints, person)
+        weights = track.precision / motion.repeated
         for joint in range(raw.joints.shape[2]):
             given = raw.joints[:, person, joint]
+            costs = TrackCosts(settings.noise, limit, float(penalty[joint]))
             for part in segments(np.isfinite(given[:, 0]), gap):
-                x, c = solve_segment(
-                    *(pixels[joint, :, part], weights[joint, :, part], given[part], rig),
-                    *(settings.noise, limit, float(penalty[joint])),
-                )
+                pixels = track.pixels[joint, :, part]
+                x, c = solve_segment(pixels, weights[joint, :, part], given[part], rig, costs)
                 # One gross error must not spoil a whole track.
                 good = np.isfinite(x).all() and np.isfinite(c).all()
                 joints[part, person, joint] = x if good else given[part]

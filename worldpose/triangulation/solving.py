@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +21,11 @@ from worldpose.triangulation.batched_gauss_newton import (
     measure,
 )
 from worldpose.triangulation.consensus import consensus
-from worldpose.triangulation.observations import Rig, gather, linearize
+from worldpose.triangulation.observations import Observations, gather, linearize
 from worldpose.triangulation.settings import TriangulationSettings
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
+class Solution(NamedTuple):
     """Joints with covariance and inliers; the arrays are those of `Triangulation`.
 
     Attributes:
@@ -42,33 +41,15 @@ class Solution:
     seen: NDArray[np.bool_]
 
 
-def no_shift() -> Floats:
-    """Return the empty shift, which moves no observation."""
-    return np.zeros((0, 0, 0, 3))
-
-
-def solve(
-    rig: Rig,
-    keypoints: NDArray[np.floating],
-    precision: Floats,
-    index: NDArray[np.integer],
-    shift: Floats,
-    settings: TriangulationSettings,
-) -> Solution:
-    """Return the joints of one clip, with covariance from `precision` and the stated noise.
+def solve_joints(observations: Observations, settings: TriangulationSettings) -> Solution:
+    """Return the joints of all frames, with covariance from `precision` and the stated noise.
 
     Args:
-        rig: the cameras.
-        keypoints: (frames, cameras, detections, joints, 2) [px].
-        precision: (frames, cameras, detections, joints), inverse of the factor on the stated
-            variance; 0 or NaN = no observation.
-        index: (frames, cameras, persons), index of the detection; -1 = not seen.
-        shift: (frames, cameras, persons, 3), subtracted from pixels [px], and additional variance
-            [px^2]; `no_shift()` for none.
+        observations: of all tracked people.
         settings: noise, inlier limit and minimum views.
     """
-    frames, count, persons = index.shape
-    shape = (frames, persons, precision.shape[-1])
+    frames, count, persons = observations.detection_index.shape
+    shape = (frames, persons, observations.precision.shape[-1])
     solution = Solution(
         joints=np.full((*shape, 3), np.nan),
         covariance=np.full((*shape, 3, 3), np.nan),
@@ -79,39 +60,31 @@ def solve(
         seen=np.zeros((frames, count, *shape[1:]), np.bool_),
     )
     _solve_all(
-        *(keypoints, precision, index, shift, rig.cameras, rig.depths, rig.centers),
+        observations,
         settings.noise,
         settings.max_deviation**2,
         settings.min_views,
         math.sin(settings.min_angle),
-        *(solution.joints, solution.covariance, solution.views, solution.spread),
-        *(solution.reprojection_error, solution.inliers, solution.seen),
+        solution,
     )
     return solution
 
 
 @compiled
 def _solve_all(
-    keypoints: NDArray[np.floating],
-    precision: NDArray[np.floating],
-    index: NDArray[np.integer],
-    shift: Floats,
-    cameras: Floats,
-    depths: Floats,
-    centers: Floats,
+    observations: Observations,
     noise: tuple[float, float],
     limit: float,
     min_views: int,
     min_sine: float,
-    joints: Floats,
-    covariance: Floats,
-    views: NDArray[np.uint8],
-    spread: NDArray[np.float32],
-    error: NDArray[np.float32],
-    inliers: NDArray[np.bool_],
-    seen: NDArray[np.bool_],
+    solution: Solution,
 ) -> None:
-    """Solve tile by tile and write `joints` and all arguments after it."""
+    """Solve tile by tile and write the arrays of `solution`."""
+    precision, index = observations.precision, observations.detection_index
+    cameras, depths, centers = observations.cameras, observations.depths, observations.centers
+    joints, covariance, views = solution.joints, solution.covariance, solution.views
+    spread, error = solution.spread, solution.reprojection_error
+    inliers, seen = solution.inliers, solution.seen
     frames, count, persons = index.shape
     joint_count = precision.shape[3]
     tiles, rays = np.empty((count, ROWS * LANES)), np.empty((count, 3 * LANES))
@@ -120,7 +93,7 @@ def _solve_all(
     agrees = np.empty((2, LANES), np.bool_)
     total = frames * persons * joint_count
     for first in range(0, total, LANES):
-        gather(keypoints, precision, index, shift, first, cameras, tiles)
+        gather(observations, first, tiles)
         for camera in range(count):
             linearize(tiles[camera], cameras[camera])
         consensus(tiles, depths, noise, limit, state)

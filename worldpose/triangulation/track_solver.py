@@ -8,10 +8,9 @@ frames before.
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from worldpose.compiled import compiled
@@ -29,7 +28,7 @@ from worldpose.triangulation.batched_gauss_newton import (
     accumulate,
     clear,
 )
-from worldpose.triangulation.observations import Rig, gather, linearize
+from worldpose.triangulation.observations import Observations, Rig, gather, linearize
 
 BAND: Final = 6
 MAX_STEPS: Final = 12
@@ -37,14 +36,26 @@ CONVERGED: Final = 1e-4
 """Largest step of a coordinate that ends the iteration [m]: a hundredth of the noise."""
 
 
+class TrackCosts(NamedTuple):
+    """Weights of errors of observations and of accelerations.
+
+    Attributes:
+        noise: of observations, [px] and [m].
+        limit: scale of the Geman-McClure loss of observations [variances].
+        penalty: on squared second differences [1/m^2].
+    """
+
+    noise: tuple[float, float]
+    limit: float
+    penalty: float
+
+
 def solve_segment(
     pixels: Floats,
     weights: Floats,
     given: Floats,
     rig: Rig,
-    noise: tuple[float, float],
-    limit: float,
-    penalty: float,
+    costs: TrackCosts,
 ) -> tuple[Floats, Floats]:
     """Return a joint's points (frames, 3) [m] and covariance (frames, 3, 3) [m^2] over time.
 
@@ -54,62 +65,56 @@ def solve_segment(
             observation.
         given: (frames, 3) [m], initial points; the first and last frame are not NaN.
         rig: the cameras.
-        noise: [px], [m].
-        limit: scale of the Geman-McClure loss of observations [variances].
-        penalty: on squared second differences [1/m^2].
+        costs: weights of the two kinds of errors.
     """
     frames = np.arange(len(given))
     known = np.isfinite(given[:, 0])
     columns = [np.interp(frames, frames[known], column[known]) for column in given.T]
     points = np.stack(columns, axis=-1)
     covariance = np.empty((len(points), 3, 3))
-    tiles = prepare(pixels, weights, rig.cameras)
-    _solve(tiles, rig.depths, noise, limit, penalty, points, covariance)
+    tiles = prepare_tiles(pixels, weights, rig)
+    _solve_track(tiles, rig.depths, costs, points, covariance)
     return points, covariance
 
 
-def prepare(pixels: Floats, weights: Floats, cameras: Floats) -> Floats:
+def prepare_tiles(pixels: Floats, weights: Floats, rig: Rig) -> Floats:
     """Return tiles of one joint's observations, one lane per frame; all are used."""
     count, frames = weights.shape
     tiles = np.empty((-(-frames // LANES), count, ROWS * LANES))
     index = np.zeros((1, count, 1), np.int64)
     shape = (1, count, 1, frames)
-    _prepare(pixels.reshape(*shape, 2), weights.reshape(shape), index, cameras, tiles)
+    image = pixels.reshape(1, count, 1, frames, 2)
+    _write_tiles(Observations.from_rig(rig, image, weights.reshape(shape), index), tiles)
     return tiles
 
 
 @compiled
-def _prepare(
-    pixels: Floats, weights: Floats, index: NDArray[np.int64], cameras: Floats, tiles: Floats
-) -> None:
-    none = np.zeros((0, 0, 0, 3))
+def _write_tiles(observations: Observations, tiles: Floats) -> None:
+    """Write the tiles of a track's observations (one frame, one person, a "joint" per frame)."""
+    cameras = observations.cameras
     for part in range(len(tiles)):
-        gather(pixels, weights, index, none, part * LANES, cameras, tiles[part])
+        gather(observations, part * LANES, tiles[part])
         for camera in range(len(cameras)):
             linearize(tiles[part, camera], cameras[camera])
             tiles[part, camera, USED : USED + LANES] = 1.0
 
 
 @compiled
-def _solve(
+def _solve_track(
     tiles: Floats,
     depths: Floats,
-    noise: tuple[float, float],
-    limit: float,
-    penalty: float,
+    costs: TrackCosts,
     points: Floats,
     covariance: Floats,
 ) -> None:
     """Minimize reprojection errors and the acceleration penalty over the points of a track.
 
-    Observations have a Geman-McClure loss of scale `limit`.
+    Observations have a Geman-McClure loss of scale `costs.limit`.
 
     Args:
-        tiles: of `prepare`.
+        tiles: of `prepare_tiles`.
         depths: (cameras, 4).
-        noise: [px], [m].
-        limit: [variances].
-        penalty: on squared second differences [1/m^2].
+        costs: weights of errors.
         points: (frames, 3) [m], initial values; written.
         covariance: (frames, 3, 3) [m^2], written.
     """
@@ -118,7 +123,7 @@ def _solve(
     band, right = np.empty((size, BAND + 1)), np.empty(size)
     state = np.empty(STATE * LANES)
     for _ in range(MAX_STEPS):
-        _equations(tiles, depths, noise, limit, penalty, points, state, band, right)
+        _write_equations(tiles, depths, costs, points, state, band, right)
         _factorize(band)
         _substitute(band, right)
         largest = 0.0
@@ -166,18 +171,17 @@ def _place(points: Floats, part: int, state: Floats) -> None:
 
 
 @compiled
-def _equations(
+def _write_equations(
     tiles: Floats,
     depths: Floats,
-    noise: tuple[float, float],
-    limit: float,
-    penalty: float,
+    costs: TrackCosts,
     points: Floats,
     state: Floats,
     band: Floats,
     right: Floats,
 ) -> None:
     """Write the Gauss-Newton matrix by rows, `band[i, k]` = entry (i, i - k), and right side."""
+    noise, limit, penalty = costs.noise, costs.limit, costs.penalty
     frames = len(points)
     band[:] = 0.0
     for part in range(len(tiles)):

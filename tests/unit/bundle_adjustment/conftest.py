@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from data_contracts.keypoints import TrackedDetections
 from worldpose.bundle_adjustment import Clicks, Clip, Problem
 from worldpose.geometry import Camera, Rigid
 from worldpose.simulation.stadium import looking
@@ -94,7 +95,7 @@ def clip():
         keypoints = np.ascontiguousarray(keypoints.swapaxes(0, 1))
         index = np.broadcast_to(np.arange(persons), (frames, cameras, persons)).astype(np.int16)
         confidence = np.ones(keypoints.shape[:-1])
-        placed = triangulate_joints(base, keypoints, confidence, index, STATED)
+        placed = triangulate_joints(base, TrackedDetections(keypoints, confidence, index), STATED)
         clicks = []
         for c in range(cameras):
             points = rng.uniform([-18.0, -18.0, 0.0], [18.0, 18.0, 0.3], (clicked, 3))

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from data_contracts.keypoints import TrackedDetections
 from worldpose.bundle_adjustment import Clicks, Clip
 from worldpose.geometry import Camera, Rigid
 from worldpose.static_calibration import stepped
@@ -146,7 +147,7 @@ def make_lab(
     index = np.broadcast_to(np.arange(persons), (frames, cameras, persons)).astype(np.int16)
     confidence = np.where(np.isfinite(keypoints[..., 0]), 0.8, np.nan)
     settings = TriangulationSettings()
-    placed = triangulate_joints(given, keypoints, confidence, index, settings)
+    placed = triangulate_joints(given, TrackedDetections(keypoints, confidence, index), settings)
     clip = Clip(
         cameras=given,
         covariance=np.zeros((cameras, 12, 12)),
@@ -168,7 +169,9 @@ def triangulated(lab, cameras, covariance=None):
     clip = lab.clip
     index = clip.detection_index.astype(np.int16)
     arrays = (clip.keypoints, clip.confidence, index)
-    return triangulate_joints(cameras, *arrays, clip.triangulation, covariance).joints
+    return triangulate_joints(
+        cameras, TrackedDetections(*arrays), clip.triangulation, covariance
+    ).joints
 
 
 def joint_error(lab, joints, aligned=False):

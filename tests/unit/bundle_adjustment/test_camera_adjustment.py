@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from data_contracts.keypoints import TrackedDetections
 from worldpose.bundle_adjustment import (
     BundleAdjustmentSettings,
     Clicks,
@@ -95,8 +96,9 @@ def test_given_cameras_are_adjusted_as_far_as_their_prior_lets_them(clip):
     step[:, 3:] = 0.0
     given = replace(made, cameras=stepped(true, step), covariance=np.zeros_like(made.covariance))
     index = made.detection_index.astype(np.int16)
-    arrays = (made.keypoints, made.confidence, index, made.triangulation)
-    given = replace(given, joints=triangulate_joints(given.cameras, *arrays).joints)
+    detections = TrackedDetections(made.keypoints, made.confidence, index)
+    placed = triangulate_joints(given.cameras, detections, made.triangulation)
+    given = replace(given, joints=placed.joints)
     adjusted = adjust_cameras(given, QUICK)
     assert adjusted.accepted.all()
     np.testing.assert_array_equal(adjusted.cameras.principal_point, given.cameras.principal_point)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from data_contracts.keypoints import TrackedDetections
 from worldpose.bundle_adjustment import BundleAdjustmentSettings, adjust_cameras
 from worldpose.bundle_adjustment.held_out_validation import compare_errors, held_out_errors
 from worldpose.static_calibration import stepped
@@ -78,9 +79,8 @@ def errors(cameras, true):
 def placed_again(clip):
     """The clip with its people triangulated with the cameras that it has now."""
     index = clip.detection_index.astype(np.int16)
-    placed = triangulate_joints(
-        clip.cameras, clip.keypoints, clip.confidence, index, clip.triangulation
-    )
+    detections = TrackedDetections(clip.keypoints, clip.confidence, index)
+    placed = triangulate_joints(clip.cameras, detections, clip.triangulation)
     return replace(clip, joints=placed.joints, views=placed.views.astype(np.int64))
 
 

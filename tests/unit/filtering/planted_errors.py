@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldpose.filtering import Suspects, perceived_joints, view_bodies
+from worldpose.filtering import TriangulatedDetections, perceived_joints, view_bodies
 from worldpose.geometry import Camera
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
@@ -29,7 +29,7 @@ class Planted:
     cameras: Camera
     joints: np.ndarray
     views: object
-    suspects: Suspects
+    suspects: TriangulatedDetections
     displaced: np.ndarray
     person: np.ndarray
 
@@ -52,7 +52,7 @@ def plant(seed, scenario="tiny", duration=0.8, displaced=0.06):
         cameras,
         scene.truth.joints,
         view_bodies(cameras, perceived_joints(joints, np.zeros((17, 3))), covariance),
-        Suspects(
+        TriangulatedDetections(
             seen.keypoints,
             seen.confidence,
             index,

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from planted_errors import plant
 
+from data_contracts.keypoints import TrackedDetections
 from worldpose.filtering import measure_held_out
 from worldpose.filtering.held_out import FARTHEST
 from worldpose.triangulation import TriangulationSettings
@@ -18,11 +19,10 @@ def scene():
 
 def measured(scene, index=None, used=None):
     suspects = scene.suspects
-    used = (suspects.keypoints, suspects.confidence) if used is None else used
+    keypoints, confidence = (suspects.keypoints, suspects.confidence) if used is None else used
     index = suspects.index if index is None else index
-    return measure_held_out(
-        scene.cameras, used, suspects.keypoints, index.astype(np.int16), SETTINGS
-    )
+    detections = TrackedDetections(keypoints, confidence, index.astype(np.int16))
+    return measure_held_out(scene.cameras, detections, suspects.keypoints, SETTINGS)
 
 
 def test_people_who_are_not_followed_make_it_worse_though_nothing_contradicts_them(scene):
@@ -52,8 +52,8 @@ def test_what_nobody_foresees_counts_as_the_farthest(scene):
 def test_without_keypoints_there_is_nothing_to_foresee(scene):
     nothing = np.full_like(scene.suspects.keypoints, np.nan)
     index = scene.suspects.index.astype(np.int16)
-    used = (nothing, nothing[..., 0])
-    assert measure_held_out(scene.cameras, used, nothing, index, SETTINGS) is None
+    used = TrackedDetections(nothing, nothing[..., 0], index)
+    assert measure_held_out(scene.cameras, used, nothing, SETTINGS) is None
 
 
 def test_a_clip_without_anybody_is_as_badly_foreseen_as_can_be(scene):
@@ -65,9 +65,12 @@ def test_left_out_cameras_judge_only_where_enough_others_are_left(scene, count, 
     suspects, some = scene.suspects, slice(count)
     found = measure_held_out(
         scene.cameras[some],
-        (suspects.keypoints[:, some], suspects.confidence[:, some]),
+        TrackedDetections(
+            suspects.keypoints[:, some],
+            suspects.confidence[:, some],
+            suspects.index[:, some].astype(np.int16),
+        ),
         suspects.keypoints[:, some],
-        suspects.index[:, some].astype(np.int16),
         TriangulationSettings(min_views=least),
     )
     assert (found is not None) == judges

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from planted_errors import plant
 
-from worldpose.filtering import FilteringSettings, judge_detections, learn_from
+from worldpose.filtering import FilteringSettings, judge_detections, learn_keypoint_spread
 
 SETTINGS = FilteringSettings()
 
@@ -18,7 +18,7 @@ def scene():
 
 def judged(scene, **changes):
     suspects = replace(scene.suspects, **changes)
-    spread = learn_from(scene.views, suspects)
+    spread = learn_keypoint_spread(scene.views, suspects)
     return judge_detections(scene.views, suspects, spread, SETTINGS)
 
 
@@ -102,7 +102,7 @@ def test_a_body_upside_down_has_the_distance_but_not_the_similarity(scene):
 def test_sides_that_were_put_right_are_no_contradiction(scene):
     frame, camera, person = 6, 3, 0
     place = scene.suspects.index[frame, camera, person]
-    honest = judged(scene).surprise[frame, camera, place]
+    honest = judged(scene).mahalanobis_distance[frame, camera, place]
     left_right = [0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15]
     keypoints, confidence = scene.suspects.keypoints.copy(), scene.suspects.confidence.copy()
     for array in (keypoints, confidence):
@@ -111,14 +111,16 @@ def test_sides_that_were_put_right_are_no_contradiction(scene):
     exchanged[frame, camera, person] = True
     found = judged(scene, keypoints=keypoints, confidence=confidence, exchanged=exchanged)
     # Each keypoint keeps its verdict at the place where the detector put it.
-    np.testing.assert_allclose(found.surprise[frame, camera, place], honest[left_right], rtol=1e-3)
+    np.testing.assert_allclose(
+        found.mahalanobis_distance[frame, camera, place], honest[left_right], rtol=1e-3
+    )
 
 
 def test_a_person_without_a_body_is_not_judged(scene):
     gone = 2
     views = replace(scene.views, image=scene.views.image.copy())
     views.image[:, :, gone] = np.nan
-    spread = learn_from(scene.views, scene.suspects)
+    spread = learn_keypoint_spread(scene.views, scene.suspects)
     found = judge_detections(views, scene.suspects, spread, SETTINGS)
     his = scene.person == gone
     assert his.any()
@@ -148,6 +150,6 @@ def test_without_anybody_boxes_are_nobody_s_and_none_is_rejected(scene):
         scene.views,
         **{name: getattr(scene.views, name)[:, :, :0] for name in ("image", "variance", "scale")},
     )
-    found = judge_detections(views, nobody, learn_from(views, nobody), SETTINGS)
+    found = judge_detections(views, nobody, learn_keypoint_spread(views, nobody), SETTINGS)
     assert (found.fits == -1).all()
     assert not found.rejected.any() and not found.dropped.any()

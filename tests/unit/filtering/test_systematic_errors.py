@@ -7,10 +7,10 @@ import pytest
 from planted_errors import plant
 
 from data_contracts.conventions import COCO17
-from worldpose.filtering import FilteringSettings, judge_detections, learn_from
-from worldpose.filtering.clock_offsets import ClockEquations
+from worldpose.filtering import FilteringSettings, judge_detections, learn_keypoint_spread
 from worldpose.filtering.residuals import Residuals
 from worldpose.filtering.systematic_errors import (
+    ClockEquations,
     SystematicErrors,
     learn_systematic_errors,
     watch_motion,
@@ -86,32 +86,37 @@ def missed_by(scene, late, noise=0.5):
         each.project(joints.reshape(len(joints), 1, -1, 3)).reshape(shape)
         for each in (cameras, moved)
     )
-    seen = seen + late[:, None, None, None] * motion.way + noise * rng.normal(size=shape)
+    seen = seen + late[:, None, None, None] * motion.image_motion + noise * rng.normal(size=shape)
     frame, camera, person = np.nonzero(np.isfinite(seen[..., 0, 0]))
     at = frame, camera, person
     missed = (seen - foreseen)[at]
     variance = np.full(missed.shape[:2], noise**2)
-    return moved, joints, motion.way[at], Residuals(*at, missed, variance, 1.0)
+    return moved, joints, motion.image_motion[at], Residuals(*at, missed, variance, 1.0)
 
 
 def test_clocks_are_told_from_the_places_of_cameras(scene):
     late = np.array([0.4, -0.3, 0.1, -0.5, 0.3, 0.0])
     *bodies, misses = missed_by(scene, late)
-    found = ClockEquations.of(*bodies, misses).learn_lateness(misses)
+    found = ClockEquations.from_residuals(*bodies, misses).learn_clock_offsets(misses)
     # Six cameras over 0.6 s, five people: some hundredths of a frame.
     np.testing.assert_allclose(found, late - late.mean(), atol=0.06)
 
 
 def test_exact_clocks_come_out_equal(scene):
     *bodies, misses = missed_by(scene, np.zeros(6))
-    assert np.abs(ClockEquations.of(*bodies, misses).learn_lateness(misses)).max() < 0.03
+    assert (
+        np.abs(ClockEquations.from_residuals(*bodies, misses).learn_clock_offsets(misses)).max()
+        < 0.03
+    )
 
 
 def test_equations_of_clocks_hold_for_what_is_left_of_the_misses(scene):
     *bodies, misses = missed_by(scene, np.array([0.4, -0.3, 0.1, -0.5, 0.3, 0.0]))
     left = misses.less(0.3 * bodies[-1])
-    found = ClockEquations.of(*bodies, misses).learn_lateness(left)
-    np.testing.assert_array_equal(found, ClockEquations.of(*bodies, left).learn_lateness(left))
+    found = ClockEquations.from_residuals(*bodies, misses).learn_clock_offsets(left)
+    np.testing.assert_array_equal(
+        found, ClockEquations.from_residuals(*bodies, left).learn_clock_offsets(left)
+    )
 
 
 def with_a_late_camera(scene, frames, held):
@@ -124,7 +129,7 @@ def with_a_late_camera(scene, frames, held):
     late = np.array([0.0, frames, 0.0, 0.0, 0.0, 0.0])
     at = np.nonzero(scene.suspects.index >= 0)
     keypoints = scene.suspects.keypoints.copy()
-    shift = late[:, None, None, None] * motion.way
+    shift = late[:, None, None, None] * motion.image_motion
     keypoints[(*at[:2], scene.suspects.index[at])] += shift[at]
     offsets = held * np.nan_to_num(shift.mean(axis=-2))
     suspects = replace(scene.suspects, keypoints=keypoints, offsets=offsets)
@@ -139,9 +144,9 @@ def test_a_late_clock_is_learned_beside_sides_and_its_shift_brings_keypoints_bac
     # What leans to the sides' account, or to the clocks', leaves less than a tenth of a frame.
     late = true.late - true.late.mean()
     np.testing.assert_allclose(systematic.late - systematic.late.mean(), late, atol=0.07)
-    right = suspects.without(systematic.shift(motion, scene.views))
+    right = suspects.subtract(systematic.shift(motion, scene.views))
     exact = replace(systematic, late=np.zeros(6)).shift(motion, scene.views)
-    on_time = scene.suspects.without(exact).keypoints
+    on_time = scene.suspects.subtract(exact).keypoints
     at = np.nonzero(scene.suspects.index >= 0)
     place = (*at[:2], scene.suspects.index[at])
     here = at[1] == 1
@@ -151,26 +156,26 @@ def test_a_late_clock_is_learned_beside_sides_and_its_shift_brings_keypoints_bac
         return np.linalg.norm((found - on_time)[place][here][honest], axis=-1)
 
     assert np.nanmean(beside(right.keypoints)) < 0.4 * np.nanmean(
-        beside(suspects.without(exact).keypoints)
+        beside(suspects.subtract(exact).keypoints)
     )
 
 
 def test_a_clock_in_the_offsets_is_not_taken_off_twice():
     scene = plant(31, duration=2.0)
     systematic, motion, suspects = with_a_late_camera(scene, 0.8, held=0.7)
-    held = systematic.late_in_offsets(suspects.offsets, motion)
+    held = systematic.clock_offsets_in(suspects.offsets, motion)
     np.testing.assert_allclose(held, 0.7 * systematic.late, atol=1e-9)
     shift = systematic.shift(motion, scene.views)
     honest = ~scene.displaced[:, 1]
 
     def rejected(suspects):
-        right = suspects.without(shift)
-        spread = learn_from(scene.views, right)
+        right = suspects.subtract(shift)
+        spread = learn_keypoint_spread(scene.views, right)
         judged = judge_detections(scene.views, right, spread, FilteringSettings())
         return judged.rejected[:, 1][honest].mean()
 
     twice = rejected(suspects)
-    once = rejected(suspects.less_clocks(held, motion.way))
+    once = rejected(suspects.subtract_clock_offsets(held, motion.image_motion))
     on_time = rejected(replace(suspects, offsets=np.zeros_like(suspects.offsets)))
     assert once == pytest.approx(on_time, abs=1e-3)
     assert twice > 1.5 * once
@@ -179,7 +184,7 @@ def test_a_clock_in_the_offsets_is_not_taken_off_twice():
 @pytest.mark.parametrize(("held", "share"), [(-0.4, 0.0), (1.7, 1.0)])
 def test_no_more_is_of_clocks_in_offsets_than_cameras_are_late(scene, held, share):
     systematic, motion, suspects = with_a_late_camera(scene, -0.5, held)
-    found = systematic.late_in_offsets(suspects.offsets, motion)
+    found = systematic.clock_offsets_in(suspects.offsets, motion)
     np.testing.assert_allclose(found, share * systematic.late, atol=1e-9)
 
 
@@ -191,10 +196,10 @@ def test_shifts_go_with_the_joint_that_a_keypoint_is(scene):
     suspects = replace(suspects, exchanged=exchanged)
     shift = np.full((*suspects.index.shape, 17, 2), np.nan)
     shift[frame, camera, person] = np.arange(34.0).reshape(17, 2)
-    found = suspects.by_detection(shift)
+    found = suspects.assign_to_detections(shift)
     own = found[frame, camera, suspects.index[frame, camera, person]]
     left, right = COCO17.index("left_hip"), COCO17.index("right_hip")
     np.testing.assert_array_equal(own[left], [2.0 * right, 2.0 * right + 1.0])
     assert np.count_nonzero(found.any(axis=(-1, -2))) == 1
-    kept = suspects.without(shift).keypoints
+    kept = suspects.subtract(shift).keypoints
     np.testing.assert_allclose(kept, suspects.keypoints - found)

@@ -5,7 +5,7 @@ import pytest
 from worldpose.triangulation import batched_gauss_newton
 from worldpose.triangulation.batched_gauss_newton import LANES, ROWS, STATE
 from worldpose.triangulation.consensus import consensus
-from worldpose.triangulation.observations import Rig, gather, linearize
+from worldpose.triangulation.observations import Observations, Rig, gather, linearize
 
 POINT = np.array([0.7, -1.1, 1.3])
 NOISE = (2.0, 0.0)
@@ -18,10 +18,10 @@ def tiles_of(camera, image, confidence=None):
     precision = np.ones((1, count, 1, LANES))
     if confidence is not None:
         precision *= np.array(confidence)[:, None, None]
-    rig = Rig.of(camera)
+    rig = Rig.from_cameras(camera)
     tiles = np.empty((count, ROWS * LANES))
     index = np.zeros((1, count, 1), np.int64)
-    gather(keypoints, precision, index, np.zeros((0, 0, 0, 3)), 0, rig.cameras, tiles)
+    gather(Observations.from_rig(rig, keypoints, precision, index), 0, tiles)
     for tile, one in zip(tiles, rig.cameras, strict=True):
         linearize(tile, one)
     return rig, tiles

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from running_samples import FPS, MIRRORED, detections, runner
 
+from data_contracts.keypoints import TrackedDetections
 from worldpose.triangulation import (
     ClipDetections,
     TriangulationSettings,
@@ -45,7 +46,7 @@ def clip(ring):
 
 def test_parts_give_what_the_whole_clip_gives(clip):
     camera, arrays = clip
-    whole = reconstruct_joints(camera, *arrays, FPS, SETTINGS)
+    whole = reconstruct_joints(camera, TrackedDetections(*arrays), FPS, SETTINGS)
     model, seen = learn_clip(camera, ClipDetections(*arrays), FPS, SETTINGS)
     parts = list(reconstruct_chunks(camera, seen, model, FPS, SETTINGS, length=128))
     assert [(part.frames.start, part.frames.stop) for part in parts] == [
@@ -70,7 +71,7 @@ def test_parts_give_what_the_whole_clip_gives(clip):
 
 def test_reports_of_parts_add_up_to_the_clip_s(clip):
     camera, arrays = clip
-    whole = reconstruct_joints(camera, *arrays, FPS, SETTINGS)
+    whole = reconstruct_joints(camera, TrackedDetections(*arrays), FPS, SETTINGS)
     model, seen = learn_clip(camera, ClipDetections(*arrays), FPS, SETTINGS)
     parts = list(reconstruct_chunks(camera, seen, model, FPS, SETTINGS, length=128))
     agreement = reduce(add, [part.triangulation.agreement for part in parts])
@@ -97,7 +98,7 @@ def test_no_more_than_a_part_and_its_margins_is_read_at_once(clip):
 def test_parts_with_corrected_clocks_are_those_of_the_whole_clip(clip):
     camera, arrays = clip
     settings = SETTINGS.model_copy(update={"correct_clocks": True, "clock_error": 10.0})
-    whole = reconstruct_joints(camera, *arrays, FPS, settings)
+    whole = reconstruct_joints(camera, TrackedDetections(*arrays), FPS, settings)
     model, seen = learn_clip(camera, ClipDetections(*arrays), FPS, settings)
     assert model.clocks.determined.all()
     parts = list(reconstruct_chunks(camera, seen, model, FPS, settings, length=128))

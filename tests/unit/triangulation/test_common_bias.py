@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from worldpose.triangulation.common_bias import (
+from worldpose.triangulation.noise_model import (
     BY_JOINT,
     PROPORTIONS,
     STATURE,

@@ -3,6 +3,7 @@ import pytest
 from running_samples import FPS, MIRRORED, detections, runner
 
 from data_contracts.conventions import COCO17
+from data_contracts.keypoints import TrackedDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.geometry import Camera, Rigid
 from worldpose.triangulation import (
@@ -12,8 +13,8 @@ from worldpose.triangulation import (
     unswap,
 )
 from worldpose.triangulation.left_right_swaps import find_swaps
-from worldpose.triangulation.observations import Rig
-from worldpose.triangulation.solving import Solution, no_shift
+from worldpose.triangulation.observations import Observations, Rig
+from worldpose.triangulation.solving import Solution
 
 SETTINGS = TriangulationSettings(learn_noise=False, offsets="none")
 FACE, ARMS, LEGS = range(len(EXCHANGED_PARTS))
@@ -41,7 +42,7 @@ def test_parts_have_every_joint_with_a_side_once():
 
 def test_exchanged_sides_are_found_named_and_put_right(clip):
     camera, (keypoints, confidence, index) = clip
-    expected = triangulate_joints(camera, keypoints, confidence, index, SETTINGS)
+    expected = triangulate_joints(camera, TrackedDetections(keypoints, confidence, index), SETTINGS)
     assert not expected.exchanged.any()
     wrong, truth = keypoints.copy(), np.zeros_like(expected.exchanged)
     wrong[3:7, 1, 0] = exchanged(keypoints[3:7, 1, 0])
@@ -49,7 +50,7 @@ def test_exchanged_sides_are_found_named_and_put_right(clip):
     legs = [joint for joint, name in enumerate(COCO17) if name[-4:] in ("_hip", "knee", "nkle")]
     wrong[5:9, 3, 1] = exchanged(keypoints[5:9, 3, 1], legs)
     truth[5:9, 3, 1, LEGS] = True
-    found = triangulate_joints(camera, wrong, confidence, index, SETTINGS)
+    found = triangulate_joints(camera, TrackedDetections(wrong, confidence, index), SETTINGS)
     np.testing.assert_array_equal(found.exchanged, truth)
     # The same observations: the same joints to the last step of the iteration.
     np.testing.assert_allclose(found.joints, expected.joints, atol=1e-6)
@@ -61,7 +62,7 @@ def test_exchanges_that_are_not_to_be_undone_are_rejected_views(clip):
     camera, (keypoints, confidence, index) = clip
     keypoints[:, 1] = exchanged(keypoints[:, 1])
     left = SETTINGS.model_copy(update={"undo_swaps": False})
-    found = triangulate_joints(camera, keypoints, confidence, index, left)
+    found = triangulate_joints(camera, TrackedDetections(keypoints, confidence, index), left)
     assert not found.exchanged.any()
     assert found.report.rejected_share[1] > 0.5
 
@@ -69,16 +70,18 @@ def test_exchanges_that_are_not_to_be_undone_are_rejected_views(clip):
 def test_noise_is_not_taken_for_an_exchange(ring):
     # 6 px are twice the stated noise here; odds of fifty to one leave a few in a thousand.
     arrays = detections(ring(5), runner(40), 6.0)
-    found = triangulate_joints(ring(5), *arrays, SETTINGS)
+    found = triangulate_joints(ring(5), TrackedDetections(*arrays), SETTINGS)
     assert found.exchanged.any(axis=-1).mean() < 0.01
 
 
 def test_smoothing_sees_the_sides_put_right(clip):
     camera, (keypoints, confidence, index) = clip
-    expected = reconstruct_joints(camera, keypoints, confidence, index, FPS, SETTINGS)
+    expected = reconstruct_joints(
+        camera, TrackedDetections(keypoints, confidence, index), FPS, SETTINGS
+    )
     wrong = keypoints.copy()
     wrong[3:7, 1, 0] = exchanged(keypoints[3:7, 1, 0])
-    found = reconstruct_joints(camera, wrong, confidence, index, FPS, SETTINGS)
+    found = reconstruct_joints(camera, TrackedDetections(wrong, confidence, index), FPS, SETTINGS)
     # The iteration ends at steps of 0.1 mm.
     np.testing.assert_allclose(found.smoothing.joints, expected.smoothing.joints, atol=2e-4)
 
@@ -87,7 +90,7 @@ def test_what_was_seen_is_put_right_as_triangulation_did(clip):
     camera, (keypoints, confidence, index) = clip
     wrong = keypoints.copy()
     wrong[3:7, 1, 0] = exchanged(keypoints[3:7, 1, 0])
-    found = triangulate_joints(camera, wrong, confidence, index, SETTINGS)
+    found = triangulate_joints(camera, TrackedDetections(wrong, confidence, index), SETTINGS)
     np.testing.assert_array_equal(unswap(wrong, index, found.exchanged), keypoints)
     nothing = np.zeros_like(found.exchanged)
     np.testing.assert_array_equal(unswap(wrong, index, nothing), wrong)
@@ -130,7 +133,7 @@ def test_an_exchange_needs_as_much_evidence_as_it_is_rare(aside, legs_fit, parts
         seen=np.ones((1, 1, 1, 17), np.bool_),
     )
     index, noise = np.zeros((1, 1, 1), np.int64), (1.0, 0.0)
-    seen = (Rig.of(camera), keypoints, precision, index, no_shift())
+    observed = Observations.from_rig(Rig.from_cameras(camera), keypoints, precision, index)
     # The square of how far it is off, less that with sides exchanged, neither beyond 25.
-    flags = find_swaps(*seen, noise, 25.0, found)
+    flags = find_swaps(observed, noise, 25.0, found)
     assert np.flatnonzero(flags).tolist() == parts

@@ -2,6 +2,7 @@
 
 A camera's calibration error moves all joints of a person by about the same vector in the image,
 because people are small. The vector is unknown and normal; its variance is that of calibration.
+The alternative of the paper shifts every image of a person so that the rays of the mid-hip meet.
 """
 
 from __future__ import annotations
@@ -14,7 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
+from data_contracts.conventions import COCO17
+from data_contracts.keypoints import TrackedDetections
 from worldpose.compiled import compiled
+from worldpose.geometry import Camera, projection
 from worldpose.triangulation.batched_gauss_newton import (
     EXTRA,
     LANES,
@@ -31,15 +35,80 @@ from worldpose.triangulation.batched_gauss_newton import (
     B,
     step,
 )
-from worldpose.triangulation.observations import Rig, gather, linearize
-from worldpose.triangulation.solving import Solution
+from worldpose.triangulation.noise_model import NoiseModel
+from worldpose.triangulation.observations import Observations, Rig, gather, linearize, no_shift
+from worldpose.triangulation.reports import Histogram
+from worldpose.triangulation.settings import TriangulationSettings
+from worldpose.triangulation.solving import Solution, solve_joints
 
+RADIAL = [0, 1, 4]
+"""k1, k2, k3 among the five coefficients."""
+HIPS = [COCO17.index("left_hip"), COCO17.index("right_hip")]
 ROUNDS: Final = 6
 """Updates of the variance factor; the last changes it by a few percent."""
 DAMPING: Final = 4.0
 """Weight of the factor before an update, in degrees of freedom."""
 LEAST: Final = 1e-3
 """Smallest variance factor."""
+
+
+@dataclass(frozen=True, eq=False)
+class StatedErrors:
+    """Variance of people's image positions caused by calibration errors.
+
+    Attributes:
+        variance: (frames, cameras, persons) per axis [px^2]; 0 where the position is unknown.
+        scale: (frames, cameras, persons) image scale there [px/m]; 0 where unknown.
+    """
+
+    variance: Floats
+    scale: Floats
+
+    def misplaced(self, factor: float) -> tuple[Histogram, ...]:
+        """Return the standard deviation at people [m], variance times `factor`, by camera."""
+        there = self.variance > 0.0
+        variance = np.where(there, self.variance, 0.0) / np.where(there, self.scale, 1.0) ** 2
+        root = np.sqrt(factor * variance)
+        return tuple(Histogram.of(root[:, c][there[:, c]]) for c in range(there.shape[1]))
+
+
+def stated_errors(
+    cameras: Camera,
+    joints: Floats,
+    settings: TriangulationSettings,
+    camera_covariance: Floats | None,
+) -> StatedErrors:
+    """Return the variance of each person's position in each image.
+
+    Args:
+        cameras: batch (cameras,).
+        joints: (frames, persons, joints, 3) [m], world; their mean is the person's position.
+        settings: `calibration_error` replaces a missing covariance.
+        camera_covariance: (cameras, 12, 12) of steps in the order of `PARAMETERS`, or None.
+    """
+    found = np.isfinite(joints[..., 0])
+    number = np.maximum(found.sum(axis=-1), 1)[..., None]
+    places = np.where(found[..., None], joints, 0.0).sum(axis=-2) / number
+    known = found.any(axis=-1)
+    pose = cameras.cam_from_world
+    shape = (len(joints), len(cameras.focal), joints.shape[1])
+    variance, scale = np.zeros(shape), np.zeros(shape)
+    for camera in range(shape[1]):
+        depth = places @ pose.rotation[camera, 2] + pose.translation[camera, 2]
+        # A missing camera sees no person.
+        before = known & (depth > 0.0) & bool(np.isfinite(cameras.focal[camera]).all())
+        size = np.sqrt(cameras.focal[camera].prod()) / np.where(before, depth, 1.0)
+        scale[:, camera] = np.where(before, size, 0.0)
+        if camera_covariance is None:
+            variance[:, camera] = (settings.calibration_error * scale[:, camera]) ** 2
+            continue
+        seen = cameras[camera].project_with_jacobians(places[before])
+        by_focal = (seen.d_intrinsics[..., :2] * cameras.focal[camera]).sum(-1, keepdims=True)
+        steps = (seen.d_pose, by_focal, seen.d_intrinsics[..., 2:], seen.d_distortion[..., RADIAL])
+        jacobian = np.concatenate(steps, axis=-1)
+        spread = np.einsum("nap,pq,naq->n", jacobian, camera_covariance[camera], jacobian) / 2.0
+        variance[:, camera][before] = np.where(np.isfinite(spread), spread, 0.0)
+    return StatedErrors(variance, scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,10 +126,7 @@ class Offsets:
 
 
 def learn_factor(
-    rig: Rig,
-    keypoints: NDArray[np.floating],
-    precision: Floats,
-    index: NDArray[np.integer],
+    observations: Observations,
     noise: tuple[float, float],
     first: Solution,
     stated: Floats,
@@ -75,9 +141,14 @@ def learn_factor(
     for _ in range(ROUNDS if known.any() else 0):
         offsets, variance = np.zeros((*stated.shape, 2)), np.zeros(stated.shape)
         _body_offsets(
-            *(keypoints, precision, index, rig.cameras, rig.depths, noise),
-            *(first.joints, first.inliers, factor * stated),
-            *(offsets, variance, np.empty((0, 0, 0, 3, 3))),
+            observations._replace(shift=no_shift()),
+            noise,
+            first.joints,
+            first.inliers,
+            factor * stated,
+            offsets,
+            variance,
+            np.empty((0, 0, 0, 3, 3)),
         )
         squares = np.where(known, (offsets**2).sum(axis=-1) / scale, 0.0).sum()
         # Degrees of freedom that the observations determine (MacKay 1992).
@@ -87,10 +158,7 @@ def learn_factor(
 
 
 def estimate_offsets(
-    rig: Rig,
-    keypoints: NDArray[np.floating],
-    precision: Floats,
-    index: NDArray[np.integer],
+    observations: Observations,
     noise: tuple[float, float],
     first: Solution,
     variance: Floats,
@@ -102,10 +170,7 @@ def estimate_offsets(
     that agree get none.
 
     Args:
-        rig: the cameras.
-        keypoints: (frames, cameras, detections, joints, 2) [px].
-        precision: (frames, cameras, detections, joints).
-        index: (frames, cameras, persons).
+        observations: of all tracked people; their shift is not used.
         noise: [px], [m].
         first: the joints without offsets.
         variance: (frames, cameras, persons) calibration variance per axis [px^2].
@@ -113,19 +178,56 @@ def estimate_offsets(
     offsets, unknown = np.zeros((*variance.shape, 2)), np.zeros(variance.shape)
     further = np.zeros((*first.joints.shape, 3))
     _body_offsets(
-        *(keypoints, precision, index, rig.cameras, rig.depths, noise),
-        *(first.joints, first.inliers, variance, offsets, unknown, further),
+        observations._replace(shift=no_shift()),
+        noise,
+        first.joints,
+        first.inliers,
+        variance,
+        offsets,
+        unknown,
+        further,
     )
     return Offsets(np.concatenate([offsets, np.zeros((*variance.shape, 1))], axis=-1), further)
 
 
+def estimate_midhip_shift(
+    rig: Rig, detections: TrackedDetections, settings: TriangulationSettings
+) -> Floats:
+    """Return the mid-hip residual of each person in each image, and a zero.
+
+    With the shift subtracted, reprojection residuals are those of the paper's second stage,
+    relative to the mid-hip. The shift is 0 in an image without both hips, and for a person without
+    a mid-hip.
+
+    Args:
+        rig: the cameras.
+        detections: of all tracked people.
+        settings: of triangulation.
+
+    Returns:
+        (frames, cameras, persons, 3) [px].
+    """
+    index = detections.index
+    middle = detections.keypoints[..., HIPS, :].mean(axis=-2, keepdims=True, dtype=np.float64)
+    sure = detections.confidence[..., HIPS].min(axis=-1, keepdims=True)
+    precision = NoiseModel.stated(1).precision(sure)
+    observed = Observations.from_rig(rig, middle, precision, index)
+    joints = solve_joints(observed, settings).joints[:, :, 0]
+    image = np.empty((len(rig.cameras), joints[..., 0].size, 2))
+    points = np.ascontiguousarray(np.broadcast_to(joints.reshape(1, -1, 3), (*image.shape[:2], 3)))
+    projection.project(rig.cameras, points, image)
+    image = image.reshape(-1, *joints.shape[:2], 2).swapaxes(0, 1)
+    place = np.maximum(index, 0).astype(np.int64)[..., None]
+    pixels = np.take_along_axis(middle[..., 0, :], place, axis=2)
+    there = (index >= 0) & (np.take_along_axis(precision[..., 0], place[..., 0], axis=2) > 0.0)
+    shift = np.where(there[..., None], pixels - image, 0.0)
+    shift = np.where(np.isfinite(shift), shift, 0.0)
+    return np.concatenate([shift, np.zeros((*index.shape, 1))], axis=-1)
+
+
 @compiled
 def _body_offsets(
-    keypoints: NDArray[np.floating],
-    precision: NDArray[np.floating],
-    index: NDArray[np.integer],
-    cameras: Floats,
-    depths: Floats,
+    observations: Observations,
     noise: tuple[float, float],
     joints: Floats,
     inliers: NDArray[np.bool_],
@@ -140,11 +242,7 @@ def _body_offsets(
     joints are eliminated (Schur complement), which leaves two unknowns per camera.
 
     Args:
-        keypoints: (frames, cameras, detections, joints, 2) [px].
-        precision: (frames, cameras, detections, joints).
-        index: (frames, cameras, persons).
-        cameras: (cameras, 22).
-        depths: (cameras, 4).
+        observations: of all tracked people, without a shift.
         noise: [px], [m].
         joints: (frames, persons, joints, 3) [m] solved without offsets.
         inliers: (frames, cameras, persons, joints).
@@ -154,18 +252,16 @@ def _body_offsets(
         further: (frames, persons, joints, 3, 3) [m^2], contribution of the offsets to the joints'
             covariance, written; no frames = not wanted.
     """
-    frames, count, persons = index.shape
-    joint_count = precision.shape[3]
-    none = np.zeros((0, 0, 0, 3))
+    cameras, depths = observations.cameras, observations.depths
+    frames, count, persons = observations.detection_index.shape
+    joint_count = observations.precision.shape[3]
     tiles, state = np.empty((count, ROWS * LANES)), np.zeros(STATE * LANES)
     slot = np.empty(count, np.int64)
     for t in range(frames):
         for n in range(persons):
             for c in range(count):
                 tiles[c, PRECISION : PRECISION + LANES] = 0.0
-            gather(
-                keypoints, precision, index, none, (t * persons + n) * joint_count, cameras, tiles
-            )
+            gather(observations, (t * persons + n) * joint_count, tiles)
             size = 0
             for c in range(count):
                 linearize(tiles[c], cameras[c])

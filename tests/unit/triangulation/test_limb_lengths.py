@@ -2,10 +2,17 @@ import numpy as np
 import pytest
 
 from data_contracts.conventions import COCO17, COCO17_LIMBS
+from data_contracts.keypoints import TrackedDetections
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
-from worldpose.triangulation.limbs import FEWEST, SLACK, _deviation, limb_lengths
-from worldpose.triangulation.observations import Rig
-from worldpose.triangulation.solving import no_shift, solve
+from worldpose.triangulation.limb_lengths import (
+    FEWEST,
+    SLACK,
+    _deviation,
+    _Points,
+    limb_lengths,
+)
+from worldpose.triangulation.observations import Observations, Rig
+from worldpose.triangulation.solving import solve_joints
 
 # Noise as stated: exact views do not make the least disagreement count.
 SETTINGS = TriangulationSettings(learn_noise=False, offsets="none")
@@ -48,9 +55,9 @@ def test_of_pairs_that_agree_as_well_the_one_that_keeps_the_limb_decides(ring, s
     arrays, wrong = misled(camera, seen(camera, joints), joints, ANKLE, 0, 1)
     # The true pair agrees to 3 px, the wrong one exactly: looked at alone, that is the better one.
     arrays[0][BAD, 2, 0, ANKLE] += [0.0, 3.0]
-    alone = triangulate_joints(camera, *arrays, AS_THEY_AGREE)
+    alone = triangulate_joints(camera, TrackedDetections(*arrays), AS_THEY_AGREE)
     assert np.linalg.norm(alone.joints[BAD, 0, ANKLE] - wrong) < 0.01
-    mended = triangulate_joints(camera, *arrays, SETTINGS)
+    mended = triangulate_joints(camera, TrackedDetections(*arrays), SETTINGS)
     # 3 px are 6 cm at 30 m.
     assert np.linalg.norm(mended.joints[BAD, 0, ANKLE] - joints[BAD, 0, ANKLE]) < 0.06
     assert mended.inliers[BAD, :, 0, ANKLE].tolist() == [False, True, True]
@@ -62,9 +69,9 @@ def test_of_pairs_that_agree_as_well_the_one_that_keeps_the_limb_decides(ring, s
 def test_end_that_two_views_alone_place_far_from_its_limb_is_missing(ring, seen):
     camera, joints = ring(4)[np.array([0, 1])], walker()
     arrays, wrong = misled(camera, seen(camera, joints), joints, WRIST, 0, 1)
-    alone = triangulate_joints(camera, *arrays, AS_THEY_AGREE)
+    alone = triangulate_joints(camera, TrackedDetections(*arrays), AS_THEY_AGREE)
     assert np.linalg.norm(alone.joints[BAD, 0, WRIST] - wrong) < 0.01
-    mended = triangulate_joints(camera, *arrays, SETTINGS)
+    mended = triangulate_joints(camera, TrackedDetections(*arrays), SETTINGS)
     for name in ("joints", "covariance", "reprojection_error", "spread"):
         assert np.isnan(getattr(mended, name)[BAD, 0, WRIST]).all()
     assert mended.views[BAD, 0, WRIST] == 0
@@ -77,7 +84,7 @@ def test_upper_limb_and_sure_wrist_place_an_elbow(ring, seen):
     arrays, _ = misled(camera, seen(camera, joints), joints, ELBOW, 0, 1)
     arrays[0][BAD, 2, 0, ELBOW] += [0.0, 3.0]
     arrays[0][BAD, 3, 0, ELBOW] = np.nan
-    mended = triangulate_joints(camera, *arrays, SETTINGS)
+    mended = triangulate_joints(camera, TrackedDetections(*arrays), SETTINGS)
     assert np.linalg.norm(mended.joints[BAD, 0, ELBOW] - joints[BAD, 0, ELBOW]) < 0.06
 
 
@@ -85,9 +92,9 @@ def test_what_three_views_agree_on_stays_however_long_the_limb(ring, seen):
     camera, joints = ring(4), walker()
     joints[BAD, 0, ANKLE] += [0.0, 0.0, 1.0]
     arrays = seen(camera, joints)
-    result = triangulate_joints(camera, *arrays, SETTINGS)
+    result = triangulate_joints(camera, TrackedDetections(*arrays), SETTINGS)
     np.testing.assert_array_equal(
-        result.joints, triangulate_joints(camera, *arrays, AS_THEY_AGREE).joints
+        result.joints, triangulate_joints(camera, TrackedDetections(*arrays), AS_THEY_AGREE).joints
     )
 
 
@@ -95,7 +102,9 @@ def test_what_three_views_agree_on_stays_however_long_the_limb(ring, seen):
 def test_lengths_need_five_frames(ring, seen, frames):
     camera, joints = ring(3), walker(frames)
     keypoints, confidence, index = seen(camera, joints)
-    found = solve(Rig.of(camera), keypoints, confidence, index, no_shift(), SETTINGS)
+    found = solve_joints(
+        Observations.from_rig(Rig.from_cameras(camera), keypoints, confidence, index), SETTINGS
+    )
     lengths = limb_lengths(found)
     assert lengths.shape == (1, len(COCO17_LIMBS))
     if frames < FEWEST:
@@ -110,7 +119,9 @@ def test_limb_that_is_hardly_ever_as_long_tells_nothing(ring, seen):
     camera, joints = ring(3), walker()
     joints[:, 0, ANKLE, 2] -= np.linspace(0.0, 0.3, len(joints))
     keypoints, confidence, index = seen(camera, joints)
-    found = solve(Rig.of(camera), keypoints, confidence, index, no_shift(), SETTINGS)
+    found = solve_joints(
+        Observations.from_rig(Rig.from_cameras(camera), keypoints, confidence, index), SETTINGS
+    )
     known = np.isfinite(limb_lengths(found)[0])
     assert known.tolist() == [end[1] != ANKLE for end in COCO17_LIMBS]
 
@@ -118,7 +129,9 @@ def test_limb_that_is_hardly_ever_as_long_tells_nothing(ring, seen):
 def test_frames_that_three_views_agree_in_tell_how_long_a_limb_is(ring, seen):
     camera, joints = ring(3), walker()
     keypoints, confidence, index = seen(camera, joints)
-    found = solve(Rig.of(camera), keypoints, confidence, index, no_shift(), SETTINGS)
+    found = solve_joints(
+        Observations.from_rig(Rig.from_cameras(camera), keypoints, confidence, index), SETTINGS
+    )
     # Two views alone put the ankle 2 cm lower in seven frames of twelve.
     found.joints[:7, 0, ANKLE, 2] -= 0.02
     found.views[:7, 0, ANKLE] = 2
@@ -130,9 +143,10 @@ def test_frames_that_three_views_agree_in_tell_how_long_a_limb_is(ring, seen):
 
 
 def test_length_of_a_limb_is_as_far_off_as_its_ends_are_unsure_along_it():
-    upper, lower = np.zeros(3), np.array([0.0, 0.0, -0.5])
     exact, along = np.zeros((3, 3)), 3.0 * SLACK**2 * np.diag([100.0, 100.0, 1.0])
+    upper = _Points(np.zeros(3), exact)
+    lower, unsure = (_Points(np.array([0.0, 0.0, -0.5]), each) for each in (exact, along))
     # 6 cm too long where limbs vary by 3 cm; what ends are unsure across does not matter.
-    assert _deviation(upper, exact, lower, exact, 0.44) == pytest.approx((4.0, 0.0))
-    assert _deviation(upper, exact, lower, along, 0.44) == pytest.approx((1.0, np.log(4.0)))
-    assert _deviation(upper, exact, lower, exact, np.nan) == pytest.approx((0.0, 0.0))
+    assert _deviation(upper, lower, 0.44) == pytest.approx((4.0, 0.0))
+    assert _deviation(upper, unsure, 0.44) == pytest.approx((1.0, np.log(4.0)))
+    assert _deviation(upper, lower, np.nan) == pytest.approx((0.0, 0.0))

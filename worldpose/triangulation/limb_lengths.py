@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17, COCO17_LIMBS
 from worldpose.geometry import projection
-from worldpose.triangulation.observations import Rig
+from worldpose.triangulation.observations import Observations
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.solving import Solution, solve
+from worldpose.triangulation.solving import Solution, solve_joints
 
 SURE: Final = 3
 """Inlier views that both ends of a measured limb need; an end with no more may be accidental."""
@@ -62,11 +62,7 @@ def limb_lengths(found: Solution) -> Floats:
 
 
 def repair_limb_lengths(
-    rig: Rig,
-    keypoints: NDArray[np.floating],
-    precision: Floats,
-    index: NDArray[np.integer],
-    shift: Floats,
+    observations: Observations,
     settings: TriangulationSettings,
     found: Solution,
     lengths: Floats,
@@ -77,13 +73,9 @@ def repair_limb_lengths(
     all views and limb lengths decide. If the limb still has a wrong length, its end is missing.
 
     Args:
-        rig: the cameras.
-        keypoints: (frames, cameras, detections, joints, 2) [px].
-        precision: (frames, cameras, detections, joints), as in `solve`.
-        index: (frames, cameras, persons), index of the detection; -1 = not seen.
-        shift: (frames, cameras, persons, 3), as in `solve`.
+        observations: of all tracked people.
         settings: noise, inlier limit and minimum views.
-        found: joints from the same arrays; changed.
+        found: joints of the same observations; changed.
         lengths: (persons, limbs) of `limb_lengths`.
     """
     if found.joints.shape[2] != len(COCO17):
@@ -96,23 +88,53 @@ def repair_limb_lengths(
         views = found.views[:, :, chain[1:]]
         seen = found.seen[..., chain[1:]].sum(axis=1)
         few = (views > 0) & ((views <= SURE) | (2 * views <= seen))
-        ends = [(found.joints[:, :, joint], found.covariance[:, :, joint]) for joint in chain]
-        first, second = (_deviation(*ends[n], *ends[n + 1], long[:, n])[0] for n in (0, 1))
+        ends = [
+            _Points(found.joints[:, :, joint], found.covariance[:, :, joint]) for joint in chain
+        ]
+        first, second = (_deviation(ends[n], ends[n + 1], long[:, n])[0] for n in (0, 1))
         strange = few[..., 0] & ((first > STRANGE) | (second > STRANGE))
         strange |= few[..., 1] & (second > STRANGE)
         for frame, person in np.argwhere(strange):
             choices = []
             for joint, doubtful in zip(chain[1:], few[frame, person], strict=True):
-                who = np.maximum(index[frame, :, person], 0)
-                place = (frame, np.arange(len(who)), who, joint)
-                there = found.seen[frame, :, person, joint] & doubtful
-                weights = np.where(there, precision[place], 0.0)
-                moved = shift[frame : frame + 1, :, person : person + 1] if len(shift) else shift
-                observed = (keypoints[place], weights, moved)
-                choices.append(_choices(rig, observed, settings, found, (frame, person, joint)))
-            root = (ends[0][0][frame, person], ends[0][1][frame, person])
+                views_of_end = _select_end(observations, found, (frame, person, joint), doubtful)
+                choices.append(_list_choices(views_of_end, settings, found, (frame, person, joint)))
+            root = _Points(ends[0].position[frame, person], ends[0].covariance[frame, person])
             limit = settings.max_deviation**2
             _choose(root, choices, long[person], limit, found, (frame, person, *chain[1:]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """Points [m] (..., 3), world, and their covariance [m^2] (..., 3, 3)."""
+
+    position: Floats
+    covariance: Floats
+
+
+def _select_end(
+    observations: Observations, found: Solution, end: tuple[int, int, int], doubtful: bool
+) -> Observations:
+    """Return one limb end's observations: one frame, one detection per camera, one joint.
+
+    Args:
+        observations: of all tracked people.
+        found: joints.
+        end: frame, person, joint.
+        doubtful: whether the end may move; otherwise it has no observations.
+    """
+    frame, person, joint = end
+    which = np.maximum(observations.detection_index[frame, :, person], 0)
+    place = (frame, np.arange(len(which)), which, joint)
+    there = found.seen[frame, :, person, joint] & doubtful
+    weights = np.where(there, observations.precision[place], 0.0)
+    shift = observations.shift
+    return observations._replace(
+        keypoints=observations.keypoints[place][None, :, None, None],
+        precision=weights[None, :, None, None],
+        detection_index=np.zeros((1, len(weights), 1), np.int64),
+        shift=shift[frame : frame + 1, :, person : person + 1] if len(shift) else shift,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,21 +142,18 @@ class _Choices:
     """Candidate positions of a limb's end.
 
     Attributes:
-        points: (choices, 3) [m], world.
-        covariance: (choices, 3, 3) [m^2].
+        points: (choices,).
         cost: (choices,) of the residuals of all views.
         tried: the solution of each; None for an end that stays.
     """
 
-    points: Floats
-    covariance: Floats
+    points: _Points
     cost: Floats
     tried: Solution | None
 
 
-def _choices(
-    rig: Rig,
-    observed: tuple[NDArray[np.floating], Floats, Floats],
+def _list_choices(
+    observations: Observations,
     settings: TriangulationSettings,
     found: Solution,
     end: tuple[int, int, int],
@@ -142,43 +161,42 @@ def _choices(
     """Return the positions of an end from pairs of views and their inliers.
 
     Args:
-        rig: the cameras.
-        observed: pixels (cameras, 2), precision (cameras,), 0 = not seen, and shift of one person;
-            an end without observations stays.
+        observations: of the end (`_select_end`); an end without observations stays.
         settings: noise, inlier limit and minimum views.
         found: joints.
         end: frame, person, joint.
     """
-    pixels, weights, shift = observed
+    weights = observations.precision[0, :, 0, 0]
     pairs = np.array(list(combinations(np.flatnonzero(weights > 0.0), 2)))
     if not len(pairs):
-        here = (found.joints[end][None], found.covariance[end][None])
-        return _Choices(*here, np.zeros(1), None)
+        here = _Points(found.joints[end][None], found.covariance[end][None])
+        return _Choices(here, np.zeros(1), None)
     used = np.zeros((len(pairs), len(weights)), np.bool_)
     np.put_along_axis(used, pairs, values=True, axis=1)
-    seen = np.repeat(pixels[None, :, None, None], len(pairs), axis=0)
-    moved = np.repeat(shift, len(pairs), axis=0)
-    nobody_else = np.zeros((*used.shape, 1), np.int64)
+    repeated = observations._replace(
+        keypoints=np.repeat(observations.keypoints, len(pairs), axis=0),
+        shift=np.repeat(observations.shift, len(pairs), axis=0),
+        detection_index=np.zeros((*used.shape, 1), np.int64),
+    )
 
-    def placed(views: NDArray[np.bool_]) -> tuple[Solution, Floats]:
+    def solve_from(views: NDArray[np.bool_]) -> tuple[Solution, Floats]:
         some = np.where(views, weights, 0.0)[:, :, None, None]
-        points = solve(rig, seen, some, nobody_else, moved, settings)
-        at = points.joints[:, 0, 0]
-        return points, _misfit(rig, pixels, weights, shift, settings.noise, at)
+        solution = solve_joints(repeated._replace(precision=some), settings)
+        return solution, _misfit(observations, settings.noise, solution.joints[:, 0, 0])
 
     limit = settings.max_deviation**2
-    _, misfit = placed(used)
-    tried, misfit = placed(misfit <= limit)
+    _, misfit = solve_from(used)
+    tried, misfit = solve_from(misfit <= limit)
     # Rejecting a view of low precision costs less.
     some = np.where(weights > 0.0, weights, 1.0)
     most = np.maximum(limit + 2.0 * np.log(some / weights.max()), 0.0)
     cost = np.where(misfit <= limit, np.minimum(misfit, most), most)
     total = np.where(tried.views[:, 0, 0] > 0, cost[:, weights > 0.0].sum(axis=1), np.inf)
-    return _Choices(tried.joints[:, 0, 0], tried.covariance[:, 0, 0], total, tried)
+    return _Choices(_Points(tried.joints[:, 0, 0], tried.covariance[:, 0, 0]), total, tried)
 
 
 def _choose(
-    root: tuple[Floats, Floats],
+    root: _Points,
     choices: list[_Choices],
     long: Floats,
     limit: float,
@@ -188,7 +206,7 @@ def _choose(
     """Set the two ends of an arm or a leg to their best candidates, in place.
 
     Args:
-        root: position (3,) and covariance (3, 3) of its first joint.
+        root: its first joint.
         choices: candidates for its middle and its end.
         long: (2,) lengths of its limbs [m].
         limit: largest squared deviation of a correct length [variances].
@@ -196,11 +214,9 @@ def _choose(
         chain: frame, person, middle and end.
     """
     middle, end = choices
-    first, sure = _deviation(*root, middle.points, middle.covariance, long[0])
-    second, known = _deviation(
-        *(middle.points[:, None], middle.covariance[:, None], end.points, end.covariance),
-        long[1],
-    )
+    first, sure = _deviation(root, middle.points, long[0])
+    each_middle = _Points(middle.points.position[:, None], middle.points.covariance[:, None])
+    second, known = _deviation(each_middle, end.points, long[1])
     cost = (middle.cost + np.minimum(first, limit) + sure)[:, None] + end.cost
     cost = cost + np.minimum(second, limit) + known
     if not np.isfinite(cost).any():
@@ -222,39 +238,31 @@ def _choose(
             found.spread[here] = found.reprojection_error[here] = np.nan
         else:
             there = (best, 0, 0)
-            found.joints[here] = choice.points[best]
-            found.covariance[here] = choice.covariance[best]
+            found.joints[here] = choice.points.position[best]
+            found.covariance[here] = choice.points.covariance[best]
             found.views[here] = choice.tried.views[there]
             found.spread[here] = choice.tried.spread[there]
             found.reprojection_error[here] = choice.tried.reprojection_error[there]
             found.inliers[views] = choice.tried.inliers[best, :, 0, 0]
 
 
-def _deviation(
-    upper: Floats,
-    covariance: Floats,
-    lower: Floats,
-    other_covariance: Floats,
-    long: Floats | float,
-) -> tuple[Floats, Floats]:
+def _deviation(upper: _Points, lower: _Points, long: Floats | float) -> tuple[Floats, Floats]:
     """Return deviations of limbs from their lengths, and their variances.
 
     Args:
-        upper: (..., 3) one end [m], world.
-        covariance: (..., 3, 3) of it [m^2].
-        lower: (..., 3) the other end.
-        other_covariance: (..., 3, 3) of it.
+        upper: one end.
+        lower: the other end.
         long: length [m].
 
     Returns:
         Squares (...) [variances] and logarithms of variances over the least one (...); both 0 where
         unknown.
     """
-    limb = lower - upper
+    limb = lower.position - upper.position
     now = np.linalg.norm(limb, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         along = limb / now[..., None]
-        both = covariance + other_covariance
+        both = upper.covariance + lower.covariance
         variance = SLACK**2 + np.einsum("...i,...ij,...j", along, both, along)
         square = (now - long) ** 2 / variance
     known = np.isfinite(square)
@@ -262,20 +270,15 @@ def _deviation(
     return np.where(known, square, 0.0), spread
 
 
-def _misfit(
-    rig: Rig,
-    pixels: NDArray[np.floating],
-    weights: Floats,
-    shift: Floats,
-    noise: tuple[float, float],
-    points: Floats,
-) -> Floats:
+def _misfit(observations: Observations, noise: tuple[float, float], points: Floats) -> Floats:
     """Return squared errors of views (points, cameras) [variances]; 0 without an observation."""
+    pixels, weights = observations.keypoints[0, :, 0, 0], observations.precision[0, :, 0, 0]
+    cameras, depths, shift = observations.cameras, observations.depths, observations.shift
     at = np.broadcast_to(points, (len(weights), *points.shape))
     image = np.empty((*at.shape[:-1], 2))
-    projection.project(rig.cameras, np.ascontiguousarray(at), image)
-    depth = at @ rig.depths[:, :3, None] + rig.depths[:, 3, None, None]
-    size = np.prod(rig.cameras[:, :2], axis=1)[:, None] / depth[..., 0] ** 2
+    projection.project(cameras, np.ascontiguousarray(at), image)
+    depth = at @ depths[:, :3, None] + depths[:, 3, None, None]
+    size = np.prod(cameras[:, :2], axis=1)[:, None] / depth[..., 0] ** 2
     moved = shift[0, :, 0] if len(shift) else np.zeros((len(weights), 3))
     error = image - (pixels - moved[:, :2])[:, None]
     seen = weights > 0.0

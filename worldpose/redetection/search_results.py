@@ -20,13 +20,13 @@ from worldpose.filtering import (
     BodyViews,
     FilteringSettings,
     Spread,
-    Suspects,
+    TriangulatedDetections,
     judge_detections,
 )
 from worldpose.geometry.boxes import box_areas, box_iou
 from worldpose.redetection.expected import Expected
+from worldpose.redetection.missing_people import MissingPeople
 from worldpose.redetection.settings import RedetectionSettings
-from worldpose.redetection.sought import Sought
 
 FEWEST: Final = 8
 """Least number of keypoints of a result [1]: half a body."""
@@ -53,9 +53,9 @@ class Verdicts:
     rejected: Flags
 
 
-def look_again(
+def search_missing_people(
     pictures: Iterable[tuple[int, Image | None]],
-    sought: Sought,
+    sought: MissingPeople,
     estimator: PoseEstimator,
     least_keypoint: float,
     detected: AnyFloats | None = None,
@@ -99,9 +99,9 @@ def look_again(
     return found
 
 
-def judge_answers(
-    answers: KeypointDetections,
-    sought: Sought,
+def judge_search_results(
+    results: KeypointDetections,
+    sought: MissingPeople,
     expected: Expected,
     detected: KeypointDetections,
     spread: Spread,
@@ -115,7 +115,7 @@ def judge_answers(
     neither a detection in the frame nor a better result has that pose already.
 
     Args:
-        answers: of the estimator.
+        results: of the estimator.
         sought: the people of these results.
         expected: all bodies in view of the camera.
         detected: the detections (frames, detections) in all frames of the camera.
@@ -123,9 +123,9 @@ def judge_answers(
         noise: stated standard deviation of keypoints, [px] and [m].
         settings: acceptance thresholds.
     """
-    agrees, rejected = _agreeing(answers, sought, expected, spread, noise, settings)
-    unsure = ~(surest_confidence(answers.confidence) >= settings.min_confidence)
-    away = _distances(answers, sought, expected)
+    agrees, rejected = _compare_with_bodies(results, sought, expected, spread, noise, settings)
+    unsure = ~(surest_confidence(results.confidence) >= settings.min_confidence)
+    away = _distances(results, sought, expected)
     rows = np.arange(len(away))
     own = away[rows, sought.person]
     nearer = (away < own[:, None]).any(axis=1)
@@ -135,8 +135,8 @@ def judge_answers(
     for frame in np.unique(sought.frame[open_]):
         here = np.flatnonzero(open_ & (sought.frame == frame))
         here = here[np.argsort(own[here], kind="stable")]
-        boxes = np.concatenate([answers.boxes[here], detected.boxes[frame]])
-        pose = np.concatenate([answers.keypoints[here], detected.keypoints[frame]])
+        boxes = np.concatenate([results.boxes[here], detected.boxes[frame]])
+        pose = np.concatenate([results.keypoints[here], detected.keypoints[frame]])
         alike = object_keypoint_similarity(pose, np.nan_to_num(box_areas(boxes)))[: len(here)]
         same = np.asarray(alike > settings.oks_nms)
         for k, row in enumerate(here):
@@ -145,9 +145,9 @@ def judge_answers(
     return Verdicts(open_ & ~another, unsure, elsewhere, another, rejected)
 
 
-def _agreeing(
-    answers: KeypointDetections,
-    sought: Sought,
+def _compare_with_bodies(
+    results: KeypointDetections,
+    sought: MissingPeople,
     expected: Expected,
     spread: Spread,
     noise: tuple[float, float],
@@ -159,9 +159,9 @@ def _agreeing(
     image, variance, scale = (
         each[at][:, None, None] for each in (expected.image, expected.variance, expected.scale)
     )
-    suspects = Suspects(
-        keypoints=answers.keypoints[:, None, None],
-        confidence=answers.confidence[:, None, None],
+    suspects = TriangulatedDetections(
+        keypoints=results.keypoints[:, None, None],
+        confidence=results.confidence[:, None, None],
         index=np.zeros((count, 1, 1), dtype=np.int64),
         offsets=np.zeros((count, 1, 1, 2)),
         exchanged=np.zeros((count, 1, 1, 3), dtype=np.bool_),
@@ -178,11 +178,11 @@ def _agreeing(
     return judged.fits[:, 0, 0] == 0, judged.rejected[:, 0, 0]
 
 
-def _distances(answers: KeypointDetections, sought: Sought, expected: Expected) -> Floats:
+def _distances(results: KeypointDetections, sought: MissingPeople, expected: Expected) -> Floats:
     """Return mean distances (n, persons) of a result's keypoints to bodies of its frame [m]."""
     image, scale = expected.image[sought.frame], expected.scale[sought.frame]
     with np.errstate(invalid="ignore"):
-        away = np.linalg.norm(answers.keypoints[:, None] - image, axis=-1) / scale
-    there = np.asarray(np.isfinite(answers.keypoints).all(axis=-1))
+        away = np.linalg.norm(results.keypoints[:, None] - image, axis=-1) / scale
+    there = np.asarray(np.isfinite(results.keypoints).all(axis=-1))
     away = np.where(there[:, None], np.fmin(away, FARTHEST), 0.0)
     return np.asarray(away.sum(axis=-1) / np.maximum(there.sum(axis=-1), 1)[:, None])

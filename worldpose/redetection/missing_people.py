@@ -17,7 +17,7 @@ Places = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class Sought:
+class MissingPeople:
     """People to search for, one per row, by rising frames.
 
     Attributes:
@@ -33,14 +33,14 @@ class Sought:
     hidden: int
 
 
-def whom_to_seek(
+def select_missing_people(
     expected: Expected,
     seen: Flags,
     size: tuple[int, int],
     settings: RedetectionSettings,
     place: Place | None = None,
     margin: float = 0.0,
-) -> Sought:
+) -> MissingPeople:
     """Return the people that should be visible and have no detection.
 
     Args:
@@ -69,10 +69,12 @@ def whom_to_seek(
         there = shown[each, person[rows]] & ~expected.hidden(int(each))[person[rows]]
         bare[rows] = there.mean(axis=-1) >= settings.min_visible_share
     frame, person = frame[bare], person[bare]
-    return Sought(frame, person, boxes[frame, person], int(np.count_nonzero(~bare)))
+    return MissingPeople(frame, person, boxes[frame, person], int(np.count_nonzero(~bare)))
 
 
-def who_is_seen(index: NDArray[np.integer], fits: NDArray[np.integer], dropped: Flags) -> Flags:
+def find_detected_people(
+    index: NDArray[np.integer], fits: NDArray[np.integer], dropped: Flags
+) -> Flags:
     """Return which people have detections (frames, persons) that fit or could not be judged.
 
     Args:

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.redetection import (
+    MissingPeople,
     RedetectionSettings,
-    Sought,
-    judge_answers,
-    look_again,
-    whom_to_seek,
+    judge_search_results,
+    search_missing_people,
+    select_missing_people,
 )
 
 SETTINGS = RedetectionSettings()
@@ -24,7 +24,9 @@ KINDS = ("found", "unsure", "elsewhere", "another")
 
 def seek(bodies, *persons):
     """Look for these persons of the only frame."""
-    return Sought(np.zeros(len(persons), int), np.array(persons), bodies.boxes[0, persons], 0)
+    return MissingPeople(
+        np.zeros(len(persons), int), np.array(persons), bodies.boxes[0, persons], 0
+    )
 
 
 def answer(bodies, *persons, off=(0.0, 0.0), confidence=0.9):
@@ -41,7 +43,7 @@ def judge(bodies, answers, sought, detected=()):
     boxes = bodies.boxes[:, list(detected)] if len(detected) else np.empty((1, 0, 4))
     none = np.full(pose.shape[:3], np.nan)
     given_ = KeypointDetections(pose, none, boxes, none[..., 0])
-    return judge_answers(answers, sought, bodies, given_, as_stated(), NOISE, SETTINGS)
+    return judge_search_results(answers, sought, bodies, given_, as_stated(), NOISE, SETTINGS)
 
 
 def kinds(verdicts):
@@ -139,10 +141,10 @@ class Seeing:
 
 def test_pictures_are_asked_for_everybody_who_is_sought_in_them():
     bodies = expected((0.0, 0.0), (3.0, 0.0))
-    sought = whom_to_seek(bodies, np.zeros((1, 2), dtype=bool), SIZE, SETTINGS)
+    sought = select_missing_people(bodies, np.zeros((1, 2), dtype=bool), SIZE, SETTINGS)
     sought = replace(sought, frame=np.array([2, 5]))
     picture = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
-    answers = look_again([(2, picture), (3, picture), (5, None)], sought, Seeing(), 0.05)
+    answers = search_missing_people([(2, picture), (3, picture), (5, None)], sought, Seeing(), 0.05)
     assert np.isnan(answers.keypoints[1]).all()  # a picture that could not be decoded
     assert np.flatnonzero(np.isnan(answers.confidence[0])).tolist() == [9]
     middle = 0.5 * (sought.boxes[0, :2] + sought.boxes[0, 2:])
@@ -167,7 +169,7 @@ def test_neighbours_who_overlap_are_shown_to_the_net_and_answered_for_by_nobody(
     touching = [left - 30.0, top, left, bottom]
     detected = np.array([[touching, beside, [np.nan] * 4]])
     net, picture = Asked(), np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
-    answers = look_again([(0, picture)], sought, net, 0.05, detected)
+    answers = search_missing_people([(0, picture)], sought, net, 0.05, detected)
     assert net.boxes == [[left, top, right, bottom], beside]
     np.testing.assert_allclose(answers.keypoints[0, 0, 0], 0.5 * (left + right), atol=1e-12)
 
@@ -176,7 +178,7 @@ def test_neighbours_who_overlap_are_shown_to_the_net_and_answered_for_by_nobody(
 def test_a_keypoint_below_the_least_confidence_was_not_found(least, found):
     bodies = expected((0.0, 0.0))
     picture = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
-    answers = look_again([(0, picture)], seek(bodies, 0), Seeing(), least)
+    answers = search_missing_people([(0, picture)], seek(bodies, 0), Seeing(), least)
     assert np.isfinite(answers.confidence[0]).sum() == found
     assert np.isfinite(answers.keypoints[0]).all(axis=-1).sum() == found
 

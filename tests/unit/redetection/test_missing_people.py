@@ -7,7 +7,7 @@ from bystander import SIZE, camera, expected
 from data_contracts.pitch import PitchSpec
 from worldpose.detection import Place
 from worldpose.pitch import PitchTemplate
-from worldpose.redetection import RedetectionSettings, who_is_seen, whom_to_seek
+from worldpose.redetection import RedetectionSettings, find_detected_people, select_missing_people
 
 SETTINGS = RedetectionSettings()
 
@@ -15,13 +15,13 @@ SETTINGS = RedetectionSettings()
 def sought(bodies, *seen, **kwargs):
     known = np.zeros(bodies.image.shape[:2], dtype=bool)
     known[:, list(seen)] = True
-    found = whom_to_seek(bodies, known, SIZE, SETTINGS, **kwargs)
+    found = select_missing_people(bodies, known, SIZE, SETTINGS, **kwargs)
     return found.person.tolist(), found.hidden
 
 
 def test_who_was_not_detected_is_looked_for_where_the_body_is():
     bodies = expected((0.0, 0.0), (3.0, 0.0))
-    found = whom_to_seek(bodies, np.array([[True, False]]), SIZE, SETTINGS)
+    found = select_missing_people(bodies, np.array([[True, False]]), SIZE, SETTINGS)
     assert (found.frame.tolist(), found.person.tolist(), found.hidden) == ([0], [1], 0)
     np.testing.assert_array_equal(found.boxes, bodies.boxes[0, 1:])
 
@@ -50,8 +50,8 @@ def test_nobody_is_looked_for_off_the_pitch():
     bodies = expected((0.0, 0.0), (3.0, 37.0))  # the second 3 m behind the touch line
     low = RedetectionSettings(min_height_px=20.0)
     nobody = np.zeros((1, 2), dtype=bool)
-    assert whom_to_seek(bodies, nobody, SIZE, low).person.tolist() == [0, 1]
-    found = whom_to_seek(bodies, nobody, SIZE, low, place=pitch, margin=2.5)
+    assert select_missing_people(bodies, nobody, SIZE, low).person.tolist() == [0, 1]
+    found = select_missing_people(bodies, nobody, SIZE, low, place=pitch, margin=2.5)
     assert found.person.tolist() == [0]
 
 
@@ -61,9 +61,11 @@ def test_seen_is_who_has_a_detection_that_fits_or_that_nobody_could_judge():
     fits = np.array([[0, -1, -1, 3]])
     dropped = np.array([[False, True, False, False]])
     # Fits; fits nobody; has too few keypoints to tell; nobody's till now; looked for anew.
-    assert who_is_seen(index, fits, dropped).tolist() == [[True, False, True, True, False]]
+    assert find_detected_people(index, fits, dropped).tolist() == [[True, False, True, True, False]]
 
 
 def test_who_has_the_detection_of_another_is_not_seen():
     index, fits = np.array([[0, -1]]), np.array([[1]])
-    assert who_is_seen(index, fits, np.zeros((1, 1), dtype=bool)).tolist() == [[False, True]]
+    assert find_detected_people(index, fits, np.zeros((1, 1), dtype=bool)).tolist() == [
+        [False, True]
+    ]
