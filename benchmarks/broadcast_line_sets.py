@@ -22,8 +22,8 @@ from data_contracts.broadcast_calibration import KeyFrame
 from worldpose.broadcast_calibration import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.key_frames import calibrate_keys
 from worldpose.errors import WorldposeError
+from worldpose.formats.soccernet import soccernet_markings
 from worldpose.geometry import Camera
-from worldpose.static_calibration.soccernet import soccernet_markings
 
 _, SIZE = pitch_lines.SETS["wc14"]
 

@@ -43,9 +43,9 @@ from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
 from worldpose.static_calibration.line_samples import (
     LineSamples,
+    project_lines,
     sample_markings,
-    see_lines,
-    thinned,
+    thin_samples,
 )
 
 NOISE = 0.15
@@ -64,8 +64,8 @@ def lines_of(
     parts = []
     for frame in range(len(true)):
         camera = true.camera[frame]
-        seen = see_lines(camera, samples, 0.12, 0.0, 0.0)
-        index = thinned(seen, samples, 4.0, settings.line_samples)
+        seen = project_lines(camera, samples, 0.12, 0.0, 0.0)
+        index = thin_samples(seen, samples, 4.0, settings.line_samples)
         world, ends = samples.points_world[index], samples.ends[index]
         shares = settings.survey_error * samples.shares[index]
         hung = np.where(ends[..., None] >= 0, shares[..., None] * painted[ends], 0.0)

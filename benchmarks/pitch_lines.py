@@ -24,6 +24,7 @@ import numpy as np
 
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
+from worldpose.formats.soccernet import soccernet_markings
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import (
@@ -32,7 +33,6 @@ from worldpose.static_calibration import (
     StaticCalibrationSettings,
     calibrate,
 )
-from worldpose.static_calibration.soccernet import soccernet_markings
 
 # The scorer's template is flat. Broadcast images are crops of a zoom lens with a varying principal
 # point. Main cameras of the even half with seven visible markings or more: focal length 2.6 widths

@@ -27,11 +27,7 @@ from worldpose.pitch import PitchTemplate
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import Scene, simulate_scene
 from worldpose.simulation.settings import ClickSettings
-from worldpose.static_calibration import (
-    StaticCalibration,
-    StaticCalibrationSettings,
-    calibrate,
-)
+from worldpose.static_calibration import StaticCalibration, StaticCalibrationSettings, calibrate
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 

@@ -252,7 +252,7 @@ def _answer(found: Preview) -> dict[str, Any]:
                 "residual": _rounded(each.residual, 3)
                 if np.isfinite(each.residual).all()
                 else None,
-                "surprise": _number(each.surprise),
+                "surprise": _number(each.mahalanobis),
                 "inlier": each.inlier,
                 "problem": each.problem,
             }

@@ -21,14 +21,15 @@ from worldpose.broadcast_calibration.moving_camera import MovingCamera, joined
 from worldpose.broadcast_calibration.normal_equations import add_points, empty_equations
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration.bar_fits import fit_bars
-from worldpose.static_calibration.clearance import Whites, clear, whites_of
-from worldpose.static_calibration.edges import BESIDE, CANDIDATES, find_bars
+from worldpose.static_calibration.line_detection import CANDIDATES, CLEARANCE, find_bars, fit_bars
 from worldpose.static_calibration.line_samples import (
     LineSamples,
+    WhiteStructures,
+    clear,
+    project_lines,
     sample_markings,
-    see_lines,
-    thinned,
+    thin_samples,
+    white_structures,
 )
 
 _SPACING: Final = 0.25
@@ -57,12 +58,12 @@ class FieldSamples:
     """
 
     lines: LineSamples
-    whites: Whites
+    whites: WhiteStructures
 
     @classmethod
     def of(cls, pitch: PitchTemplate) -> FieldSamples:
         """Return the samples of a pitch."""
-        return cls(sample_markings(pitch, _SPACING), whites_of(pitch))
+        return cls(sample_markings(pitch, _SPACING), white_structures(pitch))
 
 
 def find_lines(
@@ -100,11 +101,11 @@ def _look(
 ) -> PointEvidence:
     """Return bars of paint within reach of one frame's projected lines."""
     lines = _near(camera, samples.lines)
-    seen = see_lines(camera.camera[0], lines, _LINE_WIDTH, 0.0, 0.0)
-    index = thinned(seen, lines, 4.0, settings.line_samples)
+    seen = project_lines(camera.camera[0], lines, _LINE_WIDTH, 0.0, 0.0)
+    index = thin_samples(seen, lines, 4.0, settings.line_samples)
     if people is not None and len(index):
         index = index[~_hidden(seen.places[index], people, reach)]
-    room = 0.5 * seen.widths[index] + BESIDE
+    room = 0.5 * seen.widths[index] + CLEARANCE
     index = index[
         clear(
             camera.camera[0],
@@ -117,15 +118,12 @@ def _look(
     ]
     if not len(index):
         return PointEvidence.none()
-    places, normals = seen.places[index], seen.normals[index]
-    widths, curvatures, count = seen.widths[index], seen.curvatures[index], len(index)
+    count, sections = len(index), seen[index].sections
+    places, normals = sections.places, sections.normals
     offsets, strengths = np.empty((count, CANDIDATES)), np.empty((count, CANDIDATES))
     find_bars(
         picture,
-        places,
-        normals,
-        widths,
-        curvatures,
+        sections,
         np.full(count, reach),
         _CONTRAST,
         offsets,
@@ -137,10 +135,7 @@ def _look(
     exact, variances = np.empty(count), np.empty(count)
     fit_bars(
         picture,
-        places,
-        normals,
-        widths,
-        curvatures,
+        sections,
         offsets[np.arange(count), best],
         _CONTRAST,
         exact,

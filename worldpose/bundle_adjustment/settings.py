@@ -8,7 +8,7 @@ from pydantic import Field
 
 from data_contracts.records import Frame, Record
 from worldpose.bundle_adjustment.solver import SolverSettings
-from worldpose.static_calibration.line_settings import SURVEY_ERROR
+from worldpose.static_calibration.settings import SURVEY_ERROR
 
 
 class GivenCameraPrior(Record):

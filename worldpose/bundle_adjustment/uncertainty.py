@@ -15,8 +15,8 @@ from data_contracts.arrays import Floats
 from worldpose.bundle_adjustment.clip import Clip
 from worldpose.geometry import Camera
 from worldpose.static_calibration import PARAMETERS, project_with_jacobian
-from worldpose.static_calibration.line_samples import sample_markings, see_lines, thinned
-from worldpose.static_calibration.line_settings import LineRefinementSettings
+from worldpose.static_calibration.line_samples import project_lines, sample_markings, thin_samples
+from worldpose.static_calibration.settings import LineRefinementSettings
 
 _SPACING: Final = 0.25
 """Spacing of samples along painted lines [m]."""
@@ -58,8 +58,8 @@ def survey_response(clip: Clip, survey_error: float) -> Floats:
     samples = sample_markings(clip.pitch, _SPACING)
     response = np.zeros((count, clip.covariance.shape[1], 3 * len(clip.pitch.points)))
     for c in np.flatnonzero(clip.on_lines).tolist():
-        seen = see_lines(clip.cameras[c], samples, _LINE_WIDTH, survey_error, _SHIFT)
-        seen = seen[thinned(seen, samples, _APART, _MOST)]
+        seen = project_lines(clip.cameras[c], samples, _LINE_WIDTH, survey_error, _SHIFT)
+        seen = seen[thin_samples(seen, samples, _APART, _MOST)]
         unknowns, column = np.unique(seen.unknowns, return_inverse=True)
         by_paint = np.zeros((len(seen.places), len(unknowns)))
         np.add.at(by_paint, (np.arange(len(by_paint))[:, None], column), seen.by_paint / _NOISE)

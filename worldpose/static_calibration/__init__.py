@@ -3,7 +3,7 @@
 Input: a pitch template, clicked points and drawn markings. Output: a camera and its covariance.
 """
 
-from worldpose.static_calibration.calibrate import calibrate
+from worldpose.static_calibration.calibration import calibrate
 from worldpose.static_calibration.clip_picture import median_picture
 from worldpose.static_calibration.ground_error import GroundErrorMap, ground_error_map
 from worldpose.static_calibration.parameters import (
@@ -17,16 +17,14 @@ from worldpose.static_calibration.report import (
     MarkingResidual,
     PointResidual,
     StaticCalibration,
-)
-from worldpose.static_calibration.reporting import image_problems
-from worldpose.static_calibration.settings import CameraPrior, StaticCalibrationSettings
-from worldpose.static_calibration.stored import (
     calibration_arrays,
     calibration_attributes,
     calibration_coordinates,
     given_attributes,
+    image_problems,
     left_out_attributes,
 )
+from worldpose.static_calibration.settings import CameraPrior, StaticCalibrationSettings
 
 __all__ = [
     "PARAMETERS",

@@ -9,17 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.geometry import Camera, Rigid
-from worldpose.static_calibration.descent import descend
-from worldpose.static_calibration.evidence import Evidence, crowding
+from worldpose.static_calibration.descent import Measurements, Solutions, descend
+from worldpose.static_calibration.evidence import Evidence, count_neighbors
 from worldpose.static_calibration.parameters import PARAMETERS
 from worldpose.static_calibration.residuals import SIZE
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 _ITERATIONS: Final = 60
 """Enough from any start in the basin; most end after ten."""
-_LEAST_DEPTH: Final = 1.0
+_MIN_DEPTH: Final = 1.0
 """Depth [m] below which no point is clicked: the camera is far from the answer."""
-_LEAST_HEIGHT: Final = 0.5
+_MIN_HEIGHT: Final = 0.5
 """Height [m] below which the prior pushes a camera up as strongly as at this height."""
 
 
@@ -49,20 +49,20 @@ class Problem:
     where: str = "clicked markings"
 
     @property
-    def reach(self) -> float:
+    def half_diagonal(self) -> float:
         """Half the image diagonal [px]."""
         return 0.5 * float(np.hypot(*self.image_size))
 
-    def only(self, points: NDArray[np.bool_], markings: NDArray[np.bool_]) -> Problem:
+    def select(self, points: NDArray[np.bool_], markings: NDArray[np.bool_]) -> Problem:
         """Return the problem restricted to some clicked points (n,) and drawn markings (m,)."""
         return replace(
             self,
-            evidence=self.evidence.only(points, markings),
+            evidence=self.evidence.select(points, markings),
             click_noise=self.click_noise[points],
             drawn_noise=self.drawn_noise[markings[self.evidence.drawn_marking]],
         )
 
-    def surveyed_from(
+    def with_survey_error(
         self, row: NDArray[np.float64], settings: StaticCalibrationSettings
     ) -> Problem:
         """Return the problem with click noise that includes the projected survey error.
@@ -75,7 +75,7 @@ class Problem:
             settings: noise of clicks and survey.
         """
         depth = self.evidence.points_world @ row[15:18] + row[20]
-        meter = np.where(depth > _LEAST_DEPTH, row[0] / np.maximum(depth, _LEAST_DEPTH), 0.0)
+        meter = np.where(depth > _MIN_DEPTH, row[0] / np.maximum(depth, _MIN_DEPTH), 0.0)
         return replace(
             self, click_noise=np.hypot(settings.click_noise, settings.survey_error * meter)
         )
@@ -98,7 +98,7 @@ class Fits:
     evidence_information: NDArray[np.float64]
 
 
-def problem_of(
+def build_problem(
     evidence: Evidence,
     image_size: tuple[int, int],
     settings: StaticCalibrationSettings,
@@ -124,7 +124,7 @@ def problem_of(
     prior += [*middle, known.principal_point_spread * width, 0.5 * np.hypot(width, height)]
     prior += [known.k1_spread, known.k2_spread, known.k3_spread]
     prior += [np.log(known.height), known.height_spread]
-    prior += [np.log(known.distance), known.distance_spread, known.roll_spread, _LEAST_HEIGHT]
+    prior += [np.log(known.distance), known.distance_spread, known.roll_spread, _MIN_HEIGHT]
     prior += [*known.lens_spread, known.k1]
     return Problem(
         evidence=evidence,
@@ -132,7 +132,7 @@ def problem_of(
         prior=np.array(prior),
         free=free,
         click_noise=np.full(len(evidence.points), settings.click_noise),
-        drawn_noise=settings.drawn_noise * np.sqrt(crowding(evidence, settings.drawn_reach)),
+        drawn_noise=settings.drawn_noise * np.sqrt(count_neighbors(evidence, settings.drawn_reach)),
         drawn_loss=settings.drawn_loss,
         where=where,
     )
@@ -153,34 +153,33 @@ def adjust(
         click_loss: Cauchy scale of clicks [standard deviations]; infinite = least squares.
         iterations: at most; 0 only evaluates the starts.
     """
-    fitted = rows.copy()
-    count = len(rows)
-    cost = np.empty(count)
-    information = np.empty((count, SIZE, SIZE))
-    observed = np.empty((count, SIZE, SIZE))
-    evidence = problem.evidence
-    descend(
-        fitted,
-        evidence.points_world,
-        evidence.points_image,
-        evidence.samples_world,
-        evidence.bounds,
-        evidence.drawn_image,
-        evidence.drawn_marking,
-        problem.prior,
-        problem.free,
-        problem.click_noise,
-        problem.drawn_noise,
-        np.array([problem.reach, click_loss, problem.drawn_loss]),
-        iterations,
-        cost,
-        information,
-        observed,
+    count, evidence = len(rows), problem.evidence
+    found = Solutions(
+        rows=rows.copy(),
+        cost=np.empty(count),
+        information=np.empty((count, SIZE, SIZE)),
+        observed=np.empty((count, SIZE, SIZE)),
     )
-    return Fits(fitted, cost, information, observed)
+    given = Measurements(
+        points_world=evidence.points_world,
+        points_image=evidence.points_image,
+        samples_world=evidence.samples_world,
+        bounds=evidence.bounds,
+        drawn_image=evidence.drawn_image,
+        drawn_marking=evidence.drawn_marking,
+        prior=problem.prior,
+        free=problem.free,
+        click_noise=problem.click_noise,
+        drawn_noise=problem.drawn_noise,
+        half_diagonal=problem.half_diagonal,
+        click_loss=float(click_loss),
+        drawn_loss=float(problem.drawn_loss),
+    )
+    descend(given, iterations, found)
+    return Fits(found.rows, found.cost, found.information, found.observed)
 
 
-def row_of(camera: Camera) -> NDArray[np.float64]:
+def camera_row(camera: Camera) -> NDArray[np.float64]:
     """Return the (22,) row of a single camera; the solver checks lens folds itself."""
     pose = camera.cam_from_world
     return np.concatenate(
@@ -195,7 +194,7 @@ def row_of(camera: Camera) -> NDArray[np.float64]:
     )
 
 
-def camera_of_row(row: NDArray[np.float64], image_size: tuple[int, int]) -> Camera:
+def camera_from_row(row: NDArray[np.float64], image_size: tuple[int, int]) -> Camera:
     """Return the camera of a row."""
     u, _, v = np.linalg.svd(row[9:18].reshape(3, 3))
     return Camera(

@@ -14,10 +14,10 @@ from worldpose.static_calibration.adjustment import (
     Fits,
     Problem,
     adjust,
-    camera_of_row,
-    row_of,
+    camera_from_row,
+    camera_row,
 )
-from worldpose.static_calibration.curvature_correction import with_bends
+from worldpose.static_calibration.curvature_correction import add_curvature
 from worldpose.static_calibration.parameters import CameraEstimate
 from worldpose.static_calibration.residuals import (
     PRIORS,
@@ -77,7 +77,7 @@ class Rows:
 
 
 @dataclass(frozen=True, eq=False)
-class Screened:
+class InlierFit:
     """A fit to the inliers among the clicks.
 
     Attributes:
@@ -87,7 +87,7 @@ class Screened:
         evidence_information: (12, 12) of the inliers, at the estimated noise.
         inliers: (n,) bool.
         markings: (m,) bool, inliers among the drawn markings.
-        surprise: (n,) Mahalanobis distance of each click from its prediction by the other evidence.
+        mahalanobis: (n,) distance of each click from its prediction by the other evidence.
         noise_scale: estimated noise over the stated noise: 1 unless the residuals clearly
             contradict the stated noise.
         click_noise: standard deviation of the inlying clicks, estimated from their residuals [px];
@@ -102,14 +102,44 @@ class Screened:
     evidence_information: NDArray[np.float64]
     inliers: NDArray[np.bool_]
     markings: NDArray[np.bool_]
-    surprise: NDArray[np.float64]
+    mahalanobis: NDArray[np.float64]
     noise_scale: float
     click_noise: float
     click_freedom: float
     misfit: float
 
+    def estimate(self, image_size: tuple[int, int]) -> CameraEstimate:
+        """Return the fitted camera and its covariance."""
+        return CameraEstimate(camera_from_row(self.row, image_size), self.covariance)
 
-def residual_rows(problem: Problem, row: NDArray[np.float64]) -> Rows:
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """An explanation of the clicks: the noise that it assumes, and the fit at this noise.
+
+    Attributes:
+        problem: the clicks, at the noise of the explanation.
+        fit: fit to the inliers.
+        settings: settings at this noise.
+        assumptions: further assumptions, in words.
+    """
+
+    problem: Problem
+    fit: InlierFit
+    settings: StaticCalibrationSettings
+    assumptions: tuple[str, ...] = ()
+
+    @property
+    def estimate(self) -> CameraEstimate:
+        """The fitted camera and its covariance."""
+        return self.fit.estimate(self.problem.image_size)
+
+    def noise_factor(self, stated: StaticCalibrationSettings) -> float:
+        """Return the assumed noise over the stated noise [1]."""
+        return self.settings.click_noise / stated.click_noise
+
+
+def compute_residuals(problem: Problem, row: NDArray[np.float64]) -> Rows:
     """Return all residuals at a camera (22,); derivatives by fixed parameters are zero."""
     evidence = problem.evidence
     n, d = len(evidence.points), len(evidence.drawn_image)
@@ -117,7 +147,7 @@ def residual_rows(problem: Problem, row: NDArray[np.float64]) -> Rows:
     point_residuals(row, evidence.points_world, evidence.points_image, rows.click, rows.by_click)
     drawn_residuals(
         row,
-        problem.reach,
+        problem.half_diagonal,
         evidence.samples_world,
         evidence.bounds,
         evidence.drawn_image,
@@ -130,9 +160,9 @@ def residual_rows(problem: Problem, row: NDArray[np.float64]) -> Rows:
     )
 
 
-def screen(
+def fit_inliers(
     problem: Problem, start: NDArray[np.float64], settings: StaticCalibrationSettings
-) -> Screened:
+) -> InlierFit:
     """Return the fit to the inliers among clicks and markings.
 
     From the inliers of a robust fit, the search removes or restores one click at a time: the inlier
@@ -154,38 +184,38 @@ def screen(
     count = len(problem.evidence.points)
     robust = adjust(problem, start[None], click_loss=_ROBUST)
     row = robust.rows[0]
-    problem = problem.surveyed_from(row, settings)
-    length = np.linalg.norm(residual_rows(problem, row).click, axis=1) / problem.click_noise
-    inliers = (length < limit * max(1.0, _spread(length))) & _imaged(problem, row)
-    markings = _right_markings(problem, row, inliers, settings)
+    problem = problem.with_survey_error(row, settings)
+    length = np.linalg.norm(compute_residuals(problem, row).click, axis=1) / problem.click_noise
+    inliers = (length < limit * max(1.0, _spread(length))) & _imageable(problem, row)
+    markings = _select_markings(problem, row, inliers, settings)
     seen = set()
     while True:
         seen.add(inliers.tobytes() + markings.tobytes())
-        kept = problem.only(inliers, markings)
+        kept = problem.select(inliers, markings)
         fit = adjust(kept, row[None])
         row = fit.rows[0]
-        _, _, surprise = _judged_clicks(problem, kept, fit, inliers)
+        _, _, mahalanobis = _judge_clicks(problem, kept, fit, inliers)
         following = inliers.copy()
-        wrong = np.where(inliers, surprise, 0.0)
-        right = np.where(inliers, np.inf, surprise)
+        wrong = np.where(inliers, mahalanobis, 0.0)
+        right = np.where(inliers, np.inf, mahalanobis)
         if count and wrong.max() > limit:
             following[np.argmax(wrong)] = False
         elif count and right.min() < limit:
             following[np.argmin(right)] = True
-        following_markings = _right_markings(problem, row, following, settings)
+        following_markings = _select_markings(problem, row, following, settings)
         if following.tobytes() + following_markings.tobytes() in seen:
             break
         # With half of the clicks as outliers, the inliers are no majority.
         if 2 * following.sum() < count:
             break
         inliers, markings = following, following_markings
-    return rest_on(problem, row, inliers, markings)
+    return fit_given_inliers(problem, row, inliers, markings)
 
 
-def screen_at_best_noise(
+def fit_inliers_at_best_noise(
     problem: Problem, start: NDArray[np.float64], settings: StaticCalibrationSettings
-) -> tuple[Problem, Screened, StaticCalibrationSettings]:
-    """Return problem, fit and settings at the most probable click noise.
+) -> Explanation:
+    """Return the explanation of the clicks at their most probable noise.
 
     A few clicks with large residuals are outliers at the stated noise, or inliers at a larger
     noise. The larger posterior probability decides: inliers are Gaussian, outliers are uniform in
@@ -200,25 +230,25 @@ def screen_at_best_noise(
     Raises:
         InputError: only an impossible camera explains the clicks.
     """
-    fit = screen(problem, start, settings)
-    best = problem.surveyed_from(fit.row, settings), fit, settings
+    fit = fit_inliers(problem, start, settings)
+    best = Explanation(problem.with_survey_error(fit.row, settings), fit, settings)
     if fit.inliers.all() and fit.noise_scale <= 1.0:
         return best
-    least = improbability(*best, factor=1.0, with_prior=False)
+    lowest = negative_log_posterior(best, factor=1.0, with_prior=False)
     for factor in _NOISES:
-        other, rough = at_noise(problem, factor, settings)
+        other, rough = scale_noise(problem, factor, settings)
         try:
-            tried = screen(other, fit.row, rough)
+            tried = fit_inliers(other, fit.row, rough)
         except InputError:
             continue
-        found = other.surveyed_from(tried.row, rough), tried, rough
-        own = improbability(*found, factor=factor, with_prior=False)
-        if own < least - (CLEAR_GAIN if best[2] is settings else 0.0):
-            best, least = found, own
+        found = Explanation(other.with_survey_error(tried.row, rough), tried, rough)
+        own = negative_log_posterior(found, factor=factor, with_prior=False)
+        if own < lowest - (CLEAR_GAIN if best.settings is settings else 0.0):
+            best, lowest = found, own
     return best
 
 
-def at_noise(
+def scale_noise(
     problem: Problem, factor: float, settings: StaticCalibrationSettings
 ) -> tuple[Problem, StaticCalibrationSettings]:
     """Return problem and settings with the noise of clicks and drawn pixels times a factor."""
@@ -233,26 +263,18 @@ def at_noise(
     )
 
 
-def improbability(
-    problem: Problem,
-    fit: Screened,
-    settings: StaticCalibrationSettings,
-    *,
-    factor: float,
-    with_prior: bool,
-) -> float:
+def negative_log_posterior(found: Explanation, *, factor: float, with_prior: bool) -> float:
     """Return minus twice the log posterior of an explanation, up to a constant.
 
     Args:
-        problem: the clicks, at the noise of the explanation.
-        fit: fit to them.
-        settings: settings at this noise.
-        factor: this noise over the stated noise.
+        found: the explanation.
+        factor: its noise over the stated noise.
         with_prior: include the camera prior: for comparisons of assumptions about the camera. For
             comparisons of noise it would count a lens that is rare under the prior as noise.
     """
-    kept = problem.only(fit.inliers, fit.markings)
-    rows = residual_rows(kept, fit.row)
+    problem, fit, settings = found.problem, found.fit, found.settings
+    kept = problem.select(fit.inliers, fit.markings)
+    rows = compute_residuals(kept, fit.row)
     scale = fit.noise_scale
     squared = (_click_loss(kept, rows) + _drawn_loss(kept, rows)) / scale**2
     volume = 2.0 * float(np.log(scale)) * (2 * len(kept.click_noise) + len(kept.drawn_noise))
@@ -274,12 +296,12 @@ def improbability(
     return float(squared + volume + wrong + told + far**2)
 
 
-def rest_on(
+def fit_given_inliers(
     problem: Problem,
     row: NDArray[np.float64],
     inliers: NDArray[np.bool_],
     markings: NDArray[np.bool_],
-) -> Screened:
+) -> InlierFit:
     """Return the fit to given inliers.
 
     Args:
@@ -288,24 +310,24 @@ def rest_on(
         inliers: (n,) clicks to fit to.
         markings: (m,) drawn markings to fit to.
     """
-    kept = problem.only(inliers, markings)
+    kept = problem.select(inliers, markings)
     fit = adjust(kept, row[None])
     row = fit.rows[0]
-    covariance, noise, surprise = _judged_clicks(problem, kept, fit, inliers)
+    covariance, noise, mahalanobis = _judge_clicks(problem, kept, fit, inliers)
     scale = noise.scale
-    own = residual_rows(kept, row)
+    own = compute_residuals(kept, row)
     evidence_rows = 2 * len(own.click) + len(own.drawn)
     share = noise.freedom / max(evidence_rows, 1)
     click_freedom = share * 2 * len(own.click)
     click_squared = float((own.click**2).sum())
-    return Screened(
+    return InlierFit(
         row=row,
-        covariance=with_bends(kept, row, covariance, scale),
+        covariance=add_curvature(kept, row, covariance, scale),
         tangent_covariance=covariance,
         evidence_information=fit.evidence_information[0] / scale**2,
         inliers=inliers,
         markings=markings,
-        surprise=surprise,
+        mahalanobis=mahalanobis,
         noise_scale=scale,
         click_noise=float(np.sqrt(click_squared / click_freedom)) if click_freedom else np.nan,
         click_freedom=click_freedom,
@@ -313,37 +335,37 @@ def rest_on(
     )
 
 
-def noise_of(problem: Problem, row: NDArray[np.float64]) -> float:
+def noise_ratio(problem: Problem, row: NDArray[np.float64]) -> float:
     """Return the ratio of the median click residual to its value at the stated noise.
 
     Args:
         problem: clicks, noise and prior.
         row: (22,) camera.
     """
-    length = np.linalg.norm(residual_rows(problem, row).click, axis=1)
+    length = np.linalg.norm(compute_residuals(problem, row).click, axis=1)
     return _spread(length / problem.click_noise)
 
 
-def surprise_at(problem: Problem, estimate: CameraEstimate) -> NDArray[np.float64]:
+def mahalanobis_distances(problem: Problem, estimate: CameraEstimate) -> NDArray[np.float64]:
     """Return each click's Mahalanobis distance (n,) from its prediction by a camera.
 
     Args:
         problem: clicks, noise and prior.
         estimate: camera that is independent of these clicks.
     """
-    rows = residual_rows(problem, row_of(estimate.camera))
+    rows = compute_residuals(problem, camera_row(estimate.camera))
     nobody = np.zeros(len(rows.click), dtype=np.bool_)
-    return _surprise(rows, estimate.covariance, problem.click_noise, nobody)
+    return _leave_one_out_distances(rows, estimate.covariance, problem.click_noise, nobody)
 
 
-def held_out_error(problem: Problem, fit: Screened) -> float:
+def held_out_error(problem: Problem, fit: InlierFit) -> float:
     """Return the root mean square leave-one-out error of clicks and markings [px].
 
     The function leaves out one click, or all pixels of one marking, at a time; the fit with them
     gives their residual without them (the block form of the PRESS statistic).
     """
     evidence = problem.evidence
-    rows = residual_rows(problem, fit.row)
+    rows = compute_residuals(problem, fit.row)
     units = [
         (rows.click[i], rows.by_click[i], problem.click_noise[i : i + 1])
         for i in np.flatnonzero(fit.inliers)
@@ -371,7 +393,7 @@ def held_out_error(problem: Problem, fit: Screened) -> float:
     return float(np.sqrt(total / max(count, 1)))
 
 
-def _right_markings(
+def _select_markings(
     problem: Problem,
     row: NDArray[np.float64],
     inliers: NDArray[np.bool_],
@@ -383,7 +405,7 @@ def _right_markings(
     constraints, and enough for a camera.
     """
     evidence = problem.evidence
-    off = np.abs(residual_rows(problem, row).drawn)
+    off = np.abs(compute_residuals(problem, row).drawn)
     on = evidence.drawn_marking
     middle = np.array([np.median(off[on == index]) for index in range(len(evidence.markings))])
     right = np.asarray(middle < settings.wrong_marking * settings.drawn_noise)
@@ -396,9 +418,9 @@ def _right_markings(
     return right if enough else np.ones(len(right), dtype=np.bool_)
 
 
-def _imaged(problem: Problem, row: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _imageable(problem: Problem, row: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return a mask of the clicked points (n,) that a camera (22,) can image."""
-    camera = camera_of_row(row, problem.image_size)
+    camera = camera_from_row(row, problem.image_size)
     return np.asarray(np.isfinite(camera.project(problem.evidence.points_world)).all(axis=-1))
 
 
@@ -437,7 +459,7 @@ class _Noise:
         return cls(min(float(scale), _LARGEST_SCALE), worth, squared, freedom)
 
 
-def _judged_clicks(
+def _judge_clicks(
     problem: Problem, kept: Problem, fit: Fits, inliers: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], _Noise, NDArray[np.float64]]:
     """Return the covariance (12, 12), the noise, and each click's Mahalanobis distance (n,).
@@ -453,9 +475,9 @@ def _judged_clicks(
     """
     covariance, noise = _covariance(kept, fit)
     row = fit.rows[0]
-    rows = residual_rows(problem, row)
-    length = _surprise(rows, covariance, noise.scale * problem.click_noise, inliers)
-    surprise = np.empty(len(length))
+    rows = compute_residuals(problem, row)
+    length = _leave_one_out_distances(rows, covariance, noise.scale * problem.click_noise, inliers)
+    mahalanobis = np.empty(len(length))
     for index, own in enumerate(length):
         others = noise
         if inliers[index]:
@@ -463,12 +485,12 @@ def _judged_clicks(
             others = _Noise.told(left, noise.freedom - 2.0)
         # Drawn pixels that are more accurate than stated do not make clicks more accurate.
         scale = max(others.scale, 1.0)
-        surprise[index] = _as_gaussian(own * noise.scale / scale, others.worth)
-    surprise[~_imaged(problem, row)] = np.inf
-    return covariance, noise, surprise
+        mahalanobis[index] = _gaussian_distance(own * noise.scale / scale, others.worth)
+    mahalanobis[~_imageable(problem, row)] = np.inf
+    return covariance, noise, mahalanobis
 
 
-def _as_gaussian(distance: float, worth: float) -> float:
+def _gaussian_distance(distance: float, worth: float) -> float:
     """Return the Mahalanobis distance with the same tail probability for a 2D Gaussian."""
     if not worth < np.inf:
         return distance
@@ -480,7 +502,7 @@ def _covariance(problem: Problem, fit: Fits) -> tuple[NDArray[np.float64], _Nois
     observed = fit.evidence_information[0]
     prior = fit.information[0] - observed
     free = np.ix_(problem.free, problem.free)
-    rows = residual_rows(problem, fit.rows[0])
+    rows = compute_residuals(problem, fit.rows[0])
     squared = _click_loss(problem, rows) + _drawn_loss(problem, rows)
     count = 2 * len(rows.click) + len(rows.drawn)
     if not _is_invertible(fit.information[0][free]):
@@ -526,7 +548,7 @@ def _drawn_loss(problem: Problem, rows: Rows) -> float:
     return float(limit * np.log1p((rows.drawn / problem.drawn_noise) ** 2 / limit).sum())
 
 
-def _surprise(
+def _leave_one_out_distances(
     rows: Rows,
     covariance: NDArray[np.float64],
     noise: NDArray[np.float64],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,32 +21,85 @@ TOLERANCE: Final = 1e-10
 """Relative decrease of the cost below which the loop counts as converged."""
 
 
+class Measurements(NamedTuple):
+    """Clicks, drawn markings and prior of a camera fit.
+
+    Attributes:
+        points_world: (n, 3) clicked points [m], world.
+        points_image: (n, 2) [px].
+        samples_world: (s, 3) [m], world, along the drawn markings one after another.
+        bounds: (m + 1,) first sample of each marking, and the end.
+        drawn_image: (d, 2) drawn pixels [px].
+        drawn_marking: (d,) index of the marking of each.
+        prior: (19,), see `prior_residuals`.
+        free: (12,) parameters to solve for.
+        click_noise: (n,) standard deviations, each axis [px].
+        drawn_noise: (d,) standard deviations across the marking [px].
+        half_diagonal: of the image [px].
+        click_loss: Cauchy scale of clicks [standard deviations]; infinite = least squares.
+        drawn_loss: Cauchy scale of drawn pixels [standard deviations].
+    """
+
+    points_world: Floats
+    points_image: Floats
+    samples_world: Floats
+    bounds: Integers
+    drawn_image: Floats
+    drawn_marking: Integers
+    prior: Floats
+    free: NDArray[np.bool_]
+    click_noise: Floats
+    drawn_noise: Floats
+    half_diagonal: float
+    click_loss: float
+    drawn_loss: float
+
+
+class Linearization(NamedTuple):
+    """Normal equations at a camera, written by the kernels.
+
+    Attributes:
+        information: (12, 12) of evidence and prior.
+        observed: (12, 12) contribution of the evidence alone.
+        gradient: (12,) of the cost.
+    """
+
+    information: Floats
+    observed: Floats
+    gradient: Floats
+
+
+class Solutions(NamedTuple):
+    """Cameras and their costs and information matrices, written by the kernels.
+
+    Attributes:
+        rows: (b, 22) starts, replaced by the fitted cameras.
+        cost: (b,).
+        information: (b, 12, 12) of evidence and prior.
+        observed: (b, 12, 12) contribution of the evidence alone.
+    """
+
+    rows: Floats
+    cost: Floats
+    information: Floats
+    observed: Floats
+
+
 @compiled
-def descend(
-    rows: Floats,
-    world: Floats,
-    pixels: Floats,
-    samples: Floats,
-    bounds: Integers,
-    drawn: Floats,
-    marking: Integers,
-    prior: Floats,
-    free: NDArray[np.bool_],
-    spread: Floats,
-    drawn_spread: Floats,
-    noise: Floats,
-    iterations: int,
-    cost: Floats,
-    information: Floats,
-    observed: Floats,
-) -> None:
-    """Minimize the cost from each row in place; see `adjustment.adjust`."""
+def descend(given: Measurements, iterations: int, found: Solutions) -> None:
+    """Minimize the cost from each row in place; see `adjustment.adjust`.
+
+    Args:
+        given: evidence and prior.
+        iterations: at most, per start; 0 only evaluates the starts.
+        found: starts in its rows; written.
+    """
+    rows, cost, information, observed = found.rows, found.cost, found.information, found.observed
+    free = given.free
     trial = np.empty(22)
     system = np.empty((SIZE, SIZE))
     gradient = np.empty(SIZE)
-    new_information = np.empty((SIZE, SIZE))
-    new_observed = np.empty((SIZE, SIZE))
-    new_gradient = np.empty(SIZE)
+    new = Linearization(np.empty((SIZE, SIZE)), np.empty((SIZE, SIZE)), np.empty(SIZE))
     step = np.empty(SIZE)
     for b in range(len(rows)):
         trial[:] = rows[b]
@@ -55,30 +108,14 @@ def descend(
         stalled = 0
         iteration = 0
         while True:
-            reached = _linearize(
-                trial,
-                world,
-                pixels,
-                samples,
-                bounds,
-                drawn,
-                marking,
-                prior,
-                free,
-                spread,
-                drawn_spread,
-                noise,
-                new_information,
-                new_observed,
-                new_gradient,
-            )
+            reached = _linearize(trial, given, new)
             if reached < cost[b] or iteration == 0:
                 stalled = stalled + 1 if cost[b] - reached < TOLERANCE * cost[b] else 0
                 rows[b] = trial
                 cost[b] = reached
-                information[b] = new_information
-                observed[b] = new_observed
-                gradient[:] = new_gradient
+                information[b] = new.information
+                observed[b] = new.observed
+                gradient[:] = new.gradient
                 damping = max(0.1 * damping, 1e-9)
             else:
                 damping *= 8.0
@@ -94,43 +131,38 @@ def descend(
 
 
 @compiled
-def _linearize(
-    c: Floats,
-    world: Floats,
-    pixels: Floats,
-    samples: Floats,
-    bounds: Integers,
-    drawn: Floats,
-    marking: Integers,
-    prior: Floats,
-    free: NDArray[np.bool_],
-    spread: Floats,
-    drawn_spread: Floats,
-    noise: Floats,
-    information: Floats,
-    observed: Floats,
-    gradient: Floats,
-) -> float:
+def _linearize(c: Floats, given: Measurements, written: Linearization) -> float:
     """Return the cost at a camera; write information and gradient, zero for fixed parameters."""
-    n, d = len(world), len(drawn)
+    information, observed, gradient = written.information, written.observed, written.gradient
+    free, spread, drawn_spread = given.free, given.click_noise, given.drawn_noise
+    n, d = len(given.points_world), len(given.drawn_image)
     click = np.empty((n, 2))
     by_click = np.empty((n, 2, SIZE))
     off = np.empty(d)
     by_off = np.empty((d, SIZE))
     known = np.empty(PRIORS)
     by_known = np.empty((PRIORS, SIZE))
-    point_residuals(c, world, pixels, click, by_click)
-    drawn_residuals(c, noise[0], samples, bounds, drawn, marking, off, by_off)
-    prior_residuals(c, prior, known, by_known)
+    point_residuals(c, given.points_world, given.points_image, click, by_click)
+    drawn_residuals(
+        c,
+        given.half_diagonal,
+        given.samples_world,
+        given.bounds,
+        given.drawn_image,
+        given.drawn_marking,
+        off,
+        by_off,
+    )
+    prior_residuals(c, given.prior, known, by_known)
     gradient[:] = 0.0
     observed[:] = 0.0
     for i in range(n):
-        weight = _weight((click[i, 0] ** 2 + click[i, 1] ** 2) / spread[i] ** 2, noise[1])
+        weight = _weight((click[i, 0] ** 2 + click[i, 1] ** 2) / spread[i] ** 2, given.click_loss)
         weight /= spread[i] ** 2
         for k in range(2):
             _add(by_click[i, k], click[i, k], weight, observed, gradient)
     for i in range(d):
-        weight = _weight((off[i] / drawn_spread[i]) ** 2, noise[2]) / drawn_spread[i] ** 2
+        weight = _weight((off[i] / drawn_spread[i]) ** 2, given.drawn_loss) / drawn_spread[i] ** 2
         _add(by_off[i], off[i], weight, observed, gradient)
     information[:] = observed
     for i in range(PRIORS):
@@ -140,7 +172,7 @@ def _linearize(
             information[j, :] = information[:, j] = 0.0
             observed[j, :] = observed[:, j] = 0.0
             gradient[j] = 0.0
-    return _cost(click, off, known, spread, drawn_spread, noise)
+    return _cost(click, off, known, given)
 
 
 @compiled
@@ -188,19 +220,14 @@ def _loss(squared: float, scale: float) -> float:
 
 
 @compiled
-def _cost(
-    click: Floats,
-    off: Floats,
-    known: Floats,
-    spread: Floats,
-    drawn_spread: Floats,
-    noise: Floats,
-) -> float:
+def _cost(click: Floats, off: Floats, known: Floats, given: Measurements) -> float:
+    spread, drawn_spread = given.click_noise, given.drawn_noise
     total = 0.0
     for i in range(len(click)):
-        total += _loss((click[i, 0] ** 2 + click[i, 1] ** 2) / spread[i] ** 2, noise[1])
+        squared = (click[i, 0] ** 2 + click[i, 1] ** 2) / spread[i] ** 2
+        total += _loss(squared, given.click_loss)
     for i in range(len(off)):
-        total += _loss((off[i] / drawn_spread[i]) ** 2, noise[2])
+        total += _loss((off[i] / drawn_spread[i]) ** 2, given.drawn_loss)
     for i in range(len(known)):
         total += known[i] ** 2
     return 0.5 * total if total < np.inf else np.inf

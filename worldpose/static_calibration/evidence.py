@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,11 +11,22 @@ from numpy.typing import NDArray
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration.ground_error import points_off_line
 
-_MOST = 200
+_MAX_DRAWN: Final = 200
 """Maximum drawn pixels per marking [1]: more cost time and add no information."""
-_OUTSIDE = 1.0
+_OUTSIDE: Final = 1.0
 """Maximum distance of a click outside the image [px]: rounding at its border."""
+_POINTS: Final = 4
+"""Minimum clicked points without a drawn marking [1]: those of a homography."""
+_CONSTRAINTS: Final = 6
+"""Minimum constraints with a drawn marking [1]: pose; the prior holds the focal length."""
+_LINE: Final = 2
+"""Constraints of a straight marking, whatever its drawn length [1]."""
+_ARC: Final = 4
+"""Constraints of an arc [1]: five of its ellipse, less one for the rotation of the circle."""
+_OFF_LINE: Final = 1.0
+"""Root mean square distance from a line below which points count as collinear [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +55,7 @@ class Evidence:
     drawn_marking: NDArray[np.int64]
     straight: NDArray[np.bool_]
 
-    def only(self, points: NDArray[np.bool_], markings: NDArray[np.bool_]) -> Evidence:
+    def select(self, points: NDArray[np.bool_], markings: NDArray[np.bool_]) -> Evidence:
         """Return the evidence restricted to some clicked points (n,) and drawn markings (m,)."""
         keep, on = points, markings[self.drawn_marking]
         return replace(
@@ -56,7 +68,7 @@ class Evidence:
         )
 
 
-def gather(
+def gather_evidence(
     pitch: PitchTemplate,
     clicked: ClickedMarkings,
     image_size: tuple[int, int],
@@ -105,7 +117,7 @@ def gather(
         for pixel in marking.xy:
             _check_inside(place, pixel, image_size)
         pixels.setdefault(marking.name, []).extend(marking.xy)
-    pixels = {name: _thinned(drawn) for name, drawn in pixels.items()}
+    pixels = {name: _thin(drawn) for name, drawn in pixels.items()}
     samples = [pitch.marking_points(name, spacing) for name in pixels]
     counts = [len(drawn) for drawn in pixels.values()]
     return Evidence(
@@ -121,7 +133,7 @@ def gather(
     )
 
 
-def crowding(evidence: Evidence, reach: float) -> NDArray[np.float64]:
+def count_neighbors(evidence: Evidence, reach: float) -> NDArray[np.float64]:
     """Return per drawn pixel (d,) the count of its marking's pixels within `reach` [px].
 
     Errors of hand drawing are correlated along a line: pixels within `reach` count as one.
@@ -135,9 +147,9 @@ def crowding(evidence: Evidence, reach: float) -> NDArray[np.float64]:
     return count
 
 
-def _thinned(pixels: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return at most `_MOST` of a marking's pixels, evenly spaced in their order."""
-    chosen = np.linspace(0, len(pixels) - 1, min(len(pixels), _MOST)).astype(np.int64)
+def _thin(pixels: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return at most `_MAX_DRAWN` of a marking's pixels, evenly spaced in their order."""
+    chosen = np.linspace(0, len(pixels) - 1, min(len(pixels), _MAX_DRAWN)).astype(np.int64)
     return [pixels[index] for index in chosen]
 
 
@@ -160,3 +172,61 @@ def _unknown(where: str, name: str, known: tuple[str, ...]) -> InputError:
         found=repr(name),
         todo=f"Use one of {', '.join(sorted(known))}.",
     )
+
+
+def check_amount(evidence: Evidence, pitch: PitchTemplate, where: str) -> None:
+    """Raise InputError when the clicks are too few, or on one line, for any camera."""
+    points, found = len(evidence.points), describe_clicks(evidence)
+    if not evidence.markings:
+        if points < _POINTS:
+            more = points_off_line(pitch, evidence.points_world)
+            new = [name for name in more if name not in evidence.points]
+            raise InputError(
+                where,
+                expected=f"{_POINTS} clicked points or more, better 8, or drawn markings as well",
+                found=found,
+                todo=f"Add what the picture shows of {', '.join(new)}, far from the others.",
+            )
+        plan = evidence.points_world[:, :2]
+        spread = np.linalg.svd(plan - plan.mean(axis=0), compute_uv=False)[1]
+        if spread < _OFF_LINE * np.sqrt(points):
+            more = points_off_line(pitch, evidence.points_world)
+            raise InputError(
+                where,
+                expected="points off one line",
+                found=f"{found}, all on one line of the pitch",
+                todo=f"Add what the picture shows of {', '.join(more)}, off that line.",
+            )
+        return
+    numbers = 2 * points
+    for index in range(len(evidence.markings)):
+        pixels = int((evidence.drawn_marking == index).sum())
+        numbers += min(pixels, _LINE if evidence.straight[index] else _ARC)
+    if numbers < _CONSTRAINTS:
+        places = np.concatenate([evidence.points_world, evidence.samples_world])
+        more = points_off_line(pitch, places)
+        raise InputError(
+            where,
+            expected="three straight markings in two directions, or two points and a marking",
+            found=found,
+            todo=f"Draw another marking, or add what the picture shows of {', '.join(more)}.",
+        )
+
+
+def has_enough_points(evidence: Evidence) -> bool:
+    """Return whether the clicked points alone can determine a camera."""
+    plan = evidence.points_world[:, :2]
+    if len(plan) < _POINTS:
+        return False
+    spread = np.linalg.svd(plan - plan.mean(axis=0), compute_uv=False)[1]
+    return bool(spread >= _OFF_LINE * np.sqrt(len(plan)))
+
+
+def describe_clicks(evidence: Evidence) -> str:
+    """Return the number and the names of the clicked points and drawn markings."""
+    parts = []
+    if evidence.points:
+        parts.append(f"{len(evidence.points)} points ({', '.join(evidence.points)})")
+    if evidence.markings:
+        parts.append(f"{len(evidence.markings)} markings ({', '.join(evidence.markings)})")
+    return " and ".join(parts)

@@ -1,17 +1,238 @@
-"""Initial cameras from homographies, and from a grid of plausible places in the stands."""
+"""Initial cameras from homographies, and from a grid of plausible places in the stands (C2).
+
+Homographies between pitch plane and image come from the normalized DLT.
+"""
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import replace
 from itertools import pairwise, product
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.static_calibration.adjustment import Problem, row_of
-from worldpose.static_calibration.homography import camera_of, homographies
-from worldpose.static_calibration.settings import CameraPrior
+from worldpose.geometry import Camera, Rigid
+from worldpose.static_calibration.adjustment import Problem, adjust, camera_row
+from worldpose.static_calibration.evidence import Evidence
+from worldpose.static_calibration.settings import CameraPrior, StaticCalibrationSettings
 
+_PLANE_SCALE = 50.0
+"""Half a pitch [m]: coordinates of order one keep the DLT well conditioned."""
+_ON_SURFACE = 0.5
+"""Maximum height of points for a homography [m]: includes the crown, excludes the goals' upper
+ends."""
+_MAX_SUBSETS = 300
+"""Maximum subsets of four clicks [1]: with two outliers of twelve, 40 % of them are clean."""
+
+
+def plane_from_image(
+    points_image: NDArray[np.float64],
+    points_plane: NDArray[np.float64],
+    line_pixels: NDArray[np.float64],
+    lines: NDArray[np.float64],
+    scale: float,
+    middle: NDArray[np.float64],
+) -> NDArray[np.float64] | None:
+    """Return the (3, 3) homography from pixels to the plane [m] by the DLT, or None.
+
+    A point gives two equations; a pixel drawn anywhere on a straight line gives one, which is
+    linear as well in this direction: line . (H pixel) = 0.
+
+    Args:
+        points_image: (n, 2) [px].
+        points_plane: (n, 2) [m].
+        line_pixels: (d, 2) [px].
+        lines: (d, 3) line per pixel, a x + b y + c = 0 with a^2 + b^2 = 1 [m].
+        scale: half the image diagonal [px].
+        middle: (2,) image center [px].
+
+    Returns:
+        None if the equations do not determine one homography.
+    """
+    pixel = _homogeneous((points_image - middle) / scale)
+    x, y = (points_plane / _PLANE_SCALE).T
+    zero = np.zeros_like(pixel)
+    rows = [
+        np.concatenate([pixel, zero, -x[:, None] * pixel], axis=1),
+        np.concatenate([zero, pixel, -y[:, None] * pixel], axis=1),
+    ]
+    drawn = _homogeneous((line_pixels - middle) / scale)
+    line = lines * np.array([1.0, 1.0, 1.0 / _PLANE_SCALE])
+    rows.append((line[:, :, None] * drawn[:, None, :]).reshape(-1, 9))
+    system = np.concatenate(rows)
+    if len(system) < 8:
+        return None
+    _, values, basis = np.linalg.svd(system)
+    if values[7] < 1e-3 * values[0] / np.sqrt(len(system)):
+        return None
+    homography: NDArray[np.float64] = (
+        np.diag([_PLANE_SCALE, _PLANE_SCALE, 1.0])
+        @ basis[8].reshape(3, 3)
+        @ np.array([[1.0, 0.0, -middle[0]], [0.0, 1.0, -middle[1]], [0.0, 0.0, scale]])
+    )
+    return homography
+
+
+def camera_from_homography(
+    image_from_plane: NDArray[np.float64],
+    image_size: tuple[int, int],
+    seen: NDArray[np.float64],
+    focal_range: tuple[float, float],
+) -> Camera | None:
+    """Return the camera of a homography from the plane z = 0, or None.
+
+    The function assumes square pixels and the principal point in the image center: a plane gives
+    two equations for the internal parameters, here both for the focal length. Where they contradict
+    each other or are degenerate (a view straight down), the function clips the focal length to its
+    range.
+
+    Args:
+        image_from_plane: (3, 3).
+        image_size: width, height [px].
+        seen: (2,) [px], a pixel on the pitch: the plane is in front of the camera there.
+        focal_range: minimum and maximum plausible focal length [px].
+
+    Note:
+        C2, trap 10.
+    """
+    width, height = image_size
+    middle = np.array([0.5 * (width - 1), 0.5 * (height - 1)])
+    centred = np.array([[1.0, 0.0, -middle[0]], [0.0, 1.0, -middle[1]], [0.0, 0.0, 1.0]])
+    h = centred @ image_from_plane
+    if not np.isfinite(h).all() or abs(np.linalg.det(h)) < 1e-12 * np.abs(h).max() ** 3:
+        return None
+    # With w = 1 / f^2: the columns are orthogonal, and of one length.
+    factors = np.array(
+        [h[0, 0] * h[0, 1] + h[1, 0] * h[1, 1], (h[:2, 0] ** 2 - h[:2, 1] ** 2).sum()]
+    )
+    constants = np.array([h[2, 0] * h[2, 1], h[2, 0] ** 2 - h[2, 1] ** 2])
+    squared = float(factors @ factors)
+    inverse = -float(factors @ constants) / squared if squared > 0.0 else 0.0
+    low, high = focal_range
+    focal = 1.0 / np.sqrt(np.clip(inverse, high**-2.0, low**-2.0))
+    columns = np.diag([1.0 / focal, 1.0 / focal, 1.0]) @ h
+    columns = columns / np.sqrt(np.linalg.norm(columns[:, 0]) * np.linalg.norm(columns[:, 1]))
+    # The plane point behind `seen` has positive depth.
+    place = np.linalg.solve(h, np.append(seen - middle, 1.0))
+    depth = columns[2] @ (place / place[2])
+    columns = columns * (1.0 if depth > 0.0 else -1.0)
+    across = np.cross(columns[:, 0], columns[:, 1])
+    u, _, v = np.linalg.svd(np.stack([columns[:, 0], columns[:, 1], across], axis=1))
+    rotation = u @ v
+    if np.linalg.det(rotation) < 0.0:
+        return None
+    return Camera(
+        focal=np.array([focal, focal]),
+        principal_point=middle,
+        distortion=np.zeros(5),
+        cam_from_world=Rigid(rotation, columns[:, 2]),
+        image_size=np.array(image_size),
+    )
+
+
+def homographies(
+    evidence: Evidence, image_size: tuple[int, int], tolerance: float, *, leave_out: bool
+) -> list[NDArray[np.float64]]:
+    """Return candidate homographies (3, 3) from the plane to pixels, the best one first.
+
+    Candidates are: the DLT over straight markings and the inliers of RANSAC (four clicks at a time,
+    from five clicks on), the DLT over straight markings and all clicks, and the DLT over straight
+    markings alone.
+
+    Args:
+        evidence: clicks and drawn markings.
+        image_size: width, height [px].
+        tolerance: maximum inlier distance [px]; covers distortion and the crown.
+        leave_out: also leave out each straight marking in turn.
+    """
+    middle = np.array([0.5 * (image_size[0] - 1), 0.5 * (image_size[1] - 1)])
+    scale = 0.5 * float(np.hypot(image_size[0], image_size[1]))
+    low = np.abs(evidence.points_world[:, 2]) < _ON_SURFACE
+    plane, pixels = evidence.points_world[low, :2], evidence.points_image[low]
+    line_pixels, lines, marking = _surface_lines(evidence)
+    consensus = _consensus(pixels, plane, middle, scale, tolerance)
+    everything, nothing = np.ones(len(plane), dtype=np.bool_), np.zeros(len(plane), dtype=np.bool_)
+    every_line = np.ones(len(lines), dtype=np.bool_)
+    choices = [(kept, every_line) for kept in (consensus, everything, nothing)]
+    if leave_out:
+        choices += [(consensus, marking != index) for index in np.unique(marking)]
+    candidates: list[NDArray[np.float64]] = []
+    for kept, on in choices:
+        found = plane_from_image(
+            pixels[kept], plane[kept], line_pixels[on], lines[on], scale, middle
+        )
+        if found is not None and np.linalg.cond(found) < 1e12:
+            candidates.append(np.asarray(np.linalg.inv(found), dtype=np.float64))
+    return candidates
+
+
+def _consensus(
+    pixels: NDArray[np.float64],
+    plane: NDArray[np.float64],
+    middle: NDArray[np.float64],
+    scale: float,
+    tolerance: float,
+) -> NDArray[np.bool_]:
+    """Return the inlier mask (n,) of the best homography from four clicks."""
+    best = np.ones(len(plane), dtype=np.bool_)
+    if len(plane) < 5:
+        return best
+    subsets = np.array(list(itertools.combinations(range(len(plane)), 4)))
+    if len(subsets) > _MAX_SUBSETS:
+        chosen = np.random.default_rng(0).choice(len(subsets), _MAX_SUBSETS, replace=False)
+        subsets = subsets[chosen]
+    source = plane / _PLANE_SCALE
+    target = (pixels - middle) / scale
+    ones = np.ones(len(source))
+    rows = np.zeros((len(source), 2, 8))
+    rows[:, 0, :3] = rows[:, 1, 3:6] = np.stack([*source.T, ones], axis=1)
+    rows[:, :, 6:] = -target[:, :, None] * source[:, None, :]
+    systems = rows[subsets].reshape(-1, 8, 8)
+    usable = np.abs(np.linalg.det(systems)) > 1e-9
+    if not usable.any():
+        return best
+    answers = target[subsets[usable]].reshape(-1, 8, 1)
+    solved = np.linalg.solve(systems[usable], answers)[..., 0]
+    homography = np.concatenate([solved, np.ones((len(solved), 1))], axis=1).reshape(-1, 3, 3)
+    mapped = np.einsum("hij,nj->hni", homography, _homogeneous(source))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        errors = np.linalg.norm(mapped[..., :2] / mapped[..., 2:] - target, axis=-1) * scale
+    errors = np.where(np.isfinite(errors), errors, np.inf)
+    # Clipped squared errors rank consensus sets of equal size by their residuals.
+    costs = np.minimum(errors, tolerance) ** 2
+    winner = int(np.argmin(costs.sum(axis=1)))
+    return np.asarray(errors[winner] < tolerance)
+
+
+def _surface_lines(
+    evidence: Evidence,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Return pixels (d, 2) on straight surface markings, their lines (d, 3) and markings (d,)."""
+    straight = evidence.straight[evidence.drawn_marking]
+    lines = np.zeros((len(evidence.markings), 3))
+    for index, (first, stop) in enumerate(itertools.pairwise(evidence.bounds)):
+        start, end = evidence.samples_world[first, :2], evidence.samples_world[stop - 1, :2]
+        along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
+        normal = np.array([-along[1], along[0]])
+        lines[index] = [*normal, -normal @ start]
+    marking = evidence.drawn_marking[straight]
+    return evidence.drawn_image[straight], lines[marking], marking
+
+
+def _homogeneous(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.concatenate([points, np.ones((len(points), 1))], axis=1)
+
+
+_COARSE: Final = 60.0
+"""Cauchy scale of all residuals while starts compete [standard deviations]: it bounds the influence
+of residuals of hundreds of pixels, but not of tens."""
+_CLOSE: Final = 4.0
+"""Mean loss per observation [1] above which the search over plausible cameras replaces the camera
+of a homography."""
+_STEPS: Final = 12
+"""Iterations per start before the best start is chosen [1]."""
 _AGREES: Final = 0.012
 """Maximum inlier distance of a homography, in image widths [1]: distortion of a few percent at the
 border and the crown's height."""
@@ -25,7 +246,7 @@ _FOCAL_REACH: Final = 2.5
 """Maximum deviation of a homography's focal length, in spreads about the middle [1]."""
 
 
-def from_homographies(
+def cameras_from_homographies(
     problem: Problem, prior: CameraPrior, *, leave_out: bool
 ) -> NDArray[np.float64]:
     """Return cameras (b, 22) of the homographies from points and straight markings.
@@ -41,12 +262,12 @@ def from_homographies(
     pixels = np.concatenate([evidence.points_image, evidence.drawn_image])
     seen = np.median(pixels, axis=0)
     found = [
-        camera_of(homography, problem.image_size, seen, focal_range)
+        camera_from_homography(homography, problem.image_size, seen, focal_range)
         for homography in homographies(
             evidence, problem.image_size, _AGREES * width, leave_out=leave_out
         )
     ]
-    rows = [row_of(camera) for camera in found if camera is not None]
+    rows = [camera_row(camera) for camera in found if camera is not None]
     return np.array(rows).reshape(-1, 22)
 
 
@@ -74,7 +295,7 @@ def plausible_cameras(problem: Problem, prior: CameraPrior) -> NDArray[np.float6
     rows = np.zeros((len(grid), 22))
     rows[:, :2] = grid[:, 3:4]
     rows[:, 2:4] = problem.prior[2:4]
-    rotation = _looking(centers, aims, pixels.mean(axis=0) - rows[:, 2:4], grid[:, 3])
+    rotation = _rotations_towards(centers, aims, pixels.mean(axis=0) - rows[:, 2:4], grid[:, 3])
     rows[:, 9:18] = rotation.reshape(-1, 9)
     rows[:, 18:21] = -np.einsum("bij,bj->bi", rotation, centers)
     rows[:, 21] = np.inf
@@ -98,7 +319,7 @@ def _aims(problem: Problem) -> NDArray[np.float64]:
     return unique
 
 
-def _looking(
+def _rotations_towards(
     centers: NDArray[np.float64],
     aims: NDArray[np.float64],
     off: NDArray[np.float64],
@@ -115,3 +336,36 @@ def _looking(
     )
     right = np.stack([np.sin(pan), -np.cos(pan), np.zeros_like(pan)], axis=1)
     return np.stack([right, np.cross(forward, right), forward], axis=1)
+
+
+def find_start(problem: Problem, settings: StaticCalibrationSettings) -> NDArray[np.float64]:
+    """Return the (22,) camera that the outlier search starts from."""
+    count = 2 * len(problem.evidence.points) + len(problem.evidence.drawn_image)
+    rows = cameras_from_homographies(problem, settings.prior, leave_out=False)
+    if len(rows):
+        best, cost = fit_from_starts(problem, rows, settings.wrong_click)
+        if cost < 0.5 * _CLOSE * count:
+            return best
+    coarse = replace(problem, drawn_loss=_COARSE)
+    everywhere = plausible_cameras(problem, settings.prior)
+    weighed = adjust(coarse, everywhere, click_loss=_COARSE, iterations=0)
+    chosen = everywhere[np.argsort(weighed.cost, kind="stable")[: settings.search_cameras]]
+    rows = cameras_from_homographies(problem, settings.prior, leave_out=True)
+    return fit_from_starts(problem, np.concatenate([rows, chosen]), settings.wrong_click)[0]
+
+
+def fit_from_starts(
+    problem: Problem, rows: NDArray[np.float64], click_loss: float
+) -> tuple[NDArray[np.float64], float]:
+    """Return the best camera (22,) reached from starts (b, 22), and its robust cost.
+
+    A wide loss first moves every start into its basin; then a sharper loss decides, which a marking
+    under a wrong name cannot dominate.
+    """
+    coarse = replace(problem, drawn_loss=_COARSE)
+    near = adjust(coarse, rows, click_loss=_COARSE, iterations=_STEPS)
+    sharp = adjust(problem, near.rows, click_loss=click_loss, iterations=_STEPS)
+    direct = adjust(problem, rows, click_loss=click_loss, iterations=_STEPS)
+    cost = np.concatenate([sharp.cost, direct.cost])
+    best = int(np.argmin(cost))
+    return np.concatenate([sharp.rows, direct.rows])[best], float(cost[best])

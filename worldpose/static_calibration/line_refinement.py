@@ -4,11 +4,15 @@ The paper looks up samples of the markings in a map of the distance to the neare
 module searches each sample across its own projected line, which gives a signed offset, separates
 neighboring markings, and adds no half-width and no rounding.
 `benchmarks/static_calibration.py` measures both.
+
+Where clicks are noisier than stated, or wrong, the painted lines decide.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -19,15 +23,29 @@ from data_contracts.arrays import Floats
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration.edges import brightness
-from worldpose.static_calibration.line_profiles import Bars
+from worldpose.static_calibration.adjustment import camera_row
+from worldpose.static_calibration.click_outliers import (
+    Explanation,
+    InlierFit,
+    fit_given_inliers,
+    fit_inliers,
+    mahalanobis_distances,
+    noise_ratio,
+    scale_noise,
+)
+from worldpose.static_calibration.curvature_correction import fit_with_curvature, linearize_at
+from worldpose.static_calibration.line_detection import brightness
 from worldpose.static_calibration.line_samples import (
     sample_markings,
-    thinned,
+    thin_samples,
 )
-from worldpose.static_calibration.line_search import Found, LineSearch
-from worldpose.static_calibration.line_settings import SURVEY_ERROR, LineRefinementSettings
+from worldpose.static_calibration.line_search import Bars, LineFit, LineSearch
 from worldpose.static_calibration.parameters import CameraEstimate
+from worldpose.static_calibration.settings import (
+    SURVEY_ERROR,
+    LineRefinementSettings,
+    StaticCalibrationSettings,
+)
 
 
 @dataclass(frozen=True)
@@ -106,38 +124,38 @@ def refine_on_lines(
     everywhere = sample_markings(pitch, _WORLD_SPACING)
     begin = begin or start
     seen = search.look(begin.camera, everywhere)
-    index = thinned(seen, everywhere, settings.spacing, settings.samples)
+    index = thin_samples(seen, everywhere, settings.spacing, settings.samples)
     index = index[search.clear(begin.camera, everywhere[index], seen[index])]
     if len(index) < settings.least_found or not search.free.any():
-        return _kept(start, "no painted line is in the picture")
+        return _keep_start(start, "no painted line is in the picture")
     found = search.run(begin, everywhere[index])
     if found is None:
-        return _kept(start, "too few painted lines were found")
+        return _keep_start(start, "too few painted lines were found")
     inliers = found.adjusted.weights > _INLIER
-    inliers &= _there(found, inliers, settings.least_share)
+    inliers &= _have_inliers(found, inliers, settings.least_share)
     count, visible = int(inliers.sum()), int(found.seen.visible.sum())
     if count < max(settings.least_found, settings.least_share * visible):
-        return _kept(start, f"only {count} of {visible} samples of lines were found")
-    correlation, excess = _noise(found, inliers)
+        return _keep_start(start, f"only {count} of {visible} samples of lines were found")
+    correlation, excess = _residual_noise(found, inliers)
     independent = (1.0 - correlation) / (1.0 + correlation)
     # Neighbours are correlated: larger variances give them their joint information.
-    found = search.reweighed(found, inliers, excess / independent)
+    found = search.reweight(found, inliers, excess / independent)
     distance = search.distance(found.camera)
     if chdtrc(search.free.sum(), distance**2) < settings.contradiction:
-        return _kept(
+        return _keep_start(
             start,
             "the lines contradict the clicks: the camera would move by "
             f"{distance:.1f} standard deviations",
         )
     return LineRefinement(
-        estimate=CameraEstimate(found.camera, search.covariance_of(found)),
+        estimate=CameraEstimate(found.camera, search.covariance(found)),
         refined=True,
         reason="",
-        markings=_markings(found, inliers),
+        markings=_marking_fits(found, inliers),
         rms=float(np.sqrt(np.mean(found.adjusted.residuals[inliers] ** 2))),
         correlation=float(correlation[inliers].mean()),
         effective_samples=float(independent[inliers].sum()),
-        bars=search.bars_of(found),
+        bars=search.collect_bars(found),
     )
 
 
@@ -163,7 +181,7 @@ def _check_size(camera: Camera, grey: NDArray[np.uint8]) -> None:
         )
 
 
-def _there(found: Found, inliers: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:
+def _have_inliers(found: LineFit, inliers: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:
     """Return a mask of samples (n,) whose markings have enough inliers.
 
     Chance detections on a marking that is absent would move the camera.
@@ -174,7 +192,7 @@ def _there(found: Found, inliers: NDArray[np.bool_], least: float) -> NDArray[np
     return np.asarray((there >= least * seen)[marking])
 
 
-def _noise(found: Found, inliers: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+def _residual_noise(found: LineFit, inliers: NDArray[np.bool_]) -> tuple[Floats, Floats]:
     """Return correlation and excess variance of neighbouring residuals.
 
     Both per sample (n,), from its whole marking: grass is rougher about a far line as narrow as a
@@ -199,7 +217,7 @@ def _noise(found: Found, inliers: NDArray[np.bool_]) -> tuple[Floats, Floats]:
     return np.clip(correlation, 0.0, _MOST_CORRELATED)[marking], excess[marking]
 
 
-def _markings(found: Found, inliers: NDArray[np.bool_]) -> tuple[MarkingFit, ...]:
+def _marking_fits(found: LineFit, inliers: NDArray[np.bool_]) -> tuple[MarkingFit, ...]:
     """Return the detection result of each marking in the image."""
     samples, fits = found.samples, []
     visible, residuals = found.seen.visible, found.adjusted.residuals
@@ -211,6 +229,114 @@ def _markings(found: Found, inliers: NDArray[np.bool_]) -> tuple[MarkingFit, ...
     return tuple(fits)
 
 
-def _kept(start: CameraEstimate, reason: str) -> LineRefinement:
+def _keep_start(start: CameraEstimate, reason: str) -> LineRefinement:
     nan = float("nan")
     return LineRefinement(start, False, reason, (), nan, nan, 0.0, None)
+
+
+_WIDER: Final = (2.0, 4.0)
+"""Factors on the click noise, tried in turn where the clicks do not lead to the lines [1]; the last
+is the largest plausible one."""
+_AS_STATED: Final = 1.5
+"""Noise ratio from the lines up to which the stated noise stands [1]: the median residual of a few
+clicks exceeds it by chance."""
+
+
+def refine_and_judge(
+    found: Explanation, pitch: PitchTemplate, picture: NDArray[np.uint8]
+) -> tuple[InlierFit, LineRefinement]:
+    """Return stage 2 with inliers chosen by the painted lines, and stage 3 from there.
+
+    A few clicks close together determine neither their own noise nor the outliers among them. The
+    lines do: a camera fitted to the lines gives the residual of every click. Where the search finds
+    no lines, or the lines contradict the clicks, it retries with twice and four times the stated
+    noise, then without one click at a time. If every attempt fails, the clicks decide the camera.
+
+    Args:
+        found: stage 2; its settings have the thresholds of outliers.
+        pitch: the template.
+        picture: image of the camera.
+    """
+    problem, fit, settings = found.problem, found.fit, found.settings
+    size = problem.image_size
+    first = _refine(fit.estimate(size), pitch, picture, settings)
+    tried = [(fit, first)]
+    for factor in _WIDER:
+        if tried[-1][1].refined:
+            break
+        wider, rough = scale_noise(problem, factor, settings)
+        other = fit_inliers(wider, fit.row, rough)
+        tried.append((other, _refine(other.estimate(size), pitch, picture, settings)))
+    if not tried[-1][1].refined:
+        tried += sorted(
+            (
+                (other, _refine(other.estimate(size), pitch, picture, settings))
+                for other in _leave_one_out_fits(found)
+            ),
+            key=lambda one: -one[1].effective_samples,
+        )
+    for other, lines in tried:
+        judged = _judge(replace(found, fit=other), lines, pitch, picture)
+        if judged is not None:
+            return judged
+    return fit, first
+
+
+def _leave_one_out_fits(found: Explanation) -> Iterator[InlierFit]:
+    """Yield the leave-one-out fits at the largest noise."""
+    problem, fit = found.problem, found.fit
+    wider, _ = scale_noise(problem, _WIDER[-1], found.settings)
+    for index in range(len(problem.evidence.points)):
+        inliers = np.arange(len(problem.evidence.points)) != index
+        with suppress(InputError):
+            yield fit_given_inliers(wider, fit.row, inliers, fit.markings)
+
+
+def _judge(
+    found: Explanation, lines: LineRefinement, pitch: PitchTemplate, picture: NDArray[np.uint8]
+) -> tuple[InlierFit, LineRefinement] | None:
+    """Return the fit to the inliers of a camera refined on lines, and stage 3 from there.
+
+    None without such a camera, or with too few inliers.
+    """
+    if not lines.refined:
+        return None
+    problem, settings = found.problem, found.settings
+    row = camera_row(lines.estimate.camera)
+    ratio = noise_ratio(problem, row)
+    factor = 1.0 if ratio <= _AS_STATED else min(ratio, _WIDER[-1])
+    wider = scale_noise(problem, factor, settings)[0]
+    mahalanobis = mahalanobis_distances(wider, lines.estimate)
+    inliers = mahalanobis < settings.wrong_click
+    if len(inliers) and 1.0 - inliers.mean() > settings.max_wrong_share:
+        return None
+    fit = fit_given_inliers(wider, row, inliers, found.fit.markings)
+    # Pixels drawn along a detected line measure the same paint less accurately.
+    read = {each.name for each in lines.markings if each.found}
+    other = np.array([name not in read for name in problem.evidence.markings], dtype=bool)
+    rest = wider.select(inliers, fit.markings & other)
+    scale = fit.noise_scale
+    known = linearize_at(rest, row, scale)
+    again = _refine(known, pitch, picture, settings, begin=lines.estimate)
+    if again.bars is None:
+        return None
+    best = fit_with_curvature(rest, again.estimate.camera, again.bars, scale)
+    fit = replace(fit, mahalanobis=mahalanobis, noise_scale=factor * scale)
+    return fit, replace(again, estimate=best)
+
+
+def _refine(
+    start: CameraEstimate,
+    pitch: PitchTemplate,
+    picture: NDArray[np.uint8],
+    settings: StaticCalibrationSettings,
+    begin: CameraEstimate | None = None,
+) -> LineRefinement:
+    return refine_on_lines(
+        start,
+        pitch,
+        picture,
+        settings.line_refinement,
+        survey_error=settings.survey_error,
+        begin=begin,
+    )

@@ -1,4 +1,8 @@
-"""Projected samples of the template's markings: positions, normals, widths and derivatives."""
+"""Projected samples of the template's markings: positions, normals, widths and derivatives.
+
+Across a sample with no other white structure near it in the image there is one bar, with grass on
+both sides. A crossbar, and the other side of a far circle, are close to a sample in the image only.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +12,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Integers
+from worldpose.compiled import compiled
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration.line_detection import CrossSections
 from worldpose.static_calibration.parameters import by_step
 
 _STRIDE: Final = 0.1
@@ -65,7 +71,7 @@ class LineSamples:
 
 
 @dataclass(frozen=True, eq=False)
-class SeenLines:
+class ProjectedLines:
     """Marking samples projected into an image.
 
     Attributes:
@@ -89,8 +95,13 @@ class SeenLines:
     unknowns: NDArray[np.int64]
     visible: NDArray[np.bool_]
 
-    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> SeenLines:
-        return SeenLines(
+    @property
+    def sections(self) -> CrossSections:
+        """Cross sections at the samples, to look for bars in."""
+        return CrossSections(self.places, self.normals, self.widths, self.curvatures)
+
+    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> ProjectedLines:
+        return ProjectedLines(
             self.places[index],
             self.normals[index],
             self.widths[index],
@@ -139,9 +150,9 @@ def sample_markings(pitch: PitchTemplate, spacing: float) -> LineSamples:
     )
 
 
-def see_lines(
+def project_lines(
     camera: Camera, samples: LineSamples, line_width: float, survey_error: float, shift: float
-) -> SeenLines:
+) -> ProjectedLines:
     """Return samples projected into a camera's image, with derivatives.
 
     Args:
@@ -171,7 +182,7 @@ def see_lines(
     axes = (3 * samples.ends[:, :, None] + np.arange(3)).reshape(len(points), 6)
     # Numbers below zero belong to markings, not to points.
     own = -1 - samples.marking[:, None]
-    return SeenLines(
+    return ProjectedLines(
         image,
         normals,
         widths,
@@ -196,7 +207,9 @@ def _curvatures(camera: Camera, samples: LineSamples, normals: Floats) -> Floats
     return curvatures
 
 
-def thinned(seen: SeenLines, samples: LineSamples, spacing: float, most: int) -> NDArray[np.int64]:
+def thin_samples(
+    seen: ProjectedLines, samples: LineSamples, spacing: float, most: int
+) -> NDArray[np.int64]:
     """Return indices of visible samples at about even spacing in the image.
 
     Args:
@@ -216,3 +229,85 @@ def thinned(seen: SeenLines, samples: LineSamples, spacing: float, most: int) ->
     fresh = np.diff(bins, prepend=-1) > 0
     fresh |= np.diff(samples.marking[index], prepend=-1) != 0
     return np.asarray(index[fresh])
+
+
+_STEP: Final = 0.5
+"""Spacing of the polylines' corners [m]: the error of a corner arc is then 3 cm, a quarter of its
+width."""
+
+
+@dataclass(frozen=True, eq=False)
+class WhiteStructures:
+    """White structures of a pitch: concatenated polylines of markings and goals.
+
+    Attributes:
+        points_world: (n, 3) corners [m], world.
+        label: (n,) structure; markings have the indices of `PitchTemplate.sample_lines`, posts and
+            crossbars higher ones.
+    """
+
+    points_world: Floats
+    label: Integers
+
+
+def white_structures(pitch: PitchTemplate) -> WhiteStructures:
+    """Return the polylines of a template's markings and goals."""
+    parts = [pitch.marking_points(name, _STEP) for name in pitch.marking_names]
+    return WhiteStructures(
+        np.concatenate(parts), np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    )
+
+
+def clear(
+    camera: Camera,
+    whites: WhiteStructures,
+    half_width: float,
+    places: Floats,
+    room: Floats,
+    marking: Integers,
+) -> NDArray[np.bool_]:
+    """Return a mask of places (n,) with no structure but their own marking within a distance.
+
+    Args:
+        camera: a single camera.
+        whites: of the template.
+        half_width: of paint and posts [m].
+        places: (n, 2) of samples [px].
+        room: (n,) minimum distance to other structures [px].
+        marking: (n,) the samples' own labels.
+    """
+    depth = camera.cam_from_world.apply(whites.points_world)[:, 2]
+    corners = camera.project(whites.points_world)
+    with np.errstate(divide="ignore"):
+        radius = np.where(depth > 0.0, half_width * camera.focal[0] / depth, 0.0)
+    result = np.empty(len(places), dtype=np.bool_)
+    _clear(corners, radius, whites.label, places, room, marking, result)
+    return result
+
+
+@compiled
+def _clear(
+    corners: Floats,
+    radius: Floats,
+    label: Integers,
+    places: Floats,
+    room: Floats,
+    marking: Integers,
+    result: NDArray[np.bool_],
+) -> None:
+    for i in range(len(places)):
+        x, y = places[i, 0], places[i, 1]
+        result[i] = True
+        for j in range(len(corners) - 1):
+            if label[j] == marking[i] or label[j] != label[j + 1]:
+                continue
+            ax, ay = corners[j, 0] - x, corners[j, 1] - y
+            dx, dy = corners[j + 1, 0] - corners[j, 0], corners[j + 1, 1] - corners[j, 1]
+            share = -(ax * dx + ay * dy) / max(dx * dx + dy * dy, 1e-18)
+            share = min(max(share, 0.0), 1.0)
+            ax, ay = ax + share * dx, ay + share * dy
+            limit = room[i] + max(radius[j], radius[j + 1])
+            # Points behind the camera are NaN, which compares false.
+            if ax * ax + ay * ay < limit * limit:
+                result[i] = False
+                break

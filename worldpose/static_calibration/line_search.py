@@ -1,24 +1,198 @@
-"""Coarse-to-fine search for painted lines, samples of small uncertainty first (C4)."""
+"""Coarse-to-fine search for painted lines, samples of small uncertainty first (C4).
+
+`LineSearch` alternates between measuring bars across projected markings and a robust least-squares
+fit of the camera to them, with a prior. `Bars` are the result: measured bars of painted lines, and
+their residuals at nearby cameras.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Integers
+from worldpose.compiled import compiled
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration.bar_fits import fit_bars
-from worldpose.static_calibration.clearance import clear, whites_of
-from worldpose.static_calibration.edges import BESIDE, CANDIDATES, find_bars
-from worldpose.static_calibration.line_adjustment import Adjusted, adjust
-from worldpose.static_calibration.line_profiles import Bars
-from worldpose.static_calibration.line_samples import LineSamples, SeenLines, see_lines
-from worldpose.static_calibration.line_settings import LineRefinementSettings
-from worldpose.static_calibration.parameters import CameraEstimate, stepped
+from worldpose.static_calibration.line_detection import CANDIDATES, CLEARANCE, find_bars, fit_bars
+from worldpose.static_calibration.line_samples import (
+    LineSamples,
+    ProjectedLines,
+    clear,
+    project_lines,
+    white_structures,
+)
+from worldpose.static_calibration.parameters import (
+    CameraEstimate,
+    project_with_jacobian,
+    step_between,
+    step_jacobian,
+    stepped,
+)
+from worldpose.static_calibration.settings import LineRefinementSettings
+
+_STRIDE: Final = 0.1
+"""Step along a marking for finite differences of its projection [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bars:
+    """Bars in the image, each with its marking sample.
+
+    Attributes:
+        samples: (n,) marking samples.
+        pixels: (n, 2) positions of the bars [px].
+        noise: (n,) across the marking, standard deviation [px].
+        by_paint: (n, 7) derivatives of the marking by the paint's unknowns.
+        unknowns: (n, 7) numbers of these, see `ProjectedLines`.
+    """
+
+    samples: LineSamples
+    pixels: Floats
+    noise: Floats
+    by_paint: Floats
+    unknowns: NDArray[np.int64]
+
+    @cached_property
+    def _paint(self) -> Floats:
+        """Orthonormal basis of the paint's unknowns, in residuals and priors."""
+        numbers, index = np.unique(self.unknowns, return_inverse=True)
+        count = len(self.noise)
+        columns = np.zeros((count + len(numbers), len(numbers)))
+        np.add.at(columns, (np.arange(count)[:, None], index), self.by_paint / self.noise[:, None])
+        columns[count:] = np.eye(len(numbers))
+        return np.linalg.qr(columns)[0]
+
+    def whiten_residuals(self, camera: Camera) -> tuple[Floats, Floats]:
+        """Return whitened residuals (m,) of markings against bars, and derivatives (m, 12).
+
+        Residuals are distances to the nearest point: a marking that slides along itself fits as
+        well as before. Residuals and derivatives are projected off the paint's unknowns and their
+        priors, so that m is larger than the number of bars.
+        """
+        before, after = (camera.project(self.samples.beside(way)) for way in (-_STRIDE, _STRIDE))
+        middle, jacobian = project_with_jacobian(camera, self.samples.points_world)
+        along, bend = 0.5 * (after - before), after + before - 2.0 * middle
+        away = self.pixels - middle
+        way = (away * along).sum(-1) / (along**2).sum(-1)
+        normal = np.stack([-along[:, 1], along[:, 0]], axis=-1)
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        off = ((0.5 * way[:, None] ** 2 * bend - away) * normal).sum(-1)
+        moves = np.einsum("ni,nij->nj", normal, jacobian)
+        both = np.zeros((len(self._paint), 1 + moves.shape[1]))
+        both[: len(off), 0], both[: len(off), 1:] = off, moves
+        both[: len(off)] /= self.noise[:, None]
+        both -= self._paint @ (self._paint.T @ both)
+        return both[:, 0], both[:, 1:]
+
+
+@dataclass(frozen=True, eq=False)
+class LineStep:
+    """A step of the free parameters, its information and its residuals.
+
+    Attributes:
+        step: (f,).
+        information: (f, f) inverse covariance of the step, marginalized over the paint's unknowns.
+        residuals: (n,) after subtraction of the paint's unknowns [px].
+        weights: (n,) of the robust loss [1].
+        spent: degrees of freedom that the fit takes from the samples [1].
+    """
+
+    step: Floats
+    information: Floats
+    residuals: Floats
+    weights: Floats
+    spent: float
+
+
+def adjust(
+    offsets: Floats,
+    variances: Floats,
+    by_camera: Floats,
+    by_paint: Floats,
+    unknowns: Integers,
+    prior: tuple[Floats, Floats],
+    scales: tuple[float, ...],
+) -> LineStep:
+    """Return the step that moves projected markings onto measured ones.
+
+    Iteratively reweighted least squares with the Geman-McClure loss. The paint's unknowns have unit
+    Gaussian priors: a thousand samples of one line determine its paint, but the camera only within
+    the survey error of the line's ends.
+
+    Args:
+        offsets: (n,) measured minus projected, along the normal [px]; NaN = no measurement.
+        variances: (n,) [px^2].
+        by_camera: (n, f) derivatives of the projection by the free parameters.
+        by_paint: (n, k) derivatives of the projection by unknowns of the paint.
+        unknowns: (n, k) indices of these unknowns.
+        prior: information (f, f) and mean (f,) of the step.
+        scales: of the loss [standard deviations], one per iteration.
+    """
+    known = np.isfinite(offsets)
+    weights = known.astype(np.float64)
+    numbers, index = np.unique(unknowns, return_inverse=True)
+    free = by_camera.shape[1]
+    size = free + len(numbers)
+    shift = np.where(known, offsets, 0.0)
+    solution = np.zeros(size)
+    normal = np.empty((size, size))
+    told = np.empty((size, size))
+    residuals = shift
+    for scale in scales:
+        if scale < np.inf:
+            squared = residuals**2 / variances / scale**2
+            weights = np.where(known, 1.0 / (1.0 + squared) ** 2, 0.0)
+        normal[:] = 0.0
+        right = np.zeros(size)
+        _accumulate(shift, weights / variances, by_camera, by_paint, index, normal, right)
+        told[:] = normal
+        normal[:free, :free] += prior[0]
+        right[:free] += prior[0] @ prior[1]
+        normal[np.arange(free, size), np.arange(free, size)] += 1.0
+        solution = np.linalg.solve(normal, right)
+        residuals = shift - by_camera @ solution[:free]
+        residuals -= (by_paint * solution[free:][index]).sum(axis=1)
+    corner = normal[:free, free:]
+    information = normal[:free, :free] - corner @ np.linalg.solve(normal[free:, free:], corner.T)
+    spent = float(np.trace(np.linalg.solve(normal, told)))
+    return LineStep(solution[:free], 0.5 * (information + information.T), residuals, weights, spent)
+
+
+@compiled
+def _accumulate(
+    shift: Floats,
+    weights: Floats,
+    by_camera: Floats,
+    by_paint: Floats,
+    index: Integers,
+    normal: Floats,
+    right: Floats,
+) -> None:
+    """Add the samples to the normal equations: the camera first, then the paint's unknowns."""
+    free, paints = by_camera.shape[1], by_paint.shape[1]
+    for i in range(len(shift)):
+        w = weights[i]
+        if w == 0.0:
+            continue
+        for a in range(free):
+            left = w * by_camera[i, a]
+            right[a] += left * shift[i]
+            for b in range(free):
+                normal[a, b] += left * by_camera[i, b]
+            for b in range(paints):
+                normal[a, free + index[i, b]] += left * by_paint[i, b]
+                normal[free + index[i, b], a] += left * by_paint[i, b]
+        for a in range(paints):
+            left = w * by_paint[i, a]
+            right[free + index[i, a]] += left * shift[i]
+            for b in range(paints):
+                normal[free + index[i, a], free + index[i, b]] += left * by_paint[i, b]
+
 
 _ROUNDS: Final = 8
 """Maximum iterations of search and fit; one or two from ordinary clicks."""
@@ -49,7 +223,7 @@ which avoids the nearest local minimum."""
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class MeasuredBars:
     """Bars across samples: offsets (n,) along the normals [px] and their variances (n,) [px^2]."""
 
     offsets: Floats
@@ -57,14 +231,14 @@ class Measured:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class LineFit:
     """A camera, its samples, their projections, the bars measured there, and the last fit."""
 
     camera: Camera
     samples: LineSamples
-    seen: SeenLines
-    measured: Measured
-    adjusted: Adjusted
+    seen: ProjectedLines
+    measured: MeasuredBars
+    adjusted: LineStep
 
 
 class LineSearch:
@@ -80,7 +254,7 @@ class LineSearch:
     ) -> None:
         self.start, self.grey, self.settings = start, grey, settings
         self.survey_error = survey_error
-        self.whites = whites_of(pitch)
+        self.whites = white_structures(pitch)
         spread = np.sqrt(np.diag(start.covariance))
         self.free = spread > 0.0
         covariance = start.covariance[np.ix_(self.free, self.free)]
@@ -90,17 +264,19 @@ class LineSearch:
         inverse: Floats = np.linalg.inv(shape + 1e-12 * np.eye(len(scale)))
         self.information = inverse / np.outer(scale, scale)
 
-    def look(self, camera: Camera, samples: LineSamples) -> SeenLines:
+    def look(self, camera: Camera, samples: LineSamples) -> ProjectedLines:
         """Return the samples projected into a camera's image."""
         s = self.settings
-        return see_lines(camera, samples, s.line_width, self.survey_error, s.line_shift)
+        return project_lines(camera, samples, s.line_width, self.survey_error, s.line_shift)
 
-    def clear(self, camera: Camera, samples: LineSamples, seen: SeenLines) -> NDArray[np.bool_]:
+    def clear(
+        self, camera: Camera, samples: LineSamples, seen: ProjectedLines
+    ) -> NDArray[np.bool_]:
         """Return a mask of the samples (n,) with grass on both sides in the image."""
-        room, half = 0.5 * seen.widths + BESIDE, 0.5 * self.settings.line_width
+        room, half = 0.5 * seen.widths + CLEARANCE, 0.5 * self.settings.line_width
         return clear(camera, self.whites, half, seen.places, room, samples.marking)
 
-    def run(self, begin: CameraEstimate, samples: LineSamples) -> Found | None:
+    def run(self, begin: CameraEstimate, samples: LineSamples) -> LineFit | None:
         """Return the result of the coarse-to-fine search; None without lines."""
         camera, covariance = begin.camera, begin.covariance[np.ix_(self.free, self.free)]
         few = samples[np.arange(0, len(samples.marking), max(1, len(samples.marking) // _FEW))]
@@ -123,35 +299,35 @@ class LineSearch:
             least = self.settings.least_found * len(chosen.marking) / len(samples.marking)
             if np.isfinite(measured.offsets).sum() < max(least, 1.0):
                 return None
-            found = self._settle(camera, chosen, seen, measured, fine)
+            found = self.converge(camera, chosen, seen, measured, fine)
             if fine:
                 break
             camera = found.camera
             covariance = np.asarray(np.linalg.inv(found.adjusted.information))
         return found
 
-    def reweighed(self, found: Found, used: NDArray[np.bool_], inflation: Floats) -> Found:
+    def reweight(self, found: LineFit, used: NDArray[np.bool_], inflation: Floats) -> LineFit:
         """Return the fit to the used samples (n,), with variances times `inflation` (n,)."""
-        measured = Measured(
+        measured = MeasuredBars(
             np.where(used, found.measured.offsets, np.nan), found.measured.variances * inflation
         )
         scales = (2.0 * self.settings.loss, *(self.settings.loss,) * 2)
         adjusted = self._adjust(found.camera, found.seen, measured, scales)
-        camera = stepped(found.camera, self._whole(adjusted.step))
+        camera = stepped(found.camera, self._full_step(adjusted.step))
         return replace(found, camera=camera, measured=measured, adjusted=adjusted)
 
     def distance(self, camera: Camera) -> float:
         """Return the Mahalanobis distance of a camera from the start."""
-        gone = difference(self.start.camera, camera)[self.free]
+        gone = step_between(self.start.camera, camera)[self.free]
         return float(np.sqrt(gone @ self.information @ gone))
 
-    def covariance_of(self, found: Found) -> Floats:
+    def covariance(self, found: LineFit) -> Floats:
         """Return the (12, 12) covariance of a fit."""
         whole = np.zeros_like(self.start.covariance)
         whole[np.ix_(self.free, self.free)] = np.linalg.inv(found.adjusted.information)
         return np.asarray(0.5 * (whole + whole.T))
 
-    def bars_of(self, found: Found) -> Bars:
+    def collect_bars(self, found: LineFit) -> Bars:
         """Return the bars that contribute to a fit."""
         seen, weights = found.seen, found.adjusted.weights
         used = weights > _NO_WEIGHT
@@ -165,14 +341,14 @@ class LineSearch:
             seen.unknowns[used],
         )
 
-    def _settle(
+    def converge(
         self,
         camera: Camera,
         samples: LineSamples,
-        seen: SeenLines,
-        measured: Measured,
+        seen: ProjectedLines,
+        measured: MeasuredBars,
         fine: bool,
-    ) -> Found:
+    ) -> LineFit:
         """Return the converged fit to bars at fixed pixels."""
         bars = seen.places + measured.offsets[:, None] * seen.normals
         final = (self.settings.loss,) * 3
@@ -180,49 +356,48 @@ class LineSearch:
         for _ in range(_TURNS if fine else 1):
             adjusted = self._adjust(camera, seen, measured, scales)
             scales = (2.0 * self.settings.loss, self.settings.loss, self.settings.loss)
-            camera = stepped(camera, self._whole(adjusted.step))
+            camera = stepped(camera, self._full_step(adjusted.step))
             moved = np.abs(seen.by_camera[:, self.free] @ adjusted.step)[seen.visible]
             seen = self.look(camera, samples)
             measured = replace(measured, offsets=((bars - seen.places) * seen.normals).sum(-1))
             if moved.max(initial=0.0) < _SETTLED:
                 break
-        return Found(camera, samples, seen, measured, adjusted)
+        return LineFit(camera, samples, seen, measured, adjusted)
 
-    def _reach(self, seen: SeenLines, covariance: Floats) -> Floats:
+    def _reach(self, seen: ProjectedLines, covariance: Floats) -> Floats:
         """Return the search widths (n,) of samples along their normals [px]."""
         rows = np.where(seen.visible[:, None], seen.by_camera[:, self.free], 0.0)
         own = np.where(seen.visible, (seen.by_paint**2).sum(-1), 0.0)
         variance = ((rows @ covariance) * rows).sum(-1) + own
         return np.asarray(3.0 * np.sqrt(variance) + _LEAST_REACH)
 
-    def _measure(self, seen: SeenLines, reach: Floats, fine: bool) -> Measured:
+    def _measure(self, seen: ProjectedLines, reach: Floats, fine: bool) -> MeasuredBars:
         """Return the bars matched to the samples, to a subpixel (`fine`) or to a pixel."""
         s, count = self.settings, len(reach)
         # If all uncertainties are large, begin with the third of smallest uncertainty.
         limit = max(s.reach, float(np.quantile(reach[seen.visible], _BEST)))
         usable = seen.visible & (reach <= limit)
         offsets, strengths = np.empty((count, CANDIDATES)), np.empty((count, CANDIDATES))
-        across = seen.places, seen.normals, seen.widths, seen.curvatures
         looked = np.where(usable, reach, -1.0)
-        find_bars(self.grey, *across, looked, s.contrast, offsets, strengths)
+        find_bars(self.grey, seen.sections, looked, s.contrast, offsets, strengths)
         # A candidate's merit grows with its strength and falls with its Mahalanobis distance.
         away = 3.0 * offsets / reach[:, None]
         with np.errstate(divide="ignore"):
             merit = np.where(np.isnan(offsets), -np.inf, np.log(strengths) - 0.5 * away**2)
         best = offsets[np.arange(count), merit.argmax(axis=1)]
         if not fine:
-            return Measured(best, np.full(count, _COARSE_ERROR**2))
+            return MeasuredBars(best, np.full(count, _COARSE_ERROR**2))
         exact, variances = np.empty(count), np.empty(count)
-        fit_bars(self.grey, *across, best, s.contrast, exact, variances)
-        return Measured(exact, variances + _READING**2)
+        fit_bars(self.grey, seen.sections, best, s.contrast, exact, variances)
+        return MeasuredBars(exact, variances + _READING**2)
 
     def _adjust(
         self,
         camera: Camera,
-        seen: SeenLines,
-        measured: Measured,
+        seen: ProjectedLines,
+        measured: MeasuredBars,
         scales: tuple[float, ...],
-    ) -> Adjusted:
+    ) -> LineStep:
         """Return the step from a camera to the best one."""
         known = np.flatnonzero(seen.visible)
         adjusted = adjust(
@@ -240,36 +415,13 @@ class LineSearch:
 
     def _prior(self, camera: Camera) -> tuple[Floats, Floats]:
         """Return information and mean of the prior on the free parameters' step from a camera."""
-        gone = difference(self.start.camera, camera)
-        chain = turned(gone)[np.ix_(self.free, self.free)]
+        gone = step_between(self.start.camera, camera)
+        chain = step_jacobian(gone)[np.ix_(self.free, self.free)]
         information: Floats = chain.T @ self.information @ chain
         expected = np.linalg.solve(chain, -gone[self.free])
         return information, np.asarray(expected, dtype=np.float64)
 
-    def _whole(self, step: Floats) -> Floats:
+    def _full_step(self, step: Floats) -> Floats:
         whole = np.zeros(len(self.free))
         whole[self.free] = step
         return whole
-
-
-def turned(gone: Floats) -> Floats:
-    """Return the derivative (12, 12) of a step (12,) by a further step after it."""
-    chain = np.eye(len(gone))
-    x, y, z = gone[3:6]
-    # A further rotation also rotates the translation so far.
-    chain[3:6, :3] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return chain
-
-
-def difference(start: Camera, camera: Camera) -> Floats:
-    """Return the (12,) step from one camera to another."""
-    moved = camera.cam_from_world @ start.cam_from_world.inverse()
-    return np.concatenate(
-        [
-            moved.rotvec,
-            moved.translation,
-            np.log(camera.focal[:1] / start.focal[:1]),
-            camera.principal_point - start.principal_point,
-            (camera.distortion - start.distortion)[[0, 1, 4]],
-        ]
-    )

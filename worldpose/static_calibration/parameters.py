@@ -49,6 +49,29 @@ def stepped(camera: Camera, step: ArrayLike) -> Camera:
     )
 
 
+def step_jacobian(gone: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the derivative (12, 12) of a step (12,) by a further step after it."""
+    chain = np.eye(len(gone))
+    x, y, z = gone[3:6]
+    # A further rotation also rotates the translation so far.
+    chain[3:6, :3] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return chain
+
+
+def step_between(start: Camera, camera: Camera) -> NDArray[np.float64]:
+    """Return the (12,) step from one camera to another."""
+    moved = camera.cam_from_world @ start.cam_from_world.inverse()
+    return np.concatenate(
+        [
+            moved.rotvec,
+            moved.translation,
+            np.log(camera.focal[:1] / start.focal[:1]),
+            camera.principal_point - start.principal_point,
+            (camera.distortion - start.distortion)[[0, 1, 4]],
+        ]
+    )
+
+
 def project_with_jacobian(
     camera: Camera, points_world: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

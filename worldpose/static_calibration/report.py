@@ -1,15 +1,27 @@
-"""Calibration report: residuals, outliers, expected ground error and warnings."""
+"""Calibration report: residuals, outliers, expected ground error and warnings, and its storage."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.static_calibration.ground_error import GroundErrorMap
+from worldpose.geometry import Camera, RayStatus
+from worldpose.geometry.stored import camera_arrays
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration.adjustment import Problem, camera_row
+from worldpose.static_calibration.click_outliers import Explanation, compute_residuals
+from worldpose.static_calibration.ground_error import (
+    GroundErrorMap,
+    ground_error_map,
+    propose_clicks,
+)
 from worldpose.static_calibration.line_refinement import LineRefinement
-from worldpose.static_calibration.parameters import CameraEstimate
+from worldpose.static_calibration.parameters import PARAMETERS, CameraEstimate
+from worldpose.static_calibration.residuals import SIZE, drawn_residuals
+from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,8 +32,8 @@ class PointResidual:
         name: of the template.
         pixel: (2,) [px], the click.
         residual: (2,) [px], projected minus clicked; NaN where the camera cannot image the point.
-        surprise: Mahalanobis distance from the prediction by the other evidence [1]; infinite where
-            the camera cannot image the point.
+        mahalanobis: Mahalanobis distance from the prediction by the other evidence [1]; infinite
+            where the camera cannot image the point.
         inlier: whether the fit includes the click.
         problem: reason for exclusion; empty for inliers.
     """
@@ -29,7 +41,7 @@ class PointResidual:
     name: str
     pixel: NDArray[np.float64]
     residual: NDArray[np.float64]
-    surprise: float
+    mahalanobis: float
     inlier: bool
     problem: str = ""
 
@@ -106,3 +118,217 @@ class StaticCalibration:
 
     estimate: CameraEstimate
     report: CalibrationReport
+
+
+_CANNOT_IMAGE: Final = {
+    RayStatus.MISSING: "cannot be imaged: the camera is not known",
+    RayStatus.BEHIND: "cannot be imaged: the point is behind the camera",
+    RayStatus.BEYOND_FOLD: "cannot be imaged: the point is outside the lens's field of view",
+}
+_SAME: Final = 0.01
+"""Difference from the stated noise too small to report [1]."""
+_TRUSTED: Final = 4.0
+"""Maximum mean loss per observation [1] without a warning: twice the stated noise."""
+
+
+def build_report(
+    estimate: CameraEstimate,
+    found: Explanation,
+    lines: LineRefinement | None,
+    pitch: PitchTemplate,
+    stated: float,
+) -> CalibrationReport:
+    """Return the report of a calibrated camera.
+
+    Args:
+        estimate: the final camera.
+        found: stage 2; its settings have the estimated click noise.
+        lines: stage 3; None without an image.
+        pitch: the template.
+        stated: stated click noise [px].
+    """
+    problem, fit, settings = found.problem, found.fit, found.settings
+    decisions = found.assumptions
+    scale = fit.noise_scale * settings.click_noise / stated
+    evidence = problem.evidence
+    rows = compute_residuals(problem, camera_row(estimate.camera))
+    problems = image_problems(estimate.camera, evidence.points_world)
+    imaged = np.array([not problem for problem in problems], dtype=np.bool_)
+    mahalanobis = np.where(imaged, fit.mahalanobis, np.inf)
+    ranked = np.argsort(-mahalanobis, kind="stable")
+    points = tuple(
+        PointResidual(
+            evidence.points[i],
+            evidence.points_image[i],
+            np.where(imaged[i], rows.click[i], np.nan),
+            float(mahalanobis[i]),
+            bool(fit.inliers[i]),
+            "" if fit.inliers[i] else problems[i] or _distance(rows.click[i]),
+        )
+        for i in ranked
+    )
+    drawn = [
+        _marking_residual(
+            name, rows.drawn[evidence.drawn_marking == index], bool(fit.markings[index])
+        )
+        for index, name in enumerate(evidence.markings)
+    ]
+    known = ground_error_map(estimate, pitch, settings.map_step)
+    reasons = []
+    if known.median > settings.weak_median:
+        reasons.append(
+            f"expected ground error {known.median:.2f} m (median over the seen pitch), "
+            f"over {settings.weak_median:g} m"
+        )
+    if known.p95 > settings.weak_p95:
+        reasons.append(
+            f"expected ground error {known.p95:.2f} m on the worst twentieth of the seen pitch, "
+            f"over {settings.weak_p95:g} m"
+        )
+    if fit.misfit > _TRUSTED * fit.noise_scale**2:
+        reasons.append(
+            f"residuals {np.sqrt(fit.misfit):.1f} times the stated noise: a name may be wrong"
+        )
+    if abs(scale - 1.0) > _SAME:
+        decisions = (
+            *decisions,
+            f"clicks and drawn pixels are {scale:.2g} times as far off as stated, which "
+            "is taken for their noise",
+        )
+    if lines is not None and not lines.refined:
+        reasons.append(f"no painted lines to confirm it: {lines.reason}")
+    if lines is not None:
+        samples = f"{lines.effective_samples:.0f} independent samples" if lines.refined else "none"
+        decisions = (*decisions, f"painted lines: {lines.reason or samples}")
+    misnamed = [
+        _true_name(int(index), estimate, problem, pitch, settings)
+        for index in np.flatnonzero(~fit.markings)
+    ]
+    clicked = (*evidence.points, *evidence.markings)
+    return CalibrationReport(
+        stage="lines" if lines is not None and lines.refined else "points",
+        free=tuple(name for name, free in zip(PARAMETERS, problem.free, strict=True) if free),
+        decisions=(*decisions, *misnamed),
+        points=points,
+        drawn=tuple(sorted(drawn, key=lambda marking: -marking.rms)),
+        wrong=(
+            *(point.name for point in points if not point.inlier),
+            *(marking.name for marking in drawn if not marking.inlier),
+        ),
+        noise_scale=scale,
+        click_noise=fit.click_noise,
+        click_freedom=fit.click_freedom,
+        condition=_condition(fit.covariance, problem.free),
+        ground_error=known,
+        weak=bool(reasons),
+        reasons=tuple(reasons),
+        add_next=propose_clicks(estimate, pitch, clicked, settings.click_noise),
+        lines=lines,
+    )
+
+
+def image_problems(camera: Camera, places: NDArray[np.float64]) -> tuple[str, ...]:
+    """Return why a camera cannot image places (n, 3) [m], world; empty strings if it can."""
+    status = camera.project_with_jacobians(places).status
+    return tuple(_CANNOT_IMAGE.get(RayStatus(code), "") for code in status.tolist())
+
+
+def _distance(residual: NDArray[np.float64]) -> str:
+    return f"{float(np.linalg.norm(residual)):.0f} px off"
+
+
+def _marking_residual(name: str, off: NDArray[np.float64], inlier: bool) -> MarkingResidual:
+    rms, worst = float(np.sqrt(np.mean(off**2))), float(np.abs(off).max())
+    return MarkingResidual(name, len(off), rms, worst, inlier)
+
+
+def _true_name(
+    index: int,
+    estimate: CameraEstimate,
+    problem: Problem,
+    pitch: PitchTemplate,
+    settings: StaticCalibrationSettings,
+) -> str:
+    """Return a sentence on the marking that the pixels of a misnamed marking lie on."""
+    evidence = problem.evidence
+    pixels = evidence.drawn_image[evidence.drawn_marking == index]
+    every = np.zeros(len(pixels), dtype=np.int64)
+    off, by_step = np.empty(len(pixels)), np.empty((len(pixels), SIZE))
+    row = camera_row(estimate.camera)
+    worst = {}
+    for name in pitch.marking_names:
+        samples = pitch.marking_points(name, settings.sample_spacing)
+        bounds = np.array([0, len(samples)])
+        drawn_residuals(row, problem.half_diagonal, samples, bounds, pixels, every, off, by_step)
+        worst[name] = float(np.abs(off).max())
+    nearest = min(worst, key=lambda name: worst[name])
+    drawn = f"{evidence.markings[index]} left out: its pixels lie"
+    if worst[nearest] > settings.wrong_marking * settings.drawn_noise:
+        return f"{drawn} on no marking"
+    return f"{drawn} on {nearest}, {worst[nearest]:.1f} px off at most"
+
+
+def _condition(covariance: NDArray[np.float64], free: NDArray[np.bool_]) -> float:
+    inner = covariance[np.ix_(free, free)]
+    spread = np.sqrt(np.diag(inner))
+    return float(np.linalg.cond(inner / np.outer(spread, spread)))
+
+
+def calibration_arrays(calibration: StaticCalibration) -> dict[str, NDArray[Any]]:
+    """Return the stored arrays of a calibrated camera, by name.
+
+    A given camera has only those of `camera_arrays`.
+    """
+    report = calibration.report
+    mahalanobis = np.array([p.mahalanobis for p in report.points], dtype=np.float64)
+    return {
+        **camera_arrays(calibration.estimate.camera),
+        "covariance": calibration.estimate.covariance,
+        "point_pixel": np.array([p.pixel for p in report.points]).reshape(-1, 2),
+        "point_residual": np.array([p.residual for p in report.points]).reshape(-1, 2),
+        "point_surprise": np.where(np.isfinite(mahalanobis), mahalanobis, np.nan),
+        "point_inlier": np.array([p.inlier for p in report.points], dtype=np.bool_),
+        "marking_rms": np.array([m.rms for m in report.drawn], dtype=np.float64),
+        "marking_worst": np.array([m.worst for m in report.drawn], dtype=np.float64),
+        "marking_inlier": np.array([m.inlier for m in report.drawn], dtype=np.bool_),
+        "ground_error": report.ground_error.expected,
+    }
+
+
+def calibration_coordinates(calibration: StaticCalibration) -> dict[str, NDArray[Any]]:
+    """Return the grid coordinates of the expected ground error; a given camera has none."""
+    known = calibration.report.ground_error
+    return {"ground_x": known.x, "ground_y": known.y}
+
+
+def given_attributes(camera_id: str) -> dict[str, Any]:
+    """Return the stored attributes of a given camera."""
+    return {"camera_id": camera_id, "origin": "given", **_no_evidence()}
+
+
+def left_out_attributes(camera_id: str, reason: str) -> dict[str, Any]:
+    """Return the stored attributes of a camera without calibration; it has no arrays."""
+    return {"camera_id": camera_id, "origin": "none", **_no_evidence(), "reasons": [reason]}
+
+
+def _no_evidence() -> dict[str, Any]:
+    lists = ("point", "point_problem", "marking", "free", "decisions", "reasons", "add_next")
+    return {**{name: [] for name in lists}, "noise_scale": None, "condition": None}
+
+
+def calibration_attributes(camera_id: str, calibration: StaticCalibration) -> dict[str, Any]:
+    """Return the stored attributes of a calibrated camera."""
+    report = calibration.report
+    return {
+        "camera_id": camera_id,
+        "origin": report.stage,
+        "point": [point.name for point in report.points],
+        "point_problem": [point.problem for point in report.points],
+        "marking": [marking.name for marking in report.drawn],
+        "free": list(report.free),
+        "decisions": list(report.decisions),
+        "reasons": list(report.reasons),
+        "add_next": list(report.add_next),
+        "noise_scale": report.noise_scale,
+        "condition": report.condition,
+    }

@@ -8,8 +8,8 @@ import pytest
 from worldpose.bundle_adjustment.uncertainty import add_shared_errors, survey_response
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import stepped
-from worldpose.static_calibration.line_adjustment import adjust
-from worldpose.static_calibration.line_samples import sample_markings, see_lines, thinned
+from worldpose.static_calibration.line_samples import project_lines, sample_markings, thin_samples
+from worldpose.static_calibration.line_search import adjust
 
 SURVEY_ERROR = 0.006
 
@@ -45,8 +45,8 @@ def test_a_survey_that_is_off_as_a_whole_takes_its_cameras_along(lined):
     pitch, free = lined.pitch, np.diag(lined.covariance[0]) > 0.0
     samples = sample_markings(pitch, 0.25)
     for c in range(3):
-        seen = see_lines(lined.cameras[c], samples, 0.12, SURVEY_ERROR, 0.05)
-        seen = seen[thinned(seen, samples, 8.0, 700)]
+        seen = project_lines(lined.cameras[c], samples, 0.12, SURVEY_ERROR, 0.05)
+        seen = seen[thin_samples(seen, samples, 8.0, 700)]
         fitted = adjust(
             np.zeros(len(seen.places)),
             np.full(len(seen.places), 0.01),

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.static_calibration import StaticCalibrationSettings, calibrate, checks
+from worldpose.static_calibration import StaticCalibrationSettings, calibrate, calibration
+from worldpose.static_calibration.click_outliers import Explanation
 
 NAMES = tuple(f"point{number}" for number in range(10))
 
@@ -20,16 +21,18 @@ def fitted(wrong, misfit=1.0):
 @pytest.fixture
 def judge(monkeypatch):
     """A function that judges ten clicks that no other size of the pitch explains."""
-    monkeypatch.setattr(checks, "_fitting_size", lambda *_: None)
-    monkeypatch.setattr(checks, "at_noise", lambda problem, *_: (problem, None))
+    monkeypatch.setattr(calibration, "_find_size", lambda *_: None)
+    monkeypatch.setattr(calibration, "at_noise", lambda problem, *_: (problem, None))
     problem = SimpleNamespace(where="cam01", evidence=SimpleNamespace(points=NAMES, markings=()))
     settings = StaticCalibrationSettings()
-    return lambda fit: checks.check_agreement(problem, fit, people.PITCH, settings, settings)
+    return lambda fit: calibration.check_agreement(
+        Explanation(problem, fit, settings), people.PITCH, settings
+    )
 
 
 @pytest.mark.parametrize(("wrong", "misfit"), [(0, 1.0), (2, 1.0), (2, 3.9)])
 def test_clicks_that_mostly_agree_need_no_other_explanation(wrong, misfit):
-    assert not checks.is_suspicious(fitted(wrong, misfit), 1.0)
+    assert not calibration.is_suspicious(fitted(wrong, misfit), 1.0)
 
 
 @pytest.mark.parametrize(
@@ -37,7 +40,7 @@ def test_clicks_that_mostly_agree_need_no_other_explanation(wrong, misfit):
 )
 def test_many_wrong_clicks_or_a_bad_fit_may_be_other_than_told(wrong, misfit, factor):
     # The misfit is in the noise of the fit, which is `factor` times the stated one.
-    assert checks.is_suspicious(fitted(wrong, misfit), factor)
+    assert calibration.is_suspicious(fitted(wrong, misfit), factor)
 
 
 def test_with_more_than_four_of_ten_clicks_wrong_no_camera_is_given(judge):
@@ -72,7 +75,9 @@ def test_a_camera_is_weak_where_its_expected_error_is_beyond_a_limit():
 
 def test_the_click_that_fits_worst_is_said_first():
     camera, rng = people.seat(1)
-    surprise = [point.surprise for point in of(people.click(camera, rng).clicked).report.points]
-    assert len(surprise) == 10
-    assert surprise == sorted(surprise, reverse=True)
-    assert surprise[0] > surprise[-1]
+    mahalanobis = [
+        point.mahalanobis for point in of(people.click(camera, rng).clicked).report.points
+    ]
+    assert len(mahalanobis) == 10
+    assert mahalanobis == sorted(mahalanobis, reverse=True)
+    assert mahalanobis[0] > mahalanobis[-1]

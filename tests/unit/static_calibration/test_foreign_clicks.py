@@ -11,9 +11,13 @@ from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import calibrate
-from worldpose.static_calibration.adjustment import problem_of, row_of
-from worldpose.static_calibration.click_outliers import held_out_error, residual_rows, rest_on
-from worldpose.static_calibration.evidence import gather
+from worldpose.static_calibration.adjustment import build_problem, camera_row
+from worldpose.static_calibration.click_outliers import (
+    compute_residuals,
+    fit_given_inliers,
+    held_out_error,
+)
+from worldpose.static_calibration.evidence import gather_evidence
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 
@@ -77,9 +81,9 @@ def test_a_click_with_the_name_of_another_end_is_never_believed(words):
 
 def test_a_point_beyond_the_fold_has_its_image_outwards_not_back_in_the_picture():
     (_, clicked, _), *_ = cameras(1, 9, noise=0.0, focal=(0.6, 0.7))
-    evidence = gather(rig.PITCH, rig.markings(clicked), rig.SIZE, 0.5, "test")
-    problem = problem_of(evidence, rig.SIZE, StaticCalibrationSettings())
-    row = row_of(calibrated(clicked).estimate.camera)
+    evidence = gather_evidence(rig.PITCH, rig.markings(clicked), rig.SIZE, 0.5, "test")
+    problem = build_problem(evidence, rig.SIZE, StaticCalibrationSettings())
+    row = camera_row(calibrated(clicked).estimate.camera)
     row[4:9] = [-0.3, 0.0, 0.0, 0.0, 0.0]
     # Turned until a clicked point is 76 degrees off the axis: the fold is at 46 degrees.
     pose = row[9:18].reshape(3, 3)
@@ -87,7 +91,7 @@ def test_a_point_beyond_the_fold_has_its_image_outwards_not_back_in_the_picture(
     seen = pose @ place + row[18:21]
     away = np.array([np.tan(np.radians(76.0)), 0.0, 1.0]) * np.linalg.norm(seen) * 0.24
     row[18:21] += away - seen
-    image = residual_rows(problem, row).click[0] + evidence.points_image[0]
+    image = compute_residuals(problem, row).click[0] + evidence.points_image[0]
     folded = row[0] * away[0] / away[2] * (1.0 - 0.3 * (away[0] / away[2]) ** 2) + row[2]
     assert folded < 0  # what the polynomial alone says
     assert image[0] > rig.SIZE[0]
@@ -165,18 +169,18 @@ def test_thousands_of_drawn_pixels_are_thinned_to_two_hundred_a_marking():
     (camera, clicked, _), *_ = cameras(1, 9, noise=1.0)
     drawn = {"touch_line_near": rig.draw(camera, "touch_line_near", 2)}
     drawn = {"touch_line_near": np.linspace(*drawn["touch_line_near"], 15_000)}
-    evidence = gather(rig.PITCH, rig.markings(clicked, drawn), rig.SIZE, 0.5, "test")
+    evidence = gather_evidence(rig.PITCH, rig.markings(clicked, drawn), rig.SIZE, 0.5, "test")
     assert len(evidence.drawn_image) == 200
     np.testing.assert_allclose(evidence.drawn_image[[0, -1]], drawn["touch_line_near"][[0, -1]])
 
 
 def fit_to_all(clicked, drawn):
     settings = StaticCalibrationSettings()
-    evidence = gather(rig.PITCH, rig.markings(clicked, drawn), rig.SIZE, 0.5, "test")
-    problem = problem_of(evidence, rig.SIZE, settings)
-    start = row_of(calibrated(clicked, drawn).estimate.camera)
+    evidence = gather_evidence(rig.PITCH, rig.markings(clicked, drawn), rig.SIZE, 0.5, "test")
+    problem = build_problem(evidence, rig.SIZE, settings)
+    start = camera_row(calibrated(clicked, drawn).estimate.camera)
     every = np.ones(len(clicked), dtype=bool), np.ones(len(evidence.markings), dtype=bool)
-    return problem, rest_on(problem, start, *every)
+    return problem, fit_given_inliers(problem, start, *every)
 
 
 def test_held_out_error_is_that_of_fits_without_each_click():
@@ -184,8 +188,8 @@ def test_held_out_error_is_that_of_fits_without_each_click():
     problem, fit = fit_to_all(clicked, {})
     squared = []
     for index in range(12):
-        without = rest_on(problem, fit.row, np.arange(12) != index, fit.markings)
-        squared.append((residual_rows(problem, without.row).click[index] ** 2).mean())
+        without = fit_given_inliers(problem, fit.row, np.arange(12) != index, fit.markings)
+        squared.append((compute_residuals(problem, without.row).click[index] ** 2).mean())
     assert held_out_error(problem, fit) == pytest.approx(np.sqrt(np.mean(squared)), rel=0.01)
 
 
@@ -194,7 +198,7 @@ def test_held_out_error_of_markings_is_that_of_the_dense_press_formula():
     names = ["touch_line_near", "touch_line_far", "halfway_line"]
     drawn = {name: rig.draw(camera, name, 40, 1.5, rng) for name in names}
     problem, fit = fit_to_all(clicked, drawn)
-    rows, on = residual_rows(problem, fit.row), problem.evidence.drawn_marking
+    rows, on = compute_residuals(problem, fit.row), problem.evidence.drawn_marking
     units = [(rows.click[i], rows.by_click[i], problem.click_noise[[i, i]]) for i in range(12)]
     for k in range(3):
         units.append((rows.drawn[on == k], rows.by_drawn[on == k], problem.drawn_noise[on == k]))

@@ -12,14 +12,17 @@ from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.rendering import RenderingSettings, render_pitch
 from worldpose.simulation.stadium import looking
-from worldpose.static_calibration.clearance import clear, whites_of
-from worldpose.static_calibration.edges import brightness
-from worldpose.static_calibration.line_adjustment import adjust
+from worldpose.static_calibration.line_detection import brightness
 from worldpose.static_calibration.line_refinement import refine_on_lines
-from worldpose.static_calibration.line_samples import sample_markings, see_lines
-from worldpose.static_calibration.line_search import LineSearch, difference
-from worldpose.static_calibration.line_settings import LineRefinementSettings
-from worldpose.static_calibration.parameters import CameraEstimate, stepped
+from worldpose.static_calibration.line_samples import (
+    clear,
+    project_lines,
+    sample_markings,
+    white_structures,
+)
+from worldpose.static_calibration.line_search import LineSearch, adjust
+from worldpose.static_calibration.parameters import CameraEstimate, step_between, stepped
+from worldpose.static_calibration.settings import LineRefinementSettings
 
 PITCH = PitchTemplate.standard()
 EXACT = 0.0
@@ -163,7 +166,7 @@ def test_covariance_holds_the_truth_and_says_more_than_the_start():
     for seed in range(12):
         first = start(seed)
         found = refine_on_lines(first, PITCH, picture())
-        off = difference(found.estimate.camera, camera())[:11]
+        off = step_between(found.estimate.camera, camera())[:11]
         covariance = found.estimate.covariance[:11, :11]
         distances.append(off @ np.linalg.solve(covariance, off))
         gained = np.linalg.eigvalsh(first.covariance[:11, :11] - covariance)
@@ -184,7 +187,7 @@ def test_survey_that_is_off_is_told_by_its_setting():
 def test_derivatives_of_samples_are_those_of_projection():
     view = camera()
     samples = sample_markings(PITCH, 1.0)
-    seen = see_lines(view, samples, 0.12, 1.0, 1.0)
+    seen = project_lines(view, samples, 0.12, 1.0, 1.0)
     for parameter in range(12):
         step = np.zeros(12)
         step[parameter] = 1e-6 if parameter < 7 else 1e-4
@@ -200,7 +203,7 @@ def test_derivatives_of_samples_are_those_of_projection():
 def test_paint_moves_as_its_surveyed_points_do():
     spec, view = PitchSpec(), camera()
     samples = sample_markings(PITCH, 1.0)
-    seen = see_lines(view, samples, 0.12, 1.0, 1.0)
+    seen = project_lines(view, samples, 0.12, 1.0, 1.0)
     names = list(PITCH.points)
     # A corner holds one end of two lines, the centre mark an arc.
     for point in ("penalty_area_left_near_front", "penalty_mark_left"):
@@ -221,7 +224,7 @@ def test_paint_moves_as_its_surveyed_points_do():
 def test_curvature_is_that_of_the_projected_arc():
     view = camera()
     samples = sample_markings(PITCH, 0.1)
-    seen = see_lines(view, samples, 0.12, 0.0, 0.0)
+    seen = project_lines(view, samples, 0.12, 0.0, 0.0)
     arc = seen.visible & (samples.marking == samples.names.index("penalty_arc_left"))
     index = np.flatnonzero(arc)[5:-5:20]
     assert len(index) > 3
@@ -245,9 +248,9 @@ def test_samples_near_other_markings_and_the_goal_are_left_out():
         cam_from_world=looking(np.array([-68.0, 3.0, 9.28]), np.array([-44.0, 0.0, 0.0]), 0.0),
     )
     samples = sample_markings(PITCH, 0.2)
-    seen = see_lines(view, samples, 0.12, 0.0, 0.0)
+    seen = project_lines(view, samples, 0.12, 0.0, 0.0)
     alone = clear(
-        view, whites_of(PITCH), 0.06, seen.places, 0.5 * seen.widths + 4.0, samples.marking
+        view, white_structures(PITCH), 0.06, seen.places, 0.5 * seen.widths + 4.0, samples.marking
     )
     bar = view.project(PITCH.marking_points("crossbar_left", 0.02))
     visible = np.flatnonzero(seen.visible)

@@ -6,9 +6,9 @@ import pytest
 
 from worldpose.geometry import Camera
 from worldpose.static_calibration import stepped
-from worldpose.static_calibration.adjustment import problem_of, row_of
+from worldpose.static_calibration.adjustment import build_problem, camera_row
 from worldpose.static_calibration.descent import step_row
-from worldpose.static_calibration.evidence import gather
+from worldpose.static_calibration.evidence import gather_evidence
 from worldpose.static_calibration.ground_error import surface_motion
 from worldpose.static_calibration.parameters import PARAMETERS
 from worldpose.static_calibration.residuals import (
@@ -27,9 +27,9 @@ def problem_and_row(index=1):
     clicks = people.click(camera, rng, count=6).clicked
     drawn = people.draw(camera, people.PITCH.marking_names, rng, noise=5.0)
     clicked = clicks.model_copy(update={"drawn": drawn})
-    evidence = gather(people.PITCH, clicked, people.SIZE, 0.5, "test")
+    evidence = gather_evidence(people.PITCH, clicked, people.SIZE, 0.5, "test")
     off = stepped(camera, [0.01, -0.01, 0.02, 0.3, 0.2, -0.4, 0.02, 3.0, -4.0, 0.01, 0.002, 0.001])
-    return problem_of(evidence, people.SIZE, StaticCalibrationSettings()), off
+    return build_problem(evidence, people.SIZE, StaticCalibrationSettings()), off
 
 
 def differences(function, camera: Camera):
@@ -46,9 +46,11 @@ def test_the_compiled_step_is_that_of_the_camera():
     _, camera = problem_and_row()
     step = np.array([0.1, -0.2, 0.3, 1.0, 2.0, -3.0, 0.1, 5.0, 6.0, 0.01, 0.02, 0.03])
     row = np.empty(22)
-    step_row(row_of(camera), step, row)
+    step_row(camera_row(camera), step, row)
     # Rotations of 0.4 rad and numbers up to 1e3 at double precision.
-    np.testing.assert_allclose(row[:21], row_of(stepped(camera, step))[:21], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        row[:21], camera_row(stepped(camera, step))[:21], rtol=1e-12, atol=1e-12
+    )
 
 
 def test_residuals_of_clicks():
@@ -57,7 +59,7 @@ def test_residuals_of_clicks():
 
     def residual(at):
         out = np.empty((len(evidence.points), 2)), np.empty((len(evidence.points), 2, 12))
-        point_residuals(row_of(at), evidence.points_world, evidence.points_image, *out)
+        point_residuals(camera_row(at), evidence.points_world, evidence.points_image, *out)
         return out
 
     np.testing.assert_allclose(
@@ -76,8 +78,8 @@ def test_distances_of_drawn_pixels():
         count = len(evidence.drawn_image)
         out = np.empty(count), np.empty((count, 12))
         drawn_residuals(
-            row_of(at),
-            problem.reach,
+            camera_row(at),
+            problem.half_diagonal,
             evidence.samples_world,
             evidence.bounds,
             evidence.drawn_image,
@@ -102,7 +104,7 @@ def test_residuals_of_the_prior(k1):
 
     def residual(at):
         out = np.empty(9), np.empty((9, 12))
-        prior_residuals(row_of(at), prior, *out)
+        prior_residuals(camera_row(at), prior, *out)
         return out
 
     numeric = differences(lambda at: residual(at)[0], camera)

@@ -1,5 +1,5 @@
+from worldpose.formats.soccernet import SOCCERNET_MARKINGS, soccernet_markings
 from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration.soccernet import SOCCERNET_MARKINGS, soccernet_markings
 
 
 def test_every_name_is_another_marking_of_the_template():

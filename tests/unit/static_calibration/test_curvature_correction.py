@@ -9,11 +9,11 @@ from worldpose.simulation.rendering import render_pitch
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.stadium import place_camera
 from worldpose.static_calibration import StaticCalibrationSettings, calibrate
-from worldpose.static_calibration.adjustment import problem_of, row_of
-from worldpose.static_calibration.evidence import gather
-from worldpose.static_calibration.ill_conditioned import ClicksAndBars, fit_and_bends
-from worldpose.static_calibration.line_profiles import Bars
-from worldpose.static_calibration.line_samples import sample_markings, see_lines
+from worldpose.static_calibration.adjustment import build_problem, camera_row
+from worldpose.static_calibration.curvature_correction import ClicksAndBars, fit_with_curvature
+from worldpose.static_calibration.evidence import gather_evidence
+from worldpose.static_calibration.line_samples import project_lines, sample_markings
+from worldpose.static_calibration.line_search import Bars
 from worldpose.static_calibration.parameters import stepped
 
 SETTINGS = StaticCalibrationSettings()
@@ -28,11 +28,11 @@ def corner_camera():
 def evidence(camera, noise=0.02):
     """The corner clicked, and exact bars on all that is seen."""
     clicked = people.points(people.visible(camera, ["penalty_area_left_near_front"]))
-    problem = problem_of(
-        gather(people.PITCH, clicked, people.SIZE, 0.5, "test"), people.SIZE, SETTINGS
+    problem = build_problem(
+        gather_evidence(people.PITCH, clicked, people.SIZE, 0.5, "test"), people.SIZE, SETTINGS
     )
     samples = sample_markings(people.PITCH, 0.5)
-    seen = see_lines(camera, samples, 0.12, 0.006, 0.05)
+    seen = project_lines(camera, samples, 0.12, 0.006, 0.05)
     here = seen.visible
     bars = Bars(
         samples[here],
@@ -69,7 +69,7 @@ def test_bars_slide_along_their_line_for_nothing():
         bars.by_paint,
         bars.unknowns,
     )
-    off = np.abs(moved.whitened(camera)[0][: len(arc)]) * bars.noise
+    off = np.abs(moved.whiten_residuals(camera)[0][: len(arc)]) * bars.noise
     # Forty centimetres are 25 px; lenses bend by a hundredth of a pixel on the way.
     assert off[~arc].max() < 0.02
 
@@ -77,12 +77,12 @@ def test_bars_slide_along_their_line_for_nothing():
 def test_shared_survey_is_taken_off_once():
     camera = corner_camera()
     bars = evidence(camera).bars
-    off, _ = bars.whitened(camera)
+    off, _ = bars.whiten_residuals(camera)
     assert np.abs(off).max() < 1e-9
     # A surveyed point that is two deviations off costs four, however many samples show it.
     point = bars.unknowns[0, 1]
     shift = 2.0 * np.where(bars.unknowns == point, bars.by_paint, 0.0).sum(axis=1)
-    seen = see_lines(camera, bars.samples, 0.12, 0.006, 0.05)
+    seen = project_lines(camera, bars.samples, 0.12, 0.006, 0.05)
     other = Bars(
         bars.samples,
         bars.pixels + shift[:, None] * seen.normals,
@@ -90,7 +90,7 @@ def test_shared_survey_is_taken_off_once():
         bars.by_paint,
         bars.unknowns,
     )
-    cost = float((other.whitened(camera)[0] ** 2).sum())
+    cost = float((other.whiten_residuals(camera)[0] ** 2).sum())
     assert 0.0 < cost <= 4.0 + 1e-6
 
 
@@ -109,15 +109,15 @@ def test_best_camera_is_found_from_metres_away():
 def test_valley_widens_the_covariance_and_is_the_same_each_time():
     camera = corner_camera()
     given = evidence(camera)
-    wide = fit_and_bends(given.problem, camera, given.bars, 1.0)
+    wide = fit_with_curvature(given.problem, camera, given.bars, 1.0)
     free = np.flatnonzero(given.problem.free)
     rows = given.residuals(wide.camera)[1]
     added = wide.covariance[np.ix_(free, free)] - np.linalg.inv(rows.T @ rows)
     size = np.sqrt(np.diag(wide.covariance)[free])
     assert np.linalg.eigvalsh(added / np.outer(size, size)).min() > -1e-6
-    again = fit_and_bends(given.problem, camera, given.bars, 1.0)
+    again = fit_with_curvature(given.problem, camera, given.bars, 1.0)
     assert (again.covariance == wide.covariance).all()
-    assert (row_of(again.camera) == row_of(wide.camera)).all()
+    assert (camera_row(again.camera) == camera_row(wide.camera)).all()
 
 
 def test_stills_without_lines_make_a_camera_weak():

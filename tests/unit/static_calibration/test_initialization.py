@@ -9,8 +9,12 @@ from data_contracts.static_calibration import ClickedMarkings
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.stadium import looking
-from worldpose.static_calibration.evidence import gather
-from worldpose.static_calibration.homography import camera_of, homographies, plane_from_image
+from worldpose.static_calibration.evidence import gather_evidence
+from worldpose.static_calibration.initialization import (
+    camera_from_homography,
+    homographies,
+    plane_from_image,
+)
 
 SIZE = people.SIZE
 MIDDLE = np.array([959.5, 539.5])
@@ -72,14 +76,14 @@ def test_the_camera_in_an_exact_homography_is_found(focal, x, height, aim, roll)
     pose = camera.cam_from_world
     k = np.array([[focal, 0, MIDDLE[0]], [0, focal, MIDDLE[1]], [0, 0, 1]])
     homography = -3.0 * k @ np.column_stack([pose.rotation[:, :2], pose.translation])
-    found = camera_of(homography, SIZE, MIDDLE, (300.0, 20000.0))
+    found = camera_from_homography(homography, SIZE, MIDDLE, (300.0, 20000.0))
     np.testing.assert_allclose(found.focal, focal, rtol=1e-6)
     np.testing.assert_allclose(found.center, camera.center, rtol=1e-5, atol=1e-5)
 
 
 def test_a_view_straight_down_takes_the_focal_length_from_its_range():
     homography = np.array([[20.0, 0.0, 960.0], [0.0, -20.0, 540.0], [0.0, 0.0, 1.0]])
-    found = camera_of(homography, SIZE, MIDDLE, (1000.0, 4000.0))
+    found = camera_from_homography(homography, SIZE, MIDDLE, (1000.0, 4000.0))
     assert 1000.0 <= found.focal[0] <= 4000.0
     assert found.center[2] > 0.0
 
@@ -90,7 +94,7 @@ def test_two_wrong_clicks_of_nine_do_not_bend_the_homography():
     names = list(seen)
     for name in names[:2]:
         seen[name] = seen[name] + np.array([150.0, -90.0]) * np.where(seen[name] < 600, 1, -1)
-    evidence = gather(FLAT, people.points(seen), SIZE, 0.5, "test")
+    evidence = gather_evidence(FLAT, people.points(seen), SIZE, 0.5, "test")
     best = homographies(evidence, SIZE, 10.0, leave_out=False)[0]
     place = best @ np.append(FLAT.points[names[5]][:2], 1.0)
     # The crown is not in the flat homography: it moves pixels by up to 5.
@@ -100,5 +104,5 @@ def test_two_wrong_clicks_of_nine_do_not_bend_the_homography():
 def test_without_points_on_the_surface_there_is_no_homography():
     camera, rng = people.seat(1)
     drawn = people.draw(camera, ["center_circle", "penalty_arc_left"], rng)
-    evidence = gather(people.PITCH, ClickedMarkings(drawn=drawn), SIZE, 0.5, "test")
+    evidence = gather_evidence(people.PITCH, ClickedMarkings(drawn=drawn), SIZE, 0.5, "test")
     assert homographies(evidence, SIZE, 10.0, leave_out=True) == []

@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.static_calibration.bar_fits import fit_bars
-from worldpose.static_calibration.edges import (
+from worldpose.static_calibration.line_detection import (
     CANDIDATES,
+    CrossSections,
     brightness,
     find_bars,
+    fit_bars,
 )
 
 
@@ -24,19 +25,22 @@ def bars(middle, width, *, left=80.0, right=80.0, paint=200.0, shape=(40, 80)):
     return np.tile(np.rint(row).astype(np.uint8), (shape[0], 1))
 
 
+def across(x, width, curvature=0.0):
+    """The cross section of a vertical bar at a column."""
+    place, normal = np.array([[x, 20.0]]), np.array([[1.0, 0.0]])
+    return CrossSections(place, normal, np.array([width]), np.array([curvature]))
+
+
 def found(picture, x, width, reach=10.0, contrast=6.0):
     offsets, strengths = np.empty((1, CANDIDATES)), np.empty((1, CANDIDATES))
-    place, normal = np.array([[x, 20.0]]), np.array([[1.0, 0.0]])
-    bar = np.array([width]), np.zeros(1)
-    find_bars(picture, place, normal, *bar, np.array([reach]), contrast, offsets, strengths)
+    find_bars(picture, across(x, width), np.array([reach]), contrast, offsets, strengths)
     return offsets[0]
 
 
 def fitted(picture, x, width, start, contrast=6.0, curvature=0.0):
     offset, variance = np.empty(1), np.empty(1)
-    place, normal = np.array([[x, 20.0]]), np.array([[1.0, 0.0]])
-    bar = np.array([width]), np.array([curvature])
-    fit_bars(picture, place, normal, *bar, np.array([start]), contrast, offset, variance)
+    sections = across(x, width, curvature)
+    fit_bars(picture, sections, np.array([start]), contrast, offset, variance)
     return offset[0], variance[0]
 
 

@@ -1,0 +1,490 @@
+"""Calibration of one static camera from clicks in its image (C1-C5)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.static_calibration import ClickedMarkings
+from worldpose.errors import InputError
+from worldpose.pitch import PitchTemplate
+from worldpose.pitch.laws import law_points
+from worldpose.static_calibration.adjustment import (
+    Problem,
+    adjust,
+    build_problem,
+)
+from worldpose.static_calibration.click_outliers import (
+    CLEAR_GAIN,
+    Explanation,
+    InlierFit,
+    fit_inliers,
+    fit_inliers_at_best_noise,
+    held_out_error,
+    negative_log_posterior,
+    scale_noise,
+)
+from worldpose.static_calibration.evidence import (
+    check_amount,
+    describe_clicks,
+    gather_evidence,
+    has_enough_points,
+)
+from worldpose.static_calibration.ground_error import points_off_line, propose_clicks
+from worldpose.static_calibration.initialization import (
+    cameras_from_homographies,
+    find_start,
+    fit_from_starts,
+    plausible_cameras,
+)
+from worldpose.static_calibration.line_refinement import refine_and_judge
+from worldpose.static_calibration.parameters import PARAMETERS
+from worldpose.static_calibration.report import StaticCalibration, build_report
+from worldpose.static_calibration.settings import StaticCalibrationSettings
+
+_CROPPED: Final = 0.15
+"""Spread of a cropped image's principal point, in widths [1]: covers crops of half the size."""
+_MAX_CROP: Final = 0.5
+"""Largest offset of a cropped image's principal point from its center, in widths and in heights
+[1]: a corner of an image of twice its size."""
+_FOR_CROP: Final = 7
+"""Minimum clicked points, or markings, that distinguish a crop from wrong names [1]."""
+_MAX_LEFT_OUT: Final = 16
+"""Maximum clicks for leave-one-out starts [1]."""
+_OTHER_STARTS: Final = 2
+"""Leave-one-out starts to refine, the best first [1]."""
+_FOR_K3: Final = 24
+"""Minimum residuals to try k3 [1]: twice the parameters."""
+_POSE_SPREAD: Final = np.array([1.0, 1.0, 1.0, 30.0, 30.0, 30.0, 0.7])
+"""Spread of pose and focal length without information [rad, m, 1]: the clicks do not determine
+directions with a larger standard deviation."""
+_MIN_UNKNOWN: Final = 2
+"""Undetermined directions of pose and focal length from which the check fails [1]."""
+_MIRRORED_GAIN: Final = 0.25
+"""Names count as mirrored if mirroring leaves less than this share of the cost [1]."""
+_SUSPICIOUS: Final = 0.2
+"""Share of outliers above which the check tries mirrored names [1]."""
+_FAR: Final = 4.0
+"""Mean loss per observation in the stated noise [1] from which to try other explanations."""
+_MANY: Final = 9.0
+"""Cauchy scale of clicks [standard deviations] while mirrored names compete."""
+_BELIEVED: Final = 0.1
+"""Maximum share of outliers of a camera that rests on an assumption [1]."""
+_CLOSE: Final = 4.0
+"""Maximum mean loss per observation of such a camera [1]: twice the stated noise."""
+_SAME_SIZE: Final = 0.5
+"""Difference in length or width that clicks cannot resolve [m]."""
+_UNIT_GAIN: Final = 14.0
+"""Twice the logarithm of the minimum probability ratio in favor of a pitch in yards [1]: a
+thousand, since the fault is rare."""
+_YARD: Final = 0.9144
+"""[m]"""
+
+
+def calibrate(
+    pitch: PitchTemplate,
+    clicked: ClickedMarkings,
+    image_size: tuple[int, int],
+    *,
+    picture: NDArray[np.uint8] | None = None,
+    settings: StaticCalibrationSettings | None = None,
+    where: str = "clicked markings",
+) -> StaticCalibration:
+    """Return the camera of an image, its covariance and its report.
+
+    Stage 1 finds starts: homographies of the flattened pitch, or plausible cameras where clicks
+    are too few for one. Stage 2 fits pose, focal length, principal point and distortion on the
+    crowned pitch, and excludes outliers among the clicks. Stage 3 refines on the painted lines of
+    the image, if there is one.
+
+    Args:
+        pitch: the stadium's template.
+        clicked: named points, and pixels along named markings.
+        image_size: width, height [px].
+        picture: (height, width) or (height, width, 3); without it there is no stage 3.
+        settings: noise, prior and thresholds; the defaults if None.
+        where: file or camera, for messages.
+
+    Raises:
+        InputError: a name is unknown, a pixel lies outside the image, names are mirrored, the
+            clicks contradict each other, or they do not determine the camera; the message says
+            which clicks to add.
+
+    Note:
+        C1-C5; paper section "Static Camera Calibration".
+    """
+    stated = settings or StaticCalibrationSettings()
+    evidence = gather_evidence(pitch, clicked, image_size, stated.sample_spacing, where)
+    check_amount(evidence, pitch, where)
+    problem = build_problem(evidence, image_size, stated, where=where)
+    found = fit_inliers_at_best_noise(problem, find_start(problem, stated), stated)
+    found = _find_explanation(found, pitch, stated)
+    check_determined(found, pitch)
+    found = _try_k3(found)
+    estimate, lines = found.estimate, None
+    if picture is not None and stated.lines:
+        fit, lines = refine_and_judge(found, pitch, picture)
+        found, estimate = replace(found, fit=fit), lines.estimate
+    report = build_report(estimate, found, lines, pitch, stated.click_noise)
+    return StaticCalibration(estimate, report)
+
+
+def _find_explanation(
+    found: Explanation, pitch: PitchTemplate, stated: StaticCalibrationSettings
+) -> Explanation:
+    """Return the most probable explanation of consistent clicks.
+
+    Before many clicks count as outliers, or as far noisier than stated, the search tries other
+    explanations: drawn markings are wrong, or the image is a crop, so that the principal point
+    lies elsewhere.
+
+    Args:
+        found: the clicks at their most probable noise.
+        pitch: the template.
+        stated: settings as given.
+
+    Raises:
+        InputError: the names are mirrored, the pitch has another size or unit, or no camera
+            explains most of the clicks.
+    """
+    fit, factor = found.fit, found.noise_factor(stated)
+    as_stated = scale_noise(found.problem, 1.0 / factor, found.settings)[0]
+    if not is_suspicious(fit, factor):
+        if not fit.inliers.all() or factor * fit.noise_scale > 1.0:
+            check_unit(as_stated, found, pitch, stated)
+        return found
+    check_mirrored(found)
+    problem, best = found.problem, found
+    lowest = negative_log_posterior(best, factor=factor, with_prior=True) - CLEAR_GAIN
+    for row in _other_starts(as_stated, stated):
+        try:
+            other = fit_inliers_at_best_noise(as_stated, row, stated)
+        except InputError:
+            continue
+        factor = other.noise_factor(stated)
+        own = negative_log_posterior(other, factor=factor, with_prior=True)
+        if own < lowest + CLEAR_GAIN:
+            lowest, best = own - CLEAR_GAIN, other
+    for assumed, describe in _alternatives(as_stated):
+        try:
+            other = fit_inliers_at_best_noise(assumed, find_start(assumed, stated), stated)
+        except InputError:
+            continue
+        shift = np.abs(other.fit.row[2:4] - problem.prior[2:4])
+        if np.any(shift > _MAX_CROP * np.array(problem.image_size)):
+            continue
+        factor = other.noise_factor(stated)
+        own = negative_log_posterior(other, factor=factor, with_prior=True)
+        if own < lowest:
+            other = replace(other, assumptions=(describe(other.fit),))
+            lowest, best = own, _extend_to_all(as_stated, assumed, other, factor)
+    check_agreement(best, pitch, stated)
+    check_unit(as_stated, best, pitch, stated)
+    return best
+
+
+def _other_starts(
+    problem: Problem, settings: StaticCalibrationSettings
+) -> list[NDArray[np.float64]]:
+    """Return starts (22,) that leave out one click each.
+
+    A single click under a wrong name may hold the robust fit in another minimum.
+    """
+    count = len(problem.evidence.points)
+    if count > _MAX_LEFT_OUT:
+        return []
+    every = np.ones(len(problem.evidence.markings), dtype=np.bool_)
+    found = []
+    for index in range(count):
+        fewer = problem.select(np.arange(count) != index, every)
+        rows = cameras_from_homographies(fewer, settings.prior, leave_out=False)
+        if len(rows):
+            found.append(fit_from_starts(fewer, rows, settings.wrong_click))
+    return [row for row, _ in sorted(found, key=lambda one: one[1])[:_OTHER_STARTS]]
+
+
+def _extend_to_all(
+    problem: Problem, assumed: Problem, found: Explanation, factor: float
+) -> Explanation:
+    """Return an explanation applied to the whole problem: markings that it lacks are outliers.
+
+    Args:
+        problem: all clicks and markings, at the stated noise.
+        assumed: the problem under the assumption, perhaps without markings.
+        found: explanation of the assumed problem.
+        factor: its noise over the stated noise.
+    """
+    if len(assumed.evidence.drawn_image) == len(problem.evidence.drawn_image):
+        return found
+    none = np.zeros(len(problem.evidence.markings), dtype=np.bool_)
+    whole = scale_noise(problem, factor, found.settings)[0]
+    whole = whole.with_survey_error(found.fit.row, found.settings)
+    return replace(found, problem=whole, fit=replace(found.fit, markings=none))
+
+
+def _alternatives(problem: Problem) -> Iterator[tuple[Problem, Callable[[InlierFit], str]]]:
+    """Yield alternative problems, each with a function that describes its assumption."""
+    evidence, prior = problem.evidence, problem.prior.copy()
+    prior[4] = _CROPPED * problem.image_size[0]
+    middle = problem.prior[2:4]
+
+    def shift(fit: InlierFit) -> str:
+        x, y = fit.row[2:4] - middle
+        return (
+            f"the principal point lies {x:+.0f}, {y:+.0f} px off the image's center: the image "
+            "seems to be cropped"
+        )
+
+    names = ", ".join(evidence.markings)
+    if evidence.markings and has_enough_points(evidence):
+        points = np.ones(len(evidence.points), dtype=np.bool_)
+        alone = problem.select(points, np.zeros(len(evidence.markings), dtype=np.bool_))
+        yield alone, lambda fit: f"{names} left out: drawn elsewhere than the points say"
+    if max(len(evidence.points), len(evidence.markings)) >= _FOR_CROP:
+        yield replace(problem, prior=prior), shift
+
+
+def _try_k3(found: Explanation) -> Explanation:
+    """Return the explanation with k3 if it lowers the held-out error, and the decisions (C5)."""
+    problem, fit, settings = found.problem, found.fit, found.settings
+    before = held_out_error(problem, fit)
+    decisions = (*found.assumptions, f"held-out error {before:.2f} px with {settings.distortion}")
+    count = 2 * int(fit.inliers.sum()) + len(problem.evidence.drawn_image)
+    if settings.distortion != "k1_k2":
+        return replace(found, assumptions=decisions)
+    if count < _FOR_K3:
+        decision = f"k3 kept 0: {count} residuals, tried from {_FOR_K3}"
+        return replace(found, assumptions=(*decisions, decision))
+    wider = replace(problem, free=np.arange(len(PARAMETERS)) < len(PARAMETERS))
+    more = fit_inliers(wider, fit.row, settings)
+    after = held_out_error(wider, more)
+    same = bool((more.inliers == fit.inliers).all() and (more.markings == fit.markings).all())
+    if same and after < (1.0 - settings.k3_gain) * before:
+        decision = f"k3 solved for: held-out error {before:.2f} to {after:.2f} px"
+        return Explanation(wider, more, settings, (*decisions, decision))
+    decision = f"k3 kept 0: held-out error {before:.2f} px without, {after:.2f} px with it"
+    return replace(found, assumptions=(*decisions, decision))
+
+
+def is_suspicious(fit: InlierFit, factor: float) -> bool:
+    """Return whether outliers or residuals suggest wrong names or a cropped image.
+
+    Args:
+        fit: fit to the clicks.
+        factor: its noise over the stated noise.
+    """
+    return _outlier_share(fit) > _SUSPICIOUS or fit.misfit * factor**2 >= _FAR
+
+
+def _explains(fit: InlierFit) -> bool:
+    """Return whether a fit has few outliers and small residuals."""
+    return _outlier_share(fit) <= _BELIEVED and bool(fit.misfit < _CLOSE)
+
+
+def check_mirrored(found: Explanation) -> None:
+    """Raise InputError when mirroring the names explains the clicks."""
+    if _is_mirrored(found):
+        evidence = found.problem.evidence
+        raise InputError(
+            found.problem.where,
+            expected="names as seen from this camera's side of the pitch",
+            found=f"{describe_clicks(evidence)} that fit only with left and right exchanged",
+            todo="Exchange left and right (or near and far) in all names: left is negative x, "
+            "near is negative y, the main camera's side.",
+        )
+
+
+def check_agreement(
+    found: Explanation, pitch: PitchTemplate, stated: StaticCalibrationSettings
+) -> None:
+    """Raise InputError if no camera explains most clicks, or a pitch of another size does.
+
+    Args:
+        found: the clicks, at the most probable noise.
+        pitch: the template.
+        stated: settings as given.
+    """
+    problem, fit, settings = found.problem, found.fit, found.settings
+    evidence, wrong = problem.evidence, _outlier_share(fit)
+    factor = found.noise_factor(stated)
+    if is_suspicious(fit, factor):
+        size = _find_size(scale_noise(problem, 1.0 / factor, settings)[0], pitch, stated)
+        if size is not None:
+            raise _size_error(problem, pitch, size)
+    if wrong > settings.max_wrong_share:
+        kept = [n for n, inlier in zip(evidence.points, fit.inliers, strict=True) if inlier]
+        raise InputError(
+            problem.where,
+            expected=f"at most {settings.max_wrong_share:.0%} wrong clicks",
+            found=f"{wrong:.0%}: no camera sees more of them in place than {', '.join(kept)}",
+            todo="Check the names of the others, image_size, and the size of the pitch in "
+            "pitch.json.",
+        )
+
+
+@dataclass(frozen=True)
+class _PitchSize:
+    """A size that the clicks may have been made on.
+
+    Attributes:
+        length: [m].
+        width: [m].
+        mistake: the likely mistake in pitch.json, in words.
+    """
+
+    length: float
+    width: float
+    mistake: str
+
+
+def _size_in_yards(pitch: PitchTemplate) -> _PitchSize:
+    return _PitchSize(_YARD * pitch.length, _YARD * pitch.width, "it seems to be in yards")
+
+
+def check_unit(
+    problem: Problem,
+    best: Explanation,
+    pitch: PitchTemplate,
+    settings: StaticCalibrationSettings,
+) -> None:
+    """Raise InputError when a pitch whose size is in yards explains the clicks far better.
+
+    With lens distortion and one or two outliers, the clicks also fit a pitch that is 9 % too large.
+
+    Args:
+        problem: the clicks, at the stated noise.
+        best: its best explanation in metres, which may assume a cropped image.
+        pitch: the template.
+        settings: settings as given.
+    """
+    size = _size_in_yards(pitch)
+    other = _start_on_pitch(problem, size, settings)
+    # A score of points alone decides nothing where drawn markings also constrain the camera.
+    if other is None or problem.evidence.markings:
+        return
+    points, row = other
+    try:
+        found = fit_inliers_at_best_noise(points, row, settings)
+    except InputError:
+        return
+    in_yards, given = (
+        negative_log_posterior(each, factor=each.noise_factor(settings), with_prior=True)
+        for each in (found, best)
+    )
+    if in_yards < given - _UNIT_GAIN and _outlier_share(found.fit) <= _BELIEVED:
+        raise _size_error(problem, pitch, size)
+
+
+def _size_error(problem: Problem, pitch: PitchTemplate, size: _PitchSize) -> InputError:
+    return InputError(
+        "pitch.json: length, width",
+        expected=f"the size of the pitch in metres; the clicks of {problem.where} fit "
+        f"{size.length:.1f} x {size.width:.1f} m",
+        found=f"{pitch.length:g} x {pitch.width:g}",
+        todo=f"Correct the size: {size.mistake}.",
+    )
+
+
+def _outlier_share(fit: InlierFit) -> float:
+    return 1.0 - float(fit.inliers.mean()) if len(fit.inliers) else 0.0
+
+
+def _find_size(
+    problem: Problem, pitch: PitchTemplate, settings: StaticCalibrationSettings
+) -> _PitchSize | None:
+    """Return another size that explains the clicked points, if there is one."""
+    sizes = (_size_in_yards(pitch), _PitchSize(105.0, 68.0, "it seems to be another pitch's"))
+    for size in sizes:
+        other = abs(size.length - pitch.length), abs(size.width - pitch.width)
+        if max(other) < _SAME_SIZE:
+            continue
+        found = _start_on_pitch(problem, size, settings)
+        if found is None:
+            continue
+        points, row = found
+        try:
+            fit = fit_inliers(points, row, settings)
+        except InputError:
+            continue
+        if _explains(fit):
+            return size
+    return None
+
+
+def _start_on_pitch(
+    problem: Problem, size: _PitchSize, settings: StaticCalibrationSettings
+) -> tuple[Problem, NDArray[np.float64]] | None:
+    """Return the clicked points on a pitch of another size, and a camera (22,) near the answer.
+
+    Args:
+        problem: clicks, noise and prior.
+        size: of the other pitch.
+        settings: with the prior of cameras.
+
+    Returns:
+        None if a point is not in the Laws, or the points determine no camera.
+    """
+    evidence, laws = problem.evidence, law_points(size.length, size.width)
+    if not set(evidence.points) <= laws.keys() or not has_enough_points(evidence):
+        return None
+    world = np.array([laws[name] for name in evidence.points])
+    world[:, 2] = evidence.points_world[:, 2]
+    points = _select_points(problem)
+    other = replace(points, evidence=replace(points.evidence, points_world=world))
+    rows = cameras_from_homographies(other, settings.prior, leave_out=False)
+    if not len(rows):
+        return None
+    start = adjust(other, rows, click_loss=_MANY)
+    return other, start.rows[np.argmin(start.cost)]
+
+
+def _select_points(problem: Problem) -> Problem:
+    """Return the problem without its drawn markings."""
+    evidence = problem.evidence
+    none = np.zeros(len(evidence.markings), dtype=np.bool_)
+    return problem.select(np.ones(len(evidence.points), dtype=np.bool_), none)
+
+
+def check_determined(found: Explanation, pitch: PitchTemplate) -> None:
+    """Raise InputError when the prior alone determines several directions of the camera."""
+    block = found.fit.evidence_information[:7, :7] * np.outer(_POSE_SPREAD, _POSE_SPREAD)
+    unknown = int((np.linalg.eigvalsh(block) < 1.0).sum())
+    if unknown < _MIN_UNKNOWN:
+        return
+    evidence = found.problem.evidence
+    clicked = (*evidence.points, *evidence.markings)
+    more = propose_clicks(found.estimate, pitch, clicked, found.settings.click_noise)
+    if not more:
+        places = np.concatenate([evidence.points_world, evidence.samples_world])
+        more = points_off_line(pitch, places)
+    raise InputError(
+        found.problem.where,
+        expected="clicks that determine where the camera stands and looks",
+        found=f"{describe_clicks(evidence)}, which leave {unknown} of its 7 degrees of freedom "
+        "open",
+        todo=f"Click more of what the image shows. The most helpful are {', '.join(more)}.",
+    )
+
+
+def _is_mirrored(found: Explanation) -> bool:
+    """Return whether the clicks fit far better with mirrored names."""
+    problem, settings = found.problem, found.settings
+    flip = np.array([-1.0, 1.0, 1.0])
+    evidence = replace(
+        problem.evidence,
+        points_world=problem.evidence.points_world * flip,
+        samples_world=problem.evidence.samples_world * flip,
+    )
+    mirrored = replace(problem, evidence=evidence)
+    rows = cameras_from_homographies(mirrored, settings.prior, leave_out=False)
+    if not len(rows):
+        rows = plausible_cameras(mirrored, settings.prior)
+        weighed = adjust(mirrored, rows, click_loss=_MANY, iterations=0)
+        rows = rows[np.argsort(weighed.cost, kind="stable")[: settings.search_cameras]]
+    best = adjust(mirrored, rows, click_loss=_MANY).cost.min()
+    given = adjust(problem, found.fit.row[None], click_loss=_MANY).cost[0]
+    return bool(best < _MIRRORED_GAIN * given)
